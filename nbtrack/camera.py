@@ -1,0 +1,88 @@
+"""The pinhole camera: intrinsics, rays, back-projection, and the one place that converts axes.
+
+Inside the package every camera frame has OpenCV's axes: x right, y down, z forward. Pixel centres
+lie at integer + 0.5, so an image of width W spans [0, W].
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Real
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without distortion; lengths in pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float  # principal point, column; W/2 is the image's middle
+    cy: float  # principal point, row; H/2 is the image's middle
+
+    @classmethod
+    def from_focal(cls, width: int, height: int, focal: float) -> "Intrinsics":
+        """Square pixels and a centred principal point: what the Neural RGB-D layout stores."""
+        return cls(width, height, focal, focal, width / 2, height / 2)
+
+    def scaled(self, factor: float) -> "Intrinsics":
+        """The same camera with images resized by `factor` (0.5 halves width and height)."""
+        return Intrinsics(
+            round(self.width * factor), round(self.height * factor),
+            self.fx * factor, self.fy * factor, self.cx * factor, self.cy * factor,
+        )  # fmt: skip
+
+
+def pixel_directions(
+    intrinsics: Intrinsics, columns: Real[Tensor, "*n"], rows: Real[Tensor, "*n"]
+) -> Float[Tensor, "*n 3"]:
+    """Ray directions (camera frame) through pixel centres, with z = 1.
+
+    A z-depth times this direction is the observed point. The length is not one: at the corner of
+    a 640x480 image with a 60 degree field of view it is about 1.23.
+
+    Args:
+        columns, rows: integer pixel indices, or real ones (0 addresses the centre at 0.5).
+    """
+    x = (columns.float() + 0.5 - intrinsics.cx) / intrinsics.fx
+    y = (rows.float() + 0.5 - intrinsics.cy) / intrinsics.fy
+    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+
+
+def backproject(
+    intrinsics: Intrinsics,
+    columns: Real[Tensor, "*n"],
+    rows: Real[Tensor, "*n"],
+    depth: Float[Tensor, "*n"],
+) -> Float[Tensor, "*n 3"]:
+    """Points (m, camera frame) observed at pixels with z-depth `depth` (m)."""
+    return pixel_directions(intrinsics, columns, rows) * depth.unsqueeze(-1)
+
+
+def project(
+    intrinsics: Intrinsics, points_camera: Float[Tensor, "*n 3"]
+) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"], Float[Tensor, "*n"]]:
+    """Columns, rows (real-valued pixel indices, as `pixel_directions` takes them) and z-depth (m).
+
+    Points behind the camera give a depth <= 0 and meaningless pixels; callers mask them.
+    """
+    x, y, depth = points_camera.unbind(-1)
+    columns = intrinsics.fx * x / depth + intrinsics.cx - 0.5
+    rows = intrinsics.fy * y / depth + intrinsics.cy - 0.5
+    return columns, rows, depth
+
+
+# OpenGL's camera looks along -z with y up. The matrix is its own inverse, so one function
+# converts both ways.
+_FLIP_Y_Z = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def swap_opengl_opencv(T_world_camera: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
+    """Camera-to-world poses with OpenGL camera axes, given OpenCV's, and the other way round.
+
+    The world frame stays as it is: only the camera's own axes change.
+    """
+    return T_world_camera @ _FLIP_Y_Z

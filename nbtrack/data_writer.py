@@ -1,0 +1,85 @@
+"""Write a sequence in the Neural RGB-D layout, frame by frame."""
+
+import shutil
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
+from nbtrack.camera import Intrinsics, swap_opengl_opencv
+from nbtrack.data import DEPTH_FOLDERS
+from nbtrack.errors import DataError
+
+
+class SequenceWriter:
+    """Context manager that collects frames in a hidden folder and puts it in place at the end.
+
+    A run that is killed, or ends with an exception, leaves no half-written scene behind.
+
+        with SequenceWriter(folder, intrinsics) as writer:
+            writer.add(color, {"depth": depth_mm}, T_world_camera)
+
+    Raises:
+        DataError: the folder exists already, or a frame has another size than the intrinsics.
+    """
+
+    def __init__(
+        self, folder: Path, intrinsics: Intrinsics, depth_folders: tuple[str, ...] = DEPTH_FOLDERS
+    ) -> None:
+        if folder.exists():
+            raise DataError(f"{folder} exists: choose another folder or remove it first")
+        self.folder = folder
+        self.intrinsics = intrinsics
+        self.depth_folders = depth_folders
+        # A sibling, so that the final rename stays within one file system.
+        self._unfinished = folder.with_name(f".{folder.name}.unfinished")
+        self._poses: list[Float[np.ndarray, "4 4"]] = []
+
+    def __enter__(self) -> "SequenceWriter":
+        shutil.rmtree(self._unfinished, ignore_errors=True)
+        for name in ("images", *self.depth_folders):
+            (self._unfinished / name).mkdir(parents=True)
+        return self
+
+    def add(
+        self,
+        color: UInt8[np.ndarray, "height width 3"],
+        depths_mm: dict[str, UInt16[np.ndarray, "height width"]],
+        T_world_camera: Float[np.ndarray, "4 4"],
+    ) -> None:
+        """Append one frame: RGB colour, one depth map a depth folder, pose with OpenCV axes."""
+        number = len(self._poses)
+        images = {"images/img": cv2.cvtColor(color, cv2.COLOR_RGB2BGR)}
+        images |= {f"{name}/depth": depths_mm[name] for name in self.depth_folders}
+        for prefix, image in images.items():
+            if image.shape[:2] != (self.intrinsics.height, self.intrinsics.width):
+                raise DataError(
+                    f"frame {number} is {image.shape[1]}x{image.shape[0]} but the camera "
+                    f"{self.intrinsics.width}x{self.intrinsics.height}: write frames of one size"
+                )
+            # The fastest compression: rooms are made often and read from a local disk.
+            encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+            encoded.tofile(self._unfinished / f"{prefix}{number}.png")
+        self._poses.append(T_world_camera)
+
+    def write_text(self, name: str, text: str) -> None:
+        """Put a small text file beside the layout's own."""
+        (self._unfinished / name).write_text(text, encoding="utf-8")
+
+    def __exit__(
+        self,
+        exception_type: type[BaseException] | None,
+        exception: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if exception_type is not None:
+            shutil.rmtree(self._unfinished, ignore_errors=True)
+            return
+        poses = swap_opengl_opencv(np.stack(self._poses)).reshape(-1, 4)
+        rows = "".join(" ".join(repr(float(v)) for v in row) + "\n" for row in poses)
+        self.write_text("focal.txt", f"{self.intrinsics.fx!r}\n")
+        self.write_text("poses.txt", rows)
+        self.write_text("trainval_poses.txt", rows)
+        self._unfinished.rename(self.folder)

@@ -1,0 +1,38 @@
+"""One exception family. A message says what was found, what is allowed and what to do next."""
+
+import difflib
+
+
+class NbtrackError(Exception):
+    """Root of every error that a user can cause; the command line turns it into exit status 2."""
+
+
+class DataError(NbtrackError, ValueError):
+    """A file or folder of a sequence is not as its layout demands."""
+
+
+class MissingError(NbtrackError, FileNotFoundError):
+    """Something that was asked for by name or path does not exist."""
+
+
+class ConfigError(NbtrackError, ValueError):
+    """A setting has an unknown name or a value that is not allowed."""
+
+
+class NumericalError(NbtrackError, ArithmeticError):
+    """A loss or a pose stopped being finite; the message names where it was born."""
+
+
+def nearest_name(found: str, allowed: list[str]) -> str:
+    """Hint for a misspelt name: `did you mean 'x'? Allowed: a, b, x`.
+
+    Args:
+        found: the name as the user gave it.
+        allowed: every valid name, in the order in which to list them.
+
+    >>> nearest_name("imapp", ["imap", "neus"])
+    "did you mean 'imap'? Allowed: imap, neus"
+    """
+    close = difflib.get_close_matches(found, allowed, n=1, cutoff=0.5)
+    hint = f"did you mean '{close[0]}'? " if close else ""
+    return f"{hint}Allowed: {', '.join(allowed)}"

@@ -1,0 +1,91 @@
+"""Rigid transforms and unit quaternions, differentiable. No learning, no files."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def normalize_quaternion(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Unit quaternion of the same rotation axis and angle.
+
+    Source: paper, implementation details ("we renormalize after every optimization step").
+    """
+    return q_wxyz / q_wxyz.norm(dim=-1, keepdim=True)
+
+
+def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrix of a unit quaternion (order w, x, y, z).
+
+    The quaternion is taken as it is: a norm other than one scales the matrix. Tracking therefore
+    renormalises first, so that the gradient has no component along the norm.
+
+    >>> quaternion_to_matrix(torch.tensor([0.0, 0.0, 0.0, 1.0])).diagonal().tolist()
+    [-1.0, -1.0, 1.0]
+    """
+    w, x, y, z = q_wxyz.unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def matrix_to_quaternion(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Unit quaternion (w, x, y, z) of a rotation matrix; w >= 0.
+
+    Each of the four components is the largest for some rotation; the best-conditioned of the four
+    classical formulas is selected, so that no rotation angle divides by a small number.
+    """
+    m = rotation
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    # Four times the squares of w, x, y, z.
+    squares = torch.stack(
+        [1 + trace] + [1 - trace + 2 * m[..., i, i] for i in range(3)], dim=-1
+    ).clamp_min(0)
+    products = _quaternion_products(m)
+    best = squares.argmax(dim=-1, keepdim=True)
+    row = products.gather(-2, best.unsqueeze(-1).expand(*best.shape, 4)).squeeze(-2)
+    q_wxyz = normalize_quaternion(row)
+    return torch.where(q_wxyz[..., :1] < 0, -q_wxyz, q_wxyz)
+
+
+def _quaternion_products(m: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4 4"]:
+    """4 q qᵀ of the quaternion (w, x, y, z) of a rotation matrix: every row is a multiple of q."""
+    xx, yy, zz = (m[..., i, i] for i in range(3))
+    wx, wy, wz = (m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1])
+    xy, xz, yz = (m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1])
+    entries = [
+        1 + xx + yy + zz, wx, wy, wz,
+        wx, 1 + xx - yy - zz, xy, xz,
+        wy, xy, 1 - xx + yy - zz, yz,
+        wz, xz, yz, 1 - xx - yy + zz,
+    ]  # fmt: skip
+    return torch.stack(entries, dim=-1).unflatten(-1, (4, 4))
+
+
+def make_transform(
+    rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """Homogeneous transform from a rotation matrix and a translation (m)."""
+    bottom = rotation.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*rotation.shape[:-2], 1, 4)
+    return torch.cat([torch.cat([rotation, translation.unsqueeze(-1)], dim=-1), bottom], dim=-2)
+
+
+def invert_transform(T_a_b: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """`T_b_a` of a rigid `T_a_b`, by transposing the rotation: exact where a matrix inverse is not."""
+    rotation_b_a = T_a_b[..., :3, :3].transpose(-1, -2)
+    return make_transform(rotation_b_a, -(rotation_b_a @ T_a_b[..., :3, 3:]).squeeze(-1))
+
+
+def transform_points(
+    T_a_b: Float[Tensor, "4 4"], points_b: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Points (m) of frame b expressed in frame a."""
+    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def rotation_angle(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+    """Angle (rad, 0 to pi) of a rotation, accurate near zero, where the arc cosine is not."""
+    q_wxyz = matrix_to_quaternion(rotation)
+    return 2 * torch.atan2(q_wxyz[..., 1:].norm(dim=-1), q_wxyz[..., 0])
