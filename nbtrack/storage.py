@@ -1,0 +1,42 @@
+"""Files that are either complete or absent: every result is written aside, then moved into place.
+
+Two processes may work on the same results folder and either may be killed; a reader must never
+meet half a file.
+"""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+
+def write_bytes_atomic(path: Path, content: bytes) -> None:
+    """Replaces the file at `path` by `content` in one move; missing parent folders are made.
+
+    Raises:
+        OSError: the folder cannot be made or written; an existing file is then left as it was.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # The process id keeps two writers of one path from moving each other's half-written file.
+    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        aside.write_bytes(content)
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def write_text_atomic(path: Path, text: str) -> None:
+    """As `write_bytes_atomic`, for text: UTF-8 with the given line ends on every system."""
+    write_bytes_atomic(path, text.encode("utf-8"))
+
+
+def write_json_atomic(path: Path, content: Any) -> None:
+    """As `write_bytes_atomic`, for JSON: indented, keys in the given order, newline at the end.
+
+    Raises:
+        ValueError: a number is NaN or infinite, for which JSON has no word; pass None instead.
+    """
+    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
+    write_text_atomic(path, text + "\n")
