@@ -1,0 +1,83 @@
+"""The axis-aligned box that a sequence observes: where fields live and where rays end."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nbtrack.camera import backproject
+from nbtrack.data import Sequence
+from nbtrack.errors import DataError
+
+
+@dataclass(frozen=True)
+class SceneBounds:
+    """Axis-aligned box in the world frame, metres."""
+
+    minimum: tuple[float, float, float]
+    maximum: tuple[float, float, float]
+
+    @property
+    def center(self) -> Float[np.ndarray, "3"]:
+        """Middle of the box, world frame."""
+        return (np.array(self.minimum) + np.array(self.maximum)) / 2
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Half of the longest side: it maps the box into [-1, 1]^3 without changing its shape."""
+        return float((np.array(self.maximum) - np.array(self.minimum)).max() / 2)
+
+    def exit_depth(
+        self, origins_world: Float[Tensor, "rays 3"], directions_world: Float[Tensor, "rays 3"]
+    ) -> Float[Tensor, "rays"]:
+        """Where rays from inside leave the box, in units of the direction (z-depth, m, for z = 1).
+
+        Rays that start outside, as a lost camera's do, may give small or negative values.
+        """
+        # An axis that a ray runs along is left at infinity, never at 0/0.
+        safe = torch.where(directions_world.abs() < 1e-9, 1e-9, directions_world)
+        to_minimum = (origins_world.new_tensor(self.minimum) - origins_world) / safe
+        to_maximum = (origins_world.new_tensor(self.maximum) - origins_world) / safe
+        return torch.maximum(to_minimum, to_maximum).amin(dim=-1)
+
+
+def observed_bounds(
+    sequence: Sequence, margin: float = 0.1, quantile: float = 0.002, points_per_frame: int = 2000
+) -> SceneBounds:
+    """Box around everything a sequence sees, and its cameras, with `margin` metres to spare.
+
+    Args:
+        quantile: share of points cut off at either end of each axis, so that a few wild depths
+            do not stretch the box (our choice; the cameras are never cut off).
+        points_per_frame: pixels looked at in each frame, on a regular grid.
+
+    Raises:
+        DataError: no pixel of the sequence has a depth.
+    """
+    intrinsics = sequence.intrinsics
+    stride = max(1, round((intrinsics.width * intrinsics.height / points_per_frame) ** 0.5))
+    rows, columns = torch.meshgrid(
+        torch.arange(stride // 2, intrinsics.height, stride),
+        torch.arange(stride // 2, intrinsics.width, stride),
+        indexing="ij",
+    )
+    clouds = []
+    for index in range(len(sequence)):
+        depth = torch.from_numpy(sequence.depth(index))[rows, columns]
+        seen = depth > 0
+        points_camera = backproject(intrinsics, columns[seen], rows[seen], depth[seen]).numpy()
+        T_world_camera = sequence.T_world_camera[index]
+        clouds.append(points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])
+    points_world = np.concatenate(clouds)
+    if len(points_world) == 0:
+        raise DataError(
+            f"no pixel of {sequence.name} has a depth: all {len(sequence)} depth maps are 0; "
+            "check the depth folder and its unit (uint16 millimetres)"
+        )
+    positions = sequence.T_world_camera[:, :3, 3]
+    low, high = np.quantile(points_world, [quantile, 1 - quantile], axis=0)
+    low = np.minimum(low, positions.min(axis=0)) - margin
+    high = np.maximum(high, positions.max(axis=0)) + margin
+    return SceneBounds(tuple(low.tolist()), tuple(high.tolist()))

@@ -1,0 +1,236 @@
+"""Fit a field to posed RGB-D frames: one loop for every field, with checkpoints and resume."""
+
+import io
+import math
+import pickle
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from jaxtyping import Int
+
+from nbtrack.bounds import SceneBounds, observed_bounds
+from nbtrack.config import FieldConfig, MappingConfig, as_dict
+from nbtrack.data import Sequence
+from nbtrack.device import suitable_threads
+from nbtrack.errors import DataError, NumericalError
+from nbtrack.fields import Field, make_field
+from nbtrack.sampling import PixelSampler, mapping_depths
+from nbtrack.storage import write_bytes_atomic
+
+CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
+_FLUSH_EVERY = 10  # iterations between two looks at the losses: each look waits for the device
+_FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
+
+OnIteration = Callable[[int, dict[str, float]], None]
+
+
+@dataclass(frozen=True)
+class FittedMap:
+    """A mapped scene."""
+
+    field: Field
+    history: pd.DataFrame  # one row an iteration: weighted loss terms and diagnostics
+    seconds: float  # time spent in iterations, all sessions of a resumed run together
+    resumed_from: int = 0  # iteration at which this run took up a checkpoint
+
+
+def split_holdout(
+    n_frames: int, every: int
+) -> tuple[Int[np.ndarray, "mapping"], Int[np.ndarray, "held_out"]]:
+    """Indices of the frames to map and of those kept back for scoring.
+
+    Every `every`-th frame is kept back, beginning in the middle of the first stretch; with
+    `every` = 0, or too few frames, none is.
+
+    >>> split_holdout(6, 3)
+    (array([0, 2, 3, 5]), array([1, 4]))
+    """
+    indices = np.arange(n_frames)
+    if every < 2 or n_frames < every:
+        return indices, indices[:0]
+    held_out = indices[every // 2 :: every]
+    return np.setdiff1d(indices, held_out), held_out
+
+
+def map_sequence(
+    field_name: str,
+    sequence: Sequence,
+    field_config: FieldConfig,
+    config: MappingConfig,
+    seed: int = 0,
+    device: torch.device | None = None,
+    checkpoint: Path | None = None,
+    on_iteration: OnIteration | None = None,
+) -> FittedMap:
+    """Fit a field to a sequence with known poses.
+
+    Args:
+        checkpoint: file that is written every few seconds and, where it exists and fits, resumed
+            from. A resumed run draws the same batches as an uninterrupted one.
+        on_iteration: called with the iteration count and its losses, a few times a second at most.
+
+    Raises:
+        DataError: no pixel has a depth, or the checkpoint belongs to other settings.
+        NumericalError: a loss is not finite.
+    """
+    device = device or torch.device("cpu")
+    run = _Run(field_name, sequence, field_config, config, seed, device)
+    if checkpoint and checkpoint.exists():
+        run.load(checkpoint)
+    resumed_from = run.iteration
+    last_saved = time.perf_counter()
+    with suitable_threads(field_config.width):
+        while run.iteration < config.iterations:
+            run.advance(min(_FLUSH_EVERY, config.iterations - run.iteration))
+            if on_iteration:
+                on_iteration(run.iteration, run.history[-1])
+            if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
+                run.save(checkpoint)
+                last_saved = time.perf_counter()
+    if checkpoint:
+        run.save(checkpoint)
+    run.field.eval().requires_grad_(False)
+    return FittedMap(run.field, run.history_frame(), run.seconds, resumed_from)
+
+
+def load_map(
+    checkpoint: Path, field_name: str, field_config: FieldConfig, device: torch.device
+) -> FittedMap:
+    """A finished map from its last checkpoint, ready for tracking.
+
+    Raises:
+        DataError: the file is not a map of this field.
+    """
+    state = _read_checkpoint(checkpoint)
+    if state["settings"]["field"] != field_name:
+        raise DataError(
+            f"{checkpoint} is a map of field {state['settings']['field']!r}, not {field_name!r}: "
+            "map again or name the right field"
+        )
+    field = make_field(field_name, field_config, SceneBounds(*state["bounds"]), seed=0)
+    field.load_state_dict(state["field"])
+    field.to(device).eval().requires_grad_(False)
+    history = pd.DataFrame({name: values.numpy() for name, values in state["history"].items()})
+    history.index.name = "iteration"
+    return FittedMap(field, history, state["seconds"], state["iteration"])
+
+
+class _Run:
+    """All that changes while a field is fitted, and nothing else."""
+
+    def __init__(
+        self,
+        field_name: str,
+        sequence: Sequence,
+        field_config: FieldConfig,
+        config: MappingConfig,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        self.config = config
+        self.settings = {
+            "field": field_name, "seed": seed, "sequence": sequence.name, "frames": len(sequence),
+            "field_config": as_dict(field_config), "mapping_config": as_dict(config),
+        }  # fmt: skip
+        self.bounds = observed_bounds(sequence)
+        self.field = make_field(field_name, field_config, self.bounds, seed).to(device)
+        self.optimizer = torch.optim.Adam(self.field.parameters(), lr=config.learning_rate)
+        self.generator = torch.Generator(device).manual_seed(seed)
+        self.sampler = PixelSampler(sequence, device)
+        mapping_frames, _ = split_holdout(len(sequence), config.holdout_every)
+        self.frames = torch.from_numpy(mapping_frames).to(device)
+        self.iteration = 0
+        self.seconds = 0.0
+        self.history: list[dict[str, float]] = []
+
+    def advance(self, n_iterations: int) -> None:
+        """Take some steps, then look at their losses once."""
+        start = time.perf_counter()
+        pending = [self._step(self.iteration + offset) for offset in range(n_iterations)]
+        names = list(pending[0])
+        values = torch.stack([torch.stack(list(terms.values())) for terms in pending]).tolist()
+        diagnostics = self.field.diagnostics()
+        for offset, row in enumerate(values):
+            terms = dict(zip(names, row, strict=True))
+            for name, value in terms.items():
+                if not math.isfinite(value):
+                    raise NumericalError(
+                        f"loss term {name!r} became {value} at mapping iteration "
+                        f"{self.iteration + offset}: lower the learning rate "
+                        f"({self.config.learning_rate:g}) or check the depth and poses"
+                    )
+            self.history.append({**terms, "total": sum(row), **diagnostics})
+        self.iteration += n_iterations
+        self.seconds += time.perf_counter() - start
+
+    def _step(self, iteration: int) -> dict[str, torch.Tensor]:
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.config, iteration)
+        rays = self.sampler.draw(self.config.n_rays, self.generator, self.frames)
+        depths = mapping_depths(rays, self.bounds, self.config, self.generator)
+        terms = self.field.mapping_losses(rays, depths, self.config, self.generator)
+        self.optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(terms.values())).sum().backward()
+        self.optimizer.step()
+        return {name: value.detach() for name, value in terms.items()}
+
+    def history_frame(self) -> pd.DataFrame:
+        history = pd.DataFrame(self.history)
+        history.index.name = "iteration"
+        return history
+
+    def save(self, checkpoint: Path) -> None:
+        history = self.history_frame()
+        buffer = io.BytesIO()
+        torch.save(
+            {
+                "settings": self.settings,
+                "bounds": (self.bounds.minimum, self.bounds.maximum),
+                "field": self.field.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "generator": self.generator.get_state(),
+                "iteration": self.iteration,
+                "seconds": self.seconds,
+                "history": {name: torch.tensor(history[name].to_numpy()) for name in history},
+            },
+            buffer,
+        )
+        write_bytes_atomic(checkpoint, buffer.getvalue())
+
+    def load(self, checkpoint: Path) -> None:
+        state = _read_checkpoint(checkpoint)
+        if state["settings"] != self.settings:
+            found, wanted = state["settings"], self.settings
+            changed = [name for name in wanted if found.get(name) != wanted[name]]
+            raise DataError(
+                f"{checkpoint} was made with another {', '.join(changed)}: "
+                "remove it, or choose another output folder"
+            )
+        self.field.load_state_dict(state["field"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"])
+        self.iteration, self.seconds = state["iteration"], state["seconds"]
+        columns = {name: values.tolist() for name, values in state["history"].items()}
+        self.history = pd.DataFrame(columns).to_dict("records")
+
+
+def learning_rate(config: MappingConfig, iteration: int) -> float:
+    """Adam's learning rate: a cosine from its start down to a twentieth. Source: NeuS."""
+    progress = iteration / config.iterations
+    share = _FINAL_RATE + (1 - _FINAL_RATE) * (1 + math.cos(math.pi * progress)) / 2
+    return config.learning_rate * share
+
+
+def _read_checkpoint(checkpoint: Path) -> dict:
+    try:
+        return torch.load(checkpoint, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise DataError(
+            f"{checkpoint} is not a readable map ({type(error).__name__}): "
+            "remove it and map again"
+        ) from None

@@ -1,0 +1,11 @@
+"""Trackers. A module in this folder that registers a tracker makes it known everywhere."""
+
+import importlib
+import pkgutil
+
+from nbtrack.trackers.base import TRACKERS, AdamTracker, Tracker, tracker_class
+
+for _module in pkgutil.iter_modules(__path__):
+    importlib.import_module(f"{__name__}.{_module.name}")
+
+__all__ = ["TRACKERS", "AdamTracker", "Tracker", "tracker_class"]

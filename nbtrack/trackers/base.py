@@ -1,0 +1,121 @@
+"""What every tracker offers to the tracking loop, and the registry of trackers."""
+
+import abc
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nbtrack.config import TrackingConfig
+from nbtrack.errors import ConfigError, nearest_name
+from nbtrack.fields import Field
+from nbtrack.geometry import (
+    make_transform,
+    matrix_to_quaternion,
+    normalize_quaternion,
+    quaternion_to_matrix,
+)
+from nbtrack.sampling import PixelSampler
+
+
+class Tracker(abc.ABC):
+    """Estimates the camera's pose in a fixed field, one optimisation step at a time."""
+
+    name: str  # on the command line and in file names
+    label: str  # in tables and figures
+    field_name: str  # the field whose maps it tracks in
+    paper_steps: str = "sdf"  # whose step counts of the paper's Table II it is given
+
+    def __init__(
+        self,
+        field: Field,
+        sampler: PixelSampler,
+        config: TrackingConfig,
+        generator: torch.Generator,
+    ) -> None:
+        self.field = field
+        self.sampler = sampler
+        self.config = config
+        self.generator = generator
+
+    @abc.abstractmethod
+    def start_frame(self, frame: int, T_world_camera: Float[Tensor, "4 4"]) -> None:
+        """Take up a frame of the sequence, starting from an initial pose."""
+
+    @abc.abstractmethod
+    def step(self) -> Float[Tensor, ""]:
+        """One optimisation step; returns the loss before it, still on the device."""
+
+    @property
+    @abc.abstractmethod
+    def T_world_camera(self) -> Float[Tensor, "4 4"]:
+        """The present estimate, without gradient."""
+
+
+class AdamTracker(Tracker):
+    """The paper's optimiser: Adam on a position and a unit quaternion, new pixels every step.
+
+    Source: paper, implementation details. Each frame starts with a fresh Adam: momentum gathered
+    on the frame before would carry the pose on at a frame where the camera stands still (our
+    choice; the paper does not say).
+    """
+
+    def start_frame(self, frame: int, T_world_camera: Float[Tensor, "4 4"]) -> None:
+        """Take up a frame at an initial pose; the frame's measured pixels are listed once."""
+        self.frame = frame
+        self.rows, self.columns = self.sampler.measured_pixels(frame)
+        self.position = T_world_camera[:3, 3].clone().requires_grad_()
+        self.q_wxyz = matrix_to_quaternion(T_world_camera[:3, :3]).requires_grad_()
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": [self.position], "lr": self.config.position_rate},
+                {"params": [self.q_wxyz], "lr": self.config.orientation_rate},
+            ]
+        )
+
+    def step(self) -> Float[Tensor, ""]:
+        """Draw pixels, lower their loss by one step of Adam, renormalise the quaternion."""
+        drawn = torch.randint(
+            len(self.rows), (self.config.n_pixels,),
+            generator=self.generator, device=self.generator.device,
+        )  # fmt: skip
+        loss = self.loss(self._differentiable_pose(), self.rows[drawn], self.columns[drawn])
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.step()
+        with torch.no_grad():
+            self.q_wxyz.copy_(normalize_quaternion(self.q_wxyz))
+        return loss.detach()
+
+    @abc.abstractmethod
+    def loss(
+        self,
+        T_world_camera: Float[Tensor, "4 4"],
+        rows: Int[Tensor, "n"],
+        columns: Int[Tensor, "n"],
+    ) -> Float[Tensor, ""]:
+        """The loss of some pixels of the current frame at a pose."""
+
+    @property
+    def T_world_camera(self) -> Float[Tensor, "4 4"]:
+        """The present estimate, without gradient."""
+        return self._differentiable_pose().detach()
+
+    def _differentiable_pose(self) -> Float[Tensor, "4 4"]:
+        return make_transform(quaternion_to_matrix(self.q_wxyz), self.position)
+
+
+TRACKERS: dict[str, type[Tracker]] = {}
+
+
+def register_tracker(tracker: type[Tracker]) -> type[Tracker]:
+    """Class decorator that makes a tracker known under its name, and a row of the tables."""
+    TRACKERS[tracker.name] = tracker
+    return tracker
+
+
+def tracker_class(name: str) -> type[Tracker]:
+    """The registered tracker of a name. Raises ConfigError, naming the nearest, for any other."""
+    if name not in TRACKERS:
+        raise ConfigError(f"unknown tracker {name!r}: {nearest_name(name, sorted(TRACKERS))}")
+    return TRACKERS[name]
