@@ -124,19 +124,18 @@ _MEASURED_STEPS = {"vr": {100: 6.8, 500: 36.1}, "sdf": {100: 15.3, 500: 79.3}}
 """Steps within a budget (ms) for the default n (VR 512, SDF 4096). Source: paper, Table II."""
 
 
-def _steps_within(tracker: str, budget_ms: float | int) -> float:
-    """Steps on the paper's hardware, on the straight line through its 100 and 500 ms figures.
+def paper_steps(tracker: str, rate_hz: float) -> float:
+    """Steps a frame on the paper's hardware, on the line through its 100 and 500 ms figures.
 
-    The time per step is then the same at every budget, and so is the fixed cost of a frame. Table
-    II has no 200 ms column although Table I has 5 Hz, so this one is our choice.
+    The time per step is then the same at every rate, and so is the fixed cost of a frame. Table
+    II has no 200 ms column although Table I has 5 Hz, so that one is our choice.
+
+    Args:
+        tracker: "vr" or "sdf", with the paper's n = 512 and 4096.
+
+    Raises:
+        ConfigError: the rate is not a finite number above zero.
     """
+    budget_ms = 1000 / _positive("rate_hz", rate_hz, "10, 5 or 2 as in the paper")
     at_100, at_500 = _MEASURED_STEPS[tracker][100], _MEASURED_STEPS[tracker][500]
     return round(at_100 + (at_500 - at_100) * (budget_ms - 100) / 400, 6)
-
-
-PAPER_STEPS: dict[tuple[str, int], float] = {
-    (tracker, rate_hz): _steps_within(tracker, 1000 / rate_hz)
-    for tracker in _MEASURED_STEPS
-    for rate_hz in (10, 5, 2)
-}
-"""Steps per frame on the paper's hardware by (tracker "vr" or "sdf", rate in Hz)."""

@@ -24,9 +24,9 @@ class FieldConfig:
 
     width: int = 256  # hidden units a layer (iMAP)
     n_frequencies: int = 93  # learnable sines of the embedding (iMAP)
-    # Standard deviation of the sines' frequencies, rad per normalised unit (half the scene's
-    # longest side). 12 is 6 rad/m in a room of 4 m, where trials gave a usable distance field.
-    embedding_sigma: float = 12.0
+    # Standard deviation of the sines' first frequencies, rad per normalised unit (half the
+    # scene's longest side). 5 is iMAP's own 2.5 rad/m in a room of 4 m.
+    embedding_sigma: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class MappingConfig:
     n_surface: int = 12  # samples a ray around the measured depth (as many as iMAP's second pass)
     surface_band: float = 0.15  # half width of that region, m
     learning_rate: float = 1e-3  # Adam's, at the start; falls to a twentieth along a cosine (NeuS)
-    lambda_color: float = 5.0  # iMAP
-    lambda_depth: float = 1.0  # NeuS only; iMAP divides by the rendered deviation instead
-    lambda_eikonal: float = 0.1  # NeuS only; the method's own value
+    lambda_color: float = 5.0  # iMAP's, whose depth errors are relative to their deviation
+    lambda_depth: float = 1.0  # NeuS only, per metre
+    lambda_eikonal: float = 0.5  # NeuS only; five times the method's own: rooms are mostly empty
     eikonal_share: float = 0.25  # share of the samples that the eikonal term looks at
     holdout_every: int = 10  # every n-th frame is kept from mapping and scored afterwards
 
@@ -77,12 +77,14 @@ class TablesConfig:
 
     rates_hz: tuple[float, ...] = (10.0, 5.0, 2.0)  # paper, Table I
     budgets_ms: tuple[float, ...] = (50.0, 100.0, 500.0)  # paper, Table II
-    vr_pixels: tuple[int, ...] = (128, 512, 1024)  # paper, Table II
-    sdf_pixels: tuple[int, ...] = (2048, 4096, 16384)  # paper, Table II
+    # Pixels n of each tracker in Table II (paper); others take those of the SDF tracker.
+    pixels: dict[str, tuple[int, ...]] = field(
+        default_factory=lambda: {"vr": (128, 512, 1024), "sdf": (2048, 4096, 16384)}
+    )
 
-
-def _per_name(**configs: Any) -> Any:
-    return field(default_factory=lambda: dict(configs))
+    def pixels_of(self, tracker_name: str) -> tuple[int, ...]:
+        """Pixel counts of a tracker's rows in Table II."""
+        return self.pixels.get(tracker_name, self.pixels["sdf"])
 
 
 @dataclass(frozen=True)
@@ -90,13 +92,26 @@ class Preset:
     """Everything that a run depends on, apart from the data and the seed."""
 
     name: str
-    field: FieldConfig = FieldConfig()
-    mapping: dict[str, MappingConfig] = _per_name(imap=MappingConfig(), neus=MappingConfig())
-    tracking: dict[str, TrackingConfig] = _per_name(
-        vr=TrackingConfig(n_pixels=512, lambda_color=5.0), sdf=TrackingConfig()
+    # A density gains from finer detail; a distance must start smooth, or the eikonal term is met
+    # by ripples: 12 in place of 5 cost 30 cm of the distance in free space in trials.
+    network: dict[str, FieldConfig] = field(
+        default_factory=lambda: {"imap": FieldConfig(embedding_sigma=12.0), "neus": FieldConfig()}
+    )
+    mapping: dict[str, MappingConfig] = field(
+        default_factory=lambda: {"imap": MappingConfig(), "neus": MappingConfig(lambda_color=2.0)}
+    )
+    tracking: dict[str, TrackingConfig] = field(
+        default_factory=lambda: {
+            "vr": TrackingConfig(n_pixels=512, lambda_color=5.0),
+            "sdf": TrackingConfig(),
+        }
     )
     scenes: ScenesConfig = ScenesConfig()
     tables: TablesConfig = TablesConfig()
+
+    def network_of(self, field_name: str) -> FieldConfig:
+        """Network of a field; a field without its own takes that of NeuS."""
+        return self.network.get(field_name, self.network["neus"])
 
     def mapping_of(self, field_name: str) -> MappingConfig:
         """Mapping settings of a field; a field without its own takes those of NeuS."""
@@ -110,17 +125,22 @@ class Preset:
 # Pixel counts of `smoke` are the paper's divided by eight: the ratio of VR to SDF stays.
 _SMOKE = Preset(
     "smoke",
-    field=FieldConfig(width=96),
+    network={
+        "imap": FieldConfig(width=96, embedding_sigma=12.0),
+        "neus": FieldConfig(width=96),
+    },
     mapping={
         "imap": MappingConfig(1200, n_rays=192, n_stratified=16, n_surface=8, learning_rate=3e-3),
-        "neus": MappingConfig(1500, n_rays=128, n_stratified=16, n_surface=8, learning_rate=3e-3),
+        "neus": MappingConfig(
+            1500, n_rays=128, n_stratified=16, n_surface=8, learning_rate=3e-3, lambda_color=2.0
+        ),
     },
     tracking={
-        "vr": TrackingConfig(n_pixels=64, lambda_color=5.0, n_stratified=16, n_importance=8),
+        "vr": TrackingConfig(n_pixels=64, lambda_color=5.0),
         "sdf": TrackingConfig(n_pixels=512),
     },
     scenes=ScenesConfig(("living_room", "office"), n_frames=240, width=96, track_frames=":120"),
-    tables=TablesConfig(vr_pixels=(16, 64, 128), sdf_pixels=(256, 512, 2048)),
+    tables=TablesConfig(pixels={"vr": (16, 64, 128), "sdf": (256, 512, 2048)}),
 )
 _SYNTHETIC = Preset(
     "synthetic",
@@ -161,7 +181,7 @@ def resolve_preset(
     if file_name:
         for key, value in _flatten(_read_toml(Path(file_name))).items():
             preset = _replace(preset, key, value)
-    for setting in (*shlex.split(os.environ.get("NBTRACK_SET", "")), *settings):
+    for setting in (*_environment_settings(), *settings):
         key, equals, text = setting.partition("=")
         if not equals:
             raise ConfigError(f"setting {setting!r} has no value: write key=value")
@@ -180,6 +200,16 @@ def fingerprint(*parts: Any) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
 
 
+def _environment_settings() -> list[str]:
+    text = os.environ.get("NBTRACK_SET", "")
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise ConfigError(
+            f"NBTRACK_SET={text!r} cannot be split ({error}): quote each setting as in a shell"
+        ) from None
+
+
 def _read_toml(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise MissingError(f"no config file {path}: give a TOML file of settings")
@@ -193,7 +223,13 @@ def _parse_value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
-        return text  # a bare word is a string
+        pass
+    if text.startswith(("[", "{", '"', "'")):
+        raise ConfigError(
+            f"value {text!r} is no TOML: write ['a', 'b'] or [1, 2], and quote the whole "
+            "setting, so that the shell leaves the inner quotes"
+        )
+    return text  # a bare word is a string
 
 
 def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -216,13 +252,16 @@ def _replaced(node: Any, path: list[str], key: str, value: Any) -> Any:
     head, *rest = path
     old = node[head] if isinstance(node, dict) else getattr(node, head)
     new = _replaced(old, rest, key, value) if rest else _converted(key, old, value)
-    return {**node, head: new} if isinstance(node, dict) else dataclasses.replace(node, **{head: new})
+    if isinstance(node, dict):
+        return {**node, head: new}
+    return dataclasses.replace(node, **{head: new})
 
 
 def _converted(key: str, old: Any, value: Any) -> Any:
     wanted = type(old)
     if wanted is tuple and isinstance(value, list | str | int | float):
-        value = tuple(value) if isinstance(value, list) else (value,)
+        values = value if isinstance(value, list) else [value]
+        return tuple(_converted(key, old[0], v) if old else v for v in values)
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not wanted:

@@ -12,7 +12,6 @@ Frames are counted from 0 without padding, hence the natural sort.
 """
 
 import re
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,13 +23,13 @@ from tqdm.auto import tqdm
 
 from nbtrack.camera import Intrinsics, swap_opengl_opencv
 from nbtrack.errors import DataError, MissingError
+from nbtrack.images import read_image
 
 # Which depth to read when the caller does not say: filtered is what the dataset's own loader and
 # most users of the dataset take; the others serve scenes that lack it.
 DEPTH_FOLDERS = ("depth_filtered", "depth", "depth_with_noise")
 MILLIMETRE = 1e-3
 FRAMES_PER_SECOND = 30.0  # of the recordings; turns frame ids into time stamps
-_PNG_END = b"IEND\xaeB`\x82"
 
 
 @dataclass(frozen=True)
@@ -153,7 +152,7 @@ def list_frames(folder: Path, depth_folder: str | None = None) -> tuple[list[Pat
 
     Raises:
         MissingError: the folder, its images or the depth folder do not exist.
-        DataError: the numbers of images and depth maps, or the frame numbers in their names, differ.
+        DataError: images and depth maps differ in number or in the frame numbers of their names.
     """
     if not folder.is_dir():
         raise MissingError(
@@ -180,7 +179,7 @@ def list_frames(folder: Path, depth_folder: str | None = None) -> tuple[list[Pat
 
 
 def read_focal(path: Path) -> float:
-    """Focal length in pixels from `focal.txt`. Raises DataError unless it is one positive number."""
+    """Focal length (pixels) from `focal.txt`. Raises DataError unless it is a positive number."""
     text = _read_text(path).strip()
     try:
         focal = float(text)
@@ -188,7 +187,8 @@ def read_focal(path: Path) -> float:
         focal = float("nan")
     if not (np.isfinite(focal) and focal > 0):
         raise DataError(
-            f"{path} holds {text[:40]!r}: it must be one positive number, the focal length in pixels"
+            f"{path} holds {text[:40]!r}: it must be one positive number, "
+            "the focal length in pixels"
         )
     return focal
 
@@ -218,22 +218,6 @@ def read_poses(path: Path) -> Float[np.ndarray, "frames 4 4"]:
     return np.array(rows, dtype=np.float64).reshape(-1, 4, 4)
 
 
-def read_image(path: Path, flags: int) -> np.ndarray:
-    """Decoded image file. Raises DataError if it is cut short or not an image.
-
-    OpenCV fills the missing rows of a PNG that was cut in half, so the end is checked first.
-    """
-    content = np.fromfile(path, dtype=np.uint8)
-    complete = path.suffix.lower() != ".png" or content[-8:].tobytes() == _PNG_END
-    image = cv2.imdecode(content, flags) if complete and len(content) else None
-    if image is None:
-        raise DataError(
-            f"{path} is not a complete image ({len(content)} bytes): copy it again or remove "
-            "the frame's image, depth and pose"
-        )
-    return image
-
-
 def _read_images(
     image_files: list[Path], depth_files: list[Path], progress: bool
 ) -> tuple[UInt8[np.ndarray, "n height width 3"], UInt16[np.ndarray, "n height width"]]:
@@ -260,13 +244,10 @@ def _read_images(
     # Decoding releases the interpreter lock, so a few threads suffice.
     with ThreadPoolExecutor(max_workers=4) as pool:
         jobs = pool.map(read, range(len(image_files)))
-        _drain(tqdm(jobs, "reading frames", len(image_files), unit="frame", disable=not progress))
+        bar = tqdm(jobs, "reading frames", len(image_files), unit="frame", disable=not progress)
+        for _ in bar:  # raises what a thread raised
+            pass
     return colors, depths_mm
-
-
-def _drain(jobs: Iterable[None]) -> None:
-    for _ in jobs:
-        pass
 
 
 def _numbered_images(folder: Path) -> list[Path]:
@@ -290,7 +271,8 @@ def _read_text(path: Path) -> str:
 
 
 def _slice_text(frames: slice) -> str:
-    return ":".join("" if part is None else str(part) for part in (frames.start, frames.stop, frames.step))
+    parts = (frames.start, frames.stop, frames.step)
+    return ":".join("" if part is None else str(part) for part in parts)
 
 
 def _check_rotations(

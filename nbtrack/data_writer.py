@@ -22,7 +22,8 @@ class SequenceWriter:
             writer.add(color, {"depth": depth_mm}, T_world_camera)
 
     Raises:
-        DataError: the folder exists already, or a frame has another size than the intrinsics.
+        DataError: the folder exists already, a frame has another size than the intrinsics, or
+            no frame was added.
     """
 
     def __init__(
@@ -77,6 +78,9 @@ class SequenceWriter:
         if exception_type is not None:
             shutil.rmtree(self._unfinished, ignore_errors=True)
             return
+        if not self._poses:
+            shutil.rmtree(self._unfinished, ignore_errors=True)
+            raise DataError(f"no frame was added to {self.folder}: a scene needs at least one")
         poses = swap_opengl_opencv(np.stack(self._poses)).reshape(-1, 4)
         rows = "".join(" ".join(repr(float(v)) for v in row) + "\n" for row in poses)
         self.write_text("focal.txt", f"{self.intrinsics.fx!r}\n")

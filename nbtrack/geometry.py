@@ -14,15 +14,15 @@ def normalize_quaternion(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
 
 
 def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrix of a unit quaternion (order w, x, y, z).
+    """Rotation matrix of a quaternion (order w, x, y, z).
 
-    The quaternion is taken as it is: a norm other than one scales the matrix. Tracking therefore
-    renormalises first, so that the gradient has no component along the norm.
+    The norm is divided out here, so that the gradient is tangential: a radial part would dominate
+    Adam's coordinate-wise step and be lost again in the renormalisation after it.
 
-    >>> quaternion_to_matrix(torch.tensor([0.0, 0.0, 0.0, 1.0])).diagonal().tolist()
+    >>> quaternion_to_matrix(torch.tensor([0.0, 0.0, 0.0, 2.0])).diagonal().tolist()
     [-1.0, -1.0, 1.0]
     """
-    w, x, y, z = q_wxyz.unbind(-1)
+    w, x, y, z = normalize_quaternion(q_wxyz).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -53,8 +53,9 @@ def matrix_to_quaternion(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor,
 def _quaternion_products(m: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4 4"]:
     """4 q qᵀ of the quaternion (w, x, y, z) of a rotation matrix: every row is a multiple of q."""
     xx, yy, zz = (m[..., i, i] for i in range(3))
-    wx, wy, wz = (m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1])
-    xy, xz, yz = (m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1])
+    difference, total = m - m.mT, m + m.mT
+    wx, wy, wz = difference[..., 2, 1], difference[..., 0, 2], difference[..., 1, 0]
+    xy, xz, yz = total[..., 0, 1], total[..., 0, 2], total[..., 1, 2]
     entries = [
         1 + xx + yy + zz, wx, wy, wz,
         wx, 1 + xx - yy - zz, xy, xz,
@@ -73,7 +74,7 @@ def make_transform(
 
 
 def invert_transform(T_a_b: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """`T_b_a` of a rigid `T_a_b`, by transposing the rotation: exact where a matrix inverse is not."""
+    """`T_b_a` of a rigid `T_a_b`, by transposing: exact where a matrix inverse is not."""
     rotation_b_a = T_a_b[..., :3, :3].transpose(-1, -2)
     return make_transform(rotation_b_a, -(rotation_b_a @ T_a_b[..., :3, 3:]).squeeze(-1))
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pandas as pd
 
+from nbtrack.paths import PAPER_TABLES
 from nbtrack.storage import write_text_atomic
 from nbtrack.tables import (
     MISSING_CELL,
     PAPER_PIXELS,
-    PAPER_TABLES,
     best_cells,
     failed_cells,
     is_default,

@@ -53,7 +53,11 @@ def weights_from_sdf(
     """NeuS's unbiased, occlusion-aware weights of the sections between neighbouring samples.
 
     alpha_i = max((Phi(f_i) - Phi(f_{i+1})) / Phi(f_i), 0) with Phi(f) = sigmoid(s f) and weights
-    w_i = alpha_i prod_{j<i} (1 - alpha_j).
+    w_i = Phi(f_0) alpha_i prod_{j<i} (1 - alpha_j).
+
+    The factor Phi(f_0) is ours: a camera stands in free space, so a ray whose first sample lies
+    inside something is dark. NeuS lets such rays leave the solid unharmed, for it looks at
+    objects from outside; in rooms seen from inside the camera's own surroundings then filled up.
 
     Args:
         sdf: signed distance (m, positive in free space) at `samples` depths along each ray.
@@ -69,8 +73,8 @@ def weights_from_sdf(
     # Phi(f_i+1) / Phi(f_i) in logarithms: a plain quotient is 0/0 deep inside objects.
     log_phi = torch.nn.functional.logsigmoid(inverse_deviation * sdf)
     log_ratio = log_phi.diff(dim=-1).clamp_max(0)
-    transmittance = torch.exp(log_ratio.cumsum(dim=-1) - log_ratio)
-    return -torch.expm1(log_ratio) * transmittance
+    passed = log_phi[:, :1] + log_ratio.cumsum(dim=-1) - log_ratio
+    return -torch.expm1(log_ratio) * torch.exp(passed)
 
 
 def composite(

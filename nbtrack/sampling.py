@@ -103,7 +103,8 @@ def two_pass_depths(
     weights = field.render(rays, spread).weights
     # NeuS weighs the sections between samples: both their ends get a share.
     if weights.shape[1] < spread.shape[1]:
-        weights = torch.nn.functional.pad(weights, (0, 1)) + torch.nn.functional.pad(weights, (1, 0))
+        pad = torch.nn.functional.pad
+        weights = pad(weights, (0, 1)) + pad(weights, (1, 0))
     extra = importance_depths(spread, weights, n_importance, generator)
     return torch.cat([spread, extra], dim=-1).sort(dim=-1).values
 

@@ -12,9 +12,7 @@ from pandas.io.formats.style import Styler
 
 from nbtrack.errors import DataError, MissingError
 from nbtrack.metrics import LOST_THRESHOLD_M
-
-PROJECT_ROOT = Path(__file__).resolve().parents[1]
-PAPER_TABLES = PROJECT_ROOT / "paper_tables"
+from nbtrack.paths import PAPER_TABLES
 
 COLUMNS_1 = ("rate_hz", "method", "scene", "ate_m")
 COLUMNS_2 = ("tracker", "n_pixels", "budget_ms", "steps")

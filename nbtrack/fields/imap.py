@@ -37,7 +37,8 @@ class IMapField(Field):
         """Colour in [0, 1] and density (1/m, positive)."""
         raw_color, raw_density = self.mlp(points_world)
         # Softplus, not a rectifier: a density that starts below zero could never recover.
-        return torch.sigmoid(raw_color), DENSITY_PER_UNIT * torch.nn.functional.softplus(raw_density)
+        density = DENSITY_PER_UNIT * torch.nn.functional.softplus(raw_density)
+        return torch.sigmoid(raw_color), density
 
     def render(self, rays: Rays, depths: Float[Tensor, "rays samples"]) -> Rendering:
         """Volume rendering from density. Source: iMAP, Sec. 3.2."""

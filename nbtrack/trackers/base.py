@@ -22,7 +22,8 @@ class Tracker(abc.ABC):
     """Estimates the camera's pose in a fixed field, one optimisation step at a time."""
 
     name: str  # on the command line and in file names
-    label: str  # in tables and figures
+    label: str  # in Table I and figures
+    short_label: str  # in Table II
     field_name: str  # the field whose maps it tracks in
     paper_steps: str = "sdf"  # whose step counts of the paper's Table II it is given
 

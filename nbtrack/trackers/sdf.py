@@ -1,4 +1,4 @@
-"""NeuS with SDF: the paper's own tracker, which asks the field for distances and renders nothing."""
+"""NeuS with SDF: the paper's own tracker, which asks a field for distances, without rendering."""
 
 import torch
 from jaxtyping import Float, Int
@@ -15,6 +15,7 @@ class SdfTracker(AdamTracker):
 
     name = "sdf"
     label = "NeuS with SDF"
+    short_label = "SDF"
     field_name = "neus"
     paper_steps = "sdf"
 

@@ -17,6 +17,7 @@ class VolumeRenderingTracker(AdamTracker):
 
     name = "vr"
     label = "iMAP with VR"
+    short_label = "VR"
     field_name = "imap"
     paper_steps = "vr"
 

@@ -1,0 +1,96 @@
+"""Table II on the machine at hand: optimisation steps that fit in a time budget."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from nbtrack.bounds import observed_bounds
+from nbtrack.budget import ClockBudget
+from nbtrack.config import Preset
+from nbtrack.data import Sequence
+from nbtrack.device import suitable_threads, synchronize
+from nbtrack.fields import make_field
+from nbtrack.sampling import PixelSampler
+from nbtrack.trackers import TRACKERS, Tracker
+
+
+def measure_steps(
+    preset: Preset,
+    sequence: Sequence,
+    device: torch.device,
+    frames_per_cell: int = 5,
+    progress: bool = True,
+) -> pd.DataFrame:
+    """Steps within each budget for every tracker and its pixel counts n.
+
+    The fields are untrained: a step costs the same whatever the weights are. Each tracker first
+    spends one frame that is not counted, so that allocations and compilations are done.
+
+    Args:
+        sequence: its first frame feeds the trackers.
+        frames_per_cell: frames that a cell's mean is taken over.
+
+    Returns:
+        One row a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames),
+        steps_deviation (over frames).
+
+    Source: paper, Table II and evaluation protocol.
+    """
+    sampler = PixelSampler(sequence, device)
+    T_start = torch.from_numpy(sequence.T_world_camera[0]).float().to(device)
+    bounds = observed_bounds(sequence)
+    cells = [
+        (name, n_pixels, budget_ms)
+        for name in TRACKERS
+        for n_pixels in preset.tables.pixels_of(name)
+        for budget_ms in preset.tables.budgets_ms
+    ]
+    rows = []
+    for name, n_pixels, budget_ms in tqdm(cells, "Table II", unit="cell", disable=not progress):
+        network = preset.network_of(TRACKERS[name].field_name)
+        field = make_field(TRACKERS[name].field_name, network, bounds, seed=0)
+        field.to(device).eval().requires_grad_(False)
+        config = replace(preset.tracking_of(name), n_pixels=n_pixels)
+        tracker = TRACKERS[name](field, sampler, config, torch.Generator(device).manual_seed(0))
+        with suitable_threads(network.width):
+            steps = _count_steps(tracker, T_start, budget_ms, frames_per_cell, device)
+        rows.append(
+            {
+                "tracker": TRACKERS[name].short_label,
+                "n_pixels": n_pixels,
+                "budget_ms": budget_ms,
+                "steps": float(steps.mean()),
+                "steps_deviation": float(steps.std()),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def default_pixels(preset: Preset) -> dict[str, int]:
+    """The n that each tracker of Table II uses for Table I, by its label."""
+    return {t.short_label: preset.tracking_of(name).n_pixels for name, t in TRACKERS.items()}
+
+
+def _count_steps(
+    tracker: Tracker,
+    T_start: Float[Tensor, "4 4"],
+    budget_ms: float,
+    n_frames: int,
+    device: torch.device,
+) -> Float[np.ndarray, "frames"]:
+    """Steps of each counted frame; the same image serves all of them."""
+    budget = ClockBudget(1000 / budget_ms, synchronize=lambda: synchronize(device))
+    counts = []
+    for _ in range(n_frames + 1):
+        tracker.start_frame(0, T_start)
+        steps = 0
+        for _ in budget.frame():
+            tracker.step()
+            steps += 1
+        counts.append(steps)
+    return np.array(counts[1:], dtype=float)

@@ -1,0 +1,84 @@
+"""The paper's claims, each judged by the run at hand."""
+
+from collections.abc import Mapping, Sequence
+
+import pandas as pd
+
+from nbtrack.config import Preset
+from nbtrack.metrics import LOST_THRESHOLD_M
+
+VR, SDF = "iMAP with VR", "NeuS with SDF"
+
+
+def paper_claims(
+    cells_1: pd.DataFrame, cells_2: pd.DataFrame, iteration_ratio: float
+) -> pd.DataFrame:
+    """One row a claim: what the paper says, what this run measured, and whether it supports it.
+
+    Args:
+        cells_1, cells_2: long form of both tables, see `nbtrack.tables`.
+        iteration_ratio: seconds of a NeuS mapping iteration over those of an iMAP one, for
+            equally many samples.
+
+    Source: paper, abstract, results and conclusion.
+    """
+    fails = cells_1["ate_m"] > LOST_THRESHOLD_M
+    fast = cells_1["rate_hz"] > 2
+    vr_fails = int((fails & fast & (cells_1["method"] == VR)).sum())
+    sdf_fails = int((fails & fast & (cells_1["method"] == SDF)).sum())
+    slow = cells_1[cells_1["rate_hz"] == 2].pivot(index="scene", columns="method", values="ate_m")
+    vr_wins = int((slow[VR] < slow[SDF]).sum())
+    vr_steps, sdf_steps = _mean_steps(cells_2, "VR"), _mean_steps(cells_2, "SDF")
+    rows = [
+        (
+            "SDF tracking fails less often at 10 and 5 Hz",
+            "VR 9 of 18 cells above 0.2 m, SDF 2",
+            f"VR {vr_fails}, SDF {sdf_fails} of {int(fast.sum()) // 2} cells above 0.2 m",
+            sdf_fails < vr_fails,
+        ),
+        (
+            "VR is more accurate at 2 Hz",
+            "VR better in 6 of 9 scenes",
+            f"VR better in {vr_wins} of {len(slow)} scenes",
+            vr_wins > len(slow) / 2,
+        ),
+        (
+            "SDF takes more steps within a budget, with more pixels each",
+            "VR 36.1 (n = 512), SDF 79.3 (n = 4096) in 500 ms",
+            f"VR {vr_steps:.1f}, SDF {sdf_steps:.1f} in 500 ms at the n of Table I",
+            sdf_steps > vr_steps,
+        ),
+        (
+            "NeuS trains about half as fast as iMAP",
+            "roughly a factor of two",
+            f"a factor of {iteration_ratio:.1f} for equally many samples",
+            1.5 < iteration_ratio < 3,
+        ),
+    ]
+    return pd.DataFrame(rows, columns=["claim", "paper", "this run", "supported"])
+
+
+def iteration_ratio(
+    preset: Preset,
+    seconds: Mapping[str, Sequence[float]],
+    fields: tuple[str, str] = ("neus", "imap"),
+) -> float:
+    """Mapping seconds an iteration and sample of one field over those of another.
+
+    Args:
+        seconds: by field name, the mapping seconds of all its maps.
+        fields: numerator and denominator.
+    """
+    costs = []
+    for name in fields:
+        config = preset.mapping_of(name)
+        samples = config.iterations * config.n_rays * (config.n_stratified + config.n_surface)
+        costs.append(sum(seconds[name]) / len(seconds[name]) / samples)
+    return costs[0] / costs[1]
+
+
+def _mean_steps(cells_2: pd.DataFrame, tracker: str) -> float:
+    """Steps within the longest budget at the middle pixel count, the n of Table I."""
+    rows = cells_2[cells_2["tracker"] == tracker]
+    rows = rows[rows["budget_ms"] == rows["budget_ms"].max()].sort_values("n_pixels")
+    return float(rows["steps"].iloc[len(rows) // 2])

@@ -1,0 +1,174 @@
+"""The command line: a thin face over the functions that the notebooks call."""
+
+import argparse
+import sys
+from collections.abc import Sequence as Texts
+from pathlib import Path
+from typing import NoReturn
+
+from nbtrack.config import PRESETS, Preset, resolve_preset
+from nbtrack.errors import ConfigError, NbtrackError
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, as every other user error does."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message}; see {self.prog} --help")
+
+
+def main(arguments: Texts[str] | None = None) -> int:
+    """Run a command; returns the exit status: 0, or 2 after a user's mistake."""
+    try:
+        options = _parser().parse_args(arguments)
+        options.command(options)
+    except NbtrackError as error:
+        print(f"nbtrack: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("nbtrack: interrupted; run the same command again to go on", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
+    _add_map(commands)
+    _add_track(commands)
+    _add_tables(commands)
+    _add_notebooks(commands)
+    _add_data(commands)
+    _add_bench(commands)
+    return parser
+
+
+def _add_preset(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--preset", help=f"{', '.join(PRESETS)} (default: smoke)")
+    parser.add_argument("--config", type=Path, help="TOML file of settings")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
+        help="one setting, for example mapping.neus.iterations=500; may be repeated",
+    )  # fmt: skip
+
+
+def _preset(options: argparse.Namespace) -> Preset:
+    return resolve_preset(options.preset, options.config, tuple(options.settings))
+
+
+def _add_map(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser("map", help="fit a field to a sequence with known poses")
+    parser.add_argument("sequence", help="a folder, or the name of a room or dataset scene")
+    parser.add_argument("--field", required=True, help="imap or neus")
+    parser.add_argument("--frames", default=":", help="Python slice of frames, A:B:S")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="folder for the map (default: in the cache)")
+    _add_preset(parser)
+    parser.set_defaults(command=_map)
+
+
+def _map(options: argparse.Namespace) -> None:
+    from nbtrack.commands import map_command
+
+    map_command(
+        options.sequence, options.field, _preset(options), options.frames, options.seed, options.out
+    )
+
+
+def _add_track(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser("track", help="track a camera; maps first where no map fits")
+    parser.add_argument("sequence", help="a folder, or the name of a room or dataset scene")
+    parser.add_argument("--field", required=True, help="imap or neus")
+    parser.add_argument("--tracker", required=True, help="vr or sdf")
+    budget = parser.add_mutually_exclusive_group(required=True)
+    budget.add_argument("--rate", type=float, metavar="HZ", help="frames a second, by the clock")
+    budget.add_argument("--steps", type=float, metavar="N", help="optimisation steps a frame")
+    parser.add_argument("--pixels", type=int, metavar="N", help="pixels a step")
+    parser.add_argument("--map-frames", default=":", help="Python slice of frames to map")
+    parser.add_argument("--frames", default=":", help="Python slice of frames to track")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="folder for the results (default: in the cache)")
+    _add_preset(parser)
+    parser.set_defaults(command=_track)
+
+
+def _track(options: argparse.Namespace) -> None:
+    from nbtrack.commands import track_command
+
+    if options.pixels is not None:
+        options.settings.append(f"tracking.{options.tracker}.n_pixels={options.pixels}")
+    track_command(
+        options.sequence, options.field, options.tracker, _preset(options), steps=options.steps,
+        rate_hz=options.rate, map_frames=options.map_frames, frames=options.frames,
+        seed=options.seed, out=options.out,
+    )  # fmt: skip
+
+
+def _add_tables(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser("tables", help="both tables, CSV and LaTeX")
+    parser.add_argument(
+        "--budget", default="steps",
+        help="steps: the paper's step counts (default); clock: this machine's own speed",
+    )  # fmt: skip
+    _add_preset(parser)
+    parser.set_defaults(command=_tables)
+
+
+def _tables(options: argparse.Namespace) -> None:
+    from nbtrack.commands import tables_command
+
+    tables_command(_preset(options), options.budget)
+
+
+def _add_notebooks(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser("notebooks", help="run all notebooks headless, with HTML copies")
+    _add_preset(parser)
+    parser.set_defaults(command=_notebooks)
+
+
+def _notebooks(options: argparse.Namespace) -> None:
+    from nbtrack.notebooks import run_notebooks
+
+    preset = _preset(options)  # refuse a wrong setting before the first kernel starts
+    run_notebooks(preset.name, options.config, tuple(options.settings))
+
+
+def _add_data(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser("data", help="make synthetic rooms, check a sequence")
+    actions = parser.add_subparsers(required=True, metavar="ACTION", parser_class=_Parser)
+    make = actions.add_parser("make", help="write a synthetic room in the dataset's layout")
+    make.add_argument("room", help="its name")
+    make.add_argument("--out", type=Path, required=True, help="folder to write, new")
+    make.add_argument("--n-frames", type=int, default=300)
+    make.add_argument("--width", type=int, default=640, help="pixels; the height is 3/4 of it")
+    make.add_argument("--seed", type=int, default=0)
+    make.set_defaults(command=_make)
+    check = actions.add_parser("check", help="validate a folder and prove its pose convention")
+    check.add_argument("folder", type=Path)
+    check.add_argument("--depth-folder", help="default: depth_filtered, else depth")
+    check.add_argument("--poses", default="poses.txt", help="pose file")
+    check.set_defaults(command=_check)
+
+
+def _make(options: argparse.Namespace) -> None:
+    from nbtrack.commands import make_command
+
+    make_command(options.room, options.out, options.n_frames, options.width, options.seed)
+
+
+def _check(options: argparse.Namespace) -> None:
+    from nbtrack.commands import check_command
+
+    check_command(options.folder, options.depth_folder, options.poses)
+
+
+def _add_bench(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser("bench", help="Table II on this machine")
+    _add_preset(parser)
+    parser.set_defaults(command=_bench)
+
+
+def _bench(options: argparse.Namespace) -> None:
+    from nbtrack.commands import bench_command
+
+    bench_command(_preset(options))

@@ -1,0 +1,159 @@
+"""What each command does and prints."""
+
+from functools import partial
+from pathlib import Path
+
+import torch
+from tqdm.auto import tqdm
+
+from nbtrack.bench import default_pixels, measure_steps
+from nbtrack.config import Preset
+from nbtrack.data import parse_frames
+from nbtrack.data_check import check_sequence
+from nbtrack.device import choose_device, device_name
+from nbtrack.errors import ConfigError
+from nbtrack.experiments import MapCell, TrackCell, map_summary, obtain_map, run_track
+from nbtrack.fields import field_class
+from nbtrack.grid import BUDGETS, prepare_scenes, table_1_cells
+from nbtrack.latex import TableNotes, write_tables
+from nbtrack.parallel import Job, run_jobs
+from nbtrack.paths import PAPER_TABLES
+from nbtrack.scenes import Scene, find_scene
+from nbtrack.synthetic import make_room
+from nbtrack.tables import table_1, table_2
+from nbtrack.trackers import tracker_class
+
+
+def map_command(
+    sequence: str, field_name: str, preset: Preset, frames: str, seed: int, out: Path | None
+) -> None:
+    """Map a sequence, or resume; print the map's scores and where it lies."""
+    field_class(field_name)
+    parse_frames(frames)
+    cell = MapCell(_scene(sequence, preset), field_name, preset, frames, seed, out)
+    _map_with_bar(cell)
+    summary = map_summary(cell)
+    print(f"{cell.folder}: {field_class(field_name).label} map of {cell.scene.name}")
+    print(f"  mapped in {summary['seconds']:.0f} s on {summary['device']}")
+    for name, value in summary["quality"].items():
+        if value is not None:
+            print(f"  {_with_unit(name, value)}")
+
+
+def track_command(
+    sequence: str,
+    field_name: str,
+    tracker_name: str,
+    preset: Preset,
+    steps: float | None,
+    rate_hz: float | None,
+    map_frames: str,
+    frames: str,
+    seed: int,
+    out: Path | None,
+) -> None:
+    """Track a sequence in its map, made first where none fits; print the errors."""
+    field_class(field_name)
+    tracker = tracker_class(tracker_name)
+    if tracker.field_name != field_name:
+        raise ConfigError(
+            f"tracker {tracker_name!r} does not work on field {field_name!r}: "
+            f"{tracker.label} needs --field {tracker.field_name}"
+        )
+    parse_frames(frames)
+    parse_frames(map_frames)
+    scene = _scene(sequence, preset)
+    map_cell = MapCell(scene, field_name, preset, map_frames, seed)
+    cell = TrackCell(map_cell, tracker_name, steps, rate_hz, frames, seed)
+    device = choose_device()
+    budget = cell.budget(device)
+    n_frames = len(scene.frame_numbers(frames))
+    _map_with_bar(map_cell)
+    folder = out or cell.folder
+    (tracked,) = run_jobs(
+        [Job(cell.name, n_frames - 1, _track_job, (cell, folder, device))], "tracking", workers=1
+    )
+    print(f"{folder}: {tracker.label}, {budget}")
+    for name in _PRINTED:
+        print(f"  {_with_unit(name, tracked[name])}")
+    print(f"  on {tracked['device']}")
+
+
+def tables_command(preset: Preset, budget: str) -> None:
+    """Fill both tables of a preset and write them as CSV and LaTeX."""
+    if budget not in BUDGETS:
+        raise ConfigError(f"unknown budget {budget!r}: allowed are {', '.join(BUDGETS)}")
+    scenes = prepare_scenes(preset)
+    device = choose_device()
+    cells_1 = table_1_cells(preset, scenes, budget)
+    cells_2 = measure_steps(preset, scenes[0].read(slice(0, 1)), device)
+    folder = PAPER_TABLES / (preset.name if budget == "steps" else f"{preset.name}_clock")
+    notes = TableNotes(preset.name, BUDGETS[budget], device_name(device))
+    paths = write_tables(folder, cells_1, cells_2, notes, default_pixels(preset))
+    print(f"Table I: ATE (m), {BUDGETS[budget]}\n{table_1(cells_1).to_string(float_format='%.3f')}")
+    print(f"Table II: steps, on {notes.device}")
+    print(table_2(cells_2).to_string(float_format="%.1f"))
+    print("\n".join(str(path) for path in paths))
+
+
+def make_command(room: str, out: Path, n_frames: int, width: int, seed: int) -> None:
+    """Write a synthetic room as a sequence folder."""
+    with tqdm(total=n_frames, desc=room, unit="frame") as bar:
+        make_room(
+            room, out, n_frames, width, width * 3 // 4, seed,
+            progress=lambda done, total: bar.update(done - bar.n),
+        )  # fmt: skip
+    print(f"{out}: {room}, {n_frames} frames of {width}x{width * 3 // 4}, seed {seed}")
+
+
+def check_command(folder: Path, depth_folder: str | None, pose_file: str) -> None:
+    """Validate a sequence folder; print what it holds and which pose convention fits."""
+    print(check_sequence(folder, depth_folder, pose_file))
+
+
+def bench_command(preset: Preset) -> None:
+    """Measure and print Table II."""
+    device = choose_device()
+    name = preset.scenes.names[0]
+    scene = find_scene(name, preset.scenes)
+    cells = measure_steps(preset, scene.read(slice(0, 1)), device)
+    print(f"Table II: steps within a budget, {preset.name} network, on {device_name(device)}")
+    print(table_2(cells).to_string(float_format="%.1f"))
+
+
+_PRINTED = (
+    "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
+    "lost_frames", "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
+)  # fmt: skip
+_UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": ("s", 0)}
+
+
+def _with_unit(name: str, value: float) -> str:
+    for suffix, (unit, digits) in _UNITS.items():
+        if name.endswith(suffix):
+            return f"{name.removesuffix(suffix).replace('_', ' ')}: {value:.{digits}f} {unit}"
+    return f"{name.replace('_', ' ')}: {value:.4g}"
+
+
+def _scene(sequence: str, preset: Preset) -> Scene:
+    """The scene, with a bar while a room has to be made."""
+    config = preset.scenes
+    with tqdm(total=config.n_frames, desc="room", unit="frame", delay=0.5, leave=False) as bar:
+        return find_scene(sequence, config, lambda done, total: bar.update(done - bar.n))
+
+
+def _map_with_bar(cell: MapCell) -> None:
+    if cell.is_done:
+        tqdm.write(f"map found in {cell.folder}")
+        return
+    tqdm.write(f"no finished map in {cell.folder}: mapping")
+    total = cell.preset.mapping_of(cell.field_name).iterations
+    run_jobs([Job(cell.scene.name, total, _map_job, (cell,))], "mapping", workers=1)
+
+
+def _map_job(cell: MapCell, report: partial) -> None:
+    obtain_map(cell, report=report)
+
+
+def _track_job(cell: TrackCell, folder: Path, device: torch.device, report: partial) -> dict:
+    return run_track(cell, folder, device, report)

@@ -1,0 +1,100 @@
+"""From what a user calls a sequence to a folder on disk: a path, a room, a scene of the dataset."""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from nbtrack.config import ScenesConfig, fingerprint
+from nbtrack.data import Sequence, list_frames, parse_frames, read_sequence
+from nbtrack.errors import MissingError, nearest_name
+from nbtrack.paths import data_folder, runs_folder
+from nbtrack.synthetic import ROOMS, Room, make_room, room_of
+
+DATASET_SCENES = (
+    "breakfast_room", "complete_kitchen", "green_room", "grey_white_room", "kitchen",
+    "morning_apartment", "staircase", "thin_geometry", "whiteroom",
+)  # fmt: skip
+"""Folders of the Neural RGB-D dataset, in the order of the paper's Table I."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A sequence on disk, read when it is needed."""
+
+    name: str
+    folder: Path
+
+    @property
+    def room(self) -> Room | None:
+        """The exact geometry, if the scene is a synthetic room."""
+        return room_of(self.folder)
+
+    def read(self, frames: slice = slice(None), progress: bool = False) -> Sequence:
+        """The scene's frames. Raises DataError or MissingError as `read_sequence` does."""
+        return read_sequence(self.folder, frames, progress=progress)
+
+    def frame_numbers(self, frames: str) -> range:
+        """Which frames a slice such as `10:50:2` selects, before any are left out for a NaN pose."""
+        return range(len(list_frames(self.folder)[0]))[parse_frames(frames)]
+
+    def fingerprint(self) -> str:
+        """Changes when the data change: poses, focal length, and the images' names and sizes."""
+        image_files, depth_files = list_frames(self.folder)
+        sizes = [(f.parent.name, f.name, f.stat().st_size) for f in image_files + depth_files]
+        texts = [
+            hashlib.sha256((self.folder / name).read_bytes()).hexdigest()
+            for name in ("poses.txt", "focal.txt")
+            if (self.folder / name).is_file()
+        ]
+        return fingerprint(sizes, texts)
+
+
+def room_folder(name: str, config: ScenesConfig) -> Path:
+    """Where a synthetic room of this size, length and seed lies, made or not yet."""
+    size = f"{config.n_frames}x{config.width}"
+    return runs_folder() / "rooms" / f"{name}-{size}-seed{config.seed}" / name
+
+
+def find_scene(
+    sequence: str | Path,
+    config: ScenesConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> Scene:
+    """The scene that a user means.
+
+    Args:
+        sequence: a folder in a supported layout, the name of a synthetic room (made here at the
+            size that `config` gives, unless it is there already), or of a scene of the Neural
+            RGB-D dataset below the data folder.
+        progress: called with frames done and in all while a room is made.
+
+    Raises:
+        MissingError: there is no such folder, room or scene.
+    """
+    text = str(sequence)
+    folder = Path(text)
+    if text not in ROOMS and text not in DATASET_SCENES:
+        if folder.is_dir():
+            return Scene(folder.resolve().name, folder.resolve())
+        names = [*ROOMS, *DATASET_SCENES]
+        raise MissingError(
+            f"no sequence {text!r}: it is neither a folder nor a known scene; "
+            f"{nearest_name(text, names)}"
+        )
+    if text in ROOMS and (config.synthetic or text not in DATASET_SCENES):
+        folder = room_folder(text, config)
+        if not folder.is_dir():
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            height = config.width * 3 // 4
+            make_room(
+                text, folder, config.n_frames, config.width, height, config.seed, progress=progress
+            )
+        return Scene(text, folder)
+    folder = data_folder() / text
+    if not folder.is_dir():
+        raise MissingError(
+            f"no folder {folder}: download the Neural RGB-D dataset there (see data/README.md), "
+            f"or use a synthetic room, which needs no download: {', '.join(ROOMS)}"
+        )
+    return Scene(text, folder)
