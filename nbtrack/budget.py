@@ -12,11 +12,12 @@ import time
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 from math import floor, isfinite
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from nbtrack.errors import ConfigError
 
 
+@runtime_checkable
 class Budget(Protocol):
     """What the tracking loop needs to know about a budget."""
 

@@ -122,6 +122,9 @@ def _tables(options: argparse.Namespace) -> None:
 
 def _add_notebooks(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("notebooks", help="run all notebooks headless, with HTML copies")
+    parser.add_argument(
+        "--in-place", action="store_true", help="store the outputs in the committed notebooks too"
+    )
     _add_preset(parser)
     parser.set_defaults(command=_notebooks)
 
@@ -130,7 +133,7 @@ def _notebooks(options: argparse.Namespace) -> None:
     from nbtrack.notebooks import run_notebooks
 
     preset = _preset(options)  # refuse a wrong setting before the first kernel starts
-    run_notebooks(preset.name, options.config, tuple(options.settings))
+    run_notebooks(preset.name, options.config, tuple(options.settings), options.in_place)
 
 
 def _add_data(commands: argparse._SubParsersAction) -> None:

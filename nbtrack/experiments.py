@@ -59,7 +59,8 @@ class MapCell:
     @property
     def folder(self) -> Path:
         """Where the map is kept."""
-        return self.out or runs_folder() / "maps" / f"{self.scene.name}-{self.field_name}-{self.key}"
+        name = f"{self.scene.name}-{self.field_name}"
+        return self.out or runs_folder() / "maps" / f"{name}-{self.key}"
 
     @property
     def is_done(self) -> bool:

@@ -172,7 +172,7 @@ class _Run:
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(self.config, iteration)
         rays = self.sampler.draw(self.config.n_rays, self.generator, self.frames)
-        depths = mapping_depths(rays, self.bounds, self.config, self.generator)
+        depths = mapping_depths(self.field, rays, self.config, self.generator)
         terms = self.field.mapping_losses(rays, depths, self.config, self.generator)
         self.optimizer.zero_grad(set_to_none=True)
         torch.stack(list(terms.values())).sum().backward()

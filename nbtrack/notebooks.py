@@ -21,12 +21,19 @@ NOTEBOOKS = PROJECT_ROOT / "notebooks"
 
 
 def run_notebooks(
-    preset: str, config_file: Path | None = None, settings: tuple[str, ...] = ()
+    preset: str,
+    config_file: Path | None = None,
+    settings: tuple[str, ...] = (),
+    in_place: bool = False,
 ) -> list[Path]:
     """Execute every notebook in order; returns the HTML copies.
 
-    Copies go to `runs/notebooks/<preset>/`; the committed notebooks stay as they are. Settings
-    reach the kernels through the environment, where each notebook's settings cell finds them.
+    Copies go to `runs/notebooks/<preset>/`. Settings reach the kernels through the environment,
+    where each notebook's settings cell finds them.
+
+    Args:
+        in_place: store the outputs in the committed notebooks as well, which otherwise stay as
+            they are: for a change of theirs, on the smoke preset.
 
     Raises:
         NbtrackError: a cell failed; the copy up to there is kept.
@@ -38,6 +45,8 @@ def run_notebooks(
         for path in paths:
             start = time.perf_counter()
             notebook = execute_notebook(path, folder)
+            if in_place:
+                write_text_atomic(path, nbformat.writes(notebook) + "\n")
             pages.append(folder / f"{path.stem}.html")
             write_text_atomic(pages[-1], HTMLExporter().from_notebook_node(notebook)[0])
             tqdm.write(f"{pages[-1]}: {time.perf_counter() - start:.0f} s")
@@ -54,7 +63,7 @@ def execute_notebook(path: Path, folder: Path) -> nbformat.NotebookNode:
     total = sum(cell.cell_type == "code" for cell in notebook.cells)
     with tqdm(total=total, desc=path.stem, unit="cell") as bar:
         client = NotebookClient(
-            notebook, timeout=None, kernel_name="python3",
+            notebook, timeout=None, kernel_name="python3", record_timing=False,
             resources={"metadata": {"path": str(path.parent)}},
             on_cell_executed=lambda **_: bar.update(),
         )  # fmt: skip

@@ -67,9 +67,18 @@ class PixelSampler:
 
 
 def mapping_depths(
+    field: Field, rays: Rays, config: MappingConfig, generator: torch.Generator
+) -> Float[Tensor, "rays samples"]:
+    """Ascending sample depths (m) for a field's mapping: by its own wish, guided or not."""
+    if field.depth_guided:
+        return guided_depths(rays, field.bounds, config, generator)
+    return two_pass_depths(field, rays, config.n_stratified, config.n_surface, generator)
+
+
+def guided_depths(
     rays: Rays, bounds: SceneBounds, config: MappingConfig, generator: torch.Generator
 ) -> Float[Tensor, "rays samples"]:
-    """Ascending sample depths (m): stratified up to just behind the surface, more around it.
+    """Stratified z-depths (m) up to just behind the measured surface, and more around it.
 
     Nothing is known of what lies behind a surface, so no samples are spent there. Rays without a
     depth are sampled to the end of the scene. Our choice; NICE-SLAM and its followers do alike.

@@ -35,7 +35,7 @@ class Scene:
         return read_sequence(self.folder, frames, progress=progress)
 
     def frame_numbers(self, frames: str) -> range:
-        """Which frames a slice such as `10:50:2` selects, before any are left out for a NaN pose."""
+        """Which frames a slice such as `10:50:2` selects, those with a NaN pose included."""
         return range(len(list_frames(self.folder)[0]))[parse_frames(frames)]
 
     def fingerprint(self) -> str:

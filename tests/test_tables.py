@@ -17,11 +17,10 @@ from nbtrack.latex import (
     write_published,
     write_tables,
 )
+from nbtrack.paths import PAPER_TABLES, PROJECT_ROOT
 from nbtrack.tables import (
     COLUMNS_1,
     COLUMNS_2,
-    PAPER_TABLES,
-    PROJECT_ROOT,
     best_cells,
     compare_table_1,
     failed_cells,

@@ -33,6 +33,9 @@ class Field(nn.Module, abc.ABC):
 
     name: str  # on the command line and in file names
     label: str  # in tables and figures
+    # Whether mapping may place its samples by the measured depth. A field that is tracked by
+    # rendering must not: tracking has no such help, and the map would be thinner than its rays see.
+    depth_guided: bool = True
 
     def __init__(self, bounds: SceneBounds) -> None:
         super().__init__()

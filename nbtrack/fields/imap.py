@@ -24,6 +24,7 @@ class IMapField(Field):
 
     name = "imap"
     label = "iMAP"
+    depth_guided = False
 
     def __init__(
         self, config: FieldConfig, bounds: SceneBounds, generator: torch.Generator

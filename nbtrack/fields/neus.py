@@ -10,6 +10,7 @@ from nbtrack.fields.base import Field, Rays, measured_mean, register_field
 from nbtrack.fields.mlp import FourierMlp
 from nbtrack.rendering import Rendering, composite, weights_from_sdf
 
+
 @register_field
 class NeuSField(Field):
     """f: position -> (colour, signed distance in m, positive in free space). Paper, Sec. II-A.

@@ -128,7 +128,7 @@ def _draw_faces(
     shade = _AMBIENT + (1 - _AMBIENT) * np.clip(normals @ light, 0, 1)
     faces = PolyCollection(
         corners[order, :, :2], facecolors=(colors * shade[:, None])[order], edgecolors="face",
-        linewidths=0.4, antialiased=False, rasterized=True,
+        linewidths=0.4, antialiased=True, rasterized=True,
     )  # fmt: skip
     axes.add_collection(faces)
 

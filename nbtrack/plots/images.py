@@ -90,18 +90,19 @@ def _plot_motion(panels: Iterable[Axes], sequence: Sequence) -> None:
     T_between = np.linalg.inv(sequence.T_world_camera[:-1]) @ sequence.T_world_camera[1:]
     moved_cm = _CENTIMETRES * np.linalg.norm(T_between[:, :3, 3], axis=1)
     turned_deg = np.degrees(Rotation.from_matrix(T_between[:, :3, :3]).magnitude())
-    names = ("translation per frame (cm)", "rotation per frame (degrees)")
-    for axes, values, name in zip(panels, (moved_cm, turned_deg), names, strict=True):
+    named = (("translation", "cm", moved_cm), ("rotation", "degrees", turned_deg))
+    for axes, (name, unit, values) in zip(panels, named, strict=True):
         n_bins = min(30, max(5, len(values) // 5))
         # From zero to a little more than the largest, also where all are equal.
-        axes.hist(values, n_bins, (0, 1.02 * float(values.max()) + 1e-3), color="#9aa5b1")
+        edges = np.linspace(0, 1.02 * float(values.max()) + 1e-3, n_bins + 1)
+        axes.hist(values, edges, color="#9aa5b1")
         mean = float(values.mean())
         axes.axvline(mean, color="black", linewidth=1.2)
         axes.annotate(
-            f"mean {mean:.2f}", (mean, 0.97), xycoords=("data", "axes fraction"),
+            f"mean {mean:.2f} {unit}", (mean, 0.97), xycoords=("data", "axes fraction"),
             xytext=(5, 0), textcoords="offset points", va="top",
         )  # fmt: skip
-        axes.set(xlabel=name, ylabel="number of frames")
+        axes.set(xlabel=f"{name} per frame ({unit})", ylabel="number of frames")
         axes.set_xlim(left=0)
 
 

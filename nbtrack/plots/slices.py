@@ -59,12 +59,14 @@ def plot_slice(
     cut = _cut(field, sequence, height, room, view)
     low, high = np.array(field.bounds.minimum), np.array(field.bounds.maximum)
     shape = (high - low)[view.ahead] / (high - low)[view.right]
-    figure = new_figure(title, float(np.clip(0.75 * WIDTH * shape, 3.2, 6.6)) + 1.2)
+    figure = new_figure(
+        title, float(np.clip(0.75 * WIDTH * shape, 3.2, 5.2)) + 1.2, layout="compressed"
+    )
     axes = figure.subplots()
     _draw_values(axes, field, cut)
     _draw_lines(axes, field, cut)
     path = view.on_page(camera_positions(sequence.T_world_camera))
-    axes.plot(*path.T, color=_PATH_COLOR, linewidth=1.0)
+    axes.plot(*path.T, color=_PATH_COLOR, linewidth=1.4)
     axes.set_xlim(cut.right[0], cut.right[-1])
     axes.set_ylim(cut.ahead[0], cut.ahead[-1])
     view.finish(axes)
@@ -142,7 +144,7 @@ def _legend(field: Field, room: Room | None) -> list[Line2D | Patch]:
     entries: list[Line2D | Patch] = [Line2D([], [], color="black", label=f"surface ({level})")]
     if room is not None:
         entries.append(Line2D([], [], color=TRUE_COLOR, linestyle="dashed", label="true surface"))
-    entries.append(Line2D([], [], color=_PATH_COLOR, linewidth=1.0, label="camera path"))
+    entries.append(Line2D([], [], color=_PATH_COLOR, linewidth=1.4, label="camera path"))
     entries.append(Line2D([], [], color="0.45", linewidth=0.8, label="surface, invented"))
     entries.append(Patch(facecolor="0.94", edgecolor="0.7", label="pale: never seen"))
     return entries

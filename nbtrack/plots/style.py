@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from PIL import Image
 
 from nbtrack.trackers import TRACKERS
 
@@ -29,7 +28,6 @@ TRUE_LABEL = "true"
 
 WIDTH = 9.0  # inches of every figure: a notebook's text width
 NOT_MEASURED = "#bdbdbd"  # grey of pixels without a value
-_LARGEST_PNG = 150_000  # bytes; above it an image is stored with 256 colours
 _TITLE_CHARACTERS = 100
 STYLE = {
     "figure.dpi": 90, "figure.facecolor": "white", "figure.titlesize": 11,
@@ -49,13 +47,9 @@ class NotebookFigure(Figure):
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
-        self.savefig(buffer, format="png")
-        if buffer.tell() <= _LARGEST_PNG:
-            return buffer.getvalue()
-        # Pictures of rooms are large; 256 colours are hard to tell from all of them.
-        small = io.BytesIO()
-        Image.open(buffer).convert("RGB").quantize(256).save(small, "png", optimize=True)
-        return small.getvalue()
+        # Notebooks are committed with their figures: worth the time that small files take.
+        self.savefig(buffer, format="png", pil_kwargs={"optimize": True})
+        return buffer.getvalue()
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from nbtrack.data import FRAMES_PER_SECOND
 from nbtrack.metrics import LOST_THRESHOLD_M
@@ -42,29 +43,28 @@ def plot_trajectories(
 
     Args:
         estimates: camera-to-world poses by method.
-        mesh: of the scene; where it is cut at the path's mean height it is drawn grey.
+        mesh: of the scene; a panel more shows the paths in its cut at their mean height.
         up: the world's up; the nearest axis is taken.
     """
     view = TopView.along(up)
     paths = {TRUE_LABEL: T_true, **estimates}
     positions = {label: camera_positions(T) for label, T in paths.items()}
     colors = path_colors(paths)
-    figure = new_figure(title, 0.55 * WIDTH)
-    axes = figure.subplots()
+    figure = new_figure(title, 0.52 * WIDTH)
+    panels = figure.subplots(1, 1 if mesh is None else 2, squeeze=False)[0]
+    for axes in panels:
+        for label, points in positions.items():
+            width = 2.6 if label == TRUE_LABEL else 1.4
+            page = view.on_page(points)
+            axes.plot(*page.T, color=colors[label], label=label, linewidth=width, zorder=3)
+        start = view.on_page(positions[TRUE_LABEL][:1])
+        axes.plot(*start.T, "o", color="black", markersize=5, zorder=4, label="start")
+        view.finish(axes)
+        axes.margins(0.08)
     if mesh is not None:
-        _draw_cut(axes, mesh, view, float(positions[TRUE_LABEL][:, view.vertical].mean()))
-    for label, points in positions.items():
-        is_true = label == TRUE_LABEL
-        page = view.on_page(points)
-        axes.plot(
-            *page.T, color=colors[label], label=label, linewidth=2.6 if is_true else 1.4,
-            zorder=3 if is_true else 4,
-        )  # fmt: skip
-    start = view.on_page(positions[TRUE_LABEL][:1])
-    axes.plot(*start.T, "o", color="black", markersize=5, zorder=5, label="start", linestyle="")
-    view.finish(axes)
-    axes.margins(0.08)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
+        _draw_cut(panels[0], mesh, view, float(positions[TRUE_LABEL][:, view.vertical].mean()))
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     return figure
 
 
@@ -79,7 +79,7 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
             first frame, whose pose was given, is left out.
     """
     colors = method_colors(frames)
-    figure = new_figure(title, 4.6)
+    figure = new_figure(title, 4.9)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for label, rows in frames.items():
         tracked = rows.iloc[1:]
@@ -89,13 +89,14 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
         below.plot(seconds, tracked["rotation_error_deg"], color=colors[label])
     above.axhline(_CENTIMETRES * LOST_THRESHOLD_M, color="0.3", linestyle="--", linewidth=1)
     above.annotate(
-        "lost", (0.005, _CENTIMETRES * LOST_THRESHOLD_M), va="bottom", color="0.3",
+        "lost: above 0.2 m", (0.005, _CENTIMETRES * LOST_THRESHOLD_M), va="bottom", color="0.3",
         xycoords=("axes fraction", "data"), xytext=(0, 2), textcoords="offset points",
     )  # fmt: skip
     above.set(yscale="log", ylabel="translation error (cm)")
     low, high = above.get_ylim()
     above.set_ylim(low, max(high, 2 * _CENTIMETRES * LOST_THRESHOLD_M))
     figure.legend(loc="outside lower center", ncols=len(frames))
+    above.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
     below.set_ylim(bottom=0)
     below.set_xlim(left=0)
@@ -112,3 +113,4 @@ def _draw_cut(axes: Axes, mesh: trimesh.Trimesh, view: TopView, level: float) ->
         page = segments[:, :, [view.right, view.ahead]]
         lines = LineCollection(page, colors=_MESH_COLOR, linewidths=1.0, label="map's surface")
         axes.add_collection(lines)
+        axes.autoscale_view()

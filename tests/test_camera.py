@@ -1,0 +1,120 @@
+"""The pinhole camera: pixels and points are each other's inverse, and axes turn only twice."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from nbtrack.camera import (
+    Intrinsics,
+    backproject,
+    pixel_directions,
+    project,
+    swap_opengl_opencv,
+)
+
+CAMERA = Intrinsics(640, 480, 500.0, 510.0, 300.0, 250.0)
+
+
+def test_pixels_by_hand() -> None:
+    """Catches pixel centers at integers, and rows mixed up with columns.
+
+    The image's middle (320, 240) lies between pixels 319 and 320: pixel 320 is seen at
+    (320.5 - 320) / 500 = 0.001, pixel 239 at (239.5 - 240) / 500 = -0.001.
+    """
+    camera = Intrinsics.from_focal(640, 480, 500.0)
+    direction = pixel_directions(camera, torch.tensor(320), torch.tensor(239))
+    torch.testing.assert_close(direction, torch.tensor([0.001, -0.001, 1.0]))
+    corner = backproject(camera, torch.tensor([0]), torch.tensor([0]), torch.tensor([2.0]))
+    expected = torch.tensor([[2 * -319.5 / 500, 2 * -239.5 / 500, 2.0]])
+    torch.testing.assert_close(corner, expected)
+
+
+def test_ray_length_that_the_docstring_gives() -> None:
+    """Catches a normalized direction: with 60 degrees over 640 pixels a corner ray is 1.23 long."""
+    camera = Intrinsics.from_focal(640, 480, 320 / math.tan(math.radians(30)))
+    corner = pixel_directions(camera, torch.tensor(0), torch.tensor(0))
+    assert corner.norm().item() == pytest.approx(1.23, abs=0.005)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (50,), (3, 4), (0,)], ids=str)
+def test_project_undoes_backproject(shape: tuple[int, ...]) -> None:
+    """Catches a half pixel lost on the way, and batch shapes that are flattened."""
+    generator = torch.Generator().manual_seed(0)
+    columns = torch.randint(640, shape, generator=generator)
+    rows = torch.randint(480, shape, generator=generator)
+    depth = 0.1 + 5 * torch.rand(shape, generator=generator)
+    points = backproject(CAMERA, columns, rows, depth)
+    assert points.shape == (*shape, 3)
+    found_columns, found_rows, found_depth = project(CAMERA, points)
+    torch.testing.assert_close(found_columns, columns.float(), rtol=0, atol=1e-3)
+    torch.testing.assert_close(found_rows, rows.float(), rtol=0, atol=1e-3)
+    torch.testing.assert_close(found_depth, depth)
+
+
+def test_backproject_undoes_project() -> None:
+    """Catches real-valued pixels that are rounded between the two."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(100, 3, generator=generator) + torch.tensor([0.0, 0.0, 6.0])
+    torch.testing.assert_close(backproject(CAMERA, *project(CAMERA, points)), points)
+
+
+def test_points_behind_are_told_by_their_depth() -> None:
+    """Catches an absolute value: callers mask by the sign."""
+    depth = project(CAMERA, torch.tensor([[0.1, 0.2, -1.0]]))[2]
+    assert depth.item() == -1.0
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 0.25])
+def test_scaled_camera_sees_the_same(factor: float) -> None:
+    """Catches a principal point or focal length that is left behind: angles must not change.
+
+    The real-valued pixel index i addresses i + 0.5; scaled, that is factor (i + 0.5).
+    """
+    small = CAMERA.scaled(factor)
+    assert (small.width, small.height) == (640 * factor, 480 * factor)
+    columns, rows = torch.tensor([0.0, 100.0, 639.0]), torch.tensor([3.0, 200.0, 479.0])
+    torch.testing.assert_close(
+        pixel_directions(small, factor * (columns + 0.5) - 0.5, factor * (rows + 0.5) - 0.5),
+        pixel_directions(CAMERA, columns, rows),
+    )
+
+
+def test_gradient_reaches_depth() -> None:
+    """Catches a detached direction: the point moves by its direction for one metre of depth."""
+    depth = torch.tensor([2.0], requires_grad=True)
+    point = backproject(CAMERA, torch.tensor([10]), torch.tensor([20]), depth)
+    point[0, 0].backward()
+    assert depth.grad.item() == pytest.approx((10.5 - 300) / 500)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3)], ids=str)
+def test_axis_swap_is_an_involution(shape: tuple[int, ...]) -> None:
+    """Catches an axis that is swapped once too often: twice is nothing, to the last bit."""
+    rng = np.random.default_rng(0)
+    n_poses = int(np.prod(shape))
+    poses = np.tile(np.eye(4), (n_poses, 1, 1))
+    poses[:, :3, :3] = Rotation.random(n_poses, random_state=rng).as_matrix().reshape(-1, 3, 3)
+    poses[:, :3, 3] = rng.normal(size=(n_poses, 3))
+    poses = poses.reshape(*shape, 4, 4)
+    swapped = swap_opengl_opencv(poses)
+    assert np.array_equal(swap_opengl_opencv(swapped), poses)
+    # The camera's place and its x axis stay, in the same world; the rotation stays right-handed.
+    assert np.array_equal(swapped[..., [0, 3]], poses[..., [0, 3]])
+    np.testing.assert_allclose(np.linalg.det(swapped[..., :3, :3]), 1)
+
+
+def test_axis_swap_leaves_the_world_as_it_is() -> None:
+    """Catches a swap on the left side, which would turn the world instead of the camera.
+
+    The same world point: one metre ahead is (0, 0, 1) with OpenCV axes and (0, 0, -1) with OpenGL.
+    """
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
+    pose[:3, 3] = [1.0, 2.0, 3.0]
+    swapped = swap_opengl_opencv(pose)
+    same_points = [([0, 0, 1], [0, 0, -1]), ([0, 1, 0], [0, -1, 0]), ([1, 0, 0], [1, 0, 0])]
+    for opencv, opengl in same_points:
+        np.testing.assert_allclose(pose @ [*opencv, 1], swapped @ [*opengl, 1], atol=1e-15)

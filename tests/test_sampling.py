@@ -1,0 +1,191 @@
+"""Random pixels as rays: they carry the right measurement, and look where something is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from nbtrack.bounds import SceneBounds
+from nbtrack.camera import Intrinsics, backproject
+from nbtrack.config import MappingConfig
+from nbtrack.data import Sequence
+from nbtrack.fields import Field, Rays
+from nbtrack.geometry import transform_points
+from nbtrack.rendering import Rendering, composite, weights_from_density, weights_from_sdf
+from nbtrack.sampling import NEAR, PixelSampler, guided_depths, rays_end, two_pass_depths
+
+CAMERA = Intrinsics.from_focal(16, 12, 14.0)
+CPU = torch.device("cpu")
+BOX = SceneBounds((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))
+CONFIG = MappingConfig(n_stratified=16, n_surface=8, surface_band=0.15)
+
+
+class Wall(Field):
+    """A gray wall at z = 2, either dense behind it or as a signed distance."""
+
+    name = label = "wall"
+    surface_level = 0.0
+
+    def __init__(self, signed: bool) -> None:
+        super().__init__(BOX)
+        self.signed = signed
+
+    def forward(self, points_world: Tensor) -> tuple[Tensor, Tensor]:
+        distance = 2.0 - points_world[:, 2]
+        value = distance if self.signed else 50.0 * (distance < 0)
+        return torch.full_like(points_world, 0.5), value
+
+    def render(self, rays: Rays, depths: Tensor) -> Rendering:
+        colors, value = self(rays.points(depths).flatten(0, 1))
+        colors, value = colors.view(*depths.shape, 3), value.view_as(depths)
+        if not self.signed:
+            lengths = rays.directions_world.norm(dim=-1)
+            return composite(weights_from_density(value, depths, lengths), colors, depths)
+        weights = weights_from_sdf(value, torch.tensor(50.0))
+        return composite(weights, colors[:, 1:], (depths[:, 1:] + depths[:, :-1]) / 2)
+
+    def mapping_losses(self, *arguments: object) -> dict[str, Tensor]:
+        raise NotImplementedError
+
+
+def random_sequence(n_frames: int) -> Sequence:
+    rng = np.random.default_rng(0)
+    shape = (n_frames, CAMERA.height, CAMERA.width)
+    poses = np.tile(np.eye(4), (n_frames, 1, 1))
+    poses[:, :3, :3] = Rotation.random(n_frames, random_state=rng).as_matrix()
+    poses[:, :3, 3] = rng.normal(size=(n_frames, 3))
+    return Sequence(
+        "noise", CAMERA, rng.integers(0, 256, (*shape, 3), dtype=np.uint8),
+        rng.integers(0, 1 << 16, shape, dtype=np.uint16), poses, np.arange(n_frames),
+    )  # fmt: skip
+
+
+def rays_ahead(n_rays: int, depth: Tensor) -> Rays:
+    """Rays from the origin that fan out in x, with z = 1."""
+    slope = torch.linspace(-0.4, 0.4, n_rays)
+    directions = torch.stack([slope, torch.zeros(n_rays), torch.ones(n_rays)], dim=-1)
+    return Rays(torch.zeros(n_rays, 3), directions, torch.zeros(n_rays, 3), depth)
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def test_ray_ends_at_the_observed_point(generator: torch.Generator) -> None:
+    """Catches rows for columns, the pose of another frame, and a direction of length one."""
+    sequence = random_sequence(4)
+    sampler = PixelSampler(sequence, CPU)
+    frame = 2
+    rows = torch.randint(CAMERA.height, (30,), generator=generator)
+    columns = torch.randint(CAMERA.width, (30,), generator=generator)
+    rays = sampler.rays(torch.full((30,), frame), rows, columns)
+    depth_m = torch.from_numpy(sequence.depth(frame))[rows, columns]
+    torch.testing.assert_close(rays.depth, depth_m)
+    torch.testing.assert_close(rays.color, torch.from_numpy(sequence.color(frame))[rows, columns])
+    points_camera = backproject(CAMERA, columns, rows, depth_m)
+    T_world_camera = torch.from_numpy(sequence.T_world_camera[frame]).float()
+    torch.testing.assert_close(
+        rays.points(rays.depth[:, None])[:, 0], transform_points(T_world_camera, points_camera),
+        rtol=1e-4, atol=1e-4,
+    )  # fmt: skip
+
+
+def test_depths_above_32_metres(generator: torch.Generator) -> None:
+    """Catches signed 16 bit: 40,000 mm must not become -25.5 m, nor 65,535 no measurement."""
+    sequence = random_sequence(1)
+    sequence.depths_mm[0, 0, :4] = [0, 32_767, 40_000, 65_535]
+    sampler = PixelSampler(sequence, CPU)
+    zeros = torch.zeros(4, dtype=torch.int64)
+    _, depth = sampler.measurements(zeros, zeros, torch.arange(4))
+    torch.testing.assert_close(depth, torch.tensor([0.0, 32.767, 40.0, 65.535]))
+    rows, columns = sampler.measured_pixels(0)
+    assert len(rows) == np.count_nonzero(sequence.depths_mm[0])
+    assert torch.from_numpy(sequence.depths_mm[0].astype(np.int64))[rows, columns].min() > 0
+
+
+def test_draw_covers_only_the_given_frames(generator: torch.Generator) -> None:
+    """Catches held-out frames that are mapped, and corners or frames that are never drawn."""
+    sequence = random_sequence(5)
+    sampler = PixelSampler(sequence, CPU)
+    rays = sampler.draw(6000, generator, torch.tensor([1, 3]))
+    expected = torch.from_numpy(sequence.T_world_camera[[1, 3], :3, 3]).float()
+    from_first = (rays.origins_world == expected[0]).all(dim=-1)
+    from_second = (rays.origins_world == expected[1]).all(dim=-1)
+    assert (from_first ^ from_second).all()
+    assert from_first.float().mean().item() == pytest.approx(0.5, abs=0.03)
+    # 2 x 16 x 12 pixels, 15 draws each: all of them turn up.
+    both = torch.cat([rays.origins_world, rays.directions_world], dim=1)
+    assert len(torch.unique(both, dim=0)) == 2 * 16 * 12
+
+
+def test_draw_follows_the_generator() -> None:
+    """Catches draws from the global generator, which no seed of a run reaches."""
+    sampler = PixelSampler(random_sequence(3), CPU)
+    frames = torch.arange(3)
+    first = sampler.draw(20, torch.Generator().manual_seed(1), frames)
+    torch.manual_seed(99)
+    again = sampler.draw(20, torch.Generator().manual_seed(1), frames)
+    other = sampler.draw(20, torch.Generator().manual_seed(2), frames)
+    assert torch.equal(first.directions_world, again.directions_world)
+    assert not torch.equal(first.directions_world, other.directions_world)
+
+
+def test_mapping_depths_of_measured_rays(generator: torch.Generator) -> None:
+    """Catches samples behind the surface's band, too few around it, and an unsorted ray."""
+    rays = rays_ahead(40, torch.linspace(0.5, 2.5, 40))
+    depths = guided_depths(rays, BOX, CONFIG, generator)
+    assert depths.shape == (40, 24)
+    assert (depths.diff(dim=-1) >= 0).all()
+    assert depths.min() >= NEAR
+    assert (depths.amax(dim=-1) <= rays.depth + 0.15 + 1e-5).all()
+    in_band = ((depths - rays.depth[:, None]).abs() <= 0.15 + 1e-5).sum(dim=-1)
+    assert in_band.min() >= 8
+    # One stratified sample falls into each of 16 parts, so none is left unseen.
+    gaps = depths.diff(dim=-1).amax(dim=-1)
+    assert (gaps <= 2 * (rays.depth + 0.15) / 16).all()
+
+
+def test_mapping_depths_of_unmeasured_rays(generator: torch.Generator) -> None:
+    """Catches a missing depth taken for a surface at the camera: such rays go to the box, 3 m."""
+    depths = guided_depths(rays_ahead(40, torch.zeros(40)), BOX, CONFIG, generator)
+    assert (depths.amax(dim=-1) > 2.7).all()
+    assert (depths.amax(dim=-1) <= 3.15 + 1e-5).all()
+    assert depths.min() >= NEAR
+
+
+def test_rays_of_a_lost_camera_have_some_length() -> None:
+    """Catches negative ranges when a pose has left the box."""
+    rays = rays_ahead(3, torch.zeros(3))
+    outside = replace(rays, origins_world=rays.origins_world + torch.tensor([0.0, 0.0, 9.0]))
+    torch.testing.assert_close(rays_end(outside, BOX), torch.full((3,), 2 * NEAR))
+
+
+@pytest.mark.parametrize("signed", [False, True])
+@pytest.mark.parametrize("seeded", [False, True])
+def test_two_passes_find_the_wall(signed: bool, seeded: bool, generator: torch.Generator) -> None:
+    """Catches a second pass beside the surface: the sections' weights lie between the samples.
+
+    The first pass leaves 9 cm between its samples; 12 of the second must be around the wall.
+    """
+    wall, rays = Wall(signed), rays_ahead(20, torch.zeros(20))
+    depths = two_pass_depths(wall, rays, 32, 12, generator if seeded else None)
+    assert depths.shape == (20, 44)
+    assert (depths.diff(dim=-1) >= 0).all()
+    near_wall = ((depths - 2.0).abs() < 0.25).sum(dim=-1)
+    assert near_wall.min() >= 12
+    error = (wall.render(rays, depths).depth - 2.0).abs()
+    coarse = two_pass_depths(wall, rays, 32, 1, None)
+    assert error.mean() < 0.05
+    assert error.mean() < (wall.render(rays, coarse).depth - 2.0).abs().mean() + 0.01
+
+
+def test_two_passes_carry_no_gradient() -> None:
+    """Catches a first pass that doubles the cost of every tracking step."""
+    rays = rays_ahead(4, torch.zeros(4))
+    origins = rays.origins_world.requires_grad_()
+    depths = two_pass_depths(Wall(True), replace(rays, origins_world=origins), 16, 8)
+    assert not depths.requires_grad
