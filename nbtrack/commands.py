@@ -1,6 +1,5 @@
 """What each command does and prints."""
 
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -16,7 +15,7 @@ from nbtrack.experiments import MapCell, TrackCell, map_summary, obtain_map, run
 from nbtrack.fields import field_class
 from nbtrack.grid import BUDGETS, prepare_scenes, table_1_cells
 from nbtrack.latex import TableNotes, write_tables
-from nbtrack.parallel import Job, run_jobs
+from nbtrack.parallel import Job, Report, run_jobs
 from nbtrack.paths import PAPER_TABLES
 from nbtrack.scenes import Scene, find_scene
 from nbtrack.synthetic import make_room
@@ -151,9 +150,9 @@ def _map_with_bar(cell: MapCell) -> None:
     run_jobs([Job(cell.scene.name, total, _map_job, (cell,))], "mapping", workers=1)
 
 
-def _map_job(cell: MapCell, report: partial) -> None:
+def _map_job(cell: MapCell, report: Report) -> None:
     obtain_map(cell, report=report)
 
 
-def _track_job(cell: TrackCell, folder: Path, device: torch.device, report: partial) -> dict:
+def _track_job(cell: TrackCell, folder: Path, device: torch.device, report: Report) -> dict:
     return run_track(cell, folder, device, report)

@@ -8,6 +8,7 @@ key or a value of another type is an error that names the nearest valid key.
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import shlex
 import tomllib
@@ -258,6 +259,10 @@ def _replaced(node: Any, path: list[str], key: str, value: Any) -> Any:
     return dataclasses.replace(node, **{head: new})
 
 
+# Counts are at least one, but for these: no frame is held out, no second pass, the first seed.
+_MAY_BE_ZERO = ("holdout_every", "n_surface", "n_importance", "seed")
+
+
 def _converted(key: str, old: Any, value: Any) -> Any:
     wanted = type(old)
     if wanted is tuple and isinstance(value, list | str | int | float):
@@ -270,6 +275,7 @@ def _converted(key: str, old: Any, value: Any) -> Any:
             f"{key} = {value!r} is of type {type(value).__name__}: it must be {wanted.__name__}, "
             f"for example {old!r}"
         )
-    if wanted in (int, float) and not value >= 0:
-        raise ConfigError(f"{key} = {value!r}: it must not be negative; the preset has {old!r}")
+    least = 1 if wanted is int and key.rpartition(".")[2] not in _MAY_BE_ZERO else 0
+    if wanted in (int, float) and not least <= value < math.inf:
+        raise ConfigError(f"{key} = {value!r}: it must be {least} or more; the preset has {old!r}")
     return value

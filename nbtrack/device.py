@@ -22,22 +22,22 @@ def choose_device() -> torch.device:
 
 
 def device_name(device: torch.device) -> str:
-    """What to call the device in results: the GPU's name, or the processor's and its core count."""
+    """What to call the device in results: the GPU's name, or the processor's and its cores."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     if device.type == "mps":
         return f"Apple GPU ({platform.machine()})"
-    return f"{_processor_name()}, {torch.get_num_threads()} of {os.cpu_count()} cores"
+    return f"{_processor_name()}, {os.cpu_count()} cores"
 
 
 @contextlib.contextmanager
 def suitable_threads(width: int) -> Iterator[None]:
     """Run a block with the number of CPU threads that suits a network's width.
 
-    The count is fixed by the width alone, so that the same run gives the same bits.
+    Narrow networks get one, wide ones as many as the process already has.
     """
     before = torch.get_num_threads()
-    torch.set_num_threads(1 if width < _WIDTH_FOR_THREADS else max(1, os.cpu_count() or 1))
+    torch.set_num_threads(1 if width < _WIDTH_FOR_THREADS else before)
     try:
         yield
     finally:

@@ -155,8 +155,8 @@ def obtain_track(
 
 def run_track(
     cell: TrackCell, folder: Path, device: torch.device, report: Report = _quiet
-) -> TrackedSequence:
-    """Track now, whatever the cache holds, and write the run's files to a folder.
+) -> dict[str, Any]:
+    """Track now, whatever the cache holds, write the run's files to a folder; return its metrics.
 
     `trajectory.txt` and `groundtruth.txt` (TUM) hold the tracked frames, without the first one,
     whose pose was given: so public tools report the error of the paper's formula. `frames.csv`
@@ -173,8 +173,10 @@ def run_track(
     write_tum(folder / "trajectory.txt", frame_ids, tracked.T_estimated[1:])
     write_tum(folder / "groundtruth.txt", frame_ids, tracked.T_true[1:])
     write_text_atomic(folder / "frames.csv", tracked.frames.to_csv(index=False))
-    write_json_atomic(folder / METRICS_FILE, _metrics(cell, tracked, fitted, device))
-    return tracked
+    metrics = _metrics(cell, tracked, fitted, device)
+    # The metrics come last: where they stand, the run is complete.
+    write_json_atomic(folder / METRICS_FILE, metrics)
+    return metrics
 
 
 def read_poses(

@@ -70,7 +70,7 @@ def plot_slice(
     axes.set_xlim(cut.right[0], cut.right[-1])
     axes.set_ylim(cut.ahead[0], cut.ahead[-1])
     view.finish(axes)
-    axes.set_title(f"{field.label} at height {height:g} m", fontsize=9)
+    axes.set_title(f"{field.label} at height {height:.2f} m", fontsize=9)
     axes.grid(False)
     figure.legend(handles=_legend(field, room), loc="outside lower center", ncols=5)
     return figure

@@ -26,6 +26,7 @@ class Tracker(abc.ABC):
     short_label: str  # in Table II
     field_name: str  # the field whose maps it tracks in
     paper_steps: str = "sdf"  # whose step counts of the paper's Table II it is given
+    table_order: int = 100  # rows of the tables go by this, then by name; the paper's come first
 
     def __init__(
         self,

@@ -18,6 +18,7 @@ class SdfTracker(AdamTracker):
     short_label = "SDF"
     field_name = "neus"
     paper_steps = "sdf"
+    table_order = 1
 
     def loss(
         self,

@@ -20,6 +20,7 @@ class VolumeRenderingTracker(AdamTracker):
     short_label = "VR"
     field_name = "imap"
     paper_steps = "vr"
+    table_order = 0
 
     def loss(
         self,

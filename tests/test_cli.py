@@ -1,0 +1,192 @@
+"""The command line: every mistake is one line on standard error and exit status 2."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from nbtrack.camera import Intrinsics
+from nbtrack.cli import main
+from nbtrack.data_writer import SequenceWriter
+from nbtrack.trajectories import read_tum
+
+TINY = [
+    "--set", "scenes.n_frames=6", "--set", "scenes.width=32", "--set", "mapping.neus.iterations=8",
+    "--set", "mapping.neus.n_rays=16", "--set", "network.neus.width=16",
+    "--set", "tracking.sdf.n_pixels=32",
+]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache, and none of the caller's settings."""
+    for name in ("NBTRACK_PRESET", "NBTRACK_CONFIG", "NBTRACK_SET", "NBTRACK_DATA"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
+    return tmp_path / "runs"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A sound sequence of three frames, to be spoilt."""
+    path = tmp_path / "scene"
+    with SequenceWriter(path, Intrinsics.from_focal(16, 12, 14.0), ("depth",)) as writer:
+        for number in range(3):
+            color = np.full((12, 16, 3), 50 * number, np.uint8)
+            pose = np.eye(4)
+            pose[0, 3] = 0.01 * number
+            writer.add(color, {"depth": np.full((12, 16), 2000, np.uint16)}, pose)
+    return path
+
+
+def failure(capsys: pytest.CaptureFixture, *arguments: str) -> str:
+    """The one line that a failing command prints."""
+    assert main(list(arguments)) == 2
+    error = capsys.readouterr().err
+    lines = [line for line in error.splitlines() if line.startswith("nbtrack: ")]
+    assert len(lines) == 1, error
+    assert "Traceback" not in error
+    return lines[0]
+
+
+def track(path: Path | str, *more: str) -> list[str]:
+    """A tracking command for a folder."""
+    return [
+        "track", str(path), "--field", "neus", "--tracker", "sdf", "--steps", "2", *TINY, *more
+    ]  # fmt: skip
+
+
+def _cut_in_half(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _resize(path: Path) -> None:
+    cv2.imwrite(str(path), np.full((6, 8), 2000, np.uint16))
+
+
+SPOILT = {
+    "no images": (lambda f: [p.unlink() for p in (f / "images").iterdir()], "no images in"),
+    "one depth less": (lambda f: (f / "depth/depth2.png").unlink(), "3 images but 2 depth maps"),
+    "other size": (lambda f: _resize(f / "depth/depth1.png"), "depth1.png is 8x6"),
+    "cut colour": (lambda f: _cut_in_half(f / "images/img1.png"), "img1.png"),
+    "empty focal": (lambda f: (f / "focal.txt").write_text(""), "focal.txt holds ''"),
+    "negative focal": (lambda f: (f / "focal.txt").write_text("-5"), "focal.txt holds '-5'"),
+    "short row": (lambda f: (f / "poses.txt").write_text("1 0 0\n" * 12), "line 1 is '1 0 0'"),
+    "nan poses": (lambda f: (f / "poses.txt").write_text("nan nan nan nan\n" * 12), "are NaN"),
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_spoilt_folders(case: str, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches tracebacks and silent repair for every way a folder can be wrong."""
+    spoil, message = SPOILT[case]
+    spoil(folder)
+    assert message in failure(capsys, *track(folder))
+    assert message in failure(capsys, "data", "check", str(folder))
+
+
+WRONG = {
+    "no folder": (track("does/not/exist"), "no sequence 'does/not/exist'"),
+    "room": (track("living_rom"), "did you mean 'living_room'"),
+    "preset": (["tables", "--preset", "smok"], "did you mean 'smoke'"),
+    "field": (["map", "living_room", "--field", "imapp"], "did you mean 'imap'"),
+    "tracker": (
+        ["track", "living_room", "--field", "neus", "--tracker", "sfd", "--steps", "2"],
+        "did you mean 'sdf'",
+    ),
+    "pair": (
+        ["track", "living_room", "--field", "imap", "--tracker", "sdf", "--steps", "2"],
+        "needs --field neus",
+    ),
+    "key": (
+        ["map", "living_room", "--field", "neus", "--set", "mapping.neus.iteration=3"],
+        "did you mean 'mapping.neus.iterations'",
+    ),
+    "rate": (
+        ["track", "living_room", "--field", "neus", "--tracker", "sdf", "--rate", "0"],
+        "rate_hz is 0",
+    ),
+    "steps": (
+        ["track", "living_room", "--field", "neus", "--tracker", "sdf", "--steps", "-1"],
+        "steps_per_frame is -1",
+    ),
+    "no budget": (
+        ["track", "living_room", "--field", "neus", "--tracker", "sdf"],
+        "--rate --steps",
+    ),
+    "both budgets": (track("living_room", "--rate", "2"), "not allowed with"),
+    "budget": (["tables", "--budget", "time"], "unknown budget 'time'"),
+    "command": (["trak", "living_room"], "trak"),
+    "pixels": (track("living_room", "--pixels", "0"), "n_pixels"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_arguments(case: str, capsys: pytest.CaptureFixture) -> None:
+    """Catches usage dumps, tracebacks and guesses; the nearest valid name is offered."""
+    arguments, message = WRONG[case]
+    assert message in failure(capsys, *arguments)
+
+
+def test_frames_that_select_nothing(folder: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches an empty run that looks like a success."""
+    for option in ("--frames", "--map-frames"):
+        assert "select nothing" in failure(capsys, *track(folder, option, "10:20"))
+    assert "is not a slice" in failure(capsys, *track(folder, "--frames", "abc"))
+
+
+def test_track_writes_what_it_promises(
+    tmp_path: Path, capsys: pytest.CaptureFixture, runs: Path
+) -> None:
+    """Catches missing files and keys, and an error that the trajectories do not bear out."""
+    out = tmp_path / "result"
+    assert main(track("living_room", "--out", str(out), "--seed", "3")) == 0
+    assert "ate rmse" in capsys.readouterr().out
+    metrics = json.loads((out / "metrics.json").read_text())
+    for key in (
+        "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
+        "lost_frames", "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
+        "device", "field", "tracker", "seed", "config",
+    ):  # fmt: skip
+        assert key in metrics, key
+    assert (metrics["frames"], metrics["steps_per_frame"], metrics["seed"]) == (5, 2.0, 3)
+    times, estimated = read_tum(out / "trajectory.txt")
+    _, true = read_tum(out / "groundtruth.txt")
+    assert times.tolist() == pytest.approx([n / 30 for n in range(1, 6)])
+    error = np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=1)
+    assert np.sqrt((error**2).mean()) == pytest.approx(metrics["ate_rmse_m"])
+    rows = (out / "frames.csv").read_text().splitlines()
+    assert rows[0].startswith("frame_id,steps,seconds,loss,translation_error_m")
+    assert len(rows) == 7
+
+
+def test_a_second_run_finds_the_map(capsys: pytest.CaptureFixture) -> None:
+    """Catches maps that are made again although nothing changed, or not although it did."""
+    assert main(track("living_room")) == 0
+    capsys.readouterr()
+    assert main(track("living_room")) == 0
+    captured = capsys.readouterr()
+    assert "map found in" in captured.out + captured.err
+    assert main(track("living_room", "--set", "mapping.neus.n_rays=17")) == 0
+    captured = capsys.readouterr()
+    assert "no finished map" in captured.out + captured.err
+
+
+def test_map_prints_scores_and_place(capsys: pytest.CaptureFixture, runs: Path) -> None:
+    """Catches a map whose quality or folder is not told."""
+    assert main(["map", "living_room", "--field", "neus", *TINY]) == 0
+    printed = capsys.readouterr().out
+    assert str(runs) in printed
+    assert "sdf near" in printed
+
+
+def test_data_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches a made room that its own check would not accept."""
+    out = tmp_path / "room"
+    make = ["data", "make", "office", "--out", str(out), "--n-frames", "12", "--width", "64"]
+    assert main(make) == 0
+    assert main(["data", "check", str(out)]) == 0
+    assert "12 frames" in capsys.readouterr().out
+    assert "exists" in failure(capsys, *make)
