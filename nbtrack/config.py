@@ -25,9 +25,9 @@ class FieldConfig:
 
     width: int = 256  # hidden units a layer (iMAP)
     n_frequencies: int = 93  # learnable sines of the embedding (iMAP)
-    # Standard deviation of the sines' first frequencies, rad per normalised unit (half the
-    # scene's longest side). 5 is iMAP's own 2.5 rad/m in a room of 4 m.
-    embedding_sigma: float = 5.0
+    # Standard deviation of the sines' first frequencies, rad/m. 2.5 is iMAP's own: 25 on
+    # coordinates scaled by 1/10.
+    embedding_sigma: float = 2.5
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class TrackingConfig:
     position_rate: float = 5e-4  # Adam's learning rate of the position, m (paper)
     orientation_rate: float = 1e-3  # Adam's learning rate of the unit quaternion (paper)
     lambda_sdf: float = 1.0  # per metre; the paper gives no value
-    lambda_color: float = 0.1  # SDF; VR uses 5 as iMAP does
+    lambda_color: float = 0.3  # SDF, the paper gives no value; VR has iMAP's 5
     n_stratified: int = 32  # VR: samples of the first pass (iMAP)
     n_importance: int = 12  # VR: samples added for the second pass (iMAP)
 
@@ -95,9 +95,9 @@ class Preset:
 
     name: str
     # A density gains from finer detail; a distance must start smooth, or ripples satisfy the
-    # eikonal term: with 8 in place of 5 the distance in free space was off by 19 cm, not 5.
+    # eikonal term: at 4 rad/m in place of 2.5 it was off by 19 cm in free space, not by 5.
     network: dict[str, FieldConfig] = field(
-        default_factory=lambda: {"imap": FieldConfig(embedding_sigma=8.0), "neus": FieldConfig()}
+        default_factory=lambda: {"imap": FieldConfig(embedding_sigma=4.0), "neus": FieldConfig()}
     )
     mapping: dict[str, MappingConfig] = field(
         default_factory=lambda: {"imap": MappingConfig(), "neus": MappingConfig(lambda_color=2.0)}
@@ -128,13 +128,13 @@ class Preset:
 _SMOKE = Preset(
     "smoke",
     network={
-        "imap": FieldConfig(width=96, embedding_sigma=8.0),
+        "imap": FieldConfig(width=96, embedding_sigma=4.0),
         "neus": FieldConfig(width=96),
     },
     mapping={
         "imap": MappingConfig(1200, n_rays=96, learning_rate=3e-3),
         "neus": MappingConfig(
-            1500, n_rays=128, n_stratified=16, n_surface=8, learning_rate=3e-3, lambda_color=2.0
+            2000, n_rays=128, n_stratified=16, n_surface=8, learning_rate=3e-3, lambda_color=2.0
         ),
     },
     tracking={

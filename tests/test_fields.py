@@ -120,9 +120,9 @@ def test_neus_starts_in_free_space(sigma: float, seed: int) -> None:
 def test_neus_starts_as_an_empty_room(seed: int) -> None:
     """Catches a flat start, or gradients out of the room: distance rises inward from all walls.
 
-    Checked with frequencies low enough for the network to hold the box's smooth distance.
+    Checked with 3 rad per half room, low enough for the network to hold the box's smooth distance.
     """
-    field = make_field("neus", FieldConfig(embedding_sigma=3.0), ROOM, seed)
+    field = make_field("neus", FieldConfig(embedding_sigma=3.0 / ROOM.metres_per_unit), ROOM, seed)
     points = points_inside(ROOM, 2000)
     sdf, distance = field(points)[1], distance_to_walls(ROOM, points)
     excess = sdf - distance

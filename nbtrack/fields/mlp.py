@@ -18,9 +18,9 @@ class FourierMlp(nn.Module):
     more beside the input of the third layer. At full size (256 wide) it has 246,555 parameters.
 
     Source: Sucar et al. 2021 (iMAP); paper, implementation details ("the same network
-    architecture as iMAP for both methods"). iMAP scales coordinates by 1/10 with a standard
-    deviation of 25, that is 2.5 rad/m in any room; here coordinates are normalised by the scene's
-    own size, so that small rooms get finer detail from the same network (our choice).
+    architecture as iMAP for both methods"). iMAP scales coordinates by 1/10; here the scene's own
+    size normalises them, while the frequencies are drawn per metre, so that detail has one size in
+    rooms of any size (our choice).
     """
 
     def __init__(
@@ -36,7 +36,8 @@ class FourierMlp(nn.Module):
         self.register_buffer("center", torch.tensor(bounds.center, dtype=torch.float32))
         self.metres_per_unit = bounds.metres_per_unit
         frequencies = torch.randn(3, n_frequencies, generator=generator)
-        self.frequencies = nn.Parameter(config.embedding_sigma * frequencies)
+        sigma = config.embedding_sigma * self.metres_per_unit
+        self.frequencies = nn.Parameter(sigma * frequencies)
         self.layer_1 = _linear(n_frequencies, width, generator)
         self.layer_2 = _linear(width, width, generator)
         self.layer_3 = _linear(width + n_frequencies, width, generator)
