@@ -55,7 +55,17 @@ def paper_claims(
             1.5 < iteration_ratio < 3,
         ),
     ]
-    return pd.DataFrame(rows, columns=["claim", "paper", "this run", "supported"])
+    return pd.DataFrame(rows, columns=["claim", "paper", "here", "supported"])
+
+
+def in_words(claims: pd.DataFrame) -> str:
+    """One sentence a claim: supported or not, with the paper's numbers and this run's."""
+    verdict = {True: "SUPPORTED", False: "NOT SUPPORTED"}
+    return "\n".join(
+        f"{verdict[bool(row.supported)]}: {row.claim}.\n"
+        f"    paper: {row.paper}\n    here:  {row.here}"
+        for row in claims.itertuples()
+    )
 
 
 def iteration_ratio(

@@ -1,5 +1,6 @@
 """What each command does and prints."""
 
+import os
 from pathlib import Path
 
 import torch
@@ -99,7 +100,7 @@ def make_command(room: str, out: Path, n_frames: int, width: int, seed: int) -> 
     """Write a synthetic room as a sequence folder."""
     with tqdm(total=n_frames, desc=room, unit="frame") as bar:
         make_room(
-            room, out, n_frames, width, width * 3 // 4, seed,
+            room, out, n_frames, width, width * 3 // 4, seed, workers=os.cpu_count() or 1,
             progress=lambda done, total: bar.update(done - bar.n),
         )  # fmt: skip
     print(f"{out}: {room}, {n_frames} frames of {width}x{width * 3 // 4}, seed {seed}")
@@ -113,8 +114,7 @@ def check_command(folder: Path, depth_folder: str | None, pose_file: str) -> Non
 def bench_command(preset: Preset) -> None:
     """Measure and print Table II."""
     device = choose_device()
-    name = preset.scenes.names[0]
-    scene = find_scene(name, preset.scenes)
+    scene = _scene(preset.scenes.names[0], preset)
     cells = measure_steps(preset, scene.read(slice(0, 1)), device)
     print(f"Table II: steps within a budget, {preset.name} network, on {device_name(device)}")
     print(table_2(cells).to_string(float_format="%.1f"))
@@ -138,7 +138,11 @@ def _scene(sequence: str, preset: Preset) -> Scene:
     """The scene, with a bar while a room has to be made."""
     config = preset.scenes
     with tqdm(total=config.n_frames, desc="room", unit="frame", delay=0.5, leave=False) as bar:
-        return find_scene(sequence, config, lambda done, total: bar.update(done - bar.n))
+        # Small rooms are made sooner than processes start.
+        workers = (os.cpu_count() or 1) if config.width >= 320 else 1
+        return find_scene(
+            sequence, config, lambda done, total: bar.update(done - bar.n), workers
+        )
 
 
 def _map_with_bar(cell: MapCell) -> None:

@@ -23,7 +23,9 @@ from nbtrack.sampling import PixelSampler, mapping_depths
 from nbtrack.storage import write_bytes_atomic
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
-_FLUSH_EVERY = 10  # iterations between two looks at the losses: each look waits for the device
+# Iterations between two looks at the losses: each look waits for the device, so there are ten
+# where they are fast, and one where a user would wait for news.
+_FLUSH_EVERY, _SLOW_SECONDS = 10, 0.2
 _FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
 
 OnIteration = Callable[[int, dict[str, float]], None]
@@ -86,7 +88,7 @@ def map_sequence(
     last_saved = time.perf_counter()
     with suitable_threads(field_config.width):
         while run.iteration < config.iterations:
-            run.advance(min(_FLUSH_EVERY, config.iterations - run.iteration))
+            run.advance(min(run.iterations_to_flush, config.iterations - run.iteration))
             if on_iteration:
                 on_iteration(run.iteration, run.history[-1])
             if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
@@ -147,6 +149,12 @@ class _Run:
         self.iteration = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
+
+    @property
+    def iterations_to_flush(self) -> int:
+        """How many iterations to take before the next look at their losses."""
+        is_slow = self.seconds > _SLOW_SECONDS * max(self.iteration, 1)
+        return 1 if is_slow or self.iteration == 0 else _FLUSH_EVERY
 
     def advance(self, n_iterations: int) -> None:
         """Take some steps, then look at their losses once."""

@@ -60,6 +60,7 @@ def find_scene(
     sequence: str | Path,
     config: ScenesConfig,
     progress: Callable[[int, int], None] | None = None,
+    workers: int = 1,
 ) -> Scene:
     """The scene that a user means.
 
@@ -68,6 +69,7 @@ def find_scene(
             size that `config` gives, unless it is there already), or of a scene of the Neural
             RGB-D dataset below the data folder.
         progress: called with frames done and in all while a room is made.
+        workers: processes that make it.
 
     Raises:
         MissingError: there is no such folder, room or scene.
@@ -88,7 +90,7 @@ def find_scene(
             folder.parent.mkdir(parents=True, exist_ok=True)
             height = config.width * 3 // 4
             make_room(
-                text, folder, config.n_frames, config.width, height, config.seed, progress=progress
+                text, folder, config.n_frames, config.width, height, config.seed, workers, progress
             )
         return Scene(text, folder)
     folder = data_folder() / text

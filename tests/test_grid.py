@@ -124,7 +124,7 @@ def test_the_paper_supports_its_own_claims() -> None:
     """Catches a claim that is judged wrongly: the published numbers must support all of them."""
     claims = paper_claims(published_table_1(), published_table_2(), 2.0)
     assert claims["supported"].all()
-    assert claims["this run"].tolist()[:2] == [
+    assert claims["here"].tolist()[:2] == [
         "VR 9, SDF 2 of 18 cells above 0.2 m",
         "VR better in 6 of 9 scenes",
     ]

@@ -80,7 +80,7 @@ def test_resume_equals_uninterrupted(field_name: str, tmp_path: Path) -> None:
                 on_iteration=kill_at_20,
             )  # fmt: skip
     resumed = map_sequence(field_name, sequence, NETWORK, SHORT, seed=3, checkpoint=checkpoint)
-    assert resumed.resumed_from == 10
+    assert 0 < resumed.resumed_from < 20
     assert np.array_equal(resumed.history.to_numpy(), whole.history.to_numpy())
     for name, value in whole.field.state_dict().items():
         assert torch.equal(resumed.field.state_dict()[name], value), name
