@@ -6,13 +6,19 @@ Small networks gain nothing from a second thread, so rooms and methods share the
 import multiprocessing
 import os
 import queue
+import signal
+import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tqdm.auto import tqdm
+
+from nbtrack.errors import NbtrackError
 
 Report = Callable[[int, str], None]
 """Called by a job with the units done so far and a word on how it goes."""
@@ -71,23 +77,46 @@ class _Board:
 def _run_in_processes(jobs: Sequence[Job], workers: int, board: _Board) -> list[Any]:
     # Fresh interpreters: a forked one would inherit torch's thread pool in an unusable state.
     context = multiprocessing.get_context("spawn")
+    threads = max(1, (os.cpu_count() or 1) // workers)
     with context.Manager() as manager:
+        # The manager is a process as well, and ends by itself.
+        running_before = set(multiprocessing.active_children())
         messages = manager.Queue()
-        threads = max(1, (os.cpu_count() or 1) // workers)
-        with ProcessPoolExecutor(workers, context, _start_worker, (threads,)) as pool:
+        pool = ProcessPoolExecutor(workers, context, _start_worker, (threads, os.getpid()))
+        try:
             futures = [pool.submit(_run_one, job, messages) for job in jobs]
             pending: set[Future] = set(futures)
             while pending:
                 finished, pending = wait(pending, timeout=0.3, return_when=FIRST_EXCEPTION)
                 _show_messages(messages, board)
-                if any(future.exception() for future in finished):
-                    pool.shutdown(wait=False, cancel_futures=True)
-                    break
-            return [future.result() for future in futures]
+                for future in finished:
+                    future.result()
+        except BaseException as error:
+            # Nobody waits for what is still running; what it has kept can be resumed.
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in set(multiprocessing.active_children()) - running_before:
+                process.terminate()
+            if isinstance(error, BrokenProcessPool):
+                raise NbtrackError(
+                    "a worker process died, perhaps for lack of memory: what was finished is "
+                    "kept; run the same command again, with smaller settings if need be"
+                ) from None
+            raise
+        pool.shutdown()
+        return [future.result() for future in futures]
 
 
-def _start_worker(threads: int) -> None:
+def _start_worker(threads: int, parent: int) -> None:
     torch.set_num_threads(threads)
+    # An interruption of the command is the parent's to handle; the parent's end is ours.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
 
 
 def _run_one(job: Job, messages: Any) -> Any:
