@@ -13,7 +13,10 @@ VR, SDF = "iMAP with VR", "NeuS with SDF"
 def paper_claims(
     cells_1: pd.DataFrame, cells_2: pd.DataFrame, iteration_ratio: float
 ) -> pd.DataFrame:
-    """One row a claim: what the paper says, what this run measured, and whether it supports it.
+    """One row a claim: what the paper says, what this run measured, and the verdict.
+
+    The verdict is "supported" or "not supported", or "undecided" where nothing failed at all, so
+    that failures cannot be compared.
 
     Args:
         cells_1, cells_2: long form of both tables, see `nbtrack.tables`.
@@ -34,7 +37,7 @@ def paper_claims(
             "SDF tracking fails less often at 10 and 5 Hz",
             "VR 9 of 18 cells above 0.2 m, SDF 2",
             f"VR {vr_fails}, SDF {sdf_fails} of {int(fast.sum()) // 2} cells above 0.2 m",
-            sdf_fails < vr_fails,
+            None if vr_fails == sdf_fails == 0 else sdf_fails < vr_fails,
         ),
         (
             "VR is more accurate at 2 Hz",
@@ -55,14 +58,16 @@ def paper_claims(
             1.5 < iteration_ratio < 3,
         ),
     ]
-    return pd.DataFrame(rows, columns=["claim", "paper", "here", "supported"])
+    claims = pd.DataFrame(rows, columns=["claim", "paper", "here", "verdict"])
+    words = {True: "supported", False: "not supported", None: "undecided"}
+    claims["verdict"] = [words[row[3]] for row in rows]
+    return claims
 
 
 def in_words(claims: pd.DataFrame) -> str:
-    """One sentence a claim: supported or not, with the paper's numbers and this run's."""
-    verdict = {True: "SUPPORTED", False: "NOT SUPPORTED"}
+    """One sentence a claim and its verdict, with the paper's numbers and this run's."""
     return "\n".join(
-        f"{verdict[bool(row.supported)]}: {row.claim}.\n"
+        f"{row.verdict.upper()}: {row.claim}.\n"
         f"    paper: {row.paper}\n    here:  {row.here}"
         for row in claims.itertuples()
     )

@@ -13,7 +13,14 @@ from nbtrack.data import parse_frames
 from nbtrack.data_check import check_sequence
 from nbtrack.device import choose_device, device_name
 from nbtrack.errors import ConfigError
-from nbtrack.experiments import MapCell, TrackCell, map_summary, obtain_map, run_track
+from nbtrack.experiments import (
+    MapCell,
+    TrackCell,
+    make_budget,
+    map_summary,
+    obtain_map,
+    run_track,
+)
 from nbtrack.fields import field_class
 from nbtrack.grid import BUDGETS, prepare_scenes, table_1_cells
 from nbtrack.latex import TableNotes, write_tables
@@ -63,12 +70,13 @@ def track_command(
         )
     parse_frames(frames)
     parse_frames(map_frames)
+    budget = make_budget(steps, rate_hz)  # a wrong one is told before a room is made
     scene = _scene(sequence, preset)
+    n_frames = len(scene.frame_numbers(frames))
+    scene.frame_numbers(map_frames)
     map_cell = MapCell(scene, field_name, preset, map_frames, seed)
     cell = TrackCell(map_cell, tracker_name, steps, rate_hz, frames, seed)
     device = choose_device()
-    budget = cell.budget(device)
-    n_frames = len(scene.frame_numbers(frames))
     _map_with_bar(map_cell)
     folder = out or cell.folder
     (tracked,) = run_jobs(
@@ -99,7 +107,7 @@ def tables_command(preset: Preset, budget: str) -> None:
 
 def make_command(room: str, out: Path, n_frames: int, width: int, seed: int) -> None:
     """Write a synthetic room as a sequence folder."""
-    with tqdm(total=n_frames, desc=room, unit="frame") as bar:
+    with tqdm(total=n_frames, desc=room, unit="frame", delay=0.5) as bar:
         make_room(
             room, out, n_frames, width, width * 3 // 4, seed, workers=os.cpu_count() or 1,
             progress=lambda done, total: bar.update(done - bar.n),
@@ -109,7 +117,7 @@ def make_command(room: str, out: Path, n_frames: int, width: int, seed: int) -> 
 
 def check_command(folder: Path, depth_folder: str | None, pose_file: str) -> None:
     """Validate a sequence folder; print what it holds and which pose convention fits."""
-    print(check_sequence(folder, depth_folder, pose_file))
+    print(check_sequence(folder, depth_folder, pose_file, progress=True))
 
 
 def bench_command(preset: Preset) -> None:
@@ -130,7 +138,7 @@ _PRINTED = (
 _UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": ("s", 0)}
 
 
-def _with_unit(name: str, value: float) -> str:
+def _with_unit(name: str, value: float | int) -> str:
     for suffix, (unit, digits) in _UNITS.items():
         if name.endswith(suffix):
             return f"{name.removesuffix(suffix).replace('_', ' ')}: {value:.{digits}f} {unit}"

@@ -141,7 +141,7 @@ _SMOKE = Preset(
         "vr": TrackingConfig(n_pixels=64, lambda_color=5.0),
         "sdf": TrackingConfig(n_pixels=512),
     },
-    scenes=ScenesConfig(("living_room", "office"), n_frames=240, width=96, track_frames=":90"),
+    scenes=ScenesConfig(("living_room", "office"), n_frames=240, width=96, track_frames=":120"),
     tables=TablesConfig(pixels={"vr": (16, 64, 128), "sdf": (256, 512, 2048)}),
 )
 _SYNTHETIC = Preset(

@@ -154,7 +154,10 @@ def _scan(folder: Path, depth_folder: str | None, pose_file: str, progress: bool
     depth_counts = np.zeros(1 << 16, np.int64)
     poses, depths, frame_ids, first = [], [], [], None
     starts = range(0, len(image_files), _FRAMES_AT_ONCE)
-    for start in tqdm(starts, "checking", unit=f"{_FRAMES_AT_ONCE} frames", disable=not progress):
+    bar = tqdm(
+        starts, "checking", unit=f"{_FRAMES_AT_ONCE} frames", disable=not progress, delay=0.5
+    )
+    for start in bar:
         stretch = slice(start, start + _FRAMES_AT_ONCE)
         if not has_pose[stretch].any():
             continue

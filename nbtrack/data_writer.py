@@ -1,5 +1,6 @@
 """Write a sequence in the Neural RGB-D layout, frame by frame."""
 
+import os
 import shutil
 from pathlib import Path
 from types import TracebackType
@@ -35,7 +36,8 @@ class SequenceWriter:
         self.intrinsics = intrinsics
         self.depth_folders = depth_folders
         # A sibling, so that the final rename stays within one file system.
-        self._unfinished = folder.with_name(f".{folder.name}.unfinished")
+        # The process id keeps two commands that make one scene out of each other's way.
+        self._unfinished = folder.with_name(f".{folder.name}.{os.getpid()}.unfinished")
         self._poses: list[Float[np.ndarray, "4 4"]] = []
 
     def __enter__(self) -> "SequenceWriter":
@@ -86,4 +88,10 @@ class SequenceWriter:
         self.write_text("focal.txt", f"{self.intrinsics.fx!r}\n")
         self.write_text("poses.txt", rows)
         self.write_text("trainval_poses.txt", rows)
-        self._unfinished.rename(self.folder)
+        try:
+            self._unfinished.rename(self.folder)
+        except OSError:
+            shutil.rmtree(self._unfinished, ignore_errors=True)
+            # Another command may have finished the same scene meanwhile: then that one stands.
+            if not self.folder.is_dir():
+                raise

@@ -3,6 +3,7 @@
 import json
 import platform
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -111,9 +112,21 @@ class TrackCell:
 
     def budget(self, device: torch.device) -> Budget:
         """A fresh budget: each run needs its own."""
-        if self.rate_hz is not None:
-            return ClockBudget(self.rate_hz, synchronize=lambda: synchronize(device))
-        return StepBudget(self.steps)
+        return make_budget(self.steps, self.rate_hz, device)
+
+
+def make_budget(
+    steps: float | None, rate_hz: float | None, device: torch.device | None = None
+) -> Budget:
+    """A budget by the clock of a device if there is a rate (Hz), else of so many steps a frame.
+
+    Raises:
+        ConfigError: the number is not above zero.
+    """
+    if rate_hz is None:
+        return StepBudget(steps)
+    wait = partial(synchronize, device) if device else None
+    return ClockBudget(rate_hz, synchronize=wait)
 
 
 def obtain_map(

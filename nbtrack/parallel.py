@@ -49,7 +49,8 @@ def run_jobs(jobs: Sequence[Job], title: str, workers: int | None = None) -> lis
         workers = 1 if torch.cuda.is_available() else os.cpu_count() or 1
     workers = min(workers, len(jobs))
     total = sum(job.total for job in jobs)
-    with tqdm(total=total, desc=title, unit="step", disable=not jobs) as bar:
+    # The bar waits a moment, so that a mistake which ends the first job at once is told alone.
+    with tqdm(total=total, desc=title, unit="step", disable=not jobs, delay=0.5) as bar:
         board = _Board(bar)
         if workers <= 1:
             return [

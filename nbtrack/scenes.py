@@ -7,7 +7,7 @@ from pathlib import Path
 
 from nbtrack.config import ScenesConfig, fingerprint
 from nbtrack.data import Sequence, list_frames, parse_frames, read_sequence
-from nbtrack.errors import MissingError, nearest_name
+from nbtrack.errors import DataError, MissingError, nearest_name
 from nbtrack.paths import data_folder, runs_folder
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of
 
@@ -35,8 +35,18 @@ class Scene:
         return read_sequence(self.folder, frames, progress=progress)
 
     def frame_numbers(self, frames: str) -> range:
-        """Which frames a slice such as `10:50:2` selects, those with a NaN pose included."""
-        return range(len(list_frames(self.folder)[0]))[parse_frames(frames)]
+        """Which frames a slice such as `10:50:2` selects, those with a NaN pose included.
+
+        Raises DataError if it selects none.
+        """
+        total = len(list_frames(self.folder)[0])
+        selected = range(total)[parse_frames(frames)]
+        if not selected:
+            raise DataError(
+                f"frames {frames} select nothing of the {total} frames in {self.folder}: choose a "
+                f"range within 0:{total}"
+            )
+        return selected
 
     def fingerprint(self) -> str:
         """Changes when the data change: poses, focal length, and the images' names and sizes."""

@@ -45,10 +45,9 @@ def failure(capsys: pytest.CaptureFixture, *arguments: str) -> str:
     """The one line that a failing command prints."""
     assert main(list(arguments)) == 2
     error = capsys.readouterr().err
-    lines = [line for line in error.splitlines() if line.startswith("nbtrack: ")]
-    assert len(lines) == 1, error
-    assert "Traceback" not in error
-    return lines[0]
+    assert error.startswith("nbtrack: "), error
+    assert error.count("\n") == 1, error
+    return error
 
 
 def track(path: Path | str, *more: str) -> list[str]:

@@ -358,3 +358,18 @@ def test_writer_without_a_frame(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no frame"), SequenceWriter(tmp_path / "scene", CAMERA):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+def test_two_writers_of_one_scene(tmp_path: Path) -> None:
+    """Catches two commands that spoil each other's files of one room: the first one stands."""
+    intrinsics = Intrinsics.from_focal(8, 6, 7.0)
+    with SequenceWriter(tmp_path / "room", intrinsics, ("depth",)) as late:
+        late._unfinished = late._unfinished.with_name(".room.other.unfinished")
+        late.__enter__()
+        late.add(np.zeros((6, 8, 3), np.uint8), {"depth": np.ones((6, 8), np.uint16)}, np.eye(4))
+        with SequenceWriter(tmp_path / "room", intrinsics, ("depth",)) as early:
+            for _ in range(2):
+                early.add(
+                    np.zeros((6, 8, 3), np.uint8), {"depth": np.ones((6, 8), np.uint16)}, np.eye(4)
+                )
+    assert len(read_sequence(tmp_path / "room")) == 2

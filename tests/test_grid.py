@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from nbtrack.bench import default_pixels, measure_steps
-from nbtrack.claims import iteration_ratio, paper_claims
+from nbtrack.claims import in_words, iteration_ratio, paper_claims
 from nbtrack.config import Preset, resolve_preset
 from nbtrack.device import choose_device
 from nbtrack.errors import ConfigError, MissingError
@@ -123,11 +123,20 @@ def test_missing_dataset_scene_is_named(
 def test_the_paper_supports_its_own_claims() -> None:
     """Catches a claim that is judged wrongly: the published numbers must support all of them."""
     claims = paper_claims(published_table_1(), published_table_2(), 2.0)
-    assert claims["supported"].all()
+    assert claims["verdict"].eq("supported").all()
     assert claims["here"].tolist()[:2] == [
         "VR 9, SDF 2 of 18 cells above 0.2 m",
         "VR better in 6 of 9 scenes",
     ]
+
+
+def test_no_failures_decide_nothing() -> None:
+    """Catches "not supported" where no camera was lost by either method."""
+    cells = published_table_1().assign(ate_m=0.01)
+    claims = paper_claims(cells, published_table_2(), 1.0)
+    verdicts = ["undecided", "not supported", "supported", "not supported"]
+    assert claims["verdict"].tolist() == verdicts
+    assert in_words(claims).startswith("UNDECIDED: SDF tracking fails less often")
 
 
 def test_iteration_ratio_is_per_sample() -> None:

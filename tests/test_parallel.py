@@ -27,10 +27,11 @@ def die(code: int, report: Report) -> None:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_come_in_order(workers: int, capsys: pytest.CaptureFixture) -> None:
-    """Catches results in the order of their completion, and a bar that ends early."""
+    """Catches results in the order of their completion, and noise before there is news."""
     jobs = [Job(f"job {n}", 2, square, (n,)) for n in range(4)]
     assert run_jobs(jobs, "squares", workers) == [0, 1, 4, 9]
-    assert "8/8" in capsys.readouterr().err
+    if workers == 1:
+        assert capsys.readouterr().err == ""
 
 
 def test_no_jobs() -> None:
