@@ -125,7 +125,7 @@ _MEASURED_STEPS = {"vr": {100: 6.8, 500: 36.1}, "sdf": {100: 15.3, 500: 79.3}}
 """Steps within a budget (ms) for the default n (VR 512, SDF 4096). Source: paper, Table II."""
 
 
-def paper_steps(tracker: str, rate_hz: float) -> float:
+def paper_steps(tracker: str, rate_hz: float | int) -> float:
     """Steps a frame on the paper's hardware, on the line through its 100 and 500 ms figures.
 
     The time per step is then the same at every rate, and so is the fixed cost of a frame. Table

@@ -12,7 +12,7 @@ from nbtrack.config import Preset
 from nbtrack.data import parse_frames
 from nbtrack.data_check import check_sequence
 from nbtrack.device import choose_device, device_name
-from nbtrack.errors import ConfigError
+from nbtrack.errors import ConfigError, DataError
 from nbtrack.experiments import (
     MapCell,
     TrackCell,
@@ -24,6 +24,7 @@ from nbtrack.experiments import (
 from nbtrack.fields import field_class
 from nbtrack.grid import BUDGETS, prepare_scenes, table_1_cells
 from nbtrack.latex import TableNotes, write_tables
+from nbtrack.meshes import extract_mesh, keep_seen
 from nbtrack.parallel import Job, Report, run_jobs
 from nbtrack.paths import PAPER_TABLES
 from nbtrack.scenes import Scene, find_scene
@@ -35,7 +36,7 @@ from nbtrack.trackers import tracker_class
 def map_command(
     sequence: str, field_name: str, preset: Preset, frames: str, seed: int, out: Path | None
 ) -> None:
-    """Map a sequence, or resume; print the map's scores and where it lies."""
+    """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
     field_class(field_name)
     parse_frames(frames)
     cell = MapCell(_scene(sequence, preset), field_name, preset, frames, seed, out)
@@ -46,6 +47,14 @@ def map_command(
     for name, value in summary["quality"].items():
         if value is not None:
             print(f"  {_with_unit(name, value)}")
+    mapped = cell.scene.read(parse_frames(frames))
+    try:
+        mesh = keep_seen(extract_mesh(obtain_map(cell).field), mapped)
+    except DataError as error:
+        print(f"  no mesh: {error}")
+    else:
+        mesh.export(cell.folder / "mesh.ply")
+        print(f"  mesh of what was seen: {cell.folder / 'mesh.ply'}")
 
 
 def track_command(

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from nbtrack.data import Sequence
+from nbtrack.errors import DataError
 from nbtrack.fields import Field
 from nbtrack.meshes import extract_mesh, keep_seen, query_field, seen_by
 from nbtrack.sampling import PixelSampler
@@ -96,9 +97,14 @@ def score_mesh(field: Field, mapped: Sequence, room: Room, voxel: float) -> dict
     """Accuracy, completion (m) and F-score at 5 cm of the seen part of the mesh.
 
     Accuracy needs no sampling of the truth: the exact distance at each point of the mesh is its
-    distance from the surface.
+    distance from the surface. A map that has no surface yet gets no scores.
     """
-    mesh = keep_seen(extract_mesh(field, voxel), mapped)
+    try:
+        mesh = keep_seen(extract_mesh(field, voxel), mapped)
+    except DataError:
+        return {}
+    if len(mesh.faces) == 0:
+        return {}
     points = mesh.sample(_POINTS_SCORED, seed=0)
     to_truth = np.abs(room.sdf(points))
     truth = true_surface_points(room, _POINTS_SCORED, seed=0)

@@ -37,7 +37,7 @@ class FittedMap:
 
     field: Field
     history: pd.DataFrame  # one row an iteration: weighted loss terms and diagnostics
-    seconds: float  # time spent in iterations, all sessions of a resumed run together
+    seconds: float  # time spent in iterations, before and after a resume together
     resumed_from: int = 0  # iteration at which this run took up a checkpoint
 
 

@@ -179,6 +179,7 @@ def test_map_prints_scores_and_place(capsys: pytest.CaptureFixture, runs: Path) 
     printed = capsys.readouterr().out
     assert str(runs) in printed
     assert "sdf near" in printed
+    assert "mesh" in printed
 
 
 def test_data_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
