@@ -101,22 +101,19 @@ def table_1_cells(preset: Preset, scenes: Sequence[Scene], budget: str = "steps"
 
     Columns: rate_hz, method, scene, ate_m and the other metrics.
     """
-    cells = [
-        (rate_hz, tracker, cell)
+    rates_hz = [rate_hz for rate_hz in preset.tables.rates_hz for _ in scenes]
+    planned = [
+        (rate_hz, tracker.label, cell)
         for name, tracker in TRACKERS.items()
-        for (rate_hz, _), cell in zip(
-            [(rate, scene) for rate in preset.tables.rates_hz for scene in scenes],
-            track_cells(preset, name, scenes, budget), strict=True,
+        for rate_hz, cell in zip(
+            rates_hz, track_cells(preset, name, scenes, budget), strict=True
         )
     ]  # fmt: skip
-    results = run_tracks([cell for _, _, cell in cells])
+    results = run_tracks([cell for _, _, cell in planned])
     rows = [
-        {
-            "rate_hz": rate_hz, "method": tracker.label, "scene": cell.scene_name,
-            "ate_m": metrics["ate_rmse_m"], **metrics,
-        }
-        for (rate_hz, tracker, cell), metrics in zip(cells, results, strict=True)
-    ]  # fmt: skip
+        {"rate_hz": rate_hz, "method": method, "ate_m": metrics["ate_rmse_m"], **metrics}
+        for (rate_hz, method, _), metrics in zip(planned, results, strict=True)
+    ]
     return pd.DataFrame(rows).drop(columns="config")
 
 
