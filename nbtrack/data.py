@@ -128,13 +128,7 @@ def read_sequence(
             f"frames {_slice_text(frames)} select nothing of the {len(image_files)} frames in "
             f"{folder}: choose a range within 0:{len(image_files)}"
         )
-    has_pose = np.isfinite(poses).all(axis=(1, 2))
-    frame_ids = selected[has_pose[selected]]
-    if len(frame_ids) == 0:
-        raise DataError(
-            f"all {len(selected)} selected poses in {folder / pose_file} are NaN: "
-            "at least one frame needs a pose; choose other frames or another pose file"
-        )
+    frame_ids = _with_pose(selected, poses, folder / pose_file)
     _check_rotations(poses[frame_ids], frame_ids, folder / pose_file)
     colors, depths_mm = _read_images(
         [image_files[i] for i in frame_ids], [depth_files[i] for i in frame_ids], progress
@@ -273,6 +267,19 @@ def _read_text(path: Path) -> str:
 def _slice_text(frames: slice) -> str:
     parts = (frames.start, frames.stop, frames.step)
     return ":".join("" if part is None else str(part) for part in parts)
+
+
+def _with_pose(
+    selected: Int[np.ndarray, "n"], poses: Float[np.ndarray, "frames 4 4"], path: Path
+) -> Int[np.ndarray, "kept"]:
+    """The selected frames whose pose is not NaN: at least one, else DataError."""
+    frame_ids = selected[np.isfinite(poses[selected]).all(axis=(1, 2))]
+    if len(frame_ids) == 0:
+        raise DataError(
+            f"all {len(selected)} selected poses in {path} are NaN: at least one frame needs a "
+            "pose; choose other frames or another pose file"
+        )
+    return frame_ids
 
 
 def _check_rotations(
