@@ -116,7 +116,7 @@ def tables_command(preset: Preset, budget: str) -> None:
 
 def make_command(room: str, out: Path, n_frames: int, width: int, seed: int) -> None:
     """Write a synthetic room as a sequence folder."""
-    with tqdm(total=n_frames, desc=room, unit="frame", delay=0.5) as bar:
+    with tqdm(total=n_frames, desc=room, unit="frame", delay=1.0) as bar:
         make_room(
             room, out, n_frames, width, width * 3 // 4, seed, workers=os.cpu_count() or 1,
             progress=lambda done, total: bar.update(done - bar.n),
@@ -157,7 +157,7 @@ def _with_unit(name: str, value: float | int) -> str:
 def _scene(sequence: str, preset: Preset) -> Scene:
     """The scene, with a bar while a room has to be made."""
     config = preset.scenes
-    with tqdm(total=config.n_frames, desc="room", unit="frame", delay=0.5, leave=False) as bar:
+    with tqdm(total=config.n_frames, desc="room", unit="frame", delay=1.0, leave=False) as bar:
         # Small rooms are made sooner than processes start.
         workers = (os.cpu_count() or 1) if config.width >= 320 else 1
         return find_scene(

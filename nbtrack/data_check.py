@@ -155,7 +155,7 @@ def _scan(folder: Path, depth_folder: str | None, pose_file: str, progress: bool
     poses, depths, frame_ids, first = [], [], [], None
     starts = range(0, len(image_files), _FRAMES_AT_ONCE)
     bar = tqdm(
-        starts, "checking", unit=f"{_FRAMES_AT_ONCE} frames", disable=not progress, delay=0.5
+        starts, "checking", unit=f"{_FRAMES_AT_ONCE} frames", disable=not progress, delay=1.0
     )
     for start in bar:
         stretch = slice(start, start + _FRAMES_AT_ONCE)

@@ -50,7 +50,7 @@ def run_jobs(jobs: Sequence[Job], title: str, workers: int | None = None) -> lis
     workers = min(workers, len(jobs))
     total = sum(job.total for job in jobs)
     # The bar waits a moment, so that a mistake which ends the first job at once is told alone.
-    with tqdm(total=total, desc=title, unit="step", disable=not jobs, delay=0.5) as bar:
+    with tqdm(total=total, desc=title, unit="step", disable=not jobs, delay=1.0) as bar:
         board = _Board(bar)
         if workers <= 1:
             return [
