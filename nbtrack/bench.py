@@ -7,7 +7,7 @@ import pandas as pd
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from nbtrack.bounds import observed_bounds
 from nbtrack.budget import ClockBudget

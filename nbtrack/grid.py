@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import pandas as pd
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from nbtrack.budget import paper_steps
 from nbtrack.config import Preset, ScenesConfig

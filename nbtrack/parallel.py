@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import queue
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from nbtrack.errors import NbtrackError
 
@@ -49,8 +50,13 @@ def run_jobs(jobs: Sequence[Job], title: str, workers: int | None = None) -> lis
         workers = 1 if torch.cuda.is_available() else os.cpu_count() or 1
     workers = min(workers, len(jobs))
     total = sum(job.total for job in jobs)
+    # A terminal can be written to often. Elsewhere every line is kept: a notebook's kernel drops
+    # messages, its last ones too, once a thousand wait to be read.
+    seconds = 0.1 if sys.stderr.isatty() else 3.0
     # The bar waits a moment, so that a mistake which ends the first job at once is told alone.
-    with tqdm(total=total, desc=title, unit="step", disable=not jobs, delay=1.0) as bar:
+    with tqdm(
+        total=total, desc=title, unit="step", disable=not jobs, delay=1.0, mininterval=seconds
+    ) as bar:
         board = _Board(bar)
         if workers <= 1:
             return [
