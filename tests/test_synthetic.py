@@ -9,7 +9,9 @@ from scipy.spatial import cKDTree
 
 from nbtrack.data import read_sequence
 from nbtrack.errors import ConfigError, DataError, MissingError
+from nbtrack.scenes import DATASET_SCENES
 from nbtrack.synthetic import (
+    REPORTED_ROOMS,
     ROOMS,
     add_kinect_noise,
     build_room,
@@ -23,6 +25,9 @@ from nbtrack.synthetic import (
     room_of,
     true_surface_points,
 )
+from nbtrack.synthetic.fittings import banister, staircase
+from nbtrack.synthetic.materials import Patchwork, Plain, Split
+from nbtrack.synthetic.motion import CROSSING_FRAMES
 from nbtrack.synthetic.primitives import Box, Cylinder, Solid, Sphere
 from nbtrack.synthetic.shell import RoomShell
 
@@ -184,10 +189,212 @@ def test_rooms_differ():
     """Catches one room entered under several names."""
     points = np.random.default_rng(4).uniform([-1.6, 0.0, -1.6], [1.6, 2.4, 1.6], (2000, 3))
     values = [build_room(name).sdf(points) for name in ROOMS]
-    assert len(values) >= 4
+    assert len(values) == 11
     for i in range(len(values)):
         for j in range(i):
             assert np.abs(values[i] - values[j]).mean() > 0.05
+
+
+def test_reported_rooms_exclude_those_that_settings_were_chosen_on():
+    """Catches a tuned room in a reported table, and a room that no longer has its own name."""
+    assert set(ROOMS) - set(REPORTED_ROOMS) == {"bedroom", "kitchen_nook"}
+    assert len(REPORTED_ROOMS) == len(set(REPORTED_ROOMS)) == 9
+    for name in ROOMS:
+        assert build_room(name).name == name
+    assert not set(ROOMS) & set(DATASET_SCENES)
+
+
+@pytest.mark.parametrize(
+    ("name", "position", "mean_depth", "mean_color"),
+    [
+        ("living_room", [0.160995568788, 1.558483334243, 0.480572893476], 2.416513743226, 145.697),
+        ("office", [0.197053542691, 1.251187382997, 0.382083638681], 2.032130795526, 146.734),
+        ("bedroom", [0.738312659003, 1.464429680512, 0.431316378481], 2.210760992694, 158.702),
+        (
+            "kitchen_nook",
+            [-0.121330509117, 1.207724433708, 0.335660780400],
+            1.885787240638,
+            147.206,
+        ),
+    ],
+)
+def test_first_rooms_stay_as_they_are(name, position, mean_depth, mean_color):
+    """Catches a change to a room or the motion that forgets to raise `ROOM_VERSION`."""
+    room = build_room(name)
+    pose = handheld_trajectory(room, 120, 0)[100]
+    np.testing.assert_allclose(pose[:3, 3], position, atol=1e-9)
+    color, depth, _ = render_frame(room, room_intrinsics(32, 24), pose)
+    assert depth.mean() == pytest.approx(mean_depth, abs=1e-8)
+    assert color.mean() == pytest.approx(mean_color, abs=0.05)
+
+
+@pytest.fixture(scope="module")
+def views() -> dict[str, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+    """Color, depth and surface index of eight small pictures of each reported room."""
+    intrinsics = room_intrinsics(64, 48)
+    rooms = {name: build_room(name) for name in REPORTED_ROOMS}
+    return {
+        name: [render_frame(room, intrinsics, T) for T in handheld_trajectory(room, 300, 0)[::40]]
+        for name, room in rooms.items()
+    }
+
+
+def steepness(color):
+    """Mean change of brightness (of 255) from pixel to pixel, per pixel."""
+    return np.hypot(*np.gradient(color.astype(np.float64).mean(axis=2)))
+
+
+def assert_stands_out(values: dict[str, float], name: str, factor: float) -> None:
+    others = max(value for other, value in values.items() if other != name)
+    assert values[name] > factor * others, values
+
+
+def test_texture_is_strong_in_one_room_and_low_in_another(views):
+    """Catches a den that lost its patterns, and color or contrast that crept into the studio."""
+    steep = {
+        name: float(np.mean([steepness(color).mean() for color, _, _ in shots]))
+        for name, shots in views.items()
+    }
+    colorful = {
+        name: float(
+            np.mean([np.ptp(color.astype(np.float64), axis=2).mean() for color, _, _ in shots])
+        )
+        for name, shots in views.items()
+    }
+    assert_stands_out(steep, "patchwork_den", 1.2)
+    assert_stands_out({name: 1 / value for name, value in steep.items()}, "grey_studio", 1.1)
+    assert_stands_out({name: 1 / value for name, value in colorful.items()}, "grey_studio", 5.0)
+    assert steep["patchwork_den"] > 2 * steep["grey_studio"]
+
+
+def test_gallery_is_bare(views):
+    """Catches a gallery so full, or walls so loud, that bare wall no longer fills its views."""
+    bare = {
+        name: float(np.mean([((index == 0) & (steepness(color) < 3.0)).mean()
+                             for color, _, index in shots]))
+        for name, shots in views.items()
+    }  # fmt: skip
+    assert_stands_out(bare, "gallery", 1.25)
+
+
+def is_rod(solid: Solid) -> bool:
+    if isinstance(solid, Cylinder):
+        return 2 * solid.radius < 0.05
+    return isinstance(solid, Box) and sorted(solid.size)[1] < 0.05
+
+
+def test_trellises_are_thin_and_in_view(views):
+    """Catches thickened rods, and rods that stand where the camera never looks."""
+    shares, seen = {}, {}
+    for name, shots in views.items():
+        parts = build_room(name).parts
+        areas = np.array([part.solid.area() for part in parts])
+        thin = np.array([is_rod(part.solid) for part in parts])
+        shares[name] = float(areas[thin].sum() / areas.sum())
+        rods = np.flatnonzero(thin) + 1
+        seen[name] = float(np.mean([np.isin(index, rods).mean() for _, _, index in shots]))
+    assert_stands_out(shares, "trellis_room", 5.0)
+    assert shares["trellis_room"] > 0.2
+    assert_stands_out(seen, "trellis_room", 2.0)
+
+
+def longest_flight(name: str, rise: float = 0.2) -> int:
+    """Largest number of boxes of the room whose tops follow each other at one rise."""
+    boxes = [part.solid for part in build_room(name).parts if isinstance(part.solid, Box)]
+    tops = np.array([box.center[1] + box.size[1] / 2 for box in boxes])
+    counts = []
+    for top in tops:
+        count = 0
+        while (np.abs(tops - (top + count * rise)) < 1e-6).any():
+            count += 1
+        counts.append(count)
+    return max(counts, default=0)
+
+
+def test_only_the_stairwell_has_stairs():
+    """Catches a missing step, flights that do not meet, and a room too low for two of them."""
+    flights = {name: float(longest_flight(name)) for name in REPORTED_ROOMS}
+    assert flights["stairwell"] >= 14
+    assert_stands_out(flights, "stairwell", 3.0)
+    assert build_room("stairwell").bounds[1, 1] > 4.0
+
+
+def test_views_along_the_hall_are_near_and_far(views):
+    """Catches a hall that is wide or short: its walls are near, its ends are far."""
+    ranges = {
+        name: float(np.divide(*np.percentile([depth for _, depth, _ in shots], [99, 5])))
+        for name, shots in views.items()
+    }
+    assert min(ranges["long_hall"], ranges["two_rooms"]) > 3.0
+    width, _, length = np.ptp(build_room("long_hall").bounds, axis=0)
+    assert length > 3.5 * width
+    assert all(value < 3.0 for name, value in ranges.items() if build_room(name).walk.end is None)
+
+
+def test_depth_is_that_of_a_room(views):
+    """Catches a camera that faces a wall all the time, and one lost in a hall."""
+    for name, shots in views.items():
+        depths = np.array([depth for _, depth, _ in shots])
+        assert ((depths > 0.6) & (depths < 4.5)).mean() > 0.95, name
+        assert np.median(depths) > 1.5, name
+
+
+@pytest.mark.parametrize("name", [name for name in ROOMS if build_room(name).walk.end is not None])
+def test_a_walk_with_two_places_visits_both(name):
+    """Catches a drift that stays at one place, takes another time, or does not come back."""
+    room = build_room(name)
+    start, end = np.array(room.walk.center), np.array(room.walk.end)
+    assert 1.0 <= np.linalg.norm(end - start) <= 1.3
+    n_frames = 2 * CROSSING_FRAMES + 1
+    positions = handheld_trajectory(room, n_frames, 0)[:, :3, 3]
+    along = (positions[:, [0, 2]] - start) @ (end - start) / ((end - start) @ (end - start))
+    assert along[0] < 0.4
+    assert along[CROSSING_FRAMES] > 0.6
+    assert along[-1] < 0.4
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_camera_passes_the_doorway(seed):
+    """Catches a camera that stays on one side of the dividing wall within 300 frames."""
+    room = build_room("two_rooms")
+    T_world_camera = handheld_trajectory(room, 300, seed)
+    z = T_world_camera[:, 2, 3]
+    assert (z > 0.2).mean() > 0.2
+    assert (z < -0.2).mean() > 0.2
+    assert room.sdf(np.array([[-1.0, 1.4, 0.0], [1.0, 1.4, 0.0], [0.0, 2.4, 0.0]])).max() < 0
+    assert room.sdf(np.array([[0.0, 1.4, 0.0]]))[0] > 0.6
+    # It looks ahead, along -z, when it passes: the other room comes into view.
+    assert T_world_camera[np.abs(z).argmin(), 2, 2] < -0.7
+
+
+def test_stairs_by_hand():
+    """Catches steps that float, overlap or rise the wrong way, and a rail off its posts."""
+    oak = Plain((0.5, 0.4, 0.3))
+    steps = [part.solid for part in staircase((1.0, 2.0), (0.0, -1.0), 3, (0.9, 0.2, 0.3), oak)]
+    assert [step.size for step in steps] == [(0.9, pytest.approx(0.2 * n), 0.3) for n in (1, 2, 3)]
+    np.testing.assert_allclose(
+        [step.center for step in steps], [[1.0, 0.1, 1.85], [1.0, 0.2, 1.55], [1.0, 0.3, 1.25]]
+    )
+    (tread,) = staircase((0.0, 0.0), (-1.0, 0.0), 1, (0.9, 0.2, 0.3), oak, 1.0, 0.05)
+    np.testing.assert_allclose(tread.solid.size, (0.3, 0.05, 0.9))
+    np.testing.assert_allclose(tread.solid.center, (-0.15, 1.175, 0.0))
+    *posts, rail = banister((0.0, 0.2, 0.0), (0.0, 1.4, -1.6), 4, oak, oak)
+    heads = np.array([post.solid.end for post in posts])
+    np.testing.assert_allclose(heads[:, 1], [1.1, 1.5, 1.9, 2.3])
+    np.testing.assert_allclose(rail.solid.sdf(heads), -0.032, atol=1e-12)
+
+
+def test_materials_of_many_rooms():
+    """Catches patches that lie outside of [0, 1] or do not vary, and sides that are swapped."""
+    points = np.random.default_rng(6).uniform(-2, 2, (5000, 3))
+    colors = Patchwork((0.5, 0.5, 0.5), 0.3, 0.5, 1).albedo(points, np.zeros_like(points))
+    assert colors.min() >= 0.0
+    assert colors.max() <= 1.0
+    assert colors.std(axis=0).min() > 0.1
+    split = Split(Plain((0.1, 0.1, 0.1), 0.0), Plain((0.9, 0.9, 0.9), 0.0), 2, 0.5)
+    np.testing.assert_allclose(
+        split.albedo(points, np.zeros_like(points))[:, 0], np.where(points[:, 2] > 0.5, 0.9, 0.1)
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -220,6 +427,14 @@ def test_long_walk_sees_all_around():
     heading = np.unwrap(np.arctan2(T_world_camera[:, 0, 2], T_world_camera[:, 2, 2]))
     assert np.degrees(np.ptp(heading)) > 300
     assert 5 <= motion_statistics(T_world_camera).mean_mm <= 7
+
+
+def test_walks_of_every_reported_length_exist(room_name):
+    """Catches a room in which no path of the usual 300 frames or of a long run can be found."""
+    room = build_room(room_name)
+    for seed in (3, 4):
+        assert len(handheld_trajectory(room, 300, seed)) == 300
+    assert len(handheld_trajectory(room, 1000, 0)) == 1000
 
 
 def test_sensor_range_and_invalid_pixels():

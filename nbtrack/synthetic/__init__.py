@@ -10,10 +10,11 @@ from nbtrack.synthetic.generate import (
 from nbtrack.synthetic.motion import MotionStatistics, handheld_trajectory, motion_statistics
 from nbtrack.synthetic.render import render_frame
 from nbtrack.synthetic.room import Room, true_surface_points
-from nbtrack.synthetic.rooms import ROOMS, build_room
+from nbtrack.synthetic.rooms import REPORTED_ROOMS, ROOMS, build_room
 from nbtrack.synthetic.sensor import add_kinect_noise, filter_depth
 
 __all__ = [
+    "REPORTED_ROOMS",
     "ROOMS",
     "Frame",
     "MotionStatistics",

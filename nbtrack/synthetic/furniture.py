@@ -75,6 +75,17 @@ def chair(place: Place, yaw: float, cloth: Material, metal: Material) -> list[Pa
     return parts
 
 
+def wire_stool(place: Place, height: float, seat: Material, metal: Material) -> list[Part]:
+    """A round seat on four splayed legs of thick wire; five solids."""
+    x, z = place
+    parts = [column(place, 0.17, 0.035, seat, height - 0.035)]
+    for across, along in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+        foot = (x + 0.2 * across, 0.0, z + 0.2 * along)
+        head = (x + 0.11 * across, height - 0.02, z + 0.11 * along)
+        parts.append(Part(Cylinder(foot, head, 0.01), metal))
+    return parts
+
+
 def sofa(place: Place, width: float, cloth: Material, pillow: Material) -> list[Part]:
     """Base, back, two arms and two tilted pillows; it stands at a wall behind it (-z)."""
     x, z = place
@@ -87,6 +98,18 @@ def sofa(place: Place, width: float, cloth: Material, pillow: Material) -> list[
     for side, yaw in ((-1.0, 0.35), (1.0, -0.25)):
         spot = (x + side * (width / 2 - 0.42), z - 0.12)
         parts.append(block(spot, (0.4, 0.34, 0.13), pillow, 0.42, yaw))
+    return parts
+
+
+def armchair(
+    place: Place, yaw: float, seat: Material, frame: Material, width: float = 0.8
+) -> list[Part]:
+    """Seat, back and two arms; four solids. It faces its own +z."""
+    parts = [block(place, (width - 0.32, 0.42, 0.7), seat, 0.0, yaw)]
+    parts.append(block(_turned(place, 0.0, -0.38, yaw), (width, 0.82, 0.16), frame, 0.0, yaw))
+    for side in (-1.0, 1.0):
+        spot = _turned(place, side * (width / 2 - 0.08), 0.03, yaw)
+        parts.append(block(spot, (0.16, 0.58, 0.66), frame, 0.0, yaw))
     return parts
 
 

@@ -139,6 +139,47 @@ class Colorful(Material):
 
 
 @dataclass(frozen=True)
+class Patchwork(Material):
+    """Rounded patches in many colors, on faces of any direction: a quilt, a woven carpet."""
+
+    base: Color
+    spread: float = 0.2  # how far the colors lie from the base
+    period: float = 0.6  # m, two patches
+    seed: int = 0
+
+    def albedo(self, points_world: Points, normals: Points) -> Points:
+        """RGB in [0, 1]."""
+        rng = np.random.default_rng(self.seed)
+        # Another period for each axis and channel: no two patches near each other look alike.
+        angular = 2 * np.pi / (self.period * rng.uniform(0.8, 1.4, (3, 4)))
+        phases = rng.uniform(0, 2 * np.pi, (3, 4))
+        total = np.sin(points_world[:, :, None] * angular + phases).sum(axis=1)
+        waves = total / np.sqrt(total * total + 0.2)
+        # Patches differ in brightness, which the last wave gives, more than in hue.
+        mixed = 0.6 * waves[:, :3] + 0.9 * waves[:, 3:]
+        return np.clip(np.asarray(self.base) + self.spread * mixed, 0.05, 1.0)
+
+
+@dataclass(frozen=True)
+class Split(Material):
+    """Two materials on either side of a plane across a world axis: paint that ends at a wall."""
+
+    below: Material
+    above: Material
+    axis: int
+    at: float = 0.0  # m
+
+    def albedo(self, points_world: Points, normals: Points) -> Points:
+        """RGB in [0, 1]."""
+        above = points_world[:, self.axis, None] > self.at
+        return np.where(
+            above,
+            self.above.albedo(points_world, normals),
+            self.below.albedo(points_world, normals),
+        )
+
+
+@dataclass(frozen=True)
 class Picture(Material):
     """A framed picture: a frame of one color around soft shapes in two others."""
 
@@ -187,7 +228,7 @@ class ShellMaterial(Material):
 
 @dataclass(frozen=True)
 class Light:
-    """Two soft lamps, light from all sides and a little more from above."""
+    """Soft lamps, light from all sides and a little more from above."""
 
     lamps: tuple[Vector3, ...]  # positions (m, world)
     strength: float = 0.62  # of each lamp, at its own place

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from nbtrack.errors import ConfigError, NumericalError
-from nbtrack.synthetic.room import Room
+from nbtrack.synthetic.room import Room, Walk
 
 Signal = Float[np.ndarray, "n"]
 
@@ -18,6 +18,9 @@ CLEARANCE = 0.35  # m, least distance of the camera to any surface (our choice)
 _KNOT_SPACING = 0.35  # rad of turning between knots of the path, about 35 frames
 _BURST_FRAMES = 14  # frames between knots of the speed
 _CALIBRATION_FRAMES = 120  # shorter trajectories are the beginning of one of this length
+# Frames in which a walk with two places goes from one to the other. A camera turns by about half
+# a circle in that time, so that a walk that looks ahead in a doorway once does so again.
+CROSSING_FRAMES = 300
 _ATTEMPTS = 40
 
 
@@ -55,10 +58,12 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Float[np.ndarra
     """Camera-to-world poses (OpenCV axes) of a walk that looks around a room.
 
     The camera orbits the middle of the room's free space and looks across it, so that it sees
-    furniture at 1.5 to 3 m while turning. Radius, height (1.1 to 1.7 m), direction, tilt and roll
-    wander as cubic splines (twice continuously differentiable), the speed varies up to threefold,
-    and a hand's tremor of 1.5 to 5 Hz lies on top. Mean speeds are set to `MEAN_STEP_MM` and
-    `MEAN_STEP_DEG` over the trajectory (over its first 120 frames if it is shorter).
+    furniture at 1.5 to 3 m while turning. Where the walk has a second place, the middle of the
+    orbit goes there and back, `CROSSING_FRAMES` each way. Radius, height (1.1 to 1.7 m),
+    direction, tilt and roll wander as cubic splines (twice continuously differentiable), the
+    speed varies up to threefold, and a hand's tremor of 1.5 to 5 Hz lies on top. Mean speeds are
+    set to `MEAN_STEP_MM` and `MEAN_STEP_DEG` over the trajectory (over its first 120 frames if it
+    is shorter).
 
     Args:
         n_frames: at least 2.
@@ -149,13 +154,23 @@ def _poses(room: Room, wander: _Wander, rate: float, radius: float) -> Float[np.
     # Opposite to the direction of view, so that the whole room lies before the camera.
     from_center = walk.start_yaw + walk.turn * turned + side + np.pi
     reach = radius * (1.0 + relative_radius)
+    middle = _middle(walk, len(turned))
     poses = np.tile(np.eye(4), (len(turned), 1, 1))
     poses[:, :3, :3] = look
-    poses[:, 0, 3] = walk.center[0] - reach * np.sin(from_center)
+    poses[:, 0, 3] = middle[:, 0] - reach * np.sin(from_center)
     poses[:, 1, 3] = height
-    poses[:, 2, 3] = walk.center[1] - reach * np.cos(from_center)
+    poses[:, 2, 3] = middle[:, 1] - reach * np.cos(from_center)
     poses[:, :3, 3] += wander.tremor[:, :3]
     return poses
+
+
+def _middle(walk: Walk, length: int) -> Float[np.ndarray, "n 2"]:
+    """Middle of the orbit (x and z, m) per frame: at rest at both places, fastest between them."""
+    start = np.asarray(walk.center)
+    if walk.end is None:
+        return np.tile(start, (length, 1))
+    crossed = 0.5 - 0.5 * np.cos(np.pi / CROSSING_FRAMES * np.arange(length))
+    return start + crossed[:, None] * (np.asarray(walk.end) - start)
 
 
 def _camera_axes(yaw: Signal, pitch: Signal, roll: Signal) -> Float[np.ndarray, "n 3 3"]:

@@ -67,3 +67,8 @@ class RoomShell(Solid):
         """Uniform points on walls, floor and ceiling."""
         center, half = self._frame()
         return center + box_surface(half, n, rng)
+
+
+def centered_shell(width: float, height: float, depth: float) -> RoomShell:
+    """Shell of that size along (x, y, z), centered on x = z = 0, with its floor at y = 0."""
+    return RoomShell((-width / 2, 0.0, -depth / 2), (width / 2, height, depth / 2))
