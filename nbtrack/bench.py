@@ -11,12 +11,16 @@ from tqdm import tqdm
 
 from nbtrack.bounds import observed_bounds
 from nbtrack.budget import ClockBudget
-from nbtrack.config import Preset
+from nbtrack.config import Preset, as_dict, fingerprint
 from nbtrack.data import Sequence
-from nbtrack.device import suitable_threads, synchronize
+from nbtrack.device import device_name, suitable_threads, synchronize
+from nbtrack.device_lock import alone_on
 from nbtrack.fields import make_field
+from nbtrack.paths import runs_folder
+from nbtrack.provenance import code_fingerprint, versions
 from nbtrack.sampling import PixelSampler
-from nbtrack.trackers import TRACKERS, Tracker
+from nbtrack.storage import write_text_atomic
+from nbtrack.trackers import TRACKERS, Tracker, paper_trackers
 
 
 def measure_steps(
@@ -46,18 +50,19 @@ def measure_steps(
     bounds = observed_bounds(sequence)
     cells = [
         (name, n_pixels, budget_ms)
-        for name in TRACKERS
+        for name in paper_trackers()
         for n_pixels in preset.tables.pixels_of(name)
         for budget_ms in preset.tables.budgets_ms
     ]
     rows = []
-    for name, n_pixels, budget_ms in tqdm(cells, "Table II", unit="cell", disable=not progress):
+    bar = tqdm(cells, "Table II", unit="cell", disable=not progress)
+    for name, n_pixels, budget_ms in bar:
         network = preset.network_of(TRACKERS[name].field_name)
         field = make_field(TRACKERS[name].field_name, network, bounds, seed=0)
         field.to(device).eval().requires_grad_(False)
         config = replace(preset.tracking_of(name), n_pixels=n_pixels)
         tracker = TRACKERS[name](field, sampler, config, torch.Generator(device).manual_seed(0))
-        with suitable_threads(network.width):
+        with suitable_threads(network.width), alone_on(device, tqdm.write):
             steps = _count_steps(tracker, T_start, budget_ms, frames_per_cell, device)
         rows.append(
             {
@@ -71,9 +76,33 @@ def measure_steps(
     return pd.DataFrame(rows)
 
 
+def obtain_steps(
+    preset: Preset, sequence: Sequence, device: torch.device, measure_again: bool = False
+) -> pd.DataFrame:
+    """Table II of this device as it was measured last, or measured now; see `measure_steps`.
+
+    Args:
+        measure_again: measure although there is a measurement of the same code and settings.
+    """
+    trackers = [TRACKERS[name] for name in paper_trackers()]
+    intrinsics = sequence.intrinsics
+    key = fingerprint(
+        code_fingerprint(measure_steps, *trackers), device_name(device), torch.get_num_threads(),
+        versions(), [as_dict(preset)[part] for part in ("network", "tracking", "tables")],
+        [intrinsics.width, intrinsics.height],
+    )  # fmt: skip
+    path = runs_folder() / "bench" / f"{preset.name}-{key}.csv"
+    if measure_again or not path.is_file():
+        cells = measure_steps(preset, sequence, device)
+        write_text_atomic(path, cells.to_csv(index=False))
+    return pd.read_csv(path)
+
+
 def default_pixels(preset: Preset) -> dict[str, int]:
     """The n that each tracker of Table II uses for Table I, by its label."""
-    return {t.short_label: preset.tracking_of(name).n_pixels for name, t in TRACKERS.items()}
+    return {
+        TRACKERS[name].short_label: preset.tracking_of(name).n_pixels for name in paper_trackers()
+    }
 
 
 def _count_steps(

@@ -25,6 +25,14 @@ class Budget(Protocol):
         """Starts the next frame; yields 0, 1, 2, ... as long as another step is allowed."""
         ...
 
+    def state(self) -> dict[str, float | int | None]:
+        """What the frames so far leave to the next one."""
+        ...
+
+    def restore(self, state: dict[str, float | int | None]) -> None:
+        """Take up what `state` returned."""
+        ...
+
 
 class ClockBudget:
     """1/rate seconds per frame; a frame ends when the mean step no longer fits in what is left.
@@ -76,6 +84,14 @@ class ClockBudget:
             elapsed = self._now() - start
             mean = self._mean_step_seconds = elapsed / step
 
+    def state(self) -> dict[str, float | int | None]:
+        """The mean seconds of a step in the last frame, None before the first."""
+        return {"mean_step_seconds": self._mean_step_seconds}
+
+    def restore(self, state: dict[str, float | int | None]) -> None:
+        """Take up what `state` returned."""
+        self._mean_step_seconds = state["mean_step_seconds"]
+
     def _now(self) -> float:
         if self._synchronize is not None:
             self._synchronize()
@@ -111,6 +127,14 @@ class StepBudget:
         done = floor(self._frames * self._exact)
         self._frames += 1
         yield from range(floor(self._frames * self._exact) - done)
+
+    def state(self) -> dict[str, float | int | None]:
+        """The number of frames so far."""
+        return {"frames": self._frames}
+
+    def restore(self, state: dict[str, float | int | None]) -> None:
+        """Take up what `state` returned."""
+        self._frames = int(state["frames"])
 
 
 def _positive(name: str, value: float | int, example: str) -> float:

@@ -1,6 +1,7 @@
 """The command line: a thin face over the functions that the notebooks call."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence as Texts
 from pathlib import Path
@@ -21,6 +22,7 @@ def main(arguments: Texts[str] | None = None) -> int:
     """Run a command; returns the exit status: 0, or 2 after a user's mistake."""
     try:
         options = _parser().parse_args(arguments)
+        _set_device(options)
         options.command(options)
     except NbtrackError as error:
         print(f"nbtrack: {' '.join(str(error).split())}", file=sys.stderr)
@@ -52,6 +54,27 @@ def _add_preset(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def _add_device(parser: argparse.ArgumentParser, of_what: str = "(default: all cores)") -> None:
+    parser.add_argument("--device", help="cuda, cuda:1, mps or cpu (default: the first there is)")
+    parser.add_argument("--threads", type=int, metavar="N", help=f"CPU threads {of_what}")
+
+
+def _set_device(options: argparse.Namespace) -> None:
+    """Where and with how many threads this process and its workers compute."""
+    if getattr(options, "device", None):
+        from nbtrack.device import choose_device
+
+        os.environ["NBTRACK_DEVICE"] = options.device
+        choose_device()
+    threads = getattr(options, "threads", None)
+    if threads is not None:
+        import torch
+
+        if threads < 1:
+            raise ConfigError(f"--threads {threads}: it must be 1 or more; leave it out for all")
+        torch.set_num_threads(threads)
+
+
 def _preset(options: argparse.Namespace) -> Preset:
     return resolve_preset(options.preset, options.config, tuple(options.settings))
 
@@ -63,6 +86,7 @@ def _add_map(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--frames", default=":", help="Python slice of frames, A:B:S")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="folder for the map (default: in the cache)")
+    _add_device(parser)
     _add_preset(parser)
     parser.set_defaults(command=_map)
 
@@ -88,6 +112,7 @@ def _add_track(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--frames", default=":", help="Python slice of frames to track")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="folder for the results (default: in the cache)")
+    _add_device(parser)
     _add_preset(parser)
     parser.set_defaults(command=_track)
 
@@ -108,16 +133,56 @@ def _add_tables(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("tables", help="both tables, CSV and LaTeX")
     parser.add_argument(
         "--budget", default="steps",
-        help="steps: the paper's step counts (default); clock: this machine's own speed",
+        help="steps: the paper's step counts (default); clock: this machine's own speed; both",
     )  # fmt: skip
+    parser.add_argument("--scenes", metavar="A,B", help="only these scenes of the preset's kind")
+    parser.add_argument(
+        "--trackers", metavar="A,B", default="", help="rows (default: the paper's, vr,sdf)"
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=1, metavar="K", help="K maps and runs a cell: mean ± deviation"
+    )
+    parser.add_argument(
+        "--workers", type=int, metavar="N",
+        help="cells side by side (default: one a core, or one on a GPU)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--dask", metavar="ADDRESS", help="run the cells on a Dask cluster, as tcp://HOST:8786"
+    )
+    parser.add_argument(
+        "--explain", nargs=2, metavar=("ROW", "COLUMN"),
+        help="where one cell of Table I comes from: '10 sdf' living_room",
+    )  # fmt: skip
+    parser.add_argument(
+        "--measure-again", action="store_true", help="measure Table II although it is cached"
+    )
+    parser.add_argument("--out", type=Path, help="folder (default: paper_tables/PRESET)")
+    _add_device(parser, "of each cell (default: the cores divided by the workers)")
     _add_preset(parser)
     parser.set_defaults(command=_tables)
 
 
 def _tables(options: argparse.Namespace) -> None:
-    from nbtrack.commands import tables_command
+    from nbtrack.commands_tables import explain_command, tables_command
+    from nbtrack.parallel import Execution
 
-    tables_command(_preset(options), options.budget)
+    if options.scenes:
+        options.settings.append(f"scenes.names={_words(options.scenes)}")
+    preset, trackers = _preset(options), tuple(_words(options.trackers))
+    if options.explain:
+        explain_command(preset, options.budget, options.seeds, trackers, *options.explain)
+        return
+    if options.workers is not None and options.workers < 1:
+        raise ConfigError(f"--workers {options.workers}: it must be 1 or more, or left out")
+    tables_command(
+        preset, options.budget, options.seeds, trackers,
+        Execution(options.workers, options.threads, options.dask, keep_going=True),
+        options.measure_again, options.out,
+    )  # fmt: skip
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def _add_notebooks(commands: argparse._SubParsersAction) -> None:
@@ -167,6 +232,7 @@ def _check(options: argparse.Namespace) -> None:
 
 def _add_bench(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("bench", help="Table II on this machine")
+    _add_device(parser)
     _add_preset(parser)
     parser.set_defaults(command=_bench)
 

@@ -7,29 +7,20 @@ from pathlib import Path
 import torch
 from tqdm.auto import tqdm
 
-from nbtrack.bench import default_pixels, measure_steps
+from nbtrack.bench import obtain_steps
+from nbtrack.cells import MapCell, TrackCell, make_budget
 from nbtrack.config import Preset
-from nbtrack.data import parse_frames
+from nbtrack.data import Sequence, parse_frames
 from nbtrack.data_check import check_sequence
 from nbtrack.device import choose_device, device_name
 from nbtrack.errors import ConfigError, DataError
-from nbtrack.experiments import (
-    MapCell,
-    TrackCell,
-    make_budget,
-    map_summary,
-    obtain_map,
-    run_track,
-)
+from nbtrack.experiments import map_summary, obtain_map, run_track
 from nbtrack.fields import field_class
-from nbtrack.grid import BUDGETS, prepare_scenes, table_1_cells
-from nbtrack.latex import TableNotes, write_tables
 from nbtrack.meshes import extract_mesh, keep_seen
-from nbtrack.parallel import Job, Report, run_jobs
-from nbtrack.paths import PAPER_TABLES
+from nbtrack.parallel import Execution, Job, Report, run_jobs
 from nbtrack.scenes import Scene, find_scene
 from nbtrack.synthetic import make_room
-from nbtrack.tables import table_1, table_2
+from nbtrack.tables import deviations_2, step_texts, table_2
 from nbtrack.trackers import tracker_class
 
 
@@ -47,9 +38,8 @@ def map_command(
     for name, value in summary["quality"].items():
         if value is not None:
             print(f"  {_with_unit(name, value)}")
-    mapped = cell.scene.read(parse_frames(frames))
     try:
-        mesh = keep_seen(extract_mesh(obtain_map(cell).field), mapped)
+        mesh = keep_seen(extract_mesh(obtain_map(cell).field), _every_tenth(cell))
     except DataError as error:
         print(f"  no mesh: {error}")
     else:
@@ -88,30 +78,12 @@ def track_command(
     device = choose_device()
     _map_with_bar(map_cell)
     folder = out or cell.folder
-    (tracked,) = run_jobs(
-        [Job(cell.name, n_frames - 1, _track_job, (cell, folder, device))], "tracking", workers=1
-    )
+    job = Job(cell.name, n_frames - 1, _track_job, (cell, folder, device))
+    (tracked,) = run_jobs([job], "tracking", Execution(workers=1))
     print(f"{folder}: {tracker.label}, {budget}")
     for name in _PRINTED:
         print(f"  {_with_unit(name, tracked[name])}")
     print(f"  on {tracked['device']}")
-
-
-def tables_command(preset: Preset, budget: str) -> None:
-    """Fill both tables of a preset and write them as CSV and LaTeX."""
-    if budget not in BUDGETS:
-        raise ConfigError(f"unknown budget {budget!r}: allowed are {', '.join(BUDGETS)}")
-    scenes = prepare_scenes(preset)
-    device = choose_device()
-    cells_1 = table_1_cells(preset, scenes, budget)
-    cells_2 = measure_steps(preset, scenes[0].read(slice(0, 1)), device)
-    folder = PAPER_TABLES / (preset.name if budget == "steps" else f"{preset.name}_clock")
-    notes = TableNotes(preset.name, BUDGETS[budget], device_name(device))
-    paths = write_tables(folder, cells_1, cells_2, notes, default_pixels(preset))
-    print(f"Table I: ATE (m), {BUDGETS[budget]}\n{table_1(cells_1).to_string(float_format='%.3f')}")
-    print(f"Table II: steps, on {notes.device}")
-    print(table_2(cells_2).to_string(float_format="%.1f"))
-    print("\n".join(str(path) for path in paths))
 
 
 def make_command(room: str, out: Path, n_frames: int, width: int, seed: int) -> None:
@@ -135,9 +107,9 @@ def bench_command(preset: Preset) -> None:
     # One image is enough: a room is made of no more frames than it takes.
     one_image = replace(preset, scenes=replace(preset.scenes, n_frames=2))
     scene = _scene(preset.scenes.names[0], one_image)
-    cells = measure_steps(preset, scene.read(slice(0, 1)), device)
+    cells = obtain_steps(preset, scene.read(slice(0, 1)), device, measure_again=True)
     print(f"Table II: steps within a budget, {preset.name} network, on {device_name(device)}")
-    print(table_2(cells).to_string(float_format="%.1f"))
+    print(step_texts(table_2(cells), deviations_2(cells)).to_string())
 
 
 _PRINTED = (
@@ -165,13 +137,19 @@ def _scene(sequence: str, preset: Preset) -> Scene:
         )
 
 
+def _every_tenth(cell: MapCell) -> Sequence:
+    """Some frames of a map, enough to say what has been seen: neighbours see the same."""
+    numbers = cell.scene.frame_numbers(cell.frames)
+    return cell.scene.read(slice(numbers.start, numbers.stop, 10 * numbers.step))
+
+
 def _map_with_bar(cell: MapCell) -> None:
     if cell.is_done:
         tqdm.write(f"map found in {cell.folder}")
         return
     tqdm.write(f"no finished map in {cell.folder}: mapping")
     total = cell.preset.mapping_of(cell.field_name).iterations
-    run_jobs([Job(cell.scene.name, total, _map_job, (cell,))], "mapping", workers=1)
+    run_jobs([Job(cell.scene.name, total, _map_job, (cell,))], "mapping", Execution(workers=1))
 
 
 def _map_job(cell: MapCell, report: Report) -> None:

@@ -59,6 +59,7 @@ class TrackingConfig:
     lambda_color: float = 0.3  # SDF, the paper gives no value; VR has iMAP's 5
     n_stratified: int = 32  # VR: samples of the first pass (iMAP)
     n_importance: int = 12  # VR: samples added for the second pass (iMAP)
+    motion_model: str = "previous_pose"  # where a frame's search starts; or constant_velocity
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,7 @@ class Preset:
     tracking: dict[str, TrackingConfig] = field(
         default_factory=lambda: {
             "vr": TrackingConfig(n_pixels=512, lambda_color=5.0),
+            "vr_neus": TrackingConfig(n_pixels=512, lambda_color=5.0),
             "sdf": TrackingConfig(),
         }
     )
@@ -139,6 +141,7 @@ _SMOKE = Preset(
     },
     tracking={
         "vr": TrackingConfig(n_pixels=64, lambda_color=5.0),
+        "vr_neus": TrackingConfig(n_pixels=64, lambda_color=5.0),
         "sdf": TrackingConfig(n_pixels=512),
     },
     scenes=ScenesConfig(("living_room", "office"), n_frames=240, width=96, track_frames=":120"),
@@ -146,8 +149,13 @@ _SMOKE = Preset(
 )
 _SYNTHETIC = Preset(
     "synthetic",
-    scenes=ScenesConfig(("living_room", "office", "bedroom", "kitchen_nook"), n_frames=300),
-)
+    scenes=ScenesConfig(
+        (
+            "living_room", "office", "trellis_room", "gallery", "stairwell", "patchwork_den",
+            "grey_studio", "two_rooms", "long_hall",
+        ),
+    ),
+)  # fmt: skip
 _PAPER = Preset(
     "paper",
     scenes=ScenesConfig(
@@ -189,6 +197,16 @@ def resolve_preset(
             raise ConfigError(f"setting {setting!r} has no value: write key=value")
         preset = _replace(preset, key.strip(), _parse_value(text.strip()))
     return preset
+
+
+def changed_settings(preset: Preset) -> list[str]:
+    """The `key=value` texts that turn the preset of this name into this one."""
+    original = _flatten(as_dict(PRESETS[preset.name]))
+    return [
+        f"{key}={json.dumps(value)}"
+        for key, value in _flatten(as_dict(preset)).items()
+        if original.get(key) != value
+    ]
 
 
 def as_dict(config: Any) -> dict[str, Any]:

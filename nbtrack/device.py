@@ -7,13 +7,22 @@ from collections.abc import Iterator
 
 import torch
 
+from nbtrack.errors import ConfigError, OutOfMemory
+
 # Below this width matrix products are too small to share: on two cores, two threads were slower
 # than one. Rooms and methods then run side by side in processes instead.
 _WIDTH_FOR_THREADS = 192
 
 
 def choose_device() -> torch.device:
-    """The first there is of CUDA, Apple's MPS and the CPU."""
+    """The device that `NBTRACK_DEVICE` names, else the first there is of CUDA, MPS and the CPU.
+
+    Raises:
+        ConfigError: the named device is unknown, or not there.
+    """
+    name = os.environ.get("NBTRACK_DEVICE")
+    if name:
+        return _named_device(name)
     if torch.cuda.is_available():
         return torch.device("cuda")
     if torch.backends.mps.is_available():
@@ -30,6 +39,19 @@ def device_name(device: torch.device) -> str:
     return f"{_processor_name()}, {os.cpu_count()} cores"
 
 
+def _named_device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError):
+        there = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+        there += ["mps"] if torch.backends.mps.is_available() else []
+        raise ConfigError(
+            f"device {name!r} is not there: this machine has {', '.join(there)}"
+        ) from None
+    return device
+
+
 @contextlib.contextmanager
 def suitable_threads(width: int) -> Iterator[None]:
     """Run a block with the number of CPU threads that suits a network's width.
@@ -42,6 +64,43 @@ def suitable_threads(width: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def has_room_for(device: torch.device, n_bytes: int) -> bool:
+    """Whether a GPU could hold so much more and keep as much again free for the work itself."""
+    if device.type != "cuda":
+        return True  # the CPU's and Apple's memory is the one that the data are in already
+    free_bytes, _ = torch.cuda.mem_get_info(device)
+    return 2 * n_bytes < free_bytes
+
+
+@contextlib.contextmanager
+def naming_what_to_lower(setting: str) -> Iterator[None]:
+    """Turn running out of memory into one line that names the setting to lower.
+
+    Args:
+        setting: what decides on the memory, with its present value.
+
+    Raises:
+        OutOfMemory: the block ran out of the device's or the host's memory.
+    """
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if not _is_out_of_memory(error):
+            raise
+        raise OutOfMemory(
+            f"out of memory with {setting}: lower it with --set, or use a device with more; what "
+            "was finished is kept"
+        ) from None
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    # Only CUDA has a class of its own for it; the CPU's allocator and MPS say it in words.
+    words = ("can't allocate memory", "not enough memory", "out of memory")
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or any(
+        word in str(error) for word in words
+    )
 
 
 def synchronize(device: torch.device) -> None:

@@ -23,6 +23,10 @@ class NumericalError(NbtrackError, ArithmeticError):
     """A loss or a pose stopped being finite; the message names where it was born."""
 
 
+class OutOfMemory(NbtrackError, MemoryError):
+    """Host or device have too little memory; the message names the setting to lower."""
+
+
 def nearest_name(found: str, allowed: list[str]) -> str:
     """Hint for a misspelt name: `did you mean 'x'? Allowed: a, b, x`.
 

@@ -13,6 +13,8 @@ from nbtrack.tables import (
     MISSING_CELL,
     PAPER_PIXELS,
     best_cells,
+    deviations_1,
+    deviations_2,
     failed_cells,
     is_default,
     long_form,
@@ -69,7 +71,11 @@ class TableNotes:
 
 
 def latex_table_1(
-    wide: pd.DataFrame, caption: str = CAPTION_1, label: str = "tab:ate", budget_note: str = ""
+    wide: pd.DataFrame,
+    caption: str = CAPTION_1,
+    label: str = "tab:ate",
+    budget_note: str = "",
+    deviation: pd.DataFrame | None = None,
 ) -> str:
     """Table I as the text of a `.tex` file.
 
@@ -77,15 +83,15 @@ def latex_table_1(
         wide: ATE (m) as `nbtrack.tables.table_1` lays it out.
         caption: LaTeX. label: for `\\ref`.
         budget_note: plain sentence on which budget was used; follows the caption.
+        deviation: of the ATE over seeds, laid out as `wide`; printed small after it.
 
     Source: markup of the paper's Table I; bold and red by `best_cells` and `failed_cells`.
     """
-    values, bold, red = (
-        table.to_numpy().tolist() for table in (wide, best_cells(wide), failed_cells(wide))
-    )
+    spread = wide * float("nan") if deviation is None else deviation.loc[wide.index, wide.columns]
+    layers = (wide, best_cells(wide), failed_cells(wide), spread)
     lines = {
         row: [_error_cell(*cell) for cell in zip(*marks, strict=True)]
-        for row, *marks in zip(wide.index, values, bold, red, strict=True)
+        for row, *marks in zip(wide.index, *(t.to_numpy().tolist() for t in layers), strict=True)
     }
     rows = _grouped_rows(
         lines, lambda row: rf"$r=\SI{{{row[0]:g}}}{{Hz}}$", lambda row: escape_latex(row[1])
@@ -147,10 +153,13 @@ def write_tables(
         DataError: see `table_1` and `table_2`.
     """
     wide_1, wide_2 = table_1(cells_1), table_2(cells_2)
+    spread_1, spread_2 = deviations_1(cells_1), deviations_2(cells_2)
     texts = {
-        "table_1.csv": _csv(long_form(wide_1, "ate_m")),
-        "table_1.tex": latex_table_1(wide_1, CAPTION_1, f"tab:ate-{notes.preset}", str(notes)),
-        "table_2.csv": _csv(long_form(wide_2, "steps")),
+        "table_1.csv": _csv(_with_deviation(long_form(wide_1, "ate_m"), spread_1)),
+        "table_1.tex": latex_table_1(
+            wide_1, CAPTION_1, f"tab:ate-{notes.preset}", str(notes), spread_1
+        ),
+        "table_2.csv": _csv(_with_deviation(long_form(wide_2, "steps"), spread_2)),
         "table_2.tex": latex_table_2(
             wide_2, CAPTION_2, f"tab:runtime-{notes.preset}", str(notes), default_pixels
         ),
@@ -183,10 +192,12 @@ def escape_latex(text: object) -> str:
     return "".join(special.get(character, character) for character in str(text))
 
 
-def _error_cell(value: float, bold: bool, red: bool) -> str:
+def _error_cell(value: float, bold: bool, red: bool, deviation: float) -> str:
     if pd.isna(value):
         return "--"
     number = rf"\mathbf{{{value:.3f}}}" if bold else f"{value:.3f}"
+    if not pd.isna(deviation):
+        number += rf"{{\scriptscriptstyle\pm{deviation:.3f}}}"
     return rf"$\color{{red}} {number}$" if red else f"${number}$"
 
 
@@ -209,10 +220,19 @@ def _grouped_rows(
 
 def _stacked(name: str) -> str:
     """A column's name with one word a line, so that long names do not widen the table."""
-    words = [escape_latex(word) for word in str(name).split()]
+    words = [escape_latex(word) for word in str(name).replace("_", " ").split()]
     if len(words) < 2:
         return "".join(words)
     return r"\begin{tabular}{@{}r@{}}" + r"\\".join(words) + r"\end{tabular}"
+
+
+def _with_deviation(cells: pd.DataFrame, deviation: pd.DataFrame | None) -> pd.DataFrame:
+    """Long form with a further column, where there is a spread to tell."""
+    if deviation is None:
+        return cells
+    name = f"{cells.columns[-1].removesuffix('_m')}_deviation"
+    name += "_m" if cells.columns[-1].endswith("_m") else ""
+    return cells.assign(**{name: long_form(deviation, name)[name].to_numpy()})
 
 
 def _csv(cells: pd.DataFrame) -> str:

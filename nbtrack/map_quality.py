@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from nbtrack.data import Sequence
@@ -14,6 +14,8 @@ from nbtrack.meshes import extract_mesh, keep_seen, query_field, seen_by
 from nbtrack.sampling import PixelSampler
 from nbtrack.synthetic import Room, true_surface_points
 from nbtrack.views import render_rays
+
+Frames = Int[np.ndarray, "frames"]
 
 F_SCORE_THRESHOLD = 0.05  # m
 NEAR_SURFACE = 0.05  # m: distances below this count as near a surface
@@ -39,31 +41,36 @@ class MapQuality:
 
 
 def score_map(
-    field: Field, mapped: Sequence, held_out: Sequence, room: Room | None, voxel: float = 0.05
+    field: Field,
+    sequence: Sequence,
+    mapped: Int[np.ndarray, "mapped"],
+    held_out: Int[np.ndarray, "held_out"],
+    room: Room | None,
+    voxel: float = 0.05,
 ) -> MapQuality:
     """All scores that the data allow.
 
     Args:
-        mapped: frames the field was fitted to: they say what has been seen.
-        held_out: frames kept back; may be empty.
+        mapped: indices of the frames the field was fitted to: they say what has been seen.
+        held_out: indices of the frames kept back; may be empty.
         room: the exact scene, if it is a synthetic one.
     """
     scores: dict[str, float] = {}
     if len(held_out):
-        scores |= score_images(field, held_out)
+        scores |= score_images(field, sequence, held_out)
     if room is not None:
         if hasattr(field, "sdf_gradient"):
-            scores |= score_sdf(field, mapped, room)
-        scores |= score_mesh(field, mapped, room, voxel)
+            scores |= score_sdf(field, sequence, mapped, room)
+        scores |= score_mesh(field, sequence, mapped, room, voxel)
     return MapQuality(**scores)
 
 
-def score_images(field: Field, held_out: Sequence) -> dict[str, float]:
+def score_images(field: Field, sequence: Sequence, held_out: Frames) -> dict[str, float]:
     """PSNR (dB) and depth L1 (m) over random measured pixels of held-out frames."""
     device = next(field.parameters()).device
-    sampler = PixelSampler(held_out, device)
+    sampler = PixelSampler(sequence, device)
     generator = torch.Generator(device).manual_seed(0)
-    frames = torch.arange(len(held_out), device=device)
+    frames = torch.from_numpy(held_out).to(device)
     rays = sampler.draw(_PIXELS_SCORED, generator, frames)
     squares, errors = [], []
     for part in torch.nonzero(rays.depth > 0).squeeze(-1).split(4096):
@@ -77,13 +84,15 @@ def score_images(field: Field, held_out: Sequence) -> dict[str, float]:
     }
 
 
-def score_sdf(field: Field, mapped: Sequence, room: Room) -> dict[str, float]:
+def score_sdf(
+    field: Field, sequence: Sequence, mapped: Frames, room: Room
+) -> dict[str, float]:
     """Mean |error| (m) of the signed distance near surfaces and in free space that was seen.
 
     Points lie on rays of the mapped frames: half of them between camera and surface, half within
     5 cm of the measured surface. What counts as near is decided by the true distance.
     """
-    points = _points_along_rays(mapped)
+    points = _points_along_rays(sequence, mapped)
     true_sdf = room.sdf(points)
     error = np.abs(query_field(field, points)[1] - true_sdf)
     near = np.abs(true_sdf) < NEAR_SURFACE
@@ -93,14 +102,16 @@ def score_sdf(field: Field, mapped: Sequence, room: Room) -> dict[str, float]:
     }
 
 
-def score_mesh(field: Field, mapped: Sequence, room: Room, voxel: float) -> dict[str, float]:
+def score_mesh(
+    field: Field, sequence: Sequence, mapped: Frames, room: Room, voxel: float
+) -> dict[str, float]:
     """Accuracy, completion (m) and F-score at 5 cm of the seen part of the mesh.
 
     Accuracy needs no sampling of the truth: the exact distance at each point of the mesh is its
     distance from the surface. A map that has no surface yet gets no scores.
     """
     try:
-        mesh = keep_seen(extract_mesh(field, voxel), mapped)
+        mesh = keep_seen(extract_mesh(field, voxel), sequence, mapped)
     except DataError:
         return {}
     if len(mesh.faces) == 0:
@@ -108,7 +119,7 @@ def score_mesh(field: Field, mapped: Sequence, room: Room, voxel: float) -> dict
     points = mesh.sample(_POINTS_SCORED, seed=0)
     to_truth = np.abs(room.sdf(points))
     truth = true_surface_points(room, _POINTS_SCORED, seed=0)
-    truth = truth[seen_by(truth, mapped)]
+    truth = truth[seen_by(truth, sequence, mapped)]
     to_mesh = cKDTree(points).query(truth)[0]
     precision = float((to_truth < F_SCORE_THRESHOLD).mean())
     recall = float((to_mesh < F_SCORE_THRESHOLD).mean())
@@ -119,11 +130,11 @@ def score_mesh(field: Field, mapped: Sequence, room: Room, voxel: float) -> dict
     }
 
 
-def _points_along_rays(mapped: Sequence) -> Float[np.ndarray, "n 3"]:
+def _points_along_rays(sequence: Sequence, mapped: Frames) -> Float[np.ndarray, "n 3"]:
     """World points (m, float64) in seen free space and around seen surfaces."""
     generator = torch.Generator().manual_seed(0)
-    sampler = PixelSampler(mapped, torch.device("cpu"))
-    rays = sampler.draw(_POINTS_SCORED, generator, torch.arange(len(mapped)))
+    sampler = PixelSampler(sequence, torch.device("cpu"))
+    rays = sampler.draw(_POINTS_SCORED, generator, torch.from_numpy(mapped))
     offsets = torch.rand(len(rays.depth), generator=generator)
     in_front = rays.depth * offsets
     around = rays.depth + NEAR_SURFACE * (2 * offsets - 1)

@@ -2,7 +2,6 @@
 
 import io
 import math
-import pickle
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,11 +15,11 @@ from jaxtyping import Int
 from nbtrack.bounds import SceneBounds, observed_bounds
 from nbtrack.config import FieldConfig, MappingConfig, as_dict
 from nbtrack.data import Sequence
-from nbtrack.device import suitable_threads
+from nbtrack.device import naming_what_to_lower, suitable_threads
 from nbtrack.errors import DataError, NumericalError
 from nbtrack.fields import Field, make_field
 from nbtrack.sampling import PixelSampler, mapping_depths
-from nbtrack.storage import write_bytes_atomic
+from nbtrack.storage import read_checkpoint, write_bytes_atomic
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 # Iterations between two looks at the losses: each look waits for the device, so there are ten
@@ -79,14 +78,16 @@ def map_sequence(
     Raises:
         DataError: no pixel has a depth, or the checkpoint belongs to other settings.
         NumericalError: a loss is not finite.
+        OutOfMemory: the device holds too few rays at once.
     """
     device = device or torch.device("cpu")
-    run = _Run(field_name, sequence, field_config, config, seed, device)
-    if checkpoint and checkpoint.exists():
-        run.load(checkpoint)
-    resumed_from = run.iteration
-    last_saved = time.perf_counter()
-    with suitable_threads(field_config.width):
+    setting = f"mapping.{field_name}.n_rays={config.n_rays}"
+    with naming_what_to_lower(setting), suitable_threads(field_config.width):
+        run = _Run(field_name, sequence, field_config, config, seed, device)
+        if checkpoint and checkpoint.exists():
+            run.load(checkpoint)
+        resumed_from = run.iteration
+        last_saved = time.perf_counter()
         while run.iteration < config.iterations:
             run.advance(min(run.iterations_to_flush, config.iterations - run.iteration))
             if on_iteration:
@@ -94,8 +95,8 @@ def map_sequence(
             if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
                 run.save(checkpoint)
                 last_saved = time.perf_counter()
-    if checkpoint:
-        run.save(checkpoint)
+        if checkpoint:
+            run.save(checkpoint)
     run.field.eval().requires_grad_(False)
     return FittedMap(run.field, run.history_frame(), run.seconds, resumed_from)
 
@@ -108,7 +109,7 @@ def load_map(
     Raises:
         DataError: the file is not a map of this field.
     """
-    state = _read_checkpoint(checkpoint)
+    state = read_checkpoint(checkpoint)
     if state["settings"]["field"] != field_name:
         raise DataError(
             f"{checkpoint} is a map of field {state['settings']['field']!r}, not {field_name!r}: "
@@ -211,7 +212,7 @@ class _Run:
         write_bytes_atomic(checkpoint, buffer.getvalue())
 
     def load(self, checkpoint: Path) -> None:
-        state = _read_checkpoint(checkpoint)
+        state = read_checkpoint(checkpoint)
         if state["settings"] != self.settings:
             found, wanted = state["settings"], self.settings
             changed = [name for name in wanted if found.get(name) != wanted[name]]
@@ -232,13 +233,3 @@ def learning_rate(config: MappingConfig, iteration: int) -> float:
     progress = iteration / config.iterations
     share = _FINAL_RATE + (1 - _FINAL_RATE) * (1 + math.cos(math.pi * progress)) / 2
     return config.learning_rate * share
-
-
-def _read_checkpoint(checkpoint: Path) -> dict:
-    try:
-        return torch.load(checkpoint, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise DataError(
-            f"{checkpoint} is not a readable map ({type(error).__name__}): "
-            "remove it and map again"
-        ) from None

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from skimage.measure import marching_cubes
 
 from nbtrack.camera import project
@@ -51,13 +51,15 @@ def query_field(
     return torch.cat(colors).cpu().numpy(), torch.cat(values).cpu().numpy()
 
 
-def keep_seen(mesh: trimesh.Trimesh, sequence: Sequence) -> trimesh.Trimesh:
-    """The faces all of whose corners a sequence has seen.
+def keep_seen(
+    mesh: trimesh.Trimesh, sequence: Sequence, frames: Int[np.ndarray, "frames"] | None = None
+) -> trimesh.Trimesh:
+    """The faces all of whose corners a sequence, or those of its frames, has seen.
 
     A field says something everywhere; what no camera looked at is invention and is neither shown
     nor scored.
     """
-    seen = seen_by(mesh.vertices, sequence)
+    seen = seen_by(mesh.vertices, sequence, frames)
     kept = mesh.copy()
     kept.update_faces(seen[mesh.faces].all(axis=1))
     kept.remove_unreferenced_vertices()
@@ -67,19 +69,22 @@ def keep_seen(mesh: trimesh.Trimesh, sequence: Sequence) -> trimesh.Trimesh:
 def seen_by(
     points_world: Float[np.ndarray, "n 3"],
     sequence: Sequence,
+    frames: Int[np.ndarray, "frames"] | None = None,
     tolerance: float = 0.1,
     every: int = 5,
 ) -> Bool[np.ndarray, "n"]:
     """Whether a point (m) lies in some frame's view and not behind what that frame measured.
 
     Args:
+        frames: indices of the frames to ask; by default all.
         tolerance: how far (m) behind the measured depth a point may lie.
         every: only each `every`-th frame is asked: neighbours see the same.
     """
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32))
     seen = torch.zeros(len(points), dtype=torch.bool)
     intrinsics = sequence.intrinsics
-    for index in range(0, len(sequence), every):
+    frames = np.arange(len(sequence)) if frames is None else frames
+    for index in frames[::every].tolist():
         T_world_camera = torch.from_numpy(sequence.T_world_camera[index]).float()
         points_camera = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
         columns, rows, depth = project(intrinsics, points_camera)

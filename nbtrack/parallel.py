@@ -1,4 +1,4 @@
-"""Independent jobs side by side in processes, under one progress bar with an ETA.
+"""Jobs side by side in processes, under one progress bar with an ETA over all of them.
 
 Small networks gain nothing from a second thread, so rooms and methods share the cores instead.
 """
@@ -10,10 +10,12 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.managers import SyncManager
 from typing import Any
 
 import torch
@@ -24,80 +26,153 @@ from nbtrack.errors import NbtrackError
 Report = Callable[[int, str], None]
 """Called by a job with the units done so far and a word on how it goes."""
 
+_BAR = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+
 
 @dataclass(frozen=True)
 class Job:
     """One piece of work: `function(*arguments, report=...)`, picklable, importable by name."""
 
-    name: str
-    total: int  # units of work, for the bar: iterations or frames
+    name: str  # no two jobs of one call share it
+    total: int  # units of work that it reports: iterations or frames
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
+    cost: float | int = 0  # work in all, relative to other jobs: the bar's share; 0 means `total`
+    needs: tuple[str, ...] = ()  # jobs that must have ended well before; they stand earlier
+    label: str = ""  # shown beside the bar in place of the name
 
 
-def run_jobs(jobs: Sequence[Job], title: str, workers: int | None = None) -> list[Any]:
+@dataclass(frozen=True)
+class Execution:
+    """How jobs are run; of all this only the threads may change last digits of a result."""
+
+    # Processes; by default one a core, or this process alone where a GPU does the work: jobs on
+    # one GPU only wait for each other.
+    workers: int | None = None
+    threads: int | None = None  # of each job; by default this process's, divided by the workers
+    cluster: str | None = None  # address of a Dask scheduler that runs the jobs instead
+    # A user's mistake in one job stands in its place among the results, as the exception, and so
+    # does one for every job that needs it; the others still run.
+    keep_going: bool = False
+
+
+def run_jobs(jobs: Sequence[Job], title: str, execution: Execution | None = None) -> list[Any]:
     """Run all jobs and return their results in order.
 
     Args:
         title: stands before the progress bar.
-        workers: processes; by default one a core, or this process alone where a GPU does the
-            work: jobs on one GPU only wait for each other.
 
     Raises:
-        Whatever the first failing job raised; the others are then abandoned.
+        Whatever the first failing job raised, unless it is to keep going; the others are then
+        abandoned.
     """
+    execution = execution or Execution()
+    workers = execution.workers
     if workers is None:
         workers = 1 if torch.cuda.is_available() else os.cpu_count() or 1
-    workers = min(workers, len(jobs))
-    total = sum(job.total for job in jobs)
+    threads = execution.threads or max(1, torch.get_num_threads() // max(workers, 1))
+    with _bar(jobs, title) as bar:
+        board = Board(bar, jobs, execution.keep_going)
+        if execution.cluster is not None and jobs:
+            from nbtrack.cluster import run_on_cluster
+
+            run_on_cluster(jobs, execution.cluster, execution.threads or 1, board)
+        elif min(workers, len(jobs)) > 1:
+            _run_in_processes(jobs, min(workers, len(jobs)), threads, board)
+        else:
+            with _threads(threads):
+                _run_here(jobs, board)
+    return [board.results[job.name] for job in jobs]
+
+
+class Board:
+    """What is known of the jobs while they run: progress, results, and mistakes."""
+
+    def __init__(self, bar: tqdm, jobs: Sequence[Job], keep_going: bool) -> None:
+        self.bar = bar
+        self.jobs = {job.name: job for job in jobs}
+        self.keep_going = keep_going
+        self.units: dict[str, int] = {}
+        self.results: dict[str, Any] = {}
+
+    def show(self, name: str, done: int, status: str) -> None:
+        """Move the bar to where a job says it is."""
+        job = self.jobs[name]
+        a_unit = (job.cost or job.total) / max(job.total, 1)
+        work = a_unit * (done - self.units.get(name, 0))
+        # Sums of fractions may end a rounding error above the total, which a bar does not like.
+        self.bar.update(min(work, self.bar.total - self.bar.n))
+        self.units[name] = done
+        ended = f"{len(self.results)} of {len(self.jobs)} done"
+        self.bar.set_postfix_str(f"{ended}, {job.label or name}: {status}", refresh=False)
+
+    def reporter(self, name: str) -> Report:
+        """A report function for a job of this process."""
+        return lambda done, status: self.show(name, done, status)
+
+    def settle(self, job: Job, outcome: Callable[[], Any]) -> None:
+        """Note what a job returned. Raises what it raised, unless that is to be kept."""
+        try:
+            self.results[job.name] = outcome()
+        except NbtrackError as error:
+            if not self.keep_going:
+                raise
+            self.results[job.name] = error
+        self.show(job.name, job.total, "done")
+
+    def is_ready(self, job: Job) -> bool:
+        """Whether all that a job needs has ended, well or not."""
+        return all(name in self.results for name in job.needs)
+
+    def settle_if_hopeless(self, job: Job) -> bool:
+        """Whether something that a job needs has failed; its result is then the reason."""
+        failed = [n for n in job.needs if isinstance(self.results.get(n), NbtrackError)]
+        if failed:
+            self.results[job.name] = NbtrackError(f"not run, because {failed[0]} failed")
+            self.show(job.name, job.total, "left out")
+        return bool(failed)
+
+
+def _bar(jobs: Sequence[Job], title: str) -> tqdm:
     # A terminal can be written to often. Elsewhere every line is kept: a notebook's kernel drops
     # messages, its last ones too, once a thousand wait to be read.
     seconds = 0.1 if sys.stderr.isatty() else 3.0
+    total = sum(job.cost or job.total for job in jobs)
     # The bar waits a moment, so that a mistake which ends the first job at once is told alone.
-    with tqdm(
-        total=total, desc=title, unit="step", disable=not jobs, delay=1.0, mininterval=seconds
-    ) as bar:
-        board = _Board(bar)
-        if workers <= 1:
-            return [
-                job.function(*job.arguments, report=board.reporter(job.name)) for job in jobs
-            ]
-        return _run_in_processes(jobs, workers, board)
+    return tqdm(
+        total=total, desc=title, bar_format=_BAR, disable=not jobs, delay=1.0, mininterval=seconds
+    )
 
 
-class _Board:
-    """The bar's state: how far each job is."""
-
-    def __init__(self, bar: tqdm) -> None:
-        self.bar = bar
-        self.done: dict[str, int] = {}
-
-    def show(self, name: str, done: int, status: str) -> None:
-        self.bar.update(done - self.done.get(name, 0))
-        self.done[name] = done
-        self.bar.set_postfix_str(f"{name}: {status}", refresh=False)
-
-    def reporter(self, name: str) -> Report:
-        return lambda done, status: self.show(name, done, status)
+@contextmanager
+def _threads(number: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
-def _run_in_processes(jobs: Sequence[Job], workers: int, board: _Board) -> list[Any]:
+def _run_here(jobs: Sequence[Job], board: Board) -> None:
+    for job in jobs:
+        if not board.settle_if_hopeless(job):
+            report = board.reporter(job.name)
+            board.settle(job, lambda j=job, r=report: j.function(*j.arguments, report=r))
+
+
+def _run_in_processes(jobs: Sequence[Job], workers: int, threads: int, board: Board) -> None:
     # Fresh interpreters: a forked one would inherit torch's thread pool in an unusable state.
     context = multiprocessing.get_context("spawn")
-    threads = max(1, (os.cpu_count() or 1) // workers)
-    with context.Manager() as manager:
-        # The manager is a process as well, and ends by itself.
+    manager = SyncManager(ctx=context)
+    # It is a process as well, and must not outlive a killed command either.
+    manager.start(_end_with_parent, (os.getpid(),))
+    with manager:
         running_before = set(multiprocessing.active_children())
         messages = manager.Queue()
         pool = ProcessPoolExecutor(workers, context, _start_worker, (threads, os.getpid()))
         try:
-            futures = [pool.submit(_run_one, job, messages) for job in jobs]
-            pending: set[Future] = set(futures)
-            while pending:
-                finished, pending = wait(pending, timeout=0.3, return_when=FIRST_EXCEPTION)
-                _show_messages(messages, board)
-                for future in finished:
-                    future.result()
+            _feed(pool, jobs, messages, board)
         except BaseException as error:
             # Nobody waits for what is still running; what it has kept can be resumed.
             pool.shutdown(wait=False, cancel_futures=True)
@@ -106,21 +181,38 @@ def _run_in_processes(jobs: Sequence[Job], workers: int, board: _Board) -> list[
             if isinstance(error, BrokenProcessPool):
                 raise NbtrackError(
                     "a worker process died, perhaps for lack of memory: what was finished is "
-                    "kept; run the same command again, with smaller settings if need be"
+                    "kept; run the same command again, with fewer --workers or smaller settings"
                 ) from None
             raise
         pool.shutdown()
-        return [future.result() for future in futures]
+
+
+def _feed(pool: ProcessPoolExecutor, jobs: Sequence[Job], messages: Any, board: Board) -> None:
+    """Give the pool every job as soon as what it needs has ended, and gather the results."""
+    waiting, running = list(jobs), dict[Future, Job]()
+    while waiting or running:
+        for job in [job for job in waiting if board.is_ready(job)]:
+            waiting.remove(job)
+            if not board.settle_if_hopeless(job):
+                running[pool.submit(_run_one, job, messages)] = job
+        finished, _ = wait(running, timeout=0.3, return_when=FIRST_COMPLETED)
+        _show_messages(messages, board)
+        for future in finished:
+            board.settle(running.pop(future), future.result)
 
 
 def _start_worker(threads: int, parent: int) -> None:
     torch.set_num_threads(threads)
     # An interruption of the command is the parent's to handle; the parent's end is ours.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    _end_with_parent(parent)
 
 
-def _end_with(parent: int) -> None:
+def _end_with_parent(parent: int) -> None:
+    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+
+
+def _watch(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(1.0)
     os._exit(1)
@@ -132,9 +224,11 @@ def _run_one(job: Job, messages: Any) -> Any:
     )
 
 
-def _show_messages(messages: Any, board: _Board) -> None:
+def _show_messages(messages: Any, board: Board) -> None:
     while True:
         try:
-            board.show(*messages.get_nowait())
+            name, done, status = messages.get_nowait()
         except queue.Empty:
             return
+        if name not in board.results:
+            board.show(name, done, status)

@@ -8,6 +8,7 @@ from nbtrack.bounds import SceneBounds
 from nbtrack.camera import pixel_directions
 from nbtrack.config import MappingConfig
 from nbtrack.data import MILLIMETRE, Sequence
+from nbtrack.device import has_room_for
 from nbtrack.fields.base import Field, Rays
 from nbtrack.rendering import importance_depths, stratified_depths
 
@@ -15,17 +16,29 @@ NEAR = 0.05  # m, z-depth before which nothing is looked for: closer than any de
 
 
 class PixelSampler:
-    """Draws measured pixels of a sequence, on the device where the network is.
+    """Draws measured pixels of a sequence, for a network on some device.
 
     Images stay 8 and 16 bit; only drawn pixels become floating point, so that a long sequence of
-    full-size frames fits a laptop's memory.
+    full-size frames fits a laptop's memory. The images lie on the device too if it has room to
+    spare, else on the host, from where drawn pixels travel; what is drawn is the same.
     """
 
-    def __init__(self, sequence: Sequence, device: torch.device) -> None:
+    def __init__(
+        self, sequence: Sequence, device: torch.device, images_device: torch.device | None = None
+    ) -> None:
+        """
+        Args:
+            device: where the network is, and everything that is drawn.
+            images_device: where the images lie; by default chosen by free memory.
+        """
+        n_bytes = sequence.colors.nbytes + sequence.depths_mm.nbytes
+        if images_device is None:
+            images_device = device if has_room_for(device, n_bytes) else torch.device("cpu")
+        self.device, self.images_device = device, images_device
         self.intrinsics = sequence.intrinsics
-        self.colors = torch.from_numpy(sequence.colors).to(device)
+        self.colors = torch.from_numpy(sequence.colors).to(images_device)
         # Few torch kernels know unsigned 16 bit: the same bits travel as signed.
-        self.depths_mm = torch.from_numpy(sequence.depths_mm.view("int16")).to(device)
+        self.depths_mm = torch.from_numpy(sequence.depths_mm.view("int16")).to(images_device)
         self.T_world_camera = torch.from_numpy(sequence.T_world_camera).float().to(device)
 
     def rays(
@@ -45,8 +58,9 @@ class PixelSampler:
         self, frames: Int[Tensor, "n"], rows: Int[Tensor, "n"], columns: Int[Tensor, "n"]
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
         """Colour in [0, 1] and z-depth (m, 0 = none) of pixels."""
-        color = self.colors[frames, rows, columns].float() / 255
-        depth_mm = self.depths_mm[frames, rows, columns].int() & 0xFFFF
+        where = tuple(index.to(self.images_device) for index in (frames, rows, columns))
+        color = self.colors[where].to(self.device).float() / 255
+        depth_mm = self.depths_mm[where].to(self.device).int() & 0xFFFF
         return color, depth_mm.float() * MILLIMETRE
 
     def draw(
@@ -63,7 +77,7 @@ class PixelSampler:
     def measured_pixels(self, frame: int) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
         """Rows and columns of all pixels of one frame that have a depth."""
         rows, columns = torch.nonzero(self.depths_mm[frame], as_tuple=True)
-        return rows, columns
+        return rows.to(self.device), columns.to(self.device)
 
 
 def mapping_depths(

@@ -1,9 +1,13 @@
 """From what a user calls a sequence to a folder on disk: a path, a room, a scene of the dataset."""
 
 import hashlib
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+
+from filelock import FileLock
 
 from nbtrack.config import ScenesConfig, fingerprint
 from nbtrack.data import Sequence, list_frames, parse_frames, read_sequence
@@ -48,6 +52,7 @@ class Scene:
             )
         return selected
 
+    @cached_property
     def fingerprint(self) -> str:
         """Changes when the data change: poses, focal length, and the images' names and sizes."""
         image_files, depth_files = list_frames(self.folder)
@@ -98,10 +103,10 @@ def find_scene(
         folder = room_folder(text, config)
         if not folder.is_dir():
             folder.parent.mkdir(parents=True, exist_ok=True)
-            height = config.width * 3 // 4
-            make_room(
-                text, folder, config.n_frames, config.width, height, config.seed, workers, progress
-            )
+            # Another command may want the same room: it waits, and finds it made.
+            with FileLock(folder.with_suffix(".lock")):
+                if not folder.is_dir():
+                    _make_room(text, folder, config, workers, progress)
         return Scene(text, folder)
     folder = data_folder() / text
     if not folder.is_dir():
@@ -110,3 +115,17 @@ def find_scene(
             f"or use a synthetic room, which needs no download: {', '.join(ROOMS)}"
         )
     return Scene(text, folder)
+
+
+def _make_room(
+    name: str,
+    folder: Path,
+    config: ScenesConfig,
+    workers: int,
+    progress: Callable[[int, int], None] | None,
+) -> None:
+    """Make a room of the cache; what a killed attempt has left is removed first."""
+    for unfinished in folder.parent.glob(f".{folder.name}.*.unfinished"):
+        shutil.rmtree(unfinished, ignore_errors=True)
+    height = config.width * 3 // 4
+    make_room(name, folder, config.n_frames, config.width, height, config.seed, workers, progress)

@@ -6,8 +6,13 @@ meet half a file.
 
 import json
 import os
+import pickle
 from pathlib import Path
 from typing import Any
+
+import torch
+
+from nbtrack.errors import DataError
 
 
 def write_bytes_atomic(path: Path, content: bytes) -> None:
@@ -25,6 +30,21 @@ def write_bytes_atomic(path: Path, content: bytes) -> None:
         os.replace(aside, path)
     finally:
         aside.unlink(missing_ok=True)
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """What `torch.save` wrote: tensors and plain values only, on the CPU; no code is run.
+
+    Raises:
+        DataError: the file is damaged or something else.
+    """
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise DataError(
+            f"{path} is not a readable checkpoint ({type(error).__name__}): remove it and run the "
+            "same command again"
+        ) from None
 
 
 def write_text_atomic(path: Path, text: str) -> None:

@@ -1,4 +1,4 @@
-"""Both tables of the paper as DataFrames: long and wide form, what is bold and red, HTML.
+"""Both tables of the paper as DataFrames: long and wide form, and what is bold and red.
 
 Long form has one value a row and is what CSV files hold; wide form is laid out as printed. Rows
 follow the data, so a new tracker is a new row and nothing here names a method.
@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pandas as pd
-from pandas.io.formats.style import Styler
 
 from nbtrack.errors import DataError, MissingError
 from nbtrack.metrics import LOST_THRESHOLD_M
@@ -34,7 +33,6 @@ PAPER_PIXELS = {"VR": 512, "SDF": 4096}
 """The n that the paper's Table II prints in bold: the one used for Table I."""
 
 MISSING_CELL = "–"
-_RED, _BOLD, _PLAIN = "color: red;", "font-weight: bold;", "font-weight: normal;"
 
 
 def published_table_1() -> pd.DataFrame:
@@ -64,7 +62,7 @@ def read_table(path: Path, columns: tuple[str, ...]) -> pd.DataFrame:
     return cells[list(columns)]
 
 
-def table_1(cells: pd.DataFrame) -> pd.DataFrame:
+def table_1(cells: pd.DataFrame, value: str = "ate_m") -> pd.DataFrame:
     """Table I as printed: ATE (m), a row per rate and method, a column per scene.
 
     Rates fall; methods and scenes keep the order of their first appearance. Every method gets a
@@ -73,13 +71,14 @@ def table_1(cells: pd.DataFrame) -> pd.DataFrame:
     Args:
         cells: long form with columns COLUMNS_1. Scenes named as in the dataset's folders get the
             paper's labels.
+        value: the column to lay out.
 
     Raises:
         DataError: a column is missing, there is no row, or two rows share one cell.
     """
     _check_columns(cells, COLUMNS_1, "table 1")
     cells = cells.assign(scene=cells["scene"].replace(PAPER_SCENE_LABELS))
-    wide = _pivot(cells, ["rate_hz", "method"], "scene", "ate_m")
+    wide = _pivot(cells, ["rate_hz", "method"], "scene", value)
     rates = sorted(cells["rate_hz"].unique(), reverse=True)
     rows = pd.MultiIndex.from_product(
         [rates, cells["method"].unique()], names=["rate_hz", "method"]
@@ -87,19 +86,20 @@ def table_1(cells: pd.DataFrame) -> pd.DataFrame:
     return wide.reindex(index=rows, columns=pd.Index(cells["scene"].unique(), name="scene"))
 
 
-def table_2(cells: pd.DataFrame) -> pd.DataFrame:
+def table_2(cells: pd.DataFrame, value: str = "steps") -> pd.DataFrame:
     """Table II as printed: steps, a row per tracker and n (pixels), a column per budget (ms).
 
     Trackers keep the order of their first appearance; n and budgets rise.
 
     Args:
         cells: long form with columns COLUMNS_2.
+        value: the column to lay out.
 
     Raises:
         DataError: as `table_1`.
     """
     _check_columns(cells, COLUMNS_2, "table 2")
-    wide = _pivot(cells, ["tracker", "n_pixels"], "budget_ms", "steps")
+    wide = _pivot(cells, ["tracker", "n_pixels"], "budget_ms", value)
     order = [
         (tracker, n_pixels)
         for tracker in cells["tracker"].unique()
@@ -116,6 +116,54 @@ def long_form(wide: pd.DataFrame, value: str) -> pd.DataFrame:
     """
     rows = [(*row, column, wide.at[row, column]) for row in wide.index for column in wide.columns]
     return pd.DataFrame(rows, columns=[*wide.index.names, wide.columns.name, value])
+
+
+def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
+    """Table I in long form from a row for every seed.
+
+    Columns: those of COLUMNS_1 with the mean ATE (m), ate_deviation_m (the standard deviation of
+    the seeds as a sample; NaN for one seed), and seeds, their number. A cell with a seed that
+    failed is NaN: a mean over the others would hide the failure.
+
+    Args:
+        results: long form with columns COLUMNS_1, several rows a cell.
+    """
+    keys = list(COLUMNS_1[:3])
+    groups = results.groupby(keys, sort=False)["ate_m"]
+    return pd.DataFrame(
+        {
+            "ate_m": groups.agg(lambda ate_m: ate_m.mean(skipna=False)),
+            "ate_deviation_m": groups.agg(lambda ate_m: ate_m.std(ddof=1, skipna=False)),
+            "seeds": groups.size(),
+        }
+    ).reset_index()
+
+
+def error_texts(wide: pd.DataFrame, deviation: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Table I as strings of three decimals, with "±" and the deviation over seeds if there is one.
+
+    Args:
+        wide, deviation: ATE (m) and its deviation as `table_1` lays them out.
+    """
+    texts = wide.map(lambda value: MISSING_CELL if pd.isna(value) else f"{value:.3f}")
+    if deviation is None:
+        return texts
+    spread = deviation.map(lambda value: "" if pd.isna(value) else f" ± {value:.3f}")
+    return texts + spread.reindex(index=wide.index, columns=wide.columns)
+
+
+def deviations_1(cells: pd.DataFrame) -> pd.DataFrame | None:
+    """The deviations (m) over seeds, laid out as `table_1`; None where there was one seed only."""
+    if "ate_deviation_m" not in cells or cells["ate_deviation_m"].isna().all():
+        return None
+    return table_1(cells, "ate_deviation_m")
+
+
+def deviations_2(cells: pd.DataFrame) -> pd.DataFrame | None:
+    """The deviations over frames of the steps, laid out as `table_2`; None where not measured."""
+    if "steps_deviation" not in cells:
+        return None
+    return table_2(cells, "steps_deviation")
 
 
 def best_cells(wide: pd.DataFrame) -> pd.DataFrame:
@@ -137,67 +185,24 @@ def failed_cells(wide: pd.DataFrame) -> pd.DataFrame:
     return _as_printed(wide) > LOST_THRESHOLD_M
 
 
-def step_texts(wide: pd.DataFrame) -> pd.DataFrame:
-    """Table II as strings: one decimal, or none in a row of whole numbers, as the paper prints."""
+def step_texts(wide: pd.DataFrame, deviation: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Table II as strings: one decimal, or none in a row of whole numbers, as the paper prints.
+
+    Args:
+        wide: steps as `table_2` lays them out.
+        deviation: of the steps over frames; follows after "±" with one decimal.
+    """
     decimals = {row: 0 if (wide.loc[row].dropna() % 1 == 0).all() else 1 for row in wide.index}
     texts = {
         row: [MISSING_CELL if pd.isna(v) else f"{v:.{decimals[row]}f}" for v in wide.loc[row]]
         for row in wide.index
     }
     frame = pd.DataFrame.from_dict(texts, orient="index", columns=wide.columns)
-    return frame.set_axis(wide.index)
-
-
-def compare_table_1(ours: pd.DataFrame, published: pd.DataFrame) -> pd.DataFrame:
-    """Two wide tables in one: under each row of ours the published row, where there is one.
-
-    The index gains a level `source` ("ours", "paper"); `style_table_1` then marks the best method
-    within each source.
-
-    Raises:
-        DataError: the scenes differ. Errors in different rooms say nothing about each other.
-    """
-    if set(ours.columns) != set(published.columns):
-        raise DataError(
-            f"our scenes are {', '.join(ours.columns)}; comparable are results in exactly "
-            f"{', '.join(published.columns)}; show the two tables separately"
-        )
-    both = pd.concat({"ours": ours, "paper": published[ours.columns]}, names=["source"])
-    order = [
-        (*row, source)
-        for row in ours.index
-        for source, table in (("ours", ours), ("paper", published))
-        if row in table.index
-    ]
-    return both.reorder_levels(["rate_hz", "method", "source"]).loc[order]
-
-
-class TableStyler(Styler):
-    """A styled table whose plain-text form is the table itself, equal in every run."""
-
-    def __repr__(self) -> str:
-        return self.data.to_string(na_rep=MISSING_CELL, float_format="{:.3f}".format)
-
-
-def style_table_1(wide: pd.DataFrame, caption: str = "") -> Styler:
-    """Table I for notebooks: three decimals, best bold, above 0.2 m red; equal HTML each time."""
-    red = failed_cells(wide).map(lambda failed: _RED if failed else "")
-    css = red + best_cells(wide).map(lambda best: _BOLD if best else "")
-    styler = TableStyler(wide, uuid="table-1", caption=caption or None)
-    styler.format(precision=3, na_rep=MISSING_CELL)
-    styler.format_index("{:g} Hz", level="rate_hz")
-    return styler.apply(lambda _: css, axis=None)
-
-
-def style_table_2(
-    wide: pd.DataFrame, caption: str = "", default_pixels: Mapping[str, int] = PAPER_PIXELS
-) -> Styler:
-    """Table II for notebooks; the n that each tracker uses for Table I is bold."""
-    # Notebooks show every row label in bold, so the others must be told not to be.
-    weights = [_BOLD if is_default(row, default_pixels) else _PLAIN for row in wide.index]
-    styler = TableStyler(step_texts(wide), uuid="table-2", caption=caption or None)
-    styler.format_index("{:g} ms", axis="columns")
-    return styler.apply_index(lambda _: weights, axis="index", level="n_pixels")
+    frame = frame.set_axis(wide.index)
+    if deviation is None:
+        return frame
+    spread = deviation.map(lambda value: "" if pd.isna(value) else f" ± {value:.1f}")
+    return frame + spread.reindex(index=wide.index, columns=wide.columns)
 
 
 def is_default(row: tuple[str, int], default_pixels: Mapping[str, int]) -> bool:

@@ -1,8 +1,10 @@
 """Track a camera through a sequence in a known map: one thin loop for every tracker."""
 
+import io
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,12 +14,16 @@ from jaxtyping import Float
 from nbtrack.budget import Budget
 from nbtrack.config import TrackingConfig
 from nbtrack.data import Sequence
-from nbtrack.device import suitable_threads, synchronize
+from nbtrack.device import naming_what_to_lower, suitable_threads, synchronize
 from nbtrack.errors import DataError, NumericalError
 from nbtrack.fields import Field
 from nbtrack.metrics import rotation_errors_deg, translation_errors
+from nbtrack.motion_models import motion_model
 from nbtrack.sampling import PixelSampler
+from nbtrack.storage import read_checkpoint, write_bytes_atomic
 from nbtrack.trackers import Tracker, tracker_class
+
+CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 
 OnFrame = Callable[[int, float], None]
 
@@ -40,50 +46,110 @@ def track_sequence(
     config: TrackingConfig,
     seed: int = 0,
     device: torch.device | None = None,
+    checkpoint: Path | None = None,
     on_frame: OnFrame | None = None,
 ) -> TrackedSequence:
     """Estimate every frame's pose from the first frame's true one.
 
-    Each frame starts from the estimate of the frame before. Source: paper, Sec. I-A and the
-    evaluation protocol: every frame is processed, none is dropped.
+    Each frame starts where the motion model puts it, by default at the estimate of the frame
+    before. Source: paper, Sec. I-A and the evaluation protocol: every frame is processed, none is
+    dropped.
 
     Args:
+        checkpoint: file that is written every few seconds and, where it exists, resumed from; it
+            must be one of the same run. A resumed run goes on as if it had not stopped.
         on_frame: called with the index in the sequence and the translation error (m).
 
     Raises:
+        ConfigError: the tracker or the motion model is unknown.
         DataError: there are fewer than two frames, or a frame has no measured depth.
         NumericalError: a pose is not finite, with the frame where that began.
+        OutOfMemory: the device holds too few pixels at once.
     """
     device = device or torch.device("cpu")
     if len(sequence) < 2:
         raise DataError(f"{sequence!r} is too short to track: give at least two frames")
-    sampler = PixelSampler(sequence, device)
-
-    def fresh_tracker() -> Tracker:
-        generator = torch.Generator(device).manual_seed(seed)
-        return tracker_class(tracker_name)(field, sampler, config, generator)
-
-    _check_measured(sequence, 1)
-    _warm_up(fresh_tracker(), sequence, device)
-    tracker = fresh_tracker()
-    estimates = [sequence.T_world_camera[0]]
-    rows = [_frame_row(sequence, 0, 0, 0.0, float("nan"), estimates[0])]
-    with suitable_threads(_widest_layer(field)):
-        for index in range(1, len(sequence)):
-            _check_measured(sequence, index)
-            start = time.perf_counter()
-            tracker.start_frame(index, torch.from_numpy(estimates[-1]).float().to(device))
-            steps, loss = 0, torch.tensor(float("nan"))
-            for _ in budget.frame():
-                loss = tracker.step()
-                steps += 1
-            synchronize(device)
-            seconds = time.perf_counter() - start
-            estimates.append(_checked_pose(tracker.T_world_camera, sequence, index, steps))
-            rows.append(_frame_row(sequence, index, steps, seconds, float(loss), estimates[-1]))
+    setting = f"tracking.{tracker_name}.n_pixels={config.n_pixels}"
+    with naming_what_to_lower(setting), suitable_threads(_widest_layer(field)):
+        run = _Run(tracker_name, field, sequence, budget, config, seed, device)
+        if checkpoint and checkpoint.exists():
+            run.load(checkpoint)
+        last_saved = time.perf_counter()
+        while len(run.estimates) < len(sequence):
+            run.advance()
             if on_frame:
-                on_frame(index, rows[-1]["translation_error_m"])
-    return TrackedSequence(np.stack(estimates), sequence.T_world_camera, pd.DataFrame(rows))
+                on_frame(len(run.estimates) - 1, run.rows[-1]["translation_error_m"])
+            if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
+                run.save(checkpoint)
+                last_saved = time.perf_counter()
+    return TrackedSequence(
+        np.stack(run.estimates), sequence.T_world_camera, pd.DataFrame(run.rows)
+    )
+
+
+class _Run:
+    """All that changes while a sequence is tracked, and nothing else."""
+
+    def __init__(
+        self,
+        tracker_name: str,
+        field: Field,
+        sequence: Sequence,
+        budget: Budget,
+        config: TrackingConfig,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        self.sequence, self.budget, self.device = sequence, budget, device
+        self.predict = motion_model(config.motion_model)
+        sampler = PixelSampler(sequence, device)
+
+        def fresh_tracker() -> Tracker:
+            generator = torch.Generator(device).manual_seed(seed)
+            return tracker_class(tracker_name)(field, sampler, config, generator)
+
+        _check_measured(sequence, 1)
+        _warm_up(fresh_tracker(), sequence, device)
+        self.tracker = fresh_tracker()
+        self.estimates = [sequence.T_world_camera[0]]
+        self.rows = [_frame_row(sequence, 0, 0, 0.0, float("nan"), self.estimates[0])]
+
+    def advance(self) -> None:
+        """Estimate the pose of the next frame."""
+        index = len(self.estimates)
+        _check_measured(self.sequence, index)
+        start = time.perf_counter()
+        T_start = torch.from_numpy(self.predict(self.estimates)).float()
+        self.tracker.start_frame(index, T_start.to(self.device))
+        steps, loss = 0, torch.tensor(float("nan"))
+        for _ in self.budget.frame():
+            loss = self.tracker.step()
+            steps += 1
+        synchronize(self.device)
+        seconds = time.perf_counter() - start
+        pose = _checked_pose(self.tracker.T_world_camera, self.sequence, index, steps)
+        self.estimates.append(pose)
+        self.rows.append(_frame_row(self.sequence, index, steps, seconds, float(loss), pose))
+
+    def save(self, checkpoint: Path) -> None:
+        buffer = io.BytesIO()
+        torch.save(
+            {
+                "estimates": torch.from_numpy(np.stack(self.estimates)),
+                "rows": self.rows,
+                "tracker": self.tracker.state(),
+                "budget": self.budget.state(),
+            },
+            buffer,
+        )
+        write_bytes_atomic(checkpoint, buffer.getvalue())
+
+    def load(self, checkpoint: Path) -> None:
+        state = read_checkpoint(checkpoint)
+        self.estimates = list(state["estimates"].numpy())
+        self.rows = state["rows"]
+        self.tracker.restore(state["tracker"])
+        self.budget.restore(state["budget"])
 
 
 def _warm_up(tracker: Tracker, sequence: Sequence, device: torch.device) -> None:

@@ -4,24 +4,18 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from tiny import TINY
 
 from nbtrack.bench import default_pixels, measure_steps
+from nbtrack.cells import MapCell
 from nbtrack.claims import in_words, iteration_ratio, paper_claims
 from nbtrack.config import Preset, resolve_preset
 from nbtrack.device import choose_device
 from nbtrack.errors import ConfigError, MissingError
-from nbtrack.experiments import MapCell, map_summary, read_frames, read_poses
+from nbtrack.experiments import map_summary, read_frames, read_poses
 from nbtrack.grid import map_cells, prepare_scenes, run_maps, table_1_cells, track_cells
 from nbtrack.scenes import find_scene
 from nbtrack.tables import published_table_1, published_table_2, table_1
-
-TINY = (
-    "scenes.n_frames=5", "scenes.width=32", "tables.rates_hz=[10,2]", "tables.budgets_ms=[20]",
-    "mapping.imap.iterations=6", "mapping.imap.n_rays=8", "network.imap.width=16",
-    "mapping.neus.iterations=6", "mapping.neus.n_rays=8", "network.neus.width=16",
-    "tracking.vr.n_pixels=8", "tracking.sdf.n_pixels=16",
-    "tables.pixels.vr=[4]", "tables.pixels.sdf=[8]",
-)  # fmt: skip
 
 
 @pytest.fixture

@@ -56,14 +56,14 @@ class ShiftedRoom(Field):
 def test_sdf_error_is_the_shift(room: Room, sequence: Sequence, shift: float) -> None:
     """Catches a score in the wrong unit, or near and free space mixed up: both are the shift."""
     field = ShiftedRoom(room, observed_bounds(sequence), shift)
-    scores = score_sdf(field, sequence, room)
+    scores = score_sdf(field, sequence, np.arange(len(sequence)), room)
     assert scores == pytest.approx({"sdf_near_m": shift, "sdf_free_m": shift}, abs=1e-5)
 
 
 def test_mesh_scores_of_the_truth(room: Room, sequence: Sequence) -> None:
     """Catches scores that punish an exact map: within half a cell, and nearly all within 5 cm."""
     field = ShiftedRoom(room, observed_bounds(sequence), 0.0)
-    scores = score_mesh(field, sequence, room, voxel=0.05)
+    scores = score_mesh(field, sequence, np.arange(len(sequence)), room, voxel=0.05)
     assert scores["mesh_accuracy_m"] < 0.01
     assert scores["mesh_completion_m"] < 0.03
     assert scores["mesh_f_score"] > 0.95
@@ -72,7 +72,7 @@ def test_mesh_scores_of_the_truth(room: Room, sequence: Sequence) -> None:
 def test_mesh_scores_of_a_wrong_surface(room: Room, sequence: Sequence) -> None:
     """Catches blind scores: a surface 8 cm inside the room is 8 cm off and beyond 5 cm."""
     field = ShiftedRoom(room, observed_bounds(sequence), 0.08)
-    scores = score_mesh(field, sequence, room, voxel=0.05)
+    scores = score_mesh(field, sequence, np.arange(len(sequence)), room, voxel=0.05)
     assert scores["mesh_accuracy_m"] == pytest.approx(0.08, abs=0.01)
     assert scores["mesh_f_score"] < 0.3
 
@@ -80,7 +80,7 @@ def test_mesh_scores_of_a_wrong_surface(room: Room, sequence: Sequence) -> None:
 def test_a_map_without_surface_is_scored_without_mesh(room: Room, sequence: Sequence) -> None:
     """Catches a lost map: no surface yet is no error, its mesh scores are just empty."""
     field = ShiftedRoom(room, observed_bounds(sequence), -10.0)
-    quality = score_map(field, sequence, sequence.select(slice(0)), room)
+    quality = score_map(field, sequence, np.arange(3), np.arange(0), room)
     assert quality.mesh_f_score is None
     assert quality.psnr_db is None
 
@@ -94,6 +94,15 @@ def test_seen_points(sequence: Sequence) -> None:
         assert seen_by(point[None], sequence.select(slice(1)))[0] == expected
     behind = T_world_camera[:3, 3] - T_world_camera[:3, 2]
     assert not seen_by(behind[None], sequence.select(slice(1)))[0]
+
+
+def test_seen_by_some_frames_only(sequence: Sequence) -> None:
+    """Catches a choice of frames that is ignored: what one frame saw, a frame behind it did not."""
+    T_world_camera = sequence.T_world_camera[0]
+    behind = T_world_camera[:3, 3] - T_world_camera[:3, 2]
+    others = [i for i in range(len(sequence)) if seen_by(behind[None], sequence, np.array([i]))[0]]
+    assert 0 not in others
+    assert seen_by(behind[None], sequence, every=1)[0] == bool(others)
 
 
 def test_mesh_is_in_metres_and_world_frame(room: Room, sequence: Sequence, tmp_path: Path) -> None:

@@ -110,7 +110,7 @@ def test_damaged_checkpoint(tmp_path: Path) -> None:
     """Catches a traceback from a file that was cut or is something else."""
     checkpoint = tmp_path / "map.pt"
     checkpoint.write_bytes(b"not a checkpoint")
-    with pytest.raises(DataError, match="not a readable map"):
+    with pytest.raises(DataError, match="not a readable checkpoint"):
         map_sequence("imap", wall_sequence(), NETWORK, SHORT, checkpoint=checkpoint)
 
 

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from nbtrack.errors import DataError, NbtrackError
-from nbtrack.parallel import Job, Report, run_jobs
+from nbtrack.parallel import Execution, Job, Report, run_jobs
 
 
 def square(number: int, report: Report) -> int:
@@ -29,7 +29,7 @@ def die(code: int, report: Report) -> None:
 def test_results_come_in_order(workers: int, capsys: pytest.CaptureFixture) -> None:
     """Catches results in the order of their completion, and noise before there is news."""
     jobs = [Job(f"job {n}", 2, square, (n,)) for n in range(4)]
-    assert run_jobs(jobs, "squares", workers) == [0, 1, 4, 9]
+    assert run_jobs(jobs, "squares", Execution(workers)) == [0, 1, 4, 9]
     if workers == 1:
         assert capsys.readouterr().err == ""
 
@@ -44,11 +44,11 @@ def test_a_users_mistake_comes_through(workers: int) -> None:
     """Catches errors of workers that lose their class or message on the way."""
     jobs = [Job("bad", 1, fail, ("depth1.png is empty",)), Job("good", 2, square, (2,))]
     with pytest.raises(DataError, match=r"depth1.png is empty"):
-        run_jobs(jobs, "mixed", workers)
+        run_jobs(jobs, "mixed", Execution(workers))
 
 
 def test_a_killed_worker_is_explained() -> None:
     """Catches a traceback, or waiting for ever, where the system took a worker away."""
     jobs = [Job("dead", 1, die, (1,)), Job("good", 2, square, (2,))]
     with pytest.raises(NbtrackError, match="a worker process died"):
-        run_jobs(jobs, "dying", workers=2)
+        run_jobs(jobs, "dying", Execution(2))

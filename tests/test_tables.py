@@ -8,6 +8,13 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from nbtrack.comparison import (
+    beside_published,
+    compare_table_1,
+    compare_table_2,
+    summarize_table_1,
+    write_comparisons,
+)
 from nbtrack.errors import DataError, MissingError
 from nbtrack.latex import (
     TableNotes,
@@ -18,19 +25,21 @@ from nbtrack.latex import (
     write_tables,
 )
 from nbtrack.paths import PAPER_TABLES, PROJECT_ROOT
+from nbtrack.table_styles import style_table_1, style_table_2
 from nbtrack.tables import (
     COLUMNS_1,
     COLUMNS_2,
+    average_over_seeds,
     best_cells,
-    compare_table_1,
+    deviations_1,
+    deviations_2,
+    error_texts,
     failed_cells,
     long_form,
     published_table_1,
     published_table_2,
     read_table,
     step_texts,
-    style_table_1,
-    style_table_2,
     table_1,
     table_2,
 )
@@ -192,7 +201,7 @@ def test_latex_of_our_own_cells() -> None:
     """Catches unescaped underscores, wrong row spans, missing cells that vanish."""
     text = latex_table_1(table_1(OURS_1), budget_note=str(NOTES))
     head, *rows = tabular_rows(text)
-    assert head == ["", "", r"room\_b", r"room\_a"]
+    assert head == ["", "", "room b", "room a"]
     assert rows[0][0] == r"\multirow{3}{*}{$r=\SI{10}{Hz}$}"
     assert rows[2] == ["", "C", "--", "--"]
     assert rows[5] == ["", "C", r"$\mathbf{0.050}$", "--"]
@@ -251,13 +260,81 @@ def test_comparison() -> None:
     ours = ours.loc[[(10, "NeuS with SDF"), (10, "new")]].iloc[[0, 2], ::-1]
     both = compare_table_1(ours, published)
     assert list(both.index) == [
-        (10, "NeuS with SDF", "ours"), (10, "NeuS with SDF", "paper"), (10, "new", "ours"),
+        (10, "NeuS with SDF", "ours"), (10, "NeuS with SDF", "paper"),
+        (10, "NeuS with SDF", "difference"), (10, "new", "ours"),
     ]  # fmt: skip
-    assert both["Breakfast"].tolist() == pytest.approx([1.096, 0.096, 3.575])
-    assert list(best_cells(both)["Breakfast"]) == [True, False, False]
-    assert "font-weight: bold" in style_table_1(both).to_html()
-    with pytest.raises(DataError, match=r"our scenes are Breakfast; comparable .*; show"):
-        compare_table_1(published[["Breakfast"]], published)
+    assert both["Breakfast"].tolist() == pytest.approx([1.096, 0.096, 1.0, 3.575])
+    seven = compare_table_1(published.iloc[:, :7], published)
+    assert seven.shape == (18, 7)
+    with pytest.raises(DataError, match=r"our scenes are office; comparable .*summarize_table_1"):
+        compare_table_1(published[["Breakfast"]].set_axis(["office"], axis=1), published)
+
+
+def test_summary_by_hand() -> None:
+    """Catches shares over the wrong total: of 0.1, 0.3 and a failed run, two of three are lost."""
+    cells = cells_1([(10, "A", "x", 0.1), (10, "A", "y", 0.3), (10, "A", "z", float("nan"))])
+    summary = summarize_table_1(cells, published_table_1())
+    assert summary.index.tolist() == [(10, "A")]
+    assert summary.iloc[0, 0] == pytest.approx(0.2)
+    assert summary.iloc[0, 2] == pytest.approx(2 / 3)
+    paper = summarize_table_1(published_table_1(), published_table_1())
+    assert paper.loc[(10, "iMAP with VR")].tolist() == pytest.approx([1.575, 1.575, 7 / 9, 7 / 9])
+
+
+def test_comparison_of_steps(tmp_path: Path) -> None:
+    """Catches steps of one n beside those of another, and files that lose the difference."""
+    published = published_table_2()
+    twice = published.assign(steps=2 * published["steps"])
+    both = compare_table_2(table_2(twice), table_2(published))
+    assert both[500].unstack("source").loc[("VR", 512)].to_dict() == pytest.approx(
+        {"ours": 72.2, "paper": 36.1, "difference": 36.1}
+    )
+    paths = write_comparisons(tmp_path, OURS_1, twice)
+    assert [path.name for path in paths] == ["table_1_vs_paper.csv", "table_2_vs_paper.csv"]
+    assert "VR,512,difference,3.2,6.8,36.1" in paths[1].read_text()
+
+
+def test_what_stands_beside_the_paper() -> None:
+    """Catches rooms of our own compared scene by scene with the dataset's, and the reverse."""
+    assert "source" in beside_published(published_table_1()).index.names
+    assert "source" not in beside_published(OURS_1).index.names
+
+
+def test_mean_and_deviation_over_seeds() -> None:
+    """Catches a population's deviation, seeds mixed between cells, a failed seed averaged away."""
+    results = pd.concat(
+        [cells_1([(10, "A", "x", v), (10, "B", "x", 1.0)]) for v in (0.1, 0.2, 0.3)]
+    )
+    cells = average_over_seeds(results)
+    assert cells["method"].tolist() == ["A", "B"]
+    assert cells["ate_m"].tolist() == pytest.approx([0.2, 1.0])
+    assert cells["ate_deviation_m"].tolist() == pytest.approx([0.1, 0.0])
+    assert cells["seeds"].tolist() == [3, 3]
+    texts = error_texts(table_1(cells), deviations_1(cells))
+    assert texts["x"].tolist() == ["0.200 ± 0.100", "1.000 ± 0.000"]
+    latex = latex_table_1(table_1(cells), deviation=deviations_1(cells))
+    assert r"\mathbf{0.200}{\scriptscriptstyle\pm0.100}$" in latex
+    results.iloc[2, results.columns.get_loc("ate_m")] = float("nan")
+    assert average_over_seeds(results)["ate_m"].isna().tolist() == [True, False]
+
+
+def test_one_seed_has_no_spread() -> None:
+    """Catches "± nan" in every table that was made with one seed, as most are."""
+    cells = average_over_seeds(OURS_1.dropna())
+    assert deviations_1(cells) is None
+    assert "±" not in repr(style_table_1(table_1(cells), deviation=deviations_1(cells)))
+
+
+def test_spread_of_steps() -> None:
+    """Catches spreads that change place between rows of Table II."""
+    cells = OURS_2.assign(steps_deviation=[0.5, 1.5, 0.25, 0.75][: len(OURS_2)])
+    spread = deviations_2(cells)
+    assert spread.loc[("LM", 64)].tolist() == [
+        cells.loc[(cells["tracker"] == "LM") & (cells["budget_ms"] == b), "steps_deviation"].item()
+        for b in (50, 100)
+    ]
+    assert step_texts(table_2(cells), spread).loc[("LM", 64)].iloc[0].startswith("1.0 ± ")
+    assert deviations_2(OURS_2) is None
 
 
 def test_written_files(tmp_path: Path) -> None:

@@ -3,7 +3,13 @@
 import importlib
 import pkgutil
 
-from nbtrack.trackers.base import TRACKERS, AdamTracker, Tracker, tracker_class
+from nbtrack.trackers.base import (
+    TRACKERS,
+    AdamTracker,
+    Tracker,
+    paper_trackers,
+    tracker_class,
+)
 
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
@@ -12,4 +18,4 @@ _ordered = sorted(TRACKERS.items(), key=lambda item: (item[1].table_order, item[
 TRACKERS.clear()
 TRACKERS.update(_ordered)
 
-__all__ = ["TRACKERS", "AdamTracker", "Tracker", "tracker_class"]
+__all__ = ["TRACKERS", "AdamTracker", "Tracker", "paper_trackers", "tracker_class"]

@@ -1,6 +1,7 @@
 """What every tracker offers to the tracking loop, and the registry of trackers."""
 
 import abc
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -27,6 +28,7 @@ class Tracker(abc.ABC):
     field_name: str  # the field whose maps it tracks in
     paper_steps: str = "sdf"  # whose step counts of the paper's Table II it is given
     table_order: int = 100  # rows of the tables go by this, then by name; the paper's come first
+    in_paper_tables: bool = True  # a row of Tables I and II; else only where it is asked for
 
     def __init__(
         self,
@@ -40,6 +42,11 @@ class Tracker(abc.ABC):
         self.config = config
         self.generator = generator
 
+    @classmethod
+    def evaluations_per_pixel(cls, config: TrackingConfig) -> int:
+        """How often a step asks the network for each of its pixels; only estimates time."""
+        return 1
+
     @abc.abstractmethod
     def start_frame(self, frame: int, T_world_camera: Float[Tensor, "4 4"]) -> None:
         """Take up a frame of the sequence, starting from an initial pose."""
@@ -52,6 +59,14 @@ class Tracker(abc.ABC):
     @abc.abstractmethod
     def T_world_camera(self) -> Float[Tensor, "4 4"]:
         """The present estimate, without gradient."""
+
+    def state(self) -> dict[str, Any]:
+        """What one frame leaves to the next, besides its pose; tensors and plain values."""
+        return {"generator": self.generator.get_state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take up what `state` returned, so that a resumed run goes on as if uninterrupted."""
+        self.generator.set_state(state["generator"])
 
 
 class AdamTracker(Tracker):
@@ -121,3 +136,8 @@ def tracker_class(name: str) -> type[Tracker]:
     if name not in TRACKERS:
         raise ConfigError(f"unknown tracker {name!r}: {nearest_name(name, sorted(TRACKERS))}")
     return TRACKERS[name]
+
+
+def paper_trackers() -> list[str]:
+    """The trackers that are rows of Tables I and II unless others are asked for, in order."""
+    return [name for name, tracker in TRACKERS.items() if tracker.in_paper_tables]

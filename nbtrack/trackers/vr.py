@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nbtrack.camera import pixel_directions
+from nbtrack.config import TrackingConfig
 from nbtrack.fields import Rays
 from nbtrack.fields.imap import rendering_losses
 from nbtrack.sampling import two_pass_depths
@@ -21,6 +22,11 @@ class VolumeRenderingTracker(AdamTracker):
     field_name = "imap"
     paper_steps = "vr"
     table_order = 0
+
+    @classmethod
+    def evaluations_per_pixel(cls, config: TrackingConfig) -> int:
+        """Both passes: the second asks again for the samples of the first."""
+        return 2 * config.n_stratified + config.n_importance
 
     def loss(
         self,

@@ -1,0 +1,43 @@
+"""Where the search for a frame's pose starts, given the poses found so far."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from nbtrack.errors import ConfigError, nearest_name
+
+Pose = Float[np.ndarray, "4 4"]
+
+
+def previous_pose(estimates: Sequence[Pose]) -> Pose:
+    """The pose of the frame before: the camera is taken to stand still.
+
+    The paper does not say where it starts; every frame is processed, so this is the plain reading.
+    """
+    return estimates[-1]
+
+
+def constant_velocity(estimates: Sequence[Pose]) -> Pose:
+    """The pose of the frame before, moved on as it had moved since the one before that.
+
+    The motion is that seen from the camera: T_k-1 (T_k-2^-1 T_k-1). The second frame has nothing to
+    go by and starts from the first one's pose. Source: our choice; usual in SLAM (ORB-SLAM).
+    """
+    if len(estimates) < 2:
+        return estimates[-1]
+    before, last = estimates[-2:]
+    return last @ np.linalg.inv(before) @ last
+
+
+MOTION_MODELS: dict[str, Callable[[Sequence[Pose]], Pose]] = {
+    "previous_pose": previous_pose,
+    "constant_velocity": constant_velocity,
+}
+
+
+def motion_model(name: str) -> Callable[[Sequence[Pose]], Pose]:
+    """The motion model of a name. Raises ConfigError, naming the nearest, for any other."""
+    if name not in MOTION_MODELS:
+        raise ConfigError(f"unknown motion model {name!r}: {nearest_name(name, [*MOTION_MODELS])}")
+    return MOTION_MODELS[name]

@@ -1,0 +1,81 @@
+"""Choosing a device, its memory, and keeping it to oneself."""
+
+import subprocess
+import sys
+import threading
+
+import pytest
+import torch
+
+from nbtrack.device import choose_device, has_room_for, naming_what_to_lower
+from nbtrack.device_lock import alone_on, beside_others_on
+from nbtrack.errors import ConfigError, OutOfMemory
+
+ELSEWHERE = torch.device("cpu", 7)  # a name that no run uses
+
+
+def test_a_named_device_is_taken_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a silent fall-back to the CPU where the named GPU is not there."""
+    monkeypatch.setenv("NBTRACK_DEVICE", "cpu")
+    assert choose_device() == torch.device("cpu")
+    for name in ("cuda:99", "gpu"):
+        monkeypatch.setenv("NBTRACK_DEVICE", name)
+        with pytest.raises(ConfigError, match=rf"device '{name}' is not there: .* has cpu"):
+            choose_device()
+
+
+def test_running_out_of_memory_names_the_setting() -> None:
+    """Catches a page of torch's allocator in place of one line; the allocation here is real."""
+    with (
+        pytest.raises(OutOfMemory, match=r"out of memory with mapping.neus.n_rays=9: lower it"),
+        naming_what_to_lower("mapping.neus.n_rays=9"),
+    ):
+        torch.empty(2**55)
+    with pytest.raises(OutOfMemory), naming_what_to_lower("x"):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+
+
+def test_other_errors_keep_their_name() -> None:
+    """Catches a wrong shape that is called a lack of memory."""
+    with pytest.raises(RuntimeError, match="size of tensor"), naming_what_to_lower("x"):
+        torch.ones(2) + torch.ones(3)
+
+
+def test_host_memory_is_not_asked_twice() -> None:
+    """Catches images that are copied on a CPU, where they already are."""
+    assert has_room_for(torch.device("cpu"), 2**60)
+
+
+HOLD = """
+import sys, torch
+from nbtrack.device_lock import beside_others_on
+with beside_others_on(torch.device("cpu", 7), print):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_run_by_the_clock_waits_until_it_is_alone() -> None:
+    """Catches a clock that measures its neighbours, and a wait without a word."""
+    other = subprocess.Popen(
+        [sys.executable, "-c", HOLD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert other.stdout.readline() == "held\n"
+    said, order = [], []
+
+    def run_by_clock() -> None:
+        with alone_on(ELSEWHERE, said.append):
+            order.append("ran")
+
+    clock = threading.Thread(target=run_by_clock)
+    clock.start()
+    clock.join(timeout=0.5)
+    assert clock.is_alive()
+    assert said == ["by the clock: waits until no other run is on this device"]
+    order.append("other ended")
+    other.kill()  # however it ends, its hold ends with it
+    other.communicate()
+    clock.join(timeout=20)
+    assert order == ["other ended", "ran"]
+    with beside_others_on(ELSEWHERE, said.append):
+        assert len(said) == 1

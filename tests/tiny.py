@@ -1,0 +1,9 @@
+"""Settings so small that a whole grid is made in seconds; they show nothing but that it runs."""
+
+TINY = (
+    "scenes.n_frames=5", "scenes.width=32", "tables.rates_hz=[10,2]", "tables.budgets_ms=[20]",
+    "mapping.imap.iterations=6", "mapping.imap.n_rays=8", "network.imap.width=16",
+    "mapping.neus.iterations=6", "mapping.neus.n_rays=8", "network.neus.width=16",
+    "tracking.vr.n_pixels=8", "tracking.sdf.n_pixels=16",
+    "tables.pixels.vr=[4]", "tables.pixels.sdf=[8]",
+)  # fmt: skip
