@@ -11,13 +11,13 @@ from tqdm import tqdm
 
 from nbtrack.bounds import observed_bounds
 from nbtrack.budget import ClockBudget
-from nbtrack.config import Preset, as_dict, fingerprint
+from nbtrack.config import Preset, as_dict
 from nbtrack.data import Sequence
 from nbtrack.device import device_name, suitable_threads, synchronize
 from nbtrack.device_lock import alone_on
 from nbtrack.fields import make_field
 from nbtrack.paths import runs_folder
-from nbtrack.provenance import code_fingerprint, versions
+from nbtrack.provenance import code_fingerprint, fingerprint, versions
 from nbtrack.sampling import PixelSampler
 from nbtrack.storage import write_text_atomic
 from nbtrack.trackers import TRACKERS, Tracker, paper_trackers

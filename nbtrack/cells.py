@@ -12,14 +12,14 @@ import torch
 from filelock import FileLock, Timeout
 
 from nbtrack.budget import Budget, ClockBudget, StepBudget
-from nbtrack.config import Preset, fingerprint
+from nbtrack.config import Preset
 from nbtrack.device import choose_device, device_name, synchronize
 from nbtrack.fields import field_class
 from nbtrack.map_quality import score_map
 from nbtrack.mapping import map_sequence
 from nbtrack.metrics import trajectory_metrics
 from nbtrack.paths import runs_folder
-from nbtrack.provenance import code_fingerprint
+from nbtrack.provenance import code_fingerprint, fingerprint
 from nbtrack.scenes import Scene
 from nbtrack.trackers import tracker_class
 from nbtrack.tracking import track_sequence

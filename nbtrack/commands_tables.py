@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from nbtrack.bench import default_pixels, obtain_steps
 from nbtrack.comparison import beside_published, write_comparisons
-from nbtrack.config import Preset
+from nbtrack.config import Preset, changed_settings
 from nbtrack.device import choose_device, device_name
 from nbtrack.errors import ConfigError, NbtrackError, nearest_name
 from nbtrack.explain import explain_run, find_cells
@@ -104,7 +104,9 @@ def _write(
 ) -> None:
     cells_1 = average_over_seeds(results)
     device = device_name(choose_device())
-    notes = TableNotes(preset.name, BUDGETS[budget], device)
+    # Which scenes there are the columns tell.
+    changed = [text for text in changed_settings(preset) if not text.startswith("scenes.names")]
+    notes = TableNotes(preset.name, BUDGETS[budget], device, tuple(changed))
     paths = write_tables(folder, cells_1, cells_2, notes, default_pixels(preset))
     paths += write_comparisons(folder, cells_1, cells_2)
     paths.append(folder / "table_1_cells.csv")

@@ -6,7 +6,6 @@ key or a value of another type is an error that names the nearest valid key.
 """
 
 import dataclasses
-import hashlib
 import json
 import math
 import os
@@ -191,7 +190,16 @@ def resolve_preset(
     if file_name:
         for key, value in _flatten(_read_toml(Path(file_name))).items():
             preset = _replace(preset, key, value)
-    for setting in (*_environment_settings(), *settings):
+    return with_settings(preset, *_environment_settings(), *settings)
+
+
+def with_settings(preset: Preset, *settings: str) -> Preset:
+    """The preset with some `key=value` texts applied.
+
+    Raises:
+        ConfigError: an unknown key, or a value of the wrong type.
+    """
+    for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals:
             raise ConfigError(f"setting {setting!r} has no value: write key=value")
@@ -212,12 +220,6 @@ def changed_settings(preset: Preset) -> list[str]:
 def as_dict(config: Any) -> dict[str, Any]:
     """A config as nested dictionaries of plain values, ready for JSON."""
     return json.loads(json.dumps(dataclasses.asdict(config)))
-
-
-def fingerprint(*parts: Any) -> str:
-    """Twelve hexadecimal digits that change with any of the parts (plain values or configs)."""
-    plain = [as_dict(p) if dataclasses.is_dataclass(p) else p for p in parts]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def _environment_settings() -> list[str]:

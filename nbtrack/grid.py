@@ -23,6 +23,8 @@ from nbtrack.trackers import paper_trackers, tracker_class
 BUDGETS = {"steps": "the paper's step counts", "clock": "wall clock"}
 """What ends a frame: as many steps as the paper's hardware had time for, or our own clock."""
 
+_FEW_PIXELS = 4_000_000  # rendered in a few seconds
+
 Say = Callable[[str], None]
 
 
@@ -48,7 +50,9 @@ def prepare_scenes(preset: Preset, say: Say = tqdm.write) -> list[Scene]:
     if to_make and config.synthetic:
         say(f"making {len(to_make)} of {len(config.names)} rooms: {', '.join(to_make)}")
         jobs = [Job(name, config.n_frames, _make_scene, (name, config)) for name in to_make]
-        run_jobs(jobs, "rooms")
+        # Small rooms are made sooner than processes start.
+        pixels = len(to_make) * config.n_frames * config.width**2 * 3 // 4
+        run_jobs(jobs, "rooms", Execution(workers=1) if pixels < _FEW_PIXELS else None)
     scenes, missing = [], []
     for name in config.names:
         try:
@@ -134,7 +138,10 @@ def run_maps(
 
 
 def run_tracks(
-    cells: Sequence[TrackCell], say: Say = tqdm.write, execution: Execution | None = None
+    cells: Sequence[TrackCell],
+    say: Say = tqdm.write,
+    execution: Execution | None = None,
+    maps: Sequence[MapCell] = (),
 ) -> list[Any]:
     """Make the runs that are not cached, and their maps; returns the metrics of all, in order.
 
@@ -142,20 +149,24 @@ def run_tracks(
     go one after the other on this machine, when everything else is done: a neighbour would slow
     the clock's steps down.
 
+    Args:
+        maps: further maps to make in the same go.
+
     Returns:
         Metrics; with `execution.keep_going`, in the place of a run that failed, its error.
     """
     execution = execution or Execution()
     missing = [cell for cell in cells if not cell.is_done]
-    maps = {c.map_cell.folder: c.map_cell for c in missing if not c.map_cell.is_done}
-    if missing:
-        where = f"on {execution.cluster or device_name(choose_device())}"
-        to_make = f"{len(missing)} runs and {len(maps)} maps to make {where}"
-    say(f"{len(cells) - len(missing)} of {len(cells)} runs are cached"
-        + (f", {to_make}" if missing else ""))  # fmt: skip
+    wanted = [*maps, *(cell.map_cell for cell in missing)]
+    to_map = {cell.folder: cell for cell in wanted if not cell.is_done}
+    news = f"{len(cells) - len(missing)} of {len(cells)} runs are cached"
+    if missing or to_map:
+        where = execution.cluster or device_name(choose_device())
+        news += f", {len(missing)} runs and {len(to_map)} maps to make on {where}"
+    say(news)
     by_clock = [cell for cell in missing if cell.rate_hz is not None]
     others = [cell for cell in missing if cell.rate_hz is None]
-    jobs = _jobs_by_scene(list(maps.values()), others)
+    jobs = _jobs_by_scene(list(to_map.values()), others)
     done = run_jobs(jobs, "grid", execution)
     failed = {
         job.name: result

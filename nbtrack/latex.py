@@ -65,9 +65,11 @@ class TableNotes:
     preset: str  # name of the preset
     budget: str  # of Table I, as "the paper's step counts" or "wall clock"
     device: str  # on which Table II was measured, as "CPU" or the name of a GPU
+    changed: tuple[str, ...] = ()  # settings in which the run differs from the preset, key=value
 
     def __str__(self) -> str:
-        return f"Preset: {self.preset}; budget: {self.budget}; device: {self.device}."
+        changed = f", with {', '.join(self.changed)}" if self.changed else ""
+        return f"Preset: {self.preset}{changed}; budget: {self.budget}; device: {self.device}."
 
 
 def latex_table_1(

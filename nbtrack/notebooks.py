@@ -39,7 +39,7 @@ def run_notebooks(
         NbtrackError: a cell failed; the copy up to there is kept.
     """
     folder = runs_folder() / "notebooks" / preset
-    paths = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))
+    paths = sorted(NOTEBOOKS.glob("[0-9A]*_*.ipynb"))
     pages = []
     with _environment(NBTRACK_PRESET=preset, **_overrides(config_file, settings)):
         for path in paths:

@@ -6,8 +6,11 @@ by following imports. Comments, docstrings and layout do not count.
 """
 
 import ast
+import dataclasses
+import hashlib
 import importlib.util
 import inspect
+import json
 import platform
 import sys
 from collections.abc import Callable
@@ -18,13 +21,19 @@ from typing import Any
 import torch
 
 import nbtrack
-from nbtrack.config import fingerprint
+from nbtrack.config import as_dict
 
 # Modules that store, tell or choose. The settings stand in a key with their values, and rooms have
 # a version of their own: what was rendered is part of the key as data.
 _NO_PART = (
     "nbtrack.config", "nbtrack.errors", "nbtrack.storage", "nbtrack.device", "nbtrack.synthetic",
 )  # fmt: skip
+
+
+def fingerprint(*parts: Any) -> str:
+    """Twelve hexadecimal digits that change with any of the parts (plain values or configs)."""
+    plain = [as_dict(p) if dataclasses.is_dataclass(p) else p for p in parts]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def code_fingerprint(*entry_points: Callable[..., Any]) -> str:

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from nbtrack.config import ScenesConfig, fingerprint
+from nbtrack.config import ScenesConfig
 from nbtrack.data import Sequence, list_frames, parse_frames, read_sequence
 from nbtrack.errors import DataError, MissingError, nearest_name
 from nbtrack.paths import data_folder, runs_folder
+from nbtrack.provenance import fingerprint
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of
 
 DATASET_SCENES = (

@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from nbtrack.config import PRESETS, FieldConfig, Preset, as_dict, fingerprint, resolve_preset
+from nbtrack.config import PRESETS, FieldConfig, Preset, as_dict, resolve_preset
 from nbtrack.errors import ConfigError, MissingError
+from nbtrack.provenance import fingerprint
+from nbtrack.scenes import DATASET_SCENES
+from nbtrack.synthetic import REPORTED_ROOMS
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +52,14 @@ def test_papers_figures() -> None:
         assert (tracking.position_rate, tracking.orientation_rate) == (5e-4, 1e-3)
     assert paper.tables.rates_hz == (10.0, 5.0, 2.0)
     assert paper.tables.budgets_ms == (50.0, 100.0, 500.0)
-    assert len(paper.scenes.names) == 9
+    assert paper.scenes.names == DATASET_SCENES
+    assert {t.motion_model for t in paper.tracking.values()} == {"previous_pose"}
+
+
+def test_nothing_is_tuned_on_what_is_reported() -> None:
+    """Catches a preset that reports a room on which settings were chosen, or leaves one out."""
+    assert PRESETS["synthetic"].scenes.names == REPORTED_ROOMS
+    assert set(PRESETS["smoke"].scenes.names) <= set(REPORTED_ROOMS)
 
 
 def test_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

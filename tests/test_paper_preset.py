@@ -41,6 +41,7 @@ def run(monkeypatch: pytest.MonkeyPatch, dataset: Path, folder: Path) -> int:
     monkeypatch.setenv("NBTRACK_DATA", str(dataset))
     settings = [s for s in TINY if not s.startswith(("scenes.", "tables.rates"))]
     settings += ["scenes.track_frames=9:12"]
+    settings += [f"mapping.{field}.holdout_every=0" for field in ("imap", "neus")]
     words = [word for setting in settings for word in ("--set", setting)]
     return main(
         ["tables", "--preset", "paper", "--workers", "1", "--out", str(folder / "out"), *words]

@@ -11,7 +11,7 @@ from pathlib import Path
 from tiny import TINY
 
 # Each costs some seconds. More of them: NBTRACK_TEST_KILLS=20 pytest tests/test_resume.py
-KILLS = int(os.environ.get("NBTRACK_TEST_KILLS", "2"))
+KILLS = int(os.environ.get("NBTRACK_TEST_KILLS", "1"))
 SETTINGS = (*TINY, "mapping.imap.iterations=150", "mapping.neus.iterations=150")
 
 

@@ -122,6 +122,31 @@ def test_draw_covers_only_the_given_frames(generator: torch.Generator) -> None:
     assert len(torch.unique(both, dim=0)) == 2 * 16 * 12
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU besides the host")
+def test_images_on_the_host_give_the_same_rays() -> None:
+    """Catches other draws, or rays left behind, where the images do not fit the device."""
+    device, drawn = torch.device("cuda"), []
+    for images_device in (device, CPU):
+        sampler = PixelSampler(random_sequence(3), device, images_device)
+        generator = torch.Generator(device).manual_seed(0)
+        drawn.append(sampler.draw(100, generator, torch.arange(3, device=device)))
+        assert drawn[-1].color.device.type == "cuda"
+        assert sampler.measured_pixels(1)[0].device.type == "cuda"
+    torch.testing.assert_close(drawn[0].depth, drawn[1].depth, rtol=0, atol=0)
+
+
+def test_images_stay_on_the_host_where_the_device_is_full(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a long sequence that is copied to a small device: images stay, as 5 bytes a pixel."""
+    asked = []
+    monkeypatch.setattr(
+        "nbtrack.sampling.has_room_for", lambda device, size: asked.append((device, size))
+    )
+    sampler = PixelSampler(random_sequence(3), torch.device("meta"))
+    assert asked == [(torch.device("meta"), 5 * 3 * CAMERA.width * CAMERA.height)]
+    assert sampler.colors.device == sampler.depths_mm.device == CPU
+    assert sampler.T_world_camera.device.type == "meta"
+
+
 def test_draw_follows_the_generator() -> None:
     """Catches draws from the global generator, which no seed of a run reaches."""
     sampler = PixelSampler(random_sequence(3), CPU)

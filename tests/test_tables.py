@@ -180,6 +180,16 @@ def test_layout_of_our_own_cells() -> None:
     assert wide.at[(5, "C"), "room_b"] == 0.05
 
 
+def test_notes_tell_what_was_changed() -> None:
+    """Catches a table that claims a preset whose settings were others."""
+    notes = TableNotes("paper", "wall clock", "CPU", ("mapping.neus.iterations=5",))
+    told = "Preset: paper, with mapping.neus.iterations=5; budget: wall clock; device: CPU."
+    assert str(notes) == told
+    assert r"mapping.neus.iterations=5; budget" in latex_table_1(
+        table_1(OURS_1), budget_note=str(notes)
+    )
+
+
 def test_best_and_failed_by_hand() -> None:
     """Catches ties that only one row wins, a lone value praised, 0.2 m called a failure."""
     wide = table_1(OURS_1)

@@ -1,6 +1,11 @@
 """The two trackers and their loop, in fields whose answers are known exactly."""
 
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from jaxtyping import Float
@@ -13,6 +18,7 @@ from nbtrack.config import TrackingConfig
 from nbtrack.data import Sequence
 from nbtrack.errors import ConfigError, DataError, NumericalError
 from nbtrack.fields.base import Field, Rays
+from nbtrack.motion_models import motion_model
 from nbtrack.rendering import Rendering, composite, weights_from_density, weights_from_sdf
 from nbtrack.sampling import PixelSampler
 from nbtrack.trackers import TRACKERS, tracker_class
@@ -138,6 +144,46 @@ def test_each_frame_starts_from_the_previous_estimate() -> None:
     assert tracked.frames["steps"].sum() == 0
     assert np.allclose(tracked.T_estimated, np.eye(4), atol=1e-7)
     assert tracked.frames["translation_error_m"].tolist() == pytest.approx([0, 0.1, 0.2])
+
+
+def test_constant_velocity_starts_where_the_camera_would_be() -> None:
+    """Catches a motion model that is named in the settings and not used: no step, no error."""
+    sequence = box_sequence([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    moved = [np.eye(4), *sequence.T_world_camera[[0, 2]]]
+    config = replace(config_of("sdf"), motion_model="constant_velocity")
+    assert np.allclose(motion_model(config.motion_model)(moved)[:3, 3], [0.2, 0.0, 0.0])
+    still = track_sequence("sdf", BoxRoom(False), sequence, StepBudget(0.1), config)
+    assert np.allclose(still.T_estimated, np.eye(4), atol=1e-7)
+    unknown = replace(config, motion_model="none")
+    with pytest.raises(ConfigError, match="unknown motion model 'none'"):
+        track_sequence("sdf", BoxRoom(False), sequence, StepBudget(1), unknown)
+
+
+@pytest.mark.parametrize("name", ["vr", "sdf"])
+def test_a_killed_run_goes_on_as_if_it_had_not_stopped(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches pixels drawn twice, a budget that forgets its fractions, frames done again."""
+    sequence = box_sequence([[0.004 * i, 0.0, 0.002 * i] for i in range(6)])
+    field = BoxRoom(as_density=name == "vr").requires_grad_(False)
+    whole = track_sequence(name, field, sequence, StepBudget(2.4), config_of(name))
+    monkeypatch.setattr("nbtrack.tracking.CHECKPOINT_SECONDS", 0.0)
+    checkpoint, frames = tmp_path / "run.pt", []
+
+    def die_at_four(frame: int, error: float) -> None:
+        frames.append(frame)
+        if len(frames) == 4:
+            raise KeyboardInterrupt
+
+    run = partial(track_sequence, name, field, sequence, checkpoint=checkpoint)
+    with pytest.raises(KeyboardInterrupt):
+        run(StepBudget(2.4), config_of(name), on_frame=die_at_four)
+    resumed = run(StepBudget(2.4), config_of(name), on_frame=lambda f, e: frames.append(f))
+    # Frame 4 was done, but not kept: it is the only one that is done again.
+    assert frames == [1, 2, 3, 4, 4, 5]
+    np.testing.assert_array_equal(resumed.T_estimated, whole.T_estimated)
+    kept = ["steps", "loss", "translation_error_m"]
+    pd.testing.assert_frame_equal(resumed.frames[kept], whole.frames[kept])
 
 
 def test_seeds() -> None:

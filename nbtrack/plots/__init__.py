@@ -4,6 +4,7 @@ Every function returns a figure that a notebook shows once, with axes labelled i
 paper's method names, and a title that states the finding.
 """
 
+from nbtrack.plots.ablations import plot_quality_over_time, plot_reach
 from nbtrack.plots.comparisons import plot_ate_bars, plot_steps
 from nbtrack.plots.doll_house import mesh_viewer, plot_mesh
 from nbtrack.plots.images import plot_room_overview, plot_views
@@ -23,6 +24,8 @@ __all__ = [
     "plot_errors",
     "plot_losses",
     "plot_mesh",
+    "plot_quality_over_time",
+    "plot_reach",
     "plot_room_overview",
     "plot_slice",
     "plot_steps",

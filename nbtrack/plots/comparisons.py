@@ -16,6 +16,7 @@ _PANELS_A_ROW = 5
 _PANELS_WITH_VALUES = 2  # with more, bars are too narrow for their numbers
 _GROUP_WIDTH = 0.8  # of the distance between two rates
 _LEAST_ATE_M = 0.002  # where bars begin, unless an error is smaller still
+_LEGEND_CHARACTERS = 80  # that one line of a legend holds
 _MARKERS = "os^Dv"
 
 
@@ -24,7 +25,8 @@ def plot_ate_bars(cells: pd.DataFrame, title: str = "") -> Figure:
     """Table I as bars: ATE (m, logarithmic) by rate and method, a panel a scene.
 
     A bar that crosses the dashed line at 0.2 m is a lost camera, which the table prints red; a
-    cross on the axis is a run without result.
+    cross on the axis is a run without result. Thin lines span a deviation over seeds either way,
+    where there were several.
 
     Args:
         cells: long form with columns `rate_hz`, `method`, `scene`, `ate_m` (see `tables`).
@@ -53,7 +55,9 @@ def plot_ate_bars(cells: pd.DataFrame, title: str = "") -> Figure:
         axes.set_ylabel("ATE (m)")
     lost = Line2D([], [], color="0.3", linestyle="--", linewidth=1, label="lost above 0.2 m")
     handles, _ = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles=[*handles, lost], loc="outside lower center", ncols=len(methods) + 1)
+    wide = sum(map(len, methods)) > _LEGEND_CHARACTERS
+    n_columns = 3 if wide else len(methods) + 1
+    figure.legend(handles=[*handles, lost], loc="outside lower center", ncols=n_columns)
     return figure
 
 
@@ -100,9 +104,12 @@ def _draw_bars(
 ) -> None:
     width = _GROUP_WIDTH / len(colors)
     for number, (method, color) in enumerate(colors.items()):
-        ate = cells[cells["method"] == method].set_index("rate_hz")["ate_m"].reindex(rates)
+        rows = cells[cells["method"] == method].set_index("rate_hz").reindex(rates)
+        ate = rows["ate_m"]
         places = np.arange(len(rates)) + (number - (len(colors) - 1) / 2) * width
         bars = axes.bar(places, ate, 0.92 * width, color=color, label=method)
+        if "ate_deviation_m" in rows and rows["ate_deviation_m"].notna().any():
+            axes.errorbar(places, ate, rows["ate_deviation_m"], fmt="none", ecolor="0.2", capsize=2)
         if with_values:
             axes.bar_label(bars, fmt="{:.3f}", fontsize=7, padding=1)
         missing = places[ate.isna()]
