@@ -153,7 +153,7 @@ def compare_times(curves: pd.DataFrame, preset: Preset) -> TimeToQuality:
 def _plan_both_maps(
     preset: Preset, scenes: Sequence[Scene], rate_hz: float | int, n_frames: int | None
 ) -> list[TableCell]:
-    block = replace(preset, tables=replace(preset.tables, rates_hz=(rate_hz,)))
+    block = replace(preset, tables=replace(preset.tables, rates_hz=(float(rate_hz),)))
     beginning = replace(preset.scenes, track_frames=_beginning(preset, n_frames))
     return [
         *plan_table_1(block, scenes, trackers=("vr", "sdf")),
@@ -185,7 +185,7 @@ def _plan_reach(
 def _plan_starts(
     preset: Preset, scenes: Sequence[Scene], rate_hz: float | int, trackers: Sequence[str]
 ) -> tuple[list[dict], list[TrackCell]]:
-    block = replace(preset, tables=replace(preset.tables, rates_hz=(rate_hz,)))
+    block = replace(preset, tables=replace(preset.tables, rates_hz=(float(rate_hz),)))
     rows, cells = [], []
     for name in trackers:
         for model in MOTION_MODELS:
