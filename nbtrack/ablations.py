@@ -251,7 +251,8 @@ def _beginning(preset: Preset, n_frames: int | None) -> str:
         return tracked
     frames = parse_frames(tracked)
     start, step = frames.start or 0, frames.step or 1
-    return f"{start}:{start + n_frames * step}:{step}"
+    stop = start + n_frames * step
+    return f"{start}:{stop if frames.stop is None else min(stop, frames.stop)}:{step}"
 
 
 def _error_of_first(cell: TrackCell, n_frames: int | None) -> float:

@@ -13,7 +13,7 @@ from nbtrack.bounds import observed_bounds
 from nbtrack.budget import ClockBudget
 from nbtrack.config import Preset, as_dict
 from nbtrack.data import Sequence
-from nbtrack.device import device_name, suitable_threads, synchronize
+from nbtrack.device import device_name, naming_what_to_lower, suitable_threads, synchronize
 from nbtrack.device_lock import alone_on
 from nbtrack.fields import make_field
 from nbtrack.paths import runs_folder
@@ -62,7 +62,12 @@ def measure_steps(
         field.to(device).eval().requires_grad_(False)
         config = replace(preset.tracking_of(name), n_pixels=n_pixels)
         tracker = TRACKERS[name](field, sampler, config, torch.Generator(device).manual_seed(0))
-        with suitable_threads(network.width), alone_on(device, tqdm.write):
+        setting = f"tables.pixels.{name}={n_pixels}"
+        with (
+            naming_what_to_lower(setting),
+            suitable_threads(network.width),
+            alone_on(device, tqdm.write),
+        ):
             steps = _count_steps(tracker, T_start, budget_ms, frames_per_cell, device)
         rows.append(
             {

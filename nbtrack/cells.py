@@ -41,10 +41,11 @@ class MapCell:
 
     @cached_property
     def key(self) -> str:
-        """Changes with everything that the map depends on: code, data, settings, seed."""
+        """Changes with everything that the map depends on: code, device, data, settings, seed."""
         field = field_class(self.field_name)
         return fingerprint(
-            code_fingerprint(map_sequence, score_map, field), self.scene.fingerprint,
+            code_fingerprint(map_sequence, score_map, field), choose_device().type,
+            self.scene.fingerprint,
             self.field_name, self.preset.network_of(self.field_name),
             self.preset.mapping_of(self.field_name), self.frames, self.seed,
         )  # fmt: skip
@@ -61,8 +62,11 @@ class MapCell:
 
     @property
     def is_done(self) -> bool:
-        """Whether the map is finished and scored."""
-        return (self.folder / SUMMARY_FILE).is_file()
+        """Whether the map is finished and scored; in a folder of the user's, whether it is this."""
+        path = self.folder / SUMMARY_FILE
+        if self.out is None or not path.is_file():
+            return path.is_file()
+        return json.loads(path.read_text(encoding="utf-8")).get("key") == self.key
 
     @property
     def evaluations(self) -> float:
@@ -85,10 +89,11 @@ class TrackCell:
 
     @cached_property
     def key(self) -> str:
-        """Changes with everything that the run depends on; by the clock, with the device too."""
+        """Changes with everything that the run depends on; by the clock, with the machine too."""
         tracker = tracker_class(self.tracker_name)
         config = self.map_cell.preset.tracking_of(self.tracker_name)
-        clock = None if self.rate_hz is None else (self.rate_hz, device_name(choose_device()))
+        machine = (device_name(choose_device()), torch.get_num_threads())
+        clock = None if self.rate_hz is None else (self.rate_hz, *machine)
         return fingerprint(
             code_fingerprint(track_sequence, trajectory_metrics, tracker), self.map_cell.key,
             self.tracker_name, config, self.steps, clock, self.frames, self.seed,

@@ -31,7 +31,9 @@ def run_on_cluster(jobs: Sequence[Job], address: str, threads: int, board: Board
     Raises:
         MissingError: Dask is not installed, nothing answers at the address, or there is no worker.
     """
-    joblib, client = _connect(address)
+    joblib, client, KilledWorker = _connect(address)
+    environment = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
+    environment |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
     with client, joblib.parallel_config(backend="dask", wait_for_workers_timeout=60):
         waiting = list(jobs)
         while waiting:
@@ -40,16 +42,21 @@ def run_on_cluster(jobs: Sequence[Job], address: str, threads: int, board: Board
             wave = [job for job in wave if not board.settle_if_hopeless(job)]
             # One job a task: they are long, and a batch would keep finished ones back.
             run = joblib.Parallel(return_as="generator_unordered", batch_size=1)
-            folders = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
-            tasks = [joblib.delayed(_run_there)(job, folders, threads) for job in wave]
-            for name, result in run(tasks):
-                board.settle(board.jobs[name], lambda result=result: _unwrapped(result))
+            tasks = [joblib.delayed(_run_there)(job, environment, threads) for job in wave]
+            try:
+                for name, result in run(tasks):
+                    board.settle(board.jobs[name], lambda result=result: _unwrapped(result))
+            except KilledWorker:
+                raise NbtrackError(
+                    "a Dask worker died, perhaps for lack of memory: what was finished is kept; "
+                    "run the same command again, with fewer workers a machine if need be"
+                ) from None
 
 
-def _connect(address: str) -> tuple[Any, Any]:
+def _connect(address: str) -> tuple[Any, Any, type[Exception]]:
     try:
         import joblib
-        from distributed import Client
+        from distributed import Client, KilledWorker
     except ImportError:
         raise MissingError(
             "--dask needs joblib and Dask: pip install 'nbtrack[cluster]', or run without --dask"
@@ -67,12 +74,12 @@ def _connect(address: str) -> tuple[Any, Any]:
             f"the Dask scheduler at {address} has no worker: start some with 'dask worker "
             f"{address} --nthreads 1'"
         )
-    return joblib, client
+    return joblib, client, KilledWorker
 
 
-def _run_there(job: Job, folders: dict[str, str], threads: int) -> tuple[str, Any]:
-    """Runs in a worker, which may have been started with other folders."""
-    os.environ |= folders
+def _run_there(job: Job, environment: dict[str, str], threads: int) -> tuple[str, Any]:
+    """Runs in a worker, which may have been started with other folders, or for another device."""
+    os.environ |= environment
     torch.set_num_threads(threads)
     try:
         return job.name, job.function(*job.arguments, report=_quiet)

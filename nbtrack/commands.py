@@ -8,7 +8,7 @@ import torch
 from tqdm.auto import tqdm
 
 from nbtrack.bench import obtain_steps
-from nbtrack.cells import MapCell, TrackCell, make_budget
+from nbtrack.cells import MapCell, TrackCell, cell_lock, make_budget
 from nbtrack.config import Preset
 from nbtrack.data import Sequence, parse_frames
 from nbtrack.data_check import check_sequence
@@ -157,4 +157,6 @@ def _map_job(cell: MapCell, report: Report) -> None:
 
 
 def _track_job(cell: TrackCell, folder: Path, device: torch.device, report: Report) -> dict:
-    return run_track(cell, folder, device, report)
+    # `tables` may be at the same cell.
+    with cell_lock(cell.folder, lambda status: report(0, status)):
+        return run_track(cell, folder, device, report)

@@ -82,7 +82,7 @@ def explain_command(
     """Print where one cell of Table I comes from, and the command that makes it again."""
     (kind,) = _budgets(budget) if budget != "both" else ("steps",)
     _check_seeds(seeds)
-    cells = plan_table_1(preset, prepare_scenes(preset, _tell), kind, seeds, trackers)
+    cells = plan_table_1(preset, prepare_scenes(preset, _tell, make=False), kind, seeds, trackers)
     for cell in find_cells(cells, row, column):
         print(explain_run(cell.run))
 

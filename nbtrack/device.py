@@ -71,7 +71,9 @@ def has_room_for(device: torch.device, n_bytes: int) -> bool:
     if device.type != "cuda":
         return True  # the CPU's and Apple's memory is the one that the data are in already
     free_bytes, _ = torch.cuda.mem_get_info(device)
-    return 2 * n_bytes < free_bytes
+    # What torch keeps for later is free for us as well.
+    kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return 2 * n_bytes < free_bytes + kept
 
 
 @contextlib.contextmanager
@@ -86,6 +88,8 @@ def naming_what_to_lower(setting: str) -> Iterator[None]:
     """
     try:
         yield
+    except OutOfMemory:
+        raise  # somebody nearer has named the setting
     except (RuntimeError, MemoryError) as error:
         if not _is_out_of_memory(error):
             raise

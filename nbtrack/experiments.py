@@ -20,7 +20,7 @@ from nbtrack.cells import (
 )
 from nbtrack.config import as_dict
 from nbtrack.data import parse_frames
-from nbtrack.device import choose_device, device_name
+from nbtrack.device import choose_device, device_name, naming_what_to_lower
 from nbtrack.device_lock import alone_on, beside_others_on
 from nbtrack.map_quality import score_map
 from nbtrack.mapping import FittedMap, load_map, map_sequence, split_holdout
@@ -83,8 +83,10 @@ def run_track(
     has a row for each frame, `metrics.json` everything else.
     """
     fitted = obtain_map(cell.map_cell, device)
+    (folder / METRICS_FILE).unlink(missing_ok=True)
     config = cell.map_cell.preset.tracking_of(cell.tracker_name)
-    sequence = cell.map_cell.scene.read(parse_frames(cell.frames))
+    with naming_what_to_lower(f"frames {cell.frames} of {cell.scene_name}"):
+        sequence = cell.map_cell.scene.read(parse_frames(cell.frames))
     checkpoint = cell.folder / RUN_FILE
     occupied = alone_on if cell.rate_hz is not None else beside_others_on
     with occupied(device, lambda status: report(0, status)):
@@ -131,6 +133,7 @@ def _metrics(
         "seconds_per_frame": float(rows["seconds"].mean()),
         "map_seconds": fitted.seconds,
         "device": device_name(device),
+        "device_type": device.type,
         "threads": torch.get_num_threads(),
         "scene": cell.scene_name,
         "field": cell.map_cell.field_name,
@@ -152,15 +155,17 @@ def _metrics(
 
 def _make_map(cell: MapCell, device: torch.device, report: Report) -> FittedMap:
     config = cell.preset.mapping_of(cell.field_name)
-    sequence = cell.scene.read(parse_frames(cell.frames))
-    with beside_others_on(device, lambda status: report(0, status)):
+    setting = f"frames {cell.frames} of {cell.scene.name}"
+    waits = beside_others_on(device, lambda status: report(0, status))
+    with naming_what_to_lower(setting), waits:
+        sequence = cell.scene.read(parse_frames(cell.frames))
         fitted = map_sequence(
             cell.field_name, sequence, cell.preset.network_of(cell.field_name), config, cell.seed,
             device, checkpoint=cell.folder / MAP_FILE,
             on_iteration=lambda done, losses: report(done, _losses_text(losses)),
         )  # fmt: skip
-    mapped, held_out = split_holdout(len(sequence), config.holdout_every)
-    quality = score_map(fitted.field, sequence, mapped, held_out, cell.scene.room)
+        mapped, held_out = split_holdout(len(sequence), config.holdout_every)
+        quality = score_map(fitted.field, sequence, mapped, held_out, cell.scene.room)
     write_text_atomic(cell.folder / "history.csv", fitted.history.to_csv(float_format="%.6g"))
     summary = {
         "quality": quality.to_dict(),

@@ -8,6 +8,8 @@ from nbtrack.cells import TrackCell
 from nbtrack.config import Preset, changed_settings
 from nbtrack.errors import ConfigError, MissingError, nearest_name
 from nbtrack.grid import TableCell
+from nbtrack.scenes import DATASET_SCENES
+from nbtrack.synthetic import ROOMS
 from nbtrack.tables import PAPER_SCENE_LABELS
 
 # Where a single run gets these from its own options.
@@ -24,7 +26,7 @@ def find_cells(cells: Sequence[TableCell], row: str, column: str) -> list[TableC
     Raises:
         ConfigError: the table has no such row or column.
     """
-    match = re.fullmatch(r"\s*([\d.]+)\s*(?:hz)?[\s,/:]*(.*?)\s*", row, re.IGNORECASE)
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(?:hz)?[\s,/:]*(.*?)\s*", row, re.IGNORECASE)
     rate_hz, method = (float(match[1]), match[2].casefold()) if match else (None, "")
     scene = column.casefold()
     found = [
@@ -83,15 +85,21 @@ def command_of(run: TrackCell) -> str:
     preset = run.map_cell.preset
     by_clock = run.rate_hz is not None
     words = [
-        "python", "-m", "nbtrack", "track", run.scene_name,
+        "python", "-m", "nbtrack", "track", _name_or_folder(run),
         "--field", run.map_cell.field_name, "--tracker", run.tracker_name,
-        *(["--rate", f"{run.rate_hz:g}"] if by_clock else ["--steps", repr(run.steps)]),
+        *(["--rate", repr(run.rate_hz)] if by_clock else ["--steps", repr(run.steps)]),
         "--map-frames", run.map_cell.frames, "--frames", run.frames, "--seed", str(run.seed),
-        "--threads", str(run.metrics()["threads"]), "--preset", preset.name,
+        "--device", run.metrics()["device_type"], "--threads", str(run.metrics()["threads"]),
+        "--preset", preset.name,
     ]  # fmt: skip
     for setting in _settings(preset):
         words += ["--set", setting]
     return shlex.join([*words, "--out", f"again_{run.name}"])
+
+
+def _name_or_folder(run: TrackCell) -> str:
+    scene = run.map_cell.scene
+    return scene.name if scene.name in (*ROOMS, *DATASET_SCENES) else str(scene.folder)
 
 
 def _settings(preset: Preset) -> list[str]:

@@ -1,8 +1,10 @@
 """All cells of a preset: scenes, their maps, the tracked runs, and the rows of Table I."""
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -11,11 +13,12 @@ from tqdm import tqdm
 from nbtrack.budget import paper_steps
 from nbtrack.cells import MapCell, TrackCell
 from nbtrack.config import Preset, ScenesConfig
+from nbtrack.data import list_frames
 from nbtrack.device import choose_device, device_name
-from nbtrack.errors import ConfigError, MissingError, NbtrackError, nearest_name
+from nbtrack.errors import ConfigError, DataError, MissingError, NbtrackError, nearest_name
 from nbtrack.experiments import map_summary, obtain_map, obtain_track
 from nbtrack.parallel import Execution, Job, Report, run_jobs
-from nbtrack.scenes import Scene, find_scene, room_folder
+from nbtrack.scenes import DATASET_SCENES, Scene, find_scene, room_folder
 from nbtrack.synthetic import ROOMS
 from nbtrack.tables import average_over_seeds
 from nbtrack.trackers import paper_trackers, tracker_class
@@ -37,27 +40,38 @@ class TableCell:
     run: TrackCell
 
 
-def prepare_scenes(preset: Preset, say: Say = tqdm.write) -> list[Scene]:
+def prepare_scenes(preset: Preset, say: Say = tqdm.write, make: bool = True) -> list[Scene]:
     """The preset's scenes that are there; synthetic rooms that are not are made, side by side.
 
-    Scenes that lack a folder are named at once, and the others returned.
+    Scenes that lack a folder, or whose folder is damaged, are named at once, and the others
+    returned.
+
+    Args:
+        make: make rooms; else one that is not there counts as missing.
 
     Raises:
-        MissingError: a name is unknown, or no scene is there.
+        ConfigError: no name is given, or one is given twice or unknown.
+        MissingError, DataError: no scene is there, or none is whole; that of the first.
     """
     config = preset.scenes
+    _check_names(config)
     to_make = [n for n in config.names if n in ROOMS and not room_folder(n, config).is_dir()]
-    if to_make and config.synthetic:
+    if to_make and config.synthetic and make:
         say(f"making {len(to_make)} of {len(config.names)} rooms: {', '.join(to_make)}")
         jobs = [Job(name, config.n_frames, _make_scene, (name, config)) for name in to_make]
         # Small rooms are made sooner than processes start.
         pixels = len(to_make) * config.n_frames * config.width**2 * 3 // 4
-        run_jobs(jobs, "rooms", Execution(workers=1) if pixels < _FEW_PIXELS else None)
+        workers = 1 if pixels < _FEW_PIXELS else os.cpu_count()
+        run_jobs(jobs, "rooms", Execution(workers))
     scenes, missing = [], []
     for name in config.names:
         try:
-            scenes.append(find_scene(name, config))
-        except MissingError as error:
+            if name in to_make and not make:
+                raise MissingError(f"room {name} has not been made: run without --explain first")
+            scene = find_scene(name, config)
+            list_frames(scene.folder)  # so that a damaged folder is told here
+            scenes.append(scene)
+        except (MissingError, DataError) as error:
             missing.append((name, error))
     if missing and not scenes:
         raise missing[0][1]
@@ -65,6 +79,20 @@ def prepare_scenes(preset: Preset, say: Say = tqdm.write) -> list[Scene]:
         names = ", ".join(name for name, _ in missing)
         say(f"missing, and left out: {names} ({missing[0][1]})")
     return scenes
+
+
+def _check_names(config: ScenesConfig) -> None:
+    known = [*ROOMS, *DATASET_SCENES]
+    if not config.names:
+        raise ConfigError(f"no scene is named: give some of {', '.join(known)}")
+    for name in config.names:
+        if name not in known and not Path(name).is_dir():
+            raise ConfigError(
+                f"unknown scene {name!r}, and no such folder: {nearest_name(name, known)}"
+            )
+    columns = [Path(name).resolve().name for name in config.names]
+    if len(set(columns)) < len(columns):
+        raise ConfigError(f"scenes {', '.join(config.names)}: two have one name; give each once")
 
 
 def map_cells(
@@ -114,7 +142,7 @@ def plan_table_1(
     rates_hz = [rate_hz for rate_hz in preset.tables.rates_hz for _ in scenes]
     return [
         TableCell(rate_hz, tracker_class(name).label, run)
-        for name in (trackers or paper_trackers())
+        for name in dict.fromkeys(trackers or paper_trackers())
         for seed in range(seeds)
         for rate_hz, run in zip(
             rates_hz, track_cells(preset, name, scenes, budget, seed), strict=True

@@ -21,6 +21,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from nbtrack.device import choose_device
 from nbtrack.errors import NbtrackError
 
 Report = Callable[[int, str], None]
@@ -69,7 +70,7 @@ def run_jobs(jobs: Sequence[Job], title: str, execution: Execution | None = None
     execution = execution or Execution()
     workers = execution.workers
     if workers is None:
-        workers = 1 if torch.cuda.is_available() else os.cpu_count() or 1
+        workers = 1 if choose_device().type != "cpu" else os.cpu_count() or 1
     threads = execution.threads or max(1, torch.get_num_threads() // max(workers, 1))
     with _bar(jobs, title) as bar:
         board = Board(bar, jobs, execution.keep_going)
@@ -128,7 +129,8 @@ class Board:
         """Whether something that a job needs has failed; its result is then the reason."""
         failed = [n for n in job.needs if isinstance(self.results.get(n), NbtrackError)]
         if failed:
-            self.results[job.name] = NbtrackError(f"not run, because {failed[0]} failed")
+            reason = self.results[failed[0]]
+            self.results[job.name] = NbtrackError(f"not run, because {failed[0]} failed: {reason}")
             self.show(job.name, job.total, "left out")
         return bool(failed)
 

@@ -182,7 +182,7 @@ def _frame_row(
 def _checked_pose(
     T_world_camera: Float[torch.Tensor, "4 4"], sequence: Sequence, index: int, steps: int
 ) -> Float[np.ndarray, "4 4"]:
-    pose = T_world_camera.double().cpu().numpy()
+    pose = T_world_camera.cpu().double().numpy()
     if not np.isfinite(pose).all():
         raise NumericalError(
             f"the pose of frame {sequence.frame_ids[index]} of {sequence.name} stopped being "

@@ -9,6 +9,7 @@ from tiny import TINY
 
 from nbtrack.cli import main
 from nbtrack.config import PRESETS, changed_settings, resolve_preset, with_settings
+from nbtrack.scenes import find_scene
 
 WORDS = [word for setting in (*TINY, "scenes.track_frames=1:4") for word in ("--set", setting)]
 
@@ -48,7 +49,12 @@ def test_a_cell_is_made_again_from_its_command(
 
 def test_rows_and_columns_that_are_not_there(runs: Path, capsys: pytest.CaptureFixture) -> None:
     """Catches an explanation of another cell than the one that was meant."""
+    not_made = ["tables", "--scenes", "office", *WORDS, "--explain", "10 sdf", "office"]
+    assert main(not_made) == 2
+    assert "room office has not been made: run" in capsys.readouterr().err.splitlines()[-1]
+    find_scene("office", resolve_preset("smoke", settings=TINY).scenes)
     for row, column, told in (
+        ("1.2.3 sdf", "office", "no row '1.2.3 sdf'"),
         ("10 adam", "office", "no row '10 adam' in Table I"),
         ("7 sdf", "office", "no row '7 sdf'"),
         ("sdf", "office", "no row 'sdf'"),

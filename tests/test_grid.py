@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import pandas as pd
 import pytest
 from tiny import TINY
@@ -9,11 +10,20 @@ from tiny import TINY
 from nbtrack.bench import default_pixels, measure_steps
 from nbtrack.cells import MapCell
 from nbtrack.claims import in_words, iteration_ratio, paper_claims
-from nbtrack.config import Preset, resolve_preset
+from nbtrack.config import Preset, resolve_preset, with_settings
 from nbtrack.device import choose_device
 from nbtrack.errors import ConfigError, MissingError
 from nbtrack.experiments import map_summary, read_frames, read_poses
-from nbtrack.grid import map_cells, prepare_scenes, run_maps, table_1_cells, track_cells
+from nbtrack.grid import (
+    map_cells,
+    plan_table_1,
+    prepare_scenes,
+    run_maps,
+    table_1_cells,
+    table_1_results,
+    track_cells,
+)
+from nbtrack.parallel import Execution
 from nbtrack.scenes import find_scene
 from nbtrack.tables import published_table_1, published_table_2, table_1
 
@@ -112,6 +122,47 @@ def test_missing_dataset_scene_is_named(
     paper = resolve_preset("paper")
     with pytest.raises(MissingError, match=r"no folder .*breakfast_room.*data/README.md"):
         prepare_scenes(paper)
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        ("['living_rom']", "unknown scene 'living_rom', and no such folder: did you mean"),
+        ("['office', 'office']", "two have one name"),
+        ("[]", "no scene is named"),
+    ],
+)
+def test_wrong_scenes_are_told_before_anything_is_made(
+    preset: Preset, names: str, told: str
+) -> None:
+    """Catches a misspelt column that is left out in silence, and a column counted as two seeds."""
+    wrong = with_settings(preset, f"scenes.names={names}")
+    with pytest.raises(ConfigError, match=told):
+        prepare_scenes(wrong)
+
+
+def test_a_damaged_scene_leaves_the_others(preset: Preset, capsys: pytest.CaptureFixture) -> None:
+    """Catches one bad folder that stops the whole grid."""
+    scenes = prepare_scenes(preset)
+    (scenes[0].folder / "images" / "img2.png").unlink()
+    said = []
+    assert [s.name for s in prepare_scenes(preset, said.append)] == ["office"]
+    assert "left out: living_room" in said[-1]
+    assert "4 images but 5 depth maps" in said[-1]
+
+
+def test_a_failed_map_tells_why_in_every_cell(preset: Preset) -> None:
+    """Catches a reason that is lost between the map that failed and the runs that need it."""
+    scenes = prepare_scenes(preset)
+    for depth in (scenes[0].folder / "depth_filtered").iterdir():
+        image = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(depth), 0 * image)
+    execution = Execution(workers=1, keep_going=True)
+    results = table_1_results(plan_table_1(preset, scenes), execution=execution)
+    failed = results[results["scene"] == "living_room"]
+    assert failed["failure"].str.contains("no pixel of living_room has a depth").all()
+    assert failed["ate_m"].isna().all()
+    assert results.loc[results["scene"] == "office", "ate_m"].notna().all()
 
 
 def test_the_paper_supports_its_own_claims() -> None:
