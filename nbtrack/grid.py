@@ -26,7 +26,7 @@ from nbtrack.trackers import paper_trackers, tracker_class
 BUDGETS = {"steps": "the paper's step counts", "clock": "wall clock"}
 """What ends a frame: as many steps as the paper's hardware had time for, or our own clock."""
 
-_FEW_PIXELS = 4_000_000  # rendered in a few seconds
+_FEW_PIXELS = 500_000  # rendered in a second or two
 
 Say = Callable[[str], None]
 
