@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from nbtrack.bounds import observed_bounds
 from nbtrack.budget import ClockBudget
-from nbtrack.config import Preset, as_dict
+from nbtrack.config import FieldConfig, Preset, as_dict
 from nbtrack.data import Sequence
 from nbtrack.device import device_name, naming_what_to_lower, suitable_threads, synchronize
 from nbtrack.device_lock import alone_on
@@ -20,6 +20,7 @@ from nbtrack.paths import runs_folder
 from nbtrack.provenance import code_fingerprint, fingerprint, versions
 from nbtrack.sampling import PixelSampler
 from nbtrack.storage import write_text_atomic
+from nbtrack.tables import COLUMNS_2
 from nbtrack.trackers import TRACKERS, Tracker, paper_trackers
 
 
@@ -55,30 +56,20 @@ def measure_steps(
         for budget_ms in preset.tables.budgets_ms
     ]
     rows = []
-    bar = tqdm(cells, "Table II", unit="cell", disable=not progress)
-    for name, n_pixels, budget_ms in bar:
-        network = preset.network_of(TRACKERS[name].field_name)
-        field = make_field(TRACKERS[name].field_name, network, bounds, seed=0)
+    for name, n_pixels, budget_ms in tqdm(cells, "Table II", unit="cell", disable=not progress):
+        field = make_field(TRACKERS[name].field_name, _network_of(preset, name), bounds, seed=0)
         field.to(device).eval().requires_grad_(False)
         config = replace(preset.tracking_of(name), n_pixels=n_pixels)
         tracker = TRACKERS[name](field, sampler, config, torch.Generator(device).manual_seed(0))
-        setting = f"tables.pixels.{name}={n_pixels}"
         with (
-            naming_what_to_lower(setting),
-            suitable_threads(network.width),
+            naming_what_to_lower(f"tables.pixels.{name}={n_pixels}"),
+            suitable_threads(_network_of(preset, name).width),
             alone_on(device, tqdm.write),
         ):
             steps = _count_steps(tracker, T_start, budget_ms, frames_per_cell, device)
-        rows.append(
-            {
-                "tracker": TRACKERS[name].short_label,
-                "n_pixels": n_pixels,
-                "budget_ms": budget_ms,
-                "steps": float(steps.mean()),
-                "steps_deviation": float(steps.std()),
-            }
-        )
-    return pd.DataFrame(rows)
+        mean, deviation = float(steps.mean()), float(steps.std())
+        rows.append((TRACKERS[name].short_label, n_pixels, budget_ms, mean, deviation))
+    return pd.DataFrame(rows, columns=[*COLUMNS_2, "steps_deviation"])
 
 
 def obtain_steps(
@@ -108,6 +99,10 @@ def default_pixels(preset: Preset) -> dict[str, int]:
     return {
         TRACKERS[name].short_label: preset.tracking_of(name).n_pixels for name in paper_trackers()
     }
+
+
+def _network_of(preset: Preset, tracker_name: str) -> FieldConfig:
+    return preset.network_of(TRACKERS[tracker_name].field_name)
 
 
 def _count_steps(

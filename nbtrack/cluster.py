@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from nbtrack.errors import MissingError, NbtrackError
-from nbtrack.parallel import Board, Job
+from nbtrack.parallel import Board, Job, quiet
 from nbtrack.paths import data_folder, runs_folder
 
 _SECONDS_TO_CONNECT = 10
@@ -82,13 +82,9 @@ def _run_there(job: Job, environment: dict[str, str], threads: int) -> tuple[str
     os.environ |= environment
     torch.set_num_threads(threads)
     try:
-        return job.name, job.function(*job.arguments, report=_quiet)
+        return job.name, job.function(*job.arguments, report=quiet)
     except NbtrackError as error:
         return job.name, error
-
-
-def _quiet(done: int, status: str) -> None:
-    """A report that nobody reads."""
 
 
 def _unwrapped(result: Any) -> Any:

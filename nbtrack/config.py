@@ -1,8 +1,7 @@
 """Typed settings, the three presets, and checked overrides.
 
-Precedence: preset < TOML file (`NBTRACK_CONFIG` or `--config`) < environment (`NBTRACK_SET`) <
-explicit `--set key=value`. Keys are dotted paths such as `mapping.neus.iterations`; an unknown
-key or a value of another type is an error that names the nearest valid key.
+Precedence: preset < TOML file (`NBTRACK_CONFIG` or `--config`) < `NBTRACK_SET` < `--set key=value`.
+Keys are dotted paths such as `mapping.neus.iterations`; an unknown one is an error.
 """
 
 import dataclasses

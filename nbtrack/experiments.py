@@ -25,19 +25,15 @@ from nbtrack.device_lock import alone_on, beside_others_on
 from nbtrack.map_quality import score_map
 from nbtrack.mapping import FittedMap, load_map, map_sequence, split_holdout
 from nbtrack.metrics import trajectory_metrics
-from nbtrack.parallel import Report
+from nbtrack.parallel import Report, quiet
 from nbtrack.provenance import versions
 from nbtrack.storage import write_json_atomic, write_text_atomic
 from nbtrack.tracking import TrackedSequence, track_sequence
 from nbtrack.trajectories import read_tum, write_tum
 
 
-def _quiet(done: int, status: str) -> None:
-    """A report that nobody reads."""
-
-
 def obtain_map(
-    cell: MapCell, device: torch.device | None = None, report: Report = _quiet
+    cell: MapCell, device: torch.device | None = None, report: Report = quiet
 ) -> FittedMap:
     """The cell's map from the cache; where it is missing or unfinished, made or resumed first."""
     device = device or choose_device()
@@ -57,7 +53,7 @@ def map_summary(cell: MapCell) -> dict[str, Any]:
 
 
 def obtain_track(
-    cell: TrackCell, device: torch.device | None = None, report: Report = _quiet
+    cell: TrackCell, device: torch.device | None = None, report: Report = quiet
 ) -> dict[str, Any]:
     """The cell's metrics from the cache, or of a run made now. The map is obtained first."""
     device = device or choose_device()
@@ -71,7 +67,7 @@ def obtain_track(
 
 
 def run_track(
-    cell: TrackCell, folder: Path, device: torch.device, report: Report = _quiet
+    cell: TrackCell, folder: Path, device: torch.device, report: Report = quiet
 ) -> dict[str, Any]:
     """Track now, whatever the cache holds, write the run's files to a folder; return its metrics.
 

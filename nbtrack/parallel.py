@@ -27,6 +27,11 @@ from nbtrack.errors import NbtrackError
 Report = Callable[[int, str], None]
 """Called by a job with the units done so far and a word on how it goes."""
 
+
+def quiet(done: int, status: str) -> None:
+    """A report that nobody reads."""
+
+
 _BAR = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
 
 
