@@ -11,19 +11,21 @@ import pandas as pd
 from nbtrack.budget import paper_steps
 from nbtrack.cells import MapCell, TrackCell
 from nbtrack.claims import iteration_ratio
-from nbtrack.config import Preset, with_settings
+from nbtrack.config import Preset
 from nbtrack.data import parse_frames
 from nbtrack.experiments import map_summary, read_poses
 from nbtrack.grid import TableCell, plan_table_1, run_maps, run_tracks
 from nbtrack.metrics import translation_errors
-from nbtrack.motion_models import MOTION_MODELS
 from nbtrack.scenes import Scene
+from nbtrack.settings import with_settings
 from nbtrack.trackers import tracker_class
 
 RATE_FACTORS = (1.0, 2.0, 4.0)
 """What both of the paper's learning rates are multiplied by."""
 ITERATION_SHARES = (0.125, 0.35, 1.0)
 """Shares of a preset's mapping iterations; each is a map of its own, its learning rate too."""
+COMPARED_STARTS = ("previous_pose", "constant_velocity")
+"""Where a frame's search starts: models that give one answer, as the paper's trackers need."""
 COMPARED_FRAMES = 40
 """Frames over which volume rendering is compared in both maps: it is slow."""
 
@@ -188,7 +190,7 @@ def _plan_starts(
     block = replace(preset, tables=replace(preset.tables, rates_hz=(float(rate_hz),)))
     rows, cells = [], []
     for name in trackers:
-        for model in MOTION_MODELS:
+        for model in COMPARED_STARTS:
             changed = with_settings(block, f"tracking.{name}.motion_model={model}")
             for cell in plan_table_1(changed, scenes, trackers=(name,)):
                 cells.append(cell.run)

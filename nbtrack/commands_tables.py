@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from nbtrack.bench import default_pixels, obtain_steps
 from nbtrack.comparison import beside_published, write_comparisons
-from nbtrack.config import Preset, changed_settings
+from nbtrack.config import Preset
 from nbtrack.device import choose_device, device_name
 from nbtrack.errors import ConfigError, NbtrackError, nearest_name
 from nbtrack.explain import explain_run, find_cells
@@ -17,6 +17,7 @@ from nbtrack.grid import BUDGETS, plan_table_1, prepare_scenes, table_1_results
 from nbtrack.latex import TableNotes, write_tables
 from nbtrack.parallel import Execution
 from nbtrack.paths import PAPER_TABLES
+from nbtrack.settings import changed_settings
 from nbtrack.storage import write_text_atomic
 from nbtrack.tables import (
     average_over_seeds,

@@ -5,10 +5,11 @@ import shlex
 from collections.abc import Sequence
 
 from nbtrack.cells import TrackCell
-from nbtrack.config import Preset, changed_settings
+from nbtrack.config import Preset
 from nbtrack.errors import ConfigError, MissingError, nearest_name
 from nbtrack.grid import TableCell
 from nbtrack.scenes import DATASET_SCENES
+from nbtrack.settings import changed_settings
 from nbtrack.synthetic import ROOMS
 from nbtrack.tables import PAPER_SCENE_LABELS
 

@@ -26,7 +26,8 @@ from nbtrack.config import as_dict
 # Modules that store, tell or choose. The settings stand in a key with their values, and rooms have
 # a version of their own: what was rendered is part of the key as data.
 _NO_PART = (
-    "nbtrack.config", "nbtrack.errors", "nbtrack.storage", "nbtrack.device", "nbtrack.synthetic",
+    "nbtrack.config", "nbtrack.settings", "nbtrack.errors", "nbtrack.storage", "nbtrack.device",
+    "nbtrack.synthetic",
 )  # fmt: skip
 
 

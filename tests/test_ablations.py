@@ -13,9 +13,10 @@ from nbtrack.ablations import (
     start_of_the_search,
     vr_in_both_maps,
 )
-from nbtrack.config import Preset, resolve_preset
+from nbtrack.config import Preset
 from nbtrack.grid import prepare_scenes, table_1_cells
 from nbtrack.scenes import Scene
+from nbtrack.settings import resolve_preset
 
 
 @pytest.fixture

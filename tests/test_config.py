@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from nbtrack.config import PRESETS, FieldConfig, Preset, as_dict, resolve_preset
+from nbtrack.config import PRESETS, FieldConfig, Preset, as_dict
 from nbtrack.errors import ConfigError, MissingError
 from nbtrack.provenance import fingerprint
 from nbtrack.scenes import DATASET_SCENES
+from nbtrack.settings import resolve_preset
 from nbtrack.synthetic import REPORTED_ROOMS
 
 
@@ -53,7 +54,9 @@ def test_papers_figures() -> None:
     assert paper.tables.rates_hz == (10.0, 5.0, 2.0)
     assert paper.tables.budgets_ms == (50.0, 100.0, 500.0)
     assert paper.scenes.names == DATASET_SCENES
-    assert {t.motion_model for t in paper.tracking.values()} == {"previous_pose"}
+    of_the_paper = [paper.tracking[name] for name in ("vr", "vr_neus", "sdf")]
+    assert {t.motion_model for t in of_the_paper} == {"previous_pose"}
+    assert {t.bake_voxel for t in of_the_paper} == {0.0}
 
 
 def test_nothing_is_tuned_on_what_is_reported() -> None:

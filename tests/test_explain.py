@@ -8,8 +8,9 @@ import pytest
 from tiny import TINY
 
 from nbtrack.cli import main
-from nbtrack.config import PRESETS, changed_settings, resolve_preset, with_settings
+from nbtrack.config import PRESETS
 from nbtrack.scenes import find_scene
+from nbtrack.settings import changed_settings, resolve_preset, with_settings
 
 WORDS = [word for setting in (*TINY, "scenes.track_frames=1:4") for word in ("--set", setting)]
 

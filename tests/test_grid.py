@@ -10,7 +10,7 @@ from tiny import TINY
 from nbtrack.bench import default_pixels, measure_steps
 from nbtrack.cells import MapCell
 from nbtrack.claims import in_words, iteration_ratio, paper_claims
-from nbtrack.config import Preset, resolve_preset, with_settings
+from nbtrack.config import Preset
 from nbtrack.device import choose_device
 from nbtrack.errors import ConfigError, MissingError
 from nbtrack.experiments import map_summary, read_frames, read_poses
@@ -25,6 +25,7 @@ from nbtrack.grid import (
 )
 from nbtrack.parallel import Execution
 from nbtrack.scenes import find_scene
+from nbtrack.settings import resolve_preset, with_settings
 from nbtrack.tables import published_table_1, published_table_2, table_1
 
 
