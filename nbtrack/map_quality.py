@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 
 from nbtrack.data import Sequence
 from nbtrack.errors import DataError
-from nbtrack.fields import Field
+from nbtrack.fields import Field, LearnedField
+from nbtrack.fields.points import PointField
 from nbtrack.meshes import extract_mesh, keep_seen, query_field, seen_by
 from nbtrack.sampling import PixelSampler
 from nbtrack.synthetic import Room, true_surface_points
@@ -25,7 +26,10 @@ _POINTS_SCORED = 20_000
 
 @dataclass(frozen=True)
 class MapQuality:
-    """Scores of one map. None where the truth is not known, or the field has no distance."""
+    """Scores of one map. None where the truth is not known, or the field has no such answer.
+
+    A cloud of points is no mesh and cannot be rendered: its points take the mesh's place.
+    """
 
     psnr_db: float | None = None  # of held-out colour
     depth_l1_m: float | None = None  # of held-out depth
@@ -56,12 +60,15 @@ def score_map(
         room: the exact scene, if it is a synthetic one.
     """
     scores: dict[str, float] = {}
-    if len(held_out):
+    if len(held_out) and isinstance(field, LearnedField):
         scores |= score_images(field, sequence, held_out)
     if room is not None:
         if hasattr(field, "sdf_gradient"):
             scores |= score_sdf(field, sequence, mapped, room)
-        scores |= score_mesh(field, sequence, mapped, room, voxel)
+        if isinstance(field, PointField):
+            scores |= score_points(field, sequence, mapped, room)
+        else:
+            scores |= score_mesh(field, sequence, mapped, room, voxel)
     return MapQuality(**scores)
 
 
@@ -116,7 +123,21 @@ def score_mesh(
         return {}
     if len(mesh.faces) == 0:
         return {}
-    points = mesh.sample(_POINTS_SCORED, seed=0)
+    return _score_surface(mesh.sample(_POINTS_SCORED, seed=0), sequence, mapped, room)
+
+
+def score_points(
+    field: PointField, sequence: Sequence, mapped: Frames, room: Room
+) -> dict[str, float]:
+    """The scores of a mesh, of the map's points: as many as are drawn on a mesh."""
+    order = np.random.default_rng(0).permutation(len(field.points))[:_POINTS_SCORED]
+    points = field.points.cpu().double().numpy()[order]
+    return _score_surface(points, sequence, mapped, room) if len(points) else {}
+
+
+def _score_surface(
+    points: Float[np.ndarray, "n 3"], sequence: Sequence, mapped: Frames, room: Room
+) -> dict[str, float]:
     to_truth = np.abs(room.sdf(points))
     truth = true_surface_points(room, _POINTS_SCORED, seed=0)
     truth = truth[seen_by(truth, sequence, mapped)]

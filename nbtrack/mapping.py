@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,8 +18,8 @@ from nbtrack.config import FieldConfig, MappingConfig, as_dict
 from nbtrack.data import Sequence
 from nbtrack.device import naming_what_to_lower, suitable_threads
 from nbtrack.errors import DataError, NumericalError
-from nbtrack.fields import Field, make_field
-from nbtrack.sampling import PixelSampler, mapping_depths
+from nbtrack.fields import Field, LearnedField, field_class, make_field
+from nbtrack.sampling import PixelSampler, draw_batch
 from nbtrack.storage import read_checkpoint, write_bytes_atomic
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
@@ -68,7 +69,7 @@ def map_sequence(
     checkpoint: Path | None = None,
     on_iteration: OnIteration | None = None,
 ) -> FittedMap:
-    """Fit a field to a sequence with known poses.
+    """Fit a field to a sequence with known poses; points, which learn nothing, are fused.
 
     Args:
         checkpoint: file that is written every few seconds and, where it exists and fits, resumed
@@ -81,6 +82,11 @@ def map_sequence(
         OutOfMemory: the device holds too few rays at once.
     """
     device = device or torch.device("cpu")
+    if not issubclass(field_class(field_name), LearnedField):
+        settings = _settings(field_name, sequence, field_config, config, seed)
+        return _fuse_sequence(
+            sequence, field_config, config, settings, device, checkpoint, on_iteration
+        )
     setting = f"mapping.{field_name}.n_rays={config.n_rays}"
     with naming_what_to_lower(setting), suitable_threads(field_config.width):
         run = _Run(field_name, sequence, field_config, config, seed, device)
@@ -136,10 +142,7 @@ class _Run:
         device: torch.device,
     ) -> None:
         self.config = config
-        self.settings = {
-            "field": field_name, "seed": seed, "sequence": sequence.name, "frames": len(sequence),
-            "field_config": as_dict(field_config), "mapping_config": as_dict(config),
-        }  # fmt: skip
+        self.settings = _settings(field_name, sequence, field_config, config, seed)
         self.bounds = observed_bounds(sequence)
         self.field = make_field(field_name, field_config, self.bounds, seed).to(device)
         self.optimizer = torch.optim.Adam(self.field.parameters(), lr=config.learning_rate)
@@ -147,6 +150,7 @@ class _Run:
         self.sampler = PixelSampler(sequence, device)
         mapping_frames, _ = split_holdout(len(sequence), config.holdout_every)
         self.frames = torch.from_numpy(mapping_frames).to(device)
+        self.field.prepare(sequence, mapping_frames)
         self.iteration = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
@@ -180,9 +184,8 @@ class _Run:
     def _step(self, iteration: int) -> dict[str, torch.Tensor]:
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(self.config, iteration)
-        rays = self.sampler.draw(self.config.n_rays, self.generator, self.frames)
-        depths = mapping_depths(self.field, rays, self.config, self.generator)
-        terms = self.field.mapping_losses(rays, depths, self.config, self.generator)
+        batch = draw_batch(self.field, self.sampler, self.config, self.generator, self.frames)
+        terms = self.field.mapping_losses(batch, self.config, self.generator)
         self.optimizer.zero_grad(set_to_none=True)
         torch.stack(list(terms.values())).sum().backward()
         self.optimizer.step()
@@ -194,38 +197,99 @@ class _Run:
         return history
 
     def save(self, checkpoint: Path) -> None:
-        history = self.history_frame()
-        buffer = io.BytesIO()
-        torch.save(
-            {
-                "settings": self.settings,
-                "bounds": (self.bounds.minimum, self.bounds.maximum),
-                "field": self.field.state_dict(),
-                "optimizer": self.optimizer.state_dict(),
-                "generator": self.generator.get_state(),
-                "iteration": self.iteration,
-                "seconds": self.seconds,
-                "history": {name: torch.tensor(history[name].to_numpy()) for name in history},
-            },
-            buffer,
-        )
-        write_bytes_atomic(checkpoint, buffer.getvalue())
+        fitted = FittedMap(self.field, self.history_frame(), self.seconds)
+        _write_map(
+            checkpoint, self.settings, fitted, self.iteration,
+            optimizer=self.optimizer.state_dict(), generator=self.generator.get_state(),
+        )  # fmt: skip
 
     def load(self, checkpoint: Path) -> None:
-        state = read_checkpoint(checkpoint)
-        if state["settings"] != self.settings:
-            found, wanted = state["settings"], self.settings
-            changed = [name for name in wanted if found.get(name) != wanted[name]]
-            raise DataError(
-                f"{checkpoint} was made with another {', '.join(changed)}: "
-                "remove it, or choose another output folder"
-            )
+        state = _checked_state(checkpoint, self.settings)
         self.field.load_state_dict(state["field"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
         self.iteration, self.seconds = state["iteration"], state["seconds"]
         columns = {name: values.tolist() for name, values in state["history"].items()}
         self.history = pd.DataFrame(columns).to_dict("records")
+
+
+def _fuse_sequence(
+    sequence: Sequence,
+    field_config: FieldConfig,
+    config: MappingConfig,
+    settings: dict[str, Any],
+    device: torch.device,
+    checkpoint: Path | None,
+    on_iteration: OnIteration | None,
+) -> FittedMap:
+    """The map of a field that is not fitted, but fused from the mapped frames all at once."""
+    if checkpoint and checkpoint.exists():
+        _checked_state(checkpoint, settings)
+        return load_map(checkpoint, settings["field"], field_config, device)
+    start = time.perf_counter()
+    bounds = observed_bounds(sequence)
+    field = make_field(settings["field"], field_config, bounds, settings["seed"])
+    mapping_frames, _ = split_holdout(len(sequence), config.holdout_every)
+    field.fuse(sequence, mapping_frames, config.voxel)
+    field.to(device).eval().requires_grad_(False)
+    row = {"points": float(len(field.points)), "bytes": float(field.n_bytes)}
+    history = pd.DataFrame([row])
+    history.index.name = "iteration"
+    fitted = FittedMap(field, history, time.perf_counter() - start)
+    if on_iteration:
+        on_iteration(config.iterations, row)  # all that a progress bar waits for
+    if checkpoint:
+        _write_map(checkpoint, settings, fitted, iteration=1)
+    return fitted
+
+
+def _settings(
+    field_name: str,
+    sequence: Sequence,
+    field_config: FieldConfig,
+    config: MappingConfig,
+    seed: int,
+) -> dict[str, Any]:
+    """What a checkpoint must have been made with, to be taken up."""
+    return {
+        "field": field_name, "seed": seed, "sequence": sequence.name, "frames": len(sequence),
+        "field_config": as_dict(field_config), "mapping_config": as_dict(config),
+    }  # fmt: skip
+
+
+def _checked_state(checkpoint: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """A checkpoint's content. Raises DataError if it was made with other settings."""
+    state = read_checkpoint(checkpoint)
+    found = state["settings"]
+    if found != settings:
+        changed = [name for name in settings if found.get(name) != settings[name]]
+        raise DataError(
+            f"{checkpoint} was made with another {', '.join(changed)}: "
+            "remove it, or choose another output folder"
+        )
+    return state
+
+
+def _write_map(
+    checkpoint: Path, settings: dict[str, Any], fitted: FittedMap, iteration: int, **rest: Any
+) -> None:
+    bounds = fitted.field.bounds
+    buffer = io.BytesIO()
+    torch.save(
+        {
+            "settings": settings,
+            "bounds": (bounds.minimum, bounds.maximum),
+            "field": fitted.field.state_dict(),
+            **rest,
+            "iteration": iteration,
+            "seconds": fitted.seconds,
+            "history": {
+                name: torch.tensor(column.to_numpy()) for name, column in fitted.history.items()
+            },
+        },
+        buffer,
+    )
+    write_bytes_atomic(checkpoint, buffer.getvalue())
 
 
 def learning_rate(config: MappingConfig, iteration: int) -> float:

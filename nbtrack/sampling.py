@@ -1,18 +1,27 @@
 """Random pixels of a sequence as rays, and where along the rays to look."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from nbtrack.bounds import SceneBounds
-from nbtrack.camera import pixel_directions
+from nbtrack.camera import backproject, pixel_directions
 from nbtrack.config import MappingConfig
 from nbtrack.data import MILLIMETRE, Sequence
 from nbtrack.device import has_room_for
-from nbtrack.fields.base import Field, Rays
+from nbtrack.fields.base import Batch, LearnedField, Rays
 from nbtrack.rendering import importance_depths, stratified_depths
 
 NEAR = 0.05  # m, z-depth before which nothing is looked for: closer than any depth camera measures
+
+# Tangent planes: how far away neighbours are, as a share of the image's width, and by how much of
+# the depth they may differ, which cuts off edges and incidences above some 75 degrees (our choice).
+_PLANE_REACH, _PLANE_JUMP = 1 / 64, 0.1
+# Points to track: a neighbouring depth that differs by more, as a share, marks an edge.
+_EDGE_JUMP = 0.05
+_DRAWN_PER_POINT = 4
 
 
 class PixelSampler:
@@ -54,6 +63,31 @@ class PixelSampler:
         directions = (T_world_camera[:, :3, :3] @ directions_camera[..., None]).squeeze(-1)
         return Rays(T_world_camera[:, :3, 3], directions, color, depth)
 
+    def plane_distance_per_depth(
+        self, frames: Int[Tensor, "n"], rows: Int[Tensor, "n"], columns: Int[Tensor, "n"]
+    ) -> Float[Tensor, "n"]:
+        """Distance from the tangent plane at a pixel for one metre of z-depth; see `Rays`.
+
+        The plane goes through the pixel's neighbours to the left and right, above and below, some
+        pixels away, so that noise tilts it little. 0 where one of them is not measured, or lies on
+        another surface.
+        """
+        _, height, width = self.depths_mm.shape
+        reach = max(1, round(width * _PLANE_REACH))
+        depth = self.measurements(frames, rows, columns)[1]
+        points, is_whole = [], depth > 0
+        for down, right in ((0, -reach), (0, reach), (-reach, 0), (reach, 0)):
+            row, column = rows + down, columns + right
+            is_whole &= (row >= 0) & (row < height) & (column >= 0) & (column < width)
+            row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
+            near = self.measurements(frames, row, column)[1]
+            is_whole &= (near > 0) & ((near - depth).abs() < _PLANE_JUMP * depth)
+            points.append(backproject(self.intrinsics, column, row, near))
+        normal = torch.linalg.cross(points[1] - points[0], points[3] - points[2])
+        normal = torch.nn.functional.normalize(normal, dim=-1)
+        directions = pixel_directions(self.intrinsics, columns, rows)
+        return (normal * directions).sum(dim=-1).abs() * is_whole
+
     def measurements(
         self, frames: Int[Tensor, "n"], rows: Int[Tensor, "n"], columns: Int[Tensor, "n"]
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
@@ -64,15 +98,48 @@ class PixelSampler:
         return color, depth_mm.float() * MILLIMETRE
 
     def draw(
-        self, n_rays: int, generator: torch.Generator, frames: Int[Tensor, "frames"]
+        self,
+        n_rays: int,
+        generator: torch.Generator,
+        frames: Int[Tensor, "frames"],
+        tangent_planes: bool = False,
     ) -> Rays:
-        """Rays through pixels drawn uniformly over the given frames."""
+        """Rays through pixels drawn uniformly over the given frames; with planes, if asked for."""
         _, height, width = self.depths_mm.shape
         chosen, rows, columns = (
             torch.randint(limit, (n_rays,), generator=generator, device=generator.device)
             for limit in (len(frames), height, width)
         )
-        return self.rays(frames[chosen], rows, columns)
+        rays = self.rays(frames[chosen], rows, columns)
+        if not tangent_planes:
+            return rays
+        per_depth = self.plane_distance_per_depth(frames[chosen], rows, columns)
+        return replace(rays, plane_distance_per_depth=per_depth)
+
+    def smooth_points(
+        self, frame: int, n_points: int, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+        """Observed points (m, camera frame) of a frame and their colours in [0, 1], at random.
+
+        Pixels at the border and at depth edges are left out: an edge's depth may belong to either
+        side. Only a few times as many pixels as wanted are looked at, whatever the image's size;
+        where a frame is sparsely measured, fewer than `n_points` come back.
+        """
+        _, height, width = self.depths_mm.shape
+        drawn = (_DRAWN_PER_POINT * n_points,)
+        rows, columns = (
+            torch.randint(1, size - 1, drawn, generator=generator, device=generator.device)
+            for size in (height, width)
+        )
+        frames = torch.full_like(rows, frame)
+        color, depth = self.measurements(frames, rows, columns)
+        is_smooth = depth > 0
+        for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+            beside = self.measurements(frames, rows + down, columns + right)[1]
+            is_smooth &= (beside - depth).abs() < _EDGE_JUMP * depth
+        kept = torch.nonzero(is_smooth).squeeze(-1)[:n_points]
+        points = backproject(self.intrinsics, columns[kept], rows[kept], depth[kept])
+        return points, color[kept]
 
     def measured_pixels(self, frame: int) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
         """Rows and columns of all pixels of one frame that have a depth."""
@@ -80,13 +147,22 @@ class PixelSampler:
         return rows.to(self.device), columns.to(self.device)
 
 
-def mapping_depths(
-    field: Field, rays: Rays, config: MappingConfig, generator: torch.Generator
-) -> Float[Tensor, "rays samples"]:
-    """Ascending sample depths (m) for a field's mapping: by its own wish, guided or not."""
+def draw_batch(
+    field: LearnedField,
+    sampler: PixelSampler,
+    config: MappingConfig,
+    generator: torch.Generator,
+    frames: Int[Tensor, "frames"],
+) -> Batch:
+    """Rays for one iteration of mapping, with samples by the field's own wish: guided or not."""
+    rays = sampler.draw(config.n_rays, generator, frames, field.is_taught_distances)
     if field.depth_guided:
-        return guided_depths(rays, field.bounds, config, generator)
-    return two_pass_depths(field, rays, config.n_stratified, config.n_surface, generator)
+        depths = guided_depths(rays, field.bounds, config, generator)
+    else:
+        depths = two_pass_depths(field, rays, config.n_stratified, config.n_surface, generator)
+    if not field.is_taught_distances:
+        return Batch(rays, depths)
+    return Batch(rays, depths, sampler.draw(config.n_surface_points, generator, frames))
 
 
 def guided_depths(
@@ -110,7 +186,7 @@ def guided_depths(
 
 @torch.no_grad()
 def two_pass_depths(
-    field: Field,
+    field: LearnedField,
     rays: Rays,
     n_stratified: int,
     n_importance: int,

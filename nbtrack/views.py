@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nbtrack.camera import Intrinsics, pixel_directions
-from nbtrack.fields import Field, Rays
+from nbtrack.fields import LearnedField, Rays
 from nbtrack.sampling import two_pass_depths
 
 _RAYS_AT_ONCE = 4096
@@ -26,7 +26,7 @@ class View:
 
 
 def render_view(
-    field: Field, intrinsics: Intrinsics, T_world_camera: Float[np.ndarray, "4 4"]
+    field: LearnedField, intrinsics: Intrinsics, T_world_camera: Float[np.ndarray, "4 4"]
 ) -> View:
     """Colour and z-depth image (m) of a field from a camera pose. Nothing in it is random."""
     device = next(field.parameters()).device
@@ -49,7 +49,7 @@ def render_view(
 
 @torch.no_grad()
 def render_rays(
-    field: Field,
+    field: LearnedField,
     origins_world: Float[Tensor, "rays 3"],
     directions_world: Float[Tensor, "rays 3"],
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:

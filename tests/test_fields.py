@@ -10,8 +10,8 @@ from torch import Tensor
 from nbtrack.bounds import SceneBounds
 from nbtrack.config import FieldConfig, MappingConfig
 from nbtrack.errors import ConfigError
-from nbtrack.fields import FIELDS, Field, Rays, field_class, make_field
-from nbtrack.fields.base import measured_mean
+from nbtrack.fields import FIELDS, LearnedField, Rays, field_class, make_field
+from nbtrack.fields.base import Batch, measured_mean
 from nbtrack.fields.imap import LEAST_DEVIATION, rendering_losses
 from nbtrack.rendering import Rendering
 from nbtrack.sampling import guided_depths
@@ -41,10 +41,10 @@ def random_rays(n_rays: int, depth: float) -> Rays:
     return Rays(origins, directions, colors, torch.full((n_rays,), depth))
 
 
-def losses(field: Field, rays: Rays) -> dict[str, Tensor]:
+def losses(field: LearnedField, rays: Rays) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(3)
     depths = guided_depths(rays, ROOM, CONFIG, generator)
-    return field.mapping_losses(rays, depths, CONFIG, generator)
+    return field.mapping_losses(Batch(rays, depths), CONFIG, generator)
 
 
 @pytest.mark.parametrize(("name", "expected"), [("imap", 246_555), ("neus", 246_556)])
@@ -192,7 +192,8 @@ def test_rays_without_depth_do_not_count(name: str) -> None:
             rays.origins_world[chosen], rays.directions_world[chosen], rays.color[chosen],
             depth[chosen],
         )  # fmt: skip
-        return field.mapping_losses(some, depths[chosen], CONFIG, torch.Generator().manual_seed(0))
+        batch = Batch(some, depths[chosen])
+        return field.mapping_losses(batch, CONFIG, torch.Generator().manual_seed(0))
 
     mixed = terms(torch.ones(30, dtype=torch.bool), torch.where(measured, rays.depth, 0.0))
     alone = terms(measured, rays.depth)

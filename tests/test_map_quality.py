@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nbtrack.bounds import SceneBounds, observed_bounds
 from nbtrack.data import Sequence, read_sequence
-from nbtrack.fields.base import Field
+from nbtrack.fields.base import LearnedField
 from nbtrack.map_quality import score_map, score_mesh, score_sdf
 from nbtrack.meshes import extract_mesh, keep_seen, seen_by
 from nbtrack.synthetic import Room, build_room, make_room
@@ -30,7 +30,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Sequence:
     return read_sequence(folder, depth_folder="depth")
 
 
-class ShiftedRoom(Field):
+class ShiftedRoom(LearnedField):
     """The exact room, its distance off by a constant: the surface moves by as much."""
 
     name, label, surface_level = "shifted", "shifted", 0.0

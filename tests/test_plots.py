@@ -17,7 +17,7 @@ from nbtrack.bounds import SceneBounds
 from nbtrack.camera import Intrinsics
 from nbtrack.data import Sequence
 from nbtrack.errors import DataError
-from nbtrack.fields import Field
+from nbtrack.fields import LearnedField
 from nbtrack.plots.doll_house import screen_axes
 from nbtrack.plots.style import path_colors
 from nbtrack.plots.top_view import TopView
@@ -29,7 +29,7 @@ from nbtrack.views import View
 RADIUS = 1.5  # m
 
 
-class AnalyticField(Field):
+class AnalyticField(LearnedField):
     """A field without a network."""
 
     name, label = "analytic", "Analytic"
@@ -48,7 +48,7 @@ class AnalyticField(Field):
     def render(self, rays, depths):
         raise NotImplementedError
 
-    def mapping_losses(self, rays, depths, config, generator):
+    def mapping_losses(self, batch, config, generator):
         raise NotImplementedError
 
     @property

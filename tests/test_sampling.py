@@ -12,7 +12,7 @@ from nbtrack.bounds import SceneBounds
 from nbtrack.camera import Intrinsics, backproject
 from nbtrack.config import MappingConfig
 from nbtrack.data import Sequence
-from nbtrack.fields import Field, Rays
+from nbtrack.fields import LearnedField, Rays
 from nbtrack.geometry import transform_points
 from nbtrack.rendering import Rendering, composite, weights_from_density, weights_from_sdf
 from nbtrack.sampling import NEAR, PixelSampler, guided_depths, rays_end, two_pass_depths
@@ -23,7 +23,7 @@ BOX = SceneBounds((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))
 CONFIG = MappingConfig(n_stratified=16, n_surface=8, surface_band=0.15)
 
 
-class Wall(Field):
+class Wall(LearnedField):
     """A gray wall at z = 2, either dense behind it or as a signed distance."""
 
     name = label = "wall"

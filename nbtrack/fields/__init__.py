@@ -3,9 +3,27 @@
 import importlib
 import pkgutil
 
-from nbtrack.fields.base import FIELDS, Field, Rays, field_class, make_field
+from nbtrack.fields.base import (
+    FIELDS,
+    Field,
+    LearnedField,
+    Linearization,
+    Rays,
+    field_class,
+    make_field,
+    supervised_field,
+)
 
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
-__all__ = ["FIELDS", "Field", "Rays", "field_class", "make_field"]
+__all__ = [
+    "FIELDS",
+    "Field",
+    "LearnedField",
+    "Linearization",
+    "Rays",
+    "field_class",
+    "make_field",
+    "supervised_field",
+]

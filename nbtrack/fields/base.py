@@ -4,14 +4,19 @@ import abc
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nbtrack.bounds import SceneBounds
 from nbtrack.config import FieldConfig, MappingConfig
+from nbtrack.data import Sequence
 from nbtrack.errors import ConfigError, nearest_name
 from nbtrack.rendering import Rendering
+
+LUMA = torch.tensor([0.299, 0.587, 0.114])
+"""Weights of red, green and blue in the intensity that trackers compare (ITU-R BT.601)."""
 
 
 @dataclass(frozen=True)
@@ -22,10 +27,32 @@ class Rays:
     directions_world: Float[Tensor, "rays 3"]  # z = 1 in the camera frame: steps are z-depths
     color: Float[Tensor, "rays 3"]  # measured, in [0, 1]
     depth: Float[Tensor, "rays"]  # measured z-depth (m), 0 = no measurement
+    # Distance (m) from the measured surface's tangent plane that one metre of z-depth makes: below
+    # the ray's length by the cosine of incidence. 0 where not known; None where not asked for.
+    plane_distance_per_depth: Float[Tensor, "rays"] | None = None
 
     def points(self, depths: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples 3"]:
         """World points (m) at z-depths along the rays."""
         return self.origins_world[:, None] + depths[..., None] * self.directions_world[:, None]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What one iteration of mapping looks at."""
+
+    rays: Rays
+    depths: Float[Tensor, "rays samples"]  # ascending z-depths (m) of the samples on them
+    surface: Rays | None = None  # through further pixels, of whose points only the last counts
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """A field's value and intensity at points, with their spatial gradients; all without graph."""
+
+    value: Float[Tensor, "n"]  # signed distance, m
+    value_gradient: Float[Tensor, "n 3"]  # no unit, length 1 for a true distance
+    intensity: Float[Tensor, "n"]  # luma of the colour, in [0, 1]
+    intensity_gradient: Float[Tensor, "n 3"]  # 1/m
 
 
 class Field(nn.Module, abc.ABC):
@@ -33,9 +60,7 @@ class Field(nn.Module, abc.ABC):
 
     name: str  # on the command line and in file names
     label: str  # in tables and figures
-    # Whether mapping may place its samples by the measured depth. A field that is tracked by
-    # rendering must not: tracking has no such help, and the map would be thinner than its rays see.
-    depth_guided: bool = True
+    supervision: str = "rendering"  # what teaches it: tells variants of one field apart
 
     def __init__(self, bounds: SceneBounds) -> None:
         super().__init__()
@@ -47,24 +72,50 @@ class Field(nn.Module, abc.ABC):
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
         """Colour in [0, 1] and the field's value at points (m, world frame)."""
 
+    def linearize(self, points_world: Float[Tensor, "n 3"]) -> Linearization:
+        """Value and intensity with their gradients at points (m), by automatic differentiation.
+
+        Fields that second-order trackers use override it: writing the derivatives out saves the
+        bookkeeping, which costs more than the arithmetic of a small network.
+        """
+        points = points_world.detach().requires_grad_()
+        with torch.enable_grad():
+            color, value = self(points)
+            intensity = color @ LUMA.to(color)
+            (value_gradient,) = torch.autograd.grad(value.sum(), points, retain_graph=True)
+            (intensity_gradient,) = torch.autograd.grad(intensity.sum(), points)
+        return Linearization(
+            value.detach(), value_gradient, intensity.detach(), intensity_gradient
+        )
+
+    @property
+    @abc.abstractmethod
+    def surface_level(self) -> float:
+        """The value whose isosurface is drawn as the scene's surface."""
+
+
+class LearnedField(Field):
+    """A field that is fitted to posed frames by gradient descent, and can be rendered."""
+
+    # Whether mapping may place its samples by the measured depth. A field that is tracked by
+    # rendering must not: tracking has no such help, and the map would be thinner than its rays see.
+    depth_guided: bool = True
+    # Whether mapping's batches hold tangent planes and surface points: four more depths a ray, and
+    # more pixels.
+    is_taught_distances: bool = False
+
     @abc.abstractmethod
     def render(self, rays: Rays, depths: Float[Tensor, "rays samples"]) -> Rendering:
         """Volume rendering with samples at ascending z-depths (m)."""
 
     @abc.abstractmethod
     def mapping_losses(
-        self,
-        rays: Rays,
-        depths: Float[Tensor, "rays samples"],
-        config: MappingConfig,
-        generator: torch.Generator,
+        self, batch: Batch, config: MappingConfig, generator: torch.Generator
     ) -> dict[str, Float[Tensor, ""]]:
         """Weighted loss terms of one batch by name; their sum is minimised."""
 
-    @property
-    @abc.abstractmethod
-    def surface_level(self) -> float:
-        """The value whose isosurface is drawn as the scene's surface."""
+    def prepare(self, sequence: Sequence, frames: Int[np.ndarray, "frames"]) -> None:
+        """Take from the frames to be mapped what the losses need besides the rays of a batch."""
 
     def diagnostics(self) -> dict[str, float]:
         """Scalars worth a curve over training, beside the losses."""
@@ -85,6 +136,27 @@ def field_class(name: str) -> type[Field]:
     if name not in FIELDS:
         raise ConfigError(f"unknown field {name!r}: {nearest_name(name, sorted(FIELDS))}")
     return FIELDS[name]
+
+
+def supervised_field(name: str, supervision: str) -> str:
+    """The name of the field that is `name` under a supervision ("rendering", "rendering+sdf").
+
+    Raises:
+        ConfigError: the field or the supervision is unknown, or they do not go together.
+    """
+    if field_class(name).supervision == supervision:
+        return name
+    variants = {
+        variant.supervision: other
+        for other, variant in FIELDS.items()
+        if issubclass(variant, field_class(name))
+    }
+    if supervision not in variants:
+        raise ConfigError(
+            f"field {name!r} knows no supervision {supervision!r}: "
+            f"{nearest_name(supervision, sorted(variants))}"
+        )
+    return variants[supervision]
 
 
 def make_field(name: str, config: FieldConfig, bounds: SceneBounds, seed: int) -> Field:

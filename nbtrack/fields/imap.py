@@ -6,7 +6,7 @@ from torch import Tensor
 
 from nbtrack.bounds import SceneBounds
 from nbtrack.config import FieldConfig, MappingConfig
-from nbtrack.fields.base import Field, Rays, measured_mean, register_field
+from nbtrack.fields.base import Batch, LearnedField, Rays, measured_mean, register_field
 from nbtrack.fields.mlp import FourierMlp
 from nbtrack.rendering import Rendering, composite, weights_from_density
 
@@ -19,7 +19,7 @@ LEAST_DEVIATION = 0.02
 
 
 @register_field
-class IMapField(Field):
+class IMapField(LearnedField):
     """f: position -> (colour, density in 1/m). Paper, Sec. II-A."""
 
     name = "imap"
@@ -49,14 +49,11 @@ class IMapField(Field):
         return composite(weights, colors.view(*depths.shape, 3), depths)
 
     def mapping_losses(
-        self,
-        rays: Rays,
-        depths: Float[Tensor, "rays samples"],
-        config: MappingConfig,
-        generator: torch.Generator,
+        self, batch: Batch, config: MappingConfig, generator: torch.Generator
     ) -> dict[str, Float[Tensor, ""]]:
         """iMAP's geometric and photometric losses, the latter five times."""
-        return rendering_losses(self.render(rays, depths), rays, config.lambda_color)
+        rendering = self.render(batch.rays, batch.depths)
+        return rendering_losses(rendering, batch.rays, config.lambda_color)
 
     @property
     def surface_level(self) -> float:

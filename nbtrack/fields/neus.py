@@ -6,13 +6,21 @@ from torch import Tensor
 
 from nbtrack.bounds import SceneBounds
 from nbtrack.config import FieldConfig, MappingConfig
-from nbtrack.fields.base import Field, Rays, measured_mean, register_field
+from nbtrack.fields.base import (
+    LUMA,
+    Batch,
+    LearnedField,
+    Linearization,
+    Rays,
+    measured_mean,
+    register_field,
+)
 from nbtrack.fields.mlp import FourierMlp
 from nbtrack.rendering import Rendering, composite, weights_from_sdf
 
 
 @register_field
-class NeuSField(Field):
+class NeuSField(LearnedField):
     """f: position -> (colour, signed distance in m, positive in free space). Paper, Sec. II-A.
 
     One parameter more than iMAP: `variance`, with s = exp(10 variance) in 1/m, the inverse
@@ -54,49 +62,68 @@ class NeuSField(Field):
             (gradient,) = torch.autograd.grad(sdf.sum(), points, create_graph=create_graph)
         return sdf, gradient
 
+    @torch.no_grad()
+    def linearize(self, points_world: Float[Tensor, "n 3"]) -> Linearization:
+        """Value and intensity with their gradients, written out: see `FourierMlp.linearize`."""
+        luma = LUMA.to(points_world)
+
+        def slopes(raw: Float[Tensor, "n 4"]) -> Float[Tensor, "2 n 4"]:
+            color = torch.sigmoid(raw[:, :3])
+            of_intensity = luma * color * (1 - color)
+            slope = raw.new_zeros(2, len(raw), 4)
+            slope[0, :, 3] = self.mlp.metres_per_unit
+            slope[1, :, :3] = of_intensity
+            return slope
+
+        raw, gradients = self.mlp.linearize(points_world, slopes)
+        return Linearization(
+            raw[:, 3] * self.mlp.metres_per_unit, gradients[0],
+            torch.sigmoid(raw[:, :3]) @ luma, gradients[1],
+        )  # fmt: skip
+
     def render(self, rays: Rays, depths: Float[Tensor, "rays samples"]) -> Rendering:
         """Volume rendering of the sections between samples.
 
         A section's depth and colour are the means of its two ends: its mid-point, where the
         weight applies (our choice; NeuS evaluates the network there once more).
         """
+        return self._composite(*self._along(rays, depths), depths)
+
+    def mapping_losses(
+        self, batch: Batch, config: MappingConfig, generator: torch.Generator
+    ) -> dict[str, Float[Tensor, ""]]:
+        """Colour L1, depth L1 and the eikonal term (NeuS, Eq. 15, with RGB-D's depth added)."""
+        return {
+            **rendered_losses(self.render(batch.rays, batch.depths), batch.rays, config),
+            "eikonal": config.lambda_eikonal * self._eikonal(batch, config, generator),
+        }
+
+    def _along(
+        self, rays: Rays, depths: Float[Tensor, "rays samples"]
+    ) -> tuple[Float[Tensor, "rays samples 3"], Float[Tensor, "rays samples"]]:
+        """Colour and signed distance (m) at samples along rays."""
         colors, sdf = self(rays.points(depths).flatten(0, 1))
-        colors = colors.view(*depths.shape, 3)
-        weights = weights_from_sdf(sdf.view_as(depths), self.inverse_deviation)
+        return colors.view(*depths.shape, 3), sdf.view_as(depths)
+
+    def _composite(
+        self,
+        colors: Float[Tensor, "rays samples 3"],
+        sdf: Float[Tensor, "rays samples"],
+        depths: Float[Tensor, "rays samples"],
+    ) -> Rendering:
+        weights = weights_from_sdf(sdf, self.inverse_deviation)
         middle_colors = (colors[:, 1:] + colors[:, :-1]) / 2
         return composite(weights, middle_colors, (depths[:, 1:] + depths[:, :-1]) / 2)
 
-    def mapping_losses(
-        self,
-        rays: Rays,
-        depths: Float[Tensor, "rays samples"],
-        config: MappingConfig,
-        generator: torch.Generator,
-    ) -> dict[str, Float[Tensor, ""]]:
-        """Colour L1, depth L1 and the eikonal term (NeuS, Eq. 15, with RGB-D's depth added)."""
-        rendering = self.render(rays, depths)
-        measured = (rays.depth > 0).float()
-        color_error = (rendering.color - rays.color).abs().mean(dim=-1)
-        depth_error = (rendering.depth - rays.depth).abs()
-        return {
-            "depth": config.lambda_depth * measured_mean(depth_error, measured),
-            "color": config.lambda_color * measured_mean(color_error, measured),
-            "eikonal": config.lambda_eikonal * self._eikonal(rays, depths, config, generator),
-        }
-
     def _eikonal(
-        self,
-        rays: Rays,
-        depths: Float[Tensor, "rays samples"],
-        config: MappingConfig,
-        generator: torch.Generator,
+        self, batch: Batch, config: MappingConfig, generator: torch.Generator
     ) -> Float[Tensor, ""]:
         """Mean (|grad f| - 1)^2 over a share of the ray samples, drawn anew every time.
 
         The second derivatives cost as much as the rest of the step, and neighbouring samples say
         the same: a quarter of them kept the quality in trials.
         """
-        points = rays.points(depths).flatten(0, 1)
+        points = batch.rays.points(batch.depths).flatten(0, 1)
         n_points = max(1, round(config.eikonal_share * len(points)))
         chosen = torch.randint(
             len(points), (n_points,), generator=generator, device=points.device
@@ -134,3 +161,16 @@ class NeuSField(Field):
         solution = torch.linalg.solve(normal, moments).float()
         self.mlp.head.weight[3] = solution[:-1]
         self.mlp.head.bias[3] = solution[-1]
+
+
+def rendered_losses(
+    rendering: Rendering, rays: Rays, config: MappingConfig
+) -> dict[str, Float[Tensor, ""]]:
+    """Weighted L1 errors of rendered depth (m) and colour, over the rays with a measured depth."""
+    measured = (rays.depth > 0).float()
+    color_error = (rendering.color - rays.color).abs().mean(dim=-1)
+    depth_error = (rendering.depth - rays.depth).abs()
+    return {
+        "depth": config.lambda_depth * measured_mean(depth_error, measured),
+        "color": config.lambda_color * measured_mean(color_error, measured),
+    }
