@@ -116,7 +116,7 @@ def _count_steps(
     budget = ClockBudget(1000 / budget_ms, synchronize=lambda: synchronize(device))
     counts = []
     for _ in range(n_frames + 1):
-        tracker.start_frame(0, T_start)
+        tracker.start_frame(0, T_start[None])
         steps = 0
         for _ in budget.frame():
             tracker.step()

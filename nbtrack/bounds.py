@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nbtrack.camera import backproject
@@ -28,6 +28,13 @@ class SceneBounds:
     def metres_per_unit(self) -> float:
         """Half of the longest side: it maps the box into [-1, 1]^3 without changing its shape."""
         return float((np.array(self.maximum) - np.array(self.minimum)).max() / 2)
+
+    def contain(
+        self, points_world: Float[Tensor, "n 3"], margin: float = 0.0
+    ) -> Bool[Tensor, "n"]:
+        """Whether points (m) lie inside the box, or no farther than `margin` metres from it."""
+        low, high = points_world.new_tensor(self.minimum), points_world.new_tensor(self.maximum)
+        return ((points_world >= low - margin) & (points_world <= high + margin)).all(dim=-1)
 
     def exit_depth(
         self, origins_world: Float[Tensor, "rays 3"], directions_world: Float[Tensor, "rays 3"]

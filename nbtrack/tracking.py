@@ -108,28 +108,31 @@ class _Run:
             generator = torch.Generator(device).manual_seed(seed)
             return tracker_class(tracker_name)(field, sampler, config, generator)
 
-        _check_measured(sequence, 1)
-        _warm_up(fresh_tracker(), sequence, device)
         self.tracker = fresh_tracker()
+        self._check_measured(1)
+        _warm_up(fresh_tracker(), sequence, device)
         self.estimates = [sequence.T_world_camera[0]]
         self.rows = [_frame_row(sequence, 0, 0, 0.0, float("nan"), self.estimates[0])]
 
     def advance(self) -> None:
         """Estimate the pose of the next frame."""
         index = len(self.estimates)
-        _check_measured(self.sequence, index)
+        self._check_measured(index)
         start = time.perf_counter()
-        T_start = torch.from_numpy(self.predict(self.estimates)).float()
-        self.tracker.start_frame(index, T_start.to(self.device))
+        T_starts = torch.from_numpy(np.stack(self.predict(self.estimates))).float()
+        self.tracker.start_frame(index, T_starts.to(self.device))
         steps, loss = 0, torch.tensor(float("nan"))
         for _ in self.budget.frame():
             loss = self.tracker.step()
             steps += 1
+            if self.tracker.is_converged:
+                break
         synchronize(self.device)
         seconds = time.perf_counter() - start
         pose = _checked_pose(self.tracker.T_world_camera, self.sequence, index, steps)
         self.estimates.append(pose)
-        self.rows.append(_frame_row(self.sequence, index, steps, seconds, float(loss), pose))
+        row = _frame_row(self.sequence, index, steps, seconds, float(loss), pose)
+        self.rows.append(row | self.tracker.report())
 
     def save(self, checkpoint: Path) -> None:
         buffer = io.BytesIO()
@@ -152,10 +155,19 @@ class _Run:
         self.budget.restore(state["budget"])
 
 
+    def _check_measured(self, index: int) -> None:
+        if self.tracker.copes_without_depth or self.sequence.depths_mm[index].any():
+            return
+        raise DataError(
+            f"frame {self.sequence.frame_ids[index]} of {self.sequence.name} has no measured "
+            "depth: this tracker needs some; leave the frame out with --frames"
+        )
+
+
 def _warm_up(tracker: Tracker, sequence: Sequence, device: torch.device) -> None:
     """One step that counts nowhere: first calls load and allocate for a second or more."""
     T_world_camera = torch.from_numpy(sequence.T_world_camera[0]).float().to(device)
-    tracker.start_frame(1, T_world_camera)
+    tracker.start_frame(1, T_world_camera[None])
     tracker.step()
     synchronize(device)
 
@@ -191,13 +203,6 @@ def _checked_pose(
     return pose
 
 
-def _check_measured(sequence: Sequence, index: int) -> None:
-    if not sequence.depths_mm[index].any():
-        raise DataError(
-            f"frame {sequence.frame_ids[index]} of {sequence.name} has no measured depth: "
-            "tracking needs some; leave the frame out with --frames"
-        )
-
-
 def _widest_layer(field: Field) -> int:
-    return max(parameter.shape[0] for parameter in field.parameters() if parameter.dim())
+    widths = [parameter.shape[0] for parameter in field.parameters() if parameter.dim()]
+    return max(widths, default=0)  # 0: a grid or a cloud of points, which one thread serves best

@@ -22,15 +22,24 @@ def test_constant_velocity_repeats_the_motion_seen_from_the_camera() -> None:
     poses = [np.eye(4)]
     for _ in range(3):
         poses.append(poses[-1] @ step)
-    predicted = motion_model("constant_velocity")(poses[:3])
+    (predicted,) = motion_model("constant_velocity")(poses[:3])
     np.testing.assert_allclose(predicted, poses[3], atol=1e-12)
 
 
 def test_the_first_frames() -> None:
     """Catches a velocity made of nothing, and a model that moves the camera where none is asked."""
     poses = [turned(0.2, 1.0), turned(0.3, 1.1)]
-    np.testing.assert_array_equal(motion_model("constant_velocity")(poses[:1]), poses[0])
-    np.testing.assert_array_equal(motion_model("previous_pose")(poses), poses[1])
+    np.testing.assert_array_equal(motion_model("constant_velocity")(poses[:1]), [poses[0]])
+    np.testing.assert_array_equal(motion_model("previous_pose")(poses), [poses[1]])
+    np.testing.assert_array_equal(motion_model("better_of_both")(poses[:1]), [poses[0]])
+
+
+def test_both_starts_are_offered() -> None:
+    """Catches a choice made here: only the tracker can tell which start fits the frame."""
+    poses = [turned(0.2, 1.0), turned(0.3, 1.1)]
+    offered = motion_model("better_of_both")(poses)
+    single = [motion_model(name)(poses)[0] for name in ("constant_velocity", "previous_pose")]
+    np.testing.assert_array_equal(offered, single)
 
 
 def test_unknown_model() -> None:

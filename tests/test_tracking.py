@@ -17,7 +17,7 @@ from nbtrack.camera import Intrinsics, pixel_directions
 from nbtrack.config import TrackingConfig
 from nbtrack.data import Sequence
 from nbtrack.errors import ConfigError, DataError, NumericalError
-from nbtrack.fields.base import Field, Rays
+from nbtrack.fields.base import LearnedField, Rays
 from nbtrack.motion_models import motion_model
 from nbtrack.rendering import Rendering, composite, weights_from_density, weights_from_sdf
 from nbtrack.sampling import PixelSampler
@@ -28,7 +28,7 @@ HALF = torch.tensor([1.0, 0.8, 1.2])  # half sides of the room, m
 SHIFT = 0.03  # m behind the wall at which the density is half its largest
 
 
-class BoxRoom(Field):
+class BoxRoom(LearnedField):
     """The inside of a box with smoothly coloured walls; as a distance or as a steep density."""
 
     name, label, surface_level = "box", "box", 0.0
@@ -112,7 +112,7 @@ def test_one_step_of_adam_moves_by_the_learning_rates() -> None:
         BoxRoom(as_density=False).requires_grad_(False), sampler, config_of("sdf"),
         torch.Generator().manual_seed(0),
     )  # fmt: skip
-    tracker.start_frame(0, torch.eye(4))
+    tracker.start_frame(0, torch.eye(4)[None])
     tracker.step()
     assert tracker.position.detach().abs().tolist() == pytest.approx([5e-4] * 3, rel=1e-3)
     assert tracker.q_wxyz.detach()[1:].abs().tolist() == pytest.approx([1e-3] * 3, rel=1e-2)
@@ -128,7 +128,7 @@ def test_new_pixels_every_step() -> None:
     )
     seen = []
     tracker.loss = lambda T, rows, columns: seen.append((rows, columns)) or T.sum()
-    tracker.start_frame(0, torch.eye(4))
+    tracker.start_frame(0, torch.eye(4)[None])
     tracker.step()
     tracker.step()
     assert not torch.equal(seen[0][0], seen[1][0])
@@ -151,7 +151,7 @@ def test_constant_velocity_starts_where_the_camera_would_be() -> None:
     sequence = box_sequence([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
     moved = [np.eye(4), *sequence.T_world_camera[[0, 2]]]
     config = replace(config_of("sdf"), motion_model="constant_velocity")
-    assert np.allclose(motion_model(config.motion_model)(moved)[:3, 3], [0.2, 0.0, 0.0])
+    assert np.allclose(motion_model(config.motion_model)(moved)[0][:3, 3], [0.2, 0.0, 0.0])
     still = track_sequence("sdf", BoxRoom(False), sequence, StepBudget(0.1), config)
     assert np.allclose(still.T_estimated, np.eye(4), atol=1e-7)
     unknown = replace(config, motion_model="none")

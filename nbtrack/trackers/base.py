@@ -28,6 +28,8 @@ class Tracker(abc.ABC):
     field_name: str  # the field whose maps it tracks in
     paper_steps: str = "sdf"  # whose step counts of the paper's Table II it is given
     table_order: int = 100  # rows of the tables go by this, then by name; the paper's come first
+    renders: bool = False  # whether it needs a field that can be rendered, not only asked
+    copes_without_depth: bool = False  # whether a frame without any measured depth is no error
     in_paper_tables: bool = True  # a row of Tables I and II; else only where it is asked for
 
     def __init__(
@@ -48,12 +50,24 @@ class Tracker(abc.ABC):
         return 1
 
     @abc.abstractmethod
-    def start_frame(self, frame: int, T_world_camera: Float[Tensor, "4 4"]) -> None:
-        """Take up a frame of the sequence, starting from an initial pose."""
+    def start_frame(self, frame: int, T_starts: Float[Tensor, "starts 4 4"]) -> None:
+        """Take up a frame of the sequence; its search starts at the best of some poses."""
 
     @abc.abstractmethod
     def step(self) -> Float[Tensor, ""]:
         """One optimisation step; returns the loss before it, still on the device."""
+
+    @property
+    def is_converged(self) -> bool:
+        """Whether further steps would change nothing, so that the rest of the budget is spared."""
+        return False
+
+    def report(self) -> dict[str, float | bool]:
+        """What the tracker itself says about its estimate of the frame, by column name.
+
+        `lost`, where given, is its own verdict, which is scored against the true error.
+        """
+        return {}
 
     @property
     @abc.abstractmethod
@@ -77,10 +91,14 @@ class AdamTracker(Tracker):
     choice; the paper does not say).
     """
 
-    def start_frame(self, frame: int, T_world_camera: Float[Tensor, "4 4"]) -> None:
-        """Take up a frame at an initial pose; the frame's measured pixels are listed once."""
+    def start_frame(self, frame: int, T_starts: Float[Tensor, "starts 4 4"]) -> None:
+        """Take up a frame; its measured pixels are listed once.
+
+        Of several starts the one with the lowest loss is taken, on the same pixels for all.
+        """
         self.frame = frame
         self.rows, self.columns = self.sampler.measured_pixels(frame)
+        T_world_camera = T_starts[0] if len(T_starts) == 1 else self._cheapest(T_starts)
         self.position = T_world_camera[:3, 3].clone().requires_grad_()
         self.q_wxyz = matrix_to_quaternion(T_world_camera[:3, :3]).requires_grad_()
         self.optimizer = torch.optim.Adam(
@@ -92,17 +110,26 @@ class AdamTracker(Tracker):
 
     def step(self) -> Float[Tensor, ""]:
         """Draw pixels, lower their loss by one step of Adam, renormalise the quaternion."""
-        drawn = torch.randint(
-            len(self.rows), (self.config.n_pixels,),
-            generator=self.generator, device=self.generator.device,
-        )  # fmt: skip
-        loss = self.loss(self._differentiable_pose(), self.rows[drawn], self.columns[drawn])
+        loss = self.loss(self._differentiable_pose(), *self._drawn_pixels())
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
         with torch.no_grad():
             self.q_wxyz.copy_(normalize_quaternion(self.q_wxyz))
         return loss.detach()
+
+    def _drawn_pixels(self) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+        drawn = torch.randint(
+            len(self.rows), (self.config.n_pixels,),
+            generator=self.generator, device=self.generator.device,
+        )  # fmt: skip
+        return self.rows[drawn], self.columns[drawn]
+
+    @torch.no_grad()
+    def _cheapest(self, T_starts: Float[Tensor, "starts 4 4"]) -> Float[Tensor, "4 4"]:
+        pixels = self._drawn_pixels()
+        losses = torch.stack([self.loss(T_start, *pixels) for T_start in T_starts])
+        return T_starts[losses.argmin()]
 
     @abc.abstractmethod
     def loss(

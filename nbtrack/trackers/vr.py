@@ -22,6 +22,7 @@ class VolumeRenderingTracker(AdamTracker):
     field_name = "imap"
     paper_steps = "vr"
     table_order = 0
+    renders = True
 
     @classmethod
     def evaluations_per_pixel(cls, config: TrackingConfig) -> int:
