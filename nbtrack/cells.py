@@ -14,6 +14,7 @@ from filelock import FileLock, Timeout
 from nbtrack.budget import Budget, ClockBudget, StepBudget
 from nbtrack.config import Preset
 from nbtrack.device import choose_device, device_name, synchronize
+from nbtrack.errors import ConfigError
 from nbtrack.fields import field_class
 from nbtrack.map_quality import score_map
 from nbtrack.mapping import map_sequence
@@ -153,6 +154,25 @@ def make_budget(
         return StepBudget(steps)
     wait = partial(synchronize, device) if device else None
     return ClockBudget(rate_hz, synchronize=wait)
+
+
+def check_pair(tracker_name: str, field_name: str, bake_voxel: float) -> None:
+    """Whether a tracker works in the maps of a field, baked or not.
+
+    Raises:
+        ConfigError: one is unknown, or they do not go together.
+    """
+    tracker, field = tracker_class(tracker_name), field_class(field_name)
+    if not issubclass(field, field_class(tracker.field_name)):
+        raise ConfigError(
+            f"tracker {tracker_name!r} does not work on field {field_name!r}: "
+            f"{tracker.label} needs --field {tracker.field_name}"
+        )
+    if bake_voxel and tracker.renders:
+        raise ConfigError(
+            f"tracker {tracker_name!r} renders, which a baked field cannot: leave --bake out, or "
+            "take --tracker sdf or lm"
+        )
 
 
 @contextmanager

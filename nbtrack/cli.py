@@ -7,8 +7,9 @@ from collections.abc import Sequence as Texts
 from pathlib import Path
 from typing import NoReturn
 
-from nbtrack.config import PRESETS, Preset, resolve_preset
+from nbtrack.config import PRESETS, Preset
 from nbtrack.errors import ConfigError, NbtrackError
+from nbtrack.settings import resolve_preset
 
 
 class _Parser(argparse.ArgumentParser):
@@ -82,7 +83,7 @@ def _preset(options: argparse.Namespace) -> Preset:
 def _add_map(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("map", help="fit a field to a sequence with known poses")
     parser.add_argument("sequence", help="a folder, or the name of a room or dataset scene")
-    parser.add_argument("--field", required=True, help="imap or neus")
+    _add_field(parser)
     parser.add_argument("--frames", default=":", help="Python slice of frames, A:B:S")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="folder for the map (default: in the cache)")
@@ -95,19 +96,24 @@ def _map(options: argparse.Namespace) -> None:
     from nbtrack.commands import map_command
 
     map_command(
-        options.sequence, options.field, _preset(options), options.frames, options.seed, options.out
-    )
+        options.sequence, _field(options), _preset(options), options.frames, options.seed,
+        options.out,
+    )  # fmt: skip
 
 
 def _add_track(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("track", help="track a camera; maps first where no map fits")
     parser.add_argument("sequence", help="a folder, or the name of a room or dataset scene")
-    parser.add_argument("--field", required=True, help="imap or neus")
-    parser.add_argument("--tracker", required=True, help="vr or sdf")
+    _add_field(parser)
+    parser.add_argument("--tracker", required=True, help="vr, sdf, lm or another")
     budget = parser.add_mutually_exclusive_group(required=True)
     budget.add_argument("--rate", type=float, metavar="HZ", help="frames a second, by the clock")
     budget.add_argument("--steps", type=float, metavar="N", help="optimisation steps a frame")
     parser.add_argument("--pixels", type=int, metavar="N", help="pixels a step")
+    parser.add_argument(
+        "--bake", type=float, metavar="METRES",
+        help="ask the field on a grid of such cells instead of the network, for example 0.04",
+    )  # fmt: skip
     parser.add_argument("--map-frames", default=":", help="Python slice of frames to map")
     parser.add_argument("--frames", default=":", help="Python slice of frames to track")
     parser.add_argument("--seed", type=int, default=0)
@@ -117,13 +123,30 @@ def _add_track(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(command=_track)
 
 
+def _add_field(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--field", required=True, help="imap, neus or another")
+    parser.add_argument(
+        "--supervision", default="rendering",
+        help="rendering, as in the paper (default); rendering+sdf teaches NeuS the distances too",
+    )  # fmt: skip
+
+
+def _field(options: argparse.Namespace) -> str:
+    """The name of the field with the supervision that is asked for."""
+    from nbtrack.fields import supervised_field
+
+    return supervised_field(options.field, options.supervision)
+
+
 def _track(options: argparse.Namespace) -> None:
     from nbtrack.commands import track_command
 
     if options.pixels is not None:
         options.settings.append(f"tracking.{options.tracker}.n_pixels={options.pixels}")
+    if options.bake is not None:
+        options.settings.append(f"tracking.{options.tracker}.bake_voxel={options.bake}")
     track_command(
-        options.sequence, options.field, options.tracker, _preset(options), steps=options.steps,
+        options.sequence, _field(options), options.tracker, _preset(options), steps=options.steps,
         rate_hz=options.rate, map_frames=options.map_frames, frames=options.frames,
         seed=options.seed, out=options.out,
     )  # fmt: skip

@@ -8,12 +8,12 @@ import torch
 from tqdm.auto import tqdm
 
 from nbtrack.bench import obtain_steps
-from nbtrack.cells import MapCell, TrackCell, cell_lock, make_budget
+from nbtrack.cells import MapCell, TrackCell, cell_lock, check_pair, make_budget
 from nbtrack.config import Preset
 from nbtrack.data import Sequence, parse_frames
 from nbtrack.data_check import check_sequence
 from nbtrack.device import choose_device, device_name
-from nbtrack.errors import ConfigError, DataError
+from nbtrack.errors import DataError
 from nbtrack.experiments import map_summary, obtain_map, run_track
 from nbtrack.fields import field_class
 from nbtrack.meshes import extract_mesh, keep_seen
@@ -60,13 +60,8 @@ def track_command(
     out: Path | None,
 ) -> None:
     """Track a sequence in its map, made first where none fits; print the errors."""
-    field_class(field_name)
     tracker = tracker_class(tracker_name)
-    if tracker.field_name != field_name:
-        raise ConfigError(
-            f"tracker {tracker_name!r} does not work on field {field_name!r}: "
-            f"{tracker.label} needs --field {tracker.field_name}"
-        )
+    check_pair(tracker_name, field_name, preset.tracking_of(tracker_name).bake_voxel)
     parse_frames(frames)
     parse_frames(map_frames)
     budget = make_budget(steps, rate_hz)  # a wrong one is told before a room is made

@@ -1,6 +1,7 @@
 """Cells made or found: maps and tracked runs are computed once, and kept on disk."""
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pandas as pd
 import torch
 from jaxtyping import Float
 
+from nbtrack.baking import bake_field
 from nbtrack.cells import (
     MAP_FILE,
     METRICS_FILE,
@@ -18,10 +20,11 @@ from nbtrack.cells import (
     TrackCell,
     cell_lock,
 )
-from nbtrack.config import as_dict
+from nbtrack.config import TrackingConfig, as_dict
 from nbtrack.data import parse_frames
 from nbtrack.device import choose_device, device_name, naming_what_to_lower
 from nbtrack.device_lock import alone_on, beside_others_on
+from nbtrack.fields import Field
 from nbtrack.map_quality import score_map
 from nbtrack.mapping import FittedMap, load_map, map_sequence, split_holdout
 from nbtrack.metrics import trajectory_metrics
@@ -83,22 +86,34 @@ def run_track(
     config = cell.map_cell.preset.tracking_of(cell.tracker_name)
     with naming_what_to_lower(f"frames {cell.frames} of {cell.scene_name}"):
         sequence = cell.map_cell.scene.read(parse_frames(cell.frames))
+    field, baking = field_to_track(fitted.field, config)
     checkpoint = cell.folder / RUN_FILE
     occupied = alone_on if cell.rate_hz is not None else beside_others_on
     with occupied(device, lambda status: report(0, status)):
         tracked = track_sequence(
-            cell.tracker_name, fitted.field, sequence, cell.budget(device), config, cell.seed,
+            cell.tracker_name, field, sequence, cell.budget(device), config, cell.seed,
             device, checkpoint, lambda done, error: report(done, f"off by {100 * error:.1f} cm"),
         )  # fmt: skip
     frame_ids = tracked.frames["frame_id"].to_numpy()[1:]
     write_tum(folder / "trajectory.txt", frame_ids, tracked.T_estimated[1:])
     write_tum(folder / "groundtruth.txt", frame_ids, tracked.T_true[1:])
     write_text_atomic(folder / "frames.csv", tracked.frames.to_csv(index=False))
-    metrics = _metrics(cell, tracked, fitted, device)
+    metrics = _metrics(cell, tracked, fitted, device) | baking
     # The metrics come last: where they stand, the run is complete.
     write_json_atomic(folder / METRICS_FILE, metrics)
     checkpoint.unlink(missing_ok=True)
     return metrics
+
+
+def field_to_track(
+    field: Field, config: TrackingConfig
+) -> tuple[Field, dict[str, float | int]]:
+    """The field that a tracker asks: the map itself, or its copy on a grid; and what that took."""
+    if not config.bake_voxel:
+        return field, {}
+    start = time.perf_counter()
+    baked = bake_field(field, config.bake_voxel)
+    return baked, {"bake_seconds": time.perf_counter() - start, "grid_bytes": baked.n_bytes}
 
 
 def read_poses(
