@@ -27,7 +27,7 @@ from nbtrack.device_lock import alone_on, beside_others_on
 from nbtrack.fields import Field
 from nbtrack.map_quality import score_map
 from nbtrack.mapping import FittedMap, load_map, map_sequence, split_holdout
-from nbtrack.metrics import trajectory_metrics
+from nbtrack.metrics import score_detection, trajectory_metrics
 from nbtrack.parallel import Report, quiet
 from nbtrack.provenance import versions
 from nbtrack.storage import write_json_atomic, write_text_atomic
@@ -136,6 +136,10 @@ def _metrics(
 ) -> dict[str, Any]:
     metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true).to_dict()
     rows = tracked.frames.iloc[1:]
+    if "lost" in rows:
+        called_lost = rows["lost"].to_numpy(dtype=bool)
+        errors = rows["translation_error_m"].to_numpy()
+        metrics |= score_detection(called_lost, errors).to_dict()
     steps = int(rows["steps"].sum())
     return {
         **metrics,

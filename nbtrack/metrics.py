@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from math import isfinite
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.errors import DataError, NumericalError
@@ -62,6 +62,35 @@ def trajectory_metrics(
         max_error_m=float(errors.max()),
         frames=len(errors),
         lost_frames=int((errors > LOST_THRESHOLD_M).sum()),
+    )
+
+
+@dataclass(frozen=True)
+class LossDetection:
+    """How well a tracker's own verdict agrees with the threshold on the true error."""
+
+    precision: float  # share of the frames called lost that were; NaN where none was called so
+    recall: float  # share of the lost frames that were called so; NaN where none was lost
+
+    def to_dict(self) -> dict[str, float | None]:
+        """The fields by name, for JSON: a number that is not finite becomes None."""
+        named = {"lost_precision": self.precision, "lost_recall": self.recall}
+        return {key: value if isfinite(value) else None for key, value in named.items()}
+
+
+def score_detection(
+    called_lost: Bool[np.ndarray, "m"], errors_m: Float[np.ndarray, "m"]
+) -> LossDetection:
+    """Precision and recall of a tracker's verdicts against `LOST_THRESHOLD_M`.
+
+    >>> score_detection(np.array([True, True, False]), np.array([0.3, 0.1, 0.5]))
+    LossDetection(precision=0.5, recall=0.5)
+    """
+    is_lost = errors_m > LOST_THRESHOLD_M
+    both = int((called_lost & is_lost).sum())
+    called, lost = int(called_lost.sum()), int(is_lost.sum())
+    return LossDetection(
+        both / called if called else float("nan"), both / lost if lost else float("nan")
     )
 
 

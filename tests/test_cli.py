@@ -90,6 +90,20 @@ WRONG = {
     "no folder": (track("does/not/exist"), "no sequence 'does/not/exist'"),
     "room": (track("living_rom"), "did you mean 'living_room'"),
     "preset": (["tables", "--preset", "smok"], "did you mean 'smoke'"),
+    "supervision": (
+        ["map", "living_room", "--field", "imap", "--supervision", "rendering+sdf"],
+        "'imap' knows no supervision 'rendering+sdf'",
+    ),
+    "baked and rendered": (
+        ["track", "living_room", "--field", "neus", "--tracker", "vr_neus", "--steps", "2",
+         "--bake", "0.04"],
+        "renders, which a baked field cannot",
+    ),
+    "bake": (
+        ["track", "living_room", "--field", "neus", "--tracker", "lm", "--steps", "2",
+         "--bake", "-1"],
+        "tracking.lm.bake_voxel = -1.0: it must be 0 or more",
+    ),
     "field": (["map", "living_room", "--field", "imapp"], "did you mean 'imap'"),
     "tracker": (
         ["track", "living_room", "--field", "neus", "--tracker", "sfd", "--steps", "2"],

@@ -10,6 +10,7 @@ from nbtrack.errors import DataError, NumericalError
 from nbtrack.metrics import (
     align_rigidly,
     rotation_errors_deg,
+    score_detection,
     trajectory_metrics,
     translation_errors,
 )
@@ -124,3 +125,12 @@ def test_different_lengths() -> None:
         trajectory_metrics(wandering(1), wandering(6))
     with pytest.raises(DataError, match="0 estimated"):
         trajectory_metrics(wandering(1)[:0], wandering(1)[:0])
+
+
+def test_detection_of_lost_frames() -> None:
+    """Catches precision taken for recall, and a share of nothing that passes for a number."""
+    errors = np.array([0.5, 0.5, 0.5, 0.01])
+    found = score_detection(np.array([True, False, False, False]), errors)
+    assert (found.precision, found.recall) == (1.0, pytest.approx(1 / 3))
+    none = score_detection(np.array([False]), np.array([0.01])).to_dict()
+    assert none == {"lost_precision": None, "lost_recall": None}
