@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from filelock import FileLock, Timeout
 
+from nbtrack.baking import bake_field
 from nbtrack.budget import Budget, ClockBudget, StepBudget
 from nbtrack.config import Preset
 from nbtrack.device import choose_device, device_name, synchronize
@@ -95,8 +96,10 @@ class TrackCell:
         config = self.map_cell.preset.tracking_of(self.tracker_name)
         machine = (device_name(choose_device()), torch.get_num_threads())
         clock = None if self.rate_hz is None else (self.rate_hz, *machine)
+        baking = (bake_field,) if config.bake_voxel else ()
         return fingerprint(
-            code_fingerprint(track_sequence, trajectory_metrics, tracker), self.map_cell.key,
+            code_fingerprint(track_sequence, trajectory_metrics, tracker, *baking),
+            self.map_cell.key,
             self.tracker_name, config, self.steps, clock, self.frames, self.seed,
         )  # fmt: skip
 
