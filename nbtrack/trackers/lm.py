@@ -7,8 +7,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.config import TrackingConfig
-from nbtrack.fields import Field
 from nbtrack.registration import (
     LEAST_SCALES,
     Observation,
@@ -23,7 +21,6 @@ from nbtrack.registration import (
     scales_of,
     uncertainty,
 )
-from nbtrack.sampling import PixelSampler
 from nbtrack.trackers.base import Tracker, register_tracker
 
 # A pull towards the start of the frame's search, so weak that it decides only where the frame says
@@ -80,15 +77,7 @@ class LevenbergMarquardtTracker(Tracker):
     in_paper_tables = False
     copes_without_depth = True
 
-    def __init__(
-        self,
-        field: Field,
-        sampler: PixelSampler,
-        config: TrackingConfig,
-        generator: torch.Generator,
-    ) -> None:
-        super().__init__(field, sampler, config, generator)
-        self.last_good: Float[Tensor, "4 4"] | None = None
+    last_good: Float[Tensor, "4 4"] | None = None  # of the latest frame not taken for lost
 
     def start_frame(self, frame: int, T_starts: Float[Tensor, "starts 4 4"]) -> None:
         """Draw the frame's points; take up the search from the start that fits them best."""
