@@ -33,6 +33,7 @@ class MappingConfig:
     lambda_eikonal: float = 0.5  # NeuS only; five times the method's own: rooms are mostly empty
     lambda_sdf: float = 10.0  # NeuS+ only, per metre
     n_surface_points: int = 1024  # NeuS+ only: measured points an iteration, besides the rays
+    lambda_rendering: float = 1.0  # NeuS+ only: factor of rendered depth and colour; 0: none
     behind_band: float = 0.1  # NeuS+ only: distances are taught so far behind surfaces, m
     voxel: float = 0.02  # points only: edge of the cells whose measured points are averaged, m
     eikonal_share: float = 0.25  # share of the samples that the eikonal term looks at
@@ -54,6 +55,8 @@ class TrackingConfig:
     motion_model: str = "previous_pose"
     lambda_intensity: float = 1.0  # LM: weight of the intensity residual, both over their scale
     n_restarts: int = 8  # LM: further starts, where the first ends lost
+    anneal: bool = True  # LM: robust scales fall with the residuals; else the narrowest throughout
+    divide_by_slope: bool = True  # LM: residuals are f / |grad f|, else f
     bake_voxel: float = 0.0  # m; the field is asked on a grid of such cells, 0: itself
 
 

@@ -2,6 +2,8 @@
 
 import difflib
 
+_MOST_NAMES = 40  # a message lists no more
+
 
 class NbtrackError(Exception):
     """Root of every error that a user can cause; the command line turns it into exit status 2."""
@@ -32,11 +34,14 @@ def nearest_name(found: str, allowed: list[str]) -> str:
 
     Args:
         found: the name as the user gave it.
-        allowed: every valid name, in the order in which to list them.
+        allowed: every valid name, in the order in which to list them; of many, the nearest few.
 
     >>> nearest_name("imapp", ["imap", "neus"])
     "did you mean 'imap'? Allowed: imap, neus"
     """
-    close = difflib.get_close_matches(found, allowed, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(found, allowed, n=5, cutoff=0.5)
     hint = f"did you mean '{close[0]}'? " if close else ""
+    if len(allowed) > _MOST_NAMES:
+        some = close or allowed[:5]
+        return f"{hint}Allowed are {len(allowed)} names, such as {', '.join(some)}"
     return f"{hint}Allowed: {', '.join(allowed)}"

@@ -38,11 +38,11 @@ def find_cells(cells: Sequence[TableCell], row: str, column: str) -> list[TableC
     ]
     if not found:
         rows = dict.fromkeys(f"{cell.rate_hz:g} {cell.run.tracker_name}" for cell in cells)
-        raise ConfigError(f"no row {row!r} in Table I: {nearest_name(row, [*rows])}")
+        raise ConfigError(f"no row {row!r} in the table: {nearest_name(row, [*rows])}")
     here = [cell for cell in found if scene in _names_of(cell.run.scene_name)]
     if not here:
         columns = dict.fromkeys(cell.run.scene_name for cell in cells)
-        raise ConfigError(f"no column {column!r} in Table I: {nearest_name(column, [*columns])}")
+        raise ConfigError(f"no column {column!r} in the table: {nearest_name(column, [*columns])}")
     return here
 
 

@@ -29,6 +29,11 @@ CAPTION_1 = (
     r"Root mean square of the absolute trajectory error in \si{m} "
     r"(\textcolor{red}{red}: above \SI{0.2}{m}, \textbf{bold}: best at this rate)."
 )
+CAPTION_3 = (
+    r"The trackers of the paper and those beyond it: root mean square of the absolute trajectory "
+    r"error in \si{m} (\textcolor{red}{red}: above \SI{0.2}{m}, "
+    r"\textbf{bold}: best at this rate)."
+)
 CAPTION_2 = (
     r"Mean number of optimization steps that fit in a time budget, for $n$ pixels per step "
     r"(\textbf{bold}: the $n$ used for tracking)."
@@ -78,14 +83,16 @@ def latex_table_1(
     label: str = "tab:ate",
     budget_note: str = "",
     deviation: pd.DataFrame | None = None,
+    name: str = "table_1",
 ) -> str:
-    """Table I as the text of a `.tex` file.
+    """Table I, or another of its layout, as the text of a `.tex` file.
 
     Args:
         wide: ATE (m) as `nbtrack.tables.table_1` lays it out.
         caption: LaTeX. label: for `\\ref`.
         budget_note: plain sentence on which budget was used; follows the caption.
         deviation: of the ATE over seeds, laid out as `wide`; printed small after it.
+        name: of the file, without its ending.
 
     Source: markup of the paper's Table I; bold and red by `best_cells` and `failed_cells`.
     """
@@ -100,7 +107,7 @@ def latex_table_1(
     )
     head = " & ".join(["", "", *map(_stacked, wide.columns)]).strip()
     columns = "ll" + "r" * len(wide.columns)
-    return _file("table*", "table_1", caption, label, budget_note, columns, [head, *rows])
+    return _file("table*", name, caption, label, budget_note, columns, [head, *rows])
 
 
 def latex_table_2(
@@ -164,6 +171,24 @@ def write_tables(
         "table_2.csv": _csv(_with_deviation(long_form(wide_2, "steps"), spread_2)),
         "table_2.tex": latex_table_2(
             wide_2, CAPTION_2, f"tab:runtime-{notes.preset}", str(notes), default_pixels
+        ),
+    }
+    for name, text in texts.items():
+        write_text_atomic(Path(folder) / name, text)
+    return [Path(folder) / name for name in texts]
+
+
+def write_table_3(folder: Path, cells: pd.DataFrame, notes: TableNotes) -> list[Path]:
+    """Writes Table III as table_3.csv (long form) and table_3.tex; returns their paths.
+
+    Args:
+        cells: long form with columns COLUMNS_1, and the deviation over seeds where there is one.
+    """
+    wide, spread = table_1(cells), deviations_1(cells)
+    texts = {
+        "table_3.csv": _csv(_with_deviation(long_form(wide, "ate_m"), spread)),
+        "table_3.tex": latex_table_1(
+            wide, CAPTION_3, f"tab:beyond-{notes.preset}", str(notes), spread, "table_3"
         ),
     }
     for name, text in texts.items():

@@ -28,13 +28,16 @@ class Observation:
     points_camera: Float[Tensor, "n 3"]  # m
     intensity: Float[Tensor, "n"]  # luma, in [0, 1]
 
-
     @classmethod
     def of(
         cls, points_camera: Float[Tensor, "n 3"], color: Float[Tensor, "n 3"]
     ) -> "Observation":
         """Points with the luma of their colours in [0, 1]."""
         return cls(points_camera, color @ LUMA.to(color))
+
+    def first(self, n_points: int) -> "Observation":
+        """Only the first so many points: a random share, as they are drawn at random."""
+        return Observation(self.points_camera[:n_points], self.intensity[:n_points])
 
 
 @dataclass(frozen=True)
@@ -88,12 +91,16 @@ class Uncertainty:
 
 
 def residuals_at(
-    field: Field, observation: Observation, T_world_camera: Float[Tensor, "4 4"]
+    field: Field,
+    observation: Observation,
+    T_world_camera: Float[Tensor, "4 4"],
+    divide_by_slope: bool = True,
 ) -> Residuals:
     """Both residuals of all points at a pose.
 
     The distance is divided by the gradient's length, which corrects fields that grow too fast or
-    too slowly to first order, and its Jacobian is the unit gradient accordingly. Source: paper,
+    too slowly to first order, and its Jacobian is the unit gradient accordingly; unless
+    `divide_by_slope` is False: then both stay as the field gives them. Source: paper,
     Eq. 2, for the residuals; f / |grad f| as an option in PIN-SLAM (Pan et al. 2024).
     """
     T_world_camera = T_world_camera.to(observation.points_camera)
@@ -104,7 +111,7 @@ def residuals_at(
     is_usable &= field.bounds.contain(points_world, _MARGIN)
     # A distance field's gradient has length 1; the farther from it, the less it is trusted.
     reliability = is_usable / (1 + ((slope - 1) / _SLOPE_SCALE).square()).square()
-    slope = slope.clamp_min(_LEAST_SLOPE)
+    slope = slope.clamp_min(_LEAST_SLOPE) if divide_by_slope else torch.ones_like(slope)
     arm = points_world - T_world_camera[:3, 3]
     return Residuals(
         field_at.value / slope,

@@ -56,10 +56,10 @@ def test_rows_and_columns_that_are_not_there(runs: Path, capsys: pytest.CaptureF
     find_scene("office", resolve_preset("smoke", settings=TINY).scenes)
     for row, column, told in (
         ("1.2.3 sdf", "office", "no row '1.2.3 sdf'"),
-        ("10 adam", "office", "no row '10 adam' in Table I"),
+        ("10 adam", "office", "no row '10 adam' in the table"),
         ("7 sdf", "office", "no row '7 sdf'"),
         ("sdf", "office", "no row 'sdf'"),
-        ("10 sdf", "ofice", "no column 'ofice' in Table I: did you mean 'office'"),
+        ("10 sdf", "ofice", "no column 'ofice' in the table: did you mean 'office'"),
         ("10 sdf", "office", "has not been computed with these settings"),
     ):
         assert main(["tables", "--scenes", "office", *WORDS, "--explain", row, column]) == 2

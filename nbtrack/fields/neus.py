@@ -65,21 +65,19 @@ class NeuSField(LearnedField):
     @torch.no_grad()
     def linearize(self, points_world: Float[Tensor, "n 3"]) -> Linearization:
         """Value and intensity with their gradients, written out: see `FourierMlp.linearize`."""
-        luma = LUMA.to(points_world)
-
-        def slopes(raw: Float[Tensor, "n 4"]) -> Float[Tensor, "2 n 4"]:
-            color = torch.sigmoid(raw[:, :3])
-            of_intensity = luma * color * (1 - color)
-            slope = raw.new_zeros(2, len(raw), 4)
-            slope[0, :, 3] = self.mlp.metres_per_unit
-            slope[1, :, :3] = of_intensity
-            return slope
-
-        raw, gradients = self.mlp.linearize(points_world, slopes)
+        raw, gradients = self.mlp.linearize(points_world, self._slopes)
         return Linearization(
             raw[:, 3] * self.mlp.metres_per_unit, gradients[0],
-            torch.sigmoid(raw[:, :3]) @ luma, gradients[1],
+            torch.sigmoid(raw[:, :3]) @ LUMA.to(raw), gradients[1],
         )  # fmt: skip
+
+    def _slopes(self, raw: Float[Tensor, "n 4"]) -> Float[Tensor, "2 n 4"]:
+        """Derivatives of distance (m) and intensity with respect to the network's outputs."""
+        color = torch.sigmoid(raw[:, :3])
+        slopes = raw.new_zeros(2, len(raw), 4)
+        slopes[0, :, 3] = self.mlp.metres_per_unit
+        slopes[1, :, :3] = LUMA.to(raw) * color * (1 - color)
+        return slopes
 
     def render(self, rays: Rays, depths: Float[Tensor, "rays samples"]) -> Rendering:
         """Volume rendering of the sections between samples.

@@ -38,8 +38,9 @@ class NeuSPlusField(NeuSField):
         nearest = self.observed(rays.points(depths).flatten(0, 1)).view_as(depths)
         target, known = distance_targets(rays, depths, nearest, self.observed.voxel, config)
         sdf_error = ((sdf - target).abs() * known).sum() / known.sum().clamp_min(1)
+        rendered = rendered_losses(self._composite(colors, sdf, depths), rays, config)
         return {
-            **rendered_losses(self._composite(colors, sdf, depths), rays, config),
+            **{name: config.lambda_rendering * loss for name, loss in rendered.items()},
             "sdf": config.lambda_sdf * sdf_error,
             **self._surface_losses(batch.surface, config),
             "eikonal": config.lambda_eikonal * self._eikonal(batch, config, generator),

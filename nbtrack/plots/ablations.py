@@ -1,13 +1,11 @@
 """The open questions as pictures: what more and larger steps do, and how fast maps get good."""
 
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from nbtrack.fields import field_class
 from nbtrack.metrics import LOST_THRESHOLD_M
-from nbtrack.plots.style import method_colors, new_figure, styled
+from nbtrack.plots.style import label_few, method_colors, new_figure, styled
 
 _LINES = {"more steps": ("-", "o"), "larger steps": (":", "s")}
 
@@ -34,7 +32,7 @@ def plot_reach(table: pd.DataFrame, title: str = "") -> Figure:
         axes.axhline(100 * LOST_THRESHOLD_M, color="0.3", linestyle="--", linewidth=1)
         axes.set(title=method, xscale="log", yscale="log")
         axes.set_xlabel("reach of a frame: steps × learning rate (mm)")
-        _label_few(axes)
+        label_few(axes)
         axes.legend(loc="lower left")
     panels[0].set_ylabel("ATE (cm)")
     return figure
@@ -65,15 +63,7 @@ def plot_quality_over_time(curves: pd.DataFrame, target_m: float, title: str = "
     axes.axhline(100 * target_m, color="0.3", linestyle="--", linewidth=1)
     axes.set(xscale="log", yscale="log", xlabel="mapping time (s)")
     axes.set_ylabel("mean error of held-out depth (cm)")
-    _label_few(axes)
+    label_few(axes)
     axes.margins(x=0.15)
     axes.legend(loc="upper right")
     return figure
-
-
-def _label_few(axes: Axes) -> None:
-    """Plain numbers at 1, 2 and 5 of each decade of two logarithmic axes."""
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())

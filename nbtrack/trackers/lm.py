@@ -27,7 +27,10 @@ from nbtrack.trackers.base import Tracker, register_tracker
 # nothing, as along a corridor: one point's worth, at a twist of 0.5 rad or 0.5 m (our choice).
 START_SCALE = 0.5
 _LEAST_POINTS = 20  # below, a frame says too little for six unknowns
-_LEAST_STEP = 2e-4  # rad and m: a step below ends the search
+# A search begins on a quarter of the points and ends on all of them: far from the pose the coarse
+# answer is as good and costs a quarter. A step below these (rad and m) ends either level.
+_COARSE_SHARE = 4
+_LEAST_STEPS = (5e-3, 1e-3)
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e3
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.2
 # Starts are compared by widely robust costs: narrow ones say the same of all that are off.
@@ -45,6 +48,7 @@ class _Search:
     T_world_camera: Float[Tensor, "4 4"]
     residuals: Residuals
     scales: Scales
+    level: int = 0  # 0 on some of the points, 1 on all
     damping: float = _FIRST_DAMPING
     is_done: bool = False
 
@@ -88,12 +92,14 @@ class LevenbergMarquardtTracker(Tracker):
         )
         if len(points_camera) < _LEAST_POINTS:
             return
-        self.observation = Observation.of(points_camera, color)
+        observation = Observation.of(points_camera, color)
+        n_coarse = max(_LEAST_POINTS, len(points_camera) // _COARSE_SHARE)
+        self.levels = (observation.first(n_coarse), observation)
         searches = [self._search_from(T_start) for T_start in T_starts]
         costs = [float(robust_cost(s.residuals, _WIDE_SCALES, 1.0)) for s in searches]
         self.search = searches[costs.index(min(costs))]
-        anchor = T_starts[-1] if self.last_good is None else self.last_good
-        self.further_starts = _around(anchor)[: self.config.n_restarts]
+        self.anchor = T_starts[-1] if self.last_good is None else self.last_good
+        self.n_restarted = 0
 
     def step(self) -> Float[Tensor, ""]:
         """One step of Levenberg-Marquardt, taken or refused; returns the cost before it."""
@@ -103,18 +109,17 @@ class LevenbergMarquardtTracker(Tracker):
         weight = self.config.lambda_intensity
         twist = _damped_step(search, weight)
         T_world_camera = moved(search.T_world_camera, twist)
-        residuals = residuals_at(self.field, self.observation, T_world_camera)
+        residuals = self._residuals_at(T_world_camera, search.level)
         before = robust_cost(search.residuals, search.scales, weight)
         if robust_cost(residuals, search.scales, weight) < before:
             search.T_world_camera, search.residuals = T_world_camera, residuals
-            search.scales = scales_of(residuals, search.scales)
+            search.scales = self._scales_of(residuals, search.scales)
             search.damping = max(search.damping * _DAMPING_DOWN, _LEAST_DAMPING)
         else:
             search.damping *= _DAMPING_UP
-        is_small = bool(twist.abs().max() < _LEAST_STEP)
-        search.is_done = is_small or search.damping > _MOST_DAMPING
-        if search.is_done:
-            self._conclude()
+        is_small = bool(twist.abs().max() < _LEAST_STEPS[search.level])
+        if is_small or search.damping > _MOST_DAMPING:
+            self._end_level(search)
         return before
 
     @property
@@ -165,14 +170,28 @@ class LevenbergMarquardtTracker(Tracker):
         self.last_good = state["last_good"]
 
     def _search_from(self, T_start: Float[Tensor, "4 4"]) -> _Search:
-        residuals = residuals_at(self.field, self.observation, T_start)
-        return _Search(T_start, T_start, residuals, scales_of(residuals))
+        residuals = self._residuals_at(T_start, level=0)
+        return _Search(T_start, T_start, residuals, self._scales_of(residuals))
 
-    def _conclude(self) -> None:
-        """Keep the search that just ended if it is the best; begin another if that is lost."""
+    def _residuals_at(self, T_world_camera: Float[Tensor, "4 4"], level: int) -> Residuals:
+        by_slope = self.config.divide_by_slope
+        return residuals_at(self.field, self.levels[level], T_world_camera, by_slope)
+
+    def _scales_of(self, residuals: Residuals, before: Scales | None = None) -> Scales:
+        return scales_of(residuals, before) if self.config.anneal else LEAST_SCALES
+
+    def _end_level(self, search: _Search) -> None:
+        """Go on with all points; after that keep the best search, and restart if it is lost."""
+        if search.level == 0:
+            search.level, search.damping = 1, _FIRST_DAMPING
+            search.residuals = self._residuals_at(search.T_world_camera, level=1)
+            search.scales = self._scales_of(search.residuals)
+            return
+        search.is_done = True
         self.best = self._chosen()
-        if self.further_starts and self._is_lost(self.best):
-            self.search = self._search_from(self.further_starts.pop(0))
+        if self.n_restarted < self.config.n_restarts and self._is_lost(self.best):
+            self.search = self._search_from(_around(self.anchor, self.n_restarted))
+            self.n_restarted += 1
 
     def _chosen(self) -> _Search | None:
         if self.best is None or self.search is self.best:
@@ -199,13 +218,14 @@ def _damped_step(search: _Search, intensity_weight: float) -> Float[Tensor, "6"]
     return -torch.linalg.solve(matrix, vector).to(search.T_world_camera)
 
 
-def _around(T_world_camera: Float[Tensor, "4 4"]) -> list[Float[Tensor, "4 4"]]:
-    """A pose, and the same turned about each axis, both ways."""
-    turns = torch.zeros(7, 6).to(T_world_camera)
-    for axis in range(3):
-        turns[1 + 2 * axis, axis] = _RESTART_ANGLE
-        turns[2 + 2 * axis, axis] = -_RESTART_ANGLE
-    return [moved(T_world_camera, turn) for turn in turns]
+def _around(T_world_camera: Float[Tensor, "4 4"], number: int) -> Float[Tensor, "4 4"]:
+    """The start of a restart: a pose itself, then turned about x, y and z both ways, and wider."""
+    turn = torch.zeros(6).to(T_world_camera)
+    if number > 0:
+        round_, which = divmod(number - 1, 6)
+        axis, way = divmod(which, 2)
+        turn[axis] = (1 + round_) * _RESTART_ANGLE * (1 - 2 * way)
+    return moved(T_world_camera, turn)
 
 
 def _orthonormal(T: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
