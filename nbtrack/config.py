@@ -44,6 +44,7 @@ class MappingConfig:
 class TrackingConfig:
     """One tracker; what a tracker does not use it ignores."""
 
+    engine: str = "fast"  # how the network is asked: fast, or plain torch; the answers are equal
     n_pixels: int = 4096  # new random pixels each iteration (paper: VR 512, SDF 4096)
     position_rate: float = 5e-4  # Adam's learning rate of the position, m (paper)
     orientation_rate: float = 1e-3  # Adam's learning rate of the unit quaternion (paper)

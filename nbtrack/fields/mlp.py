@@ -11,24 +11,6 @@ from nbtrack.bounds import SceneBounds
 from nbtrack.config import FieldConfig
 
 
-def silu_slope(before: Tensor) -> Tensor:
-    """Derivative of x sigmoid(x)."""
-    gate = torch.sigmoid(before)
-    return gate * (1 + before * (1 - gate))
-
-
-def relu_slope(before: Tensor) -> Tensor:
-    """Derivative of max(x, 0); 0 at 0."""
-    return (before > 0).to(before.dtype)
-
-
-SLOPES: dict[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]] = {
-    nn.functional.silu: silu_slope,
-    nn.functional.relu: relu_slope,
-}
-"""The derivative of each activation, for `FourierMlp.linearize`."""
-
-
 class FourierMlp(nn.Module):
     """Four hidden layers on 93 learnable sines; position in, colour logits and one value out.
 
@@ -70,44 +52,6 @@ class FourierMlp(nn.Module):
         hidden = self.activation(self.layer_2(hidden))
         hidden = self.activation(self.layer_3(torch.cat([hidden, embedding], dim=-1)))
         return self.activation(self.layer_4(hidden))
-
-    def linearize(
-        self,
-        points_world: Float[Tensor, "n 3"],
-        slopes: Callable[[Float[Tensor, "n 4"]], Float[Tensor, "k n 4"]],
-    ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "k n 3"]]:
-        """Raw outputs and the spatial gradients (1/m) of k functions of them, without autograd.
-
-        Reverse mode by hand. With a_l = W_l h_l-1 + b_l, h_l = act(a_l), e = sin(x B) and the
-        embedding entering layers 1 and 3, the gradient g_l of a function with respect to h_l obeys
-
-            g_4 = W_head' slope,     d_l = act'(a_l) g_l,
-            [g_2, s] = W_3' d_3,     g_3 = W_4' d_4,     g_1 = W_2' d_2,
-            gradient = ((s + W_1' d_1) cos(x B)) B'.
-
-        Args:
-            slopes: derivatives of the k functions with respect to the raw outputs, at these.
-        """
-        slope_of_activation = SLOPES[self.activation]
-        phase = (points_world - self.center) / self.metres_per_unit @ self.frequencies
-        embedding = torch.sin(phase)
-        layers = (self.layer_1, self.layer_2, self.layer_3, self.layer_4)
-        hidden, slopes_of_layers = embedding, []
-        for layer in layers:
-            if layer is self.layer_3:
-                hidden = torch.cat([hidden, embedding], dim=-1)
-            before = layer(hidden)
-            hidden = self.activation(before)
-            slopes_of_layers.append(slope_of_activation(before))
-        raw = self.head(hidden)
-        gradient = slopes(raw) @ self.head.weight
-        for layer, slope in zip(reversed(layers), reversed(slopes_of_layers), strict=True):
-            gradient = (gradient * slope) @ layer.weight
-            if layer is self.layer_3:
-                width = gradient.shape[-1] - embedding.shape[-1]
-                gradient, skipped = gradient[..., :width], gradient[..., width:]
-        gradient = (gradient + skipped) * torch.cos(phase)
-        return raw, gradient @ self.frequencies.T / self.metres_per_unit
 
     def forward(
         self, points_world: Float[Tensor, "n 3"]

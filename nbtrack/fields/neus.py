@@ -15,6 +15,7 @@ from nbtrack.fields.base import (
     measured_mean,
     register_field,
 )
+from nbtrack.fields.engine import FrozenMlp
 from nbtrack.fields.mlp import FourierMlp
 from nbtrack.rendering import Rendering, composite, weights_from_sdf
 
@@ -64,7 +65,9 @@ class NeuSField(LearnedField):
 
     @torch.no_grad()
     def linearize(self, points_world: Float[Tensor, "n 3"]) -> Linearization:
-        """Value and intensity with their gradients, written out: see `FourierMlp.linearize`."""
+        """Value and intensity with their gradients; by the engine, if the field is frozen."""
+        if not isinstance(self.mlp, FrozenMlp):
+            return super().linearize(points_world)
         raw, gradients = self.mlp.linearize(points_world, self._slopes)
         return Linearization(
             raw[:, 3] * self.mlp.metres_per_unit, gradients[0],

@@ -1,6 +1,7 @@
 """What every tracker offers to the tracking loop, and the registry of trackers."""
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from nbtrack.config import TrackingConfig
 from nbtrack.errors import ConfigError, nearest_name
 from nbtrack.fields import Field
+from nbtrack.fields.engine import frozen
 from nbtrack.geometry import (
     make_transform,
     matrix_to_quaternion,
@@ -17,6 +19,9 @@ from nbtrack.geometry import (
     quaternion_to_matrix,
 )
 from nbtrack.sampling import PixelSampler
+
+ENGINES: dict[str, Callable[[Field], Field]] = {"fast": frozen, "plain": lambda field: field}
+"""How a tracker asks a field: on the engine, or as the field's own plain torch."""
 
 
 class Tracker(abc.ABC):
@@ -39,7 +44,11 @@ class Tracker(abc.ABC):
         config: TrackingConfig,
         generator: torch.Generator,
     ) -> None:
-        self.field = field
+        if config.engine not in ENGINES:
+            raise ConfigError(
+                f"unknown engine {config.engine!r}: {nearest_name(config.engine, [*ENGINES])}"
+            )
+        self.field = ENGINES[config.engine](field)
         self.sampler = sampler
         self.config = config
         self.generator = generator

@@ -1,0 +1,154 @@
+"""The engine gives the answers of plain torch: it would catch a wrong term of any derivative."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from nbtrack.bounds import SceneBounds
+from nbtrack.budget import StepBudget
+from nbtrack.config import FieldConfig, TrackingConfig
+from nbtrack.data import Sequence, read_sequence
+from nbtrack.errors import ConfigError
+from nbtrack.fields import Rays, make_field
+from nbtrack.fields.engine import _CHUNK_ROWS, PULL_BACKS, FrozenMlp, frozen
+from nbtrack.sampling import PixelSampler
+from nbtrack.synthetic import make_room
+from nbtrack.trackers import tracker_class
+from nbtrack.tracking import track_sequence
+
+BOUNDS = SceneBounds((-2.0, -1.0, 0.0), (3.0, 2.0, 4.0))
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory) -> Sequence:
+    folder = tmp_path_factory.mktemp("engine") / "office"
+    make_room("office", folder, 4, 32, 24, 0, 1)
+    return read_sequence(folder)
+
+
+def both(name, dtype=torch.float32, width=32):
+    field = make_field(name, FieldConfig(width=width), BOUNDS, seed=3).to(dtype)
+    field.eval().requires_grad_(False)
+    return field, frozen(field)
+
+
+def points_inside(n, dtype=torch.float32):
+    low, high = torch.tensor(BOUNDS.minimum), torch.tensor(BOUNDS.maximum)
+    share = torch.rand(n, 3, generator=torch.Generator().manual_seed(0))
+    return (low + (high - low) * share).to(dtype)
+
+
+def close(found, expected, dtype):
+    scale = expected.abs().max().clamp_min(1)
+    return float((found - expected).abs().max() / scale) < TOLERANCE[dtype]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["imap", "neus"])
+@pytest.mark.parametrize("n", [1, 37, _CHUNK_ROWS + 5])
+def test_values_and_position_gradients_are_those_of_autograd(name, dtype, n):
+    answers = []
+    for field in both(name, dtype):
+        points = points_inside(n, dtype).requires_grad_()
+        color, value = field(points)
+        loss = (color * torch.arange(3)).sum() + (value * value).sum()
+        answers.append((color.detach(), value.detach(), *torch.autograd.grad(loss, points)))
+    for found, expected in zip(answers[1], answers[0], strict=True):
+        assert close(found, expected, dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_linearization_is_that_of_autograd(dtype):
+    plain, fast = both("neus", dtype)
+    points = points_inside(_CHUNK_ROWS + 3, dtype)
+    for name in ("value", "value_gradient", "intensity", "intensity_gradient"):
+        expected = getattr(plain.linearize(points), name)
+        assert close(getattr(fast.linearize(points), name), expected, dtype), name
+
+
+@pytest.mark.parametrize("activation", list(PULL_BACKS))
+def test_pull_backs_are_the_derivatives_of_their_activations(activation):
+    before = torch.linspace(-4, 4, 81, dtype=torch.float64) + 1e-3
+    gradient = torch.linspace(1, 2, 81, dtype=torch.float64)
+    found = PULL_BACKS[activation](gradient, before, torch.empty_like(before))
+    step = 1e-6
+    slope = (activation(before + step) - activation(before - step)) / (2 * step)
+    assert torch.allclose(found, gradient * slope, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["imap", "neus"])
+def test_rendered_pixels_and_their_gradients_are_equal(name):
+    depths = torch.linspace(0.2, 3, 16).expand(40, 16)
+    found = []
+    for field in both(name):
+        origins = torch.tensor([0.5, 0.5, 2.0]).expand(40, 3).clone().requires_grad_()
+        directions = torch.nn.functional.normalize(points_inside(40) - 1, dim=-1)
+        rays = Rays(origins, directions, torch.zeros(40, 3), torch.ones(40))
+        rendering = field.render(rays, depths)
+        (gradient,) = torch.autograd.grad(rendering.depth.sum(), origins)
+        found.append((rendering.depth.detach(), rendering.color.detach(), gradient))
+    for fast, plain in zip(found[1], found[0], strict=True):
+        assert torch.allclose(fast, plain, atol=2e-5)
+
+
+def test_a_backward_pass_after_another_forward_pass_is_refused():
+    _, fast = both("neus")
+    loss = fast(points_inside(5).requires_grad_())[1].sum()
+    fast(points_inside(5))
+    with pytest.raises(RuntimeError, match="anew"):
+        loss.backward()
+
+
+def test_no_points_give_no_answers():
+    _, fast = both("neus")
+    color, value = fast(torch.empty(0, 3))
+    assert color.shape == (0, 3)
+    assert value.shape == (0,)
+
+
+def test_memory_is_reused_and_bounded_whatever_the_numbers_of_points():
+    _, fast = both("neus")
+    mlp = fast.mlp
+    mlp.linearize(points_inside(64), fast._slopes)
+    before = mlp._tape(64).phase.data_ptr()
+    mlp.linearize(points_inside(64), fast._slopes)
+    assert mlp._tape(64).phase.data_ptr() == before
+    for n in range(1, 200):
+        mlp.linearize(points_inside(n), fast._slopes)
+    assert len(mlp._kept) < 20
+
+
+def test_training_does_not_reach_a_frozen_copy():
+    field, fast = both("neus")
+    before = fast(points_inside(4))[1]
+    with torch.no_grad():
+        field.mlp.head.bias += 1
+    assert torch.equal(fast(points_inside(4))[1], before)
+    assert isinstance(fast.mlp, FrozenMlp)
+    assert not isinstance(field.mlp, FrozenMlp)
+
+
+@pytest.mark.parametrize(("name", "field_name"), [("sdf", "neus"), ("vr", "imap"), ("lm", "neus")])
+def test_both_engines_track_alike(name, field_name, sequence):
+    """Same seeds, same steps: the trajectories differ by less than 0.1 mm."""
+    field = make_field(field_name, FieldConfig(width=32), BOUNDS, seed=0)
+    field.eval().requires_grad_(False)
+    paths = [
+        track_sequence(
+            name, field, sequence, StepBudget(4),
+            replace(TrackingConfig(n_pixels=64), engine=engine),
+        ).T_estimated
+        for engine in ("plain", "fast")
+    ]  # fmt: skip
+    assert np.abs(paths[1] - paths[0])[:, :3, 3].max() < 1e-4
+
+
+def test_an_unknown_engine_is_named(sequence):
+    sampler = PixelSampler(sequence, torch.device("cpu"))
+    with pytest.raises(ConfigError, match="unknown engine 'fats': did you mean 'fast'"):
+        tracker_class("sdf")(
+            both("neus")[0], sampler, TrackingConfig(engine="fats"), torch.Generator()
+        )
