@@ -1,6 +1,7 @@
 """The axis-aligned box that a sequence observes: where fields live and where rays end."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -33,7 +34,7 @@ class SceneBounds:
         self, points_world: Float[Tensor, "n 3"], margin: float = 0.0
     ) -> Bool[Tensor, "n"]:
         """Whether points (m) lie inside the box, or no farther than `margin` metres from it."""
-        low, high = points_world.new_tensor(self.minimum), points_world.new_tensor(self.maximum)
+        low, high = _corners(self, points_world.device, points_world.dtype)
         return ((points_world >= low - margin) & (points_world <= high + margin)).all(dim=-1)
 
     def exit_depth(
@@ -45,9 +46,20 @@ class SceneBounds:
         """
         # An axis that a ray runs along is left at infinity, never at 0/0.
         safe = torch.where(directions_world.abs() < 1e-9, 1e-9, directions_world)
-        to_minimum = (origins_world.new_tensor(self.minimum) - origins_world) / safe
-        to_maximum = (origins_world.new_tensor(self.maximum) - origins_world) / safe
+        low, high = _corners(self, origins_world.device, origins_world.dtype)
+        to_minimum, to_maximum = (low - origins_world) / safe, (high - origins_world) / safe
         return torch.maximum(to_minimum, to_maximum).amin(dim=-1)
+
+
+@cache
+def _corners(
+    bounds: SceneBounds, device: torch.device, dtype: torch.dtype
+) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Both corners on a device, copied there once."""
+    return (
+        torch.tensor(bounds.minimum, device=device, dtype=dtype),
+        torch.tensor(bounds.maximum, device=device, dtype=dtype),
+    )
 
 
 def observed_bounds(

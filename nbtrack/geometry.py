@@ -81,7 +81,9 @@ def make_transform(
     rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
     """Homogeneous transform from a rotation matrix and a translation (m)."""
-    bottom = rotation.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*rotation.shape[:-2], 1, 4)
+    # Made on the device: a row of numbers from the host would be copied there in every step.
+    identity = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
+    bottom = identity[3:].expand(*rotation.shape[:-2], 1, 4)
     return torch.cat([torch.cat([rotation, translation.unsqueeze(-1)], dim=-1), bottom], dim=-2)
 
 

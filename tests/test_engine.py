@@ -1,10 +1,12 @@
 """The engine gives the answers of plain torch: it would catch a wrong term of any derivative."""
 
+import gc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from nbtrack.bounds import SceneBounds
 from nbtrack.budget import StepBudget
@@ -152,3 +154,68 @@ def test_an_unknown_engine_is_named(sequence):
         tracker_class("sdf")(
             both("neus")[0], sampler, TrackingConfig(engine="fats"), torch.Generator()
         )
+
+
+class HostTraffic(TorchDispatchMode):
+    """Notes the operations that copy between host and device or wait for the device."""
+
+    COPIES = ("lift_fresh", "_local_scalar_dense", "nonzero", "masked_select", "unique")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        name = operation._overloadpacket.__name__
+        if name in self.COPIES:
+            self.found.append(name)
+        return operation(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(("name", "field_name"), [("sdf", "neus"), ("vr", "imap")])
+def test_a_step_copies_nothing_between_host_and_device(name, field_name, sequence):
+    """On CUDA each such copy would wait for the device, and none can be captured in a graph."""
+    sampler = PixelSampler(sequence, torch.device("cpu"))
+    tracker = tracker_class(name)(
+        both(field_name)[0], sampler, TrackingConfig(n_pixels=32), torch.Generator()
+    )
+    tracker.start_frame(1, torch.from_numpy(sequence.T_world_camera[:1]).float())
+    tracker.step()
+    with HostTraffic() as traffic:
+        tracker.loss(tracker._differentiable_pose(), *tracker.pixels).backward()
+        torch.tensor(1.0).item()  # what the mode must see
+    assert traffic.found == ["lift_fresh", "_local_scalar_dense"]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize(("name", "field_name"), [("sdf", "neus"), ("vr", "imap")])
+def test_graphed_steps_track_as_plain_ones_do(name, field_name, sequence):
+    device = torch.device("cuda")
+    field = both(field_name)[0].to(device)
+    paths = [
+        track_sequence(
+            name, field, sequence, StepBudget(6),
+            replace(TrackingConfig(n_pixels=64), engine=engine), device=device,
+        ).T_estimated
+        for engine in ("plain", "fast")
+    ]  # fmt: skip
+    assert np.abs(paths[1] - paths[0])[:, :3, 3].max() < 1e-4
+
+
+def test_many_frames_leave_no_memory_behind(sequence):
+    """The engine's buffers and the tracker's tensors are the same ones after every frame."""
+    sampler = PixelSampler(sequence, torch.device("cpu"))
+    tracker = tracker_class("sdf")(
+        both("neus")[0], sampler, TrackingConfig(n_pixels=16), torch.Generator()
+    )
+    T_start = torch.from_numpy(sequence.T_world_camera[:1]).float()
+
+    def tensors_after(n_frames: int) -> int:
+        for _ in range(n_frames):
+            tracker.start_frame(1, T_start)
+            tracker.step()
+        gc.collect()
+        return sum(issubclass(type(thing), torch.Tensor) for thing in gc.get_objects())
+
+    after_few = tensors_after(10)
+    assert tensors_after(190) <= after_few

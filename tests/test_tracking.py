@@ -127,7 +127,7 @@ def test_new_pixels_every_step() -> None:
         BoxRoom(as_density=False), sampler, config_of("sdf"), torch.Generator().manual_seed(0)
     )
     seen = []
-    tracker.loss = lambda T, rows, columns: seen.append((rows, columns)) or T.sum()
+    tracker.loss = lambda T, rows, columns: seen.append((rows.clone(), columns.clone())) or T.sum()
     tracker.start_frame(0, torch.eye(4)[None])
     tracker.step()
     tracker.step()

@@ -19,6 +19,7 @@ from nbtrack.geometry import (
     quaternion_to_matrix,
 )
 from nbtrack.sampling import PixelSampler
+from nbtrack.trackers.cuda_graph import GraphedStep
 
 ENGINES: dict[str, Callable[[Field], Field]] = {"fast": frozen, "plain": lambda field: field}
 """How a tracker asks a field: on the engine, or as the field's own plain torch."""
@@ -100,39 +101,77 @@ class AdamTracker(Tracker):
     choice; the paper does not say).
     """
 
+    def __init__(
+        self,
+        field: Field,
+        sampler: PixelSampler,
+        config: TrackingConfig,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__(field, sampler, config, generator)
+        device = sampler.device
+        # All that a step works on keeps its place in memory, so that it can be captured.
+        self.frame_number = torch.zeros((), dtype=torch.long, device=device)
+        self.pixels = torch.zeros(2, config.n_pixels, dtype=torch.long, device=device)
+        self.position = torch.zeros(3, device=device, requires_grad=True)
+        self.q_wxyz = torch.zeros(4, device=device, requires_grad=True)
+        self.is_graphed = (
+            config.engine == "fast" and device.type == "cuda" and sampler.images_device == device
+        )
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": [self.position], "lr": config.position_rate},
+                {"params": [self.q_wxyz], "lr": config.orientation_rate},
+            ],
+            capturable=self.is_graphed,
+        )
+        self.graphed_step: GraphedStep | None = None
+
     def start_frame(self, frame: int, T_starts: Float[Tensor, "starts 4 4"]) -> None:
         """Take up a frame; its measured pixels are listed once.
 
         Of several starts the one with the lowest loss is taken, on the same pixels for all.
         """
-        self.frame = frame
+        self.frame_number.fill_(frame)
         self.rows, self.columns = self.sampler.measured_pixels(frame)
         T_world_camera = T_starts[0] if len(T_starts) == 1 else self._cheapest(T_starts)
-        self.position = T_world_camera[:3, 3].clone().requires_grad_()
-        self.q_wxyz = matrix_to_quaternion(T_world_camera[:3, :3]).requires_grad_()
-        self.optimizer = torch.optim.Adam(
-            [
-                {"params": [self.position], "lr": self.config.position_rate},
-                {"params": [self.q_wxyz], "lr": self.config.orientation_rate},
-            ]
-        )
+        if self.is_graphed and self.graphed_step is None:
+            self._start_at(T_world_camera)
+            # Any pixels will do; drawing some would change which ones the steps see.
+            self.pixels.copy_(torch.stack([self.rows[:1], self.columns[:1]]))
+            self.graphed_step = GraphedStep(self._step_on_pixels, self.generator)
+        self._start_at(T_world_camera)
 
     def step(self) -> Float[Tensor, ""]:
         """Draw pixels, lower their loss by one step of Adam, renormalise the quaternion."""
-        loss = self.loss(self._differentiable_pose(), *self._drawn_pixels())
+        self.pixels.copy_(self._drawn_pixels())
+        return self.graphed_step() if self.graphed_step else self._step_on_pixels()
+
+    def _step_on_pixels(self) -> Float[Tensor, ""]:
         self.optimizer.zero_grad(set_to_none=True)
+        loss = self.loss(self._differentiable_pose(), *self.pixels)
         loss.backward()
         self.optimizer.step()
         with torch.no_grad():
             self.q_wxyz.copy_(normalize_quaternion(self.q_wxyz))
         return loss.detach()
 
-    def _drawn_pixels(self) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+    @torch.no_grad()
+    def _start_at(self, T_world_camera: Float[Tensor, "4 4"]) -> None:
+        """Put the pose there and forget all momentum."""
+        self.position.copy_(T_world_camera[:3, 3])
+        self.q_wxyz.copy_(matrix_to_quaternion(T_world_camera[:3, :3]))
+        for moments in self.optimizer.state.values():
+            for moment in moments.values():
+                moment.zero_()
+
+    def _drawn_pixels(self) -> Int[Tensor, "2 n"]:
+        """Rows and columns of randomly drawn measured pixels."""
         drawn = torch.randint(
             len(self.rows), (self.config.n_pixels,),
             generator=self.generator, device=self.generator.device,
         )  # fmt: skip
-        return self.rows[drawn], self.columns[drawn]
+        return torch.stack([self.rows[drawn], self.columns[drawn]])
 
     @torch.no_grad()
     def _cheapest(self, T_starts: Float[Tensor, "starts 4 4"]) -> Float[Tensor, "4 4"]:

@@ -1,6 +1,5 @@
 """NeuS with SDF: the paper's own tracker, which asks a field for distances, without rendering."""
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -27,7 +26,7 @@ class SdfTracker(AdamTracker):
         columns: Int[Tensor, "n"],
     ) -> Float[Tensor, ""]:
         """Paper, Eq. 2, for the pixels' back-projected points."""
-        frames = torch.full_like(rows, self.frame)
+        frames = self.frame_number.expand_as(rows)
         color, depth = self.sampler.measurements(frames, rows, columns)
         points_camera = backproject(self.sampler.intrinsics, columns, rows, depth)
         field_color, field_sdf = self.field(transform_points(T_world_camera, points_camera))

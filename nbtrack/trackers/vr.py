@@ -1,6 +1,5 @@
 """iMAP with VR: the paper's baseline, which renders pixels and compares images."""
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -36,7 +35,7 @@ class VolumeRenderingTracker(AdamTracker):
         columns: Int[Tensor, "n"],
     ) -> Float[Tensor, ""]:
         """iMAP's loss of rendered pixels; gradients reach the pose through every sample."""
-        frames = torch.full_like(rows, self.frame)
+        frames = self.frame_number.expand_as(rows)
         color, depth = self.sampler.measurements(frames, rows, columns)
         directions_camera = pixel_directions(self.sampler.intrinsics, columns, rows)
         directions_world = directions_camera @ T_world_camera[:3, :3].T
