@@ -23,15 +23,19 @@ from nbtrack.storage import write_text_atomic
 from nbtrack.tables import COLUMNS_2
 from nbtrack.trackers import TRACKERS, Tracker, paper_trackers
 
+ENGINE_LABELS = {"plain": "", "fast": ", engine"}
+"""What follows a tracker's name in Table II: the paper's trackers are in plain torch."""
+
 
 def measure_steps(
     preset: Preset,
     sequence: Sequence,
     device: torch.device,
-    frames_per_cell: int = 5,
+    frames_per_cell: int = 3,
     progress: bool = True,
+    engines: tuple[str, ...] = tuple(ENGINE_LABELS),
 ) -> pd.DataFrame:
-    """Steps within each budget for every tracker and its pixel counts n.
+    """Steps within each budget for every tracker, its pixel counts n, and both engines.
 
     The fields are untrained: a step costs the same whatever the weights are. Each tracker first
     spends one frame that is not counted, so that allocations and compilations are done.
@@ -41,34 +45,33 @@ def measure_steps(
         frames_per_cell: frames that a cell's mean is taken over.
 
     Returns:
-        One row a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames),
-        steps_deviation (over frames).
+        One row a cell: tracker ("VR", "SDF", ... in plain torch, as the paper's; "VR, engine" and
+        so on), n_pixels, budget_ms, steps (mean over frames), steps_deviation (over frames).
 
     Source: paper, Table II and evaluation protocol.
     """
-    sampler = PixelSampler(sequence, device)
     T_start = torch.from_numpy(sequence.T_world_camera[0]).float().to(device)
-    bounds = observed_bounds(sequence)
+    make_tracker = TrackerMaker(preset, sequence, device)
     cells = [
-        (name, n_pixels, budget_ms)
+        (name, engine, n_pixels, budget_ms)
+        for engine in engines
         for name in paper_trackers()
         for n_pixels in preset.tables.pixels_of(name)
         for budget_ms in preset.tables.budgets_ms
     ]
     rows = []
-    for name, n_pixels, budget_ms in tqdm(cells, "Table II", unit="cell", disable=not progress):
-        field = make_field(TRACKERS[name].field_name, _network_of(preset, name), bounds, seed=0)
-        field.to(device).eval().requires_grad_(False)
-        config = replace(preset.tracking_of(name), n_pixels=n_pixels)
-        tracker = TRACKERS[name](field, sampler, config, torch.Generator(device).manual_seed(0))
+    for name, engine, n_pixels, budget_ms in tqdm(
+        cells, "Table II", unit="cell", disable=not progress
+    ):
         with (
             naming_what_to_lower(f"tables.pixels.{name}={n_pixels}"),
-            suitable_threads(_network_of(preset, name).width),
+            suitable_threads(network_of(preset, name).width),
             alone_on(device, tqdm.write),
         ):
+            tracker = make_tracker(name, n_pixels, engine)
             steps = _count_steps(tracker, T_start, budget_ms, frames_per_cell, device)
         mean, deviation = float(steps.mean()), float(steps.std())
-        rows.append((TRACKERS[name].short_label, n_pixels, budget_ms, mean, deviation))
+        rows.append((row_label(name, engine), n_pixels, budget_ms, mean, deviation))
     return pd.DataFrame(rows, columns=[*COLUMNS_2, "steps_deviation"])
 
 
@@ -97,11 +100,37 @@ def obtain_steps(
 def default_pixels(preset: Preset) -> dict[str, int]:
     """The n that each tracker of Table II uses for Table I, by its label."""
     return {
-        TRACKERS[name].short_label: preset.tracking_of(name).n_pixels for name in paper_trackers()
+        row_label(name, engine): preset.tracking_of(name).n_pixels
+        for name in paper_trackers()
+        for engine in ENGINE_LABELS
     }
 
 
-def _network_of(preset: Preset, tracker_name: str) -> FieldConfig:
+class TrackerMaker:
+    """Makes trackers in untrained fields, which cost a step as much as trained ones."""
+
+    def __init__(self, preset: Preset, sequence: Sequence, device: torch.device) -> None:
+        self.preset, self.device = preset, device
+        self.sampler = PixelSampler(sequence, device)
+        self.bounds = observed_bounds(sequence)
+
+    def __call__(self, name: str, n_pixels: int, engine: str) -> Tracker:
+        """A tracker by name, with n pixels a step, on an engine."""
+        network = network_of(self.preset, name)
+        field = make_field(TRACKERS[name].field_name, network, self.bounds, seed=0)
+        field.to(self.device).eval().requires_grad_(False)
+        config = replace(self.preset.tracking_of(name), n_pixels=n_pixels, engine=engine)
+        generator = torch.Generator(self.device).manual_seed(0)
+        return TRACKERS[name](field, self.sampler, config, generator)
+
+
+def row_label(tracker_name: str, engine: str) -> str:
+    """A tracker's name in Table II: the paper's, and a further one on the engine."""
+    return TRACKERS[tracker_name].short_label + ENGINE_LABELS[engine]
+
+
+def network_of(preset: Preset, tracker_name: str) -> FieldConfig:
+    """Network of the field that a tracker works in."""
     return preset.network_of(TRACKERS[tracker_name].field_name)
 
 

@@ -1,18 +1,16 @@
 """What each command does and prints."""
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import torch
 from tqdm.auto import tqdm
 
-from nbtrack.bench import obtain_steps
 from nbtrack.cells import MapCell, TrackCell, cell_lock, check_pair, make_budget
 from nbtrack.config import Preset
 from nbtrack.data import Sequence, parse_frames
 from nbtrack.data_check import check_sequence
-from nbtrack.device import choose_device, device_name
+from nbtrack.device import choose_device
 from nbtrack.errors import DataError
 from nbtrack.experiments import map_summary, obtain_map, run_track
 from nbtrack.fields import field_class
@@ -20,7 +18,6 @@ from nbtrack.meshes import extract_mesh, keep_seen
 from nbtrack.parallel import Execution, Job, Report, run_jobs
 from nbtrack.scenes import Scene, find_scene
 from nbtrack.synthetic import make_room
-from nbtrack.tables import deviations_2, step_texts, table_2
 from nbtrack.trackers import tracker_class
 
 
@@ -94,17 +91,6 @@ def make_command(room: str, out: Path, n_frames: int, width: int, seed: int) -> 
 def check_command(folder: Path, depth_folder: str | None, pose_file: str) -> None:
     """Validate a sequence folder; print what it holds and which pose convention fits."""
     print(check_sequence(folder, depth_folder, pose_file, progress=True))
-
-
-def bench_command(preset: Preset) -> None:
-    """Measure and print Table II."""
-    device = choose_device()
-    # One image is enough: a room is made of no more frames than it takes.
-    one_image = replace(preset, scenes=replace(preset.scenes, n_frames=2))
-    scene = _scene(preset.scenes.names[0], one_image)
-    cells = obtain_steps(preset, scene.read(slice(0, 1)), device, measure_again=True)
-    print(f"Table II: steps within a budget, {preset.name} network, on {device_name(device)}")
-    print(step_texts(table_2(cells), deviations_2(cells)).to_string())
 
 
 _PRINTED = (

@@ -80,7 +80,8 @@ def plot_steps(
     for axes, tracker in zip(panels, trackers, strict=True):
         _draw_steps(axes, cells[cells["tracker"] == tracker], colors[tracker], "-", "this machine")
         if published is not None:
-            paper = published[published["tracker"] == tracker]
+            # Rows of the engine stand beside the paper's of the same tracker.
+            paper = published[published["tracker"] == tracker.partition(",")[0]]
             _draw_steps(axes, paper, colors[tracker], ":", "paper")
         budgets = sorted(cells["budget_ms"].unique())
         axes.set(title=tracker, xscale="log", yscale="log", xlabel="budget a frame (ms)")
