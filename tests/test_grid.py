@@ -110,9 +110,12 @@ def test_table_2_of_this_machine(preset: Preset) -> None:
     """Catches empty cells: even a slow machine fits a step of 16 points into 20 ms sometimes."""
     scene = find_scene("living_room", preset.scenes)
     cells = measure_steps(preset, scene.read(slice(0, 1)), choose_device(), progress=False)
-    assert cells[["tracker", "n_pixels"]].to_numpy().tolist() == [["VR", 4], ["SDF", 8]]
+    assert cells[["tracker", "n_pixels"]].to_numpy().tolist() == [
+        ["VR", 4], ["SDF", 8], ["VR, engine", 4], ["SDF, engine", 8],
+    ]  # fmt: skip
     assert (cells["steps"] >= 0).all()
-    assert default_pixels(preset) == {"VR": 8, "SDF": 16}
+    assert default_pixels(preset)["VR"] == default_pixels(preset)["VR, engine"] == 8
+    assert default_pixels(preset)["SDF"] == 16
 
 
 def test_missing_dataset_scene_is_named(

@@ -46,10 +46,10 @@ class ShiftedRoom(LearnedField):
         sdf = self.room.sdf(points_world.double().numpy()) - self.shift
         return torch.full_like(points_world, 0.5), torch.from_numpy(sdf).float()
 
-    def render(self, *arguments: object) -> None:
+    def composite(self, *arguments: object) -> None:
         raise NotImplementedError
 
-    mapping_losses = render
+    mapping_losses = composite
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.02])

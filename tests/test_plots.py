@@ -45,7 +45,7 @@ class AnalyticField(LearnedField):
     def forward(self, points_world: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return torch.full_like(points_world, 0.5), self.value(points_world)
 
-    def render(self, rays, depths):
+    def composite(self, colors, values, rays, depths):
         raise NotImplementedError
 
     def mapping_losses(self, batch, config, generator):

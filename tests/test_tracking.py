@@ -46,9 +46,13 @@ class BoxRoom(LearnedField):
         # Light goes out at the wall on average: the shift was solved for numerically.
         return color, 150 * torch.sigmoid((-sdf - SHIFT) / 0.02) if self.as_density else sdf
 
-    def render(self, rays: Rays, depths: Float[Tensor, "rays samples"]) -> Rendering:
-        colors, values = self(rays.points(depths).flatten(0, 1))
-        colors, values = colors.view(*depths.shape, 3), values.view_as(depths)
+    def composite(
+        self,
+        colors: Float[Tensor, "rays samples 3"],
+        values: Float[Tensor, "rays samples"],
+        rays: Rays,
+        depths: Float[Tensor, "rays samples"],
+    ) -> Rendering:
         if self.as_density:
             lengths = rays.directions_world.norm(dim=-1)
             return composite(weights_from_density(values, depths, lengths), colors, depths)

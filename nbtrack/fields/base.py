@@ -105,8 +105,25 @@ class LearnedField(Field):
     is_taught_distances: bool = False
 
     @abc.abstractmethod
+    def composite(
+        self,
+        colors: Float[Tensor, "rays samples 3"],
+        values: Float[Tensor, "rays samples"],
+        rays: Rays,
+        depths: Float[Tensor, "rays samples"],
+    ) -> Rendering:
+        """Volume rendering from what the field answered at ascending z-depths (m)."""
+
+    def along(
+        self, rays: Rays, depths: Float[Tensor, "rays samples"]
+    ) -> tuple[Float[Tensor, "rays samples 3"], Float[Tensor, "rays samples"]]:
+        """Colour and value at z-depths (m) along rays."""
+        colors, values = self(rays.points(depths).flatten(0, 1))
+        return colors.view(*depths.shape, 3), values.view_as(depths)
+
     def render(self, rays: Rays, depths: Float[Tensor, "rays samples"]) -> Rendering:
         """Volume rendering with samples at ascending z-depths (m)."""
+        return self.composite(*self.along(rays, depths), rays, depths)
 
     @abc.abstractmethod
     def mapping_losses(

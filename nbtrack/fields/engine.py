@@ -100,8 +100,7 @@ class FrozenMlp(nn.Module):
     """A `FourierMlp` that is only asked: same answers, no graph inside, nothing allocated twice.
 
     It takes the network's place in a field (see `frozen`). Values are differentiable with respect
-    to the points; the backward pass must follow before the next forward pass, as it does in a
-    loop of optimisation, because both use the same memory.
+    to the points, once: the backward pass gives the memory free for the next forward pass.
     """
 
     def __init__(self, mlp: FourierMlp) -> None:
@@ -125,7 +124,7 @@ class FrozenMlp(nn.Module):
         self.weights_back = [weight.contiguous() for weight in weights]
         self.biases = [layer.bias.detach().clone() for layer in layers]
         self._kept: dict[tuple, Any] = {}
-        self.n_forward = 0
+        self._free: list[_Tape] = []
 
     def forward(
         self, points_world: Float[Tensor, "n 3"]
@@ -212,6 +211,16 @@ class FrozenMlp(nn.Module):
     def _tape(self, n_rows: int) -> _Tape:
         return self._keep(("tape", n_rows), lambda: _Tape(n_rows, self))
 
+    def _take_tape(self, n_rows: int) -> _Tape:
+        """A tape that nothing else uses until it is given back."""
+        for index, tape in enumerate(self._free):
+            if tape.n_rows == n_rows:
+                return self._free.pop(index)
+        return _Tape(n_rows, self)
+
+    def _give_back(self, tape: _Tape) -> None:
+        self._free = [*self._free[1 - _MOST_FREE :], tape]
+
     def _scratch(self, n_rows: int, n_functions: int) -> _Scratch:
         return self._keep(
             ("scratch", n_rows, n_functions), lambda: _Scratch(n_rows, n_functions, self)
@@ -226,35 +235,35 @@ class FrozenMlp(nn.Module):
         return self._kept[key]
 
 
-_MOST_KEPT = 12
+_MOST_KEPT, _MOST_FREE = 12, 4
 
 
 class _Answer(torch.autograd.Function):
-    """`FrozenMlp.forward` as one node of a graph."""
+    """`FrozenMlp.forward` as one node of a graph, which holds a tape until its backward pass."""
 
     @staticmethod
     def forward(ctx: Any, points_world: Tensor, mlp: FrozenMlp) -> Tensor:
         n_rows = len(points_world)
-        mlp.n_forward += 1
-        ctx.mlp, ctx.n_forward = mlp, mlp.n_forward
-        ctx.bounds = bounds = mlp._chunks(n_rows)
+        ctx.mlp, ctx.bounds = mlp, mlp._chunks(n_rows)
         if ctx.needs_input_grad[0]:
-            ctx.tapes = tapes = mlp._tape(n_rows).chunks(bounds)
+            ctx.tape = mlp._take_tape(n_rows)
+            tapes = ctx.tape.chunks(ctx.bounds)
         else:
-            tapes = [mlp._tape(stop - start) for start, stop in bounds]
+            tapes = [mlp._tape(stop - start) for start, stop in ctx.bounds]
         raw = points_world.new_empty(n_rows, 4)
-        for (start, stop), tape in zip(bounds, tapes, strict=True):
+        for (start, stop), tape in zip(ctx.bounds, tapes, strict=True):
             mlp._answer(points_world[start:stop], tape, out=raw[start:stop])
         return raw
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        mlp = ctx.mlp
-        if ctx.n_forward != mlp.n_forward:
-            raise RuntimeError("a frozen network was asked anew before the backward pass")
+        if ctx.tape is None:
+            raise RuntimeError("a frozen network's memory serves one backward pass only")
         result = gradient.new_empty(len(gradient), 3)
-        for (start, stop), tape in zip(ctx.bounds, ctx.tapes, strict=True):
-            result[start:stop] = mlp._pull_back(gradient[None, start:stop], tape)[0]
+        for (start, stop), tape in zip(ctx.bounds, ctx.tape.chunks(ctx.bounds), strict=True):
+            result[start:stop] = ctx.mlp._pull_back(gradient[None, start:stop], tape)[0]
+        ctx.mlp._give_back(ctx.tape)
+        ctx.tape = None
         return result, None
 
 

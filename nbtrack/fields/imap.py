@@ -41,12 +41,16 @@ class IMapField(LearnedField):
         density = DENSITY_PER_UNIT * torch.nn.functional.softplus(raw_density)
         return torch.sigmoid(raw_color), density
 
-    def render(self, rays: Rays, depths: Float[Tensor, "rays samples"]) -> Rendering:
+    def composite(
+        self,
+        colors: Float[Tensor, "rays samples 3"],
+        values: Float[Tensor, "rays samples"],
+        rays: Rays,
+        depths: Float[Tensor, "rays samples"],
+    ) -> Rendering:
         """Volume rendering from density. Source: iMAP, Sec. 3.2."""
-        colors, density = self(rays.points(depths).flatten(0, 1))
-        ray_lengths = rays.directions_world.norm(dim=-1)
-        weights = weights_from_density(density.view_as(depths), depths, ray_lengths)
-        return composite(weights, colors.view(*depths.shape, 3), depths)
+        weights = weights_from_density(values, depths, rays.directions_world.norm(dim=-1))
+        return composite(weights, colors, depths)
 
     def mapping_losses(
         self, batch: Batch, config: MappingConfig, generator: torch.Generator

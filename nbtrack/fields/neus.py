@@ -82,13 +82,21 @@ class NeuSField(LearnedField):
         slopes[1, :, :3] = LUMA.to(raw) * color * (1 - color)
         return slopes
 
-    def render(self, rays: Rays, depths: Float[Tensor, "rays samples"]) -> Rendering:
+    def composite(
+        self,
+        colors: Float[Tensor, "rays samples 3"],
+        values: Float[Tensor, "rays samples"],
+        rays: Rays,
+        depths: Float[Tensor, "rays samples"],
+    ) -> Rendering:
         """Volume rendering of the sections between samples.
 
         A section's depth and colour are the means of its two ends: its mid-point, where the
         weight applies (our choice; NeuS evaluates the network there once more).
         """
-        return self._composite(*self._along(rays, depths), depths)
+        weights = weights_from_sdf(values, self.inverse_deviation)
+        middle_colors = (colors[:, 1:] + colors[:, :-1]) / 2
+        return composite(weights, middle_colors, (depths[:, 1:] + depths[:, :-1]) / 2)
 
     def mapping_losses(
         self, batch: Batch, config: MappingConfig, generator: torch.Generator
@@ -98,23 +106,6 @@ class NeuSField(LearnedField):
             **rendered_losses(self.render(batch.rays, batch.depths), batch.rays, config),
             "eikonal": config.lambda_eikonal * self._eikonal(batch, config, generator),
         }
-
-    def _along(
-        self, rays: Rays, depths: Float[Tensor, "rays samples"]
-    ) -> tuple[Float[Tensor, "rays samples 3"], Float[Tensor, "rays samples"]]:
-        """Colour and signed distance (m) at samples along rays."""
-        colors, sdf = self(rays.points(depths).flatten(0, 1))
-        return colors.view(*depths.shape, 3), sdf.view_as(depths)
-
-    def _composite(
-        self,
-        colors: Float[Tensor, "rays samples 3"],
-        sdf: Float[Tensor, "rays samples"],
-        depths: Float[Tensor, "rays samples"],
-    ) -> Rendering:
-        weights = weights_from_sdf(sdf, self.inverse_deviation)
-        middle_colors = (colors[:, 1:] + colors[:, :-1]) / 2
-        return composite(weights, middle_colors, (depths[:, 1:] + depths[:, :-1]) / 2)
 
     def _eikonal(
         self, batch: Batch, config: MappingConfig, generator: torch.Generator

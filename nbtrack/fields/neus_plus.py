@@ -34,11 +34,11 @@ class NeuSPlusField(NeuSField):
     ) -> dict[str, Float[Tensor, ""]]:
         """The terms of NeuS, and L1 errors of the signed distance and of the surface's colour."""
         rays, depths = batch.rays, batch.depths
-        colors, sdf = self._along(rays, depths)
+        colors, sdf = self.along(rays, depths)
         nearest = self.observed(rays.points(depths).flatten(0, 1)).view_as(depths)
         target, known = distance_targets(rays, depths, nearest, self.observed.voxel, config)
         sdf_error = ((sdf - target).abs() * known).sum() / known.sum().clamp_min(1)
-        rendered = rendered_losses(self._composite(colors, sdf, depths), rays, config)
+        rendered = rendered_losses(self.composite(colors, sdf, rays, depths), rays, config)
         return {
             **{name: config.lambda_rendering * loss for name, loss in rendered.items()},
             "sdf": config.lambda_sdf * sdf_error,

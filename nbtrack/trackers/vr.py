@@ -1,13 +1,14 @@
 """iMAP with VR: the paper's baseline, which renders pixels and compares images."""
 
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Generator, Tensor
 
 from nbtrack.camera import pixel_directions
 from nbtrack.config import TrackingConfig
-from nbtrack.fields import Rays
+from nbtrack.fields import LearnedField, Rays
 from nbtrack.fields.imap import rendering_losses
-from nbtrack.sampling import two_pass_depths
+from nbtrack.rendering import Rendering
+from nbtrack.sampling import render_in_two_passes, two_pass_depths
 from nbtrack.trackers.base import AdamTracker, register_tracker
 
 
@@ -41,8 +42,22 @@ class VolumeRenderingTracker(AdamTracker):
         directions_world = directions_camera @ T_world_camera[:3, :3].T
         origins_world = T_world_camera[:3, 3].expand_as(directions_world)
         rays = Rays(origins_world, directions_world, color, depth)
-        depths = two_pass_depths(
+        render = render_in_two_passes if self.config.engine == "fast" else _render_plainly
+        rendering = render(
             self.field, rays, self.config.n_stratified, self.config.n_importance, self.generator
         )
-        terms = rendering_losses(self.field.render(rays, depths), rays, self.config.lambda_color)
+        terms = rendering_losses(rendering, rays, self.config.lambda_color)
         return terms["depth"] + terms["color"]
+
+
+def _render_plainly(
+    field: LearnedField,
+    rays: Rays,
+    n_stratified: int,
+    n_importance: int,
+    generator: Generator,
+) -> Rendering:
+    """iMAP's two passes as they are described: depths first, then a rendering at all of them."""
+    return field.render(
+        rays, two_pass_depths(field, rays, n_stratified, n_importance, generator)
+    )
