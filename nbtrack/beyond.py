@@ -10,6 +10,7 @@ from nbtrack.cells import MapCell, TrackCell
 from nbtrack.config import Preset
 from nbtrack.experiments import map_summary
 from nbtrack.grid import TableCell, run_tracks, table_1_results
+from nbtrack.parallel import Execution
 from nbtrack.scenes import Scene
 from nbtrack.settings import with_settings
 from nbtrack.trackers import tracker_class
@@ -59,7 +60,7 @@ INGREDIENTS = (
     ("in NeuS, as in the paper", "neus", ()),
 )  # fmt: skip
 """What LM is made of: name, field and settings; each row differs from the first in one thing."""
-MOST_STEPS = 30
+MOST_STEPS = 30.0
 """Steps a frame that LM may take where no rate is set; it stops when it has converged."""
 
 
@@ -89,9 +90,12 @@ def table_3_results(
     scenes: Sequence[Scene],
     budget: str = "steps",
     methods: Sequence[Method] = METHODS,
+    execution: Execution | None = None,
 ) -> pd.DataFrame:
     """Table III in long form, as `grid.table_1_results` gives Table I; runs what is missing."""
-    return table_1_results(plan_table_3(preset, scenes, budget, methods))
+    return table_1_results(
+        plan_table_3(preset, scenes, budget, methods), execution=execution
+    )
 
 
 def speed_and_accuracy(results: pd.DataFrame, rate_hz: float | int = 10) -> pd.DataFrame:
@@ -112,7 +116,10 @@ def speed_and_accuracy(results: pd.DataFrame, rate_hz: float | int = 10) -> pd.D
 
 
 def what_each_ingredient_adds(
-    preset: Preset, scenes: Sequence[Scene], strides: Sequence[int] = (1, 8)
+    preset: Preset,
+    scenes: Sequence[Scene],
+    strides: Sequence[int] = (1, 8),
+    execution: Execution | None = None,
 ) -> pd.DataFrame:
     """LM with one thing changed at a time, with every frame and with most of them left out.
 
@@ -126,7 +133,7 @@ def what_each_ingredient_adds(
         for scene in scenes
         for stride in strides
     ]
-    metrics = run_tracks([cell for *_, cell in plans])
+    metrics = run_tracks([cell for *_, cell in plans], execution=execution)
     return pd.DataFrame(
         {
             "ingredient": ingredient, "scene": scene.name, "stride": stride,
