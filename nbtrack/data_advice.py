@@ -85,7 +85,7 @@ def _reading_warnings(fits: list[Fit], n_pairs: int, recording: Recording) -> li
             f"points overlap) and no other reading fits: check {recording.calibration.source.name},"
             f" the depth unit and {file}, and that image, depth and pose belong to one moment"
         ]
-    alike = [fit for fit in fits[1:] if fits_alike(own, fit)]
+    alike = [fit for fit in fits[1:] if fit.reading.subject == "poses" and fits_alike(own, fit)]
     if not alike:
         return []
     return [

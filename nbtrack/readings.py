@@ -1,8 +1,7 @@
 """Ways to read a recording's numbers, and how well the depth maps agree under each.
 
 Poses, calibration and depth are only right together if the surfaces that two frames see lie on
-each other. Each candidate reading is applied to pairs of frames, and the distance between the
-surfaces is measured.
+each other. Each reading is applied to pairs of frames, and the surfaces' distance is measured.
 """
 
 import math
@@ -21,7 +20,7 @@ from nbtrack.readers.declaration import Declaration
 # in front of the measured surface contradict a reading at any distance.
 _HIDDEN_BEHIND = 0.25  # m, our choice: several times a depth camera's noise
 _SAME_SURFACE = 0.05  # of the depth: neighbours further apart lie on different surfaces
-_POINTS_PER_FRAME = 2000
+_POINTS_PER_FRAME = 1000  # 20 pairs of frames have enough for a median
 _CLEARLY_BETTER = 0.5  # of the distance as declared (our choice)
 _LEAST_GAIN = 5e-4  # of the depth: 1 mm at 2 m, depth's resolution on disk
 FAR_APART = 0.05  # m, median distance above which a map of the scene would be blurred (our choice)
@@ -174,33 +173,48 @@ def fit_readings(
         file_poses: matrices as they stand in the file; no NaN.
         pairs: indices (a, b): points that frame a measured are looked up in frame b.
     """
-    return [_fit(reading, depths, file_poses, pairs) for reading in candidates]
+    stride = math.ceil((depths[0].size / _POINTS_PER_FRAME) ** 0.5)
+    grid = depths[pairs[:, 0], ::stride, ::stride]
+    pair, rows, columns = np.nonzero(grid)
+    samples = _Samples(pair, rows * stride, columns * stride, grid[pair, rows, columns])
+    return [_fit(reading, samples, depths, file_poses, pairs) for reading in candidates]
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Measured pixels of a regular grid in the first frame of every pair."""
+
+    pair: Int[np.ndarray, "n"]
+    rows: Int[np.ndarray, "n"]
+    columns: Int[np.ndarray, "n"]
+    values: UInt16[np.ndarray, "n"]  # depth, as in the file
 
 
 def _fit(
     reading: Reading,
+    samples: _Samples,
     depths: UInt16[np.ndarray, "frames height width"],
     file_poses: Float[np.ndarray, "frames 4 4"],
     pairs: Int[np.ndarray, "pairs 2"],
 ) -> Fit:
+    camera, metres = reading.intrinsics, _metres_per_value(reading)
+    z = samples.values * metres[samples.rows, samples.columns]
+    x = (samples.columns + 0.5 - camera.cx) / camera.fx
+    y = (samples.rows + 0.5 - camera.cy) / camera.fy
+    points_a = np.stack([x * z, y * z, z], axis=1)
     T_world_camera = reading.to_opencv(file_poses)
-    used = np.unique(pairs)
-    per_value = _metres_per_value(reading)
-    depths_m = {int(frame): depths[frame] * per_value for frame in used}
-    distances, shares, n_points = [np.zeros(0)], [np.zeros(0)], 0
-    for a, b in pairs.tolist():
-        T_b_a = np.linalg.solve(T_world_camera[b], T_world_camera[a])
-        points_a = _points(reading.intrinsics, depths_m[a])
-        points_b = points_a @ T_b_a[:3, :3].T + T_b_a[:3, 3]
-        behind, measured = _behind_surface(reading.intrinsics, points_b, depths_m[b])
-        distances.append(np.abs(behind))
-        shares.append(np.abs(behind) / measured)
-        n_points += len(points_a)
-    together = np.concatenate(distances)
-    if len(together) == 0:
+    T_world_a, T_world_b = T_world_camera[pairs[:, 0]], T_world_camera[pairs[:, 1]]
+    T_b_a = np.linalg.solve(T_world_b, T_world_a)[samples.pair]
+    points_b = np.einsum("nij,nj->ni", T_b_a[:, :3, :3], points_a) + T_b_a[:, :3, 3]
+    frames_b = pairs[:, 1][samples.pair]
+    behind, measured = _behind_surface(camera, points_b, frames_b, depths, metres)
+    if len(behind) == 0:
         return Fit(reading, float("nan"), float("nan"), 0.0)
-    relative = float(np.median(np.concatenate(shares)))
-    return Fit(reading, float(np.median(together)), relative, len(together) / max(1, n_points))
+    apart = np.abs(behind)
+    return Fit(
+        reading, float(np.median(apart)), float(np.median(apart / measured)),
+        len(apart) / len(samples.values),
+    )  # fmt: skip
 
 
 def _metres_per_value(reading: Reading) -> Float[np.ndarray, "height width"]:
@@ -217,39 +231,35 @@ def _with_rolled_quaternions(
     return rolled
 
 
-def _points(
-    camera: Intrinsics, depth_m: Float[np.ndarray, "height width"]
-) -> Float[np.ndarray, "n 3"]:
-    """Points (m, camera frame, OpenCV axes) of a regular grid of measured pixels."""
-    stride = math.ceil((depth_m.size / _POINTS_PER_FRAME) ** 0.5)
-    rows, columns = np.nonzero(depth_m[::stride, ::stride])
-    rows, columns = rows * stride, columns * stride
-    z = depth_m[rows, columns]
-    x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
-    return np.stack([x * z, y * z, z], axis=1)
-
-
 def _behind_surface(
     camera: Intrinsics,
     points_camera: Float[np.ndarray, "n 3"],
-    depth_m: Float[np.ndarray, "height width"],
+    frames: Int[np.ndarray, "n"],
+    depths: UInt16[np.ndarray, "frames height width"],
+    metres: Float[np.ndarray, "height width"],
 ) -> tuple[Float[np.ndarray, "seen"], Float[np.ndarray, "seen"]]:
     """How far (m) points lie behind what a frame measured in their direction, and that depth (m).
 
     The measured depth is interpolated between four pixels, in 1/z: for planes that is exact.
     Points are left out where the four lie on different surfaces, and where they are hidden.
+
+    Args:
+        points_camera: m, in the axes of the frame that each is looked up in.
+        frames: that frame, by its index in `depths`.
+        metres: that a depth value of 1 stands for, by pixel.
     """
-    in_front = points_camera[points_camera[:, 2] > 1e-6]
-    x, y, z = in_front.T
+    in_front = points_camera[:, 2] > 1e-6
+    (x, y, z), frames = points_camera[in_front].T, frames[in_front]
     columns = camera.fx * x / z + camera.cx - 0.5
     rows = camera.fy * y / z + camera.cy - 0.5
-    height, width = depth_m.shape
+    height, width = metres.shape
     inside = (columns >= 0) & (columns < width - 1) & (rows >= 0) & (rows < height - 1)
-    columns, rows, z = columns[inside], rows[inside], z[inside]
+    columns, rows, z, frames = columns[inside], rows[inside], z[inside], frames[inside]
     left, top = columns.astype(int), rows.astype(int)
-    corners = np.stack(
-        [depth_m[top + down, left + right] for down in (0, 1) for right in (0, 1)]
-    )
+    corners = np.stack([
+        depths[frames, top + down, left + right] * metres[top + down, left + right]
+        for down in (0, 1) for right in (0, 1)
+    ])  # fmt: skip
     smooth = corners.min(axis=0) > (1 - _SAME_SURFACE) * corners.max(axis=0)
     right, down = (columns - left)[smooth], (rows - top)[smooth]
     weights = np.stack(
