@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Int, UInt8, UInt16
 from tqdm.auto import tqdm
 
@@ -28,8 +29,8 @@ class Cloud:
     def seen_share(self, cell: float = 0.1, by_frames: int = 3) -> float:
         """Share of the surface's cells (edge in m) that so many of the kept frames saw."""
         cells = np.floor(self.points_world / cell).astype(np.int64)
-        sightings = np.unique(np.column_stack([cells, self.frames]), axis=0)
-        _, counts = np.unique(sightings[:, :3], axis=0, return_counts=True)
+        sightings = pd.DataFrame(cells, columns=list("xyz")).assign(frame=self.frames)
+        counts = sightings.drop_duplicates().groupby(list("xyz")).size().to_numpy()
         needed = min(by_frames, len(np.unique(self.frames)))
         return float((counts >= needed).mean()) if len(counts) else 0.0
 

@@ -19,6 +19,7 @@ from nbtrack.readers.text_files import read_json, read_numbers
 _HALF_PIXEL = 0.5
 _EXAMPLE = '{"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5}'
 _LARGEST = 1e6  # pixels: no image is so wide
+_LEAST_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,11 @@ def read_calibration(path: Path, needed: str) -> Calibration:
             "camera matrix"
         )
     return _from_matrix(path, numbers[:3, :3])
+
+
+def is_focal(length: float) -> bool:
+    """Whether a number can be a focal length in pixels; NaN cannot."""
+    return _LEAST_FOCAL <= length < _LARGEST
 
 
 def as_text(intrinsics: Intrinsics) -> str:
@@ -146,7 +152,7 @@ def _checked(
     size: tuple[int, int] | None = None,
     distortion: tuple[float, ...] = (),
 ) -> Calibration:
-    if not (0 < fx < _LARGEST and 0 < fy < _LARGEST):
+    if not (is_focal(fx) and is_focal(fy)):
         raise DataError(
             f"{path} gives focal lengths {fx:g} and {fy:g}: they must be positive numbers, in "
             "pixels; calibrate anew"

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from nbtrack.errors import DataError, MissingError
 from nbtrack.readers.base import Format, Request, register
-from nbtrack.readers.calibration import Calibration, read_calibration
+from nbtrack.readers.calibration import Calibration, is_focal, read_calibration
 from nbtrack.readers.declaration import Declaration
 from nbtrack.readers.frame_files import check_paired, numbered_files
 from nbtrack.readers.pose_files import blocks
@@ -36,7 +36,7 @@ def read_focal(path: Path) -> float:
         focal = float(text)
     except ValueError:
         focal = float("nan")
-    if not (np.isfinite(focal) and focal > 0):
+    if not is_focal(focal):
         raise DataError(
             f"{path} holds {text[:40]!r}: it must be one positive number, "
             "the focal length in pixels"
