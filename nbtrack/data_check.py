@@ -192,10 +192,11 @@ def _bounds(scan: Scan, recording: Recording) -> SceneBounds:
     """As the mapper will find them, from the kept frames."""
     declared = recording.declared
     lengths = ray_lengths(scan.intrinsics) if declared.depth_along == "ray" else 1.0
-    depths_m = scan.kept_depths / (declared.depth_scale * lengths)
-    depths_mm = np.rint(depths_m / MILLIMETRE).clip(0, 65535).astype(np.uint16)
-    # A unit that leaves less than a millimetre is told as a warning, not here.
-    depths_mm = np.maximum(depths_mm, (scan.kept_depths > 0).astype(np.uint16))
+    depths_mm = np.empty_like(scan.kept_depths)
+    for values, depth_mm in zip(scan.kept_depths, depths_mm, strict=True):
+        exact = values / (declared.depth_scale * lengths) / MILLIMETRE
+        # A unit that leaves less than a millimetre is told as a warning, not here.
+        depth_mm[:] = np.where(values > 0, np.rint(exact).clip(1, 65535), 0)
     black = np.broadcast_to(np.uint8(0), (*depths_mm.shape, 3))
     poses = recording.T_world_camera[scan.kept_ids]
     kept = Sequence(recording.name, scan.intrinsics, black, depths_mm, poses, scan.kept_ids)

@@ -58,17 +58,15 @@ class Scan:
         """Points of the kept frames in the world, with their colours."""
         stride, camera, declared = self.stride, self.intrinsics, recording.declared
         lengths = ray_lengths(camera) if declared.depth_along == "ray" else np.ones((1, 1))
-        values = np.arange(len(self.kept_depths))
-        depth = (self.kept_depths / (declared.depth_scale * lengths))[:, ::stride, ::stride]
+        values_per_metre = declared.depth_scale * lengths[::stride, ::stride]
+        depth = self.kept_depths[:, ::stride, ::stride] / values_per_metre
         kept, rows, columns = np.nonzero(depth)
         z = depth[kept, rows, columns]
         x = (columns * stride + 0.5 - camera.cx) / camera.fx
         y = (rows * stride + 0.5 - camera.cy) / camera.fy
         T = recording.T_world_camera[self.kept_ids][kept]
         points = np.einsum("nij,nj->ni", T[:, :3, :3], np.stack([x * z, y * z, z], axis=1))
-        return Cloud(
-            points + T[:, :3, 3], self.kept_colors[kept, rows, columns], values[kept]
-        )
+        return Cloud(points + T[:, :3, 3], self.kept_colors[kept, rows, columns], kept)
 
 
 def scan_recording(recording: Recording, progress: bool = False) -> Scan:

@@ -186,7 +186,7 @@ BROKEN: dict[str, dict[str, tuple[Damage, str]]] = {
         "no poses": (without("trajectory.txt"), "no poses in .*trajectory.txt or poses.txt"),
         "two pose files": (text("poses.txt", "1 2 3"), "has trajectory.txt and poses.txt: choose"),
         "9 columns": (text("trajectory.txt", "1 2 3 4 5 6 7 8 9\n"), "trajectory.txt line 1 is"),
-        "a line less": (text("trajectory.txt", "0.5001 0 0 0 0 0 0 1\n"), "1 poses but there are 6"),
+        "a line less": (text("trajectory.txt", "0.5001 0 0 0 0 0 0 1\n"), "has 1 poses but"),
         "order of columns": (
             text("trajectory.txt", "0 0 0 0 1 2 3 4\n" * 6), "quaternion of norm 5.48: columns"
         ),
