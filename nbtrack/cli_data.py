@@ -37,7 +37,7 @@ def add_format(parser: argparse.ArgumentParser) -> None:
     """The option that names a recording's format."""
     parser.add_argument(
         "--format", metavar="NAME",
-        help="how the folder is laid out: neural_rgbd, tum, replica, 7scenes, scannet or plain "
+        help="how the folder is laid out, as neural_rgbd, tum, replica, 7scenes, scannet or plain "
         "(default: told by its files)",
     )  # fmt: skip
 

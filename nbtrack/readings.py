@@ -153,8 +153,8 @@ def _camera_readings(own: Reading) -> list[Reading]:
     return [
         replace(
             own, subject="calibration", name=name, intrinsics=other,
-            remedy=f"set the focal length to {other.fx:.6g}, {other.fy:.6g} and the principal "
-            f"point to {other.cx - 0.5:.6g}, {other.cy - 0.5:.6g} (pixels, first centre at 0)",
+            remedy=f"set fx fy cx cy in the calibration to {other.fx:.6g} {other.fy:.6g} "
+            f"{other.cx - 0.5:.6g} {other.cy - 0.5:.6g} (the first pixel's centre at 0)",
         )
         for name, other in found
     ]  # fmt: skip

@@ -13,6 +13,7 @@ from recordings import WRITERS, write_recording
 
 from nbtrack.cli import main
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 Damage = Callable[[Path], object]
 
 

@@ -17,6 +17,7 @@ from nbtrack.data_writer import SequenceWriter
 from nbtrack.errors import DataError, MissingError
 from nbtrack.readers.neural_rgbd import read_poses
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 REAL_ROOM = Path(__file__).resolve().parents[2] / "shared/data/real_room"
 CAMERA = Intrinsics.from_focal(64, 48, 56.0)
 ROOM = SceneBounds((-1.5, -1.2, -1.0), (1.5, 1.2, 2.0))

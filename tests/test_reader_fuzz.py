@@ -23,6 +23,7 @@ from nbtrack.data import read_sequence
 from nbtrack.data_check import check_sequence
 from nbtrack.errors import NbtrackError
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 EXAMPLES = int(os.environ.get("NBTRACK_FUZZ_EXAMPLES", "200"))
 TEXTS = (
     ("neural_rgbd", "poses.txt"), ("neural_rgbd", "focal.txt"), ("neural_rgbd", "intrinsics.txt"),
@@ -35,7 +36,8 @@ TEXTS = (
 WORDS = (
     "nan", "inf", "-inf", "1e400", "-1e308", "1e200", "1e7", "-0.5", "[" * 100_000,
     "1e-320", "0", "-0", "1", "1_0", "0x1p3", "٣", "½", "true", "null", "NaN", "1" * 400,
-    "a" * 5000, "\0", "#", ",", '"', "{", "=", "..", "/", "rgb", "\ufeff", "\u2028", "wxyz", "plain", "depth_scale", "[x]", "-5",
+    "a" * 5000, "\0", "#", ",", '"', "{", "=", "..", "/", "rgb", "\ufeff", "\u2028", "wxyz",
+    "plain", "depth_scale", "[x]", "-5",
 )  # fmt: skip
 KEYS = (
     "format", "depth_scale", "no_depth", "depth_along", "camera_axes", "poses", "quaternion",

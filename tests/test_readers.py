@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from recordings import (
     CAMERA,
     N_FRAMES,
@@ -37,16 +36,8 @@ from nbtrack.readers import FORMATS, Format, open_recording, register
 from nbtrack.scenes import Scene, find_scene
 from nbtrack.tracking import track_sequence
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 LOSSY = ("replica", "scannet")  # colour is JPEG
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Images are so small that threads only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def check_equal(sequence: Sequence, data: Source, lossy: bool = False) -> None:

@@ -6,14 +6,13 @@ Rooms are seen with a Kinect's noise in small images; every mistake is one that 
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from recordings import Source, camera_matrix, matrix_text, write_images
 from scipy.spatial.transform import Rotation
 
@@ -31,19 +30,11 @@ from nbtrack.synthetic import (
     room_intrinsics,
 )
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 REAL_ROOM = Path(__file__).resolve().parents[2] / "shared/data/real_room"
 ROOMS = ("living_room", "office", "long_hall", "two_rooms")
 CAMERA = room_intrinsics(48, 36)
 N_FRAMES, STRIDE = 30, 3
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Images are so small that threads only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @cache
