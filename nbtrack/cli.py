@@ -7,6 +7,7 @@ from collections.abc import Sequence as Texts
 from pathlib import Path
 from typing import NoReturn
 
+from nbtrack.cli_data import add_data, add_format
 from nbtrack.config import PRESETS, Preset
 from nbtrack.errors import ConfigError, NbtrackError
 from nbtrack.settings import resolve_preset
@@ -41,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_track(commands)
     _add_tables(commands)
     _add_notebooks(commands)
-    _add_data(commands)
+    add_data(commands, _Parser)
     _add_bench(commands)
     return parser
 
@@ -83,6 +84,7 @@ def _preset(options: argparse.Namespace) -> Preset:
 def _add_map(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("map", help="fit a field to a sequence with known poses")
     parser.add_argument("sequence", help="a folder, or the name of a room or dataset scene")
+    add_format(parser)
     _add_field(parser)
     parser.add_argument("--frames", default=":", help="Python slice of frames, A:B:S")
     parser.add_argument("--seed", type=int, default=0)
@@ -97,13 +99,14 @@ def _map(options: argparse.Namespace) -> None:
 
     map_command(
         options.sequence, _field(options), _preset(options), options.frames, options.seed,
-        options.out,
+        options.out, options.format,
     )  # fmt: skip
 
 
 def _add_track(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("track", help="track a camera; maps first where no map fits")
     parser.add_argument("sequence", help="a folder, or the name of a room or dataset scene")
+    add_format(parser)
     _add_field(parser)
     parser.add_argument("--tracker", required=True, help="vr, sdf, lm or another")
     budget = parser.add_mutually_exclusive_group(required=True)
@@ -148,7 +151,7 @@ def _track(options: argparse.Namespace) -> None:
     track_command(
         options.sequence, _field(options), options.tracker, _preset(options), steps=options.steps,
         rate_hz=options.rate, map_frames=options.map_frames, frames=options.frames,
-        seed=options.seed, out=options.out,
+        seed=options.seed, out=options.out, format=options.format,
     )  # fmt: skip
 
 
@@ -233,35 +236,6 @@ def _notebooks(options: argparse.Namespace) -> None:
 
     preset = _preset(options)  # refuse a wrong setting before the first kernel starts
     run_notebooks(preset.name, options.config, tuple(options.settings), options.in_place)
-
-
-def _add_data(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser("data", help="make synthetic rooms, check a sequence")
-    actions = parser.add_subparsers(required=True, metavar="ACTION", parser_class=_Parser)
-    make = actions.add_parser("make", help="write a synthetic room in the dataset's layout")
-    make.add_argument("room", help="its name")
-    make.add_argument("--out", type=Path, required=True, help="folder to write, new")
-    make.add_argument("--n-frames", type=int, default=300)
-    make.add_argument("--width", type=int, default=640, help="pixels; the height is 3/4 of it")
-    make.add_argument("--seed", type=int, default=0)
-    make.set_defaults(command=_make)
-    check = actions.add_parser("check", help="validate a folder and prove its pose convention")
-    check.add_argument("folder", type=Path)
-    check.add_argument("--depth-folder", help="default: depth_filtered, else depth")
-    check.add_argument("--poses", default="poses.txt", help="pose file")
-    check.set_defaults(command=_check)
-
-
-def _make(options: argparse.Namespace) -> None:
-    from nbtrack.commands import make_command
-
-    make_command(options.room, options.out, options.n_frames, options.width, options.seed)
-
-
-def _check(options: argparse.Namespace) -> None:
-    from nbtrack.commands import check_command
-
-    check_command(options.folder, options.depth_folder, options.poses)
 
 
 def _add_bench(commands: argparse._SubParsersAction) -> None:

@@ -9,7 +9,6 @@ from tqdm.auto import tqdm
 from nbtrack.cells import MapCell, TrackCell, cell_lock, check_pair, make_budget
 from nbtrack.config import Preset
 from nbtrack.data import Sequence, parse_frames
-from nbtrack.data_check import check_sequence
 from nbtrack.device import choose_device
 from nbtrack.errors import DataError
 from nbtrack.experiments import map_summary, obtain_map, run_track
@@ -17,17 +16,22 @@ from nbtrack.fields import field_class
 from nbtrack.meshes import extract_mesh, keep_seen
 from nbtrack.parallel import Execution, Job, Report, run_jobs
 from nbtrack.scenes import Scene, find_scene
-from nbtrack.synthetic import make_room
 from nbtrack.trackers import tracker_class
 
 
 def map_command(
-    sequence: str, field_name: str, preset: Preset, frames: str, seed: int, out: Path | None
+    sequence: str,
+    field_name: str,
+    preset: Preset,
+    frames: str,
+    seed: int,
+    out: Path | None,
+    format: str | None = None,
 ) -> None:
     """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
     field_class(field_name)
     parse_frames(frames)
-    cell = MapCell(_scene(sequence, preset), field_name, preset, frames, seed, out)
+    cell = MapCell(_scene(sequence, preset, format), field_name, preset, frames, seed, out)
     _map_with_bar(cell)
     summary = map_summary(cell)
     print(f"{cell.folder}: {field_class(field_name).label} map of {cell.scene.name}")
@@ -55,6 +59,7 @@ def track_command(
     frames: str,
     seed: int,
     out: Path | None,
+    format: str | None = None,
 ) -> None:
     """Track a sequence in its map, made first where none fits; print the errors."""
     tracker = tracker_class(tracker_name)
@@ -62,7 +67,7 @@ def track_command(
     parse_frames(frames)
     parse_frames(map_frames)
     budget = make_budget(steps, rate_hz)  # a wrong one is told before a room is made
-    scene = _scene(sequence, preset)
+    scene = _scene(sequence, preset, format)
     n_frames = len(scene.frame_numbers(frames))
     scene.frame_numbers(map_frames)
     map_cell = MapCell(scene, field_name, preset, map_frames, seed)
@@ -78,19 +83,6 @@ def track_command(
     print(f"  on {tracked['device']}")
 
 
-def make_command(room: str, out: Path, n_frames: int, width: int, seed: int) -> None:
-    """Write a synthetic room as a sequence folder."""
-    with tqdm(total=n_frames, desc=room, unit="frame", delay=1.0) as bar:
-        make_room(
-            room, out, n_frames, width, width * 3 // 4, seed, workers=os.cpu_count() or 1,
-            progress=lambda done, total: bar.update(done - bar.n),
-        )  # fmt: skip
-    print(f"{out}: {room}, {n_frames} frames of {width}x{width * 3 // 4}, seed {seed}")
-
-
-def check_command(folder: Path, depth_folder: str | None, pose_file: str) -> None:
-    """Validate a sequence folder; print what it holds and which pose convention fits."""
-    print(check_sequence(folder, depth_folder, pose_file, progress=True))
 
 
 _PRINTED = (
@@ -107,14 +99,14 @@ def _with_unit(name: str, value: float | int) -> str:
     return f"{name.replace('_', ' ')}: {value:.4g}"
 
 
-def _scene(sequence: str, preset: Preset) -> Scene:
+def _scene(sequence: str, preset: Preset, format: str | None = None) -> Scene:
     """The scene, with a bar while a room has to be made."""
     config = preset.scenes
     with tqdm(total=config.n_frames, desc="room", unit="frame", delay=1.0, leave=False) as bar:
         # Small rooms are made sooner than processes start.
         workers = (os.cpu_count() or 1) if config.width >= 320 else 1
         return find_scene(
-            sequence, config, lambda done, total: bar.update(done - bar.n), workers
+            sequence, config, lambda done, total: bar.update(done - bar.n), workers, format
         )
 
 

@@ -1,33 +1,20 @@
-"""Validate a sequence folder, and prove from its own depth maps that its poses are read rightly."""
+"""Validate a recording, and find from its own depth maps whether its numbers are read rightly."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
-from tqdm.auto import tqdm
 
 from nbtrack.bounds import SceneBounds, observed_bounds
-from nbtrack.camera import swap_opengl_opencv
-from nbtrack.conventions import (
-    FAR_APART,
-    LAYOUT_CONVENTION,
-    LEAST_OVERLAP,
-    ConventionFit,
-    best_fit,
-    fit_conventions,
-    fits_alike,
-)
-from nbtrack.data import MILLIMETRE, Sequence, list_frames, read_poses, read_sequence
+from nbtrack.data import MILLIMETRE, Sequence
+from nbtrack.data_advice import Advice, advise
+from nbtrack.data_scan import Cloud, Scan, scan_recording
 from nbtrack.errors import DataError
 from nbtrack.metrics import rotation_errors_deg, translation_errors
-
-_FRAMES_AT_ONCE = 32  # read at a time: 50 MB at 640x480
-_SPREAD_FRAMES = 60  # over the sequence, for its bounds; with the pairs at most 60 MB
-_N_PAIRS = 20
-_GAPS = (5, 10, 15)  # frames between the two of a pair: they moved, and still see the same
-_JUMP = 0.3  # m between consecutive frames; a hand moves 0.02
-_PLAUSIBLE_DEPTH = (0.2, 20.0)  # m, median of a depth camera's measurements
+from nbtrack.readers import FORMATS, Recording, open_recording, ray_lengths
+from nbtrack.readings import Fit, best_fit, fit_readings, readings
 
 
 @dataclass(frozen=True)
@@ -40,235 +27,204 @@ class Motion:
     max_deg: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DataReport:
-    """What a sequence folder holds, and how well its frames agree with each other."""
+    """What a recording holds, and how well its frames agree with each other."""
 
     name: str
+    format: str
     frames: int
     excluded_frames: int  # without a pose
     size: tuple[int, int]  # pixels, width and height
-    focal: float  # pixels
+    focal: tuple[float, float]  # pixels, fx and fy
+    principal_point: tuple[float, float]  # pixels; centres at integer + 0.5
     field_of_view_deg: float  # horizontal
     depth_range: tuple[float, float]  # m, 1 % and 99 % of the measured pixels
     measured: float  # share of pixels with a depth
+    measured_least: float  # the same, of the frame that has the fewest
     motion: Motion
+    rate_hz: float  # frames a second of the recording
+    brightness: tuple[float, float]  # of the darkest and the brightest frame, 0 to 1
+    brightness_step: float  # largest change between consecutive frames, as a share
+    seen_thrice: float  # share of the surface (10 cm cells) that three of the kept frames saw
     bounds: SceneBounds
-    median_overlap_m: float  # as the file stands; NaN for a single frame
-    best_convention: str
-    candidates: tuple[ConventionFit, ...]  # every reading of the pose file, the layout's own first
-    warnings: tuple[str, ...]
+    fits: tuple[Fit, ...]  # every reading, the declared one first
+    advice: Advice
+    cloud: Cloud
+    T_world_camera: Float[np.ndarray, "frames 4 4"]  # OpenCV camera axes
+
+    @property
+    def best(self) -> Fit:
+        """The reading that fits: the declared one unless another is clearly better."""
+        return best_fit(list(self.fits))
+
+    @property
+    def median_overlap_m(self) -> float:
+        """Median distance between surfaces that two frames see, as declared; NaN for one frame."""
+        return self.fits[0].median_m
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is wrong, each in a sentence."""
+        return self.advice.warnings
+
+    @property
+    def title(self) -> str:
+        """The finding, for a picture."""
+        agree = f"surfaces of two frames lie {1e3 * self.median_overlap_m:.1f} mm apart (median)"
+        return f"{self.name}: {agree}" if self.best is self.fits[0] else self.warnings[0]
 
     def __str__(self) -> str:
-        corners = (self.bounds.minimum, self.bounds.maximum)
-        sides = [f"{high - low:.2f}" for low, high in zip(*corners, strict=True)]
-        own, motion = self.candidates[0], self.motion
-        middle = f"({self.size[0] / 2:g}, {self.size[1] / 2:g})"
-        rows = [
-            ("frames", f"{self.frames} ({self.excluded_frames} more without a pose)"),
-            ("size", f"{self.size[0]} x {self.size[1]} px"),
-            ("focal length", f"{self.focal:.2f} px ({self.field_of_view_deg:.1f} deg wide)"),
-            ("principal point", f"{middle} px, the middle of the image (assumed)"),
-            ("depth", f"{self.depth_range[0]:.2f} to {self.depth_range[1]:.2f} m (1 % and 99 %)"),
-            ("measured", f"{100 * self.measured:.1f} % of the pixels"),
-            ("motion", f"mean {motion.mean_mm:.1f} mm, {motion.mean_deg:.2f} deg a frame"),
-            ("", f"max {motion.max_mm:.1f} mm, {motion.max_deg:.2f} deg a frame"),
-            ("bounds", f"{' x '.join(sides)} m"),
-            ("overlap", f"{1e3 * own.median_m:.1f} mm median, {100 * own.overlap:.0f} % of points"),
-            ("poses fit as", self.best_convention),
-        ]
-        lines = [f"{self.name}", *(f"  {label:<16}{text}" for label, text in rows)]
-        lines += ["  overlap by reading of the pose file (median, share of points)"]
+        lines = [f"{self.name}", *(f"  {label:<16}{text}" for label, text in self._rows())]
+        lines += ["  overlap by reading (median, share of points)"]
         lines += [f"    {_fit_text(fit)}" for fit in self._closest(4)]
         lines += [f"  warning: {text}" for text in self.warnings]
-        return "\n".join(lines)
+        return "\n".join([*lines, f"  start with: {self.advice.suggestion}"])
 
-    def _closest(self, count: int) -> list[ConventionFit]:
-        """The layout's own reading and the nearest rivals with some overlap."""
-        own, *others = self.candidates
-        rivals = sorted((f for f in others if f.overlap > 0), key=lambda fit: fit.median_m)
+    def _rows(self) -> list[tuple[str, str]]:
+        corners = (self.bounds.minimum, self.bounds.maximum)
+        sides = [f"{high - low:.2f}" for low, high in zip(*corners, strict=True)]
+        own, motion, (fx, fy) = self.fits[0], self.motion, self.focal
+        focal = f"{fx:.2f}" if abs(fx - fy) < 5e-3 else f"{fx:.2f} and {fy:.2f}"
+        is_middle = np.allclose(self.principal_point, np.array(self.size) / 2)
+        where = ", the middle of the image" if is_middle else ""
+        low, high = self.brightness
+        return [
+            ("format", FORMATS[self.format].label),
+            ("frames", f"{self.frames} ({self.excluded_frames} more without a pose)"),
+            ("size", f"{self.size[0]} x {self.size[1]} px"),
+            ("focal length", f"{focal} px ({self.field_of_view_deg:.1f} deg wide)"),
+            ("principal point", "({:g}, {:g}) px".format(*self.principal_point) + where),
+            ("depth", f"{self.depth_range[0]:.2f} to {self.depth_range[1]:.2f} m (1 % and 99 %)"),
+            ("measured", f"{100 * self.measured:.1f} % of the pixels, at least "
+                         f"{100 * self.measured_least:.0f} % in a frame"),
+            ("motion", f"mean {motion.mean_mm:.1f} mm, {motion.mean_deg:.2f} deg a frame"),
+            ("", f"max {motion.max_mm:.1f} mm, {motion.max_deg:.2f} deg a frame"),
+            ("exposure", f"brightness {low:.2f} to {high:.2f}, by at most "
+                         f"{100 * self.brightness_step:.0f} % between frames"),
+            ("bounds", f"{' x '.join(sides)} m"),
+            ("coverage", f"{100 * self.seen_thrice:.0f} % of the surface seen by 3 of "
+                         f"{len(np.unique(self.cloud.frames))} frames looked at"),
+            ("overlap", f"{1e3 * own.median_m:.1f} mm median, {100 * own.overlap:.0f} % of points"),
+            ("read as", own.reading.name),
+            ("fits best as", self.best.reading.name),
+        ]  # fmt: skip
+
+    def _closest(self, count: int) -> list[Fit]:
+        """The declared reading and the nearest rivals with some overlap."""
+        own, *others = self.fits
+        rivals = sorted((f for f in others if f.overlap > 0), key=lambda fit: fit.relative)
         return [own, *rivals[: count - 1]]
 
 
-def _fit_text(fit: ConventionFit) -> str:
-    return f"{1e3 * fit.median_m:8.1f} mm {100 * fit.overlap:4.0f} %  {fit.convention.name}"
+def _fit_text(fit: Fit) -> str:
+    return f"{1e3 * fit.median_m:8.1f} mm {100 * fit.overlap:4.0f} %  {fit.reading.name}"
 
 
 def check_sequence(
     folder: Path | str,
     depth_folder: str | None = None,
-    pose_file: str = "poses.txt",
+    pose_file: str | None = None,
     progress: bool = False,
+    format: str | None = None,
 ) -> DataReport:
-    """Read every frame of a folder and report what is there and whether it fits together.
-
-    Frames are read a few at a time: at 640x480 that takes 0.3 GB, however long the sequence is.
+    """Read every frame of a recording and report what is there and whether it fits together.
 
     Args:
-        depth_folder, pose_file, progress: as `read_sequence` takes them.
+        folder, depth_folder, pose_file, progress, format: as `read_sequence` takes them.
 
     Raises:
         DataError, MissingError: as `read_sequence` raises them, or no pixel has a depth.
     """
-    folder = Path(folder)
-    scan = _scan(folder, depth_folder, pose_file, progress)
-    kept, camera = scan.kept, scan.kept.intrinsics
-    bounds = observed_bounds(kept)  # first: it refuses a sequence without any depth
-    low, middle, high = (_quantile_m(scan.depth_counts, q) for q in (0.01, 0.5, 0.99))
-    file_poses = swap_opengl_opencv(kept.T_world_camera)
-    pairs = np.searchsorted(kept.frame_ids, scan.frame_ids[_pairs(len(scan.frame_ids))])
-    fits = fit_conventions(camera, kept.depths_mm, file_poses, pairs)
-    motion, jumps = _motion(scan.T_world_camera, scan.frame_ids)
+    recording = open_recording(folder, format, depth_folder, pose_file)
+    scan = scan_recording(recording, progress)
+    if not scan.depth_counts[1:].any():
+        raise DataError(
+            f"no pixel of {recording.name} has a depth: all {len(scan.frame_ids)} depth maps are "
+            "0; check the depth folder and no_depth"
+        )
+    camera = scan.intrinsics
+    candidates = readings(recording.declared, camera)
+    file_poses = recording.file_poses[scan.kept_ids]
+    fits = fit_readings(candidates, scan.kept_depths, file_poses, scan.pairs)
+    poses = recording.T_world_camera[scan.frame_ids]
+    steps_m, steps_deg, first = _steps(poses, scan.frame_ids)
+    low, middle, high = (_quantile_m(scan, recording, q) for q in (0.01, 0.5, 0.99))
+    cloud = scan.cloud(recording)
     return DataReport(
-        name=kept.name,
+        name=recording.name,
+        format=recording.declared.format,
         frames=len(scan.frame_ids),
-        excluded_frames=kept.excluded_frames,
+        excluded_frames=len(recording) - len(scan.frame_ids),
         size=(camera.width, camera.height),
-        focal=camera.fx,
-        field_of_view_deg=2 * float(np.degrees(np.arctan(camera.cx / camera.fx))),
+        focal=(camera.fx, camera.fy),
+        principal_point=(camera.cx, camera.cy),
+        field_of_view_deg=float(np.degrees(
+            np.arctan(camera.cx / camera.fx) + np.arctan((camera.width - camera.cx) / camera.fx)
+        )),
         depth_range=(low, high),
         measured=float(1 - scan.depth_counts[0] / scan.depth_counts.sum()),
-        motion=motion,
-        bounds=bounds,
-        median_overlap_m=fits[0].median_m,
-        best_convention=best_fit(fits).convention.name,
-        candidates=tuple(fits),
-        warnings=(*_pose_warnings(fits, len(pairs), pose_file), *jumps, *_depth_warnings(middle)),
-    )
-
-
-@dataclass(frozen=True)
-class _Scan:
-    """One pass over a folder: counts of all frames, pixels of a few."""
-
-    frame_ids: Int[np.ndarray, "frames"]
-    T_world_camera: Float[np.ndarray, "frames 4 4"]  # OpenCV camera axes
-    depth_counts: Int[np.ndarray, "65536"]  # pixels by depth in mm
-    kept: Sequence  # some of the frames; its colors are black
-
-
-def _scan(folder: Path, depth_folder: str | None, pose_file: str, progress: bool) -> _Scan:
-    image_files, _ = list_frames(folder, depth_folder)
-    has_pose = np.isfinite(read_poses(folder / pose_file)).all(axis=(1, 2))
-    wanted = np.flatnonzero(has_pose)[_kept_positions(int(has_pose.sum()))]
-    depth_counts = np.zeros(1 << 16, np.int64)
-    poses, depths, frame_ids, first = [], [], [], None
-    starts = range(0, len(image_files), _FRAMES_AT_ONCE)
-    bar = tqdm(
-        starts, "checking", unit=f"{_FRAMES_AT_ONCE} frames", disable=not progress, delay=1.0
-    )
-    for start in bar:
-        stretch = slice(start, start + _FRAMES_AT_ONCE)
-        if not has_pose[stretch].any():
-            continue
-        part = read_sequence(folder, stretch, depth_folder, pose_file)
-        first = first or part
-        _check_same_size(first, part, image_files)
-        depth_counts += np.bincount(part.depths_mm.ravel(), minlength=1 << 16)
-        frame_ids.append(part.frame_ids)
-        poses.append(part.T_world_camera)
-        depths.append(part.depths_mm[np.isin(part.frame_ids, wanted)])
-    if first is None:
-        first = read_sequence(folder, slice(None), depth_folder, pose_file)  # says what is wrong
-    all_ids, all_poses, kept_depths = map(np.concatenate, (frame_ids, poses, depths))
-    black = np.broadcast_to(np.uint8(0), (*kept_depths.shape, 3))
-    is_kept = np.isin(all_ids, wanted)
-    kept = Sequence(
-        first.name, first.intrinsics, black, kept_depths, all_poses[is_kept], all_ids[is_kept],
-        len(image_files) - len(all_ids),
+        measured_least=float(scan.measured.min()),
+        motion=_motion(steps_m, steps_deg),
+        rate_hz=recording.rate_hz,
+        brightness=(float(scan.brightness.min()), float(scan.brightness.max())),
+        brightness_step=_largest_step(scan),
+        seen_thrice=cloud.seen_share(),
+        bounds=_bounds(scan, recording),
+        fits=tuple(fits),
+        advice=advise(
+            fits, len(scan.pairs), recording, middle, steps_m, steps_deg, scan.frame_ids[first],
+            _largest_step(scan), float(scan.measured.mean()), torch.cuda.is_available(),
+        ),
+        cloud=cloud,
+        T_world_camera=poses,
     )  # fmt: skip
-    return _Scan(all_ids, all_poses, depth_counts, kept)
 
 
-def _check_same_size(first: Sequence, part: Sequence, image_files: list[Path]) -> None:
-    if part.intrinsics != first.intrinsics:
-        found, wanted = part.intrinsics, first.intrinsics
-        raise DataError(
-            f"{image_files[part.frame_ids[0]]} is {found.width}x{found.height} but "
-            f"{image_files[first.frame_ids[0]]} is {wanted.width}x{wanted.height}: all images "
-            "and depth maps need one size; resize them first"
-        )
+def _quantile_m(scan: Scan, recording: Recording, share: float) -> float:
+    """A quantile of the measured depths (m), as declared; along the ray where that is declared."""
+    cumulative = scan.depth_counts[1:].cumsum()
+    value = 1 + np.searchsorted(cumulative, share * cumulative[-1])
+    return float(value / recording.declared.depth_scale)
 
 
-def _pairs(n_frames: int) -> Int[np.ndarray, "pairs 2"]:
-    """Positions of frame pairs, spread over the sequence, with all gaps alike."""
-    pairs = set()
-    for i in range(_N_PAIRS):
-        gap = min(_GAPS[i % len(_GAPS)], n_frames - 1)
-        first = round((n_frames - 1 - gap) * i / (_N_PAIRS - 1))
-        pairs |= {(first, first + gap)} if gap > 0 else set()
-    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+def _bounds(scan: Scan, recording: Recording) -> SceneBounds:
+    """As the mapper will find them, from the kept frames."""
+    declared = recording.declared
+    lengths = ray_lengths(scan.intrinsics) if declared.depth_along == "ray" else 1.0
+    depths_mm = np.empty_like(scan.kept_depths)
+    for values, depth_mm in zip(scan.kept_depths, depths_mm, strict=True):
+        exact = values / (declared.depth_scale * lengths) / MILLIMETRE
+        # A unit that leaves less than a millimetre is told as a warning, not here.
+        depth_mm[:] = np.where(values > 0, np.rint(exact).clip(1, 65535), 0)
+    black = np.broadcast_to(np.uint8(0), (*depths_mm.shape, 3))
+    poses = recording.T_world_camera[scan.kept_ids]
+    kept = Sequence(recording.name, scan.intrinsics, black, depths_mm, poses, scan.kept_ids)
+    return observed_bounds(kept)
 
 
-def _kept_positions(n_frames: int) -> Int[np.ndarray, "kept"]:
-    """The frames of the pairs, and enough others to know the room's extent."""
-    spread = np.linspace(0, max(0, n_frames - 1), min(n_frames, _SPREAD_FRAMES)).astype(np.int64)
-    return np.union1d(spread, _pairs(n_frames))
-
-
-def _quantile_m(depth_counts: Int[np.ndarray, "65536"], share: float) -> float:
-    cumulative = depth_counts[1:].cumsum()
-    return float(1 + np.searchsorted(cumulative, share * cumulative[-1])) * MILLIMETRE
-
-
-def _motion(
+def _steps(
     T_world_camera: Float[np.ndarray, "frames 4 4"], frame_ids: Int[np.ndarray, "frames"]
-) -> tuple[Motion, list[str]]:
-    """Motion over the pairs of frames without a gap between, and warnings of jumps."""
+) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:
+    """Motion (m, degrees) over the pairs of frames without a gap between, and where they start."""
     first = np.flatnonzero(np.diff(frame_ids) == 1)
-    if len(first) == 0:
-        return Motion(*[float("nan")] * 4), []
     before, after = T_world_camera[first], T_world_camera[first + 1]
-    steps_m, steps_deg = translation_errors(after, before), rotation_errors_deg(after, before)
-    motion = Motion(
+    if len(first) == 0:
+        return np.zeros(0), np.zeros(0), first
+    return translation_errors(after, before), rotation_errors_deg(after, before), first
+
+
+def _motion(steps_m: Float[np.ndarray, "n"], steps_deg: Float[np.ndarray, "n"]) -> Motion:
+    if len(steps_m) == 0:
+        return Motion(*[float("nan")] * 4)
+    return Motion(
         1e3 * float(steps_m.mean()), 1e3 * float(steps_m.max()),
         float(steps_deg.mean()), float(steps_deg.max()),
     )  # fmt: skip
-    jumps = np.flatnonzero(steps_m > _JUMP)
-    if len(jumps) == 0:
-        return motion, []
-    worst = steps_m.argmax()
-    return motion, [
-        f"{len(jumps)} of {len(first)} steps between frames are longer than {_JUMP} m, the "
-        f"longest {steps_m[worst]:.2f} m after frame {frame_ids[first[worst]]}: check the poses "
-        "there, or leave the frames out with --frames"
-    ]
 
 
-def _pose_warnings(
-    fits: list[ConventionFit], n_pairs: int, pose_file: str
-) -> list[str]:
-    own, best = fits[0], best_fit(fits)
-    if n_pairs == 0:
-        return [f"{pose_file} is not proved: that takes two frames with a pose"]
-    found = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
-    if best is not own:
-        return [
-            f"{pose_file} fits {best.convention.name}: surfaces then lie {1e3 * best.median_m:.0f} "
-            f"mm apart, but {found} as {LAYOUT_CONVENTION.name}, which the layout demands; "
-            f"convert with poses = {best.convention.conversion}"
-        ]
-    if own.overlap < LEAST_OVERLAP or own.median_m > FAR_APART:
-        return [
-            f"surfaces that two frames see {found} (median, {100 * own.overlap:.0f} % of the "
-            "points overlap) and no other reading of the poses fits: check focal.txt, the "
-            "principal point (assumed in the middle), the depth unit (millimetres) and "
-            f"{pose_file}"
-        ]
-    alike = [fit for fit in fits[1:] if fits_alike(own, fit)]
-    if not alike:
-        return []
-    return [
-        f"{pose_file} is not proved: the camera moves too little to tell {len(alike)} other "
-        f"readings apart, such as {alike[0].convention.name}"
-    ]
-
-
-def _depth_warnings(median_m: float) -> list[str]:
-    low, high = _PLAUSIBLE_DEPTH
-    if low <= median_m <= high:
-        return []
-    return [
-        f"the median depth is {median_m:.3g} m, outside {low:g} to {high:g} m: depth must be in "
-        "millimetres; multiply other units by the factor between, and write the maps again"
-    ]
+def _largest_step(scan: Scan) -> float:
+    """Largest relative change of brightness between consecutive frames."""
+    levels = scan.brightness + 1e-3  # a black frame divides by nothing
+    steps = np.abs(np.diff(levels)) / np.minimum(levels[1:], levels[:-1])
+    return float(steps[np.diff(scan.frame_ids) == 1].max(initial=0.0))

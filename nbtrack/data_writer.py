@@ -10,8 +10,18 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from nbtrack.camera import Intrinsics, swap_opengl_opencv
-from nbtrack.data import DEPTH_FOLDERS
 from nbtrack.errors import DataError
+from nbtrack.readers.calibration import as_text
+from nbtrack.readers.neural_rgbd import DEPTH_FOLDERS, FOCAL_FILE, INTRINSICS_FILE
+
+_SAME_CAMERA = 1e-6  # pixels: rounding, not another camera
+
+
+def layout_holds(camera: Intrinsics) -> bool:
+    """Whether one focal length says it all: square pixels, and a centred principal point."""
+    own = (camera.fx, camera.fy, camera.cx, camera.cy)
+    told = (camera.fx, camera.fx, camera.width / 2, camera.height / 2)
+    return max(abs(a - b) for a, b in zip(own, told, strict=True)) < _SAME_CAMERA
 
 
 class SequenceWriter:
@@ -71,6 +81,18 @@ class SequenceWriter:
         """Put a small text file beside the layout's own."""
         (self._unfinished / name).write_text(text, encoding="utf-8")
 
+    def _write_camera(self) -> None:
+        """`focal.txt` where the layout can say it; else a camera matrix, and no focal length.
+
+        Without `focal.txt` programs that know only the layout stop, instead of reading a camera
+        that is not this one.
+        """
+        camera = self.intrinsics
+        if layout_holds(camera):
+            self.write_text(FOCAL_FILE, f"{float(camera.fx)!r}\n")
+        else:
+            self.write_text(INTRINSICS_FILE, as_text(camera))
+
     def __exit__(
         self,
         exception_type: type[BaseException] | None,
@@ -85,7 +107,7 @@ class SequenceWriter:
             raise DataError(f"no frame was added to {self.folder}: a scene needs at least one")
         poses = swap_opengl_opencv(np.stack(self._poses)).reshape(-1, 4)
         rows = "".join(" ".join(repr(float(v)) for v in row) + "\n" for row in poses)
-        self.write_text("focal.txt", f"{self.intrinsics.fx!r}\n")
+        self._write_camera()
         self.write_text("poses.txt", rows)
         self.write_text("trainval_poses.txt", rows)
         try:

@@ -10,10 +10,11 @@ from pathlib import Path
 from filelock import FileLock
 
 from nbtrack.config import ScenesConfig
-from nbtrack.data import Sequence, list_frames, parse_frames, read_sequence
+from nbtrack.data import Sequence, parse_frames, read_frames
 from nbtrack.errors import DataError, MissingError, nearest_name
 from nbtrack.paths import data_folder, runs_folder
-from nbtrack.provenance import fingerprint
+from nbtrack.provenance import code_fingerprint, fingerprint
+from nbtrack.readers import FORMATS, Recording, open_recording
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of
 
 DATASET_SCENES = (
@@ -29,22 +30,27 @@ class Scene:
 
     name: str
     folder: Path
+    format: str | None = None  # None: told by the files that are there
 
     @property
     def room(self) -> Room | None:
         """The exact geometry, if the scene is a synthetic room."""
         return room_of(self.folder)
 
+    def open(self) -> Recording:
+        """Its files, poses and calibration. Raises as `open_recording` does."""
+        return open_recording(self.folder, self.format)
+
     def read(self, frames: slice = slice(None), progress: bool = False) -> Sequence:
         """The scene's frames. Raises DataError or MissingError as `read_sequence` does."""
-        return read_sequence(self.folder, frames, progress=progress)
+        return read_frames(self.open(), frames, progress)
 
     def frame_numbers(self, frames: str) -> range:
         """Which frames a slice such as `10:50:2` selects, those with a NaN pose included.
 
         Raises DataError if it selects none.
         """
-        total = len(list_frames(self.folder)[0])
+        total = len(self.open())
         selected = range(total)[parse_frames(frames)]
         if not selected:
             raise DataError(
@@ -55,15 +61,14 @@ class Scene:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Changes when the data change: poses, focal length, and the images' names and sizes."""
-        image_files, depth_files = list_frames(self.folder)
-        sizes = [(f.parent.name, f.name, f.stat().st_size) for f in image_files + depth_files]
-        texts = [
-            hashlib.sha256((self.folder / name).read_bytes()).hexdigest()
-            for name in ("poses.txt", "focal.txt")
-            if (self.folder / name).is_file()
-        ]
-        return fingerprint(sizes, texts)
+        """Changes with what was read and how: texts, the images' names and sizes, and the reader.
+
+        An image that changes in place and keeps its size is not noticed.
+        """
+        recording = self.open()
+        texts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in recording.text_files]
+        reader = code_fingerprint(FORMATS[recording.declared.format].open)
+        return fingerprint(recording.file_sizes, texts, recording.declared, reader)
 
 
 def room_folder(name: str, config: ScenesConfig) -> Path:
@@ -77,6 +82,7 @@ def find_scene(
     config: ScenesConfig,
     progress: Callable[[int, int], None] | None = None,
     workers: int = 1,
+    format: str | None = None,
 ) -> Scene:
     """The scene that a user means.
 
@@ -86,6 +92,7 @@ def find_scene(
             RGB-D dataset below the data folder.
         progress: called with frames done and in all while a room is made.
         workers: processes that make it.
+        format: of the folder; by default told by its files.
 
     Raises:
         MissingError: there is no such folder, room or scene.
@@ -94,7 +101,7 @@ def find_scene(
     folder = Path(text)
     if text not in ROOMS and text not in DATASET_SCENES:
         if folder.is_dir():
-            return Scene(folder.resolve().name, folder.resolve())
+            return Scene(folder.resolve().name, folder.resolve(), format)
         names = [*ROOMS, *DATASET_SCENES]
         raise MissingError(
             f"no sequence {text!r}: it is neither a folder nor a known scene; "
@@ -115,7 +122,7 @@ def find_scene(
             f"no folder {folder}: download the Neural RGB-D dataset there (see data/README.md), "
             f"or use a synthetic room, which needs no download: {', '.join(ROOMS)}"
         )
-    return Scene(text, folder)
+    return Scene(text, folder, format)
 
 
 def _make_room(

@@ -10,10 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nbtrack.camera import Intrinsics, swap_opengl_opencv
-from nbtrack.data import Sequence, parse_frames, read_focal, read_poses, read_sequence
+from nbtrack.data import Sequence, parse_frames, read_sequence
 from nbtrack.data_writer import SequenceWriter
 from nbtrack.errors import DataError, MissingError, NbtrackError
 from nbtrack.images import read_image
+from nbtrack.readers.neural_rgbd import read_focal, read_poses
 
 CAMERA = Intrinsics.from_focal(12, 8, 10.123456789012345)
 

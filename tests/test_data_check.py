@@ -1,5 +1,6 @@
 """A folder's report: facts by hand, and pose conventions told apart by the depth maps alone."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -10,12 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.bounds import SceneBounds
 from nbtrack.camera import Intrinsics, pixel_directions
-from nbtrack.conventions import CONVENTIONS, LAYOUT_CONVENTION, Convention
-from nbtrack.data import read_poses
-from nbtrack.data_check import check_sequence
+from nbtrack.conventions import CONVENTIONS, OPENGL, Convention
+from nbtrack.data_check import DataReport, check_sequence
 from nbtrack.data_writer import SequenceWriter
 from nbtrack.errors import DataError, MissingError
+from nbtrack.readers.neural_rgbd import read_poses
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 REAL_ROOM = Path(__file__).resolve().parents[2] / "shared/data/real_room"
 CAMERA = Intrinsics.from_focal(64, 48, 56.0)
 ROOM = SceneBounds((-1.5, -1.2, -1.0), (1.5, 1.2, 2.0))
@@ -56,14 +58,15 @@ def rewrite_poses(folder: Path, poses: np.ndarray) -> None:
     np.savetxt(folder / "poses.txt", poses.reshape(-1, 4), fmt="%.17g")
 
 
-def as_file(convention: Convention, T_world_camera: np.ndarray) -> np.ndarray:
-    """What somebody with this convention would have written."""
-    axes = np.eye(4)
-    axes[:3, :3] = convention.axes
-    poses = T_world_camera @ np.linalg.inv(axes)
-    if np.linalg.det(axes) < 0:  # left-handed cameras live in left-handed worlds
-        poses = np.diag([1.0, -1.0, 1.0, 1.0]) @ poses
-    return np.linalg.inv(poses) if convention.world_to_camera else poses
+def best_name(report: DataReport) -> str:
+    return report.best.reading.name
+
+
+def obey(folder: Path, warning: str) -> None:
+    """Set in `sequence.toml` what a warning says."""
+    settings = re.findall(r'\w+ = (?:"[^"]+"|[\d.]+)', warning)
+    assert settings
+    (folder / "sequence.toml").write_text("\n".join(settings) + "\n")
 
 
 @pytest.fixture
@@ -79,12 +82,12 @@ def test_right_poses(room: Path) -> None:
     """
     report = check_sequence(room)
     assert report.median_overlap_m < 0.02
-    assert report.best_convention == LAYOUT_CONVENTION.name
-    assert report.candidates[0].median_m == report.median_overlap_m
-    assert report.candidates[0].overlap > 0.5
+    assert report.best is report.fits[0]
+    assert report.best.reading.convention == OPENGL
+    assert report.fits[0].overlap > 0.5
     assert report.warnings == ()
     assert (report.name, report.frames, report.excluded_frames) == ("room", N_FRAMES, 0)
-    assert (report.size, report.focal, report.measured) == ((64, 48), 56.0, 1.0)
+    assert (report.size, report.focal, report.measured) == ((64, 48), (56.0, 56.0), 1.0)
     assert report.field_of_view_deg == pytest.approx(59.49, abs=0.01)
     direction = np.linalg.norm([0.55, -0.4, 0.73])
     axis = np.linalg.norm([0.35, 0.8, 0.49])
@@ -95,27 +98,26 @@ def test_right_poses(room: Path) -> None:
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS[1:], ids=lambda c: c.name)
-def test_wrong_poses_are_named_and_converted(room: Path, convention: Convention) -> None:
-    """Catches a check that passes wrong axes, names others, or advises a wrong conversion."""
-    rewrite_poses(room, as_file(convention, walk(N_FRAMES)))
+def test_wrong_poses_are_named_and_declared(room: Path, convention: Convention) -> None:
+    """Catches a check that passes wrong axes, names others, or advises a wrong setting."""
+    rewrite_poses(room, convention.from_opencv(walk(N_FRAMES)))
     report = check_sequence(room)
-    assert report.best_convention == convention.name
+    assert best_name(report) == convention.name
     assert len(report.warnings) == 1
-    assert convention.name in report.warnings[0]
-    assert f"convert with poses = {convention.conversion}" in report.warnings[0]
+    assert f"your poses look like {convention.name}; set " in report.warnings[0]
     assert report.median_overlap_m > 0.03
-    poses = read_poses(room / "poses.txt")
-    rewrite_poses(room, eval(convention.conversion, {"numpy": np, "poses": poses}))
-    converted = check_sequence(room)
-    assert converted.best_convention == LAYOUT_CONVENTION.name
-    assert converted.median_overlap_m < 0.02
-    assert converted.warnings == ()
+    obey(room, report.warnings[0])
+    declared = check_sequence(room)
+    assert declared.best is declared.fits[0]
+    assert declared.best.reading.convention == convention
+    assert declared.median_overlap_m < 0.02
+    assert declared.warnings == ()
 
 
 def test_still_camera_proves_nothing(tmp_path: Path) -> None:
     """Catches a folder called right because all readings of identical poses agree."""
     report = check_sequence(write_room(tmp_path / "room", walk(8, 0.0, 0.0)))
-    assert report.best_convention == LAYOUT_CONVENTION.name
+    assert report.best is report.fits[0]
     assert "not proved" in report.warnings[0]
 
 
@@ -128,14 +130,22 @@ def test_single_frame(tmp_path: Path) -> None:
     assert "room" in str(report)
 
 
-@pytest.mark.parametrize("scale", [10.0, 5.0, 2.0, 0.1])
+@pytest.mark.parametrize("scale", [10.0, 5.0, 0.1])
 def test_wrong_depth_unit(tmp_path: Path, scale: float) -> None:
-    """Catches axes blamed for a wrong unit: where no reading fits, none may be advised."""
+    """Catches axes blamed for a wrong unit, and another unit advised than the one it is."""
     report = check_sequence(write_room(tmp_path / "room", walk(N_FRAMES), scale))
-    assert report.best_convention == LAYOUT_CONVENTION.name
-    assert "depth unit" in report.warnings[0]
-    implausible = [text for text in report.warnings if text.startswith("the median depth is 0.1")]
-    assert len(implausible) == (scale == 0.1)
+    assert len(report.warnings) == 1
+    wanted = f"your depth looks like {1000 * scale:g} depth values a metre; set depth_scale"
+    assert report.warnings[0].startswith(wanted)
+    obey(tmp_path / "room", report.warnings[0])
+    assert check_sequence(tmp_path / "room").warnings == ()
+
+
+def test_no_reading_fits(tmp_path: Path) -> None:
+    """Catches something usual advised where depth is off by a factor that nobody uses."""
+    report = check_sequence(write_room(tmp_path / "room", walk(N_FRAMES), 2.0))
+    assert report.best is report.fits[0]
+    assert "no other reading fits: check focal.txt, the depth unit" in report.warnings[0]
 
 
 def test_jump(tmp_path: Path) -> None:
@@ -167,7 +177,7 @@ def test_long_sequences_are_read_in_stretches(tmp_path: Path, monkeypatch) -> No
     poses[4:8] = np.nan
     rewrite_poses(tmp_path / "room", poses)
     whole = check_sequence(tmp_path / "room")
-    monkeypatch.setattr("nbtrack.data_check._FRAMES_AT_ONCE", 4)
+    monkeypatch.setattr("nbtrack.data_scan._FRAMES_AT_ONCE", 4)
     assert str(check_sequence(tmp_path / "room")) == str(whole)
     smaller = np.ones((24, 32), np.uint16)
     cv2.imwrite(str(tmp_path / "room/images/img9.png"), np.ones((24, 32, 3), np.uint8))
@@ -178,7 +188,7 @@ def test_long_sequences_are_read_in_stretches(tmp_path: Path, monkeypatch) -> No
 
 def test_other_size_between_stretches(room: Path, monkeypatch) -> None:
     """Catches sizes that are compared within a stretch only."""
-    monkeypatch.setattr("nbtrack.data_check._FRAMES_AT_ONCE", 8)
+    monkeypatch.setattr("nbtrack.data_scan._FRAMES_AT_ONCE", 8)
     for number in range(8, N_FRAMES):
         cv2.imwrite(str(room / f"images/img{number}.png"), np.ones((24, 32, 3), np.uint8))
         cv2.imwrite(str(room / f"depth/depth{number}.png"), np.ones((24, 32), np.uint16))
@@ -215,8 +225,8 @@ def test_text_of_the_report(room: Path) -> None:
     assert "  size            64 x 48 px" in lines
     assert "  focal length    56.00 px (59.5 deg wide)" in lines
     assert max(map(len, lines)) <= 100
-    rewrite_poses(room, as_file(CONVENTIONS[1], walk(N_FRAMES)))
-    assert "  warning: poses.txt fits OpenCV axes" in str(check_sequence(room))
+    rewrite_poses(room, CONVENTIONS[1].from_opencv(walk(N_FRAMES)))
+    assert "  warning: your poses look like OpenCV axes" in str(check_sequence(room))
 
 
 @pytest.mark.skipif(not REAL_ROOM.is_dir(), reason="the real recording is not on this machine")
@@ -224,7 +234,7 @@ def test_real_recording() -> None:
     """Catches a wrong convention in the reader itself: real surfaces must meet within 2 cm."""
     report = check_sequence(REAL_ROOM)
     assert report.median_overlap_m < 0.02
-    assert report.best_convention == LAYOUT_CONVENTION.name
+    assert report.best is report.fits[0]
     assert report.warnings == ()
-    others = [fit.median_m for fit in report.candidates[1:]]
-    assert min(others) > 5 * report.median_overlap_m
+    others = [fit.relative for fit in report.fits[1:]]
+    assert min(others) > 4 * report.fits[0].relative

@@ -8,8 +8,8 @@ import pytest
 from tiny import TINY
 
 from nbtrack.cli import main
-from nbtrack.data import read_poses
 from nbtrack.data_writer import SequenceWriter
+from nbtrack.readers.neural_rgbd import read_poses
 from nbtrack.scenes import DATASET_SCENES
 from nbtrack.synthetic import build_room
 from nbtrack.synthetic.generate import room_frames, room_intrinsics

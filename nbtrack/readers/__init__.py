@@ -1,0 +1,26 @@
+"""Readers of recordings. A module in this folder that registers a format makes it known everywhere.
+
+"""
+
+import importlib
+import pkgutil
+
+from nbtrack.readers.base import FORMATS, Format, Request, find_format, open_recording, register
+from nbtrack.readers.decoding import Decoded, decode, ray_lengths
+from nbtrack.readers.recording import Recording
+
+for _module in pkgutil.iter_modules(__path__):
+    importlib.import_module(f"{__name__}.{_module.name}")
+
+__all__ = [
+    "FORMATS",
+    "Decoded",
+    "Format",
+    "Recording",
+    "Request",
+    "decode",
+    "find_format",
+    "open_recording",
+    "ray_lengths",
+    "register",
+]

@@ -1,0 +1,172 @@
+"""One short recording of a synthetic room, written as every format has it, by its documentation.
+
+Nothing of the readers is used here: a convention that both got wrong would go unnoticed.
+"""
+
+import json
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from nbtrack.camera import Intrinsics
+from nbtrack.synthetic import build_room, handheld_trajectory, render_frame
+
+# The focal length of 7-Scenes at this width; pixel centres at integer + 0.5.
+CAMERA = Intrinsics.from_focal(48, 36, 585.0 * 48 / 640)
+N_FRAMES = 6
+START = 1305031102.175  # s, of the first frame in formats with times
+
+
+class Source(NamedTuple):
+    """What is written: RGB colours, depth in mm, poses with OpenCV axes, camera-to-world."""
+
+    colors: np.ndarray
+    depths_mm: np.ndarray
+    poses: np.ndarray
+    camera: Intrinsics = CAMERA
+
+
+@cache
+def source(room: str = "living_room", n_frames: int = N_FRAMES, stride: int = 3) -> Source:
+    """Clean frames; every `stride`-th of a hand-held camera's."""
+    poses = handheld_trajectory(build_room(room), n_frames * stride, 0)[::stride]
+    rendered = [render_frame(build_room(room), CAMERA, pose) for pose in poses]
+    colors = np.stack([color for color, _, _ in rendered])
+    depths = np.stack([np.rint(1000 * depth).astype(np.uint16) for _, depth, _ in rendered])
+    depths[:, :2, :3] = 0  # a corner without measurement
+    return Source(colors, depths, poses)
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """RGB colour or 16-bit depth; JPEG as good as it gets."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    bgr = image[..., ::-1] if image.ndim == 3 else image
+    options = [cv2.IMWRITE_JPEG_QUALITY, 100] if path.suffix == ".jpg" else []
+    assert cv2.imwrite(str(path), np.ascontiguousarray(bgr), options)
+
+
+def matrix_text(matrix: np.ndarray) -> str:
+    return "\n".join(" ".join(map(repr, row)) for row in np.atleast_2d(matrix).tolist()) + "\n"
+
+
+def camera_matrix(camera: Intrinsics, size: int = 3) -> np.ndarray:
+    """OpenCV's, with pixel centres at whole numbers."""
+    K = np.eye(size)
+    K[0, 0], K[1, 1], K[0, 2], K[1, 2] = camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5
+    return K
+
+
+def tum_lines(times: np.ndarray, poses: np.ndarray, order: str = "xyzw") -> str:
+    q = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=order == "wxyz")
+    return matrix_text(np.column_stack([times, poses[:, :3, 3], q]))
+
+
+def write_neural_rgbd(folder: Path, data: Source) -> None:
+    opengl = data.poses @ np.diag([1.0, -1, -1, 1])
+    for i, (color, depth) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
+        write_image(folder / f"images/img{i}.png", color)
+        write_image(folder / f"depth_filtered/depth{i}.png", depth)
+    (folder / "poses.txt").write_text(matrix_text(opengl.reshape(-1, 4)))
+    (folder / "focal.txt").write_text(f"{data.camera.fx!r}\n")
+
+
+def write_tum(folder: Path, data: Source) -> None:
+    """With a colour image that has no depth, a depth map that has no image, and denser poses."""
+    times = START + np.arange(len(data.poses)) / 10
+    lists = {"rgb": ["# timestamp filename"], "depth": ["# timestamp filename"]}
+    for i, time in enumerate(times):
+        for name, image, late in (
+            ("rgb", data.colors[i], 0.0), ("depth", 5 * data.depths_mm[i], 0.011)
+        ):  # fmt: skip
+            file = f"{name}/{time + late:.6f}.png"
+            write_image(folder / file, image)
+            lists[name].append(f"{time + late:.6f} {file}")
+    # 0.025 s from each other, and from the next frame: too far to belong together.
+    odd = (("rgb", data.colors[0], 0.05), ("depth", data.depths_mm[0], 0.075))
+    for name, image, late in odd:
+        write_image(folder / name / "odd.png", image)
+        lists[name].append(f"{times[1] + late:.6f} {name}/odd.png")
+    for name, lines in lists.items():
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    # Between the frames' poses others that must not be taken.
+    between = np.tile(np.eye(4), (len(times), 1, 1))
+    all_times = np.stack([times + 0.002, times + 0.05], axis=1).ravel()
+    all_poses = np.stack([data.poses, between], axis=1).reshape(-1, 4, 4)
+    head = "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n"
+    (folder / "groundtruth.txt").write_text(head + tum_lines(all_times, all_poses))
+    K = camera_matrix(data.camera)
+    (folder / "calibration.txt").write_text(matrix_text(K[[0, 1, 0, 1], [0, 1, 2, 2]]))
+
+
+def write_replica(folder: Path, data: Source) -> None:
+    for i, (color, depth) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
+        write_image(folder / f"results/frame{i:06d}.jpg", color)
+        raw = np.rint(depth * 6.5535).astype(np.uint16)
+        write_image(folder / f"results/depth{i:06d}.png", raw)
+    (folder / "traj.txt").write_text(matrix_text(data.poses.reshape(-1, 16)))
+    camera = data.camera
+    params = {
+        "w": camera.width, "h": camera.height, "fx": camera.fx, "fy": camera.fy,
+        "cx": camera.cx - 0.5, "cy": camera.cy - 0.5, "scale": 6553.5,
+    }  # fmt: skip
+    (folder.parent / "cam_params.json").write_text(json.dumps({"camera": params}))
+
+
+def write_seven_scenes(folder: Path, data: Source) -> None:
+    for i, (color, depth) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
+        write_image(folder / f"frame-{i:06d}.color.png", color)
+        write_image(folder / f"frame-{i:06d}.depth.png", np.where(depth == 0, 65535, depth))
+        text = matrix_text(data.poses[i]).replace(" ", "\t ")
+        (folder / f"frame-{i:06d}.pose.txt").write_text(text)
+
+
+def write_scannet(folder: Path, data: Source) -> None:
+    """Colour twice as large as depth, as the real export's is larger."""
+    for i, (color, depth) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
+        write_image(folder / f"color/{i}.jpg", color.repeat(2, axis=0).repeat(2, axis=1))
+        write_image(folder / f"depth/{i}.png", depth)
+        (folder / "pose").mkdir(exist_ok=True)
+        (folder / f"pose/{i}.txt").write_text(matrix_text(data.poses[i]))
+    (folder / "intrinsic").mkdir()
+    text = matrix_text(camera_matrix(data.camera, 4))
+    (folder / "intrinsic/intrinsic_depth.txt").write_text(text)
+
+
+def write_images(folder: Path, data: Source) -> None:
+    """Those of a plain folder."""
+    for i, (color, depth) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
+        write_image(folder / f"color/{i:06d}.png", color)
+        write_image(folder / f"depth/{i:06d}.png", depth)
+
+
+def write_plain(folder: Path, data: Source) -> None:
+    write_images(folder, data)
+    K, camera = camera_matrix(data.camera), data.camera
+    content = {
+        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
+        "cx": K[0, 2], "cy": K[1, 2],
+    }  # fmt: skip
+    (folder / "intrinsics.json").write_text(json.dumps(content))
+    (folder / "trajectory.txt").write_text(tum_lines(np.arange(len(data.poses)) / 30, data.poses))
+
+
+WRITERS: dict[str, Callable[[Path, Source], None]] = {
+    "neural_rgbd": write_neural_rgbd,
+    "tum": write_tum,
+    "replica": write_replica,
+    "7scenes": write_seven_scenes,
+    "scannet": write_scannet,
+    "plain": write_plain,
+}
+
+
+def write_recording(format: str, folder: Path, data: Source | None = None) -> Path:
+    """The recording in a format's own conventions; returns `folder`."""
+    folder.mkdir(parents=True)
+    WRITERS[format](folder, data or source())
+    return folder

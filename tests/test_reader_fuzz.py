@@ -1,0 +1,123 @@
+"""Texts of every format with anything in them: what is wrong is told, nothing else is raised.
+
+What can be read is also checked now and then: absurd numbers must not break the check either.
+
+`NBTRACK_FUZZ_EXAMPLES` sets how many are tried (default 200).
+"""
+
+import os
+import re
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("hypothesis")
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from recordings import WRITERS, source, write_recording
+
+from nbtrack.data import read_sequence
+from nbtrack.data_check import check_sequence
+from nbtrack.errors import NbtrackError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+EXAMPLES = int(os.environ.get("NBTRACK_FUZZ_EXAMPLES", "200"))
+TEXTS = (
+    ("neural_rgbd", "poses.txt"), ("neural_rgbd", "focal.txt"), ("neural_rgbd", "intrinsics.txt"),
+    ("tum", "rgb.txt"), ("tum", "depth.txt"), ("tum", "groundtruth.txt"),
+    ("tum", "calibration.txt"), ("replica", "traj.txt"), ("replica", "cam_params.json"),
+    ("7scenes", "frame-000000.pose.txt"), ("scannet", "pose/0.txt"),
+    ("scannet", "intrinsic/intrinsic_depth.txt"), ("plain", "trajectory.txt"),
+    ("plain", "intrinsics.json"), ("plain", "sequence.toml"), ("tum", "sequence.toml"),
+)  # fmt: skip
+WORDS = (
+    "nan", "inf", "-inf", "1e400", "-1e308", "1e200", "1e7", "-0.5", "[" * 100_000,
+    "1e-320", "0", "-0", "1", "1_0", "0x1p3", "٣", "½", "true", "null", "NaN", "1" * 400,
+    "a" * 5000, "\0", "#", ",", '"', "{", "=", "..", "/", "rgb", "\ufeff", "\u2028", "wxyz",
+    "plain", "depth_scale", "[x]", "-5",
+)  # fmt: skip
+KEYS = (
+    "format", "depth_scale", "no_depth", "depth_along", "camera_axes", "poses", "quaternion",
+    "frame_rate", "other",
+)  # fmt: skip
+VALUES = (
+    "1", "-1", "0", "1e-5", "1e9", "nan", "inf", "true", "[]", "{}", '"ray"', '"axis"', '"opengl"',
+    '"right up forward"', '"up up up"', '"world-to-camera"', '"wxyz"', '"plain"', '"tum"', '""',
+    "65535", "70000", "1979-05-27", '"\\u0000"', "5000", "9" * 400,
+)  # fmt: skip
+
+
+@cache
+def recordings(base: Path) -> dict[str, Path]:
+    few = source(n_frames=2)
+    return {format: write_recording(format, base / format / "r", few) for format in WRITERS}
+
+
+@st.composite
+def changed(draw: Callable, original: bytes) -> bytes:
+    """A text that is nearly right: words replaced, lines dropped or doubled, bytes overwritten."""
+    lines = original.decode().splitlines()
+    for _ in range(draw(st.integers(1, 4))):
+        number = draw(st.integers(0, max(0, len(lines) - 1)))
+        kind = draw(st.sampled_from(("word",) * 6 + ("drop", "double", "cut", "join")))
+        if not lines:
+            break
+        if kind == "word":
+            # Mostly a number: what surrounds it decides little.
+            spans = [match.span() for match in re.finditer(r"-?[\d.e+-]+|\S+", lines[number])]
+            start, stop = draw(st.sampled_from(spans or [(0, 0)]))
+            any_word = st.sampled_from(WORDS)
+            word = draw(any_word | any_word | any_word | st.text(max_size=8) | st.floats().map(str))
+            lines[number] = lines[number][:start] + word + lines[number][stop:]
+        elif kind == "drop":
+            del lines[number]
+        elif kind == "double":
+            lines.insert(number, lines[number])
+        elif kind == "cut":
+            lines[number] = lines[number][: draw(st.integers(0, 40))]
+        else:
+            lines[number] = lines[number] + " " + lines[0]
+    end = draw(st.sampled_from(("\n", "\r\n", "\r", "\n\n")))
+    return end.join(lines).encode("utf-8", "surrogatepass")
+
+
+def toml_texts() -> st.SearchStrategy[bytes]:
+    entry = st.tuples(st.sampled_from(KEYS), st.sampled_from(VALUES))
+    return st.lists(entry, max_size=4, unique_by=lambda e: e[0]).map(
+        lambda entries: "\n".join(f"{key} = {value}" for key, value in entries).encode()
+    )
+
+
+@settings(
+    max_examples=EXAMPLES, deadline=None, derandomize=EXAMPLES <= 200, database=None,
+    suppress_health_check=list(HealthCheck),
+)  # fmt: skip
+@given(data=st.data())
+def test_only_our_own_errors(tmp_path_factory: pytest.TempPathFactory, data) -> None:
+    """Catches any other exception or warning, and poses or pixels that are no numbers."""
+    base = tmp_path_factory.getbasetemp() / "fuzz"
+    format, name = data.draw(st.sampled_from(TEXTS))
+    folder = recordings(base)[format]
+    path = folder / name if name != "cam_params.json" else folder.parent / name
+    original = path.read_bytes() if path.is_file() else None
+    strategies = [st.binary(max_size=200), st.text(max_size=200).map(lambda t: t.encode("utf-8"))]
+    strategies.append(toml_texts() if path.suffix == ".toml" else changed(original or b"1 2 3 4"))
+    content = data.draw(st.one_of(*strategies, strategies[-1], strategies[-1]))
+    path.write_bytes(content)
+    message = "nothing wrong"
+    try:
+        sequence = read_sequence(folder, slice(0, 1), format=format)
+        assert np.isfinite(sequence.T_world_camera).all()
+        assert np.isfinite([sequence.intrinsics.fx, sequence.intrinsics.cx]).all()
+        if data.draw(st.integers(0, 19)) == 0:
+            str(check_sequence(folder, format=format))
+    except NbtrackError as error:
+        message = str(error)
+    finally:
+        path.unlink()
+        if original is not None:
+            path.write_bytes(original)
+    assert 0 < len(message) < 1000
