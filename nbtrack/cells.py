@@ -1,6 +1,5 @@
 """The cells of a grid: maps and tracked runs, each named by everything that it depends on."""
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from nbtrack.metrics import trajectory_metrics
 from nbtrack.paths import runs_folder
 from nbtrack.provenance import code_fingerprint, fingerprint
 from nbtrack.scenes import Scene
+from nbtrack.storage import read_json
 from nbtrack.trackers import tracker_class
 from nbtrack.tracking import track_sequence
 
@@ -68,7 +68,7 @@ class MapCell:
         path = self.folder / SUMMARY_FILE
         if self.out is None or not path.is_file():
             return path.is_file()
-        return json.loads(path.read_text(encoding="utf-8")).get("key") == self.key
+        return read_json(path).get("key") == self.key
 
     @property
     def evaluations(self) -> float:
@@ -142,7 +142,7 @@ class TrackCell:
 
     def metrics(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""
-        return json.loads((self.folder / METRICS_FILE).read_text(encoding="utf-8"))
+        return read_json(self.folder / METRICS_FILE)
 
 
 def make_budget(

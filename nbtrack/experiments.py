@@ -1,6 +1,5 @@
 """Cells made or found: maps and tracked runs are computed once, and kept on disk."""
 
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -30,9 +29,15 @@ from nbtrack.mapping import FittedMap, load_map, map_sequence, split_holdout
 from nbtrack.metrics import score_detection, trajectory_metrics
 from nbtrack.parallel import Report, quiet
 from nbtrack.provenance import versions
-from nbtrack.storage import write_json_atomic, write_text_atomic
+from nbtrack.storage import (
+    json_bytes,
+    read_json,
+    write_json_atomic,
+    write_text_atomic,
+    write_together,
+)
 from nbtrack.tracking import TrackedSequence, track_sequence
-from nbtrack.trajectories import read_tum, write_tum
+from nbtrack.trajectories import read_tum, tum_text
 
 
 def obtain_map(
@@ -52,7 +57,7 @@ def obtain_map(
 
 def map_summary(cell: MapCell) -> dict[str, Any]:
     """What is kept beside a finished map: config, quality, seconds, device, versions."""
-    return json.loads((cell.folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+    return read_json(cell.folder / SUMMARY_FILE)
 
 
 def obtain_track(
@@ -82,7 +87,6 @@ def run_track(
     has a row for each frame, `metrics.json` everything else.
     """
     fitted = obtain_map(cell.map_cell, device)
-    (folder / METRICS_FILE).unlink(missing_ok=True)
     config = cell.map_cell.preset.tracking_of(cell.tracker_name)
     with naming_what_to_lower(f"frames {cell.frames} of {cell.scene_name}"):
         sequence = cell.map_cell.scene.read(parse_frames(cell.frames))
@@ -95,12 +99,14 @@ def run_track(
             device, checkpoint, lambda done, error: report(done, f"off by {100 * error:.1f} cm"),
         )  # fmt: skip
     frame_ids = tracked.frames["frame_id"].to_numpy()[1:]
-    write_tum(folder / "trajectory.txt", frame_ids, tracked.T_estimated[1:])
-    write_tum(folder / "groundtruth.txt", frame_ids, tracked.T_true[1:])
-    write_text_atomic(folder / "frames.csv", tracked.frames.to_csv(index=False))
     metrics = _metrics(cell, tracked, fitted, device) | baking
     # The metrics come last: where they stand, the run is complete.
-    write_json_atomic(folder / METRICS_FILE, metrics)
+    write_together(folder, {
+        "trajectory.txt": tum_text(frame_ids, tracked.T_estimated[1:]).encode(),
+        "groundtruth.txt": tum_text(frame_ids, tracked.T_true[1:]).encode(),
+        "frames.csv": tracked.frames.to_csv(index=False).encode(),
+        METRICS_FILE: json_bytes(metrics),
+    })  # fmt: skip
     checkpoint.unlink(missing_ok=True)
     return metrics
 
@@ -143,6 +149,7 @@ def _metrics(
     steps = int(rows["steps"].sum())
     return {
         **metrics,
+        "frames_without_depth": int(rows["without_depth"].sum()),
         "steps_per_frame": steps / len(rows),
         "seconds_per_step": float(rows["seconds"].sum()) / max(steps, 1),
         "seconds_per_frame": float(rows["seconds"].mean()),
