@@ -16,6 +16,7 @@ from nbtrack.config import Preset
 from nbtrack.device import choose_device, device_name, synchronize
 from nbtrack.errors import ConfigError
 from nbtrack.fields import field_class
+from nbtrack.map_files import SUMMARY_FILE, StoredMap
 from nbtrack.map_quality import score_map
 from nbtrack.mapping import map_sequence
 from nbtrack.metrics import trajectory_metrics
@@ -26,7 +27,6 @@ from nbtrack.storage import read_json
 from nbtrack.trackers import tracker_class
 from nbtrack.tracking import track_sequence
 
-MAP_FILE, SUMMARY_FILE = "map.pt", "map.json"
 RUN_FILE, METRICS_FILE = "run.pt", "metrics.json"
 
 
@@ -79,10 +79,39 @@ class MapCell:
 
 
 @dataclass(frozen=True)
+class GivenMap:
+    """A map made earlier in the place of a scene's own: in it the scene is tracked."""
+
+    scene: Scene
+    preset: Preset  # its network is the map's
+    stored: StoredMap
+
+    @property
+    def field_name(self) -> str:
+        """The map's field."""
+        return self.stored.field.name
+
+    @property
+    def frames(self) -> str:
+        """The slice of frames, of its own scene, that the map was made from."""
+        return self.stored.made["frames"]
+
+    @property
+    def seed(self) -> int:
+        """The seed that the map was made with."""
+        return self.stored.made["seed"]
+
+    @cached_property
+    def key(self) -> str:
+        """Changes with the map's weights and with the scene that is tracked."""
+        return fingerprint(self.stored.key, choose_device().type, self.scene.fingerprint)
+
+
+@dataclass(frozen=True)
 class TrackCell:
     """One tracked run in a map, under one budget: so many steps a frame, or a rate by the clock."""
 
-    map_cell: MapCell
+    map_cell: MapCell | GivenMap
     tracker_name: str
     steps: float | None = None
     rate_hz: float | None = None
@@ -146,7 +175,7 @@ class TrackCell:
 
 
 def make_budget(
-    steps: float | None, rate_hz: float | None, device: torch.device | None = None
+    steps: float | int | None, rate_hz: float | int | None, device: torch.device | None = None
 ) -> Budget:
     """A budget by the clock of a device if there is a rate (Hz), else of so many steps a frame.
 

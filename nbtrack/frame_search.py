@@ -69,7 +69,8 @@ class FrameSearch:
     def warm_up(self, frame: int) -> None:
         """One step that counts nowhere: first calls load and allocate for a second or more."""
         tracker = self.fresh_tracker()
-        tracker.start_frame(frame, torch.from_numpy(self.estimates[0]).float()[None].to(self.device))
+        T_start = torch.from_numpy(self.estimates[0]).float()
+        tracker.start_frame(frame, T_start[None].to(self.device))
         tracker.step()
         synchronize(self.device)
 

@@ -23,14 +23,14 @@ def write_bytes_atomic(path: Path, content: bytes) -> None:
         OSError: the folder cannot be made or written; an existing file is then left as it was.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # The process id keeps two writers of one path from moving each other's half-written file.
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        aside.write_bytes(content)
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
+    aside = _aside(path)
+    with _naming_file(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            aside.write_bytes(content)
+            os.replace(aside, path)
+        finally:
+            _remove(aside)
 
 
 def write_together(folder: Path, contents: Mapping[str, bytes]) -> None:
@@ -43,21 +43,47 @@ def write_together(folder: Path, contents: Mapping[str, bytes]) -> None:
         OSError: the folder cannot be made or written.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    asides = {name: folder / f".{name}.{os.getpid()}.tmp" for name in contents}
+    asides = {name: _aside(folder / name) for name in contents}
+    with _naming_file(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            for name, content in contents.items():
+                asides[name].write_bytes(content)
+            (folder / list(contents)[-1]).unlink(missing_ok=True)
+            for name, aside in asides.items():
+                os.replace(aside, folder / name)
+        finally:
+            for aside in asides.values():
+                _remove(aside)
+
+
+def _aside(path: Path) -> Path:
+    # The process id keeps two writers of one path from moving each other's half-written file.
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
+def _remove(path: Path) -> None:
+    with contextlib.suppress(OSError):  # what went wrong before is what the user must hear
+        path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _naming_file(path: Path) -> Iterator[None]:
+    """Give errors the name of the result: a write that finds the disk full has none of its own."""
     try:
-        for name, content in contents.items():
-            asides[name].write_bytes(content)
-        (folder / list(contents)[-1]).unlink(missing_ok=True)
-        for name, aside in asides.items():
-            os.replace(aside, folder / name)
-    finally:
-        for aside in asides.values():
-            aside.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
 
 
-def read_checkpoint(path: Path) -> dict[str, Any]:
+_AGAIN = "remove it and run the same command again"
+
+
+def read_checkpoint(path: Path, kind: str = "checkpoint", advice: str = _AGAIN) -> dict[str, Any]:
     """What `torch.save` wrote: tensors and plain values only, on the CPU; no code is run.
+
+    Args:
+        kind, advice: what the file should be and what to do if it is not, for the message.
 
     Raises:
         DataError: the file is damaged or something else.
@@ -66,14 +92,16 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        raise _damaged(path, type(error).__name__) from None
+        raise _damaged(path, kind, type(error).__name__, advice) from None
     if not isinstance(content, dict):
-        raise _damaged(path, f"holds a {type(content).__name__}")
+        raise _damaged(path, kind, f"holds a {type(content).__name__}", advice)
     return content
 
 
 @contextlib.contextmanager
-def naming_damaged(path: Path) -> Iterator[None]:
+def naming_damaged(
+    path: Path, kind: str = "checkpoint", advice: str = _AGAIN
+) -> Iterator[None]:
     """Turn what goes wrong in taking up a checkpoint's content into one line that names the file.
 
     Raises:
@@ -84,14 +112,12 @@ def naming_damaged(path: Path) -> Iterator[None]:
     except (LookupError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         if isinstance(error, NbtrackError):
             raise
-        raise _damaged(path, f"{type(error).__name__}: {error}") from None
+        raise _damaged(path, kind, f"{type(error).__name__}: {error}", advice) from None
 
 
-def _damaged(path: Path, reason: str) -> DataError:
+def _damaged(path: Path, kind: str, reason: str, advice: str) -> DataError:
     reason = " ".join(reason.split())[:120]
-    return DataError(
-        f"{path} is not a readable checkpoint ({reason}): remove it and run the same command again"
-    )
+    return DataError(f"{path} is not a readable {kind} ({reason}): {advice}")
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -104,10 +130,10 @@ def read_json(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise DataError(
-            f"{path} is not readable JSON ({error}): remove it and run the same command again"
+            f"{path} is not readable JSON ({error}): {_AGAIN}"
         ) from None
     if not isinstance(content, dict):
-        raise DataError(f"{path} holds no object: remove it and run the same command again")
+        raise DataError(f"{path} holds no object: {_AGAIN}")
     return content
 
 
