@@ -7,6 +7,7 @@ from collections.abc import Sequence as Texts
 from nbtrack.cli_options import (
     Parser,
     a_path,
+    a_seed,
     add_device,
     add_field,
     add_preset,
@@ -59,7 +60,7 @@ def _add_map(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("sequence", help="a folder, or the name of a room or dataset scene")
     add_field(parser)
     parser.add_argument("--frames", default=":", help="Python slice of frames, A:B:S")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=a_seed, default=0)
     parser.add_argument("--out", type=a_path, help="folder for the map (default: in the cache)")
     add_device(parser)
     add_preset(parser)
@@ -94,7 +95,7 @@ def _add_track(commands: argparse._SubParsersAction) -> None:
         help="track in this map, of another recording of the room: a folder or a map file",
     )  # fmt: skip
     parser.add_argument("--frames", default=":", help="Python slice of frames to track")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=a_seed, default=0)
     parser.add_argument("--out", type=a_path, help="folder for the results (default: in the cache)")
     add_device(parser)
     add_preset(parser)
@@ -224,7 +225,7 @@ def _add_data(commands: argparse._SubParsersAction) -> None:
     make.add_argument("--out", type=a_path, required=True, help="folder to write, new")
     make.add_argument("--n-frames", type=int, default=300)
     make.add_argument("--width", type=int, default=640, help="pixels; the height is 3/4 of it")
-    make.add_argument("--seed", type=int, default=0)
+    make.add_argument("--seed", type=a_seed, default=0)
     make.set_defaults(command=_make)
     check = actions.add_parser("check", help="validate a folder and prove its pose convention")
     check.add_argument("folder", type=a_path)

@@ -25,6 +25,13 @@ def a_path(text: str) -> Path:
     return Path(text)
 
 
+def a_seed(text: str) -> int:
+    """A seed: what every generator in use takes."""
+    if not (text.isdecimal() and int(text) < 2**63):
+        raise argparse.ArgumentTypeError(f"{text!r} is no seed: give a whole number from 0 on")
+    return int(text)
+
+
 def add_preset(parser: argparse.ArgumentParser) -> None:
     """`--preset`, `--config` and `--set`."""
     parser.add_argument("--preset", help=f"{', '.join(PRESETS)} (default: smoke)")

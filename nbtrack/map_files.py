@@ -80,7 +80,10 @@ def read_map(path: Path | str) -> StoredMap:
             f"{FORMAT_VERSION}: {_ADVICE} of the same nbtrack"
         )
     with naming_damaged(path, "map file", _ADVICE):
-        return _opened(content)
+        stored = _opened(content)
+        if stored.key != content["key"]:  # a bit that flipped on a disk shows nowhere else
+            raise ValueError("its content is not what was written")
+    return stored
 
 
 def write_map(path: Path, stored: StoredMap) -> None:
@@ -101,6 +104,7 @@ def write_map(path: Path, stored: StoredMap) -> None:
             "state": {
                 name: tensor.cpu().clone() for name, tensor in stored.field.state_dict().items()
             },
+            "key": stored.key,
             "made": stored.made,
             "usual_fit": stored.usual_fit and stored.usual_fit.to_dict(),
             "seen": stored.seen.to_dict(),
