@@ -22,7 +22,7 @@ from nbtrack.cli import main
 
 SETTINGS = (
     "scenes.n_frames=6", "scenes.width=32", "network.neus.width=16", "mapping.neus.iterations=8",
-    "mapping.neus.n_rays=16", "tracking.sdf.n_pixels=16", "tracking.lm.n_pixels=32",
+    "mapping.neus.n_rays=16", "mapping.neus.holdout_every=0", "tracking.sdf.n_pixels=16",
 )  # fmt: skip
 SET = [word for setting in SETTINGS for word in ("--set", setting)]
 MAP = ["map", "living_room", "--field", "neus", "--out", "map", *SET]

@@ -21,19 +21,23 @@ from tiny import TINY
 from nbtrack.trajectories import read_tum
 
 KILLS = int(os.environ.get("NBTRACK_TEST_KILLS", "3"))
-# Forks a child for each line `[arguments, seconds until SIGKILL or null]`; answers with its exit
-# status, negative where it was killed, and how long it ran. Checkpoints are written after every
+# Forks a child for each line `[folder, arguments, seconds until SIGKILL or null]`; answers with its
+# exit status, negative where it was killed, and how long it ran. Checkpoints are written after every
 # step, or every other command would be over before its first one.
 _FORKER = """
 import json, os, signal, sys, time
+import torch._dynamo, trimesh  # else every child would import them by itself
 import nbtrack.commands, nbtrack.commands_tables, nbtrack.mapping, nbtrack.tracking
 from nbtrack.cli import main
 nbtrack.mapping.CHECKPOINT_SECONDS = nbtrack.tracking.CHECKPOINT_SECONDS = 0.0
 for line in sys.stdin:
-    arguments, seconds = json.loads(line)
+    folder, arguments, seconds = json.loads(line)
     start = time.monotonic()
     child = os.fork()
     if not child:
+        os.makedirs(folder, exist_ok=True)
+        os.chdir(folder)
+        os.environ["NBTRACK_RUNS"] = folder + "/runs"
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         status = 1
         try:
@@ -48,6 +52,7 @@ for line in sys.stdin:
     print(json.dumps([status, time.monotonic() - start]), flush=True)
 """
 SET = [word for setting in (*TINY, "mapping.neus.iterations=25", "mapping.imap.iterations=25",
+                            "mapping.neus.holdout_every=0", "mapping.imap.holdout_every=0",
                             "scenes.n_frames=10", "tracking.lm.n_pixels=32")
        for word in ("--set", setting)]  # fmt: skip
 COMMANDS = {
@@ -60,37 +65,40 @@ COMMANDS = {
 
 
 class Forker:
-    """Runs commands in children of a process that has imported the package, in some folder."""
+    """Runs commands in children of one process that has imported the package."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self) -> None:
         kept = {k: v for k, v in os.environ.items() if not k.startswith("NBTRACK_")}
         paths = [str(Path(__file__).parents[1]), kept.get("PYTHONPATH", "")]
         kept["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
-        folder.mkdir()
         self.process = subprocess.Popen(
-            [sys.executable, "-c", _FORKER], cwd=folder, text=True, stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, env={**kept, "NBTRACK_RUNS": str(folder / "runs")},
+            [sys.executable, "-c", _FORKER], text=True, stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, env=kept,
         )  # fmt: skip
 
-    def run(self, arguments: list[str], seconds: float | None = None) -> tuple[int, float]:
-        """Exit status and running time (s) of a command, killed after some seconds if given."""
-        self.process.stdin.write(json.dumps([arguments, seconds]) + "\n")
+    def run(
+        self, folder: Path, arguments: list[str], seconds: float | None = None
+    ) -> tuple[int, float]:
+        """Exit status and time (s) of a command in a folder, killed after some seconds if given."""
+        self.process.stdin.write(json.dumps([str(folder), arguments, seconds]) + "\n")
         self.process.stdin.flush()
         status, ran = json.loads(self.process.stdout.readline())
         return status, ran
 
-    def close(self) -> None:
-        """End the process, whose children have ended."""
-        self.process.communicate()
+
+@pytest.fixture(scope="module")
+def forker() -> Iterator[Forker]:
+    started = Forker()
+    yield started
+    started.process.communicate()  # ends with its input
 
 
-@pytest.fixture
-def forkers(tmp_path: Path) -> Iterator[tuple[Forker, Forker]]:
-    both = Forker(tmp_path / "undisturbed"), Forker(tmp_path / "disturbed")
-    yield both
-    for forker in both:
-        forker.close()
+@pytest.fixture(scope="module")
+def room(forker: Forker, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The room that all commands work on: what is killed is the command's own work."""
+    folder = tmp_path_factory.mktemp("room")
+    assert forker.run(folder, [*COMMANDS["map"], "--frames", ":2"])[0] == 0
+    return folder / "runs" / "rooms"
 
 
 def result(folder: Path) -> dict[str, object]:
@@ -112,30 +120,26 @@ def result(folder: Path) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_killed_and_told_again(name: str, forkers: tuple[Forker, Forker], tmp_path: Path) -> None:
+def test_killed_and_told_again(name: str, forker: Forker, room: Path, tmp_path: Path) -> None:
     """Catches half-written results that count, and runs that go on otherwise than they began."""
-    undisturbed, disturbed = forkers
-    # A first map elsewhere makes the room and loads what is loaded once: what is killed is the
-    # command's own work.
-    for forker in forkers:
-        assert forker.run([*COMMANDS["map"], "--out", "first", "--frames", ":3"])[0] == 0
-    status, seconds = undisturbed.run(COMMANDS[name])
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    for folder in (whole, killed):
+        shutil.copytree(room, folder / "runs" / "rooms")
+    status, seconds = forker.run(whole, COMMANDS[name])
     assert status == 0
-    rng, killed = random.Random(name), 0
-    kills = max(1, KILLS // len(COMMANDS))
-    while killed < kills:
-        status, _ = disturbed.run(COMMANDS[name], rng.uniform(0.02, 0.7) * seconds)
-        assert status in (0, -9)
-        killed += status == -9
-        if status == 0:  # it ended before the kill: the next one begins from nothing
-            assert result(tmp_path / "disturbed/out") == result(tmp_path / "undisturbed/out")
-            shutil.rmtree(tmp_path / "disturbed/out")
-            shutil.rmtree(tmp_path / "disturbed/runs")
-    assert disturbed.run(COMMANDS[name])[0] == 0
-    expected = result(tmp_path / "undisturbed/out")
+    expected = result(whole / "out")
     assert len(expected) >= 3
-    assert result(tmp_path / "disturbed/out") == expected
-    unfinished = list((tmp_path / "disturbed/out").rglob(".*.tmp"))
-    assert len(unfinished) <= killed
+    rng, kills = random.Random(name), 0
+    while kills < max(1, KILLS // len(COMMANDS)):
+        status, _ = forker.run(killed, COMMANDS[name], rng.uniform(0.02, 0.7) * seconds)
+        assert status in (0, -9)
+        kills += status == -9
+        if status == 0:  # it ended before the kill: the next one begins from nothing
+            assert result(killed / "out") == expected
+            shutil.rmtree(killed)
+            shutil.copytree(room, killed / "runs" / "rooms")
+    assert forker.run(killed, COMMANDS[name])[0] == 0
+    assert result(killed / "out") == expected
+    assert len(list((killed / "out").rglob(".*.tmp"))) <= kills
     if name == "track":
-        assert len(read_tum(tmp_path / "disturbed/out/trajectory.txt")[0]) == 9
+        assert len(read_tum(killed / "out/trajectory.txt")[0]) == 9

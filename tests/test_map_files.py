@@ -26,7 +26,8 @@ from nbtrack.trajectories import read_tum
 
 SETTINGS = (
     "scenes.n_frames=8", "scenes.width=32", "network.neus.width=24", "mapping.neus.iterations=60",
-    "mapping.neus.n_rays=64", "mapping.neus.learning_rate=3e-3", "tracking.lm.n_pixels=64",
+    "mapping.neus.n_rays=64", "mapping.neus.holdout_every=0", "mapping.neus.learning_rate=3e-3",
+    "tracking.lm.n_pixels=64",
 )  # fmt: skip
 TRACK = ("--tracker", "lm", "--steps", "4", "--frames", "2:6")
 
