@@ -1,6 +1,5 @@
 """The cells of a grid: maps and tracked runs, each named by everything that it depends on."""
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,16 +16,17 @@ from nbtrack.config import Preset
 from nbtrack.device import choose_device, device_name, synchronize
 from nbtrack.errors import ConfigError
 from nbtrack.fields import field_class
+from nbtrack.map_files import SUMMARY_FILE, StoredMap
 from nbtrack.map_quality import score_map
 from nbtrack.mapping import map_sequence
 from nbtrack.metrics import trajectory_metrics
 from nbtrack.paths import runs_folder
 from nbtrack.provenance import code_fingerprint, fingerprint
 from nbtrack.scenes import Scene
+from nbtrack.storage import read_json
 from nbtrack.trackers import tracker_class
 from nbtrack.tracking import track_sequence
 
-MAP_FILE, SUMMARY_FILE = "map.pt", "map.json"
 RUN_FILE, METRICS_FILE = "run.pt", "metrics.json"
 
 
@@ -68,7 +68,7 @@ class MapCell:
         path = self.folder / SUMMARY_FILE
         if self.out is None or not path.is_file():
             return path.is_file()
-        return json.loads(path.read_text(encoding="utf-8")).get("key") == self.key
+        return read_json(path).get("key") == self.key
 
     @property
     def evaluations(self) -> float:
@@ -79,10 +79,39 @@ class MapCell:
 
 
 @dataclass(frozen=True)
+class GivenMap:
+    """A map made earlier in the place of a scene's own: in it the scene is tracked."""
+
+    scene: Scene
+    preset: Preset  # its network is the map's
+    stored: StoredMap
+
+    @property
+    def field_name(self) -> str:
+        """The map's field."""
+        return self.stored.field.name
+
+    @property
+    def frames(self) -> str:
+        """The slice of frames, of its own scene, that the map was made from."""
+        return self.stored.made["frames"]
+
+    @property
+    def seed(self) -> int:
+        """The seed that the map was made with."""
+        return self.stored.made["seed"]
+
+    @cached_property
+    def key(self) -> str:
+        """Changes with the map's weights and with the scene that is tracked."""
+        return fingerprint(self.stored.key, choose_device().type, self.scene.fingerprint)
+
+
+@dataclass(frozen=True)
 class TrackCell:
     """One tracked run in a map, under one budget: so many steps a frame, or a rate by the clock."""
 
-    map_cell: MapCell
+    map_cell: MapCell | GivenMap
     tracker_name: str
     steps: float | None = None
     rate_hz: float | None = None
@@ -142,11 +171,11 @@ class TrackCell:
 
     def metrics(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""
-        return json.loads((self.folder / METRICS_FILE).read_text(encoding="utf-8"))
+        return read_json(self.folder / METRICS_FILE)
 
 
 def make_budget(
-    steps: float | None, rate_hz: float | None, device: torch.device | None = None
+    steps: float | int | None, rate_hz: float | int | None, device: torch.device | None = None
 ) -> Budget:
     """A budget by the clock of a device if there is a rate (Hz), else of so many steps a frame.
 

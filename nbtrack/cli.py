@@ -4,30 +4,39 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence as Texts
-from pathlib import Path
-from typing import NoReturn
 
 from nbtrack.cli_data import add_data, add_format
-from nbtrack.config import PRESETS, Preset
+from nbtrack.cli_options import (
+    Parser,
+    a_path,
+    a_seed,
+    add_device,
+    add_field,
+    add_preset,
+    field_of,
+    preset_of,
+    set_device,
+    words_of,
+)
 from nbtrack.errors import ConfigError, NbtrackError
-from nbtrack.settings import resolve_preset
-
-
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, as every other user error does."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ConfigError(f"{message}; see {self.prog} --help")
 
 
 def main(arguments: Texts[str] | None = None) -> int:
     """Run a command; returns the exit status: 0, or 2 after a user's mistake."""
     try:
         options = _parser().parse_args(arguments)
-        _set_device(options)
+        set_device(options)
         options.command(options)
     except NbtrackError as error:
         print(f"nbtrack: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except OSError as error:  # a disk that is full or read-only, a file where a folder should be
+        where = error.filename2 or error.filename or "the output"
+        print(
+            f"nbtrack: {where}: {error.strerror or error}; what was finished is kept: make room or "
+            "choose another place, and run the same command again",
+            file=sys.stderr,
+        )
         return 2
     except KeyboardInterrupt:
         print("nbtrack: interrupted; run the same command again to go on", file=sys.stderr)
@@ -36,61 +45,28 @@ def main(arguments: Texts[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
+    parser = Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
     _add_map(commands)
     _add_track(commands)
+    _add_export(commands)
     _add_tables(commands)
     _add_notebooks(commands)
-    add_data(commands, _Parser)
+    add_data(commands, Parser)
     _add_bench(commands)
     return parser
-
-
-def _add_preset(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--preset", help=f"{', '.join(PRESETS)} (default: smoke)")
-    parser.add_argument("--config", type=Path, help="TOML file of settings")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
-        help="one setting, for example mapping.neus.iterations=500; may be repeated",
-    )  # fmt: skip
-
-
-def _add_device(parser: argparse.ArgumentParser, of_what: str = "(default: all cores)") -> None:
-    parser.add_argument("--device", help="cuda, cuda:1, mps or cpu (default: the first there is)")
-    parser.add_argument("--threads", type=int, metavar="N", help=f"CPU threads {of_what}")
-
-
-def _set_device(options: argparse.Namespace) -> None:
-    """Where and with how many threads this process and its workers compute."""
-    if getattr(options, "device", None):
-        from nbtrack.device import choose_device
-
-        os.environ["NBTRACK_DEVICE"] = options.device
-        choose_device()
-    threads = getattr(options, "threads", None)
-    if threads is not None:
-        import torch
-
-        if threads < 1:
-            raise ConfigError(f"--threads {threads}: it must be 1 or more; leave it out for all")
-        torch.set_num_threads(threads)
-
-
-def _preset(options: argparse.Namespace) -> Preset:
-    return resolve_preset(options.preset, options.config, tuple(options.settings))
 
 
 def _add_map(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("map", help="fit a field to a sequence with known poses")
     parser.add_argument("sequence", help="a folder, or the name of a room or dataset scene")
     add_format(parser)
-    _add_field(parser)
+    add_field(parser)
     parser.add_argument("--frames", default=":", help="Python slice of frames, A:B:S")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="folder for the map (default: in the cache)")
-    _add_device(parser)
-    _add_preset(parser)
+    parser.add_argument("--seed", type=a_seed, default=0)
+    parser.add_argument("--out", type=a_path, help="folder for the map (default: in the cache)")
+    add_device(parser)
+    add_preset(parser)
     parser.set_defaults(command=_map)
 
 
@@ -98,7 +74,7 @@ def _map(options: argparse.Namespace) -> None:
     from nbtrack.commands import map_command
 
     map_command(
-        options.sequence, _field(options), _preset(options), options.frames, options.seed,
+        options.sequence, field_of(options), preset_of(options), options.frames, options.seed,
         options.out, options.format,
     )  # fmt: skip
 
@@ -107,7 +83,7 @@ def _add_track(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("track", help="track a camera; maps first where no map fits")
     parser.add_argument("sequence", help="a folder, or the name of a room or dataset scene")
     add_format(parser)
-    _add_field(parser)
+    add_field(parser, required=False)
     parser.add_argument("--tracker", required=True, help="vr, sdf, lm or another")
     budget = parser.add_mutually_exclusive_group(required=True)
     budget.add_argument("--rate", type=float, metavar="HZ", help="frames a second, by the clock")
@@ -117,28 +93,17 @@ def _add_track(commands: argparse._SubParsersAction) -> None:
         "--bake", type=float, metavar="METRES",
         help="ask the field on a grid of such cells instead of the network, for example 0.04",
     )  # fmt: skip
-    parser.add_argument("--map-frames", default=":", help="Python slice of frames to map")
-    parser.add_argument("--frames", default=":", help="Python slice of frames to track")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="folder for the results (default: in the cache)")
-    _add_device(parser)
-    _add_preset(parser)
-    parser.set_defaults(command=_track)
-
-
-def _add_field(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--field", required=True, help="imap, neus or another")
+    parser.add_argument("--map-frames", help="Python slice of frames to map (default: all)")
     parser.add_argument(
-        "--supervision", default="rendering",
-        help="rendering, as in the paper (default); rendering+sdf teaches NeuS the distances too",
+        "--map-from", type=a_path, metavar="MAP",
+        help="track in this map, of another recording of the room: a folder or a map file",
     )  # fmt: skip
-
-
-def _field(options: argparse.Namespace) -> str:
-    """The name of the field with the supervision that is asked for."""
-    from nbtrack.fields import supervised_field
-
-    return supervised_field(options.field, options.supervision)
+    parser.add_argument("--frames", default=":", help="Python slice of frames to track")
+    parser.add_argument("--seed", type=a_seed, default=0)
+    parser.add_argument("--out", type=a_path, help="folder for the results (default: in the cache)")
+    add_device(parser)
+    add_preset(parser)
+    parser.set_defaults(command=_track)
 
 
 def _track(options: argparse.Namespace) -> None:
@@ -148,11 +113,33 @@ def _track(options: argparse.Namespace) -> None:
         options.settings.append(f"tracking.{options.tracker}.n_pixels={options.pixels}")
     if options.bake is not None:
         options.settings.append(f"tracking.{options.tracker}.bake_voxel={options.bake}")
+    if options.field is None and options.map_from is None:
+        raise ConfigError("track needs --field, or --map-from with a map that knows its own")
+    if options.field is None and options.supervision is not None:
+        raise ConfigError("--supervision belongs to --field: name that too, or leave both out")
     track_command(
-        options.sequence, _field(options), options.tracker, _preset(options), steps=options.steps,
-        rate_hz=options.rate, map_frames=options.map_frames, frames=options.frames,
-        seed=options.seed, out=options.out, format=options.format,
+        options.sequence, field_of(options) if options.field else None, options.tracker,
+        preset_of(options), steps=options.steps, rate_hz=options.rate,
+        map_frames=options.map_frames, frames=options.frames, seed=options.seed, out=options.out,
+        map_from=options.map_from, format=options.format,
     )  # fmt: skip
+
+
+def _add_export(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser("export", help="a run's trajectory or a map in another format")
+    parser.add_argument("source", type=a_path, help="folder of a run or a map, or a map file")
+    parser.add_argument(
+        "--to", required=True, metavar="FORMAT",
+        help="tum, kitti: trajectory; ply, glb: coloured mesh; map: one file that opens anywhere",
+    )  # fmt: skip
+    parser.add_argument("out", type=a_path, help="file to write")
+    parser.set_defaults(command=_export)
+
+
+def _export(options: argparse.Namespace) -> None:
+    from nbtrack.commands import export_command
+
+    export_command(options.source, options.to, options.out)
 
 
 def _add_tables(commands: argparse._SubParsersAction) -> None:
@@ -186,9 +173,9 @@ def _add_tables(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--measure-again", action="store_true", help="measure Table II although it is cached"
     )
-    parser.add_argument("--out", type=Path, help="folder (default: paper_tables/PRESET)")
-    _add_device(parser, "of each cell (default: the cores divided by the workers)")
-    _add_preset(parser)
+    parser.add_argument("--out", type=a_path, help="folder (default: paper_tables/PRESET)")
+    add_device(parser, "of each cell (default: the cores divided by the workers)")
+    add_preset(parser)
     parser.set_defaults(command=_tables)
 
 
@@ -197,8 +184,8 @@ def _tables(options: argparse.Namespace) -> None:
     from nbtrack.parallel import Execution
 
     if options.scenes:
-        options.settings.append(f"scenes.names={_words(options.scenes)}")
-    preset, trackers = _preset(options), tuple(_words(options.trackers))
+        options.settings.append(f"scenes.names={words_of(options.scenes)}")
+    preset, trackers = preset_of(options), tuple(words_of(options.trackers))
     if options.beyond and (trackers or options.measure_again):
         raise ConfigError("--beyond has rows of its own: leave --trackers and --measure-again out")
     if options.explain:
@@ -218,23 +205,19 @@ def _tables(options: argparse.Namespace) -> None:
     )  # fmt: skip
 
 
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
-
-
 def _add_notebooks(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("notebooks", help="run all notebooks headless, with HTML copies")
     parser.add_argument(
         "--in-place", action="store_true", help="store the outputs in the committed notebooks too"
     )
-    _add_preset(parser)
+    add_preset(parser)
     parser.set_defaults(command=_notebooks)
 
 
 def _notebooks(options: argparse.Namespace) -> None:
     from nbtrack.notebooks import run_notebooks
 
-    preset = _preset(options)  # refuse a wrong setting before the first kernel starts
+    preset = preset_of(options)  # refuse a wrong setting before the first kernel starts
     run_notebooks(preset.name, options.config, tuple(options.settings), options.in_place)
 
 
@@ -242,9 +225,9 @@ def _add_bench(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "bench", help="Table II, step times and mapping speed on this machine, full-size networks"
     )
-    parser.add_argument("--out", type=Path, help="folder for the CSV files (default: in the cache)")
-    _add_device(parser)
-    _add_preset(parser)
+    parser.add_argument("--out", type=a_path, help="folder of CSV files (default: in the cache)")
+    add_device(parser)
+    add_preset(parser)
     parser.set_defaults(command=_bench)
 
 
@@ -254,4 +237,4 @@ def _bench(options: argparse.Namespace) -> None:
     # The paper's sizes unless something else is asked for: small networks measure bookkeeping.
     if "NBTRACK_PRESET" not in os.environ:
         options.preset = options.preset or "synthetic"
-    bench_command(_preset(options), options.out)
+    bench_command(preset_of(options), options.out)

@@ -1,7 +1,8 @@
 """The command line's part on data: making, checking and converting recordings."""
 
 import argparse
-from pathlib import Path
+
+from nbtrack.cli_options import a_path, a_seed
 
 
 def add_data(
@@ -12,22 +13,22 @@ def add_data(
     actions = parser.add_subparsers(required=True, metavar="ACTION", parser_class=parser_class)
     make = actions.add_parser("make", help="write a synthetic room in the dataset's layout")
     make.add_argument("room", help="its name")
-    make.add_argument("--out", type=Path, required=True, help="folder to write, new")
+    make.add_argument("--out", type=a_path, required=True, help="folder to write, new")
     make.add_argument("--n-frames", type=int, default=300)
     make.add_argument("--width", type=int, default=640, help="pixels; the height is 3/4 of it")
-    make.add_argument("--seed", type=int, default=0)
+    make.add_argument("--seed", type=a_seed, default=0)
     make.set_defaults(command=_make)
     check = actions.add_parser("check", help="validate a recording, and say what is wrong with it")
-    check.add_argument("folder", type=Path)
+    check.add_argument("folder", type=a_path)
     _add_parts(check)
     check.add_argument(
-        "--out", type=Path, metavar="PATH",
+        "--out", type=a_path, metavar="PATH",
         help="draw the cloud of all frames there: a .png file, or a folder for check.png",
     )  # fmt: skip
     check.set_defaults(command=_check)
     convert = actions.add_parser("convert", help="write a recording in the Neural RGB-D layout")
-    convert.add_argument("folder", type=Path)
-    convert.add_argument("out", type=Path, help="folder to write, new")
+    convert.add_argument("folder", type=a_path)
+    convert.add_argument("out", type=a_path, help="folder to write, new")
     convert.add_argument("--frames", default=":", help="Python slice of frames, A:B:S")
     _add_parts(convert)
     convert.set_defaults(command=_convert)

@@ -1,19 +1,23 @@
 """What each command does and prints."""
 
 import os
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from tqdm.auto import tqdm
 
-from nbtrack.cells import MapCell, TrackCell, cell_lock, check_pair, make_budget
+from nbtrack.cells import GivenMap, MapCell, TrackCell, cell_lock, check_pair, make_budget
 from nbtrack.config import Preset
 from nbtrack.data import Sequence, parse_frames
 from nbtrack.device import choose_device
-from nbtrack.errors import DataError
+from nbtrack.errors import ConfigError, DataError
 from nbtrack.experiments import map_summary, obtain_map, run_track
+from nbtrack.export import MESH_FILE, export
 from nbtrack.fields import field_class
-from nbtrack.meshes import extract_mesh, keep_seen
+from nbtrack.map_files import StoredMap, read_map
+from nbtrack.meshes import extract_mesh, keep_seen, write_mesh
 from nbtrack.parallel import Execution, Job, Report, run_jobs
 from nbtrack.scenes import Scene, find_scene
 from nbtrack.trackers import tracker_class
@@ -44,43 +48,66 @@ def map_command(
     except DataError as error:
         print(f"  no mesh: {error}")
     else:
-        mesh.export(cell.folder / "mesh.ply")
-        print(f"  mesh of what was seen: {cell.folder / 'mesh.ply'}")
+        write_mesh(cell.folder / MESH_FILE, mesh)
+        print(f"  mesh of what was seen: {cell.folder / MESH_FILE}")
 
 
 def track_command(
     sequence: str,
-    field_name: str,
+    field_name: str | None,
     tracker_name: str,
     preset: Preset,
     steps: float | None,
     rate_hz: float | None,
-    map_frames: str,
+    map_frames: str | None,
     frames: str,
     seed: int,
     out: Path | None,
     format: str | None = None,
+    map_from: Path | None = None,
 ) -> None:
-    """Track a sequence in its map, made first where none fits; print the errors."""
+    """Track a sequence in its map, made first where none fits, or in a given one; print the errors.
+
+    Args:
+        field_name: the map's field; None to take a given map as it is.
+        map_from: folder or file of a map made earlier, which then stands for the sequence's own.
+    """
     tracker = tracker_class(tracker_name)
+    stored = None if map_from is None else _given_map(map_from, field_name, map_frames)
+    field_name = field_name if stored is None else stored.field.name
     check_pair(tracker_name, field_name, preset.tracking_of(tracker_name).bake_voxel)
     parse_frames(frames)
+    map_frames = map_frames or ":"
     parse_frames(map_frames)
     budget = make_budget(steps, rate_hz)  # a wrong one is told before a room is made
     scene = _scene(sequence, preset, format)
     n_frames = len(scene.frame_numbers(frames))
     scene.frame_numbers(map_frames)
-    map_cell = MapCell(scene, field_name, preset, map_frames, seed)
+    if stored is None:
+        map_cell = MapCell(scene, field_name, preset, map_frames, seed)
+    else:
+        network = {**preset.network, field_name: stored.network}
+        map_cell = GivenMap(scene, replace(preset, network=network), stored)
     cell = TrackCell(map_cell, tracker_name, steps, rate_hz, frames, seed)
     device = choose_device()
-    _map_with_bar(map_cell)
+    if stored is None:
+        _map_with_bar(map_cell)
     folder = out or cell.folder
     job = Job(cell.name, n_frames - 1, _track_job, (cell, folder, device))
     (tracked,) = run_jobs([job], "tracking", Execution(workers=1))
     print(f"{folder}: {tracker.label}, {budget}")
     for name in _PRINTED:
         print(f"  {_with_unit(name, tracked[name])}")
+    if tracked["frames_without_depth"]:
+        print(f"  frames without any depth, not searched: {tracked['frames_without_depth']}")
     print(f"  on {tracked['device']}")
+    if tracked.get("map_warning"):
+        print(f"nbtrack: warning: {tracked['map_warning']}", file=sys.stderr)
+
+
+def export_command(source: Path, format_name: str, out: Path) -> None:
+    """Write a run's trajectory or a map in another format; print what was written."""
+    print(f"{out}: {export(source, format_name, out)}")
 
 
 
@@ -108,6 +135,17 @@ def _scene(sequence: str, preset: Preset, format: str | None = None) -> Scene:
         return find_scene(
             sequence, config, lambda done, total: bar.update(done - bar.n), workers, format
         )
+
+
+def _given_map(path: Path, field_name: str | None, map_frames: str | None) -> StoredMap:
+    """The map at a path. Raises ConfigError if it is not what else was asked for."""
+    if map_frames is not None:
+        raise ConfigError("--map-from names a map that is made: leave --map-frames out")
+    stored = read_map(path)
+    found = stored.field.name
+    if field_name is not None and not issubclass(field_class(found), field_class(field_name)):
+        raise ConfigError(f"{path} is a map of field {found!r}, not {field_name!r}: leave it out")
+    return stored
 
 
 def _every_tenth(cell: MapCell) -> Sequence:

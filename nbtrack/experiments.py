@@ -1,7 +1,7 @@
 """Cells made or found: maps and tracked runs are computed once, and kept on disk."""
 
-import json
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,34 +12,45 @@ from jaxtyping import Float
 
 from nbtrack.baking import bake_field
 from nbtrack.cells import (
-    MAP_FILE,
     METRICS_FILE,
     RUN_FILE,
-    SUMMARY_FILE,
+    GivenMap,
     MapCell,
     TrackCell,
     cell_lock,
 )
 from nbtrack.config import TrackingConfig, as_dict
-from nbtrack.data import parse_frames
+from nbtrack.data import Sequence, parse_frames
 from nbtrack.device import choose_device, device_name, naming_what_to_lower
 from nbtrack.device_lock import alone_on, beside_others_on
 from nbtrack.fields import Field
+from nbtrack.map_files import MAP_FILE, SUMMARY_FILE
+from nbtrack.map_fit import frame_fit, usual_fit, warn_of_misfit
 from nbtrack.map_quality import score_map
 from nbtrack.mapping import FittedMap, load_map, map_sequence, split_holdout
 from nbtrack.metrics import score_detection, trajectory_metrics
 from nbtrack.parallel import Report, quiet
 from nbtrack.provenance import versions
-from nbtrack.storage import write_json_atomic, write_text_atomic
+from nbtrack.seen_volume import seen_volume
+from nbtrack.storage import (
+    json_bytes,
+    read_json,
+    write_json_atomic,
+    write_text_atomic,
+    write_together,
+)
 from nbtrack.tracking import TrackedSequence, track_sequence
-from nbtrack.trajectories import read_tum, write_tum
+from nbtrack.trajectories import read_tum, tum_text
 
 
 def obtain_map(
-    cell: MapCell, device: torch.device | None = None, report: Report = quiet
+    cell: MapCell | GivenMap, device: torch.device | None = None, report: Report = quiet
 ) -> FittedMap:
     """The cell's map from the cache; where it is missing or unfinished, made or resumed first."""
     device = device or choose_device()
+    if isinstance(cell, GivenMap):
+        stored = cell.stored
+        return FittedMap(stored.field.to(device), pd.DataFrame(), float(stored.made["seconds"]))
     network = cell.preset.network_of(cell.field_name)
     config = cell.preset.mapping_of(cell.field_name)
     if not cell.is_done:
@@ -52,7 +63,7 @@ def obtain_map(
 
 def map_summary(cell: MapCell) -> dict[str, Any]:
     """What is kept beside a finished map: config, quality, seconds, device, versions."""
-    return json.loads((cell.folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+    return read_json(cell.folder / SUMMARY_FILE)
 
 
 def obtain_track(
@@ -80,12 +91,15 @@ def run_track(
     `trajectory.txt` and `groundtruth.txt` (TUM) hold the tracked frames, without the first one,
     whose pose was given: so public tools report the error of the paper's formula. `frames.csv`
     has a row for each frame, `metrics.json` everything else.
+
+    Raises:
+        DataError: a given map does not fit the first frame at its given pose.
     """
     fitted = obtain_map(cell.map_cell, device)
-    (folder / METRICS_FILE).unlink(missing_ok=True)
     config = cell.map_cell.preset.tracking_of(cell.tracker_name)
     with naming_what_to_lower(f"frames {cell.frames} of {cell.scene_name}"):
         sequence = cell.map_cell.scene.read(parse_frames(cell.frames))
+    map_note = _note_on_given(cell.map_cell, sequence)
     field, baking = field_to_track(fitted.field, config)
     checkpoint = cell.folder / RUN_FILE
     occupied = alone_on if cell.rate_hz is not None else beside_others_on
@@ -95,12 +109,14 @@ def run_track(
             device, checkpoint, lambda done, error: report(done, f"off by {100 * error:.1f} cm"),
         )  # fmt: skip
     frame_ids = tracked.frames["frame_id"].to_numpy()[1:]
-    write_tum(folder / "trajectory.txt", frame_ids, tracked.T_estimated[1:])
-    write_tum(folder / "groundtruth.txt", frame_ids, tracked.T_true[1:])
-    write_text_atomic(folder / "frames.csv", tracked.frames.to_csv(index=False))
-    metrics = _metrics(cell, tracked, fitted, device) | baking
+    metrics = _metrics(cell, tracked, fitted, device) | baking | map_note
     # The metrics come last: where they stand, the run is complete.
-    write_json_atomic(folder / METRICS_FILE, metrics)
+    write_together(folder, {
+        "trajectory.txt": tum_text(frame_ids, tracked.T_estimated[1:]).encode(),
+        "groundtruth.txt": tum_text(frame_ids, tracked.T_true[1:]).encode(),
+        "frames.csv": tracked.frames.to_csv(index=False).encode(),
+        METRICS_FILE: json_bytes(metrics),
+    })  # fmt: skip
     checkpoint.unlink(missing_ok=True)
     return metrics
 
@@ -131,6 +147,22 @@ def read_frames(cell: TrackCell) -> pd.DataFrame:
     return pd.read_csv(cell.folder / "frames.csv")
 
 
+def _note_on_given(cell: MapCell | GivenMap, sequence: Sequence) -> dict[str, Any]:
+    """Where a given map comes from, and a warning where it fits the first frame badly.
+
+    A scene's own map is made from its own poses, so that there is nothing to check.
+    """
+    if not isinstance(cell, GivenMap):
+        return {}
+    stored, warning = cell.stored, None
+    if stored.usual_fit is not None:
+        found = frame_fit(stored.field, stored.seen, sequence, 0)
+        frame = f"frame {sequence.frame_ids[0]} of {sequence.name}"
+        map_name = f"the map of {stored.made['scene']}"
+        warning = warn_of_misfit(found, stored.usual_fit, map_name, frame)
+    return {"map_from": stored.made, "map_warning": warning}
+
+
 def _metrics(
     cell: TrackCell, tracked: TrackedSequence, fitted: FittedMap, device: torch.device
 ) -> dict[str, Any]:
@@ -143,6 +175,7 @@ def _metrics(
     steps = int(rows["steps"].sum())
     return {
         **metrics,
+        "frames_without_depth": int(rows["without_depth"].sum()),
         "steps_per_frame": steps / len(rows),
         "seconds_per_step": float(rows["seconds"].sum()) / max(steps, 1),
         "seconds_per_frame": float(rows["seconds"].mean()),
@@ -181,9 +214,14 @@ def _make_map(cell: MapCell, device: torch.device, report: Report) -> FittedMap:
         )  # fmt: skip
         mapped, held_out = split_holdout(len(sequence), config.holdout_every)
         quality = score_map(fitted.field, sequence, mapped, held_out, cell.scene.room)
+        seen = seen_volume(sequence, mapped, fitted.field.bounds)
+        fit = usual_fit(fitted.field, seen, sequence, mapped)
     write_text_atomic(cell.folder / "history.csv", fitted.history.to_csv(float_format="%.6g"))
     summary = {
         "quality": quality.to_dict(),
+        "usual_fit": fit and fit.to_dict(),
+        "seen": seen.to_dict(),
+        "camera": asdict(sequence.intrinsics),
         "seconds": fitted.seconds,
         "scene": cell.scene.name,
         "field": cell.field_name,

@@ -20,7 +20,7 @@ from nbtrack.device import naming_what_to_lower, suitable_threads
 from nbtrack.errors import DataError, NumericalError
 from nbtrack.fields import Field, LearnedField, field_class, make_field
 from nbtrack.sampling import PixelSampler, draw_batch
-from nbtrack.storage import read_checkpoint, write_bytes_atomic
+from nbtrack.storage import naming_damaged, read_checkpoint, write_bytes_atomic
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 # Iterations between two looks at the losses: each look waits for the device, so there are ten
@@ -116,17 +116,18 @@ def load_map(
         DataError: the file is not a map of this field.
     """
     state = read_checkpoint(checkpoint)
-    if state["settings"]["field"] != field_name:
-        raise DataError(
-            f"{checkpoint} is a map of field {state['settings']['field']!r}, not {field_name!r}: "
-            "map again or name the right field"
-        )
-    field = make_field(field_name, field_config, SceneBounds(*state["bounds"]), seed=0)
-    field.load_state_dict(state["field"])
-    field.to(device).eval().requires_grad_(False)
-    history = pd.DataFrame({name: values.numpy() for name, values in state["history"].items()})
-    history.index.name = "iteration"
-    return FittedMap(field, history, state["seconds"], state["iteration"])
+    with naming_damaged(checkpoint):
+        if state["settings"]["field"] != field_name:
+            raise DataError(
+                f"{checkpoint} is a map of field {state['settings']['field']!r}, not "
+                f"{field_name!r}: map again or name the right field"
+            )
+        field = make_field(field_name, field_config, SceneBounds(*state["bounds"]), seed=0)
+        field.load_state_dict(state["field"])
+        field.to(device).eval().requires_grad_(False)
+        columns = {name: values.numpy() for name, values in state["history"].items()}
+        history = pd.DataFrame(columns).rename_axis("iteration")
+        return FittedMap(field, history, state["seconds"], state["iteration"])
 
 
 class _Run:
@@ -192,9 +193,7 @@ class _Run:
         return {name: value.detach() for name, value in terms.items()}
 
     def history_frame(self) -> pd.DataFrame:
-        history = pd.DataFrame(self.history)
-        history.index.name = "iteration"
-        return history
+        return pd.DataFrame(self.history).rename_axis("iteration")
 
     def save(self, checkpoint: Path) -> None:
         fitted = FittedMap(self.field, self.history_frame(), self.seconds)
@@ -205,12 +204,13 @@ class _Run:
 
     def load(self, checkpoint: Path) -> None:
         state = _checked_state(checkpoint, self.settings)
-        self.field.load_state_dict(state["field"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.generator.set_state(state["generator"])
-        self.iteration, self.seconds = state["iteration"], state["seconds"]
-        columns = {name: values.tolist() for name, values in state["history"].items()}
-        self.history = pd.DataFrame(columns).to_dict("records")
+        with naming_damaged(checkpoint):
+            self.field.load_state_dict(state["field"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.generator.set_state(state["generator"])
+            self.iteration, self.seconds = state["iteration"], state["seconds"]
+            columns = {name: values.tolist() for name, values in state["history"].items()}
+            self.history = pd.DataFrame(columns).to_dict("records")
 
 
 def _fuse_sequence(
@@ -233,8 +233,7 @@ def _fuse_sequence(
     field.fuse(sequence, mapping_frames, config.voxel)
     field.to(device).eval().requires_grad_(False)
     row = {"points": float(len(field.points)), "bytes": float(field.n_bytes)}
-    history = pd.DataFrame([row])
-    history.index.name = "iteration"
+    history = pd.DataFrame([row]).rename_axis("iteration")
     fitted = FittedMap(field, history, time.perf_counter() - start)
     if on_iteration:
         on_iteration(config.iterations, row)  # all that a progress bar waits for
@@ -260,7 +259,8 @@ def _settings(
 def _checked_state(checkpoint: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """A checkpoint's content. Raises DataError if it was made with other settings."""
     state = read_checkpoint(checkpoint)
-    found = state["settings"]
+    with naming_damaged(checkpoint):
+        found = state["settings"]
     if found != settings:
         changed = [name for name in settings if found.get(name) != settings[name]]
         raise DataError(

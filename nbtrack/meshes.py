@@ -1,5 +1,7 @@
 """Triangle meshes of fields, and which part of a surface a sequence has seen."""
 
+from pathlib import Path
+
 import numpy as np
 import torch
 import trimesh
@@ -10,6 +12,7 @@ from nbtrack.camera import project
 from nbtrack.data import Sequence
 from nbtrack.errors import DataError
 from nbtrack.fields import Field
+from nbtrack.storage import write_bytes_atomic
 
 _POINTS_AT_ONCE = 65_536
 
@@ -37,6 +40,15 @@ def extract_mesh(field: Field, voxel: float = 0.05) -> trimesh.Trimesh:
     colors = query_field(field, vertices)[0]
     colors_255 = (255 * colors).round().astype(np.uint8)
     return trimesh.Trimesh(vertices, faces, vertex_colors=colors_255, process=False)
+
+
+def write_mesh(path: Path, mesh: trimesh.Trimesh, file_type: str = "ply") -> None:
+    """Writes a mesh with the colours of its vertices, as PLY or as binary glTF ("glb").
+
+    The world frame stays as it is (m): viewers that take y for up show rooms whose z is up lying
+    on their side.
+    """
+    write_bytes_atomic(path, mesh.export(file_type=file_type))
 
 
 @torch.no_grad()

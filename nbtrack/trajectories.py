@@ -1,4 +1,4 @@
-"""Trajectories as TUM text files, which evaluation tools read: the only place with q_xyzw."""
+"""Trajectories as text files that evaluation tools read; the only place with q_xyzw."""
 
 from pathlib import Path
 
@@ -16,7 +16,14 @@ _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 def write_tum(
     path: Path, frame_ids: Int[np.ndarray, "n"], T_world_camera: Float[np.ndarray, "n 4 4"]
 ) -> None:
-    """Writes camera-to-world poses (m, OpenCV camera axes), one frame a line.
+    """Writes `tum_text` to a file."""
+    write_text_atomic(path, tum_text(frame_ids, T_world_camera))
+
+
+def tum_text(
+    frame_ids: Int[np.ndarray, "n"], T_world_camera: Float[np.ndarray, "n 4 4"]
+) -> str:
+    """Camera-to-world poses (m, OpenCV camera axes) in TUM format, one frame a line.
 
     Numbers have the digits that restore the same double. A quaternion's sign is chosen so that
     qw >= 0.
@@ -32,7 +39,20 @@ def write_tum(
     # Adding zero turns -0.0 into 0.0.
     rows = np.column_stack([frame_ids / FRAMES_PER_SECOND, T_world_camera[:, :3, 3], q_xyzw]) + 0.0
     lines = [f"# {_COLUMNS}"] + [" ".join(map(repr, row)) for row in rows.tolist()]
-    write_text_atomic(path, "\n".join(lines) + "\n")
+    return "\n".join(lines) + "\n"
+
+
+def write_kitti(path: Path, T_world_camera: Float[np.ndarray, "n 4 4"]) -> None:
+    """Writes camera-to-world poses (m, OpenCV camera axes) in KITTI's format.
+
+    Twelve numbers a line: the upper three rows of the matrix, row by row, with the digits that
+    restore the same double. There are no time stamps, so a frame is known by its line alone.
+
+    Source: KITTI odometry benchmark. Its own files begin at the identity; ours keep the world
+    frame (our choice: `evo_ape kitti` aligns if it is asked to).
+    """
+    rows = np.asarray(T_world_camera, dtype=np.float64)[:, :3].reshape(-1, 12) + 0.0
+    write_text_atomic(path, "\n".join(" ".join(map(repr, row)) for row in rows.tolist()) + "\n")
 
 
 def read_tum(path: Path) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 4 4"]]:

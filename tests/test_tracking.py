@@ -215,11 +215,25 @@ def test_errors_name_the_frame() -> None:
     field.forward = lambda points: (points * float("nan"), points[:, 0] * float("nan"))
     with pytest.raises(NumericalError, match="frame 1 of box"):
         track_sequence("sdf", field, sequence, StepBudget(2), config_of("sdf"))
-    sequence.depths_mm[2] = 0
-    with pytest.raises(DataError, match="frame 2 of box has no measured depth"):
+    sequence.depths_mm[:] = 0
+    with pytest.raises(DataError, match="no frame of box has a measured depth"):
         track_sequence(
             "sdf", BoxRoom(as_density=False), sequence, StepBudget(1), config_of("sdf")
         )
+
+
+@pytest.mark.parametrize("name", ["vr", "sdf"])
+def test_a_frame_without_depth_keeps_the_expected_pose_and_is_marked(name: str) -> None:
+    """Catches a run that one blind frame ends, a pose from nothing, and NaN in the results."""
+    sequence = box_sequence([[0.003 * i, 0.0, 0.0] for i in range(5)])
+    sequence.depths_mm[[0, 2]] = 0
+    field = BoxRoom(as_density=name == "vr").requires_grad_(False)
+    tracked = track_sequence(name, field, sequence, StepBudget(20), config_of(name))
+    assert tracked.frames["without_depth"].tolist() == [True, False, True, False, False]
+    assert tracked.frames["steps"].tolist() == [0, 20, 0, 20, 20]
+    np.testing.assert_array_equal(tracked.T_estimated[2], tracked.T_estimated[1])
+    assert np.isfinite(tracked.T_estimated).all()
+    assert tracked.frames["translation_error_m"].iloc[4] < 0.01
 
 
 def test_registry_holds_the_papers_methods() -> None:

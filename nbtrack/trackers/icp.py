@@ -43,6 +43,7 @@ class IcpTracker(Tracker):
     paper_steps = "sdf"
     table_order = 6
     in_paper_tables = False
+    copes_without_depth = True
 
     def __init__(
         self,
@@ -64,6 +65,9 @@ class IcpTracker(Tracker):
         """Draw the frame's points and find their planes; the first pose is the start."""
         self.T_estimated, self.is_aligned, self.inlier_ratio = T_starts[0], False, 0.0
         rows, columns = self.sampler.measured_pixels(frame)
+        if not len(rows):
+            self.source = self.small_gicp.PointCloud(np.empty((0, 3)))
+            return
         drawn = torch.randint(
             len(rows), (self.config.n_pixels,),
             generator=self.generator, device=self.generator.device,

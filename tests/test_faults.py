@@ -1,0 +1,498 @@
+"""Broken input of every kind: one clear line, exit status 2, and earlier results as they were."""
+
+import errno
+import io
+import json
+import os
+import pickle
+import resource
+import shutil
+import signal
+import subprocess
+import zipfile
+from collections.abc import Callable
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from nbtrack.cli import main
+
+SETTINGS = (
+    "scenes.n_frames=6", "scenes.width=32", "network.neus.width=16", "mapping.neus.iterations=8",
+    "mapping.neus.n_rays=16", "mapping.neus.holdout_every=0", "tracking.sdf.n_pixels=16",
+)  # fmt: skip
+SET = [word for setting in SETTINGS for word in ("--set", setting)]
+MAP = ["map", "living_room", "--field", "neus", "--out", "map", *SET]
+TRACK = ["track", "living_room", "--tracker", "sdf", "--steps", "2", "--out", "run", *SET]
+GIVEN = [*TRACK, "--map-from"]
+OWN = [*TRACK, "--field", "neus"]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with results to be spoilt or left alone: `map`, `map.pt`, `run`, and a cache."""
+    folder = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        _isolate(folder, patch)
+        for command in (MAP, ["export", "map", "--to", "map", "map.pt"], OWN, [*GIVEN, "map"]):
+            assert main(command) == 0
+    return folder
+
+
+@pytest.fixture
+def work(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the finished results as the working folder."""
+    folder = tmp_path / "work"
+    shutil.copytree(finished, folder)
+    _isolate(folder, monkeypatch)
+    return folder
+
+
+def _isolate(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    for name in ("PRESET", "CONFIG", "SET", "DATA", "DEVICE"):
+        patch.delenv(f"NBTRACK_{name}", raising=False)
+    patch.setenv("NBTRACK_RUNS", str(folder / "runs"))
+    patch.chdir(folder)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file but locks, which are empty."""
+    files = [p for p in folder.rglob("*") if p.is_file() and p.suffix != ".lock"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def assert_refused(work: Path, capsys: pytest.CaptureFixture, command: list[str], says: str) -> str:
+    """The command fails as a user's mistake must: one line, status 2, nothing changed."""
+    before = contents(work)
+    capsys.readouterr()
+    assert main(command) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("nbtrack: "), error
+    assert error.count("\n") == 1, error
+    assert says in error
+    assert contents(work) == before
+    return error
+
+
+# Settings: in a file, on the command line, in the environment.
+TOML = {
+    "binary": (b"\x00\xff\xfe", "is no TOML"),
+    "no TOML": (b"width: 3", "is no TOML"),
+    "half a line": (b"[mapping.neus]\niterations =", "is no TOML"),
+    "twice": (b"name = 'a'\nname = 'b'", "is no TOML"),
+    "unknown key": (b"[mapping.neus]\niteration = 3", "did you mean 'mapping.neus.iterations'"),
+    "unknown table": (b"[maping.neus]\niterations = 3", "unknown config key"),
+    "value for a table": (b"mapping = 3", "unknown config key 'mapping'"),
+    "another name": (b"name = 'mine'", "unknown config key 'name'"),
+    "text for a number": (b"[mapping.neus]\niterations = 'many'", "must be int"),
+    "fraction": (b"[mapping.neus]\niterations = 1.5", "must be int"),
+    "truth": (b"[mapping.neus]\niterations = true", "must be int"),
+    "date": (b"[mapping.neus]\niterations = 2020-01-01", "must be int"),
+    "zero": (b"[mapping.neus]\nn_rays = 0", "must be 1 or more"),
+    "not a number": (b"[mapping.neus]\nlearning_rate = nan", "must be 0 or more"),
+    "infinite": (b"[mapping.neus]\nlearning_rate = inf", "must be 0 or more"),
+    "list of words": (b"[tables]\nrates_hz = ['fast']", "must be float"),
+}
+
+
+@pytest.mark.parametrize("case", TOML)
+def test_config_files(case: str, work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches settings that are guessed, ignored, or met only in the middle of a run."""
+    content, says = TOML[case]
+    (work / "settings.toml").write_bytes(content)
+    assert_refused(work, capsys, [*MAP, "--config", "settings.toml"], says)
+
+
+SET_TEXTS = {
+    "no value": ("mapping.neus.iterations", "has no value"),
+    "empty value": ("mapping.neus.iterations=", "must be int"),
+    "no key": ("=3", "unknown config key"),
+    "unknown": ("mapping.neus.iteration=3", "did you mean"),
+    "part of a tree": ("mapping.neus=3", "unknown config key 'mapping.neus'"),
+    "negative": ("mapping.neus.iterations=-5", "must be 1 or more"),
+    "broken list": ("tables.rates_hz=[1,", "is no TOML"),
+    "blank inside": ("mapping.neus .iterations=5", "unknown config key"),
+}
+
+
+@pytest.mark.parametrize("case", SET_TEXTS)
+@pytest.mark.parametrize("place", ["--set", "NBTRACK_SET"])
+def test_settings(
+    case: str, place: str, work: Path, capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Catches one place of settings that is checked less than the other."""
+    text, says = SET_TEXTS[case]
+    if place == "--set":
+        assert_refused(work, capsys, [*MAP, "--set", text], says)
+    else:
+        monkeypatch.setenv("NBTRACK_SET", f"'{text}'")
+        assert_refused(work, capsys, MAP, says)
+
+
+ENVIRONMENT = {
+    "unclosed quote": ("SET", "'a=3", "cannot be split"),
+    "preset": ("PRESET", "smok", "did you mean 'smoke'"),
+    "no config": ("CONFIG", "none.toml", "no config file none.toml"),
+    "config folder": ("CONFIG", "map", "no config file map"),
+    "device": ("DEVICE", "gpu7", "device 'gpu7' is not there"),
+    "runs in a file": ("RUNS", "map.pt", "map.pt"),
+}
+
+
+@pytest.mark.parametrize("case", ENVIRONMENT)
+def test_environment(
+    case: str, work: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches variables that only fail with a traceback."""
+    name, value, says = ENVIRONMENT[case]
+    monkeypatch.setenv(f"NBTRACK_{name}", value)
+    assert_refused(work, capsys, OWN, says)
+
+
+# Map files. Each spoils the content of a sound one.
+class Bomb:
+    """Runs a command where it is unpickled."""
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str]]:
+        return os.system, ("touch exploded",)
+
+
+def _with(**changes: Any) -> Callable[[dict], dict]:
+    return lambda content: {**content, **changes}
+
+
+def _without(name: str) -> Callable[[dict], dict]:
+    return lambda content: {key: value for key, value in content.items() if key != name}
+
+
+def _in_part(part: str, **changes: Any) -> Callable[[dict], dict]:
+    return lambda content: {**content, part: {**content[part], **changes}}
+
+
+def _spoilt_weight(change: Callable[[torch.Tensor], Any]) -> Callable[[dict], dict]:
+    return lambda content: {**content, "state": {
+        name: change(value) if name == "mlp.layer_2.weight" else value
+        for name, value in content["state"].items()}}  # fmt: skip
+
+
+MAP_CONTENT = {
+    "a list": (lambda content: [1, 2], "holds a list"),
+    "another thing": (lambda content: {"weights": torch.ones(3)}, "is not a map file"),
+    "a later version": (_with(format_version=2), "has map format 2, and this nbtrack reads 1"),
+    "no version": (_without("format_version"), "has map format None"),
+    "a word for a version": (_with(format_version="new"), "has map format 'new'"),
+    "unknown field": (_with(field="nerf"), "needs a field that this nbtrack lacks"),
+    "field of another kind": (_with(field=3), "field is a int"),
+    "another field": (_with(field="points"), "not a readable map file"),
+    "no weights": (_without("state"), "KeyError: 'state'"),
+    "empty weights": (_with(state={}), "Missing key"),
+    "weights that are none": (_spoilt_weight(lambda w: "heavy"), "not a readable map file"),
+    "NaN weights": (_spoilt_weight(lambda w: w * float("nan")), "weights are not finite"),
+    "infinite weights": (_spoilt_weight(lambda w: w / 0), "weights are not finite"),
+    "other shape": (_spoilt_weight(lambda w: w[:3]), "size mismatch"),
+    "changed weights": (_spoilt_weight(lambda w: w + 1e-6), "is not what was written"),
+    "other width": (_in_part("network", width=17), "size mismatch"),
+    "giant width": (_in_part("network", width=10**9), "network.width is 1000000000"),
+    "width as text": (_in_part("network", width="16"), "network.width is '16'"),
+    "unknown setting": (_in_part("network", depth=9), "unexpected keyword"),
+    "one corner": (_with(bounds=[[0.0, 0.0, 0.0]]), "bounds are not two corners"),
+    "empty bounds": (_with(bounds=[[0.0] * 3, [0.0] * 3]), "are empty"),
+    "NaN bounds": (_with(bounds=[[float("nan")] * 3, [1.0] * 3]), "not finite"),
+    "no camera": (_with(camera={}), "KeyError"),
+    "camera without size": (_in_part("camera", width=0), "the camera has no size"),
+    "NaN camera": (_in_part("camera", fx=float("nan")), "not finite"),
+    "no provenance": (_with(made={}), "KeyError"),
+    "no key": (_without("key"), "KeyError: 'key'"),
+    "seen of another shape": (_in_part("seen", shape=[900, 900, 900]), "does not fit"),
+    "seen that is no text": (_in_part("seen", bits="*"), "not a readable map file"),
+}
+
+
+@pytest.mark.parametrize("case", MAP_CONTENT)
+def test_map_files(case: str, work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches trust in a file that comes from anybody."""
+    spoil, says = MAP_CONTENT[case]
+    torch.save(spoil(torch.load("map.pt", weights_only=True)), "spoilt.pt")
+    assert_refused(work, capsys, [*GIVEN, "spoilt.pt"], says)
+
+
+def _pickled_bomb() -> bytes:
+    return pickle.dumps({"format": "nbtrack map", "format_version": 1, "field": Bomb()})
+
+
+def _saved_bomb() -> bytes:
+    buffer = io.BytesIO()
+    torch.save({"format": "nbtrack map", "format_version": 1, "field": Bomb()}, buffer)
+    return buffer.getvalue()
+
+
+def _zipped_bomb() -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("map/data.pkl", _pickled_bomb())
+        archive.writestr("map/version", "3")
+    return buffer.getvalue()
+
+
+def _sound() -> bytes:
+    return Path("map.pt").read_bytes()
+
+
+MAP_BYTES = {
+    "empty": lambda: b"",
+    "text": lambda: b"a map\n",
+    "zeros": lambda: bytes(4096),
+    "half": lambda: _sound()[: len(_sound()) // 2],
+    "without its end": lambda: _sound()[:-30],
+    "beginning lost": lambda: _sound()[100:],
+    "bytes flipped": lambda: _sound()[:9000] + bytes(255 - b for b in _sound()[9000:9100])
+    + _sound()[9100:],
+    "an archive": lambda: _zipped_bomb()[:-5],
+    "a pickled bomb": _pickled_bomb,
+    "a saved bomb": _saved_bomb,
+    "a zipped bomb": _zipped_bomb,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", MAP_BYTES)
+@pytest.mark.parametrize("command", ["track", "export"])
+def test_map_bytes(
+    case: str, command: str, work: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Catches code that is run from a file, and damage that gives a traceback."""
+    (work / "spoilt.pt").write_bytes(MAP_BYTES[case]())
+    words = [*GIVEN, "spoilt.pt"] if command == "track" else [
+        "export", "spoilt.pt", "--to", "map", "out.pt"]  # fmt: skip
+    assert_refused(work, capsys, words, "spoilt.pt is not a readable map file")
+    assert not (work / "exploded").exists()
+
+
+def _cut(path: str) -> Callable[[], None]:
+    def cut() -> None:
+        Path(path).write_bytes(Path(path).read_bytes()[: Path(path).stat().st_size // 2])
+
+    return cut
+
+
+def _rewrite(path: str, text: str) -> Callable[[], None]:
+    return lambda: Path(path).write_text(text) and None
+
+
+def _resave(path: str, change: Callable[[dict], Any]) -> Callable[[], None]:
+    def resave() -> None:
+        torch.save(change(torch.load(path, weights_only=True)), path)
+
+    return resave
+
+
+def _unfinished(spoil: Callable[[], None]) -> Callable[[], None]:
+    def both() -> None:
+        Path("map/map.json").unlink()
+        spoil()
+
+    return both
+
+
+def _run_checkpoint(content: Any) -> Callable[[], None]:
+    """What a killed run would have left, but spoilt; its folder is named like its lock."""
+
+    def write() -> None:
+        for lock in Path("runs/locks").glob("living_room-sdf-2steps-*.lock"):
+            folder = Path("runs/tracks") / lock.stem
+            folder.mkdir(parents=True, exist_ok=True)
+            torch.save(content, folder / "run.pt")
+
+    return write
+
+
+def _no_optimizer(content: dict) -> dict:
+    return {**content, "optimizer": {"state": {}, "param_groups": []}, "iteration": 2}
+
+
+def _forget_the_map() -> None:
+    shutil.rmtree("map")
+    Path("map").mkdir()
+
+
+KITTI = ["export", "run", "--to", "kitti", "poses.txt"]
+ROW = "0.1 1 2 3 0 0 0 1"
+FILES = {
+    "no map": (lambda: None, [*GIVEN, "nowhere"], "no map nowhere"),
+    "empty folder": (_forget_the_map, [*GIVEN, "map"], "map holds no map"),
+    "unfinished map": (_unfinished(lambda: None), [*GIVEN, "map"], "map holds an unfinished map"),
+    "a run for a map": (lambda: None, [*GIVEN, "run"], "run holds no map"),
+    "checkpoint for a map": (lambda: None, [*GIVEN, "map/map.pt"], "give its folder map"),
+    "weights cut": (_cut("map/map.pt"), [*GIVEN, "map"], "not a readable checkpoint"),
+    "summary cut": (_cut("map/map.json"), [*GIVEN, "map"], "map.json is not readable JSON"),
+    "summary is a list": (_rewrite("map/map.json", "[]"), [*GIVEN, "map"], "holds no object"),
+    "summary is empty": (_rewrite("map/map.json", "{}"), [*GIVEN, "map"], "an earlier nbtrack"),
+    "checkpoint cut": (_unfinished(_cut("map/map.pt")), MAP, "not a readable checkpoint"),
+    "checkpoint is text": (
+        _unfinished(_rewrite("map/map.pt", "text")), MAP, "not a readable checkpoint"),
+    "checkpoint is empty": (
+        _unfinished(_resave("map/map.pt", lambda c: {})), MAP, "not a readable checkpoint"),
+    "checkpoint without state": (
+        _unfinished(_resave("map/map.pt", _without("generator"))), MAP, "KeyError: 'generator'"),
+    "checkpoint of another optimiser": (
+        _unfinished(_resave("map/map.pt", _no_optimizer)), MAP, "not a readable checkpoint"),
+    "checkpoint of another seed": (
+        _unfinished(lambda: None), [*MAP, "--seed", "5"], "made with another seed"),
+    "finished map of another seed": (
+        lambda: None, [*MAP, "--seed", "5"], "made with another seed"),
+    "run checkpoint is a list": (_run_checkpoint([1]), OWN, "run.pt is not a readable checkpoint"),
+    "run checkpoint is empty": (_run_checkpoint({}), OWN, "run.pt is not a readable checkpoint"),
+    "run checkpoint of words": (
+        _run_checkpoint({"estimates": "here", "rows": [], "tracker": {}, "budget": {}}), OWN,
+        "run.pt is not a readable checkpoint"),
+    "trajectory gone": (lambda: Path("run/trajectory.txt").unlink(), KITTI, "no file run/traj"),
+    "trajectory empty": (_rewrite("run/trajectory.txt", " "), KITTI, "holds no pose"),
+    "trajectory of comments": (_rewrite("run/trajectory.txt", "# a\n# b\n"), KITTI, "no pose"),
+    "a column less": (_rewrite("run/trajectory.txt", ROW[:-2]), KITTI, "has 7 columns"),
+    "a column more": (_rewrite("run/trajectory.txt", f"{ROW} 1"), KITTI, "has 9 columns"),
+    "a word": (_rewrite("run/trajectory.txt", ROW.replace("3", "x")), KITTI, "not a number"),
+    "a NaN": (_rewrite("run/trajectory.txt", ROW.replace("3", "nan")), KITTI, "not finite"),
+    "no rotation": (_rewrite("run/trajectory.txt", ROW[:-1] + "0"), KITTI, "norm 0"),
+    "second line": (
+        _rewrite("run/trajectory.txt", f"{ROW}\n{ROW[:-2]}"), KITTI, "line 2 has 7 columns"),
+    "a map for a run": (
+        lambda: None, ["export", "map", "--to", "tum", "p.txt"], "a map, which exports to ply"),
+    "a run for a mesh": (
+        lambda: None, ["export", "run", "--to", "glb", "m.glb"], "which exports to tum or kitti"),
+    "unfinished run": (
+        lambda: Path("run/metrics.json").unlink(), KITTI, "run holds no finished run"),
+    "mesh cut": (
+        _cut("map/mesh.ply"), ["export", "map", "--to", "glb", "m.glb"], "not a readable mesh"),
+    "mesh is text": (
+        _rewrite("map/mesh.ply", "ply"), ["export", "map", "--to", "glb", "m.glb"],
+        "not a readable mesh"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_damaged_results(case: str, work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches results that are half there and taken for whole, or repaired in silence."""
+    spoil, command, says = FILES[case]
+    spoil()
+    assert_refused(work, capsys, command, says)
+
+
+ARGUMENTS = {
+    "nothing": ([], "COMMAND"),
+    "unknown format": (["export", "map", "--to", "gltf", "x"], "did you mean 'glb'"),
+    "no format": (["export", "map", "x"], "--to"),
+    "no output": (["export", "map", "--to", "glb"], "out"),
+    "empty output": (["export", "map", "--to", "glb", ""], "the path is empty"),
+    "onto itself": (["export", "map.pt", "--to", "map", "map.pt"], "is the source itself"),
+    "no field": (TRACK, "track needs --field, or --map-from"),
+    "supervision alone": ([*GIVEN, "map", "--supervision", "rendering"], "belongs to --field"),
+    "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames out"),
+    "field not the map's": ([*GIVEN, "map", "--field", "imap"], "is a map of field 'neus'"),
+    "supervision not the map's": (
+        [*GIVEN, "map", "--field", "neus", "--supervision", "rendering+sdf"], "not 'neus_plus'"),
+    "tracker not the map's": ([*GIVEN, "map", "--tracker", "vr"], "does not work on field 'neus'"),
+    "steps that are none": ([*OWN, "--steps", "nan"], "steps_per_frame is nan"),
+    "steps in words": ([*OWN, "--steps", "few"], "invalid float value: 'few'"),
+    "endless steps": ([*OWN, "--steps", "inf"], "steps_per_frame is inf"),
+    "no grid": ([*OWN, "--bake", "nan"], "bake_voxel"),
+    "negative pixels": ([*OWN, "--pixels", "-5"], "must be 1 or more"),
+    "negative seed": ([*OWN, "--seed", "-1"], "is no seed"),
+    "giant seed": ([*OWN, "--seed", "9" * 30], "is no seed"),
+    "no threads": ([*OWN, "--threads", "0"], "must be 1 or more"),
+    "unknown device": ([*OWN, "--device", "tpu"], "is not there"),
+    "no slice": ([*OWN, "--frames", "3"], "is not a slice"),
+    "no step": ([*OWN, "--frames", "::0"], "a step is 1 or more"),
+    "one frame": ([*OWN, "--frames", "2:3"], "too short to track"),
+    "nothing selected": ([*OWN, "--frames", "90:"], "select nothing"),
+    "unknown motion": ([*OWN, "--set", "tracking.sdf.motion_model=leap"], "unknown motion model"),
+    "empty folder name": ([*OWN, "--out", ""], "the path is empty"),
+    "no seeds": (["tables", "--seeds", "0"], "seeds"),
+    "no workers": (["tables", "--workers", "0"], "must be 1 or more"),
+    "unknown row": (["tables", "--trackers", "vr,sfd"], "did you mean 'sdf'"),
+}
+
+
+@pytest.mark.parametrize("case", ARGUMENTS)
+def test_arguments(case: str, work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches usage dumps, tracebacks, and mistakes that are met after earlier results are gone."""
+    command, says = ARGUMENTS[case]
+    assert_refused(work, capsys, command, says)
+
+
+OUTPUTS = {
+    "run into a file": [*OWN, "--out", "map.pt"],
+    "run below a file": [*OWN, "--out", "map.pt/run"],
+    "map into a file": [*MAP, "--out", "map.pt"],
+    "map below a file": [*MAP, "--out", "map.pt/map"],
+    "export onto a folder": ["export", "map", "--to", "map", "run"],
+    "export below a file": ["export", "run", "--to", "kitti", "map.pt/poses.txt"],
+    "export into the kernel": ["export", "run", "--to", "kitti", "/proc/nbtrack/poses.txt"],
+    "run into the kernel": [*OWN, "--out", "/proc/nbtrack"],
+    "room onto a file": ["data", "make", "office", "--out", "map.pt", "--n-frames", "2"],
+}
+
+
+@pytest.mark.parametrize("case", OUTPUTS)
+def test_places_that_cannot_be_written(
+    case: str, work: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Catches tracebacks of the system's errors, also for root, whom no permission bit stops."""
+    assert_refused(work, capsys, OUTPUTS[case], "nbtrack: ")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root writes where permissions forbid it")
+def test_a_read_only_folder(work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches a traceback where an ordinary user may only read."""
+    (work / "run").chmod(0o500)
+    try:
+        assert_refused(work, capsys, OWN, "Permission denied")
+    finally:
+        (work / "run").chmod(0o700)
+
+
+@contextmanager
+def files_limited_to(n_bytes: int) -> Any:
+    """No file may grow beyond a size: a disk that is full in the middle of a write."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+
+
+@pytest.mark.parametrize("n_bytes", [0, 200, 1500])
+def test_a_disk_that_fills_up_while_results_are_written(
+    n_bytes: int, work: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Catches a run of which half is new and half is old: all of it stays old."""
+    with files_limited_to(n_bytes):
+        error = assert_refused(work, capsys, [*OWN, "--seed", "0", "--frames", "1:"], "run")
+        assert os.strerror(errno.EFBIG) in error
+        for kind, source in (("map", "map"), ("kitti", "run")):
+            if n_bytes < 200:
+                command = ["export", source, "--to", kind, "new"]
+                assert_refused(work, capsys, command, "File too large")
+    assert json.loads((work / "run/metrics.json").read_text())["frames"] == 5
+
+
+def test_a_full_disk(work: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches the same on a real disk without room, where a small one can be mounted."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(disk)]
+    if os.geteuid() or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("only root may mount a disk, and not everywhere")
+    try:
+        (disk / "filler").write_bytes(bytes(12_000))
+        before = contents(disk)
+        assert_refused(work, capsys, ["export", "map", "--to", "map", str(disk / "m.pt")], "No spa")
+        assert_refused(work, capsys, [*OWN, "--out", str(disk / "run")], "No space left")
+        assert contents(disk) == before
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)

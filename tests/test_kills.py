@@ -1,0 +1,145 @@
+"""Mapping, tracking and tables killed at any moment, then told the same again: the same result.
+
+`test_resume.py` does so for tables with workers. Here one process that has imported everything
+forks a child for each command, so that many kills are affordable: NBTRACK_TEST_KILLS=30.
+"""
+
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+from tiny import TINY
+
+from nbtrack.trajectories import read_tum
+
+KILLS = int(os.environ.get("NBTRACK_TEST_KILLS", "3"))
+# Forks a child for each line `[folder, arguments, seconds to SIGKILL or null]`; answers with its
+# exit status, negative where it was killed, and how long it ran. Checkpoints are written after each
+# step, or every other command would be over before its first one.
+_FORKER = """
+import json, os, signal, sys, time
+import torch._dynamo, trimesh  # else every child would import them by itself
+import nbtrack.commands, nbtrack.commands_tables, nbtrack.mapping, nbtrack.tracking
+from nbtrack.cli import main
+nbtrack.mapping.CHECKPOINT_SECONDS = nbtrack.tracking.CHECKPOINT_SECONDS = 0.0
+for line in sys.stdin:
+    folder, arguments, seconds = json.loads(line)
+    start = time.monotonic()
+    child = os.fork()
+    if not child:
+        os.makedirs(folder, exist_ok=True)
+        os.chdir(folder)
+        os.environ["NBTRACK_RUNS"] = folder + "/runs"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        status = 1
+        try:
+            status = main(arguments)
+        finally:
+            sys.stderr.flush()
+            os._exit(status)
+    if seconds is not None:
+        time.sleep(seconds)
+        os.kill(child, signal.SIGKILL)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    print(json.dumps([status, time.monotonic() - start]), flush=True)
+"""
+SET = [word for setting in (*TINY, "mapping.neus.iterations=25", "mapping.imap.iterations=25",
+                            "mapping.neus.holdout_every=0", "mapping.imap.holdout_every=0",
+                            "scenes.n_frames=10", "tracking.lm.n_pixels=32")
+       for word in ("--set", setting)]  # fmt: skip
+COMMANDS = {
+    "map": ["map", "living_room", "--field", "neus", "--out", "out", *SET],
+    "track": ["track", "living_room", "--field", "neus", "--tracker", "lm", "--steps", "6",
+              "--out", "out", *SET],
+    "tables": ["tables", "--workers", "1", "--out", "out", "--scenes", "living_room", "--set",
+               "scenes.track_frames=:4", *SET],
+}  # fmt: skip
+
+
+class Forker:
+    """Runs commands in children of one process that has imported the package."""
+
+    def __init__(self) -> None:
+        kept = {k: v for k, v in os.environ.items() if not k.startswith("NBTRACK_")}
+        paths = [str(Path(__file__).parents[1]), kept.get("PYTHONPATH", "")]
+        kept["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", _FORKER], text=True, stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, env=kept,
+        )  # fmt: skip
+
+    def run(
+        self, folder: Path, arguments: list[str], seconds: float | None = None
+    ) -> tuple[int, float]:
+        """Exit status and time (s) of a command in a folder, killed after some seconds if given."""
+        self.process.stdin.write(json.dumps([str(folder), arguments, seconds]) + "\n")
+        self.process.stdin.flush()
+        status, ran = json.loads(self.process.stdout.readline())
+        return status, ran
+
+
+@pytest.fixture(scope="module")
+def forker() -> Iterator[Forker]:
+    started = Forker()
+    yield started
+    started.process.communicate()  # ends with its input
+
+
+@pytest.fixture(scope="module")
+def room(forker: Forker, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The room that all commands work on: what is killed is the command's own work."""
+    folder = tmp_path_factory.mktemp("room")
+    assert forker.run(folder, [*COMMANDS["map"], "--frames", ":2"])[0] == 0
+    return folder / "runs" / "rooms"
+
+
+def result(folder: Path) -> dict[str, object]:
+    """All of a result that the clock does not enter, by file and part."""
+    found: dict[str, object] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix in (".txt", ".ply") or path.name == "history.csv":
+            found[path.name] = path.read_bytes()
+        elif path.name == "frames.csv":
+            found[path.name] = pd.read_csv(path).drop(columns="seconds").to_csv()
+        elif path.name == "map.pt":
+            state = torch.load(path, weights_only=True)["field"]
+            found[path.name] = {name: value.numpy().tobytes() for name, value in state.items()}
+        elif path.name.startswith("table_1") and path.suffix in (".csv", ".tex"):
+            found[path.name] = path.read_bytes()
+        else:
+            found[path.name] = "there"
+    return found
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_killed_and_told_again(name: str, forker: Forker, room: Path, tmp_path: Path) -> None:
+    """Catches half-written results that count, and runs that go on otherwise than they began."""
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    for folder in (whole, killed):
+        shutil.copytree(room, folder / "runs" / "rooms")
+    status, seconds = forker.run(whole, COMMANDS[name])
+    assert status == 0
+    expected = result(whole / "out")
+    assert len(expected) >= 3
+    rng, kills = random.Random(name), 0
+    while kills < max(1, KILLS // len(COMMANDS)):
+        status, _ = forker.run(killed, COMMANDS[name], rng.uniform(0.02, 0.7) * seconds)
+        assert status in (0, -9)
+        kills += status == -9
+        if status == 0:  # it ended before the kill: the next one begins from nothing
+            assert result(killed / "out") == expected
+            shutil.rmtree(killed)
+            shutil.copytree(room, killed / "runs" / "rooms")
+    assert forker.run(killed, COMMANDS[name])[0] == 0
+    assert result(killed / "out") == expected
+    assert len(list((killed / "out").rglob(".*.tmp"))) <= kills
+    if name == "track":
+        assert len(read_tum(killed / "out/trajectory.txt")[0]) == 9
