@@ -32,7 +32,7 @@ from nbtrack.synthetic import (
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 REAL_ROOM = Path(__file__).resolve().parents[2] / "shared/data/real_room"
-ROOMS = ("living_room", "office", "long_hall", "two_rooms")
+ROOMS = ("living_room", "office", "long_hall")
 CAMERA = room_intrinsics(48, 36)
 N_FRAMES, STRIDE = 30, 3
 

@@ -23,7 +23,7 @@ def plot_recording(
     Args:
         title: the finding, in a sentence.
     """
-    figure = new_figure(title, 4.6)
+    figure = new_figure(title, 4.2, layout="compressed")
     up = -T_world_camera[:, :3, 1].mean(axis=0)  # cameras are mostly held upright
     view = TopView.along(tuple(up.tolist()))
     positions = camera_positions(T_world_camera)

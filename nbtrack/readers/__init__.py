@@ -1,6 +1,4 @@
-"""Readers of recordings. A module in this folder that registers a format makes it known everywhere.
-
-"""
+"""Readers of recordings. A module in this folder that registers a format makes it known to all."""
 
 import importlib
 import pkgutil

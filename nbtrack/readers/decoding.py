@@ -1,6 +1,4 @@
-"""From image files to arrays: one size, depth in millimetres along the optical axis, no distortion.
-
-"""
+"""From image files to arrays: one size, depth in mm along the optical axis, no distortion."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -27,7 +27,9 @@ def read_text(path: Path, needed: str) -> str:
         MissingError: there is no such file.
     """
     if not is_file(path):
-        raise MissingError(f"no file {path}: {needed} needs it")
+        raise MissingError(
+            f"no file {path}: {needed} needs it; add it, or name another format with --format"
+        )
     return path.read_text(encoding="utf-8-sig", errors="replace")
 
 
