@@ -21,9 +21,9 @@ from tiny import TINY
 from nbtrack.trajectories import read_tum
 
 KILLS = int(os.environ.get("NBTRACK_TEST_KILLS", "3"))
-# Forks a child for each line `[folder, arguments, seconds to SIGKILL or null]`; answers with its
-# exit status, negative where it was killed, and how long it ran. Checkpoints are written after each
-# step, or every other command would be over before its first one.
+# Forks a child for each line `[folder, arguments, seconds until SIGKILL or null]`; answers with
+# its exit status, negative where it was killed, and how long it ran. Checkpoints are written after
+# every step, or every other command would be over before its first one.
 _FORKER = """
 import json, os, signal, sys, time
 import torch._dynamo, trimesh  # else every child would import them by itself

@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -195,3 +197,18 @@ def test_stored_maps_open_whatever_the_field(tmp_path: Path) -> None:
         )  # fmt: skip
         write_map(tmp_path / name, stored)
         assert read_map(tmp_path / name).key == stored.key
+
+
+def test_the_readmes_example(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Catches a README that shows what no longer runs."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", readme, flags=re.DOTALL)
+    assert len(example.strip().splitlines()) <= 11
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(made / "map.pt", "room.pt")
+    (room,) = (made / "runs" / "rooms").glob("*/living_room")
+    shutil.copytree(room, "recording")
+    exec(compile(example, "README.md", "exec"), {})
+    assert len(capsys.readouterr().out.splitlines()) == 7
