@@ -12,6 +12,6 @@ export NBTRACK_RUNS
 unset NBTRACK_PRESET NBTRACK_CONFIG NBTRACK_SET NBTRACK_DATA
 
 step "Style" "$venv_python" -m ruff check
-step "Unit tests" "$venv_python" -m pytest -q
+step "Unit tests" "$venv_python" -m pytest -q -n auto --dist loadfile
 step "Notebooks against their stored outputs" "$venv_python" -m pytest --nbval notebooks -q
 printf 'All checks passed in %d min %d s.\n' "$((SECONDS / 60))" "$((SECONDS % 60))"
