@@ -14,7 +14,7 @@ Written out, the same mathematics is a list of matrix products into memory that 
 Rows are taken in chunks whose intermediate results stay in a core's cache. `FourierMlp` under
 torch's own differentiation is the readable reference; tests hold the engine to it.
 
-An activation needs two things here: that torch has it, and its entry in `PULL_BACKS`.
+A new activation needs its derivative once, in `PULL_BACKS`, and its in-place form beside it.
 """
 
 import copy
