@@ -51,10 +51,10 @@ def add_device(parser: argparse.ArgumentParser, of_what: str = "(default: all co
 def set_device(options: argparse.Namespace) -> None:
     """Where and with how many threads this process and its workers compute."""
     if getattr(options, "device", None):
-        from nbtrack.device import choose_device
+        from nbtrack.device import named_device
 
+        named_device(options.device)
         os.environ["NBTRACK_DEVICE"] = options.device
-        choose_device()
     threads = getattr(options, "threads", None)
     if threads is not None:
         import torch

@@ -22,7 +22,7 @@ def choose_device() -> torch.device:
     """
     name = os.environ.get("NBTRACK_DEVICE")
     if name:
-        return _named_device(name)
+        return named_device(name)
     if torch.cuda.is_available():
         return torch.device("cuda")
     if torch.backends.mps.is_available():
@@ -39,7 +39,8 @@ def device_name(device: torch.device) -> str:
     return f"{_processor_name()}, {os.cpu_count()} cores"
 
 
-def _named_device(name: str) -> torch.device:
+def named_device(name: str) -> torch.device:
+    """A device by its name. Raises ConfigError, saying what there is, if it is not there."""
     try:
         device = torch.device(name)
         torch.empty(0, device=device)

@@ -50,6 +50,7 @@ def sdf_loss(
 
     Source: paper, Eq. 2.
 
+    >>> import torch
     >>> zeros = torch.zeros(2, 3)
     >>> sdf_loss(torch.tensor([0.1, -0.3]), zeros, zeros + 0.5, 1.0, 0.1).item()
     0.25
