@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
+from nbtrack.ablations import beginning_of, error_of_first
 from nbtrack.budget import paper_steps
 from nbtrack.cells import MapCell, TrackCell
 from nbtrack.config import Preset
@@ -70,19 +71,26 @@ def plan_table_3(
     budget: str = "steps",
     methods: Sequence[Method] = METHODS,
     seeds: int = 1,
+    n_frames: int | None = None,
 ) -> list[TableCell]:
     """Every cell of Table III: method, rate, scene, seed.
 
     With step counts every tracker on distances has those that the paper measured for SDF, every
     renderer those for VR; some stop sooner. Rows and rates that are in Table I are the same runs.
+
+    Args:
+        n_frames: runs that are not in Table I end after so many frames.
     """
     return [
-        TableCell(rate_hz, method.label, _track_cell(preset, scene, method, budget, rate_hz, seed))
+        TableCell(
+            rate_hz, method.label,
+            _track_cell(preset, scene, method, budget, rate_hz, seed, n_frames),
+        )
         for method in methods
         for seed in range(seeds)
         for rate_hz in RATES_HZ
         for scene in scenes
-    ]
+    ]  # fmt: skip
 
 
 def table_3_results(
@@ -91,11 +99,19 @@ def table_3_results(
     budget: str = "steps",
     methods: Sequence[Method] = METHODS,
     execution: Execution | None = None,
+    n_frames: int | None = None,
 ) -> pd.DataFrame:
-    """Table III in long form, as `grid.table_1_results` gives Table I; runs what is missing."""
-    return table_1_results(
-        plan_table_3(preset, scenes, budget, methods), execution=execution
-    )
+    """Table III in long form, as `grid.table_1_results` gives Table I; runs what is missing.
+
+    Args:
+        n_frames: only so many frames are scored, in every row. Runs of Table I are not made anew
+            for it: a run's beginning does not depend on what follows.
+    """
+    cells = plan_table_3(preset, scenes, budget, methods, n_frames=n_frames)
+    results = table_1_results(cells, execution=execution)
+    if n_frames is None:
+        return results
+    return results.assign(ate_m=[error_of_first(cell.run, n_frames) for cell in cells])
 
 
 def speed_and_accuracy(results: pd.DataFrame, rate_hz: float | int = 10) -> pd.DataFrame:
@@ -165,14 +181,22 @@ def map_errors(preset: Preset, scenes: Sequence[Scene]) -> pd.DataFrame:
 
 
 def _track_cell(
-    preset: Preset, scene: Scene, method: Method, budget: str, rate_hz: float, seed: int
+    preset: Preset,
+    scene: Scene,
+    method: Method,
+    budget: str,
+    rate_hz: float,
+    seed: int,
+    n_frames: int | None,
 ) -> TrackCell:
     preset = with_settings(preset, *method.settings)
+    is_in_table_1 = method.label in PAPERS_METHODS and rate_hz in preset.tables.rates_hz
+    frames = beginning_of(preset, None if is_in_table_1 else n_frames)
     steps = paper_steps(tracker_class(method.tracker_name).paper_steps, rate_hz)
     return TrackCell(
         MapCell(scene, method.field_name, preset, seed=seed), method.tracker_name,
         **({"rate_hz": rate_hz} if budget == "clock" else {"steps": steps}),
-        frames=preset.scenes.track_frames, seed=seed,
+        frames=frames, seed=seed,
     )  # fmt: skip
 
 

@@ -55,7 +55,7 @@ class FrameSearch:
     ) -> None:
         """
         Args:
-            sampler: the frames; whoever gets new ones puts another one in its place.
+            sampler: the frames; whoever gets new ones shows them to it.
             T_first: pose of the frame before the first that is searched for.
         """
         self.sampler, self.budget, self.device = sampler, budget, sampler.device

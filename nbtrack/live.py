@@ -102,9 +102,7 @@ class LiveTracker:
             DataError: an image has another size, type or unit.
         """
         frame = _one_frame(self.camera, color, depth)
-        device = self.search.device
-        sampler = PixelSampler(frame, device, images_device=device)
-        self.search.sampler = self.search.tracker.sampler = sampler
+        self.search.sampler.show(frame)
         with tracking_threads(self.field):
             found = self.search.find(0, f"live frame {self.n_frames}")
         self.n_frames += 1

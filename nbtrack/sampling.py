@@ -50,6 +50,15 @@ class PixelSampler:
         self.depths_mm = torch.from_numpy(sequence.depths_mm.view("int16")).to(images_device)
         self.T_world_camera = torch.from_numpy(sequence.T_world_camera).float().to(device)
 
+    def show(self, sequence: Sequence) -> None:
+        """Take other images of the same size and number, into the same memory.
+
+        Steps that were captured as a CUDA graph go on reading there.
+        """
+        self.colors.copy_(torch.from_numpy(sequence.colors))
+        self.depths_mm.copy_(torch.from_numpy(sequence.depths_mm.view("int16")))
+        self.T_world_camera.copy_(torch.from_numpy(sequence.T_world_camera))
+
     def rays(
         self,
         frames: Int[Tensor, "n"],
