@@ -2,7 +2,7 @@
 
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, PercentFormatter
+from matplotlib.ticker import PercentFormatter
 
 from nbtrack.metrics import LOST_THRESHOLD_M
 from nbtrack.plots.style import label_few, method_colors, new_figure, styled
@@ -29,7 +29,7 @@ def plot_speed_accuracy(points: pd.DataFrame, title: str = "") -> Figure:
     axes.set(xscale="log", yscale="log", xlabel="time a frame (ms)", ylabel="ATE (cm)")
     label_few(axes)
     axes.margins(0.12)
-    figure.legend(loc="outside right upper")
+    figure.legend(loc="outside right center")
     return figure
 
 
@@ -58,7 +58,7 @@ def plot_basin(shares: pd.DataFrame, title: str = "") -> Figure:
 
 @styled
 def plot_ingredients(table: pd.DataFrame, title: str = "") -> Figure:
-    """ATE (cm, logarithmic) of LM with one thing changed at a time, a group of bars a stride.
+    """ATE (cm) of LM with one thing changed at a time, a group of bars a stride.
 
     Args:
         table: from `nbtrack.beyond.what_each_ingredient_adds`, of one scene.
@@ -73,9 +73,7 @@ def plot_ingredients(table: pd.DataFrame, title: str = "") -> Figure:
             rows["ingredient"], 100 * rows["ate_m"],
             color=["#17a2a2" if first else "#9bbfc4" for first in is_first],
         )  # fmt: skip
-        axes.axvline(100 * LOST_THRESHOLD_M, color="0.3", linestyle="--", linewidth=1)
-        axes.set(xscale="log", xlabel="ATE (cm)")
+        axes.set(xlabel="ATE (cm)")
         axes.set_title("every frame" if stride == 1 else f"one frame of {stride}")
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.grid(False, axis="y")
     return figure
