@@ -13,6 +13,7 @@ from nbtrack.plots.style import method_colors, new_figure, styled
 from nbtrack.tables import PAPER_SCENE_LABELS
 
 _PANELS_A_ROW = 5
+_STEP_PANELS_A_ROW = 2  # each holds a legend of two columns
 _PANELS_WITH_VALUES = 2  # with more, bars are too narrow for their numbers
 _GROUP_WIDTH = 0.8  # of the distance between two rates
 _LEAST_ATE_M = 0.002  # where bars begin, unless an error is smaller still
@@ -74,10 +75,15 @@ def plot_steps(
         published: the paper's values in the same form, shown beside.
     """
     trackers = list(cells["tracker"].unique())
-    figure = new_figure(title, 3.6)
-    panels = figure.subplots(1, len(trackers), sharey=True, squeeze=False)[0]
+    n_rows = -(-len(trackers) // _STEP_PANELS_A_ROW)
+    figure = new_figure(title, 3.6 * n_rows)
+    n_columns = min(len(trackers), _STEP_PANELS_A_ROW)
+    grid = figure.subplots(n_rows, n_columns, sharey=True, squeeze=False)
+    panels = grid.flat
+    for axes in panels[len(trackers) :]:
+        axes.set_visible(False)
     colors = method_colors(trackers)
-    for axes, tracker in zip(panels, trackers, strict=True):
+    for axes, tracker in zip(panels, trackers, strict=False):
         _draw_steps(axes, cells[cells["tracker"] == tracker], colors[tracker], "-", "this machine")
         if published is not None:
             # Rows of the engine stand beside the paper's of the same tracker.
@@ -90,7 +96,8 @@ def plot_steps(
         axes.xaxis.set_major_formatter(_plain_numbers())
         axes.yaxis.set_major_formatter(_plain_numbers())
         axes.legend(loc="upper left", ncols=1 if published is None else 2)
-    panels[0].set_ylabel("optimization steps (number)")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("optimization steps (number)")
     low, high = panels[0].get_ylim()
     panels[0].set_ylim(low, 6 * high)  # room for the legends
     return figure
