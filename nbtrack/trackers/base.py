@@ -1,6 +1,7 @@
 """What every tracker offers to the tracking loop, and the registry of trackers."""
 
 import abc
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -139,8 +140,17 @@ class AdamTracker(Tracker):
             self._start_at(T_world_camera)
             # Any pixels will do; drawing some would change which ones the steps see.
             self.pixels.copy_(torch.stack([self.rows[:1], self.columns[:1]]))
-            self.graphed_step = GraphedStep(self._step_on_pixels, self.generator)
+            self._capture()
         self._start_at(T_world_camera)
+
+    def _capture(self) -> None:
+        """Capture the step; a device or driver that cannot takes its steps one kernel at a time."""
+        try:
+            self.graphed_step = GraphedStep(self._step_on_pixels, self.generator)
+        except RuntimeError as error:
+            self.is_graphed = False
+            reason = str(error).splitlines()[0]
+            warnings.warn(f"steps are not captured as a CUDA graph: {reason}", stacklevel=2)
 
     def step(self) -> Float[Tensor, ""]:
         """Draw pixels, lower their loss by one step of Adam, renormalise the quaternion."""
