@@ -17,7 +17,7 @@ from nbtrack.fields import Rays, make_field
 from nbtrack.fields.engine import _CHUNK_ROWS, PULL_BACKS, FrozenMlp, frozen
 from nbtrack.sampling import PixelSampler
 from nbtrack.synthetic import make_room
-from nbtrack.trackers import tracker_class
+from nbtrack.trackers import base, tracker_class
 from nbtrack.tracking import track_sequence
 
 BOUNDS = SceneBounds((-2.0, -1.0, 0.0), (3.0, 2.0, 4.0))
@@ -231,3 +231,20 @@ def test_many_frames_leave_no_memory_behind(sequence):
 
     after_few = tensors_after(10)
     assert tensors_after(190) <= after_few
+
+
+def test_a_device_that_cannot_capture_goes_on_without(sequence, monkeypatch):
+    """Catches a run that ends because of a driver, and one that says nothing of it."""
+
+    def refuse(*arguments):
+        raise RuntimeError("operation not permitted\nwhen stream is capturing")
+
+    monkeypatch.setattr(base, "GraphedStep", refuse)
+    sampler = PixelSampler(sequence, torch.device("cpu"))
+    tracker = tracker_class("sdf")(
+        both("neus")[0], sampler, TrackingConfig(n_pixels=16), torch.Generator()
+    )
+    tracker.is_graphed = True  # as on CUDA
+    with pytest.warns(UserWarning, match="not captured as a CUDA graph: operation not permitted$"):
+        tracker.start_frame(1, torch.from_numpy(sequence.T_world_camera[:1]).float())
+    assert torch.isfinite(tracker.step())
