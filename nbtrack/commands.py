@@ -4,6 +4,7 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from tqdm.auto import tqdm
@@ -96,6 +97,10 @@ def track_command(
     job = Job(cell.name, n_frames - 1, _track_job, (cell, folder, device))
     (tracked,) = run_jobs([job], "tracking", Execution(workers=1))
     print(f"{folder}: {tracker.label}, {budget}")
+    _print_metrics(tracked)
+
+
+def _print_metrics(tracked: dict[str, Any]) -> None:
     for name in _PRINTED:
         print(f"  {_with_unit(name, tracked[name])}")
     if tracked["frames_without_depth"]:

@@ -63,12 +63,7 @@ def decode(
         color_file = recording.color_files[frame_ids[index]]
         depth_file = recording.depth_files[frame_ids[index]]
         color = _read(color_file, cv2.IMREAD_COLOR)
-        depth = _read(depth_file, cv2.IMREAD_UNCHANGED)
-        if depth.dtype != np.uint16 or depth.ndim != 2:
-            raise DataError(
-                f"{depth_file} is {depth.dtype} of shape {depth.shape}: depth is a 16-bit image of "
-                "one channel; write it as a 16-bit PNG"
-            )
+        depth = _read_depth(depth_file)
         if recording.resize_color:
             color = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
         for path, image in ((color_file, color), (depth_file, depth)):
@@ -91,6 +86,17 @@ def decode(
         for _ in bar:  # raises what a thread raised
             pass
     return Decoded(intrinsics, colors, depths)
+
+
+def _read_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
+    """Depth as the file holds it. Raises DataError if it is no 16-bit image of one channel."""
+    depth = _read(path, cv2.IMREAD_UNCHANGED)
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        raise DataError(
+            f"{path} is {depth.dtype} of shape {depth.shape}: depth is a 16-bit image of "
+            "one channel; write it as a 16-bit PNG"
+        )
+    return depth
 
 
 def ray_lengths(intrinsics: Intrinsics) -> Float[np.ndarray, "height width"]:
