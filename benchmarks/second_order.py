@@ -11,14 +11,14 @@ import sys
 import pandas as pd
 import torch
 
-from nbtrack.basin import find_from_afar, score_verdicts, share_recovered
-from nbtrack.beyond import ADAM_PLUS, BAKED, LM, METHODS, Method
-from nbtrack.cells import MapCell, TrackCell
-from nbtrack.config import Preset
-from nbtrack.experiments import map_summary, obtain_map, obtain_track
-from nbtrack.parallel import Execution
-from nbtrack.scenes import Scene, find_scene
-from nbtrack.settings import resolve_preset, with_settings
+from nbtrack.core.config import Preset
+from nbtrack.core.settings import resolve_preset, with_settings
+from nbtrack.experiments.basin import find_from_afar, score_verdicts, share_recovered
+from nbtrack.experiments.beyond import ADAM_PLUS, BAKED, LM, METHODS, Method
+from nbtrack.experiments.cells import MapCell, TrackCell
+from nbtrack.experiments.parallel import Execution
+from nbtrack.experiments.results import map_summary, obtain_map, obtain_track
+from nbtrack.experiments.scenes import Scene, find_scene
 
 MORE_POINTS = Method(
     "NeuS+ with SDF (LM), 2048 points", "neus_plus", "lm", ("tracking.lm.n_pixels=2048",)

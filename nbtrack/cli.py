@@ -18,7 +18,7 @@ from nbtrack.cli_options import (
     set_device,
     words_of,
 )
-from nbtrack.errors import ConfigError, NbtrackError
+from nbtrack.core.errors import ConfigError, NbtrackError
 
 
 def main(arguments: Texts[str] | None = None) -> int:
@@ -71,7 +71,7 @@ def _add_map(commands: argparse._SubParsersAction) -> None:
 
 
 def _map(options: argparse.Namespace) -> None:
-    from nbtrack.commands import map_command
+    from nbtrack.experiments.commands import map_command
 
     map_command(
         options.sequence, field_of(options), preset_of(options), options.frames, options.seed,
@@ -107,7 +107,7 @@ def _add_track(commands: argparse._SubParsersAction) -> None:
 
 
 def _track(options: argparse.Namespace) -> None:
-    from nbtrack.commands import track_command
+    from nbtrack.experiments.commands import track_command
 
     if options.pixels is not None:
         options.settings.append(f"tracking.{options.tracker}.n_pixels={options.pixels}")
@@ -137,7 +137,7 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from nbtrack.commands import export_command
+    from nbtrack.experiments.commands import export_command
 
     export_command(options.source, options.to, options.out)
 
@@ -180,8 +180,8 @@ def _add_tables(commands: argparse._SubParsersAction) -> None:
 
 
 def _tables(options: argparse.Namespace) -> None:
-    from nbtrack.commands_tables import beyond_command, explain_command, tables_command
-    from nbtrack.parallel import Execution
+    from nbtrack.experiments.commands_tables import beyond_command, explain_command, tables_command
+    from nbtrack.experiments.parallel import Execution
 
     if options.scenes:
         options.settings.append(f"scenes.names={words_of(options.scenes)}")
@@ -215,7 +215,7 @@ def _add_notebooks(commands: argparse._SubParsersAction) -> None:
 
 
 def _notebooks(options: argparse.Namespace) -> None:
-    from nbtrack.notebooks import run_notebooks
+    from nbtrack.experiments.notebooks import run_notebooks
 
     preset = preset_of(options)  # refuse a wrong setting before the first kernel starts
     run_notebooks(preset.name, options.config, tuple(options.settings), options.in_place)
@@ -232,7 +232,7 @@ def _add_bench(commands: argparse._SubParsersAction) -> None:
 
 
 def _bench(options: argparse.Namespace) -> None:
-    from nbtrack.commands_bench import bench_command
+    from nbtrack.experiments.commands_bench import bench_command
 
     # The paper's sizes unless something else is asked for: small networks measure bookkeeping.
     if "NBTRACK_PRESET" not in os.environ:

@@ -50,21 +50,19 @@ def _add_parts(parser: argparse.ArgumentParser) -> None:
 
 
 def _make(options: argparse.Namespace) -> None:
-    from nbtrack.commands_data import make_command
+    from nbtrack.experiments.commands_data import make_command
 
     make_command(options.room, options.out, options.n_frames, options.width, options.seed)
 
 
 def _check(options: argparse.Namespace) -> None:
-    from nbtrack.commands_data import check_command
+    from nbtrack.experiments.commands_data import check_command
 
-    check_command(
-        options.folder, options.depth_folder, options.poses, options.format, options.out
-    )
+    check_command(options.folder, options.depth_folder, options.poses, options.format, options.out)
 
 
 def _convert(options: argparse.Namespace) -> None:
-    from nbtrack.commands_data import convert_command
+    from nbtrack.experiments.commands_data import convert_command
 
     convert_command(
         options.folder, options.out, options.format, options.frames, options.depth_folder,

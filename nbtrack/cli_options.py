@@ -5,9 +5,9 @@ import os
 from pathlib import Path
 from typing import NoReturn
 
-from nbtrack.config import PRESETS, Preset
-from nbtrack.errors import ConfigError
-from nbtrack.settings import resolve_preset
+from nbtrack.core.config import PRESETS, Preset
+from nbtrack.core.errors import ConfigError
+from nbtrack.core.settings import resolve_preset
 
 
 class Parser(argparse.ArgumentParser):
@@ -51,7 +51,7 @@ def add_device(parser: argparse.ArgumentParser, of_what: str = "(default: all co
 def set_device(options: argparse.Namespace) -> None:
     """Where and with how many threads this process and its workers compute."""
     if getattr(options, "device", None):
-        from nbtrack.device import named_device
+        from nbtrack.core.device import named_device
 
         named_device(options.device)
         os.environ["NBTRACK_DEVICE"] = options.device

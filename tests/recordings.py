@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nbtrack.camera import Intrinsics
+from nbtrack.core.camera import Intrinsics
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame
 
 # The focal length of 7-Scenes at this width; pixel centres at integer + 0.5.

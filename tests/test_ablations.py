@@ -6,24 +6,24 @@ import pandas as pd
 import pytest
 from tiny import TINY
 
-from nbtrack.ablations import (
+from nbtrack.core.config import Preset
+from nbtrack.core.settings import resolve_preset
+from nbtrack.experiments.ablations import (
     compare_times,
     learning_rate_and_steps,
     quality_over_time,
     start_of_the_search,
     vr_in_both_maps,
 )
-from nbtrack.config import Preset
-from nbtrack.grid import prepare_scenes, table_1_cells
-from nbtrack.scenes import Scene
-from nbtrack.settings import resolve_preset
+from nbtrack.experiments.grid import prepare_scenes, table_1_cells
+from nbtrack.experiments.scenes import Scene
 
 
 @pytest.fixture
 def preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Preset:
     """One room of a few pixels, an empty cache, one process."""
     monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
-    monkeypatch.setattr("nbtrack.parallel.os.cpu_count", lambda: 1)
+    monkeypatch.setattr("nbtrack.experiments.parallel.os.cpu_count", lambda: 1)
     return resolve_preset("smoke", settings=(*TINY, "scenes.names=['office']"))
 
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from nbtrack import baking
-from nbtrack.baking import BakedField, bake_field
-from nbtrack.bounds import SceneBounds
-from nbtrack.errors import ConfigError
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.errors import ConfigError
 from nbtrack.fields import FIELDS, Field
+from nbtrack.fields import grid as baking
 from nbtrack.fields.base import LUMA
+from nbtrack.fields.grid import BakedField, bake_field
 
 BOX = SceneBounds((-0.5, -0.25, 0.25), (0.55, 0.5, 1.0))  # x is no multiple of VOXEL
 VOXEL = 0.125  # exact in binary, as all corners' coordinates are

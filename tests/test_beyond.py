@@ -7,13 +7,13 @@ import pandas as pd
 import pytest
 from tiny import TINY
 
-from nbtrack import basin, beyond
 from nbtrack.cli import main
-from nbtrack.grid import plan_table_1, prepare_scenes
-from nbtrack.latex import TableNotes, write_table_3
-from nbtrack.parallel import Execution
+from nbtrack.core.settings import resolve_preset, with_settings
+from nbtrack.experiments import basin, beyond
+from nbtrack.experiments.grid import plan_table_1, prepare_scenes
+from nbtrack.experiments.parallel import Execution
 from nbtrack.plots import plot_basin, plot_ingredients, plot_speed_accuracy
-from nbtrack.settings import resolve_preset, with_settings
+from nbtrack.tables.latex import TableNotes, write_table_3
 
 SETTINGS = (
     *TINY, "scenes.names=office", "mapping.neus_plus.iterations=6", "mapping.neus_plus.n_rays=8",

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from nbtrack.bounds import SceneBounds, observed_bounds
-from nbtrack.camera import Intrinsics
-from nbtrack.data import Sequence
-from nbtrack.errors import DataError
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.errors import DataError
+from nbtrack.data.sequence import Sequence, observed_bounds
 
 UNIT = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 # 90 degrees wide and high: the corner pixels' centers are seen at 19/20 of the half width.

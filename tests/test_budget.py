@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import pytest
 
-from nbtrack.budget import Budget, ClockBudget, StepBudget, paper_steps
-from nbtrack.errors import ConfigError
+from nbtrack.core.errors import ConfigError
+from nbtrack.tracking.budget import Budget, ClockBudget, StepBudget, paper_steps
 
 
 class FakeClock:

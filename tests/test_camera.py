@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nbtrack.camera import (
+from nbtrack.core.camera import (
     Intrinsics,
     backproject,
     pixel_directions,

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from nbtrack.camera import Intrinsics
 from nbtrack.cli import main
-from nbtrack.data_writer import SequenceWriter
-from nbtrack.trajectories import read_tum
+from nbtrack.core.camera import Intrinsics
+from nbtrack.data.writer import SequenceWriter
+from nbtrack.tracking.trajectories import read_tum
 
 TINY = [
     "--set", "scenes.n_frames=6", "--set", "scenes.width=32", "--set", "mapping.neus.iterations=8",
@@ -95,13 +95,33 @@ WRONG = {
         "'imap' knows no supervision 'rendering+sdf'",
     ),
     "baked and rendered": (
-        ["track", "living_room", "--field", "neus", "--tracker", "vr_neus", "--steps", "2",
-         "--bake", "0.04"],
+        [
+            "track",
+            "living_room",
+            "--field",
+            "neus",
+            "--tracker",
+            "vr_neus",
+            "--steps",
+            "2",
+            "--bake",
+            "0.04",
+        ],
         "renders, which a baked field cannot",
     ),
     "bake": (
-        ["track", "living_room", "--field", "neus", "--tracker", "lm", "--steps", "2",
-         "--bake", "-1"],
+        [
+            "track",
+            "living_room",
+            "--field",
+            "neus",
+            "--tracker",
+            "lm",
+            "--steps",
+            "2",
+            "--bake",
+            "-1",
+        ],
         "tracking.lm.bake_voxel = -1.0: it must be 0 or more",
     ),
     "field": (["map", "living_room", "--field", "imapp"], "did you mean 'imap'"),

@@ -41,7 +41,7 @@ def test_the_same_table_as_on_this_machine(
     # A failure in a worker comes back as one line, and the other cells still run.
     for file in (tmp_path / "there").rglob("office*/**/depth_filtered/depth1.png"):
         file.write_bytes(b"no image")
-    monkeypatch.setattr("nbtrack.commands_tables.tqdm.write", lambda *a, **k: None)
+    monkeypatch.setattr("nbtrack.experiments.commands_tables.tqdm.write", lambda *a, **k: None)
     words = [word for setting in TINY for word in ("--set", setting)]
     options = ["--dask", address, "--threads", "1", "--out", str(tmp_path / "broken")]
     assert main(["tables", *options, *words]) == 2
@@ -55,7 +55,7 @@ def test_no_scheduler(
 ) -> None:
     """Catches a traceback of sockets where the address is wrong."""
     monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
-    monkeypatch.setattr("nbtrack.cluster._SECONDS_TO_CONNECT", 0.5)
+    monkeypatch.setattr("nbtrack.experiments.cluster._SECONDS_TO_CONNECT", 0.5)
     words = [word for setting in TINY for word in ("--set", setting)]
     assert main(["tables", "--dask", "tcp://127.0.0.1:9", *words]) == 2
     assert "no Dask scheduler at 'tcp://127.0.0.1:9'" in capsys.readouterr().err.splitlines()[-1]

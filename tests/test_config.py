@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from nbtrack.config import PRESETS, FieldConfig, Preset, as_dict
-from nbtrack.errors import ConfigError, MissingError
-from nbtrack.provenance import fingerprint
-from nbtrack.scenes import DATASET_SCENES
-from nbtrack.settings import resolve_preset
+from nbtrack.core.config import PRESETS, FieldConfig, Preset, as_dict
+from nbtrack.core.errors import ConfigError, MissingError
+from nbtrack.core.provenance import fingerprint
+from nbtrack.core.settings import resolve_preset
+from nbtrack.experiments.scenes import DATASET_SCENES
 from nbtrack.synthetic import REPORTED_ROOMS
 
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nbtrack.camera import Intrinsics, swap_opengl_opencv
-from nbtrack.data import Sequence, parse_frames, read_sequence
-from nbtrack.data_writer import SequenceWriter
-from nbtrack.errors import DataError, MissingError, NbtrackError
-from nbtrack.images import read_image
-from nbtrack.readers.neural_rgbd import read_focal, read_poses
+from nbtrack.core.camera import Intrinsics, swap_opengl_opencv
+from nbtrack.core.errors import DataError, MissingError, NbtrackError
+from nbtrack.data.images import read_image
+from nbtrack.data.readers.neural_rgbd import read_focal, read_poses
+from nbtrack.data.sequence import Sequence, parse_frames, read_sequence
+from nbtrack.data.writer import SequenceWriter
 
 CAMERA = Intrinsics.from_focal(12, 8, 10.123456789012345)
 

@@ -9,13 +9,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.camera import Intrinsics, pixel_directions
-from nbtrack.conventions import CONVENTIONS, OPENGL, Convention
-from nbtrack.data_check import DataReport, check_sequence
-from nbtrack.data_writer import SequenceWriter
-from nbtrack.errors import DataError, MissingError
-from nbtrack.readers.neural_rgbd import read_poses
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import Intrinsics, pixel_directions
+from nbtrack.core.errors import DataError, MissingError
+from nbtrack.data.check import DataReport, check_sequence
+from nbtrack.data.conventions import CONVENTIONS, OPENGL, Convention
+from nbtrack.data.readers.neural_rgbd import read_poses
+from nbtrack.data.writer import SequenceWriter
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 REAL_ROOM = Path(__file__).resolve().parents[2] / "shared/data/real_room"
@@ -177,7 +177,7 @@ def test_long_sequences_are_read_in_stretches(tmp_path: Path, monkeypatch) -> No
     poses[4:8] = np.nan
     rewrite_poses(tmp_path / "room", poses)
     whole = check_sequence(tmp_path / "room")
-    monkeypatch.setattr("nbtrack.data_scan._FRAMES_AT_ONCE", 4)
+    monkeypatch.setattr("nbtrack.data.scan._FRAMES_AT_ONCE", 4)
     assert str(check_sequence(tmp_path / "room")) == str(whole)
     smaller = np.ones((24, 32), np.uint16)
     cv2.imwrite(str(tmp_path / "room/images/img9.png"), np.ones((24, 32, 3), np.uint8))
@@ -188,7 +188,7 @@ def test_long_sequences_are_read_in_stretches(tmp_path: Path, monkeypatch) -> No
 
 def test_other_size_between_stretches(room: Path, monkeypatch) -> None:
     """Catches sizes that are compared within a stretch only."""
-    monkeypatch.setattr("nbtrack.data_scan._FRAMES_AT_ONCE", 8)
+    monkeypatch.setattr("nbtrack.data.scan._FRAMES_AT_ONCE", 8)
     for number in range(8, N_FRAMES):
         cv2.imwrite(str(room / f"images/img{number}.png"), np.ones((24, 32, 3), np.uint8))
         cv2.imwrite(str(room / f"depth/depth{number}.png"), np.ones((24, 32), np.uint16))

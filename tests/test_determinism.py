@@ -7,11 +7,11 @@ import pytest
 import torch
 from test_tracking import box_sequence
 
-from nbtrack.budget import StepBudget
-from nbtrack.config import FieldConfig, MappingConfig, TrackingConfig
-from nbtrack.mapping import map_sequence
-from nbtrack.parallel import Execution, Job, run_jobs
-from nbtrack.tracking import track_sequence
+from nbtrack.core.config import FieldConfig, MappingConfig, TrackingConfig
+from nbtrack.experiments.parallel import Execution, Job, run_jobs
+from nbtrack.mapping.fit import map_sequence
+from nbtrack.tracking.budget import StepBudget
+from nbtrack.tracking.sequence import track_sequence
 
 MAPPING = MappingConfig(
     12, n_rays=64, n_stratified=8, n_surface=8, n_surface_points=64, learning_rate=3e-3

@@ -7,9 +7,9 @@ import threading
 import pytest
 import torch
 
-from nbtrack.device import choose_device, has_room_for, naming_what_to_lower
-from nbtrack.device_lock import alone_on, beside_others_on
-from nbtrack.errors import ConfigError, OutOfMemory
+from nbtrack.core.device import choose_device, has_room_for, naming_what_to_lower
+from nbtrack.core.device_lock import alone_on, beside_others_on
+from nbtrack.core.errors import ConfigError, OutOfMemory
 
 ELSEWHERE = torch.device("cpu", 7)  # a name that no run uses
 
@@ -48,7 +48,7 @@ def test_host_memory_is_not_asked_twice() -> None:
 
 HOLD = """
 import sys, torch
-from nbtrack.device_lock import beside_others_on
+from nbtrack.core.device_lock import beside_others_on
 with beside_others_on(torch.device("cpu", 7), print):
     print("held", flush=True)
     sys.stdin.read()

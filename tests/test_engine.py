@@ -8,17 +8,17 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.budget import StepBudget
-from nbtrack.config import FieldConfig, TrackingConfig
-from nbtrack.data import Sequence, read_sequence
-from nbtrack.errors import ConfigError
-from nbtrack.fields import Rays, make_field
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.config import FieldConfig, TrackingConfig
+from nbtrack.core.errors import ConfigError
+from nbtrack.data.pixels import PixelSampler, Rays
+from nbtrack.data.sequence import Sequence, read_sequence
+from nbtrack.fields import make_field
 from nbtrack.fields.engine import _CHUNK_ROWS, PULL_BACKS, FrozenMlp, frozen
-from nbtrack.sampling import PixelSampler
 from nbtrack.synthetic import make_room
-from nbtrack.trackers import base, tracker_class
-from nbtrack.tracking import track_sequence
+from nbtrack.tracking.budget import StepBudget
+from nbtrack.tracking.sequence import track_sequence
+from nbtrack.tracking.trackers import base, tracker_class
 
 BOUNDS = SceneBounds((-2.0, -1.0, 0.0), (3.0, 2.0, 4.0))
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}

@@ -8,9 +8,9 @@ import pytest
 from tiny import TINY
 
 from nbtrack.cli import main
-from nbtrack.config import PRESETS
-from nbtrack.scenes import find_scene
-from nbtrack.settings import changed_settings, resolve_preset, with_settings
+from nbtrack.core.config import PRESETS
+from nbtrack.core.settings import changed_settings, resolve_preset, with_settings
+from nbtrack.experiments.scenes import find_scene
 
 WORDS = [word for setting in (*TINY, "scenes.track_frames=1:4") for word in ("--set", setting)]
 

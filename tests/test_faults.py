@@ -260,9 +260,7 @@ MAP_BYTES = {
 
 @pytest.mark.parametrize("case", MAP_BYTES)
 @pytest.mark.parametrize("command", ["track", "export"])
-def test_map_bytes(
-    case: str, command: str, work: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_map_bytes(case: str, command: str, work: Path, capsys: pytest.CaptureFixture) -> None:
     """Catches code that is run from a file, and damage that gives a traceback."""
     (work / "spoilt.pt").write_bytes(MAP_BYTES[case]())
     words = [*GIVEN, "spoilt.pt"] if command == "track" else [
@@ -392,7 +390,9 @@ ARGUMENTS = {
     "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames out"),
     "field not the map's": ([*GIVEN, "map", "--field", "imap"], "is a map of field 'neus'"),
     "supervision not the map's": (
-        [*GIVEN, "map", "--field", "neus", "--supervision", "rendering+sdf"], "not 'neus_plus'"),
+        [*GIVEN, "map", "--field", "neus", "--supervision", "rendering+sdf"],
+        "not 'neus_plus'",
+    ),
     "tracker not the map's": ([*GIVEN, "map", "--tracker", "vr"], "does not work on field 'neus'"),
     "steps that are none": ([*OWN, "--steps", "nan"], "steps_per_frame is nan"),
     "steps in words": ([*OWN, "--steps", "few"], "invalid float value: 'few'"),

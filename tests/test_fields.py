@@ -7,14 +7,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.config import FieldConfig, MappingConfig
-from nbtrack.errors import ConfigError
-from nbtrack.fields import FIELDS, LearnedField, Rays, field_class, make_field
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.config import FieldConfig, MappingConfig
+from nbtrack.core.errors import ConfigError
+from nbtrack.data.pixels import Rays
+from nbtrack.fields import FIELDS, LearnedField, field_class, make_field
 from nbtrack.fields.base import Batch, measured_mean
 from nbtrack.fields.imap import LEAST_DEVIATION, rendering_losses
-from nbtrack.rendering import Rendering
-from nbtrack.sampling import guided_depths
+from nbtrack.fields.rendering import Rendering
+from nbtrack.fields.sampling import guided_depths
 
 ROOM = SceneBounds((-1.0, -1.2, 0.5), (3.0, 1.3, 3.7))  # 4 x 2.5 x 3.2 m
 SMALL = FieldConfig(width=64)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nbtrack.geometry import (
+from nbtrack.core.geometry import (
     invert_transform,
     make_transform,
     matrix_to_quaternion,

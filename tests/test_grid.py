@@ -7,14 +7,13 @@ import pandas as pd
 import pytest
 from tiny import TINY
 
-from nbtrack.bench import default_pixels, measure_steps
-from nbtrack.cells import MapCell
-from nbtrack.claims import in_words, iteration_ratio, paper_claims
-from nbtrack.config import Preset
-from nbtrack.device import choose_device
-from nbtrack.errors import ConfigError, MissingError
-from nbtrack.experiments import map_summary, read_frames, read_poses
-from nbtrack.grid import (
+from nbtrack.core.config import Preset
+from nbtrack.core.device import choose_device
+from nbtrack.core.errors import ConfigError, MissingError
+from nbtrack.core.settings import resolve_preset, with_settings
+from nbtrack.experiments.bench import default_pixels, measure_steps
+from nbtrack.experiments.cells import MapCell
+from nbtrack.experiments.grid import (
     map_cells,
     plan_table_1,
     prepare_scenes,
@@ -23,10 +22,11 @@ from nbtrack.grid import (
     table_1_results,
     track_cells,
 )
-from nbtrack.parallel import Execution
-from nbtrack.scenes import find_scene
-from nbtrack.settings import resolve_preset, with_settings
-from nbtrack.tables import published_table_1, published_table_2, table_1
+from nbtrack.experiments.parallel import Execution
+from nbtrack.experiments.results import map_summary, read_frames, read_poses
+from nbtrack.experiments.scenes import find_scene
+from nbtrack.tables.claims import in_words, iteration_ratio, paper_claims
+from nbtrack.tables.layout import published_table_1, published_table_2, table_1
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Preset:
     for name in ("NBTRACK_PRESET", "NBTRACK_CONFIG", "NBTRACK_SET"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
-    monkeypatch.setattr("nbtrack.parallel.os.cpu_count", lambda: 1)
+    monkeypatch.setattr("nbtrack.experiments.parallel.os.cpu_count", lambda: 1)
     return resolve_preset("smoke", settings=TINY)
 
 
@@ -51,8 +51,8 @@ def test_table_1_is_complete_and_cached(preset: Preset, monkeypatch: pytest.Monk
     def forbidden(*arguments: object, **options: object) -> None:
         raise AssertionError("computed again")
 
-    monkeypatch.setattr("nbtrack.experiments.map_sequence", forbidden)
-    monkeypatch.setattr("nbtrack.experiments.track_sequence", forbidden)
+    monkeypatch.setattr("nbtrack.experiments.results.map_sequence", forbidden)
+    monkeypatch.setattr("nbtrack.experiments.results.track_sequence", forbidden)
     pd.testing.assert_frame_equal(table_1_cells(preset, scenes), cells)
 
 
@@ -74,9 +74,7 @@ def test_keys_change_with_what_matters(preset: Preset) -> None:
         MapCell(scene, "imap", preset),
         MapCell(scene, "neus", preset, seed=1),
         MapCell(scene, "neus", preset, frames=":3"),
-        MapCell(
-            scene, "neus", resolve_preset("smoke", settings=(*TINY, "mapping.neus.n_rays=9"))
-        ),
+        MapCell(scene, "neus", resolve_preset("smoke", settings=(*TINY, "mapping.neus.n_rays=9"))),
     ]
     assert len({cell.key, *(other.key for other in others)}) == 5
     untouched = resolve_preset("smoke", settings=(*TINY, "tracking.sdf.n_pixels=17"))

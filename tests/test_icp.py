@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 import torch
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.budget import StepBudget
-from nbtrack.camera import Intrinsics
-from nbtrack.config import FieldConfig, MappingConfig, TrackingConfig
-from nbtrack.data import Sequence, read_sequence
-from nbtrack.errors import DataError, MissingError
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.config import FieldConfig, MappingConfig, TrackingConfig
+from nbtrack.core.errors import DataError, MissingError
+from nbtrack.core.geometry import rotation_vector_to_matrix
+from nbtrack.data.pixels import PixelSampler
+from nbtrack.data.sequence import Sequence, read_sequence
 from nbtrack.fields import make_field
-from nbtrack.fusion import fuse_points
-from nbtrack.geometry import rotation_vector_to_matrix
-from nbtrack.map_quality import score_map
-from nbtrack.mapping import FittedMap, load_map, map_sequence, split_holdout
-from nbtrack.sampling import PixelSampler
+from nbtrack.fields.fusion import fuse_points
+from nbtrack.mapping.fit import FittedMap, load_map, map_sequence, split_holdout
+from nbtrack.mapping.quality import score_map
 from nbtrack.synthetic import build_room, make_room
-from nbtrack.trackers import tracker_class
-from nbtrack.tracking import track_sequence
+from nbtrack.tracking.budget import StepBudget
+from nbtrack.tracking.sequence import track_sequence
+from nbtrack.tracking.trackers import tracker_class
 
 NETWORK, MAPPING, TRACKING = FieldConfig(), MappingConfig(), TrackingConfig()
 BOX = SceneBounds((-1.0, -1.0, 0.0), (1.0, 1.0, 3.0))

@@ -18,7 +18,7 @@ import pytest
 import torch
 from tiny import TINY
 
-from nbtrack.trajectories import read_tum
+from nbtrack.tracking.trajectories import read_tum
 
 KILLS = int(os.environ.get("NBTRACK_TEST_KILLS", "3"))
 # Forks a child for each line `[folder, arguments, seconds until SIGKILL or null]`; answers with
@@ -27,9 +27,10 @@ KILLS = int(os.environ.get("NBTRACK_TEST_KILLS", "3"))
 _FORKER = """
 import json, os, signal, sys, time
 import torch._dynamo, trimesh  # else every child would import them by itself
-import nbtrack.commands, nbtrack.commands_tables, nbtrack.mapping, nbtrack.tracking
+import nbtrack.experiments.commands, nbtrack.experiments.commands_tables
+import nbtrack.mapping.fit, nbtrack.tracking.sequence
 from nbtrack.cli import main
-nbtrack.mapping.CHECKPOINT_SECONDS = nbtrack.tracking.CHECKPOINT_SECONDS = 0.0
+nbtrack.mapping.fit.CHECKPOINT_SECONDS = nbtrack.tracking.sequence.CHECKPOINT_SECONDS = 0.0
 for line in sys.stdin:
     folder, arguments, seconds = json.loads(line)
     start = time.monotonic()

@@ -8,13 +8,13 @@ import torch
 from test_lm import furnished
 from test_tracking import BoxRoom, box_sequence, config_of
 
-from nbtrack.baking import bake_field
-from nbtrack.budget import StepBudget
-from nbtrack.config import PRESETS, TrackingConfig
-from nbtrack.data import Sequence
-from nbtrack.errors import ConfigError, DataError
-from nbtrack.live import LiveTracker
-from nbtrack.tracking import track_sequence
+from nbtrack.core.config import PRESETS, TrackingConfig
+from nbtrack.core.errors import ConfigError, DataError
+from nbtrack.data.sequence import Sequence
+from nbtrack.fields.grid import bake_field
+from nbtrack.tracking.budget import StepBudget
+from nbtrack.tracking.live import LiveTracker
+from nbtrack.tracking.sequence import track_sequence
 
 LM = replace(PRESETS["paper"].tracking["lm"], n_restarts=2)
 
@@ -28,9 +28,7 @@ def live(sequence: Sequence, name: str = "lm", **settings: object) -> LiveTracke
     """A tracker at the sequence's first pose."""
     field = BoxRoom(as_density=name == "vr").requires_grad_(False)
     settings = {"steps": 20, "config": LM if name == "lm" else config_of(name)} | settings
-    return LiveTracker(
-        field, sequence.intrinsics, sequence.T_world_camera[0], name, **settings
-    )
+    return LiveTracker(field, sequence.intrinsics, sequence.T_world_camera[0], name, **settings)
 
 
 def error_m(found: np.ndarray, sequence: Sequence, index: int) -> float:
@@ -217,7 +215,7 @@ def test_a_gap_of_two_seconds_is_found_again_or_flagged() -> None:
     field, sequence = furnished()
     jumped = sequence.T_world_camera[2].copy()
     jumped[:3, 3] += 0.12
-    turn = torch.linalg.matrix_exp(0.15 * torch.tensor([[0., -1, 0], [1, 0, 0], [0, 0, 0]]))
+    turn = torch.linalg.matrix_exp(0.15 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
     jumped[:3, :3] = turn.double().numpy() @ jumped[:3, :3]
     tracker = LiveTracker(field, sequence.intrinsics, jumped, steps=80, config=TrackingConfig(
         n_pixels=512, motion_model="better_of_both"))  # fmt: skip

@@ -9,18 +9,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.budget import StepBudget
-from nbtrack.camera import Intrinsics
-from nbtrack.config import PRESETS
-from nbtrack.data import Sequence
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.config import PRESETS
+from nbtrack.core.geometry import rotation_angle, rotation_vector_to_matrix
+from nbtrack.data.pixels import PixelSampler
+from nbtrack.data.sequence import Sequence
 from nbtrack.fields import Field
-from nbtrack.geometry import rotation_angle, rotation_vector_to_matrix
-from nbtrack.registration import moved
-from nbtrack.sampling import PixelSampler
 from nbtrack.synthetic import build_room, render_frame
-from nbtrack.trackers.lm import LevenbergMarquardtTracker
-from nbtrack.tracking import track_sequence
+from nbtrack.tracking.budget import StepBudget
+from nbtrack.tracking.registration import moved
+from nbtrack.tracking.sequence import track_sequence
+from nbtrack.tracking.trackers.lm import LevenbergMarquardtTracker
 
 CONFIG = PRESETS["smoke"].tracking["lm"]
 
@@ -155,7 +155,7 @@ def test_a_rejected_step_leaves_the_pose_unchanged(monkeypatch: pytest.MonkeyPat
     T_true = torch.from_numpy(sequence.T_world_camera[0]).float()
     tracker.start_frame(0, T_true[None])
     bad = torch.tensor([0.3, 0.0, 0.0, 0.5, 0.0, 0.0], dtype=torch.float64)
-    monkeypatch.setattr("nbtrack.trackers.lm._damped_step", lambda *arguments: bad)
+    monkeypatch.setattr("nbtrack.tracking.trackers.lm._damped_step", lambda *arguments: bad)
     damping = tracker.search.damping
     tracker.step()
     torch.testing.assert_close(tracker.T_world_camera, T_true, atol=1e-6, rtol=0)

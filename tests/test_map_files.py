@@ -15,16 +15,16 @@ import torch
 import trimesh
 from test_lm import furnished
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.camera import Intrinsics
 from nbtrack.cli import main
-from nbtrack.config import FieldConfig
-from nbtrack.errors import DataError
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.config import FieldConfig
+from nbtrack.core.errors import DataError
 from nbtrack.fields import make_field
-from nbtrack.map_files import StoredMap, read_map, write_map
-from nbtrack.map_fit import MapFit, warn_of_misfit
-from nbtrack.seen_volume import SEEN_VOXEL, SeenVolume, seen_volume
-from nbtrack.trajectories import read_tum
+from nbtrack.mapping.files import StoredMap, read_map, write_map
+from nbtrack.mapping.fits import MapFit, warn_of_misfit
+from nbtrack.mapping.seen_volume import SEEN_VOXEL, SeenVolume, seen_volume
+from nbtrack.tracking.trajectories import read_tum
 
 SETTINGS = (
     "scenes.n_frames=8", "scenes.width=32", "network.neus.width=24", "mapping.neus.iterations=60",
@@ -46,12 +46,27 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for name in ("NBTRACK_PRESET", "NBTRACK_CONFIG", "NBTRACK_SET", "NBTRACK_DATA"):
             patch.delenv(name, raising=False)
         patch.setenv("NBTRACK_RUNS", str(folder / "runs"))
-        assert main(with_settings(
-            "map", "living_room", "--field", "neus", "--out", str(folder / "map"))) == 0
+        assert (
+            main(
+                with_settings("map", "living_room", "--field", "neus", "--out", str(folder / "map"))
+            )
+            == 0
+        )
         assert main(["export", str(folder / "map"), "--to", "map", str(folder / "map.pt")]) == 0
-        assert main(with_settings(
-            "track", "living_room", "--map-from", str(folder / "map"), *TRACK,
-            "--out", str(folder / "run"))) == 0
+        assert (
+            main(
+                with_settings(
+                    "track",
+                    "living_room",
+                    "--map-from",
+                    str(folder / "map"),
+                    *TRACK,
+                    "--out",
+                    str(folder / "run"),
+                )
+            )
+            == 0
+        )
     return folder
 
 
@@ -141,9 +156,20 @@ def test_a_map_of_another_scene_is_refused(
     content = torch.load(made / "map.pt", weights_only=True)
     content["usual_fit"] = MapFit(0.98, 0.97, 0.01).to_dict()
     torch.save(content, tmp_path / "good.pt")
-    assert main(with_settings(
-        "track", "long_hall", "--map-from", str(tmp_path / "good.pt"), *TRACK,
-        "--out", str(made / "run"))) == 2
+    assert (
+        main(
+            with_settings(
+                "track",
+                "long_hall",
+                "--map-from",
+                str(tmp_path / "good.pt"),
+                *TRACK,
+                "--out",
+                str(made / "run"),
+            )
+        )
+        == 2
+    )
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith("nbtrack: at its given pose frame 2 of long_hall is off the map of")
     assert "usual in this map: median 0.010 m, 97 % within 10 cm; it is a map of" in error

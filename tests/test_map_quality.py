@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.bounds import SceneBounds, observed_bounds
-from nbtrack.data import Sequence, read_sequence
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.data.sequence import Sequence, observed_bounds, read_sequence
 from nbtrack.fields.base import LearnedField
-from nbtrack.map_quality import score_map, score_mesh, score_sdf
-from nbtrack.meshes import extract_mesh, keep_seen, seen_by
+from nbtrack.mapping.meshes import extract_mesh, keep_seen, seen_by
+from nbtrack.mapping.quality import score_map, score_mesh, score_sdf
 from nbtrack.synthetic import Room, build_room, make_room
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from nbtrack.camera import Intrinsics
-from nbtrack.config import FieldConfig, MappingConfig
-from nbtrack.data import Sequence
-from nbtrack.errors import DataError, NumericalError
-from nbtrack.mapping import learning_rate, load_map, map_sequence, split_holdout
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.config import FieldConfig, MappingConfig
+from nbtrack.core.errors import DataError, NumericalError
+from nbtrack.data.sequence import Sequence
+from nbtrack.mapping.fit import learning_rate, load_map, map_sequence, split_holdout
 
 NETWORK = FieldConfig(width=48, n_frequencies=32)
 SHORT = MappingConfig(iterations=30, n_rays=32, n_stratified=8, n_surface=4, learning_rate=3e-3)
@@ -46,7 +46,7 @@ def test_neus_finds_a_wall() -> None:
 
 def test_imap_renders_a_wall() -> None:
     """Catches densities that do not absorb: the rendered depth must be the wall's."""
-    from nbtrack.views import render_view
+    from nbtrack.fields.views import render_view
 
     config = MappingConfig(
         iterations=250, n_rays=64, n_stratified=24, n_surface=8, learning_rate=3e-3
@@ -73,7 +73,7 @@ def test_resume_equals_uninterrupted(field_name: str, tmp_path: Path) -> None:
 
     checkpoint = tmp_path / "map.pt"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbtrack.mapping.CHECKPOINT_SECONDS", 0.0)
+        patch.setattr("nbtrack.mapping.fit.CHECKPOINT_SECONDS", 0.0)
         with pytest.raises(Killed):
             map_sequence(
                 field_name, sequence, NETWORK, SHORT, seed=3, checkpoint=checkpoint,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nbtrack.errors import DataError, NumericalError
-from nbtrack.metrics import (
+from nbtrack.core.errors import DataError, NumericalError
+from nbtrack.tracking.metrics import (
     align_rigidly,
     rotation_errors_deg,
     score_detection,

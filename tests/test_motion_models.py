@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nbtrack.errors import ConfigError
-from nbtrack.motion_models import motion_model
+from nbtrack.core.errors import ConfigError
+from nbtrack.tracking.motion_models import motion_model
 
 
 def turned(angle: float, x: float) -> np.ndarray:

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.camera import Intrinsics
-from nbtrack.config import PRESETS, FieldConfig, MappingConfig
-from nbtrack.data import Sequence
-from nbtrack.errors import ConfigError
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.config import PRESETS, FieldConfig, MappingConfig
+from nbtrack.core.errors import ConfigError
+from nbtrack.data.pixels import PixelSampler, Rays
+from nbtrack.data.sequence import Sequence
 from nbtrack.fields import supervised_field
-from nbtrack.fields.base import Rays
 from nbtrack.fields.neus_plus import distance_targets
-from nbtrack.mapping import map_sequence
-from nbtrack.observed_distance import ObservedDistance
-from nbtrack.sampling import PixelSampler
+from nbtrack.fields.observed_distance import ObservedDistance
+from nbtrack.mapping.fit import map_sequence
 
 CONFIG = PRESETS["smoke"].mapping["neus_plus"]
 CAMERA = Intrinsics.from_focal(64, 48, 48.0)

@@ -8,12 +8,12 @@ import pytest
 from tiny import TINY
 
 from nbtrack.cli import main
-from nbtrack.data_writer import SequenceWriter
-from nbtrack.readers.neural_rgbd import read_poses
-from nbtrack.scenes import DATASET_SCENES
+from nbtrack.data.readers.neural_rgbd import read_poses
+from nbtrack.data.writer import SequenceWriter
+from nbtrack.experiments.scenes import DATASET_SCENES
 from nbtrack.synthetic import build_room
 from nbtrack.synthetic.generate import room_frames, room_intrinsics
-from nbtrack.tables import PAPER_SCENE_LABELS
+from nbtrack.tables.layout import PAPER_SCENE_LABELS
 
 N_FRAMES = 13  # so that img10 would come before img2 if sorted as text
 WIDTH, HEIGHT = 32, 24

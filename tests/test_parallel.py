@@ -4,8 +4,8 @@ import os
 
 import pytest
 
-from nbtrack.errors import DataError, NbtrackError
-from nbtrack.parallel import Execution, Job, Report, run_jobs
+from nbtrack.core.errors import DataError, NbtrackError
+from nbtrack.experiments.parallel import Execution, Job, Report, run_jobs
 
 
 def square(number: int, report: Report) -> int:

@@ -13,18 +13,18 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 
 from nbtrack import plots
-from nbtrack.bounds import SceneBounds
-from nbtrack.camera import Intrinsics
-from nbtrack.data import Sequence
-from nbtrack.errors import DataError
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.errors import DataError
+from nbtrack.data.sequence import Sequence
 from nbtrack.fields import LearnedField
+from nbtrack.fields.views import View
 from nbtrack.plots.doll_house import screen_axes
 from nbtrack.plots.style import path_colors
 from nbtrack.plots.top_view import TopView
 from nbtrack.plots.training import loss_terms, running_median
 from nbtrack.synthetic import Room, build_room
-from nbtrack.tables import published_table_1, published_table_2
-from nbtrack.views import View
+from nbtrack.tables.layout import published_table_1, published_table_2
 
 RADIUS = 1.5  # m
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from nbtrack import provenance
-from nbtrack.provenance import code_fingerprint, versions
-from nbtrack.trackers import TRACKERS
-from nbtrack.tracking import track_sequence
+from nbtrack.core import provenance
+from nbtrack.core.provenance import code_fingerprint, versions
+from nbtrack.tracking.sequence import track_sequence
+from nbtrack.tracking.trackers import TRACKERS
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def keys() -> tuple[str, str]:
 def test_a_changed_tracker_is_computed_again(changed) -> None:
     """Catches a researcher's edited loss that is answered with the old, cached result."""
     vr, sdf = keys()
-    changed("nbtrack.trackers.sdf", "field_sdf.abs().mean()", "field_sdf.square().mean()")
+    changed("nbtrack.tracking.trackers.sdf", "field_sdf.abs().mean()", "field_sdf.square().mean()")
     assert keys()[1] != sdf
     assert keys()[0] == vr
 
@@ -44,21 +44,21 @@ def test_a_changed_tracker_is_computed_again(changed) -> None:
 def test_a_module_behind_an_import_counts(changed) -> None:
     """Catches imports that are not followed: rendering is three imports away from tracking."""
     before = keys()
-    changed("nbtrack.rendering", "weights", "wights")
+    changed("nbtrack.fields.rendering", "weights", "wights")
     assert keys()[0] != before[0]
 
 
 def test_words_do_not_count(changed) -> None:
     """Catches days of results thrown away for a comment or a docstring."""
     before = keys()
-    changed("nbtrack.trackers.sdf", "Paper, Sec. II-B.2.", "See the paper.  # and more")
+    changed("nbtrack.tracking.trackers.sdf", "Paper, Sec. II-B.2.", "See the paper.  # and more")
     assert keys() == before
 
 
 def test_modules_that_only_tell_do_not_count(changed) -> None:
     """Catches results thrown away for the wording of an error."""
     before = keys()
-    changed("nbtrack.errors", "did you mean", "perhaps")
+    changed("nbtrack.core.errors", "did you mean", "perhaps")
     assert keys() == before
 
 

@@ -19,9 +19,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from recordings import WRITERS, source, write_recording
 
-from nbtrack.data import read_sequence
-from nbtrack.data_check import check_sequence
-from nbtrack.errors import NbtrackError
+from nbtrack.core.errors import NbtrackError
+from nbtrack.data.check import check_sequence
+from nbtrack.data.sequence import read_sequence
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 EXAMPLES = int(os.environ.get("NBTRACK_FUZZ_EXAMPLES", "200"))

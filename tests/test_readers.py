@@ -23,18 +23,18 @@ from recordings import (
 )
 from test_lm import ExactRoom
 
-from nbtrack.budget import StepBudget
-from nbtrack.camera import Intrinsics
 from nbtrack.cli import main
-from nbtrack.config import PRESETS, ScenesConfig
-from nbtrack.data import Sequence, read_sequence
-from nbtrack.data_convert import convert_sequence
-from nbtrack.data_writer import SequenceWriter
-from nbtrack.errors import ConfigError, DataError, MissingError
-from nbtrack.metrics import trajectory_metrics
-from nbtrack.readers import FORMATS, Format, open_recording, register
-from nbtrack.scenes import Scene, find_scene
-from nbtrack.tracking import track_sequence
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.config import PRESETS, ScenesConfig
+from nbtrack.core.errors import ConfigError, DataError, MissingError
+from nbtrack.data.convert import convert_sequence
+from nbtrack.data.readers import FORMATS, Format, open_recording, register
+from nbtrack.data.sequence import Sequence, read_sequence
+from nbtrack.data.writer import SequenceWriter
+from nbtrack.experiments.scenes import Scene, find_scene
+from nbtrack.tracking.budget import StepBudget
+from nbtrack.tracking.metrics import trajectory_metrics
+from nbtrack.tracking.sequence import track_sequence
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 LOSSY = ("replica", "scannet")  # colour is JPEG
@@ -291,7 +291,7 @@ def test_formats_are_told_apart(tmp_path: Path) -> None:
 
 def test_a_new_format_is_one_registration(tmp_path: Path, monkeypatch) -> None:
     """Catches formats listed anywhere but in the registry."""
-    monkeypatch.setattr("nbtrack.readers.base.FORMATS", formats := dict(FORMATS))
+    monkeypatch.setattr("nbtrack.data.readers.base.FORMATS", formats := dict(FORMATS))
     own = Format("own", "own", ("own.txt",), FORMATS["plain"].open)
     register(own)
     folder = write_recording("plain", tmp_path / "r")

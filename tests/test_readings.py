@@ -16,11 +16,11 @@ import pytest
 from recordings import Source, camera_matrix, matrix_text, write_images
 from scipy.spatial.transform import Rotation
 
-from nbtrack.camera import Intrinsics
 from nbtrack.cli import main
-from nbtrack.conventions import Convention
-from nbtrack.data import read_sequence
-from nbtrack.data_check import check_sequence
+from nbtrack.core.camera import Intrinsics
+from nbtrack.data.check import check_sequence
+from nbtrack.data.conventions import Convention
+from nbtrack.data.sequence import read_sequence
 from nbtrack.synthetic import (
     add_kinect_noise,
     build_room,
@@ -96,36 +96,37 @@ def scaled(camera: Intrinsics, factor: float) -> Intrinsics:
 
 MISTAKES = {
     "OpenGL axes": Mistake(
-        "poses look like OpenGL axes .*camera-to-world; set camera_axes = \"opengl\" in",
+        'poses look like OpenGL axes .*camera-to-world; set camera_axes = "opengl" in',
         poses=Convention("opengl").from_opencv,
     ),
     "OpenCV axes called OpenGL": Mistake(
-        "poses look like OpenCV axes .*; set camera_axes = \"opencv\" in",
+        'poses look like OpenCV axes .*; set camera_axes = "opencv" in',
         settings='camera_axes = "opengl"',
     ),
     "world-to-camera": Mistake(
-        "poses look like OpenCV axes .*world-to-camera; set poses = \"world-to-camera\" in",
+        'poses look like OpenCV axes .*world-to-camera; set poses = "world-to-camera" in',
         poses=Convention("opencv", True).from_opencv,
     ),
     "camera-to-world called the inverse": Mistake(
-        "poses look like OpenCV axes .*camera-to-world; set poses = \"camera-to-world\" in",
+        'poses look like OpenCV axes .*camera-to-world; set poses = "camera-to-world" in',
         settings='poses = "world-to-camera"',
     ),
     "OpenGL axes, world-to-camera": Mistake(
-        "set camera_axes = \"opengl\" and poses = \"world-to-camera\" in",
+        'set camera_axes = "opengl" and poses = "world-to-camera" in',
         poses=Convention("opengl", True).from_opencv,
     ),
     "robot axes": Mistake(
-        "poses look like robot axes .*; set camera_axes = \"forward left up\" in",
+        'poses look like robot axes .*; set camera_axes = "forward left up" in',
         poses=Convention("forward left up").from_opencv,
     ),
     "quaternions wxyz": Mistake(
-        "poses look like quaternions in the order wxyz; set quaternion = \"wxyz\" in",
+        'poses look like quaternions in the order wxyz; set quaternion = "wxyz" in',
         poses=rolled(1),
     ),
     "quaternions xyzw": Mistake(
-        "poses look like quaternions in the order xyzw; set quaternion = \"xyzw\" in",
-        settings='quaternion = "wxyz"', poses=rolled(-1),
+        'poses look like quaternions in the order xyzw; set quaternion = "xyzw" in',
+        settings='quaternion = "wxyz"',
+        poses=rolled(-1),
     ),
     "TUM's depth called millimetres": Mistake(
         "depth looks like 5000 depth values a metre; set depth_scale = 5000 in",
@@ -145,11 +146,11 @@ MISTAKES = {
         "depth looks like 1000 depth values a metre", settings="depth_scale = 5000000"
     ),
     "distances along the ray": Mistake(
-        "depth looks like distances along the ray, not z-depth; set depth_along = \"ray\" in",
+        'depth looks like distances along the ray, not z-depth; set depth_along = "ray" in',
         depth=lambda depth: np.rint(depth * ray_lengths(depth, CAMERA)),
     ),
     "z-depth called distances": Mistake(
-        "depth looks like depth along the optical axis; set depth_along = \"axis\" in",
+        'depth looks like depth along the optical axis; set depth_along = "axis" in',
         settings='depth_along = "ray"',
     ),
     "principal point in the corner": Mistake(

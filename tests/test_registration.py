@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.baking import bake_field
-from nbtrack.bounds import SceneBounds
-from nbtrack.config import FieldConfig
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.config import FieldConfig
+from nbtrack.core.geometry import make_transform, rotation_vector_to_matrix
 from nbtrack.fields import Field, make_field
-from nbtrack.geometry import make_transform, rotation_vector_to_matrix
-from nbtrack.registration import (
+from nbtrack.fields.grid import bake_field
+from nbtrack.tracking.registration import (
     LEAST_SCALES,
     Observation,
     Residuals,

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nbtrack.rendering import (
+from nbtrack.fields.rendering import (
     composite,
     importance_depths,
     stratified_depths,

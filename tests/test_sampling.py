@@ -8,16 +8,16 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.camera import Intrinsics, backproject
-from nbtrack.config import MappingConfig
-from nbtrack.data import Sequence
-from nbtrack.fields import LearnedField, Rays
-from nbtrack.geometry import transform_points
-from nbtrack.rendering import Rendering, composite, weights_from_density, weights_from_sdf
-from nbtrack.sampling import (
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import Intrinsics, backproject
+from nbtrack.core.config import MappingConfig
+from nbtrack.core.geometry import transform_points
+from nbtrack.data.pixels import PixelSampler, Rays
+from nbtrack.data.sequence import Sequence
+from nbtrack.fields import LearnedField
+from nbtrack.fields.rendering import Rendering, composite, weights_from_density, weights_from_sdf
+from nbtrack.fields.sampling import (
     NEAR,
-    PixelSampler,
     guided_depths,
     rays_end,
     render_in_two_passes,
@@ -144,7 +144,7 @@ def test_images_stay_on_the_host_where_the_device_is_full(monkeypatch: pytest.Mo
     """Catches a long sequence that is copied to a small device: images stay, as 5 bytes a pixel."""
     asked = []
     monkeypatch.setattr(
-        "nbtrack.sampling.has_room_for", lambda device, size: asked.append((device, size))
+        "nbtrack.data.pixels.has_room_for", lambda device, size: asked.append((device, size))
     )
     sampler = PixelSampler(random_sequence(3), torch.device("meta"))
     assert asked == [(torch.device("meta"), 5 * 3 * CAMERA.width * CAMERA.height)]

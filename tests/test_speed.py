@@ -3,11 +3,11 @@
 import torch
 from tiny import TINY
 
-from nbtrack.config import FieldConfig, TrackingConfig
-from nbtrack.data import read_sequence
-from nbtrack.scenes import find_scene
-from nbtrack.settings import resolve_preset, with_settings
-from nbtrack.speed import (
+from nbtrack.core.config import FieldConfig, TrackingConfig
+from nbtrack.core.settings import resolve_preset, with_settings
+from nbtrack.data.sequence import read_sequence
+from nbtrack.experiments.scenes import find_scene
+from nbtrack.experiments.speed import (
     forward_flops,
     measure_mapping,
     measure_step_times,

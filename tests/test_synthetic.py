@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from nbtrack.data import read_sequence
-from nbtrack.errors import ConfigError, DataError, MissingError
-from nbtrack.scenes import DATASET_SCENES
+from nbtrack.core.errors import ConfigError, DataError, MissingError
+from nbtrack.data.sequence import read_sequence
+from nbtrack.experiments.scenes import DATASET_SCENES
 from nbtrack.synthetic import (
     REPORTED_ROOMS,
     ROOMS,

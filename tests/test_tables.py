@@ -8,15 +8,16 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from nbtrack.comparison import (
+from nbtrack.core.errors import DataError, MissingError
+from nbtrack.core.paths import PAPER_TABLES, PROJECT_ROOT
+from nbtrack.tables.comparison import (
     beside_published,
     compare_table_1,
     compare_table_2,
     summarize_table_1,
     write_comparisons,
 )
-from nbtrack.errors import DataError, MissingError
-from nbtrack.latex import (
+from nbtrack.tables.latex import (
     TableNotes,
     escape_latex,
     latex_table_1,
@@ -24,9 +25,7 @@ from nbtrack.latex import (
     write_published,
     write_tables,
 )
-from nbtrack.paths import PAPER_TABLES, PROJECT_ROOT
-from nbtrack.table_styles import style_table_1, style_table_2
-from nbtrack.tables import (
+from nbtrack.tables.layout import (
     COLUMNS_1,
     COLUMNS_2,
     average_over_seeds,
@@ -43,6 +42,7 @@ from nbtrack.tables import (
     table_1,
     table_2,
 )
+from nbtrack.tables.styles import style_table_1, style_table_2
 
 PAPER_SOURCE = PROJECT_ROOT / ".." / "shared" / "reference" / "paper.tex"
 
@@ -168,7 +168,7 @@ def test_golden_files(tmp_path: Path) -> None:
     """Catches committed LaTeX that was edited by hand or not written anew."""
     for path in write_published(tmp_path):
         committed = PAPER_TABLES / "published" / path.name
-        assert path.read_bytes() == committed.read_bytes(), "run nbtrack.latex.write_published()"
+        assert path.read_bytes() == committed.read_bytes(), "run write_published()"
 
 
 def test_layout_of_our_own_cells() -> None:

@@ -11,18 +11,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.budget import StepBudget
-from nbtrack.camera import Intrinsics, pixel_directions
-from nbtrack.config import TrackingConfig
-from nbtrack.data import Sequence
-from nbtrack.errors import ConfigError, DataError, NumericalError
-from nbtrack.fields.base import LearnedField, Rays
-from nbtrack.motion_models import motion_model
-from nbtrack.rendering import Rendering, composite, weights_from_density, weights_from_sdf
-from nbtrack.sampling import PixelSampler
-from nbtrack.trackers import TRACKERS, tracker_class
-from nbtrack.tracking import track_sequence
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import Intrinsics, pixel_directions
+from nbtrack.core.config import TrackingConfig
+from nbtrack.core.errors import ConfigError, DataError, NumericalError
+from nbtrack.data.pixels import PixelSampler, Rays
+from nbtrack.data.sequence import Sequence
+from nbtrack.fields.base import LearnedField
+from nbtrack.fields.rendering import Rendering, composite, weights_from_density, weights_from_sdf
+from nbtrack.tracking.budget import StepBudget
+from nbtrack.tracking.motion_models import motion_model
+from nbtrack.tracking.sequence import track_sequence
+from nbtrack.tracking.trackers import TRACKERS, tracker_class
 
 HALF = torch.tensor([1.0, 0.8, 1.2])  # half sides of the room, m
 SHIFT = 0.03  # m behind the wall at which the density is half its largest
@@ -171,7 +171,7 @@ def test_a_killed_run_goes_on_as_if_it_had_not_stopped(
     sequence = box_sequence([[0.004 * i, 0.0, 0.002 * i] for i in range(6)])
     field = BoxRoom(as_density=name == "vr").requires_grad_(False)
     whole = track_sequence(name, field, sequence, StepBudget(2.4), config_of(name))
-    monkeypatch.setattr("nbtrack.tracking.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("nbtrack.tracking.sequence.CHECKPOINT_SECONDS", 0.0)
     checkpoint, frames = tmp_path / "run.pt", []
 
     def die_at_four(frame: int, error: float) -> None:
@@ -217,9 +217,7 @@ def test_errors_name_the_frame() -> None:
         track_sequence("sdf", field, sequence, StepBudget(2), config_of("sdf"))
     sequence.depths_mm[:] = 0
     with pytest.raises(DataError, match="no frame of box has a measured depth"):
-        track_sequence(
-            "sdf", BoxRoom(as_density=False), sequence, StepBudget(1), config_of("sdf")
-        )
+        track_sequence("sdf", BoxRoom(as_density=False), sequence, StepBudget(1), config_of("sdf"))
 
 
 @pytest.mark.parametrize("name", ["vr", "sdf"])

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nbtrack.errors import DataError, MissingError
-from nbtrack.storage import write_bytes_atomic, write_json_atomic, write_text_atomic
-from nbtrack.trajectories import read_tum, write_tum
+from nbtrack.core.errors import DataError, MissingError
+from nbtrack.core.files import write_bytes_atomic, write_json_atomic, write_text_atomic
+from nbtrack.tracking.trajectories import read_tum, write_tum
 
 GOOD_LINE = "0.5 1 2 3 0 0 0 1"
 

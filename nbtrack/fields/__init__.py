@@ -3,12 +3,12 @@
 import importlib
 import pkgutil
 
+from nbtrack.data.pixels import Rays
 from nbtrack.fields.base import (
     FIELDS,
     Field,
     LearnedField,
     Linearization,
-    Rays,
     field_class,
     make_field,
     supervised_field,

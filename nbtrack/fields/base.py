@@ -9,31 +9,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.config import FieldConfig, MappingConfig
-from nbtrack.data import Sequence
-from nbtrack.errors import ConfigError, nearest_name
-from nbtrack.rendering import Rendering
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.config import FieldConfig, MappingConfig
+from nbtrack.core.errors import ConfigError, nearest_name
+from nbtrack.data.pixels import Rays
+from nbtrack.data.sequence import Sequence
+from nbtrack.fields.rendering import Rendering
 
 LUMA = torch.tensor([0.299, 0.587, 0.114])
 """Weights of red, green and blue in the intensity that trackers compare (ITU-R BT.601)."""
-
-
-@dataclass(frozen=True)
-class Rays:
-    """Rays through pixels, with what the camera measured there."""
-
-    origins_world: Float[Tensor, "rays 3"]
-    directions_world: Float[Tensor, "rays 3"]  # z = 1 in the camera frame: steps are z-depths
-    color: Float[Tensor, "rays 3"]  # measured, in [0, 1]
-    depth: Float[Tensor, "rays"]  # measured z-depth (m), 0 = no measurement
-    # Distance (m) from the measured surface's tangent plane that one metre of z-depth makes: below
-    # the ray's length by the cosine of incidence. 0 where not known; None where not asked for.
-    plane_distance_per_depth: Float[Tensor, "rays"] | None = None
-
-    def points(self, depths: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples 3"]:
-        """World points (m) at z-depths along the rays."""
-        return self.origins_world[:, None] + depths[..., None] * self.directions_world[:, None]
 
 
 @dataclass(frozen=True)
@@ -84,9 +68,7 @@ class Field(nn.Module, abc.ABC):
             intensity = color @ LUMA.to(color)
             (value_gradient,) = torch.autograd.grad(value.sum(), points, retain_graph=True)
             (intensity_gradient,) = torch.autograd.grad(intensity.sum(), points)
-        return Linearization(
-            value.detach(), value_gradient, intensity.detach(), intensity_gradient
-        )
+        return Linearization(value.detach(), value_gradient, intensity.detach(), intensity_gradient)
 
     @property
     @abc.abstractmethod

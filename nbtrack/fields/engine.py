@@ -170,9 +170,7 @@ class FrozenMlp(nn.Module):
             activate(before, outputs[layer])
         torch.addmm(self.biases[4], hidden, self.weights[4], out=out)
 
-    def _pull_back(
-        self, slopes: Float[Tensor, "k m 4"], tape: _Tape
-    ) -> Float[Tensor, "k m 3"]:
+    def _pull_back(self, slopes: Float[Tensor, "k m 4"], tape: _Tape) -> Float[Tensor, "k m 3"]:
         """Spatial gradients (1/m) of k functions, from their derivatives by the raw outputs."""
         n_functions, n_rows = slopes.shape[:2]
         scratch = self._scratch(n_rows, n_functions)

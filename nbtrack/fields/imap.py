@@ -4,11 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.config import FieldConfig, MappingConfig
-from nbtrack.fields.base import Batch, LearnedField, Rays, measured_mean, register_field
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.config import FieldConfig, MappingConfig
+from nbtrack.data.pixels import Rays
+from nbtrack.fields.base import Batch, LearnedField, measured_mean, register_field
 from nbtrack.fields.mlp import FourierMlp
-from nbtrack.rendering import Rendering, composite, weights_from_density
+from nbtrack.fields.rendering import Rendering, composite, weights_from_density
 
 # Density (1/m) of one unit of network output: surfaces need hundreds per metre, networks like
 # outputs near one. Source of the factor: vMAP's re-implementation of iMAP.

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.config import FieldConfig
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.config import FieldConfig
 
 
 class FourierMlp(nn.Module):

@@ -4,20 +4,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.config import FieldConfig, MappingConfig
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.config import FieldConfig, MappingConfig
+from nbtrack.data.pixels import Rays
 from nbtrack.fields.base import (
     LUMA,
     Batch,
     LearnedField,
     Linearization,
-    Rays,
     measured_mean,
     register_field,
 )
 from nbtrack.fields.engine import FrozenMlp
 from nbtrack.fields.mlp import FourierMlp
-from nbtrack.rendering import Rendering, composite, weights_from_sdf
+from nbtrack.fields.rendering import Rendering, composite, weights_from_sdf
 
 
 @register_field
@@ -117,9 +117,7 @@ class NeuSField(LearnedField):
         """
         points = batch.rays.points(batch.depths).flatten(0, 1)
         n_points = max(1, round(config.eikonal_share * len(points)))
-        chosen = torch.randint(
-            len(points), (n_points,), generator=generator, device=points.device
-        )
+        chosen = torch.randint(len(points), (n_points,), generator=generator, device=points.device)
         _, gradient = self.sdf_gradient(points[chosen], create_graph=True)
         return (gradient.norm(dim=-1) - 1).square().mean()
 

@@ -5,11 +5,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nbtrack.config import MappingConfig
-from nbtrack.data import Sequence
-from nbtrack.fields.base import Batch, Rays, measured_mean, register_field
+from nbtrack.core.config import MappingConfig
+from nbtrack.data.pixels import Rays
+from nbtrack.data.sequence import Sequence
+from nbtrack.fields.base import Batch, measured_mean, register_field
 from nbtrack.fields.neus import NeuSField, rendered_losses
-from nbtrack.observed_distance import ObservedDistance
+from nbtrack.fields.observed_distance import ObservedDistance
 
 
 @register_field
@@ -46,9 +47,7 @@ class NeuSPlusField(NeuSField):
             "eikonal": config.lambda_eikonal * self._eikonal(batch, config, generator),
         }
 
-    def _surface_losses(
-        self, surface: Rays, config: MappingConfig
-    ) -> dict[str, Float[Tensor, ""]]:
+    def _surface_losses(self, surface: Rays, config: MappingConfig) -> dict[str, Float[Tensor, ""]]:
         """At measured points the distance is zero, and the colour is that of the pixel."""
         color, sdf = self(surface.points(surface.depth[:, None])[:, 0])
         measured = (surface.depth > 0).float()

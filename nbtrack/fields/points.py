@@ -8,11 +8,11 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.config import FieldConfig
-from nbtrack.data import Sequence
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.config import FieldConfig
+from nbtrack.data.sequence import Sequence
 from nbtrack.fields.base import Field, register_field
-from nbtrack.fusion import fuse_points
+from nbtrack.fields.fusion import fuse_points
 
 
 @register_field

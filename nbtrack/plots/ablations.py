@@ -4,8 +4,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from nbtrack.fields import field_class
-from nbtrack.metrics import LOST_THRESHOLD_M
 from nbtrack.plots.style import label_few, method_colors, new_figure, styled
+from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 _LINES = {"more steps": ("-", "o"), "larger steps": (":", "s")}
 
@@ -15,7 +15,7 @@ def plot_reach(table: pd.DataFrame, title: str = "") -> Figure:
     """ATE (cm) against how far Adam can move the camera in a frame (mm), a panel a method.
 
     Args:
-        table: from `nbtrack.ablations.learning_rate_and_steps`.
+        table: from `nbtrack.experiments.ablations.learning_rate_and_steps`.
     """
     methods = list(table["method"].unique())
     colors = method_colors(methods)
@@ -43,7 +43,7 @@ def plot_quality_over_time(curves: pd.DataFrame, target_m: float, title: str = "
     """Error of held-out depth (cm) against mapping time (s), a line a field.
 
     Args:
-        curves: from `nbtrack.ablations.quality_over_time`.
+        curves: from `nbtrack.experiments.ablations.quality_over_time`.
         target_m: error (m) to mark: the best that all fields reach.
     """
     figure = new_figure(title, 3.4)

@@ -4,8 +4,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from nbtrack.metrics import LOST_THRESHOLD_M
 from nbtrack.plots.style import label_few, method_colors, new_figure, styled
+from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 _MARKERS = "osD^vPX"
 
@@ -15,7 +15,7 @@ def plot_speed_accuracy(points: pd.DataFrame, title: str = "") -> Figure:
     """ATE (cm) against time a frame (ms), both logarithmic, a point a method; lower left is better.
 
     Args:
-        points: from `nbtrack.beyond.speed_and_accuracy`.
+        points: from `nbtrack.experiments.beyond.speed_and_accuracy`.
     """
     figure = new_figure(title, 3.6)
     axes = figure.subplots()
@@ -38,7 +38,7 @@ def plot_basin(shares: pd.DataFrame, title: str = "") -> Figure:
     """Share of starts that converged against how far off they were, a line a method.
 
     Args:
-        shares: from `nbtrack.basin.share_recovered`.
+        shares: from `nbtrack.experiments.basin.share_recovered`.
     """
     figure = new_figure(title, 3.2)
     axes = figure.subplots()
@@ -61,7 +61,7 @@ def plot_ingredients(table: pd.DataFrame, title: str = "") -> Figure:
     """ATE (cm) of LM with one thing changed at a time, a group of bars a stride.
 
     Args:
-        table: from `nbtrack.beyond.what_each_ingredient_adds`, of one scene.
+        table: from `nbtrack.experiments.beyond.what_each_ingredient_adds`, of one scene.
     """
     figure = new_figure(title, 3.4)
     strides = list(table["stride"].unique())

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from nbtrack.metrics import LOST_THRESHOLD_M
 from nbtrack.plots.style import method_colors, new_figure, styled
-from nbtrack.tables import PAPER_SCENE_LABELS
+from nbtrack.tables.layout import PAPER_SCENE_LABELS
+from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 _PANELS_A_ROW = 5
 _STEP_PANELS_A_ROW = 2  # each holds a legend of two columns

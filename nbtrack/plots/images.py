@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from scipy.spatial.transform import Rotation
 
-from nbtrack.data import Sequence
+from nbtrack.data.sequence import Sequence
+from nbtrack.fields.views import View
 from nbtrack.plots.style import NOT_MEASURED, WIDTH, bare, new_figure, styled
-from nbtrack.views import View
 
 _COLUMNS = (
     "observed colour", "rendered colour", "observed depth", "rendered depth", "|depth error|",

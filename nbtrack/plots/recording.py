@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from nbtrack.data_scan import Cloud
+from nbtrack.data.scan import Cloud
 from nbtrack.plots.style import TRUE_COLOR, camera_positions, new_figure, styled
 from nbtrack.plots.top_view import TopView
 

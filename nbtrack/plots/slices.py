@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from nbtrack.bounds import SceneBounds
-from nbtrack.data import Sequence
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.data.sequence import Sequence
 from nbtrack.fields import Field
-from nbtrack.meshes import query_field, seen_by
+from nbtrack.mapping.meshes import query_field, seen_by
 from nbtrack.plots.style import TRUE_COLOR, WIDTH, camera_positions, new_figure, styled
 from nbtrack.plots.top_view import Y_UP, Direction, TopView
 from nbtrack.synthetic import Room

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from nbtrack.trackers import TRACKERS
+from nbtrack.tracking.trackers import TRACKERS
 
 TRUE_COLOR, TRACKED_COLOR = "#1a9641", "#d7191c"
 """Green and red of the true and the tracked trajectory, as in the paper's first figure."""

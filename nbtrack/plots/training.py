@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import pandas as pd
 from matplotlib.figure import Figure
 
-from nbtrack.errors import DataError
+from nbtrack.core.errors import DataError
 from nbtrack.plots.style import METHOD_COLORS, method_colors, new_figure, styled
 
 _CENTIMETRES = 100

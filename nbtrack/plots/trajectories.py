@@ -11,8 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from nbtrack.data import FRAMES_PER_SECOND
-from nbtrack.metrics import LOST_THRESHOLD_M
+from nbtrack.data.sequence import FRAMES_PER_SECOND
 from nbtrack.plots.style import (
     TRUE_LABEL,
     WIDTH,
@@ -23,6 +22,7 @@ from nbtrack.plots.style import (
     styled,
 )
 from nbtrack.plots.top_view import Y_UP, Direction, TopView
+from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 _CENTIMETRES = 100
 _MESH_COLOR = "#b9b9b9"

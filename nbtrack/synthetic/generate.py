@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
-from nbtrack.camera import Intrinsics
-from nbtrack.data_writer import SequenceWriter
-from nbtrack.errors import ConfigError, DataError
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.errors import ConfigError, DataError
+from nbtrack.data.writer import SequenceWriter
 from nbtrack.synthetic.motion import handheld_trajectory
 from nbtrack.synthetic.render import render_frame
 from nbtrack.synthetic.room import Room

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
-from nbtrack.errors import ConfigError, NumericalError
+from nbtrack.core.errors import ConfigError, NumericalError
 from nbtrack.synthetic.room import Room, Walk
 
 Signal = Float[np.ndarray, "n"]

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from nbtrack.camera import Intrinsics
+from nbtrack.core.camera import Intrinsics
 from nbtrack.synthetic.closed_forms import Points, Values
 from nbtrack.synthetic.room import Room
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from nbtrack.errors import NumericalError
+from nbtrack.core.errors import NumericalError
 from nbtrack.synthetic.closed_forms import Origins, Points, Values, row_dot
 from nbtrack.synthetic.materials import Light, Material
 from nbtrack.synthetic.primitives import Solid

@@ -6,7 +6,7 @@ walls, so that a camera at head height finds free space in the middle.
 
 from collections.abc import Callable
 
-from nbtrack.errors import MissingError, nearest_name
+from nbtrack.core.errors import MissingError, nearest_name
 from nbtrack.synthetic.room import Room
 from nbtrack.synthetic.rooms.bare import gallery
 from nbtrack.synthetic.rooms.connected import long_hall, two_rooms

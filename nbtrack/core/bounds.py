@@ -1,0 +1,56 @@
+"""The axis-aligned box of a scene: where fields live and where rays end."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class SceneBounds:
+    """Axis-aligned box in the world frame, metres."""
+
+    minimum: tuple[float, float, float]
+    maximum: tuple[float, float, float]
+
+    @property
+    def center(self) -> Float[np.ndarray, "3"]:
+        """Middle of the box, world frame."""
+        return (np.array(self.minimum) + np.array(self.maximum)) / 2
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Half of the longest side: it maps the box into [-1, 1]^3 without changing its shape."""
+        return float((np.array(self.maximum) - np.array(self.minimum)).max() / 2)
+
+    def contain(self, points_world: Float[Tensor, "n 3"], margin: float = 0.0) -> Bool[Tensor, "n"]:
+        """Whether points (m) lie inside the box, or no farther than `margin` metres from it."""
+        low, high = _corners(self, points_world.device, points_world.dtype)
+        return ((points_world >= low - margin) & (points_world <= high + margin)).all(dim=-1)
+
+    def exit_depth(
+        self, origins_world: Float[Tensor, "rays 3"], directions_world: Float[Tensor, "rays 3"]
+    ) -> Float[Tensor, "rays"]:
+        """Where rays from inside leave the box, in units of the direction (z-depth, m, for z = 1).
+
+        Rays that start outside, as a lost camera's do, may give small or negative values.
+        """
+        # An axis that a ray runs along is left at infinity, never at 0/0.
+        safe = torch.where(directions_world.abs() < 1e-9, 1e-9, directions_world)
+        low, high = _corners(self, origins_world.device, origins_world.dtype)
+        to_minimum, to_maximum = (low - origins_world) / safe, (high - origins_world) / safe
+        return torch.maximum(to_minimum, to_maximum).amin(dim=-1)
+
+
+@cache
+def _corners(
+    bounds: SceneBounds, device: torch.device, dtype: torch.dtype
+) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Both corners on a device, copied there once."""
+    return (
+        torch.tensor(bounds.minimum, device=device, dtype=dtype),
+        torch.tensor(bounds.maximum, device=device, dtype=dtype),
+    )

@@ -1,0 +1,124 @@
+"""Which device does the work, and with how many threads."""
+
+import contextlib
+import os
+import platform
+from collections.abc import Iterator
+
+import torch
+
+from nbtrack.core.errors import ConfigError, OutOfMemory
+
+# Below this width matrix products are too small to share: on two cores, two threads were slower
+# than one. Rooms and methods then run side by side in processes instead.
+_WIDTH_FOR_THREADS = 192
+
+
+def choose_device() -> torch.device:
+    """The device that `NBTRACK_DEVICE` names, else the first there is of CUDA, MPS and the CPU.
+
+    Raises:
+        ConfigError: the named device is unknown, or not there.
+    """
+    name = os.environ.get("NBTRACK_DEVICE")
+    if name:
+        return named_device(name)
+    if torch.cuda.is_available():
+        return torch.device("cuda")
+    if torch.backends.mps.is_available():
+        return torch.device("mps")
+    return torch.device("cpu")
+
+
+def device_name(device: torch.device) -> str:
+    """What to call the device in results: the GPU's name, or the processor's and its cores."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    if device.type == "mps":
+        return f"Apple GPU ({platform.machine()})"
+    return f"{_processor_name()}, {os.cpu_count()} cores"
+
+
+def named_device(name: str) -> torch.device:
+    """A device by its name. Raises ConfigError, saying what there is, if it is not there."""
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError):
+        there = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+        there += ["mps"] if torch.backends.mps.is_available() else []
+        raise ConfigError(
+            f"device {name!r} is not there: this machine has {', '.join(there)}"
+        ) from None
+    return device
+
+
+@contextlib.contextmanager
+def suitable_threads(width: int) -> Iterator[None]:
+    """Run a block with the number of CPU threads that suits a network's width.
+
+    Narrow networks get one, wide ones as many as the process already has.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1 if width < _WIDTH_FOR_THREADS else before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def has_room_for(device: torch.device, n_bytes: int) -> bool:
+    """Whether a GPU could hold so much more and keep as much again free for the work itself."""
+    if device.type != "cuda":
+        return True  # the CPU's and Apple's memory is the one that the data are in already
+    free_bytes, _ = torch.cuda.mem_get_info(device)
+    # What torch keeps for later is free for us as well.
+    kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return 2 * n_bytes < free_bytes + kept
+
+
+@contextlib.contextmanager
+def naming_what_to_lower(setting: str) -> Iterator[None]:
+    """Turn running out of memory into one line that names the setting to lower.
+
+    Args:
+        setting: what decides on the memory, with its present value.
+
+    Raises:
+        OutOfMemory: the block ran out of the device's or the host's memory.
+    """
+    try:
+        yield
+    except OutOfMemory:
+        raise  # somebody nearer has named the setting
+    except (RuntimeError, MemoryError) as error:
+        if not _is_out_of_memory(error):
+            raise
+        raise OutOfMemory(
+            f"out of memory with {setting}: lower it with --set, or use a device with more; what "
+            "was finished is kept"
+        ) from None
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    # Only CUDA has a class of its own for it; the CPU's allocator and MPS say it in words.
+    words = ("can't allocate memory", "not enough memory", "out of memory")
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or any(
+        word in str(error) for word in words
+    )
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait until everything queued on the device is done, so that a clock reading means it."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    elif device.type == "mps":
+        torch.mps.synchronize()
+
+
+def _processor_name() -> str:
+    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
+        for line in lines:
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
