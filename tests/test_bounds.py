@@ -7,16 +7,16 @@ import torch
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
-from nbtrack.data.sequence import Sequence, observed_bounds
+from nbtrack.data.sequence import RgbdSequence, observed_bounds
 
 UNIT = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 # 90 degrees wide and high: the corner pixels' centers are seen at 19/20 of the half width.
 CAMERA = Intrinsics.from_focal(20, 20, 10.0)
 
 
-def facing_walls(depths_mm: np.ndarray, poses: np.ndarray) -> Sequence:
+def facing_walls(depths_mm: np.ndarray, poses: np.ndarray) -> RgbdSequence:
     """A sequence of black images with given depth."""
-    return Sequence(
+    return RgbdSequence(
         "room", CAMERA, np.zeros((*depths_mm.shape, 3), np.uint8), depths_mm.astype(np.uint16),
         poses, np.arange(len(poses)),
     )  # fmt: skip

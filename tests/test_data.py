@@ -13,7 +13,7 @@ from nbtrack.core.camera import Intrinsics, swap_opengl_opencv
 from nbtrack.core.errors import DataError, MissingError, NbtrackError
 from nbtrack.data.images import read_image
 from nbtrack.data.readers.neural_rgbd import read_focal, read_poses
-from nbtrack.data.sequence import Sequence, parse_frames, read_sequence
+from nbtrack.data.sequence import RgbdSequence, parse_frames, read_sequence
 from nbtrack.data.writer import SequenceWriter
 
 CAMERA = Intrinsics.from_focal(12, 8, 10.123456789012345)
@@ -66,7 +66,7 @@ def test_round_trip(tmp_path: Path) -> None:
     assert sequence.intrinsics == CAMERA
     assert sequence.frame_ids.tolist() == list(range(13))
     assert (sequence.name, len(sequence), sequence.excluded_frames) == ("scene", 13, 0)
-    assert repr(sequence) == "Sequence('scene', 13 frames of 12x8)"
+    assert repr(sequence) == "RgbdSequence('scene', 13 frames of 12x8)"
 
 
 def test_file_holds_opengl_axes(scene: Path) -> None:
@@ -337,7 +337,7 @@ def test_writer_clears_what_a_killed_one_left(tmp_path: Path) -> None:
     with SequenceWriter(tmp_path / "scene", CAMERA, ("depth",)) as writer:
         writer.add(colors[0], {"depth": depths[0, 0]}, poses[0])
     sequence = read_sequence(tmp_path / "scene")
-    assert isinstance(sequence, Sequence)
+    assert isinstance(sequence, RgbdSequence)
     assert np.array_equal(sequence.colors, colors[:1])
 
 

@@ -7,7 +7,7 @@ import threading
 import pytest
 import torch
 
-from nbtrack.core.device import choose_device, has_room_for, naming_what_to_lower
+from nbtrack.core.device import advise_on_memory, choose_device, has_room_for
 from nbtrack.core.device_lock import alone_on, beside_others_on
 from nbtrack.core.errors import ConfigError, OutOfMemory
 
@@ -28,16 +28,16 @@ def test_running_out_of_memory_names_the_setting() -> None:
     """Catches a page of torch's allocator in place of one line; the allocation here is real."""
     with (
         pytest.raises(OutOfMemory, match=r"out of memory with mapping.neus.n_rays=9: lower it"),
-        naming_what_to_lower("mapping.neus.n_rays=9"),
+        advise_on_memory("mapping.neus.n_rays=9"),
     ):
         torch.empty(2**55)
-    with pytest.raises(OutOfMemory), naming_what_to_lower("x"):
+    with pytest.raises(OutOfMemory), advise_on_memory("x"):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
 
 
 def test_other_errors_keep_their_name() -> None:
     """Catches a wrong shape that is called a lack of memory."""
-    with pytest.raises(RuntimeError, match="size of tensor"), naming_what_to_lower("x"):
+    with pytest.raises(RuntimeError, match="size of tensor"), advise_on_memory("x"):
         torch.ones(2) + torch.ones(3)
 
 

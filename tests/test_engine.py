@@ -12,7 +12,7 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.config import FieldConfig, TrackingConfig
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.pixels import PixelSampler, Rays
-from nbtrack.data.sequence import Sequence, read_sequence
+from nbtrack.data.sequence import RgbdSequence, read_sequence
 from nbtrack.fields import make_field
 from nbtrack.fields.engine import _CHUNK_ROWS, PULL_BACKS, FrozenMlp, frozen
 from nbtrack.synthetic import make_room
@@ -25,7 +25,7 @@ TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 
 
 @pytest.fixture(scope="module")
-def sequence(tmp_path_factory) -> Sequence:
+def sequence(tmp_path_factory) -> RgbdSequence:
     folder = tmp_path_factory.mktemp("engine") / "office"
     make_room("office", folder, 4, 32, 24, 0, 1)
     return read_sequence(folder)

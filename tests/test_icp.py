@@ -13,7 +13,7 @@ from nbtrack.core.config import FieldConfig, MappingConfig, TrackingConfig
 from nbtrack.core.errors import DataError, MissingError
 from nbtrack.core.geometry import rotation_vector_to_matrix
 from nbtrack.data.pixels import PixelSampler
-from nbtrack.data.sequence import Sequence, read_sequence
+from nbtrack.data.sequence import RgbdSequence, read_sequence
 from nbtrack.fields import make_field
 from nbtrack.fields.fusion import fuse_points
 from nbtrack.mapping.fit import FittedMap, load_map, map_sequence, split_holdout
@@ -27,13 +27,13 @@ NETWORK, MAPPING, TRACKING = FieldConfig(), MappingConfig(), TrackingConfig()
 BOX = SceneBounds((-1.0, -1.0, 0.0), (1.0, 1.0, 3.0))
 
 
-def two_pixel_sequence(depths_mm: list[list[int]], shades: list[list[int]]) -> Sequence:
+def two_pixel_sequence(depths_mm: list[list[int]], shades: list[list[int]]) -> RgbdSequence:
     """Frames of two pixels side by side, from one camera at the origin; grey by pixel.
 
     The pixels' directions are (-0.25, 0, 1) and (0.25, 0, 1).
     """
     shape = (len(depths_mm), 1, 2)
-    return Sequence(
+    return RgbdSequence(
         "two pixels", Intrinsics(2, 1, 2.0, 2.0, 1.0, 0.5),
         np.repeat(np.array(shades, np.uint8).reshape(*shape, 1), 3, axis=3),
         np.array(depths_mm, np.uint16).reshape(shape),
@@ -42,7 +42,7 @@ def two_pixel_sequence(depths_mm: list[list[int]], shades: list[list[int]]) -> S
 
 
 @pytest.fixture(scope="module")
-def room_sequence(tmp_path_factory: pytest.TempPathFactory) -> Sequence:
+def room_sequence(tmp_path_factory: pytest.TempPathFactory) -> RgbdSequence:
     """A few clean frames of a furnished room."""
     folder = tmp_path_factory.mktemp("data") / "bedroom"
     make_room("bedroom", folder, 12, 96, 72)
@@ -50,7 +50,7 @@ def room_sequence(tmp_path_factory: pytest.TempPathFactory) -> Sequence:
 
 
 @pytest.fixture(scope="module")
-def room_map(room_sequence: Sequence) -> FittedMap:
+def room_map(room_sequence: RgbdSequence) -> FittedMap:
     return map_sequence("points", room_sequence, NETWORK, MAPPING)
 
 
@@ -94,7 +94,7 @@ def test_field_answers_for_the_nearest_point() -> None:
     assert field(torch.tensor([[-0.25, 0.0, 1.5]]))[1].item() == pytest.approx(0.5)
 
 
-def test_held_out_frames_are_not_mapped(room_sequence: Sequence, room_map: FittedMap) -> None:
+def test_held_out_frames_are_not_mapped(room_sequence: RgbdSequence, room_map: FittedMap) -> None:
     """Catches a map that ignores `holdout_every`: it must be that of the other frames alone."""
     mapped, held_out = split_holdout(len(room_sequence), MAPPING.holdout_every)
     assert len(held_out) > 0
@@ -103,7 +103,7 @@ def test_held_out_frames_are_not_mapped(room_sequence: Sequence, room_map: Fitte
 
 
 def test_loaded_map_is_the_same_and_tracks_the_same(
-    room_sequence: Sequence, tmp_path: Path
+    room_sequence: RgbdSequence, tmp_path: Path
 ) -> None:
     """Catches a checkpoint that cannot hold any number of points, or loses their order."""
     checkpoint, seen = tmp_path / "map.pt", []
@@ -130,7 +130,7 @@ def test_loaded_map_is_the_same_and_tracks_the_same(
     assert np.array_equal(first, second)
 
 
-def test_scores_of_points(room_sequence: Sequence, room_map: FittedMap) -> None:
+def test_scores_of_points(room_sequence: RgbdSequence, room_map: FittedMap) -> None:
     """Catches images asked of points, and points off the exact surface: depth here is clean."""
     mapped, held_out = split_holdout(len(room_sequence), MAPPING.holdout_every)
     room = build_room("bedroom")
@@ -144,7 +144,7 @@ def test_scores_of_points(room_sequence: Sequence, room_map: FittedMap) -> None:
     assert set(unknown.to_dict().values()) == {None}
 
 
-def test_icp_lands_on_the_true_pose(room_sequence: Sequence, room_map: FittedMap) -> None:
+def test_icp_lands_on_the_true_pose(room_sequence: RgbdSequence, room_map: FittedMap) -> None:
     """Catches a pose taken for its inverse, or wrong axes: from 5 cm and 3 degrees off."""
     pytest.importorskip("small_gicp")
     sampler = PixelSampler(room_sequence, torch.device("cpu"))
@@ -168,7 +168,7 @@ def test_icp_lands_on_the_true_pose(room_sequence: Sequence, room_map: FittedMap
     assert not tracker.report()["lost"]
 
 
-def test_icp_says_when_it_is_lost(room_sequence: Sequence, room_map: FittedMap) -> None:
+def test_icp_says_when_it_is_lost(room_sequence: RgbdSequence, room_map: FittedMap) -> None:
     """Catches a crash, or a pose that is no number, where no point has a partner."""
     pytest.importorskip("small_gicp")
     sampler = PixelSampler(room_sequence, torch.device("cpu"))
@@ -184,7 +184,7 @@ def test_icp_says_when_it_is_lost(room_sequence: Sequence, room_map: FittedMap) 
 
 
 def test_missing_package_is_one_line(
-    room_sequence: Sequence, room_map: FittedMap, monkeypatch: pytest.MonkeyPatch
+    room_sequence: RgbdSequence, room_map: FittedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a traceback where the optional package is not installed."""
     monkeypatch.setitem(sys.modules, "small_gicp", None)

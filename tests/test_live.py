@@ -10,7 +10,7 @@ from test_tracking import BoxRoom, box_sequence, config_of
 
 from nbtrack.core.config import PRESETS, TrackingConfig
 from nbtrack.core.errors import ConfigError, DataError
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.grid import bake_field
 from nbtrack.tracking.budget import StepBudget
 from nbtrack.tracking.live import LiveTracker
@@ -19,19 +19,19 @@ from nbtrack.tracking.sequence import track_sequence
 LM = replace(PRESETS["paper"].tracking["lm"], n_restarts=2)
 
 
-def walk(n_frames: int = 6) -> Sequence:
+def walk(n_frames: int = 6) -> RgbdSequence:
     """A camera that moves by 6 mm a frame in the box."""
     return box_sequence([[0.006 * i, 0.003 * i, 0.0] for i in range(n_frames)])
 
 
-def live(sequence: Sequence, name: str = "lm", **settings: object) -> LiveTracker:
+def live(sequence: RgbdSequence, name: str = "lm", **settings: object) -> LiveTracker:
     """A tracker at the sequence's first pose."""
     field = BoxRoom(as_density=name == "vr").requires_grad_(False)
     settings = {"steps": 20, "config": LM if name == "lm" else config_of(name)} | settings
     return LiveTracker(field, sequence.intrinsics, sequence.T_world_camera[0], name, **settings)
 
 
-def error_m(found: np.ndarray, sequence: Sequence, index: int) -> float:
+def error_m(found: np.ndarray, sequence: RgbdSequence, index: int) -> float:
     return float(np.linalg.norm(found[:3, 3] - sequence.T_world_camera[index, :3, 3]))
 
 
@@ -118,7 +118,7 @@ def test_a_baked_field_and_a_restart() -> None:
     assert len(tracker.T_world_camera) == 2
 
 
-def exact_walk() -> tuple[torch.nn.Module, Sequence]:
+def exact_walk() -> tuple[torch.nn.Module, RgbdSequence]:
     """A furnished room with exact distances, and three frames in it, again and again."""
     field, sequence = furnished()
     return field, sequence.select(np.array([0, 1, 2, 1, 0, 1, 2, 1]))

@@ -14,7 +14,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.config import PRESETS
 from nbtrack.core.geometry import rotation_angle, rotation_vector_to_matrix
 from nbtrack.data.pixels import PixelSampler
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.synthetic import build_room, render_frame
 from nbtrack.tracking.budget import StepBudget
@@ -79,7 +79,7 @@ class Corridor(Field):
 
 
 @cache
-def furnished() -> tuple[ExactRoom, Sequence]:
+def furnished() -> tuple[ExactRoom, RgbdSequence]:
     """The living room from three poses of one hand-held stretch; colours as `color_at` says."""
     field, intrinsics = ExactRoom("living_room"), Intrinsics.from_focal(64, 48, 40.0)
     poses, colors, depths = [], [], []
@@ -98,7 +98,7 @@ def furnished() -> tuple[ExactRoom, Sequence]:
         poses.append(T)
         colors.append((255 * color).round().astype(np.uint8))
         depths.append((1000 * depth).round().astype(np.uint16))
-    return field, Sequence(
+    return field, RgbdSequence(
         "living_room", intrinsics, np.stack(colors), np.stack(depths), np.stack(poses),
         np.arange(3),
     )  # fmt: skip
@@ -108,7 +108,9 @@ def rotation_about_up(angle: float) -> Float[np.ndarray, "3 3"]:
     return rotation_vector_to_matrix(torch.tensor([0.0, 0.0, angle])).double().numpy()
 
 
-def tracker_in(field: Field, sequence: Sequence, **settings: float) -> LevenbergMarquardtTracker:
+def tracker_in(
+    field: Field, sequence: RgbdSequence, **settings: float
+) -> LevenbergMarquardtTracker:
     sampler = PixelSampler(sequence, torch.device("cpu"))
     config = replace(CONFIG, **settings)
     return LevenbergMarquardtTracker(field, sampler, config, torch.Generator().manual_seed(0))
@@ -188,7 +190,7 @@ def test_in_a_corridor_the_axis_is_flagged_and_the_pose_stays() -> None:
     T[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     far = np.maximum(np.abs(x), np.abs(y)) < 0.2  # the open end is not measured
     depths = np.where(far, 0, (1000 * depth).round()).astype(np.uint16)[None]
-    sequence = Sequence("corridor", intrinsics, gray, depths, T[None], np.arange(1))
+    sequence = RgbdSequence("corridor", intrinsics, gray, depths, T[None], np.arange(1))
     tracker = tracker_in(Corridor(), sequence)
     offset = torch.tensor([0.02, 0.03, 0.0, 0.03, 0.05, -0.02])
     run(tracker, moved(torch.from_numpy(T).float(), offset), 40)

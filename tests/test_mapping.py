@@ -9,19 +9,19 @@ import torch
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.config import FieldConfig, MappingConfig
 from nbtrack.core.errors import DataError, NumericalError
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.mapping.fit import learning_rate, load_map, map_sequence, split_holdout
 
 NETWORK = FieldConfig(width=48, n_frequencies=32)
 SHORT = MappingConfig(iterations=30, n_rays=32, n_stratified=8, n_surface=4, learning_rate=3e-3)
 
 
-def wall_sequence(n_frames: int = 6, distance: float = 2.0) -> Sequence:
+def wall_sequence(n_frames: int = 6, distance: float = 2.0) -> RgbdSequence:
     """Cameras side by side that look straight at a grey wall, `distance` metres ahead."""
     height, width = 12, 16
     poses = np.tile(np.eye(4), (n_frames, 1, 1))
     poses[:, 0, 3] = np.linspace(-0.5, 0.5, n_frames)
-    return Sequence(
+    return RgbdSequence(
         "wall", Intrinsics.from_focal(width, height, 14.0),
         np.full((n_frames, height, width, 3), 128, np.uint8),
         np.full((n_frames, height, width), int(1000 * distance), np.uint16),

@@ -11,7 +11,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.config import PRESETS, FieldConfig, MappingConfig
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.pixels import PixelSampler, Rays
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import supervised_field
 from nbtrack.fields.neus_plus import distance_targets
 from nbtrack.fields.observed_distance import ObservedDistance
@@ -21,12 +21,12 @@ CONFIG = PRESETS["smoke"].mapping["neus_plus"]
 CAMERA = Intrinsics.from_focal(64, 48, 48.0)
 
 
-def slanted_wall(n_frames: int = 1) -> Sequence:
+def slanted_wall(n_frames: int = 1) -> RgbdSequence:
     """A wall through (0, 0, 2) whose normal is turned by 45 degrees about y: z = 2 + x."""
     _, columns = np.indices((48, 64))
     x_over_z = (columns + 0.5 - 32) / 48
     depth = 2 / (1 - x_over_z)
-    return Sequence(
+    return RgbdSequence(
         "slanted", CAMERA, np.full((n_frames, 48, 64, 3), 100, np.uint8),
         np.tile((1000 * depth).round().astype(np.uint16), (n_frames, 1, 1)),
         np.tile(np.eye(4), (n_frames, 1, 1)), np.arange(n_frames),

@@ -16,7 +16,7 @@ from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import LearnedField
 from nbtrack.fields.views import View
 from nbtrack.plots.doll_house import screen_axes
@@ -85,7 +85,7 @@ def sphere() -> AnalyticField:
 
 
 @pytest.fixture
-def sequence() -> Sequence:
+def sequence() -> RgbdSequence:
     """Six frames from the origin along +z, everything at 1 m but one pixel without depth."""
     n, height, width = 6, 12, 16
     colors = np.random.default_rng(0).integers(0, 256, (n, height, width, 3), dtype=np.uint8)
@@ -94,7 +94,7 @@ def sequence() -> Sequence:
     T_world_camera = np.tile(np.eye(4), (n, 1, 1))
     T_world_camera[:, 0, 3] = 0.01 * np.arange(n)
     intrinsics = Intrinsics.from_focal(width, height, 12.0)
-    return Sequence("six", intrinsics, colors, depths_mm, T_world_camera, np.arange(n) + 30)
+    return RgbdSequence("six", intrinsics, colors, depths_mm, T_world_camera, np.arange(n) + 30)
 
 
 @pytest.fixture

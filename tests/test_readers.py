@@ -29,7 +29,7 @@ from nbtrack.core.config import PRESETS, ScenesConfig
 from nbtrack.core.errors import ConfigError, DataError, MissingError
 from nbtrack.data.convert import convert_sequence
 from nbtrack.data.readers import FORMATS, Format, open_recording, register
-from nbtrack.data.sequence import Sequence, read_sequence
+from nbtrack.data.sequence import RgbdSequence, read_sequence
 from nbtrack.data.writer import SequenceWriter
 from nbtrack.experiments.scenes import Scene, find_scene
 from nbtrack.tracking.budget import StepBudget
@@ -40,7 +40,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 LOSSY = ("replica", "scannet")  # colour is JPEG
 
 
-def check_equal(sequence: Sequence, data: Source, lossy: bool = False) -> None:
+def check_equal(sequence: RgbdSequence, data: Source, lossy: bool = False) -> None:
     """The sequence is the source, to rounding; JPEG colours to a few levels on average."""
     np.testing.assert_allclose(sequence.T_world_camera, data.poses, rtol=0, atol=1e-9)
     assert np.array_equal(sequence.depths_mm, data.depths_mm)
@@ -76,7 +76,7 @@ def test_converted_is_the_same(tmp_path: Path, format: str) -> None:
     assert not (out / "intrinsics.txt").exists()
 
 
-def track(sequence: Sequence) -> np.ndarray:
+def track(sequence: RgbdSequence) -> np.ndarray:
     """Poses found by the second-order tracker in the room's exact distance, without colour."""
     config = replace(PRESETS["smoke"].tracking["lm"], lambda_color=0.0, n_pixels=200)
     return track_sequence(

@@ -13,7 +13,7 @@ from nbtrack.core.camera import Intrinsics, backproject
 from nbtrack.core.config import MappingConfig
 from nbtrack.core.geometry import transform_points
 from nbtrack.data.pixels import PixelSampler, Rays
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import LearnedField
 from nbtrack.fields.rendering import Rendering, composite, weights_from_density, weights_from_sdf
 from nbtrack.fields.sampling import (
@@ -56,13 +56,13 @@ class Wall(LearnedField):
         raise NotImplementedError
 
 
-def random_sequence(n_frames: int) -> Sequence:
+def random_sequence(n_frames: int) -> RgbdSequence:
     rng = np.random.default_rng(0)
     shape = (n_frames, CAMERA.height, CAMERA.width)
     poses = np.tile(np.eye(4), (n_frames, 1, 1))
     poses[:, :3, :3] = Rotation.random(n_frames, random_state=rng).as_matrix()
     poses[:, :3, 3] = rng.normal(size=(n_frames, 3))
-    return Sequence(
+    return RgbdSequence(
         "noise", CAMERA, rng.integers(0, 256, (*shape, 3), dtype=np.uint8),
         rng.integers(0, 1 << 16, shape, dtype=np.uint16), poses, np.arange(n_frames),
     )  # fmt: skip

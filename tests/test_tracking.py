@@ -16,7 +16,7 @@ from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.core.config import TrackingConfig
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
 from nbtrack.data.pixels import PixelSampler, Rays
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import LearnedField
 from nbtrack.fields.rendering import Rendering, composite, weights_from_density, weights_from_sdf
 from nbtrack.tracking.budget import StepBudget
@@ -63,7 +63,7 @@ class BoxRoom(LearnedField):
         raise NotImplementedError
 
 
-def box_sequence(offsets: list[list[float]]) -> Sequence:
+def box_sequence(offsets: list[list[float]]) -> RgbdSequence:
     """Exact images of the box room from cameras at offsets (m) from the middle, not rotated."""
     intrinsics = Intrinsics.from_focal(32, 24, 24.0)
     rows, columns = torch.meshgrid(torch.arange(24), torch.arange(32), indexing="ij")
@@ -76,7 +76,7 @@ def box_sequence(offsets: list[list[float]]) -> Sequence:
         points = offset + depth[..., None] * directions
         colors.append((255 * (0.5 + 0.4 * torch.sin(3 * points))).round().byte().numpy())
         depths.append((1000 * depth).round().short().numpy().astype(np.uint16))
-    return Sequence(
+    return RgbdSequence(
         "box", intrinsics, np.stack(colors), np.stack(depths), poses, np.arange(len(offsets))
     )
 

@@ -78,7 +78,7 @@ def has_room_for(device: torch.device, n_bytes: int) -> bool:
 
 
 @contextlib.contextmanager
-def naming_what_to_lower(setting: str) -> Iterator[None]:
+def advise_on_memory(setting: str) -> Iterator[None]:
     """Turn running out of memory into one line that names the setting to lower.
 
     Args:

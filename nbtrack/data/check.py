@@ -13,7 +13,7 @@ from nbtrack.data.advice import Advice, advise
 from nbtrack.data.readers import FORMATS, Recording, open_recording, ray_lengths
 from nbtrack.data.readings import Fit, best_fit, fit_readings, readings
 from nbtrack.data.scan import Cloud, Scan, scan_recording
-from nbtrack.data.sequence import MILLIMETRE, Sequence, observed_bounds
+from nbtrack.data.sequence import MILLIMETRE, RgbdSequence, observed_bounds
 from nbtrack.tracking.metrics import rotation_errors_deg, translation_errors
 
 
@@ -199,7 +199,7 @@ def _bounds(scan: Scan, recording: Recording) -> SceneBounds:
         depth_mm[:] = np.where(values > 0, np.rint(exact).clip(1, 65535), 0)
     black = np.broadcast_to(np.uint8(0), (*depths_mm.shape, 3))
     poses = recording.T_world_camera[scan.kept_ids]
-    kept = Sequence(recording.name, scan.intrinsics, black, depths_mm, poses, scan.kept_ids)
+    kept = RgbdSequence(recording.name, scan.intrinsics, black, depths_mm, poses, scan.kept_ids)
     return observed_bounds(kept)
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nbtrack.core.camera import backproject, pixel_directions
 from nbtrack.core.device import has_room_for
-from nbtrack.data.sequence import MILLIMETRE, Sequence
+from nbtrack.data.sequence import MILLIMETRE, RgbdSequence
 
 # Tangent planes: how far away neighbours are, as a share of the image's width, and by how much of
 # the depth they may differ, which cuts off edges and incidences above some 75 degrees (our choice).
@@ -44,7 +44,10 @@ class PixelSampler:
     """
 
     def __init__(
-        self, sequence: Sequence, device: torch.device, images_device: torch.device | None = None
+        self,
+        sequence: RgbdSequence,
+        device: torch.device,
+        images_device: torch.device | None = None,
     ) -> None:
         """
         Args:
@@ -61,7 +64,7 @@ class PixelSampler:
         self.depths_mm = torch.from_numpy(sequence.depths_mm.view("int16")).to(images_device)
         self.T_world_camera = torch.from_numpy(sequence.T_world_camera).float().to(device)
 
-    def show(self, sequence: Sequence) -> None:
+    def show(self, sequence: RgbdSequence) -> None:
         """Take other images of the same size and number, into the same memory.
 
         Steps that were captured as a CUDA graph go on reading there.

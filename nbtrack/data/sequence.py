@@ -20,7 +20,7 @@ FRAMES_PER_SECOND = 30.0  # of the recordings; turns frame ids into time stamps
 
 
 @dataclass(frozen=True)
-class Sequence:
+class RgbdSequence:
     """Posed RGB-D frames, kept as compactly as on disk (5 bytes a pixel).
 
     1,600 frames of 640x480 take 2.5 GB. Pixels become floating point only when sampled.
@@ -40,7 +40,7 @@ class Sequence:
     def __repr__(self) -> str:
         size = f"{self.intrinsics.width}x{self.intrinsics.height}"
         left_out = f", {self.excluded_frames} without pose" if self.excluded_frames else ""
-        return f"Sequence({self.name!r}, {len(self)} frames of {size}{left_out})"
+        return f"RgbdSequence({self.name!r}, {len(self)} frames of {size}{left_out})"
 
     def color(self, index: int) -> Float[np.ndarray, "height width 3"]:
         """Colour image in [0, 1]."""
@@ -50,9 +50,9 @@ class Sequence:
         """Z-depth image in metres, 0 where there is no measurement."""
         return self.depths_mm[index].astype(np.float32) * np.float32(MILLIMETRE)
 
-    def select(self, indices: slice | Int[np.ndarray, "n"]) -> "Sequence":
+    def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
         """The sequence of some of the frames, in the order given; slices copy nothing."""
-        return Sequence(
+        return RgbdSequence(
             self.name, self.intrinsics, self.colors[indices], self.depths_mm[indices],
             self.T_world_camera[indices], self.frame_ids[indices], self.excluded_frames,
         )  # fmt: skip
@@ -88,7 +88,7 @@ def read_sequence(
     pose_file: str | None = None,
     progress: bool = False,
     format: str | None = None,
-) -> Sequence:
+) -> RgbdSequence:
     """Read a recording in one of the formats of `nbtrack.data.readers.FORMATS`.
 
     Args:
@@ -111,7 +111,7 @@ def read_sequence(
 
 def read_frames(
     recording: Recording, frames: slice = slice(None), progress: bool = False
-) -> Sequence:
+) -> RgbdSequence:
     """The frames of an opened recording that a slice selects and that have a pose.
 
     Raises:
@@ -130,7 +130,7 @@ def read_frames(
             "frame needs a pose; choose other frames or another pose file"
         )
     decoded = decode(recording, frame_ids, progress)
-    return Sequence(
+    return RgbdSequence(
         recording.name, decoded.intrinsics, decoded.colors, decoded.depths,
         recording.T_world_camera[frame_ids], frame_ids, len(selected) - len(frame_ids),
     )  # fmt: skip
@@ -154,7 +154,10 @@ def _slice_text(frames: slice) -> str:
 
 
 def observed_bounds(
-    sequence: Sequence, margin: float = 0.1, quantile: float = 0.002, points_per_frame: int = 2000
+    sequence: RgbdSequence,
+    margin: float = 0.1,
+    quantile: float = 0.002,
+    points_per_frame: int = 2000,
 ) -> SceneBounds:
     """Box around everything a sequence sees, and its cameras, with `margin` metres to spare.
 

@@ -10,13 +10,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from nbtrack.core.config import FieldConfig, Preset, as_dict
-from nbtrack.core.device import device_name, naming_what_to_lower, suitable_threads, synchronize
+from nbtrack.core.device import advise_on_memory, device_name, suitable_threads, synchronize
 from nbtrack.core.device_lock import alone_on
 from nbtrack.core.files import write_text_atomic
 from nbtrack.core.paths import runs_folder
 from nbtrack.core.provenance import code_fingerprint, fingerprint, versions
 from nbtrack.data.pixels import PixelSampler
-from nbtrack.data.sequence import Sequence, observed_bounds
+from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import make_field
 from nbtrack.tables.layout import COLUMNS_2
 from nbtrack.tracking.budget import ClockBudget
@@ -28,7 +28,7 @@ ENGINE_LABELS = {"plain": "", "fast": ", engine"}
 
 def measure_steps(
     preset: Preset,
-    sequence: Sequence,
+    sequence: RgbdSequence,
     device: torch.device,
     frames_per_cell: int = 3,
     progress: bool = True,
@@ -63,7 +63,7 @@ def measure_steps(
         cells, "Table II", unit="cell", disable=not progress
     ):
         with (
-            naming_what_to_lower(f"tables.pixels.{name}={n_pixels}"),
+            advise_on_memory(f"tables.pixels.{name}={n_pixels}"),
             suitable_threads(network_of(preset, name).width),
             alone_on(device, tqdm.write),
         ):
@@ -75,7 +75,7 @@ def measure_steps(
 
 
 def obtain_steps(
-    preset: Preset, sequence: Sequence, device: torch.device, measure_again: bool = False
+    preset: Preset, sequence: RgbdSequence, device: torch.device, measure_again: bool = False
 ) -> pd.DataFrame:
     """Table II of this device as it was measured last, or measured now; see `measure_steps`.
 
@@ -108,7 +108,7 @@ def default_pixels(preset: Preset) -> dict[str, int]:
 class TrackerMaker:
     """Makes trackers in untrained fields, which cost a step as much as trained ones."""
 
-    def __init__(self, preset: Preset, sequence: Sequence, device: torch.device) -> None:
+    def __init__(self, preset: Preset, sequence: RgbdSequence, device: torch.device) -> None:
         self.preset, self.device = preset, device
         self.sampler = PixelSampler(sequence, device)
         self.bounds = observed_bounds(sequence)

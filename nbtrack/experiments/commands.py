@@ -12,7 +12,7 @@ from tqdm.auto import tqdm
 from nbtrack.core.config import Preset
 from nbtrack.core.device import choose_device
 from nbtrack.core.errors import ConfigError, DataError
-from nbtrack.data.sequence import Sequence, parse_frames
+from nbtrack.data.sequence import RgbdSequence, parse_frames
 from nbtrack.experiments.cells import (
     GivenMap,
     MapCell,
@@ -158,7 +158,7 @@ def _given_map(path: Path, field_name: str | None, map_frames: str | None) -> St
     return stored
 
 
-def _every_tenth(cell: MapCell) -> Sequence:
+def _every_tenth(cell: MapCell) -> RgbdSequence:
     """Some frames of a map, enough to say what has been seen: neighbours see the same."""
     numbers = cell.scene.frame_numbers(cell.frames)
     return cell.scene.read(slice(numbers.start, numbers.stop, 10 * numbers.step))

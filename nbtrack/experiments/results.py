@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 
 from nbtrack.core.config import TrackingConfig, as_dict
-from nbtrack.core.device import choose_device, device_name, naming_what_to_lower
+from nbtrack.core.device import advise_on_memory, choose_device, device_name
 from nbtrack.core.device_lock import alone_on, beside_others_on
 from nbtrack.core.files import (
     json_bytes,
@@ -21,7 +21,7 @@ from nbtrack.core.files import (
     write_together,
 )
 from nbtrack.core.provenance import versions
-from nbtrack.data.sequence import Sequence, parse_frames
+from nbtrack.data.sequence import RgbdSequence, parse_frames
 from nbtrack.experiments.cells import (
     METRICS_FILE,
     RUN_FILE,
@@ -97,7 +97,7 @@ def run_track(
     """
     fitted = obtain_map(cell.map_cell, device)
     config = cell.map_cell.preset.tracking_of(cell.tracker_name)
-    with naming_what_to_lower(f"frames {cell.frames} of {cell.scene_name}"):
+    with advise_on_memory(f"frames {cell.frames} of {cell.scene_name}"):
         sequence = cell.map_cell.scene.read(parse_frames(cell.frames))
     map_note = _note_on_given(cell.map_cell, sequence)
     field, baking = field_to_track(fitted.field, config)
@@ -145,7 +145,7 @@ def read_frames(cell: TrackCell) -> pd.DataFrame:
     return pd.read_csv(cell.folder / "frames.csv")
 
 
-def _note_on_given(cell: MapCell | GivenMap, sequence: Sequence) -> dict[str, Any]:
+def _note_on_given(cell: MapCell | GivenMap, sequence: RgbdSequence) -> dict[str, Any]:
     """Where a given map comes from, and a warning where it fits the first frame badly.
 
     A scene's own map is made from its own poses, so that there is nothing to check.
@@ -203,7 +203,7 @@ def _make_map(cell: MapCell, device: torch.device, report: Report) -> FittedMap:
     config = cell.preset.mapping_of(cell.field_name)
     setting = f"frames {cell.frames} of {cell.scene.name}"
     waits = beside_others_on(device, lambda status: report(0, status))
-    with naming_what_to_lower(setting), waits:
+    with advise_on_memory(setting), waits:
         sequence = cell.scene.read(parse_frames(cell.frames))
         fitted = map_sequence(
             cell.field_name, sequence, cell.preset.network_of(cell.field_name), config, cell.seed,

@@ -14,7 +14,7 @@ from nbtrack.core.errors import DataError, MissingError, nearest_name
 from nbtrack.core.paths import data_folder, runs_folder
 from nbtrack.core.provenance import code_fingerprint, fingerprint
 from nbtrack.data.readers import FORMATS, Recording, open_recording
-from nbtrack.data.sequence import Sequence, parse_frames, read_frames
+from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of
 
 DATASET_SCENES = (
@@ -41,7 +41,7 @@ class Scene:
         """Its files, poses and calibration. Raises as `open_recording` does."""
         return open_recording(self.folder, self.format)
 
-    def read(self, frames: slice = slice(None), progress: bool = False) -> Sequence:
+    def read(self, frames: slice = slice(None), progress: bool = False) -> RgbdSequence:
         """The scene's frames. Raises DataError or MissingError as `read_sequence` does."""
         return read_frames(self.open(), frames, progress)
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from nbtrack.core.config import FieldConfig, Preset, TrackingConfig
 from nbtrack.core.device import suitable_threads, synchronize
 from nbtrack.core.device_lock import alone_on
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.bench import ENGINE_LABELS, TrackerMaker, network_of, row_label
 from nbtrack.experiments.scenes import Scene
 from nbtrack.mapping.fit import map_sequence, split_holdout
@@ -50,7 +50,7 @@ def step_flops(tracker_name: str, config: TrackingConfig, network: FieldConfig) 
 
 
 def measure_step_times(
-    preset: Preset, sequence: Sequence, device: torch.device, progress: bool = True
+    preset: Preset, sequence: RgbdSequence, device: torch.device, progress: bool = True
 ) -> pd.DataFrame:
     """Time of a step for every tracker, its pixel counts n and both engines, side by side.
 
@@ -90,7 +90,7 @@ def measure_step_times(
     return pd.DataFrame(rows)
 
 
-def measure_mapping(preset: Preset, sequence: Sequence, device: torch.device) -> pd.DataFrame:
+def measure_mapping(preset: Preset, sequence: RgbdSequence, device: torch.device) -> pd.DataFrame:
     """Mapping iterations a second of the paper's two fields, and the ratio for equal samples.
 
     Returns:

@@ -13,7 +13,7 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.config import FieldConfig, MappingConfig
 from nbtrack.core.errors import ConfigError, nearest_name
 from nbtrack.data.pixels import Rays
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.rendering import Rendering
 
 LUMA = torch.tensor([0.299, 0.587, 0.114])
@@ -113,7 +113,7 @@ class LearnedField(Field):
     ) -> dict[str, Float[Tensor, ""]]:
         """Weighted loss terms of one batch by name; their sum is minimised."""
 
-    def prepare(self, sequence: Sequence, frames: Int[np.ndarray, "frames"]) -> None:
+    def prepare(self, sequence: RgbdSequence, frames: Int[np.ndarray, "frames"]) -> None:
         """Take from the frames to be mapped what the losses need besides the rays of a batch."""
 
     def diagnostics(self) -> dict[str, float]:

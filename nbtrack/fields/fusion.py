@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import backproject
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 
 _FRAMES_AT_ONCE = 8  # frames whose voxels wait to be merged: what the memory is bounded by
 
@@ -15,7 +15,7 @@ _Sums = tuple[Int[np.ndarray, "voxels"], Float[np.ndarray, "voxels 7"]]
 
 
 def fuse_points(
-    sequence: Sequence, frames: Int[np.ndarray, "frames"], bounds: SceneBounds, voxel: float
+    sequence: RgbdSequence, frames: Int[np.ndarray, "frames"], bounds: SceneBounds, voxel: float
 ) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points 3"]]:
     """One point a voxel: mean position (m, world frame) and mean colour (in [0, 1]).
 
@@ -54,7 +54,7 @@ def _summed(voxels: Int[np.ndarray, "n"], values: Float[np.ndarray, "n 7"]) -> _
 
 
 def _measured_points(
-    sequence: Sequence, index: int
+    sequence: RgbdSequence, index: int
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """World points (m) and colours (in [0, 1]) of a frame's measured pixels."""
     depth = torch.from_numpy(sequence.depth(index))

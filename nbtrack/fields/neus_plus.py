@@ -7,7 +7,7 @@ from torch import Tensor
 
 from nbtrack.core.config import MappingConfig
 from nbtrack.data.pixels import Rays
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Batch, measured_mean, register_field
 from nbtrack.fields.neus import NeuSField, rendered_losses
 from nbtrack.fields.observed_distance import ObservedDistance
@@ -26,7 +26,7 @@ class NeuSPlusField(NeuSField):
     supervision = "rendering+sdf"
     is_taught_distances = True
 
-    def prepare(self, sequence: Sequence, frames: Int[np.ndarray, "frames"]) -> None:
+    def prepare(self, sequence: RgbdSequence, frames: Int[np.ndarray, "frames"]) -> None:
         """Collect the surface that the frames saw: distances in free space are measured from it."""
         self.observed = ObservedDistance(sequence, frames, self.bounds, self.mlp.center.device)
 

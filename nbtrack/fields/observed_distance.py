@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import backproject
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 
 _LEAST_VOXEL = 0.05  # m; finer cells hold too few points to tell a surface from noise
 _MOST_CELLS_A_SIDE = 256  # so that a large scene takes no more than some 60 MB
@@ -28,7 +28,7 @@ class ObservedDistance:
 
     def __init__(
         self,
-        sequence: Sequence,
+        sequence: RgbdSequence,
         frames: Int[np.ndarray, "frames"],
         bounds: SceneBounds,
         device: torch.device,
@@ -62,7 +62,7 @@ class ObservedDistance:
 
 
 def _observed_points(
-    sequence: Sequence, frames: Int[np.ndarray, "frames"]
+    sequence: RgbdSequence, frames: Int[np.ndarray, "frames"]
 ) -> Iterator[Float[np.ndarray, "n 3"]]:
     """World points (m) of each frame, on a regular grid of its pixels."""
     intrinsics = sequence.intrinsics

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.config import FieldConfig
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Field, register_field
 from nbtrack.fields.fusion import fuse_points
 
@@ -40,7 +40,7 @@ class PointField(Field):
         self.voxel = nn.Parameter(torch.zeros(1), requires_grad=False)
         self._tree: cKDTree | None = None
 
-    def fuse(self, sequence: Sequence, frames: Int[np.ndarray, "frames"], voxel: float) -> None:
+    def fuse(self, sequence: RgbdSequence, frames: Int[np.ndarray, "frames"], voxel: float) -> None:
         """Replace the points by those of some frames, one a voxel of an edge in metres."""
         points, colors = fuse_points(sequence, frames, self.bounds, voxel)
         self.points = torch.from_numpy(points).to(self.voxel.device)

@@ -15,11 +15,11 @@ from jaxtyping import Int
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.config import FieldConfig, MappingConfig, as_dict
-from nbtrack.core.device import naming_what_to_lower, suitable_threads
+from nbtrack.core.device import advise_on_memory, suitable_threads
 from nbtrack.core.errors import DataError, NumericalError
 from nbtrack.core.files import naming_damaged, read_checkpoint, write_bytes_atomic
 from nbtrack.data.pixels import PixelSampler
-from nbtrack.data.sequence import Sequence, observed_bounds
+from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import Field, LearnedField, field_class, make_field
 from nbtrack.fields.sampling import draw_batch
 
@@ -62,7 +62,7 @@ def split_holdout(
 
 def map_sequence(
     field_name: str,
-    sequence: Sequence,
+    sequence: RgbdSequence,
     field_config: FieldConfig,
     config: MappingConfig,
     seed: int = 0,
@@ -89,7 +89,7 @@ def map_sequence(
             sequence, field_config, config, settings, device, checkpoint, on_iteration
         )
     setting = f"mapping.{field_name}.n_rays={config.n_rays}"
-    with naming_what_to_lower(setting), suitable_threads(field_config.width):
+    with advise_on_memory(setting), suitable_threads(field_config.width):
         run = _Run(field_name, sequence, field_config, config, seed, device)
         if checkpoint and checkpoint.exists():
             run.load(checkpoint)
@@ -137,7 +137,7 @@ class _Run:
     def __init__(
         self,
         field_name: str,
-        sequence: Sequence,
+        sequence: RgbdSequence,
         field_config: FieldConfig,
         config: MappingConfig,
         seed: int,
@@ -215,7 +215,7 @@ class _Run:
 
 
 def _fuse_sequence(
-    sequence: Sequence,
+    sequence: RgbdSequence,
     field_config: FieldConfig,
     config: MappingConfig,
     settings: dict[str, Any],
@@ -245,7 +245,7 @@ def _fuse_sequence(
 
 def _settings(
     field_name: str,
-    sequence: Sequence,
+    sequence: RgbdSequence,
     field_config: FieldConfig,
     config: MappingConfig,
     seed: int,

@@ -11,7 +11,7 @@ from nbtrack.core.camera import backproject
 from nbtrack.core.errors import DataError
 from nbtrack.core.geometry import transform_points
 from nbtrack.data.pixels import PixelSampler
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField
 from nbtrack.fields.views import render_rays
 from nbtrack.mapping.seen_volume import SeenVolume
@@ -50,7 +50,7 @@ class MapFit:
         return asdict(self)
 
 
-def frame_fit(field: Field, seen: SeenVolume, sequence: Sequence, index: int) -> MapFit | None:
+def frame_fit(field: Field, seen: SeenVolume, sequence: RgbdSequence, index: int) -> MapFit | None:
     """How a map fits one frame at its given pose; None where nothing was measured.
 
     Depths of random pixels are compared with rendered ones wherever the rendered point lies where
@@ -68,7 +68,7 @@ def frame_fit(field: Field, seen: SeenVolume, sequence: Sequence, index: int) ->
 
 
 def usual_fit(
-    field: Field, seen: SeenVolume, sequence: Sequence, frames: Int[np.ndarray, "frames"]
+    field: Field, seen: SeenVolume, sequence: RgbdSequence, frames: Int[np.ndarray, "frames"]
 ) -> MapFit | None:
     """The median fit of some of the frames, evenly spread; None where the map shows nothing."""
     spread = np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).round().astype(int)
@@ -98,7 +98,7 @@ def warn_of_misfit(found: MapFit | None, usual: MapFit, map_name: str, frame: st
 
 
 def _errors(
-    field: Field, seen: SeenVolume, sequence: Sequence, index: int
+    field: Field, seen: SeenVolume, sequence: RgbdSequence, index: int
 ) -> tuple[Float[Tensor, "n"], Tensor]:
     """How far (m) measured depths of random pixels are from the map's, and where it knows."""
     device = next(field.parameters()).device

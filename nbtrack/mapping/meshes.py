@@ -11,7 +11,7 @@ from skimage.measure import marching_cubes
 from nbtrack.core.camera import project
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import write_bytes_atomic
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 
 _POINTS_AT_ONCE = 65_536
@@ -64,7 +64,7 @@ def query_field(
 
 
 def keep_seen(
-    mesh: trimesh.Trimesh, sequence: Sequence, frames: Int[np.ndarray, "frames"] | None = None
+    mesh: trimesh.Trimesh, sequence: RgbdSequence, frames: Int[np.ndarray, "frames"] | None = None
 ) -> trimesh.Trimesh:
     """The faces all of whose corners a sequence, or those of its frames, has seen.
 
@@ -80,7 +80,7 @@ def keep_seen(
 
 def seen_by(
     points_world: Float[np.ndarray, "n 3"],
-    sequence: Sequence,
+    sequence: RgbdSequence,
     frames: Int[np.ndarray, "frames"] | None = None,
     tolerance: float = 0.1,
     every: int = 5,

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from nbtrack.core.errors import DataError
 from nbtrack.data.pixels import PixelSampler
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField
 from nbtrack.fields.points import PointField
 from nbtrack.fields.views import render_rays
@@ -46,7 +46,7 @@ class MapQuality:
 
 def score_map(
     field: Field,
-    sequence: Sequence,
+    sequence: RgbdSequence,
     mapped: Int[np.ndarray, "mapped"],
     held_out: Int[np.ndarray, "held_out"],
     room: Room | None,
@@ -72,7 +72,7 @@ def score_map(
     return MapQuality(**scores)
 
 
-def score_images(field: Field, sequence: Sequence, held_out: Frames) -> dict[str, float]:
+def score_images(field: Field, sequence: RgbdSequence, held_out: Frames) -> dict[str, float]:
     """PSNR (dB) and depth L1 (m) over random measured pixels of held-out frames."""
     device = next(field.parameters()).device
     sampler = PixelSampler(sequence, device)
@@ -91,7 +91,7 @@ def score_images(field: Field, sequence: Sequence, held_out: Frames) -> dict[str
     }
 
 
-def score_sdf(field: Field, sequence: Sequence, mapped: Frames, room: Room) -> dict[str, float]:
+def score_sdf(field: Field, sequence: RgbdSequence, mapped: Frames, room: Room) -> dict[str, float]:
     """Mean |error| (m) of the signed distance near surfaces and in free space that was seen.
 
     Points lie on rays of the mapped frames: half of them between camera and surface, half within
@@ -108,7 +108,7 @@ def score_sdf(field: Field, sequence: Sequence, mapped: Frames, room: Room) -> d
 
 
 def score_mesh(
-    field: Field, sequence: Sequence, mapped: Frames, room: Room, voxel: float
+    field: Field, sequence: RgbdSequence, mapped: Frames, room: Room, voxel: float
 ) -> dict[str, float]:
     """Accuracy, completion (m) and F-score at 5 cm of the seen part of the mesh.
 
@@ -125,7 +125,7 @@ def score_mesh(
 
 
 def score_points(
-    field: PointField, sequence: Sequence, mapped: Frames, room: Room
+    field: PointField, sequence: RgbdSequence, mapped: Frames, room: Room
 ) -> dict[str, float]:
     """The scores of a mesh, of the map's points: as many as are drawn on a mesh."""
     order = np.random.default_rng(0).permutation(len(field.points))[:_POINTS_SCORED]
@@ -134,7 +134,7 @@ def score_points(
 
 
 def _score_surface(
-    points: Float[np.ndarray, "n 3"], sequence: Sequence, mapped: Frames, room: Room
+    points: Float[np.ndarray, "n 3"], sequence: RgbdSequence, mapped: Frames, room: Room
 ) -> dict[str, float]:
     to_truth = np.abs(room.sdf(points))
     truth = true_surface_points(room, _POINTS_SCORED, seed=0)
@@ -149,7 +149,7 @@ def _score_surface(
     }
 
 
-def _points_along_rays(sequence: Sequence, mapped: Frames) -> Float[np.ndarray, "n 3"]:
+def _points_along_rays(sequence: RgbdSequence, mapped: Frames) -> Float[np.ndarray, "n 3"]:
     """World points (m, float64) in seen free space and around seen surfaces."""
     generator = torch.Generator().manual_seed(0)
     sampler = PixelSampler(sequence, torch.device("cpu"))

@@ -16,7 +16,7 @@ from torch import Tensor
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import backproject
 from nbtrack.core.geometry import transform_points
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 
 SEEN_VOXEL = 0.2  # m: a room takes some kilobytes
 _PIXELS_A_SIDE = 80  # of a frame, at most
@@ -60,7 +60,7 @@ class SeenVolume:
 
 
 def seen_volume(
-    sequence: Sequence, frames: Int[np.ndarray, "frames"], bounds: SceneBounds
+    sequence: RgbdSequence, frames: Int[np.ndarray, "frames"], bounds: SceneBounds
 ) -> SeenVolume:
     """The cells inside the bounds in which some of a sequence's frames measured a point."""
     low, high = torch.tensor(bounds.minimum), torch.tensor(bounds.maximum)

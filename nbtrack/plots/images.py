@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from scipy.spatial.transform import Rotation
 
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.views import View
 from nbtrack.plots.style import NOT_MEASURED, WIDTH, bare, new_figure, styled
 
@@ -25,7 +25,7 @@ _CENTIMETRES = 100
 
 @styled
 def plot_views(
-    sequence: Sequence, indices: Many[int], views: Many[View], title: str = ""
+    sequence: RgbdSequence, indices: Many[int], views: Many[View], title: str = ""
 ) -> Figure:
     """Observed and rendered colour and depth of some frames, one a row; unmeasured pixels grey.
 
@@ -60,7 +60,7 @@ def plot_views(
 
 
 @styled
-def plot_room_overview(sequence: Sequence, title: str = "", n_frames: int = 5) -> Figure:
+def plot_room_overview(sequence: RgbdSequence, title: str = "", n_frames: int = 5) -> Figure:
     """Some frames of a sequence, colour over depth, and how far the camera moves between frames.
 
     Args:
@@ -85,7 +85,7 @@ def plot_room_overview(sequence: Sequence, title: str = "", n_frames: int = 5) -
     return figure
 
 
-def _plot_motion(panels: Iterable[Axes], sequence: Sequence) -> None:
+def _plot_motion(panels: Iterable[Axes], sequence: RgbdSequence) -> None:
     """Histograms of the motion from each frame to the next."""
     T_between = np.linalg.inv(sequence.T_world_camera[:-1]) @ sequence.T_world_camera[1:]
     moved_cm = _CENTIMETRES * np.linalg.norm(T_between[:, :3, 3], axis=1)

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.mapping.meshes import query_field, seen_by
 from nbtrack.plots.style import TRUE_COLOR, WIDTH, camera_positions, new_figure, styled
@@ -38,7 +38,7 @@ class _Slice:
 @styled
 def plot_slice(
     field: Field,
-    sequence: Sequence,
+    sequence: RgbdSequence,
     height: float,
     room: Room | None = None,
     title: str = "",
@@ -77,7 +77,7 @@ def plot_slice(
 
 
 def _cut(
-    field: Field, sequence: Sequence, height: float, room: Room | None, view: TopView
+    field: Field, sequence: RgbdSequence, height: float, room: Room | None, view: TopView
 ) -> _Slice:
     right, ahead = _axes_of(field.bounds, view)
     points = np.empty((len(ahead), len(right), 3))

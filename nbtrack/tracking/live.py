@@ -11,7 +11,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.config import PRESETS, TrackingConfig
 from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.data.pixels import PixelSampler
-from nbtrack.data.sequence import MILLIMETRE, Sequence
+from nbtrack.data.sequence import MILLIMETRE, RgbdSequence
 from nbtrack.experiments.cells import check_pair, make_budget
 from nbtrack.fields import FIELDS, Field
 from nbtrack.fields.grid import BakedField, bake_field
@@ -137,7 +137,7 @@ def _field_to_ask(field: Field, tracker_name: str, config: TrackingConfig) -> Fi
 
 def _one_frame(
     camera: Intrinsics, color: Shaped[np.ndarray, "..."], depth: Shaped[np.ndarray, "..."]
-) -> Sequence:
+) -> RgbdSequence:
     """A sequence of one frame, whose pose nobody asks for."""
     size = (camera.height, camera.width)
     for name, image, shape in (("color", color, (*size, 3)), ("depth", depth, size)):
@@ -148,7 +148,9 @@ def _one_frame(
             )
     color_255, is_usable = _bytes(color)
     depth_mm = np.where(is_usable, _millimetres(depth), np.uint16(0))
-    return Sequence("live", camera, color_255[None], depth_mm[None], np.eye(4)[None], np.arange(1))
+    return RgbdSequence(
+        "live", camera, color_255[None], depth_mm[None], np.eye(4)[None], np.arange(1)
+    )
 
 
 def _bytes(

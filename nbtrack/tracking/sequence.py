@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float
 
 from nbtrack.core.config import TrackingConfig
-from nbtrack.core.device import naming_what_to_lower
+from nbtrack.core.device import advise_on_memory
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import naming_damaged, read_checkpoint, write_bytes_atomic
 from nbtrack.data.pixels import PixelSampler
-from nbtrack.data.sequence import Sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.frame_search import FrameEstimate, FrameSearch, tracking_threads
@@ -41,7 +41,7 @@ class TrackedSequence:
 def track_sequence(
     tracker_name: str,
     field: Field,
-    sequence: Sequence,
+    sequence: RgbdSequence,
     budget: Budget,
     config: TrackingConfig,
     seed: int = 0,
@@ -69,7 +69,7 @@ def track_sequence(
     device = device or torch.device("cpu")
     _check_trackable(sequence)
     setting = f"tracking.{tracker_name}.n_pixels={config.n_pixels}"
-    with naming_what_to_lower(setting), tracking_threads(field):
+    with advise_on_memory(setting), tracking_threads(field):
         run = _Run(tracker_name, field, sequence, budget, config, seed, device)
         if checkpoint and checkpoint.exists():
             run.load(checkpoint)
@@ -93,7 +93,7 @@ class _Run:
         self,
         tracker_name: str,
         field: Field,
-        sequence: Sequence,
+        sequence: RgbdSequence,
         budget: Budget,
         config: TrackingConfig,
         seed: int,
@@ -125,7 +125,7 @@ class _Run:
             self.rows = state["rows"]
 
 
-def _check_trackable(sequence: Sequence) -> None:
+def _check_trackable(sequence: RgbdSequence) -> None:
     if len(sequence) < 2:
         raise DataError(f"{sequence!r} is too short to track: give at least two frames")
     if not sequence.depths_mm.any():
@@ -136,7 +136,7 @@ def _check_trackable(sequence: Sequence) -> None:
 
 
 def _frame_row(
-    sequence: Sequence, index: int, estimate: FrameEstimate
+    sequence: RgbdSequence, index: int, estimate: FrameEstimate
 ) -> dict[str, float | int | bool]:
     T_estimated = estimate.T_world_camera[None]
     T_true = sequence.T_world_camera[index : index + 1]
