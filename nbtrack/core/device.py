@@ -54,17 +54,22 @@ def named_device(name: str) -> torch.device:
 
 
 @contextlib.contextmanager
-def suitable_threads(width: int) -> Iterator[None]:
-    """Run a block with the number of CPU threads that suits a network's width.
-
-    Narrow networks get one, wide ones as many as the process already has.
-    """
+def threads(number: int) -> Iterator[None]:
+    """Run a block with so many CPU threads."""
     before = torch.get_num_threads()
-    torch.set_num_threads(1 if width < _WIDTH_FOR_THREADS else before)
+    torch.set_num_threads(number)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def suitable_threads(width: int) -> contextlib.AbstractContextManager[None]:
+    """Run a block with the number of CPU threads that suits a network's width.
+
+    Narrow networks get one, wide ones as many as the process already has.
+    """
+    return threads(1 if width < _WIDTH_FOR_THREADS else torch.get_num_threads())
 
 
 def has_room_for(device: torch.device, n_bytes: int) -> bool:

@@ -1,19 +1,103 @@
-"""Files that are either complete or absent: every result is written aside, then moved into place.
+"""Where results are kept, files that are complete or absent, and what a result was made by.
 
 Two processes may work on the same results folder and either may be killed; a reader must never
-meet half a file.
+meet half a file. So every result is written aside, then moved into place.
 """
 
+import ast
 import contextlib
+import dataclasses
+import hashlib
+import inspect
 import json
 import os
+import platform
+import sys
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
 
+import nbtrack
 from nbtrack.core.errors import DataError, NbtrackError
+from nbtrack.core.settings import as_dict
+
+PACKAGE = Path(nbtrack.__file__).resolve().parent
+_AGAIN = "remove it and run the same command again"
+
+
+def project_folder() -> Path:
+    """The checkout that the package lies in; the current folder where it is installed elsewhere."""
+    is_checkout = (PACKAGE.parent / "pyproject.toml").is_file()
+    return PACKAGE.parent if is_checkout else Path.cwd()
+
+
+def runs_folder() -> Path:
+    """Cache of rooms, maps and trajectories: `NBTRACK_RUNS`, else `runs/` of the project."""
+    return Path(os.environ.get("NBTRACK_RUNS") or project_folder() / "runs").resolve()
+
+
+def data_folder() -> Path:
+    """Folder with downloaded scenes: `NBTRACK_DATA`, else `data/` of the project."""
+    return Path(os.environ.get("NBTRACK_DATA") or project_folder() / "data").resolve()
+
+
+def tables_folder() -> Path:
+    """Where tables are written, a folder a preset: `paper_tables/` of the project."""
+    return project_folder() / "paper_tables"
+
+
+def fingerprint(*parts: Any) -> str:
+    """Twelve hexadecimal digits that change with any of the parts (plain values or configs)."""
+    plain = [as_dict(p) if dataclasses.is_dataclass(p) else p for p in parts]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
+
+
+@cache
+def sources_fingerprint(*rooms: str) -> str:
+    """Twelve hexadecimal digits that change with the code of rooms, or of modules as core.camera.
+
+    A cached result must not outlive the code that made it. Comments, docstrings and layout do not
+    count.
+    """
+    found = {}
+    for room in rooms:
+        path = PACKAGE / room.replace(".", "/")
+        files = sorted(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
+        found |= {str(f.relative_to(PACKAGE)): _code(f.read_text("utf-8")) for f in files}
+        found |= {str(f.relative_to(PACKAGE)): f.read_text("utf-8") for f in path.rglob("*.toml")}
+    return fingerprint(found)
+
+
+def foreign_source(kind: type) -> str:
+    """The code of a class that somebody wrote outside this package, in a file or a notebook."""
+    if kind.__module__.startswith("nbtrack."):
+        return ""
+    file = getattr(sys.modules.get(kind.__module__), "__file__", None)
+    text = Path(file).read_text("utf-8") if file else inspect.cleandoc(inspect.getsource(kind))
+    return _code(text)
+
+
+def _code(text: str) -> str:
+    """Python source without comments, docstrings and layout."""
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(
+            node, clean=False
+        ):
+            node.body = node.body[1:] or [ast.Pass()]
+    return ast.unparse(tree)
+
+
+def versions() -> dict[str, str]:
+    """Versions that a result depends on, to be kept beside it."""
+    return {
+        "nbtrack": nbtrack.__version__,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
 
 
 def write_bytes_atomic(path: Path, content: bytes) -> None:
@@ -23,14 +107,7 @@ def write_bytes_atomic(path: Path, content: bytes) -> None:
         OSError: the folder cannot be made or written; an existing file is then left as it was.
     """
     path = Path(path)
-    aside = _aside(path)
-    with _naming_file(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            aside.write_bytes(content)
-            os.replace(aside, path)
-        finally:
-            _remove(aside)
+    _write_aside_and_move({path: content}, path)
 
 
 def write_together(folder: Path, contents: Mapping[str, bytes]) -> None:
@@ -43,40 +120,58 @@ def write_together(folder: Path, contents: Mapping[str, bytes]) -> None:
         OSError: the folder cannot be made or written.
     """
     folder = Path(folder)
-    asides = {name: _aside(folder / name) for name in contents}
-    with _naming_file(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            for name, content in contents.items():
-                asides[name].write_bytes(content)
-            (folder / list(contents)[-1]).unlink(missing_ok=True)
-            for name, aside in asides.items():
-                os.replace(aside, folder / name)
-        finally:
-            for aside in asides.values():
-                _remove(aside)
+    _write_aside_and_move({folder / name: content for name, content in contents.items()}, folder)
 
 
-def _aside(path: Path) -> Path:
+def _write_aside_and_move(contents: Mapping[Path, bytes], called: Path) -> None:
     # The process id keeps two writers of one path from moving each other's half-written file.
-    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
-
-
-def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):  # what went wrong before is what the user must hear
-        path.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _naming_file(path: Path) -> Iterator[None]:
-    """Give errors the name of the result: a write that finds the disk full has none of its own."""
+    asides = {path: path.with_name(f".{path.name}.{os.getpid()}.tmp") for path in contents}
+    *_, last = contents
     try:
-        yield
-    except OSError as error:
-        raise OSError(error.errno, error.strerror or str(error), str(path)) from None
+        last.parent.mkdir(parents=True, exist_ok=True)
+        for path, content in contents.items():
+            asides[path].write_bytes(content)
+        if len(contents) > 1:
+            last.unlink(missing_ok=True)
+        for path, aside in asides.items():
+            os.replace(aside, path)
+    except OSError as error:  # a write that finds the disk full has no name of its own
+        raise OSError(error.errno, error.strerror or str(error), str(called)) from None
+    finally:
+        for aside in asides.values():
+            with contextlib.suppress(OSError):  # what went wrong before is what users must hear
+                aside.unlink(missing_ok=True)
 
 
-_AGAIN = "remove it and run the same command again"
+def write_text_atomic(path: Path, text: str) -> None:
+    """As `write_bytes_atomic`, for text: UTF-8 with the given line ends on every system."""
+    write_bytes_atomic(path, text.encode("utf-8"))
+
+
+def write_json_atomic(path: Path, content: Any) -> None:
+    """As `write_bytes_atomic`, for JSON as `json_bytes` gives it."""
+    write_bytes_atomic(path, json_bytes(content))
+
+
+def json_bytes(content: Any) -> bytes:
+    """JSON, indented, keys in the given order, newline at the end.
+
+    Raises:
+        ValueError: a number is NaN or infinite, for which JSON has no word; pass None instead.
+    """
+    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
+    return (text + "\n").encode("utf-8")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """An object from a JSON file of a finished result. Raises DataError if it is none."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise DataError(f"{path} is not readable JSON ({error}): {_AGAIN}") from None
+    if not isinstance(content, dict):
+        raise DataError(f"{path} holds no object: {_AGAIN}")
+    return content
 
 
 def read_checkpoint(path: Path, kind: str = "checkpoint", advice: str = _AGAIN) -> dict[str, Any]:
@@ -100,7 +195,7 @@ def read_checkpoint(path: Path, kind: str = "checkpoint", advice: str = _AGAIN) 
 
 @contextlib.contextmanager
 def naming_damaged(path: Path, kind: str = "checkpoint", advice: str = _AGAIN) -> Iterator[None]:
-    """Turn what goes wrong in taking up a checkpoint's content into one line that names the file.
+    """Turn what goes wrong in taking up a file's content into one line that names the file.
 
     Raises:
         DataError: the block met a part that is missing, or of another kind or shape.
@@ -116,38 +211,3 @@ def naming_damaged(path: Path, kind: str = "checkpoint", advice: str = _AGAIN) -
 def _damaged(path: Path, kind: str, reason: str, advice: str) -> DataError:
     reason = " ".join(reason.split())[:120]
     return DataError(f"{path} is not a readable {kind} ({reason}): {advice}")
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """An object from a JSON file of a finished result.
-
-    Raises:
-        DataError: the file is not one.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise DataError(f"{path} is not readable JSON ({error}): {_AGAIN}") from None
-    if not isinstance(content, dict):
-        raise DataError(f"{path} holds no object: {_AGAIN}")
-    return content
-
-
-def write_text_atomic(path: Path, text: str) -> None:
-    """As `write_bytes_atomic`, for text: UTF-8 with the given line ends on every system."""
-    write_bytes_atomic(path, text.encode("utf-8"))
-
-
-def write_json_atomic(path: Path, content: Any) -> None:
-    """As `write_bytes_atomic`, for JSON: indented, keys in the given order, newline at the end.
-
-    Raises:
-        ValueError: a number is NaN or infinite, for which JSON has no word; pass None instead.
-    """
-    write_bytes_atomic(path, json_bytes(content))
-
-
-def json_bytes(content: Any) -> bytes:
-    """JSON as `write_json_atomic` writes it."""
-    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
-    return (text + "\n").encode("utf-8")

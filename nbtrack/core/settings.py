@@ -1,49 +1,38 @@
-"""Checked overrides of a preset: from the command line, the environment and TOML files.
+"""Settings: trees of frozen dataclasses and dictionaries of them, changed by checked `key=value`.
 
-Precedence: preset < TOML file (`NBTRACK_CONFIG` or `--config`) < `NBTRACK_SET` < `--set key=value`.
-Keys are dotted paths such as `mapping.neus.iterations`; an unknown one is an error.
+Keys are dotted paths such as `mapping.neus.iterations`; an unknown one is an error. Counts are at
+least one, unless their field says `may_be_zero`.
 """
 
 import dataclasses
 import json
 import math
-import os
-import shlex
 import tomllib
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeVar
 
-from nbtrack.core.config import PRESETS, Preset, as_dict
-from nbtrack.core.errors import ConfigError, MissingError, nearest_name
+from nbtrack.core.errors import ConfigError, nearest_name
 
-
-def resolve_preset(
-    name: str | None = None, config_file: Path | None = None, settings: tuple[str, ...] = ()
-) -> Preset:
-    """The preset with all overrides applied.
-
-    Args:
-        name: a preset's name; by default `NBTRACK_PRESET`, else `smoke`.
-        config_file: TOML file of overrides; by default the one `NBTRACK_CONFIG` names, if any.
-        settings: `key=value` texts, applied last, after those in `NBTRACK_SET`.
-
-    Raises:
-        ConfigError: an unknown preset or key, or a value of the wrong type.
-        MissingError: the file does not exist.
-    """
-    name = name or os.environ.get("NBTRACK_PRESET", "smoke")
-    if name not in PRESETS:
-        raise ConfigError(f"unknown preset {name!r}: {nearest_name(name, list(PRESETS))}")
-    preset = PRESETS[name]
-    file_name = config_file or os.environ.get("NBTRACK_CONFIG")
-    if file_name:
-        for key, value in _flatten(_read_toml(Path(file_name))).items():
-            preset = _replace(preset, key, value)
-    return with_settings(preset, *_environment_settings(), *settings)
+Config = TypeVar("Config")
 
 
-def with_settings(preset: Preset, *settings: str) -> Preset:
-    """The preset with some `key=value` texts applied.
+def may_be_zero(default: int) -> Any:
+    """A dataclass field with a count that may also be 0."""
+    return dataclasses.field(default=default, metadata={"least": 0})
+
+
+def not_a_setting() -> Any:
+    """A dataclass field that no `key=value` reaches, as a preset's own name."""
+    return dataclasses.field(metadata={"is_setting": False})
+
+
+def as_dict(config: Any) -> dict[str, Any]:
+    """A config as nested dictionaries of plain values, ready for JSON."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def with_settings(config: Config, *settings: str) -> Config:
+    """The config with some `key=value` texts applied, the last one last.
 
     Raises:
         ConfigError: an unknown key, or a value of the wrong type.
@@ -52,37 +41,52 @@ def with_settings(preset: Preset, *settings: str) -> Preset:
         key, equals, text = setting.partition("=")
         if not equals:
             raise ConfigError(f"setting {setting!r} has no value: write key=value")
-        preset = _replace(preset, key.strip(), _parse_value(text.strip()))
-    return preset
+        config = with_values(config, {key.strip(): _parse_value(text.strip())})
+    return config
 
 
-def changed_settings(preset: Preset) -> list[str]:
-    """The `key=value` texts that turn the preset of this name into this one."""
-    original = _flatten(as_dict(PRESETS[preset.name]))
+def with_values(config: Config, values: Mapping[str, Any]) -> Config:
+    """The config with some values of dotted keys, or of trees of keys as TOML gives them.
+
+    Raises:
+        ConfigError: an unknown key, or a value of the wrong type.
+    """
+    valid = [key for key, _ in _leaves(config)]
+    for key, value in _flatten(values):
+        if key not in valid:
+            raise ConfigError(f"unknown config key {key!r}: {nearest_name(key, valid)}")
+        config = _replaced(config, key.split("."), key, value)
+    return config
+
+
+def changed_settings(config: Config, original: Config) -> list[str]:
+    """The `key=value` texts that turn the original into this config."""
+    before = dict(_leaves(original))
     return [
         f"{key}={json.dumps(value)}"
-        for key, value in _flatten(as_dict(preset)).items()
-        if original.get(key) != value
+        for key, value in _leaves(config)
+        if key not in before or before[key] != value
     ]
 
 
-def _environment_settings() -> list[str]:
-    text = os.environ.get("NBTRACK_SET", "")
-    try:
-        return shlex.split(text)
-    except ValueError as error:
-        raise ConfigError(
-            f"NBTRACK_SET={text!r} cannot be split ({error}): quote each setting as in a shell"
-        ) from None
+def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and values of all settings."""
+    if dataclasses.is_dataclass(node):
+        fields = [f for f in dataclasses.fields(node) if f.metadata.get("is_setting", True)]
+        node = {f.name: getattr(node, f.name) for f in fields}
+    if not isinstance(node, dict):
+        yield prefix, node
+        return
+    for name, value in node.items():
+        yield from _leaves(value, f"{prefix}.{name}" if prefix else name)
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise MissingError(f"no config file {path}: give a TOML file of settings")
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is no TOML: {error}; write lines like 'width = 128'") from None
+def _flatten(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flatten(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def _parse_value(text: str) -> Any:
@@ -98,48 +102,32 @@ def _parse_value(text: str) -> Any:
     return text  # a bare word is a string
 
 
-def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        path = f"{prefix}{key}"
-        flat |= _flatten(value, f"{path}.") if isinstance(value, dict) else {path: value}
-    return flat
-
-
-def _replace(preset: Preset, key: str, value: Any) -> Preset:
-    """The preset with one dotted key set. Nested parts are rebuilt, never changed in place."""
-    valid = [k for k in _flatten(as_dict(preset)) if k != "name"]
-    if key not in valid:
-        raise ConfigError(f"unknown config key {key!r}: {nearest_name(key, valid)}")
-    return _replaced(preset, key.split("."), key, value)
-
-
-def _replaced(node: Any, path: list[str], key: str, value: Any) -> Any:
-    head, *rest = path
-    old = node[head] if isinstance(node, dict) else getattr(node, head)
-    new = _replaced(old, rest, key, value) if rest else _converted(key, old, value)
+def _replaced(node: Any, path: list[str], key: str, value: Any, least: int = 1) -> Any:
+    """The tree with one key set. Nested parts are rebuilt, never changed in place."""
+    if not path:
+        return _converted(key, node, value, least)
+    name, *rest = path
     if isinstance(node, dict):
-        return {**node, head: new}
-    return dataclasses.replace(node, **{head: new})
+        return {**node, name: _replaced(node[name], rest, key, value)}
+    metadata = next(f.metadata for f in dataclasses.fields(node) if f.name == name)
+    new = _replaced(getattr(node, name), rest, key, value, metadata.get("least", 1))
+    return dataclasses.replace(node, **{name: new})
 
 
-# Counts are at least one, but for these: no frame is held out, no second pass, the first seed.
-_MAY_BE_ZERO = ("holdout_every", "n_surface", "n_importance", "n_restarts", "seed")
-
-
-def _converted(key: str, old: Any, value: Any) -> Any:
+def _converted(key: str, old: Any, value: Any, least: int) -> Any:
     wanted = type(old)
     if wanted is tuple and isinstance(value, list | str | int | float):
         values = value if isinstance(value, list) else [value]
-        return tuple(_converted(key, old[0], v) if old else v for v in values)
-    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        return tuple(_converted(key, old[0], v, least) if old else v for v in values)
+    # Integers of TOML may be too large for a float.
+    if wanted is float and type(value) is int and abs(value) < 1e300:
         value = float(value)
     if type(value) is not wanted:
         raise ConfigError(
             f"{key} = {value!r} is of type {type(value).__name__}: it must be {wanted.__name__}, "
             f"for example {old!r}"
         )
-    least = 1 if wanted is int and key.rpartition(".")[2] not in _MAY_BE_ZERO else 0
+    least = least if wanted is int else 0
     if wanted in (int, float) and not least <= value < math.inf:
         raise ConfigError(f"{key} = {value!r}: it must be {least} or more; the preset has {old!r}")
     return value

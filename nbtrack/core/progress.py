@@ -1,0 +1,81 @@
+"""One progress bar: a line that moves where somebody watches, elsewhere one line at the end."""
+
+import sys
+import time
+from typing import Any
+
+from tqdm import tqdm
+
+_SECONDS_BEFORE_SHOWN = 1.0  # so that a mistake which ends the work at once is told alone
+_FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+
+
+def tell(news: str) -> None:
+    """Print news: to standard error, since it is no result; notebooks would show that in red."""
+    print(news, file=sys.stdout if _is_notebook() else sys.stderr)
+
+
+def _is_notebook() -> bool:
+    ipython = sys.modules.get("IPython")
+    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
+
+
+class _NotebookLine:
+    """A file whose text is one output of a notebook's cell, replaced at every write.
+
+    It needs no widget, so that stored notebooks and exported pages end with the last text.
+    """
+
+    handle: Any = None
+
+    def write(self, text: str) -> None:
+        from IPython.display import display
+
+        shown = {"text/plain": text.strip()}
+        if not shown["text/plain"]:
+            return
+        if self.handle is None:
+            self.handle = display(shown, raw=True, display_id=True)
+        else:
+            self.handle.update(shown, raw=True)
+
+    def flush(self) -> None:
+        """Nothing waits."""
+
+
+class ProgressBar:
+    """Progress with an ETA over a known amount of work, to be used in a `with` block."""
+
+    def __init__(self, title: str, total: float | int, is_shown: bool = True) -> None:
+        is_notebook = _is_notebook()
+        self.title, self.total, self.done, self.is_shown = title, total, 0.0, is_shown
+        self._start = time.monotonic()
+        # A notebook's kernel drops messages once a thousand wait to be read.
+        self._bar = tqdm(
+            total=total,
+            desc=title,
+            bar_format=_FORMAT,
+            delay=_SECONDS_BEFORE_SHOWN,
+            file=_NotebookLine() if is_notebook else sys.stderr,
+            mininterval=1.0 if is_notebook else 0.1,
+            ascii=False,
+            disable=not (is_shown and (is_notebook or sys.stderr.isatty())),
+        )
+
+    def move_to(self, done: float | int, status: str = "") -> None:
+        """Show how much is done, and a word on how it goes."""
+        # Sums of fractions may end a rounding error above the total, which a bar does not like.
+        done = min(done, self.total)
+        self._bar.set_postfix_str(status, refresh=False)
+        self._bar.update(done - self.done)
+        self.done = done
+
+    def __enter__(self) -> "ProgressBar":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        seconds, is_hidden = time.monotonic() - self._start, self._bar.disable
+        self._bar.close()
+        is_told = self.is_shown and is_hidden and kind is None
+        if is_told and seconds > _SECONDS_BEFORE_SHOWN:
+            print(f"{self.title}: done in {seconds:.0f} s", file=sys.stderr)
