@@ -1,32 +1,71 @@
-"""Decode image files, and refuse those that are damaged."""
+"""From image files to arrays: one size, depth in mm along the optical axis, no distortion."""
 
+import os
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Shaped, UInt8
+from jaxtyping import Int, Shaped, UInt8, UInt16
 
-from nbtrack.core.errors import DataError
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.errors import DataError, MissingError
+from nbtrack.core.progress import ProgressBar
+from nbtrack.data.recording import Recording
+from nbtrack.data.text_files import camera_matrix
 
+_FARTHEST_MM = 65535  # what 16 bits hold
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CHUNK_OVERHEAD = 12  # bytes of a PNG chunk beside its content: length, type, checksum
-_JPEG_END = b"\xff\xd9"
-_JPEG_TAIL = 1024  # bytes within which the end marker must come: some cameras append notes
 
 
-def read_image(path: Path, flags: int) -> Shaped[np.ndarray, "height width *channels"]:
-    """Decoded PNG or JPEG file, as OpenCV gives it with `flags`.
+def decode(
+    recording: Recording, frame_ids: Int[np.ndarray, "n"], progress: bool = False
+) -> tuple[Intrinsics, UInt8[np.ndarray, "n height width 3"], UInt16[np.ndarray, "n height width"]]:
+    """The camera, and RGB colours and depths (mm along the axis) of some frames (at least one).
 
-    Depending on its version OpenCV fills the missing part of a damaged file with whatever it
-    has, or complains on standard error. Hence the file is checked first, which takes a fortieth
-    of the time that decoding does.
-
-    Raises:
-        DataError: the file is cut short, damaged or not an image.
+    Raises DataError if a file is damaged, of another kind or size, or holds depths over 65.535 m.
     """
+    files = [(recording.color_files[i], recording.depth_files[i]) for i in frame_ids]
+    resize = recording.format.resize_color
+    first = files[0][1 if resize else 0]  # the size is its
+    height, width = _read_image(first, cv2.IMREAD_COLOR).shape[:2]
+    camera = recording.calibration.for_size(width, height, first)
+    maps = _undistortion(camera, recording.calibration.distortion)
+    colors = np.empty((len(files), height, width, 3), np.uint8)
+    depths = np.empty((len(files), height, width), np.uint16)
+
+    def read(index: int) -> None:
+        color_file, depth_file = files[index]
+        color = _read_image(color_file, cv2.IMREAD_COLOR)
+        depth = _read_image(depth_file, cv2.IMREAD_UNCHANGED)
+        if resize:
+            color = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
+        _check(color_file, color, colors[index], first)
+        _check(depth_file, depth, depths[index], first)
+        if maps:
+            color = cv2.remap(color, *maps, cv2.INTER_LINEAR)
+            # Interpolation would invent points between a table and the wall behind.
+            depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
+        depth[depth == recording.declared.no_depth] = 0
+        depths[index] = _in_millimetres(depth, recording, camera, depth_file)
+        colors[index] = cv2.cvtColor(color, cv2.COLOR_BGR2RGB)
+
+    # Decoding releases the interpreter lock, so a few threads suffice.
+    bar = ProgressBar("reading frames", len(files), progress)
+    with bar, ThreadPoolExecutor(max_workers=4) as pool:
+        for done, _ in enumerate(pool.map(read, range(len(files))), start=1):
+            bar.move_to(done)
+    return camera, colors, depths
+
+
+def _read_image(path: Path, flags: int) -> Shaped[np.ndarray, "height width *channels"]:
+    """Decoded PNG or JPEG file, checked before: of a damaged one OpenCV fills in anything."""
+    if not os.path.isfile(path):
+        raise MissingError(f"no file {path}: a frame needs it; add it or remove the frame")
     content = np.fromfile(path, dtype=np.uint8)
-    image = cv2.imdecode(content, flags) if _is_complete(content) else None
+    image = cv2.imdecode(content, flags) if _is_complete(memoryview(content)) else None
     if image is None:
         raise DataError(
             f"{path} is damaged or not a complete PNG or JPEG ({len(content)} bytes): copy it "
@@ -35,22 +74,54 @@ def read_image(path: Path, flags: int) -> Shaped[np.ndarray, "height width *chan
     return image
 
 
-def _is_complete(content: UInt8[np.ndarray, "bytes"]) -> bool:
-    if content[:8].tobytes() == _PNG_SIGNATURE:
-        return _png_is_intact(memoryview(content))
-    # Compressed JPEG data never holds the end marker's two bytes.
-    return _JPEG_END in content[-_JPEG_TAIL:].tobytes()
-
-
-def _png_is_intact(content: memoryview) -> bool:
-    """Whether all chunks up to the closing one are there and their checksums agree."""
-    start = len(_PNG_SIGNATURE)
-    while start + _CHUNK_OVERHEAD <= len(content):
+def _is_complete(content: memoryview) -> bool:
+    """A JPEG with its end marker, or a PNG with all chunks, whose checksums agree."""
+    if content[:8] != _PNG_SIGNATURE:
+        # Some cameras append notes. Compressed JPEG data never holds the marker's two bytes.
+        return b"\xff\xd9" in bytes(content[-1024:])
+    start, kind = len(_PNG_SIGNATURE), b""
+    while kind != b"IEND":
         end = start + _CHUNK_OVERHEAD + int.from_bytes(content[start : start + 4], "big")
         checksum = int.from_bytes(content[end - 4 : end], "big")
         if end > len(content) or zlib.crc32(content[start + 4 : end - 4]) != checksum:
             return False
-        if content[start + 4 : start + 8] == b"IEND":
-            return True
-        start = end
-    return False
+        start, kind = end, content[start + 4 : start + 8]
+    return True
+
+
+def _check(path: Path, image: np.ndarray, wanted: np.ndarray, first: Path) -> None:
+    if (image.shape, image.dtype) != (wanted.shape, wanted.dtype):
+        raise DataError(
+            f"{path} is {image.dtype} of shape {image.shape}: it must be {wanted.dtype} of shape "
+            f"{wanted.shape}, for the size of {first} (depth has 16 bits and one channel)"
+        )
+
+
+def _in_millimetres(
+    depth: np.ndarray, recording: Recording, camera: Intrinsics, file: Path
+) -> np.ndarray:
+    """Millimetres along the optical axis."""
+    scale, along_ray = recording.declared.depth_scale, recording.declared.depth_along == "ray"
+    if scale == 1000 and not along_ray:
+        return depth
+    depth_mm = depth * (1000 / scale)
+    if along_ray:
+        x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+        y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+        depth_mm = depth_mm / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
+    if depth_mm.max() > _FARTHEST_MM:
+        raise DataError(
+            f"{file} holds {depth_mm.max() / 1000:.4g} m with {scale:g} depth values a metre: at "
+            "most 65.535 m can be kept; set depth_scale or no_depth in sequence.toml"
+        )
+    return np.rint(depth_mm).astype(np.uint16)
+
+
+def _undistortion(camera: Intrinsics, distortion: tuple[float, ...]) -> tuple[np.ndarray, ...]:
+    """For cv2.remap: where a pinhole camera's pixels lie in the image; empty for a pinhole's."""
+    if not any(distortion):
+        return ()
+    # OpenCV counts pixel centres as whole numbers.
+    K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
+    size = (camera.width, camera.height)
+    return cv2.initUndistortRectifyMap(K, np.array(distortion), None, K, size, cv2.CV_32FC1)

@@ -1,22 +1,26 @@
-"""RGB-D sequences with known camera poses, whatever format they are stored in.
+"""RGB-D sequences with known camera poses, whatever format they are stored in."""
 
-Formats are modules of `nbtrack.data.readers`; data/README.md describes them.
-"""
-
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8, UInt16
 
+from nbtrack.core.arrays import Poses
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.camera import Intrinsics, backproject
+from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
-from nbtrack.data.readers import Recording, decode, open_recording
+from nbtrack.data.frame import MILLIMETRE, Frame
+from nbtrack.data.images import decode
+from nbtrack.data.recording import Recording, open_recording
 
-MILLIMETRE = 1e-3
 FRAMES_PER_SECOND = 30.0  # of the recordings; turns frame ids into time stamps
+# Of bounds (our choice): pixels looked at in each frame, on a regular grid, and the share of points
+# cut off at either end of each axis, so that a few wild depths do not stretch the box.
+_POINTS_PER_FRAME, _CUT_OFF = 2000, 0.002
+_SLICE = r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?"
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class RgbdSequence:
     intrinsics: Intrinsics
     colors: UInt8[np.ndarray, "frames height width 3"]  # RGB
     depths_mm: UInt16[np.ndarray, "frames height width"]  # z-depth, 0 = no measurement
-    T_world_camera: Float[np.ndarray, "frames 4 4"]  # OpenCV camera axes
+    T_world_camera: Poses  # OpenCV camera axes
     frame_ids: Int[np.ndarray, "frames"]  # position in the folder's natural order
     excluded_frames: int = 0  # frames left out because their pose is NaN
 
@@ -42,6 +46,13 @@ class RgbdSequence:
         left_out = f", {self.excluded_frames} without pose" if self.excluded_frames else ""
         return f"RgbdSequence({self.name!r}, {len(self)} frames of {size}{left_out})"
 
+    def __getitem__(self, index: int) -> Frame:
+        """One frame, with the pose that it was recorded with."""
+        color = torch.from_numpy(self.colors[index])
+        depth_mm = torch.from_numpy(self.depths_mm[index].astype(np.int32))
+        name = f"frame {self.frame_ids[index]} of {self.name}"
+        return Frame(self.intrinsics, color, depth_mm, self.T_world_camera[index], name)
+
     def color(self, index: int) -> Float[np.ndarray, "height width 3"]:
         """Colour image in [0, 1]."""
         return self.colors[index].astype(np.float32) / 255
@@ -52,33 +63,22 @@ class RgbdSequence:
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
         """The sequence of some of the frames, in the order given; slices copy nothing."""
-        return RgbdSequence(
-            self.name, self.intrinsics, self.colors[indices], self.depths_mm[indices],
-            self.T_world_camera[indices], self.frame_ids[indices], self.excluded_frames,
-        )  # fmt: skip
+        arrays = ("colors", "depths_mm", "T_world_camera", "frame_ids")
+        return replace(self, **{name: getattr(self, name)[indices] for name in arrays})
 
 
 def parse_frames(text: str) -> slice:
-    """A Python slice written `A:B:S`; every part may be missing.
-
-    Raises:
-        DataError: the text is not a slice, or its step is not positive.
+    """A Python slice written `A:B:S` with S > 0; every part may be missing. Or raises DataError.
 
     >>> parse_frames("10:50:2"), parse_frames(":100")
     (slice(10, 50, 2), slice(None, 100, None))
     """
-    try:
-        parts = [int(part) if part.strip() else None for part in text.split(":")]
-        if not 2 <= len(parts) <= 3:
-            raise ValueError
-        frames = slice(*parts)
-    except ValueError:
+    match = re.fullmatch(_SLICE, text.replace(" ", ""))
+    if not match:
         raise DataError(
-            f"frames {text!r} is not a slice: write A:B or A:B:S, for example 0:100:2"
-        ) from None
-    if frames.step is not None and frames.step < 1:
-        raise DataError(f"frames {text!r} steps by {frames.step}: a step is 1 or more")
-    return frames
+            f"frames {text!r} is no slice: write A:B or A:B:S, for example 0:100:2, with S above 0"
+        )
+    return slice(*(int(part) if part else None for part in match.groups()))
 
 
 def read_sequence(
@@ -89,24 +89,12 @@ def read_sequence(
     progress: bool = False,
     format: str | None = None,
 ) -> RgbdSequence:
-    """Read a recording in one of the formats of `nbtrack.data.readers.FORMATS`.
+    """Read a recording; arguments and errors are those of `open_recording` and `read_frames`.
 
-    Args:
-        frames: Python slice over the recording's frames in their order.
-        depth_folder: of a Neural RGB-D scene or a plain folder; by default the first there is of
-            `depth_filtered`, `depth` and `depth_with_noise`.
-        pose_file: by default the format's own; a Neural RGB-D scene also has
-            `trainval_poses.txt` (the dataset's BundleFusion poses, in a frame of their own).
-        progress: show a bar.
-        format: the name of one; by default told by the files that are there.
-
-    Raises:
-        MissingError: the folder or a part of it does not exist.
-        DataError: a file is unreadable, counts or sizes disagree, or nothing is left to read.
-        ConfigError: there is no such format.
+    A Neural RGB-D scene also has depth in `depth` and `depth_with_noise`, and poses in
+    `trainval_poses.txt` (BundleFusion's, in another world frame).
     """
-    recording = open_recording(folder, format, depth_folder, pose_file)
-    return read_frames(recording, frames, progress)
+    return read_frames(open_recording(folder, format, depth_folder, pose_file), frames, progress)
 
 
 def read_frames(
@@ -114,75 +102,45 @@ def read_frames(
 ) -> RgbdSequence:
     """The frames of an opened recording that a slice selects and that have a pose.
 
-    Raises:
-        MissingError, DataError: as `read_sequence` does.
+    Raises MissingError or DataError if an image cannot be read, or no selected frame has a pose.
     """
-    selected = np.arange(len(recording))[frames]
-    if len(selected) == 0:
-        raise DataError(
-            f"frames {_slice_text(frames)} select nothing of the {len(recording)} frames in "
-            f"{recording.folder}: choose a range within 0:{len(recording)}"
-        )
-    frame_ids = selected[recording.has_pose[selected]]
-    if len(frame_ids) == 0:
-        raise DataError(
-            f"all {len(selected)} selected poses in {recording.pose_file} are NaN: at least one "
-            "frame needs a pose; choose other frames or another pose file"
-        )
-    decoded = decode(recording, frame_ids, progress)
+    frame_ids = select_frames(recording, frames)
+    known = frame_ids[recording.has_pose[frame_ids]]
+    poses, n_excluded = recording.T_world_camera[known], len(frame_ids) - len(known)
     return RgbdSequence(
-        recording.name, decoded.intrinsics, decoded.colors, decoded.depths,
-        recording.T_world_camera[frame_ids], frame_ids, len(selected) - len(frame_ids),
-    )  # fmt: skip
+        recording.name, *decode(recording, known, progress), poses, known, n_excluded
+    )
 
 
-def list_frames(
-    folder: Path, depth_folder: str | None = None, format: str | None = None
-) -> tuple[list[Path], list[Path]]:
-    """Colour and depth files of a recording, paired, in order.
-
-    Raises:
-        MissingError, DataError, ConfigError: as `read_sequence` does, pixels aside.
-    """
-    recording = open_recording(folder, format, depth_folder)
-    return recording.color_files, recording.depth_files
-
-
-def _slice_text(frames: slice) -> str:
-    parts = (frames.start, frames.stop, frames.step)
-    return ":".join("" if part is None else str(part) for part in parts)
+def select_frames(recording: Recording, frames: slice) -> Int[np.ndarray, "n"]:
+    """Numbers of the selected frames. Raises DataError if none of them has a pose."""
+    frame_ids = np.arange(len(recording))[frames]
+    if not recording.has_pose[frame_ids].any():
+        parts = (frames.start, frames.stop, frames.step)
+        text = ":".join("" if part is None else str(part) for part in parts)
+        n_frames, file = len(recording), recording.pose_file
+        raise DataError(
+            f"frames {text} select {len(frame_ids)} of the {n_frames} frames in {recording.folder},"
+            f" but no pose in {file} that is not NaN: choose others of 0:{n_frames}, or other poses"
+        )
+    return frame_ids
 
 
-def observed_bounds(
-    sequence: RgbdSequence,
-    margin: float = 0.1,
-    quantile: float = 0.002,
-    points_per_frame: int = 2000,
-) -> SceneBounds:
+def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
     """Box around everything a sequence sees, and its cameras, with `margin` metres to spare.
 
-    Args:
-        quantile: share of points cut off at either end of each axis, so that a few wild depths
-            do not stretch the box (our choice; the cameras are never cut off).
-        points_per_frame: pixels looked at in each frame, on a regular grid.
-
-    Raises:
-        DataError: no pixel of the sequence has a depth.
+    Raises DataError if no pixel of the sequence has a depth.
     """
-    intrinsics = sequence.intrinsics
-    stride = max(1, round((intrinsics.width * intrinsics.height / points_per_frame) ** 0.5))
-    rows, columns = torch.meshgrid(
-        torch.arange(stride // 2, intrinsics.height, stride),
-        torch.arange(stride // 2, intrinsics.width, stride),
-        indexing="ij",
-    )
+    height, width = sequence.depths_mm.shape[1:]
+    stride = max(1, round((width * height / _POINTS_PER_FRAME) ** 0.5))
+    sides = (torch.arange(stride // 2, length, stride) for length in (height, width))
+    grid = torch.meshgrid(*sides, indexing="ij")
     clouds = []
-    for index in range(len(sequence)):
-        depth = torch.from_numpy(sequence.depth(index))[rows, columns]
-        seen = depth > 0
-        points_camera = backproject(intrinsics, columns[seen], rows[seen], depth[seen]).numpy()
-        T_world_camera = sequence.T_world_camera[index]
-        clouds.append(points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])
+    for index, T in enumerate(sequence.T_world_camera):
+        frame = sequence[index]
+        seen = frame.depth_mm[grid] > 0
+        points_camera, _ = frame.points(*(pixels[seen] for pixels in grid))
+        clouds.append(points_camera.numpy() @ T[:3, :3].T + T[:3, 3])
     points_world = np.concatenate(clouds)
     if len(points_world) == 0:
         raise DataError(
@@ -190,7 +148,7 @@ def observed_bounds(
             "check the depth folder and its unit (uint16 millimetres)"
         )
     positions = sequence.T_world_camera[:, :3, 3]
-    low, high = np.quantile(points_world, [quantile, 1 - quantile], axis=0)
+    low, high = np.quantile(points_world, [_CUT_OFF, 1 - _CUT_OFF], axis=0)
     low = np.minimum(low, positions.min(axis=0)) - margin
     high = np.maximum(high, positions.max(axis=0)) + margin
     return SceneBounds(tuple(low.tolist()), tuple(high.tolist()))

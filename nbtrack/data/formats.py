@@ -1,0 +1,168 @@
+"""The formats of recordings: one table of layouts and conventions. data/README.md describes them.
+
+A format of one's own is one more entry. What a recording does otherwise than its format, it says
+in `sequence.toml`: any field of `Declaration`.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
+from nbtrack.core.settings import may_be_zero, with_values
+from nbtrack.data.conventions import CAMERA_TO_WORLD, WORLD_TO_CAMERA, camera_axes_in_opencv
+from nbtrack.data.text_files import Calibration, read_object
+
+DECLARATION_FILE = "sequence.toml"
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """How the numbers of a recording are meant. Raises ConfigError for what cannot be."""
+
+    format: str = ""  # empty: told by the files
+    depth_scale: float = 1000.0  # depth values a metre
+    no_depth: int = may_be_zero(0)  # a value that means "not measured", besides 0
+    depth_along: str = "axis"  # the optical axis (z-depth), or "ray" (distance)
+    camera_axes: str = "opencv"  # or "opengl", or where x, y, z point: "right up forward"
+    poses: str = CAMERA_TO_WORLD  # or "world-to-camera"
+    quaternion: str = "xyzw"  # or "wxyz": the order in pose files with quaternions
+    frame_rate: float = 30.0  # Hz
+
+    def __post_init__(self) -> None:
+        for key, (first, last) in _ALLOWED.items():
+            value = getattr(self, key)
+            is_text = isinstance(value, str)
+            if not (value in (first, last) if is_text else first <= value <= last):
+                allowed = f"{first!r} {'or' if is_text else 'to'} {last!r}"
+                raise ConfigError(f"{key} = {value!r}: write {allowed}")
+        camera_axes_in_opencv(self.camera_axes)  # raises where the axes are none
+
+
+# Two choices, or limits: far beyond any camera's, and what 16 bits hold.
+_ALLOWED: dict[str, tuple[Any, Any]] = {
+    "depth_scale": (1e-8, 1e8), "no_depth": (0, 65535), "frame_rate": (1e-8, 1e8),
+    "depth_along": ("axis", "ray"), "quaternion": ("xyzw", "wxyz"),
+    "poses": (CAMERA_TO_WORLD, WORLD_TO_CAMERA),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Format:
+    """One layout of recordings on disk. Paths are patterns within the recording's folder."""
+
+    label: str  # for people
+    color: str  # image files, or a .txt with `timestamp file` a line
+    depth: tuple[str, ...]  # the same; the first whose folder is there
+    poses: tuple[str, ...]  # a file of all poses, or with `*` one a frame
+    cameras: tuple[str, ...]  # calibration files; the first that is there
+    known_cameras: tuple[Calibration, ...] = ()  # without a file; `source` is in the folder's name
+    declared: Declaration = Declaration()  # what its numbers mean
+    resize_color: bool = False  # colour has another size than depth and shows the same view
+
+    @property
+    def needs(self) -> tuple[tuple[str, ...], ...]:
+        """Of each of these patterns one must be there."""
+        cameras = () if self.known_cameras else (self.cameras,)
+        return (self.color,), self.depth, self.poses, *cameras
+
+
+_VGA = (640, 480)
+# The benchmark's own calibrations of its three cameras. The third needs no correction.
+_TUM_CAMERAS = (
+    Calibration(Path("freiburg1"), 517.3, 516.5, (319.1, 255.8), _VGA,
+                (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    Calibration(Path("freiburg2"), 520.9, 521.0, (325.6, 250.2), _VGA,
+                (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    Calibration(Path("freiburg3"), 535.4, 539.2, (320.6, 248.1), _VGA),
+)  # fmt: skip
+FORMATS: dict[str, Format] = {
+    # Azinovic et al. 2022. Filtered depth is what the dataset's own loader takes; intrinsics.txt
+    # is an addition of this package.
+    "neural_rgbd": Format(
+        "Neural RGB-D", color="images/*",
+        depth=("depth_filtered/*", "depth/*", "depth_with_noise/*"), poses=("poses.txt",),
+        cameras=("intrinsics.txt", "focal.txt"), declared=Declaration(camera_axes="opengl"),
+    ),
+    # Sturm et al. 2012. The depth maps carry their scale correction already.
+    "tum": Format(
+        "TUM RGB-D", color="rgb.txt", depth=("depth.txt",), poses=("groundtruth.txt",),
+        cameras=("intrinsics.json", "intrinsics.txt", "calibration.txt"),
+        known_cameras=_TUM_CAMERAS, declared=Declaration(depth_scale=5000.0),
+    ),
+    # As rendered for iMAP and shared with NICE-SLAM, whose loader turns the y and z axes of these
+    # poses to reach OpenGL's.
+    "replica": Format(
+        "Replica (NICE-SLAM)", color="results/frame*", depth=("results/depth*",),
+        poses=("traj.txt",), cameras=("cam_params.json", "../cam_params.json"),
+        declared=Declaration(depth_scale=6553.5),
+    ),
+    # Shotton et al. 2013. Colour and depth come from two cameras 25 mm apart that the dataset does
+    # not register. Its page states the focal length and the principal point (320, 240), taken here
+    # as the middle of the image.
+    "7scenes": Format(
+        "7-Scenes", color="*.color.*", depth=("*.depth.*",), poses=("*.pose.txt",),
+        cameras=("intrinsics.txt",), declared=Declaration(no_depth=65535),
+        known_cameras=(Calibration(Path(), 585.0, 585.0, None, _VGA),),
+    ),
+    # Dai et al. 2017, as SensReader exports a scan: one view, colour larger than depth.
+    "scannet": Format(
+        "ScanNet export", color="color/*", depth=("depth/*",), poses=("pose/*.txt",),
+        cameras=("intrinsic/intrinsic_depth.txt",), resize_color=True,
+    ),
+    # A folder of an own recording. The last two cameras are Open3D's.
+    "plain": Format(
+        "plain folder", color="color/*", depth=("depth/*",),
+        poses=("trajectory.txt", "poses.txt", "poses/*.txt"),
+        cameras=("intrinsics.json", "intrinsics.txt", "intrinsic.json", "camera_intrinsic.json"),
+    ),
+}  # fmt: skip
+
+
+def declaration(folder: Path, format: str | None = None) -> Declaration:
+    """What a recording's numbers mean, with its format: named, declared, or told by the files.
+
+    Where files are missing, the format that the most are left of; reading says what is missing.
+    Raises MissingError, ConfigError or DataError for what it cannot tell.
+    """
+    if not folder.is_dir():
+        raise MissingError(
+            f"no folder {folder}: give a folder with a recording, or the name of a synthetic room"
+        )
+    path = folder / DECLARATION_FILE
+    format = format or _declared(path, Declaration()).format or _told_by_files(folder)
+    if format not in FORMATS:
+        raise ConfigError(f"unknown format {format[:40]!r}: {nearest_name(format, list(FORMATS))}")
+    return replace(_declared(path, FORMATS[format].declared), format=format)
+
+
+def _told_by_files(folder: Path) -> str:
+    """The format with the largest share of what it needs."""
+    shares = {
+        name: np.mean([any(any(folder.glob(p)) for p in patterns) for patterns in layout.needs])
+        for name, layout in FORMATS.items()
+    }
+    most = max(shares.values())
+    best = [name for name, share in shares.items() if share == most]
+    if most == 0:
+        files = (f"{name} ({', '.join(map(' or '.join, FORMATS[name].needs))})" for name in best)
+        raise MissingError(
+            f"{folder} is no known recording: it needs the files of {'; '.join(files)}; of a scene "
+            "in parts, give one part's folder"
+        )
+    if len(best) > 1 and most == 1:
+        raise DataError(
+            f"{folder} can be read as {' or '.join(best)}: choose with --format, or format = "
+            f'"{best[0]}" in {DECLARATION_FILE}'
+        )
+    return best[0]
+
+
+def _declared(path: Path, defaults: Declaration) -> Declaration:
+    """The defaults with what a file changes, if it is there."""
+    try:
+        return with_values(defaults, read_object(path)) if path.is_file() else defaults
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from None

@@ -1,0 +1,112 @@
+"""One RGB-D image: the unit of tracking, from a recording or from a running camera."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Int, UInt8
+from torch import Tensor
+
+from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values
+from nbtrack.core.camera import Intrinsics, backproject
+from nbtrack.core.errors import DataError
+
+MILLIMETRE = 1e-3
+_MOST_MILLIMETRES = np.iinfo(np.uint16).max
+# Points to track: a neighbouring depth that differs by more, as a share, marks an edge.
+_EDGE_JUMP, _DRAWN_PER_POINT = 0.05, 4
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Colour and depth of one moment; only pixels that are asked for become floating point."""
+
+    camera: Intrinsics
+    color: UInt8[Tensor, "height width 3"]  # RGB
+    depth_mm: Int[Tensor, "height width"]  # z-depth, 0 = no measurement
+    T_world_camera: Pose | None = None  # the true pose, where it is known
+    name: str = "the frame"  # what errors call it
+
+    @classmethod
+    def of_images(cls, camera: Intrinsics, color: np.ndarray, depth: np.ndarray) -> "Frame":
+        """A camera's images. Raises DataError if one has another size, type or unit.
+
+        Args:
+            color: RGB, (height, width, 3): uint8, or floating point in [0, 1].
+            depth: z-depth along the optical axis, (height, width): uint16 in millimetres, or
+                floating point in metres, kept to the millimetre. 0, NaN, infinite and negative ones
+                are none; nor are those whose colour is not finite.
+        """
+        size = (camera.height, camera.width)
+        # Metres beyond 100 in most of an image are none (our choice).
+        _check("color", color, (*size, 3), "uint8, or floating point in [0, 1]", 1.0, 1.5)
+        _check("depth", depth, size, "uint16 in mm, or floating point in metres", 0.5, 100.0)
+        if depth.dtype != np.uint16:
+            metres = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float64)
+            depth = (metres / MILLIMETRE).round()
+            depth = np.where(depth > _MOST_MILLIMETRES, 0, depth)
+        if color.dtype != np.uint8:
+            is_known = np.isfinite(color).all(axis=-1)
+            color = np.where(is_known[..., None], color, 0)
+            color = (255 * color.clip(0, 1)).round().astype(np.uint8)
+            depth = np.where(is_known, depth, 0)
+        # Read-only memory is copied: torch does not take it.
+        color = torch.from_numpy(np.require(color, requirements="CW"))
+        return cls(camera, color, torch.from_numpy(depth.astype(np.int32)))
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether any pixel is measured."""
+        return bool(self.depth_mm.any())
+
+    def to(self, device: torch.device) -> "Frame":
+        """The same on a device."""
+        return replace(self, color=self.color.to(device), depth_mm=self.depth_mm.to(device))
+
+    def measured_pixels(self) -> Int[Tensor, "2 n"]:
+        """Rows and columns of all pixels that have a depth."""
+        return torch.nonzero(self.depth_mm).T
+
+    def at(self, rows: Indices, columns: Indices) -> tuple[Colors, Values]:
+        """Colour in [0, 1] and z-depth (m, 0 = none) of pixels."""
+        depth = self.depth_mm[rows, columns].float() * MILLIMETRE
+        return self.color[rows, columns].float() / 255, depth
+
+    def points(self, rows: Indices, columns: Indices) -> tuple[Points, Colors]:
+        """Points (m, camera frame) observed at pixels, and their colours in [0, 1]."""
+        color, depth = self.at(rows, columns)
+        return backproject(self.camera, columns, rows, depth), color
+
+    def smooth_points(self, n_points: int, generator: torch.Generator) -> tuple[Points, Colors]:
+        """Random observed points (m, camera frame), and their colours in [0, 1].
+
+        Not those at depth edges, which may belong to either side, nor at the border. Only a few
+        times as many pixels as wanted are drawn: where little is measured, fewer points come back.
+        """
+        n_drawn = (_DRAWN_PER_POINT * n_points,)
+        rows, columns = (
+            torch.randint(1, size - 1, n_drawn, generator=generator, device=generator.device)
+            for size in self.depth_mm.shape
+        )
+        depth = self.at(rows, columns)[1]
+        is_smooth = depth > 0
+        for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+            beside = self.at(rows + down, columns + right)[1]
+            is_smooth &= (beside - depth).abs() < _EDGE_JUMP * depth
+        kept = torch.nonzero(is_smooth).squeeze(-1)[:n_points]
+        return self.points(rows[kept], columns[kept])
+
+
+def _check(
+    what: str, image: np.ndarray, shape: tuple[int, ...], kinds: str, quantile: float, limit: float
+) -> None:
+    """Raises DataError for another shape or type, or where so many positive values are larger."""
+    if image.shape == shape and str(image.dtype) == kinds.split()[0].strip(","):
+        return
+    values = image[np.isfinite(image) & (image > 0)]
+    large = np.quantile(values, quantile) if values.size else 0.0
+    if image.shape != shape or not np.issubdtype(image.dtype, np.floating) or large > limit:
+        raise DataError(
+            f"{what} is {image.dtype} of shape {image.shape} with values like {large:.4g}: give "
+            f"{kinds}, of the camera's shape {shape}"
+        )

@@ -1,0 +1,108 @@
+"""Images, depth maps and poses that belong together: by numbers in names, or by times in lists."""
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int
+
+from nbtrack.core.arrays import Poses
+from nbtrack.core.errors import DataError, MissingError
+from nbtrack.data.text_files import Times, read_rows
+
+_IMAGES = (".png", ".jpg", ".jpeg")
+_TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
+
+
+def numbered_files(pattern: Path, suffixes: tuple[str, ...] = _IMAGES) -> list[Path]:
+    """Files in natural order, `img2` before `img10`. Raises MissingError if there is none."""
+    files = pattern.parent.glob(pattern.name)
+    files = [path for path in files if path.suffix.lower() in suffixes and path.is_file()]
+    if not files:
+        needed = f"{pattern} ({', '.join(suffixes)})"
+        raise MissingError(f"no file {needed}: add some, with the frame's number in the name")
+    # The name decides between img1 and img01.
+    return sorted(files, key=lambda path: (_numbers(path), path.name))
+
+
+def numbers_of(files: list[Path]) -> Int[np.ndarray, "_"]:
+    """Frame numbers: the last in each file's name; -1 if it has none."""
+    return np.array([[-1, *_numbers(path)][-1] for path in files])
+
+
+def _numbers(path: Path) -> list[int]:
+    # A dot ends the stem: frame-000001.color.png counts as 1. Of more digits no camera is capable.
+    return [int(digits[-18:]) for digits in re.findall(r"[0-9]+", path.stem)]
+
+
+def check_paired(colors: list[Path], others: list[Path]) -> None:
+    """Raises DataError unless every image has its depth map or pose, with the same frame number."""
+    numbers, other_numbers = numbers_of(colors), numbers_of(others)
+    if not np.array_equal(numbers, other_numbers):
+        odd = np.setxor1d(numbers, other_numbers)[:5].tolist()
+        raise DataError(
+            f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
+            f"{len(others)} {others[0].suffix} files, with other frame numbers in the names (only "
+            f"one has {odd}): every image needs one; rename or remove the odd files"
+        )
+
+
+def listed_pairs(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Path], Times]:
+    """Images and depth maps of two lists that are each other's nearest in time, and the times."""
+    (color_times, colors), (depth_times, depths) = map(_read_list, (color_list, depth_list))
+    closest = _nearest(color_times, depth_times)
+    kept = _nearest(depth_times, color_times)[closest] == np.arange(len(colors))
+    kept &= np.abs(depth_times[closest] - color_times) <= _TOLERANCE
+    if not kept.any():
+        raise DataError(
+            f"{color_list} ({_span(color_times)}) and {depth_list} ({_span(depth_times)}) have no "
+            f"times within {_TOLERANCE} s of each other: both need timestamps of one clock"
+        )
+    colors = [colors[i] for i in np.flatnonzero(kept)]
+    return colors, [depths[i] for i in closest[kept]], color_times[kept]
+
+
+def _read_list(path: Path) -> tuple[Times, list[Path]]:
+    """Times and files of a list with `timestamp file` a line, in the order of time."""
+    meaning = "'timestamp file', as in '1305031102.175 rgb/1305031102.175.png'"
+    rows = sorted(read_rows(path, _entry, (2,), meaning), key=lambda row: row[0])
+    files = [path.parent / name for _, name in rows]
+    for file in files:
+        # Unlike pathlib's, it takes names that no file can have.
+        if not os.path.isfile(file):
+            raise MissingError(f"no file {str(file)[:200]!r}, named in {path}: add it there")
+    return np.array([time for time, _ in rows]), files
+
+
+def _entry(line: str) -> tuple[float, str]:
+    time, name = line.split(maxsplit=1)
+    if not np.isfinite(float(time)):
+        raise ValueError
+    return float(time), name.strip()
+
+
+def _nearest(times: Times, others: Times) -> Int[np.ndarray, "_"]:
+    """For every time the index of the nearest other one (m > 0)."""
+    order = np.argsort(others, kind="stable")
+    ranks = np.searchsorted(others[order], times)
+    before, after = order[(ranks - 1).clip(0)], order[ranks.clip(max=len(others) - 1)]
+    return np.where(np.abs(others[before] - times) <= np.abs(others[after] - times), before, after)
+
+
+def posed_by_time(
+    times: Times, poses: Poses, pose_times: Times, path: Path, tolerance: float = _TOLERANCE
+) -> Poses:
+    """The pose nearest to every frame in time; NaN where none is within the tolerance (s)."""
+    closest = _nearest(times, pose_times)
+    has_pose = np.abs(pose_times[closest] - times) <= tolerance
+    if not (has_pose.any() and np.isfinite(pose_times).all()):
+        raise DataError(
+            f"{path} ({_span(pose_times)}) has no pose within {tolerance:g} s of an image "
+            f"({_span(times)}): it needs finite timestamps of the same clock, one a frame"
+        )
+    return np.where(has_pose[:, None, None], poses[closest], np.nan)
+
+
+def _span(times: Times) -> str:
+    return f"{times.min():.13g} to {times.max():.13g} s"

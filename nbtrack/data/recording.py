@@ -1,0 +1,161 @@
+"""A recording whose files are found and whose texts are read, before any pixel is decoded."""
+
+import hashlib
+import os
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from nbtrack.core.arrays import Poses
+from nbtrack.core.errors import DataError, MissingError
+from nbtrack.data.conventions import poses_to_opencv
+from nbtrack.data.formats import DECLARATION_FILE, FORMATS, Declaration, Format, declaration
+from nbtrack.data.pairs import check_paired, listed_pairs, numbered_files, numbers_of, posed_by_time
+from nbtrack.data.text_files import Calibration, Times, checked_poses, read_calibration, read_poses
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What is found in a folder: paired image files, poses as the file has them, their meaning."""
+
+    folder: Path
+    name: str  # the folder's own
+    format: Format
+    declared: Declaration
+    color_files: list[Path]  # in the order of the recording, frame by frame
+    depth_files: list[Path]
+    times: Times  # of the frames, as recorded, or by their numbers and the rate declared
+    file_poses: Poses  # as `declared` says; NaN without a pose
+    pose_file: Path  # named in messages; a folder where every frame has a file
+    calibration: Calibration  # of the depth images, and of the colour that lies on them
+    text_files: list[Path]  # everything read beside the images
+
+    def __len__(self) -> int:
+        return len(self.color_files)
+
+    @cached_property
+    def T_world_camera(self) -> Poses:
+        """Camera-to-world poses with OpenCV's camera axes; NaN where there is none."""
+        return poses_to_opencv(self.file_poses, self.declared.camera_axes, self.declared.poses)
+
+    @cached_property
+    def has_pose(self) -> Bool[np.ndarray, "frames"]:
+        """Which frames have a pose."""
+        return np.isfinite(self.file_poses).all(axis=(1, 2))
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second; as declared where the frames have neither times nor numbers."""
+        step = np.median(np.diff(self.times)) if len(self.times) > 1 else 0.0
+        return float(1 / step if step > 0 else self.declared.frame_rate)
+
+    def contents(self) -> tuple[list[tuple[str, str, int]], list[str], Declaration]:
+        """What changes when a recording does: images' names and sizes, texts, the declaration.
+
+        An image that changes in place and keeps its size is not noticed.
+        """
+        files = self.color_files + self.depth_files
+        sizes = [(file.parent.name, file.name, os.path.getsize(file)) for file in files]
+        texts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in self.text_files]
+        return sizes, texts, self.declared
+
+
+def open_recording(
+    folder: Path | str,
+    format: str | None = None,
+    depth_folder: str | None = None,
+    pose_file: str | None = None,
+) -> Recording:
+    """Find the files of a recording and read its poses and calibration; pixels come later.
+
+    The format is told by the files, unless named; a depth folder or a pose file replaces its own.
+    Raises MissingError, DataError or ConfigError if something is not there, wrong or unknown.
+    """
+    folder = Path(folder)
+    declared = declaration(folder, format)
+    layout, lists = FORMATS[declared.format], []
+    if layout.color.endswith(".txt"):
+        names = (layout.color, *layout.depth)
+        lists = [_first_there(folder, (name,), "images", layout) for name in names]
+        colors, depths, times = listed_pairs(*lists)
+    else:
+        patterns = [folder / (depth_folder or Path(p).parent) / Path(p).name for p in layout.depth]
+        there = [pattern for pattern in patterns if pattern.parent.is_dir()]
+        if not there:
+            names = " or ".join(dict.fromkeys(pattern.parent.name for pattern in patterns))
+            raise MissingError(f"no depth in {folder}: it needs a folder {names}")
+        colors, depths = numbered_files(folder / layout.color), numbered_files(there[0])
+        check_paired(colors, depths)
+        times = (numbers_of(colors) - numbers_of(colors[:1])) / declared.frame_rate
+    poses, pose_files = _poses(folder, declared, pose_file, colors, times)
+    pose_path = pose_files[0] if len(pose_files) == 1 else pose_files[0].parent
+    camera = _calibration(folder, declared)
+    texts = [*lists, *pose_files, camera.source, folder / DECLARATION_FILE]
+    texts = [path for path in texts if path.is_file()]
+    poses, what = checked_poses(poses, pose_path), (folder.resolve().name, layout, declared)
+    return Recording(folder, *what, colors, depths, times, poses, pose_path, camera, texts)
+
+
+def _first_there(folder: Path, names: tuple[str, ...], what: str, layout: Format) -> Path:
+    for name in names:
+        if (folder / name).is_file():
+            return folder / name
+    needed = f"{layout.label} needs {' or '.join(names)}"
+    raise MissingError(
+        f"no {what} in {folder}: {needed}; add it, or name another format with --format"
+    )
+
+
+def _calibration(folder: Path, declared: Declaration) -> Calibration:
+    """From the folder's own file, else that of a camera which is in the folder's name."""
+    layout = FORMATS[declared.format]
+    known = [c for c in layout.known_cameras if c.source.name in folder.resolve().name]
+    if known and not any((folder / name).is_file() for name in layout.cameras):
+        return replace(known[0], source=folder / known[0].source)
+    named = tuple(f"{c.source} in the folder's name" for c in layout.known_cameras)
+    path = _first_there(folder, layout.cameras + named, "calibration", layout)
+    camera, scale = read_calibration(path), declared.depth_scale
+    if camera.depth_scale not in (None, scale):
+        raise DataError(
+            f"{path}: scale is {str(camera.depth_scale)[:40]!r} but {scale:g} depth values a metre "
+            f"are in use: correct scale, or set depth_scale in {DECLARATION_FILE}"
+        )
+    return camera
+
+
+def _poses(
+    folder: Path, declared: Declaration, pose_file: str | None, colors: list[Path], times: Times
+) -> tuple[Poses, list[Path]]:
+    """A pose a frame, and the files that they were read from."""
+    layout = FORMATS[declared.format]
+    names = (pose_file,) if pose_file else layout.poses
+    files = [folder / name for name in names if (folder / name).is_file()]
+    if len(files) > 1:
+        found = " and ".join(file.name for file in files)
+        raise DataError(f"{folder} has {found}: choose with --poses, or remove one")
+    patterns = [folder / (f"{n}/*.txt" if (folder / n).is_dir() else n) for n in names]
+    patterns = [p for p in patterns if "*" in p.name and p.parent.is_dir()]
+    if patterns and not files:
+        files = numbered_files(patterns[0], (".txt",))
+        check_paired(colors, files)
+    else:
+        files = [_first_there(folder, names, "poses", layout)]
+    found = [read_poses(file, declared.quaternion) for file in files]
+    poses, pose_times, path = np.concatenate([T for T, _ in found]), found[0][1], files[0]
+    if pose_times is not None and layout.color.endswith(".txt"):
+        poses = posed_by_time(times, poses, pose_times, path)
+    elif pose_times is not None and len(poses) != len(colors):
+        # nbtrack's own trajectories leave frames out.
+        placed = posed_by_time(times, poses, pose_times, path, tolerance=1e-3)
+        # Unless all poses find a frame the times are something else.
+        if np.isfinite(placed).sum() == np.isfinite(poses).sum():
+            poses = placed
+    if len(poses) != len(colors):
+        raise DataError(
+            f"{path} has {len(poses)} poses but there are {len(colors)} images: every frame needs "
+            "one; write 'nan' for each number of a frame without a pose"
+        )
+    return poses, files

@@ -1,0 +1,236 @@
+"""Texts of recordings, read strictly: objects, tables of numbers, poses, calibration.
+
+In calibration files, pixel centres lie at whole numbers, as OpenCV's calibration and all supported
+datasets have it: the middle of 640 pixels is 319.5. Inside the package they lie at integer + 0.5.
+"""
+
+import json
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from nbtrack.core.arrays import Poses
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.errors import DataError
+
+Times = Float[np.ndarray, "_"]  # s
+_TOLERANT = {"encoding": "utf-8-sig", "errors": "replace"}  # of a byte-order mark, and of any bytes
+_POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
+_CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
+_CAMERA = '{"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5}'
+_FARTHEST = 1e7  # m from the origin: beyond map coordinates, within what floats can square
+_RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
+_LARGEST = 1e6  # pixels: no image is so wide
+_LEAST_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """A JSON or TOML file, by its name, that holds an object. Raises DataError otherwise."""
+    kind = "TOML" if path.suffix == ".toml" else "JSON"
+    try:
+        text = path.read_text(**_TOLERANT)
+        content = tomllib.loads(text) if kind == "TOML" else json.loads(text)
+    # Nesting thousands deep ends the parser's recursion.
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path} is no {kind} ({error}): correct it or write it anew") from None
+    if not isinstance(content, dict):
+        raise DataError(f"{path} holds {content!r:.40}: it must be an object, as in {_CAMERA}")
+    return content
+
+
+def read_rows(
+    path: Path, parse: Callable[[str], Sequence], columns: tuple[int, ...], meaning: str
+) -> list[Sequence]:
+    """What `parse` makes of every line that is not blank and does not start with `#`.
+
+    Raises DataError for a line of other columns, or for which `parse` raises ValueError.
+    """
+    rows: list[Sequence] = []
+    for number, line in enumerate(path.read_text(**_TOLERANT).splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            row = parse(line)
+        except ValueError:
+            row = ()
+        if len(row) not in (columns if not rows else (len(rows[0]),)):
+            found = f"{path} line {number} is {line[:60]!r}"
+            raise DataError(f"{found}: every line holds {meaning}; correct it")
+        rows.append(row)
+    if not rows:
+        raise DataError(f"{path} is empty: every line holds {meaning}; write it anew")
+    return rows
+
+
+def _read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> np.ndarray:
+    """A table of numbers separated by blanks or commas; NaN and infinity are kept."""
+
+    def parse(line: str) -> list[float]:
+        return [float(word) for word in line.replace(",", " ").split()]
+
+    return np.array(read_rows(path, parse, columns, meaning), dtype=np.float64)
+
+
+def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | None]:
+    """Poses as they stand in a file, and their timestamps (s) where it has quaternions.
+
+    Lines hold `timestamp tx ty tz` and a quaternion in the order that is given, a 4x4 or 3x4
+    matrix, or one of the rows of a matrix; else DataError is raised. NaN gives NaN poses.
+    """
+    numbers = _read_numbers(path, (4, 8, 12, 16), _POSE_LINE)
+    if numbers.shape[1] == 8:
+        return _from_quaternions(numbers[:, 1:], quaternion, path), numbers[:, 0]
+    if numbers.shape == (3, 4):
+        numbers = numbers.reshape(1, 12)
+    if numbers.shape[1] == 12:
+        numbers = np.hstack([numbers, np.tile([0.0, 0, 0, 1], (len(numbers), 1))])
+    if numbers.size % 16:
+        raise DataError(f"{path} has {len(numbers)} rows: it needs the four of each 4x4 matrix")
+    return numbers.reshape(-1, 4, 4), None
+
+
+def _from_quaternions(numbers: np.ndarray, order: str, path: Path) -> Poses:
+    """Poses of rows with a position and a quaternion."""
+    poses = np.full((len(numbers), 4, 4), np.nan)
+    known = np.flatnonzero(np.isfinite(numbers).all(axis=1))
+    positions, quaternions = np.split(numbers[known], [3], axis=1)
+    # Clipped, so that absurd numbers are refused below and overflow nothing here.
+    norms = np.linalg.norm(quaternions.clip(-1e6, 1e6), axis=1)
+    for i in np.flatnonzero(np.abs(norms - 1) > _RIGID):
+        raise DataError(
+            f"{path} pose {known[i]} has a quaternion of norm {norms[i]:.3g}: columns must be "
+            f"tx ty tz and a unit quaternion ({' '.join('q' + axis for axis in order)})"
+        )
+    # SciPy refuses an empty list of rotations.
+    if len(known):
+        q_xyzw = quaternions[:, [order.index(axis) for axis in "xyzw"]]
+        poses[known] = np.eye(4)
+        poses[known, :3, :3] = Rotation.from_quat(q_xyzw).as_matrix()
+        poses[known, :3, 3] = positions
+    return poses
+
+
+def checked_poses(poses: Poses, path: Path) -> Poses:
+    """The poses, all NaN where one number is not finite: those frames have no pose.
+
+    Raises DataError if a pose is no rigid transform, or absurdly far from the origin.
+    """
+    is_known = np.isfinite(poses).all(axis=(1, 2))
+    # Clipped, so that absurd numbers are refused and overflow nothing.
+    R = np.where(is_known[:, None, None], poses[:, :3, :3], np.eye(3)).clip(-1e6, 1e6)
+    is_rigid = np.abs(R @ R.mT - np.eye(3)).max(axis=(1, 2)) <= _RIGID
+    is_rigid &= np.abs(np.linalg.det(R) - 1) <= _RIGID
+    is_rigid &= np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1) <= _RIGID
+    is_rigid &= np.abs(poses[:, :3, 3]).max(axis=1) <= _FARTHEST
+    for i in np.flatnonzero(is_known & ~is_rigid):
+        found = " ".join(f"{number:.4g}" for number in poses[i].flat)
+        raise DataError(
+            f"{path} frame {i} is no rigid transform in metres ({found}): rows must be [R | t] "
+            f"with a right-handed rotation R and t up to {_FARTHEST:g}, and 0 0 0 1"
+        )
+    return np.where(is_known[:, None, None], poses, np.nan)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera, before the size of its images is known; pixel centres at integer + 0.5."""
+
+    source: Path  # where it was found, for messages
+    fx: float
+    fy: float
+    principal_point: tuple[float, float] | None = None  # None: the middle of the image
+    size: tuple[int, int] | None = None  # width, height that the numbers hold for; None: any
+    distortion: tuple[float, ...] = ()  # OpenCV's coefficients k1 k2 p1 p2 k3 ...; empty: none
+    depth_scale: Any = None  # depth values a metre, as some files state it beside the camera
+
+    def for_size(self, width: int, height: int, image: Path) -> Intrinsics:
+        """The camera of images of a size: scaled where the calibration is for another one.
+
+        Raises DataError, which names `image`, if the proportions are others.
+        """
+        factor = width / self.size[0] if self.size else 1.0
+        if self.size and abs(factor * self.size[1] - height) > 1:
+            raise DataError(
+                f"{image} is {width}x{height} but {self.source} is for {self.size[0]}x"
+                f"{self.size[1]}: images may be resized but not cropped; give their calibration"
+            )
+        cx, cy = self.principal_point or (width / factor / 2, height / factor / 2)
+        in_pixels = (factor * length for length in (self.fx, self.fy, cx, cy))
+        return Intrinsics(width, height, *in_pixels)
+
+
+def read_calibration(path: Path) -> Calibration:
+    """A camera from a text or a JSON file.
+
+    Text holds `fx fy cx cy` in a line, OpenCV's 3x3 camera matrix, that within a 4x4 matrix, or
+    one focal length. JSON holds an object with fx, fy, cx, cy or Open3D's `intrinsic_matrix` (nine
+    numbers column by column) and, if known, width and height (or w and h), `distortion` and
+    `scale`; it may be the value of `camera`, as in Replica's files. Raises DataError if something
+    is missing, no number, or impossible.
+    """
+    K, others = _from_json(path) if path.suffix.lower() == ".json" else _from_text(path)
+    fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    is_matrix = np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6)
+    # NaN fails both: numpy's minimum keeps it, unlike Python's.
+    is_camera = np.min([fx, fy]) >= _LEAST_FOCAL and np.abs([fx, fy, cx, cy]).max() < _LARGEST
+    if not (is_matrix and is_camera):
+        raise DataError(
+            f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
+            "pixels, without skew, the focal lengths positive, all finite; calibrate anew"
+        )
+    return Calibration(path, fx, fy, **{"principal_point": (cx + 0.5, cy + 0.5), **others})
+
+
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
+    """OpenCV's, as `read_calibration` takes it."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
+
+
+def _from_text(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    numbers = _read_numbers(path, (1, 3, 4, 9, 16), _CAMERA_LINE)
+    if numbers.size == 1:
+        focal = numbers.item()
+        return camera_matrix(focal, focal, 0.0, 0.0), {"principal_point": None}
+    if numbers.size == 4:
+        return camera_matrix(*numbers.flat), {}
+    columns = {9: 3, 12: 4, 16: 4}.get(numbers.size)
+    if not columns:
+        raise DataError(f"{path} holds {numbers.size} numbers: every line holds {_CAMERA_LINE}")
+    return numbers.reshape(-1, columns)[:3, :3], {}
+
+
+def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    content = read_object(path)
+    camera = content["camera"] if isinstance(content.get("camera"), dict) else content
+
+    def numbers(key: str, *counts: int) -> list[float]:
+        """A single one needs no list."""
+        found = camera.get(key)
+        values = found if isinstance(found, list) else [found]
+        # NaN is not below anything, and True is no number here.
+        are_numbers = all(type(v) in (int, float) and abs(v) < _LARGEST for v in values)
+        if not (are_numbers and len(values) in counts):
+            allowed = " or ".join(map(str, counts))
+            text = f"{path}: {key} is {str(found)[:40]!r}: write {allowed} finite number(s)"
+            raise DataError(f"{text}, as in {_CAMERA}")
+        return [float(value) for value in values]
+
+    others: dict[str, Any] = {"depth_scale": camera.get("scale")}
+    if "distortion" in camera:
+        others["distortion"] = tuple(numbers("distortion", 0, 4, 5, 8))
+    for sides in (("width", "height"), ("w", "h")):
+        if not any(side in camera for side in sides):
+            continue
+        width, height = (numbers(side, 1)[0] for side in sides)
+        if not (width % 1 == height % 1 == 0 and min(width, height) > 0):
+            raise DataError(f"{path} gives a size of {width} x {height}: whole pixels, 1 or more")
+        others["size"] = (int(width), int(height))
+    if "intrinsic_matrix" in camera:
+        return np.array(numbers("intrinsic_matrix", 9)).reshape(3, 3).T, others
+    return camera_matrix(*(numbers(key, 1)[0] for key in ("fx", "fy", "cx", "cy"))), others
