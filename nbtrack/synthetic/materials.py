@@ -1,45 +1,42 @@
 """What surfaces look like: albedo as a smooth function of world position, and the room's light.
 
+A material is a function of points (m, world) on a surface, (n, 3): its reflectance there, RGB in
+[0, 1], (n, 3). `functools.partial` fixes its options. Periods, wavelengths and sizes are in
+metres, directions unit vectors across the pattern.
+
 Patterns have wavelengths of 0.2 m and more, so that small images do not alias and a small network
 can learn them. Nothing depends on the direction of view: the fields of this package have none.
 """
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
-from nbtrack.synthetic.closed_forms import Points, Values, Vector3, row_dot
+from nbtrack.synthetic.primitives import Box, Points, Solid, Values, Vector3, row_dot
 
+Pair = tuple[float, float]  # (x, z) of a place, or width and height
 Color = tuple[float, float, float]
+Colors3 = tuple[Color, Color, Color]
+Material = Callable[[Points], Points]
 
 
-class Material(ABC):
-    """Diffuse reflectance of a surface."""
+@dataclass(frozen=True)
+class Part:
+    """A solid and what it is made of."""
 
-    @abstractmethod
-    def albedo(self, points_world: Points, normals: Points) -> Points:
-        """RGB in [0, 1] at surface points (m, world) with unit normals."""
+    solid: Solid
+    material: Material
 
 
-@lru_cache(maxsize=256)
-def _waves(wavelength: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _smooth_noise(points: Points, wavelength: float, seed: int) -> Values:
+    """Five sines in random directions, about in [-1, 1], `wavelength` (m) to 2.4 times as long."""
     rng = np.random.default_rng(seed)
     vectors = rng.normal(size=(5, 3))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     lengths = wavelength * np.array([1.0, 1.2, 1.5, 1.9, 2.4])
-    return (2 * np.pi * vectors / lengths[:, None]).T, rng.uniform(0, 2 * np.pi, 5)
-
-
-def smooth_noise(points_world: Points, wavelength: float, seed: int) -> Values:
-    """Sum of five sines in fixed random directions, about in [-1, 1].
-
-    Args:
-        wavelength: the shortest one (m); the others are up to 2.4 times as long.
-    """
-    vectors, phases = _waves(wavelength, seed)
-    return np.sin(points_world @ vectors + phases).sum(axis=1) / 2.5
+    waves = points @ (2 * np.pi * vectors / lengths[:, None]).T
+    return np.sin(waves + rng.uniform(0, 2 * np.pi, 5)).sum(axis=1) / 2.5
 
 
 def _square_wave(phase: Values) -> Values:
@@ -52,178 +49,92 @@ def _mix(first: Color, second: Color, amount: Values) -> Points:
     return np.asarray(first) + amount[:, None] * (np.asarray(second) - np.asarray(first))
 
 
-@dataclass(frozen=True)
-class Plain(Material):
-    """One color with a faint cloudy variation, as of paint, cloth or plaster."""
-
-    color: Color
-    variation: float = 0.08  # relative change of brightness
-    wavelength: float = 0.45  # m
-    seed: int = 0
-
-    def albedo(self, points_world: Points, normals: Points) -> Points:
-        """RGB in [0, 1]."""
-        noise = smooth_noise(points_world, self.wavelength, self.seed)
-        return np.asarray(self.color) * (1.0 + self.variation * noise)[:, None]
+def plain(
+    points: Points, color: Color, variation: float = 0.08, wavelength: float = 0.45, seed: int = 0
+) -> Points:
+    """One color with a faint, relative, cloudy variation, as of paint, cloth or plaster."""
+    noise = _smooth_noise(points, wavelength, seed)
+    return np.asarray(color) * (1.0 + variation * noise)[:, None]
 
 
-@dataclass(frozen=True)
-class Checker(Material):
-    """Two colors in rounded squares over two world axes."""
-
-    first: Color
-    second: Color
-    period: float  # m, two squares
-    axes: tuple[int, int] = (0, 2)
-
-    def albedo(self, points_world: Points, normals: Points) -> Points:
-        """RGB in [0, 1]."""
-        angular = 2 * np.pi / self.period
-        product = np.sin(angular * points_world[:, self.axes[0]] + 0.7) * np.sin(
-            angular * points_world[:, self.axes[1]] + 0.4
-        )
-        return _mix(self.first, self.second, 0.5 + 0.5 * product / np.sqrt(product**2 + 0.02))
+def checker(
+    points: Points, first: Color, second: Color, period: float, axes: tuple[int, int] = (0, 2)
+) -> Points:
+    """Two colors in rounded squares over two world axes; a period is two squares."""
+    across, along = (2 * np.pi / period * points[:, axis] for axis in axes)
+    product = np.sin(across + 0.7) * np.sin(along + 0.4)
+    return _mix(first, second, 0.5 + 0.5 * product / np.sqrt(product**2 + 0.02))
 
 
-@dataclass(frozen=True)
-class Stripes(Material):
-    """Two colors in rounded stripes, perpendicular to a direction."""
-
-    first: Color
-    second: Color
-    period: float  # m
-    direction: Vector3 = (1.0, 0.0, 0.0)  # unit vector across the stripes
-
-    def albedo(self, points_world: Points, normals: Points) -> Points:
-        """RGB in [0, 1]."""
-        phase = 2 * np.pi / self.period * (points_world @ np.asarray(self.direction))
-        return _mix(self.first, self.second, _square_wave(phase))
+def stripes(
+    points: Points, first: Color, second: Color, period: float, direction: Vector3 = (1.0, 0.0, 0.0)
+) -> Points:
+    """Two colors in rounded stripes."""
+    phase = 2 * np.pi / period * (points @ np.asarray(direction))
+    return _mix(first, second, _square_wave(phase))
 
 
-@dataclass(frozen=True)
-class Wood(Material):
-    """Planks with grain: a slow wave across the fibres, bent by smooth noise."""
-
-    light: Color
-    dark: Color
-    period: float = 0.3  # m, across the grain
-    direction: Vector3 = (0.0, 0.0, 1.0)  # unit vector across the grain
-    seed: int = 0
-
-    def albedo(self, points_world: Points, normals: Points) -> Points:
-        """RGB in [0, 1]."""
-        across = points_world @ np.asarray(self.direction)
-        bend = smooth_noise(points_world, 0.6, self.seed)
-        wave = 0.5 + 0.5 * np.sin(2 * np.pi / self.period * across + 1.6 * bend)
-        return _mix(self.light, self.dark, 0.75 * wave + 0.25 * (0.5 + 0.5 * bend))
+def wood(
+    points: Points, light: Color, dark: Color, period: float = 0.3, axis: int = 2, seed: int = 0
+) -> Points:
+    """Planks with grain across an axis: a slow wave across the fibres, bent by smooth noise."""
+    bend = _smooth_noise(points, 0.6, seed)
+    wave = 0.5 + 0.5 * np.sin(2 * np.pi / period * points[:, axis] + 1.6 * bend)
+    return _mix(light, dark, 0.75 * wave + 0.25 * (0.5 + 0.5 * bend))
 
 
-@dataclass(frozen=True)
-class Colorful(Material):
-    """Many colors side by side along a direction: book spines, tins, a patchwork."""
-
-    base: Color
-    spread: float = 0.22  # how far the colors lie from the base
-    period: float = 0.25  # m
-    direction: Vector3 = (1.0, 0.0, 0.0)  # unit vector along the row
-    seed: int = 0
-
-    def albedo(self, points_world: Points, normals: Points) -> Points:
-        """RGB in [0, 1]."""
-        phase = 2 * np.pi / self.period * (points_world @ np.asarray(self.direction))
-        turns = np.random.default_rng(self.seed).uniform(0, 2 * np.pi, 3)
-        waves = np.sin(phase[:, None] * np.array([1.0, 0.83, 0.64]) + turns)
-        # Half of the change is common to all channels: spines differ in brightness, not hue alone.
-        waves = 0.7 * waves + 0.5 * np.sin(1.13 * phase + turns[0])[:, None]
-        return np.clip(np.asarray(self.base) + self.spread * waves, 0.05, 1.0)
+def colorful(
+    points: Points, base: Color, seed: int, spread: float, period: float, axis: int
+) -> Points:
+    """Many colors, `spread` from a base, side by side along an axis: book spines, tins."""
+    phase = 2 * np.pi / period * points[:, axis]
+    turns = np.random.default_rng(seed).uniform(0, 2 * np.pi, 3)
+    waves = np.sin(phase[:, None] * np.array([1.0, 0.83, 0.64]) + turns)
+    # Half of the change is common to all channels: spines differ in brightness, not hue alone.
+    waves = 0.7 * waves + 0.5 * np.sin(1.13 * phase + turns[0])[:, None]
+    return np.clip(np.asarray(base) + spread * waves, 0.05, 1.0)
 
 
-@dataclass(frozen=True)
-class Patchwork(Material):
-    """Rounded patches in many colors, on faces of any direction: a quilt, a woven carpet."""
-
-    base: Color
-    spread: float = 0.2  # how far the colors lie from the base
-    period: float = 0.6  # m, two patches
-    seed: int = 0
-
-    def albedo(self, points_world: Points, normals: Points) -> Points:
-        """RGB in [0, 1]."""
-        rng = np.random.default_rng(self.seed)
-        # Another period for each axis and channel: no two patches near each other look alike.
-        angular = 2 * np.pi / (self.period * rng.uniform(0.8, 1.4, (3, 4)))
-        phases = rng.uniform(0, 2 * np.pi, (3, 4))
-        total = np.sin(points_world[:, :, None] * angular + phases).sum(axis=1)
-        waves = total / np.sqrt(total * total + 0.2)
-        # Patches differ in brightness, which the last wave gives, more than in hue.
-        mixed = 0.6 * waves[:, :3] + 0.9 * waves[:, 3:]
-        return np.clip(np.asarray(self.base) + self.spread * mixed, 0.05, 1.0)
+def patchwork(points: Points, base: Color, period: float, seed: int, spread: float = 0.2) -> Points:
+    """Rounded patches in many colors around a base, on any face: a quilt, a woven carpet."""
+    rng = np.random.default_rng(seed)
+    # Another period for each axis and channel: no two patches near each other look alike.
+    angular = 2 * np.pi / (period * rng.uniform(0.8, 1.4, (3, 4)))
+    total = np.sin(points[:, :, None] * angular + rng.uniform(0, 2 * np.pi, (3, 4))).sum(axis=1)
+    waves = total / np.sqrt(total * total + 0.2)
+    # Patches differ in brightness, which the last wave gives, more than in hue.
+    mixed = 0.6 * waves[:, :3] + 0.9 * waves[:, 3:]
+    return np.clip(np.asarray(base) + spread * mixed, 0.05, 1.0)
 
 
-@dataclass(frozen=True)
-class Split(Material):
-    """Two materials on either side of a plane across a world axis: paint that ends at a wall."""
-
-    below: Material
-    above: Material
-    axis: int
-    at: float = 0.0  # m
-
-    def albedo(self, points_world: Points, normals: Points) -> Points:
-        """RGB in [0, 1]."""
-        above = points_world[:, self.axis, None] > self.at
-        return np.where(
-            above,
-            self.above.albedo(points_world, normals),
-            self.below.albedo(points_world, normals),
-        )
+def split(points: Points, below: Material, above: Material, axis: int) -> Points:
+    """Two materials on either side of the middle of a world axis: paint that ends at a wall."""
+    return np.where(points[:, axis, None] > 0.0, above(points), below(points))
 
 
-@dataclass(frozen=True)
-class Picture(Material):
-    """A framed picture: a frame of one color around soft shapes in two others."""
-
-    center: Vector3
-    size: tuple[float, float]  # m: width along `right`, height along y
-    right: Vector3  # unit vector
-    frame: Color
-    first: Color
-    second: Color
-    border: float = 0.05  # m, width of the frame
-    seed: int = 0
-
-    def albedo(self, points_world: Points, normals: Points) -> Points:
-        """RGB in [0, 1]."""
-        offset = points_world - np.asarray(self.center)
-        across, up = np.abs(offset @ np.asarray(self.right)), np.abs(offset[:, 1])
-        inset = np.minimum(self.size[0] / 2 - across, self.size[1] / 2 - up)
-        shapes = _square_wave(2.5 * smooth_noise(points_world, 0.25, self.seed))
-        return np.where((inset < self.border)[:, None], np.asarray(self.frame),
-                        _mix(self.first, self.second, shapes))  # fmt: skip
+def framed(
+    points: Points, center: Vector3, size: Pair, axis: int, colors: Colors3, seed: int
+) -> Points:
+    """A picture across `axis`: a frame of the first color, 5 cm wide, around soft shapes in two."""
+    offset = np.abs(points - np.asarray(center))
+    inset = np.minimum(size[0] / 2 - offset[:, 2 - axis], size[1] / 2 - offset[:, 1])
+    shapes = _mix(*colors[1:], _square_wave(2.5 * _smooth_noise(points, 0.25, seed)))
+    return np.where((inset < 0.05)[:, None], np.asarray(colors[0]), shapes)
 
 
-@dataclass(frozen=True)
-class ShellMaterial(Material):
-    """Floor, ceiling and two pairs of walls of a `RoomShell`, told apart by their normals."""
-
-    floor: Material
-    ceiling: Material
-    walls_x: Material  # the two walls perpendicular to x
-    walls_z: Material  # the two walls perpendicular to z
-
-    def albedo(self, points_world: Points, normals: Points) -> Points:
-        """RGB in [0, 1]."""
-        colors = np.empty_like(points_world)
-        faces = [
-            (normals[:, 1] > 0.5, self.floor),
-            (normals[:, 1] < -0.5, self.ceiling),
-            (np.abs(normals[:, 0]) > 0.5, self.walls_x),
-            (np.abs(normals[:, 2]) > 0.5, self.walls_z),
-        ]
-        for chosen, material in faces:
-            if chosen.any():
-                colors[chosen] = material.albedo(points_world[chosen], normals[chosen])
-        return colors
+def lining(
+    points: Points, shell: Box, floor: Material, ceiling: Material, sides: Material, ends: Material
+) -> Points:
+    """Of a room's shell; `sides` are the walls perpendicular to x, `ends` those to z."""
+    colors, normals = np.empty_like(points), shell.normals(points)
+    for chosen, material in (
+        (normals[:, 1] > 0.5, floor),
+        (normals[:, 1] < -0.5, ceiling),
+        (np.abs(normals[:, 0]) > 0.5, sides),
+        (np.abs(normals[:, 2]) > 0.5, ends),
+    ):
+        colors[chosen] = material(points[chosen])
+    return colors
 
 
 @dataclass(frozen=True)
@@ -236,20 +147,15 @@ class Light:
     ambient: float = 0.34
     sky: float = 0.14  # added where the normal points up
 
-    def shade(
-        self, albedo: Points, points_world: Points, normals: Points, openness: Values
-    ) -> Points:
+    def shade(self, albedo: Points, points: Points, normals: Points, openness: Values) -> Points:
         """RGB in [0, 1] of a matt surface: Lambert's law, wrapped so that its terminator is soft.
 
-        Args:
-            openness: 0 in a corner to 1 in the open; darkens the light from all sides, which
-                stands in for contact shadows.
-
-        Source: our choice; a light model is needed only to give shapes a look.
+        `openness` is 0 in a corner and 1 in the open: it darkens the light from all sides, which
+        stands in for contact shadows. Source: our choice; it only gives shapes a look.
         """
         energy = (self.ambient + self.sky * (0.5 + 0.5 * normals[:, 1])) * (0.55 + 0.45 * openness)
         for position in self.lamps:
-            towards = np.asarray(position) - points_world
+            towards = np.asarray(position) - points
             squared = row_dot(towards, towards)
             cosine = row_dot(towards, normals) / np.sqrt(squared)
             wrapped = np.maximum(cosine + 0.35, 0.0) / 1.35

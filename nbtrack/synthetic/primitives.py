@@ -3,66 +3,77 @@
 World axes: y up, metres. Distances are positive outside a solid and negative inside it.
 """
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from nbtrack.synthetic.closed_forms import (
-    Origins,
-    Points,
-    Values,
-    Vector3,
-    box_distance,
-    box_surface,
-    quadratic_interval,
-    row_dot,
-    slab_interval,
-)
+Vector3 = tuple[float, float, float]
+Array3 = Float[np.ndarray, "3"]
+Points = Float[np.ndarray, "n 3"]
+Values = Float[np.ndarray, "n"]
+Indices = Int[np.ndarray, "n"]
+Rows = Float[np.ndarray, "n k"]
+Vectors = Float[np.ndarray, "... k"]
+Origins = Float[np.ndarray, "... 3"]  # one origin for all rays, (3,), or one each, (n, 3)
+Interval = tuple[Values, Values]  # ray parameters between which a ray is inside; none: near > far
+Sphere3 = tuple[Array3, float]  # center (world) and radius (m)
 
 
-class Solid(ABC):
-    """A closed convex body. Subclasses say how far, where hit, which normal and how large."""
+def row_dot(first: Vectors, second: Vectors) -> Float[np.ndarray, "..."]:
+    """Scalar products along the last axis; several times as fast as multiply and sum."""
+    return np.asarray(np.einsum("...i,...i->...", first, second))
 
-    @abstractmethod
-    def sdf(self, points_world: Points) -> Values:
-        """Exact signed distance (m), outside and inside."""
 
-    @abstractmethod
+def _row_max(rows: Rows) -> Values:
+    """Largest entry of each row; for short rows several times as fast as `rows.max(axis=1)`."""
+    return reduce(np.maximum, rows.T)
+
+
+def _box_distance(excess: Rows) -> Values:
+    """Signed distance to a k-dimensional box from `|local| - half_size`, exact on both sides."""
+    beyond = np.maximum(excess, 0.0)
+    return np.sqrt(row_dot(beyond, beyond)) + np.minimum(_row_max(excess), 0.0)
+
+
+def _slab_interval(origins: Vectors, directions: Rows, half: Vectors) -> Interval:
+    """Where a ray is inside the box |local| <= half."""
+    # A direction parallel to a slab: a tiny slope sends both crossings far away, without 0/0.
+    slope = np.where(directions == 0.0, 1e-30, directions)
+    first, second = (-half - origins) / slope, (half - origins) / slope
+    return _row_max(np.minimum(first, second)), -_row_max(-np.maximum(first, second))
+
+
+def _round_interval(offsets: Origins, directions: Points, radius: float) -> Interval:
+    """Where |offset + t direction| <= radius (none: near = inf, far = -inf)."""
+    a, b = row_dot(directions, directions), row_dot(offsets, directions)
+    c = row_dot(offsets, offsets) - radius**2
+    moving = a > 1e-24
+    a = np.where(moving, a, 1.0)
+    discriminant = b * b - a * c
+    # A ray along the axis of a cylinder never crosses its side: it is inside for ever or never.
+    met = np.where(moving, discriminant > 0.0, c < 0.0)
+    half_width = np.where(moving, np.sqrt(np.maximum(discriminant, 0.0)) / a, np.inf)
+    return np.where(met, -b / a - half_width, np.inf), np.where(met, -b / a + half_width, -np.inf)
+
+
+class Solid:
+    """A closed convex body.
+
+    Each has `sdf`, the exact signed distance (m) outside and inside; `_crossing`, where endless
+    lines are inside; `normals`, unit and outward, at points on the surface; `bounding_sphere`,
+    which holds it; `area` of its surface (m²); and `sample_surface`, uniform points there.
+    """
+
     def hit(self, origins: Origins, directions: Points) -> Values:
         """Ray parameter at which a ray from outside enters the solid; inf for a miss.
 
         In units of the direction's length: with camera directions of z = 1 it is the z-depth.
         Rays that start inside count as misses: cameras live in free space.
         """
-
-    @abstractmethod
-    def normals(self, points_world: Points) -> Points:
-        """Unit outward normals at points on the surface."""
-
-    @abstractmethod
-    def bounding_sphere(self) -> tuple[Float[np.ndarray, "3"], float]:
-        """Center (world) and radius (m) of a sphere that holds the solid."""
-
-    @abstractmethod
-    def area(self) -> float:
-        """Surface area (m²)."""
-
-    @abstractmethod
-    def sample_surface(self, n: int, rng: np.random.Generator) -> Points:
-        """`n` world points, uniform over the surface."""
-
-    def intersect(self, origins: Origins, directions: Points) -> tuple[Values, Points]:
-        """First hit: ray parameter (n,), inf for a miss, and outward normals, zero for a miss."""
-        t = self.hit(origins, directions)
-        found = np.isfinite(t)
-        points = origins + np.where(found, t, 0.0)[:, None] * directions
-        return t, np.where(found[:, None], self.normals(points), 0.0)
-
-
-def _entry(near: Values, far: Values) -> Values:
-    return np.where((near <= far) & (near > 0.0), near, np.inf)
+        near, far = self._crossing(origins, directions)
+        return np.where((near <= far) & (near > 0.0), near, np.inf)
 
 
 @dataclass(frozen=True)
@@ -77,31 +88,30 @@ class Box(Solid):
         cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
         return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
-    def _half(self) -> Float[np.ndarray, "3"]:
+    def _half(self) -> Array3:
         return np.asarray(self.size) / 2
 
-    def _to_box(self, points_world: Origins) -> Origins:
-        return (points_world - np.asarray(self.center)) @ self._rotation_world_box()
+    def _turned(self, vectors: Origins) -> Origins:
+        return vectors @ self._rotation_world_box() if self.yaw else vectors
 
-    def sdf(self, points_world: Points) -> Values:
+    def _to_box(self, points: Origins) -> Origins:
+        return self._turned(points - np.asarray(self.center))
+
+    def sdf(self, points: Points) -> Values:
         """Exact signed distance (m)."""
-        return box_distance(np.abs(self._to_box(points_world)) - self._half())
+        return _box_distance(np.abs(self._to_box(points)) - self._half())
 
-    def hit(self, origins: Origins, directions: Points) -> Values:
-        """Entry parameter by the slab method; inf for a miss."""
-        turned = directions @ self._rotation_world_box()
-        return _entry(*slab_interval(self._to_box(origins), turned, self._half()))
+    def _crossing(self, origins: Origins, directions: Points) -> Interval:
+        return _slab_interval(self._to_box(origins), self._turned(directions), self._half())
 
-    def normals(self, points_world: Points) -> Points:
+    def normals(self, points: Points) -> Points:
         """Unit normals of the face that lies nearest."""
-        local = self._to_box(points_world)
+        local = self._to_box(points)
         axis = (np.abs(local) - self._half()).argmax(axis=1)
-        rows = np.arange(len(local))
-        normals = np.zeros_like(local)
-        normals[rows, axis] = np.where(local[rows, axis] < 0, -1.0, 1.0)
-        return normals @ self._rotation_world_box().T
+        normals = np.eye(3)[axis] * np.where(local < 0, -1.0, 1.0)
+        return normals @ self._rotation_world_box().T if self.yaw else normals
 
-    def bounding_sphere(self) -> tuple[Float[np.ndarray, "3"], float]:
+    def bounding_sphere(self) -> Sphere3:
         """Center and half the diagonal."""
         return np.asarray(self.center), float(np.linalg.norm(self._half()))
 
@@ -112,8 +122,33 @@ class Box(Solid):
 
     def sample_surface(self, n: int, rng: np.random.Generator) -> Points:
         """Uniform points on the six faces."""
-        local = box_surface(self._half(), n, rng)
+        half = self._half()
+        face_areas = np.array([half[1] * half[2], half[0] * half[2], half[0] * half[1]])
+        axes = rng.choice(3, size=n, p=face_areas / face_areas.sum())
+        local = rng.uniform(-1.0, 1.0, (n, 3)) * half
+        local[np.arange(n), axes] = rng.choice([-1.0, 1.0], n) * half[axes]
         return local @ self._rotation_world_box().T + np.asarray(self.center)
+
+
+class RoomShell(Box):
+    """Walls, floor and ceiling: the solid is everything outside a cuboid, normals point inwards."""
+
+    def sdf(self, points: Points) -> Values:
+        """Exact signed distance (m), positive inside the room."""
+        return -super().sdf(points)
+
+    def hit(self, origins: Origins, directions: Points) -> Values:
+        """Ray parameter at which a ray from inside reaches the wall; inf when it starts outside."""
+        near, far = self._crossing(origins, directions)
+        return np.where((near <= 0.0) & (far > 0.0), far, np.inf)
+
+    def normals(self, points: Points) -> Points:
+        """Unit normals, into the room, of the nearest wall, floor or ceiling."""
+        return -super().normals(points)
+
+    def bounding_sphere(self) -> Sphere3:
+        """All of space."""
+        return np.asarray(self.center), np.inf
 
 
 @dataclass(frozen=True)
@@ -123,21 +158,19 @@ class Sphere(Solid):
     center: Vector3
     radius: float
 
-    def sdf(self, points_world: Points) -> Values:
+    def sdf(self, points: Points) -> Values:
         """Exact signed distance (m)."""
-        offset = points_world - np.asarray(self.center)
+        offset = points - np.asarray(self.center)
         return np.sqrt(row_dot(offset, offset)) - self.radius
 
-    def hit(self, origins: Origins, directions: Points) -> Values:
-        """Smaller root of the quadratic; inf for a miss."""
-        offset = origins - np.asarray(self.center)
-        return _entry(*quadratic_interval(offset, directions, self.radius))
+    def _crossing(self, origins: Origins, directions: Points) -> Interval:
+        return _round_interval(origins - np.asarray(self.center), directions, self.radius)
 
-    def normals(self, points_world: Points) -> Points:
+    def normals(self, points: Points) -> Points:
         """Unit radial directions."""
-        return (points_world - np.asarray(self.center)) / self.radius
+        return (points - np.asarray(self.center)) / self.radius
 
-    def bounding_sphere(self) -> tuple[Float[np.ndarray, "3"], float]:
+    def bounding_sphere(self) -> Sphere3:
         """The sphere itself."""
         return np.asarray(self.center), self.radius
 
@@ -160,41 +193,40 @@ class Cylinder(Solid):
     end: Vector3  # center of the other cap
     radius: float
 
-    def _frame(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
+    def _frame(self) -> tuple[Array3, Array3, float]:
         start, end = np.asarray(self.start), np.asarray(self.end)
         length = float(np.linalg.norm(end - start))
         return (start + end) / 2, (end - start) / length, length / 2
 
-    def _excess(self, points_world: Points) -> tuple[Float[np.ndarray, "n 2"], Points, Values]:
+    def _excess(self, points: Points) -> tuple[Float[np.ndarray, "n 2"], Points, Values]:
         center, axis, half = self._frame()
-        axial = (points_world - center) @ axis
-        radial = points_world - center - axial[:, None] * axis
+        axial = (points - center) @ axis
+        radial = points - center - axial[:, None] * axis
         sideways = np.sqrt(row_dot(radial, radial)) - self.radius
         return np.stack([sideways, np.abs(axial) - half], axis=1), radial, axial
 
-    def sdf(self, points_world: Points) -> Values:
+    def sdf(self, points: Points) -> Values:
         """Exact signed distance (m): a rectangle's, in the plane of radius and axis."""
-        return box_distance(self._excess(points_world)[0])
+        return _box_distance(self._excess(points)[0])
 
-    def hit(self, origins: Origins, directions: Points) -> Values:
-        """Entry parameter: the later of entering the endless cylinder and the slab of its caps."""
+    def _crossing(self, origins: Origins, directions: Points) -> Interval:
         center, axis, half = self._frame()
         offset_along, slope_along = (origins - center) @ axis, directions @ axis
         offset_side = origins - center - offset_along[..., None] * axis
         slope_side = directions - slope_along[:, None] * axis
-        side = quadratic_interval(offset_side, slope_side, self.radius)
-        caps = slab_interval(offset_along[..., None], slope_along[:, None], np.array([half]))
-        return _entry(np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1]))
+        side = _round_interval(offset_side, slope_side, self.radius)
+        caps = _slab_interval(offset_along[..., None], slope_along[:, None], np.array([half]))
+        return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
 
-    def normals(self, points_world: Points) -> Points:
+    def normals(self, points: Points) -> Points:
         """Unit normals of the side or the cap, whichever lies nearer."""
         _, axis, _ = self._frame()
-        excess, radial, axial = self._excess(points_world)
+        excess, radial, axial = self._excess(points)
         lengths = np.maximum(np.linalg.norm(radial, axis=1, keepdims=True), 1e-12)
         cap = np.where(axial < 0, -1.0, 1.0)[:, None] * axis
         return np.where((excess[:, 1] > excess[:, 0])[:, None], cap, radial / lengths)
 
-    def bounding_sphere(self) -> tuple[Float[np.ndarray, "3"], float]:
+    def bounding_sphere(self) -> Sphere3:
         """Middle of the axis and the distance to a cap's rim."""
         center, _, half = self._frame()
         return center, float(np.hypot(half, self.radius))

@@ -3,68 +3,57 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from nbtrack.core.arrays import Pose
 from nbtrack.core.camera import Intrinsics
-from nbtrack.synthetic.closed_forms import Points, Values
 from nbtrack.synthetic.room import Room
 
 # Samples of a refined pixel, as offsets from its center in pixels: a 2x2 grid.
 _SUBPIXELS = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)]
 _CONTRAST = 0.06  # difference of color to a neighbor above which a pixel is refined (our choice)
+Color = UInt8[np.ndarray, "h w 3"]
+Depth = Float[np.ndarray, "h w"]
+Surfaces = Int[np.ndarray, "h w"]
 
 
 def render_frame(
-    room: Room, intrinsics: Intrinsics, T_world_camera: Float[np.ndarray, "4 4"]
-) -> tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
+    room: Room, intrinsics: Intrinsics, T_world_camera: Pose
+) -> tuple[Color, Depth, Surfaces]:
     """Color (RGB), z-depth (m, float64, at pixel centers) and surface index of each pixel.
 
     Pixels at the outline of a surface or in a steep pattern get four color samples instead of
-    one. Depth is never averaged: a mean over an edge is a point in mid-air.
-
-    Args:
-        T_world_camera: OpenCV camera-to-world; the camera stands in free space.
+    one. Depth is never averaged: a mean over an edge is a point in mid-air. The pose has OpenCV
+    axes; the camera stands in free space.
     """
     height, width = intrinsics.height, intrinsics.width
     rows, columns = (grid.ravel() for grid in np.indices((height, width)))
-    depth, colors, index = _cast(room, intrinsics, T_world_camera, columns, rows)
+
+    def cast(columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+        # `camera.pixel_directions` is single precision, too coarse for an exact depth.
+        x = (columns + 0.5 - intrinsics.cx) / intrinsics.fx
+        y = (rows + 0.5 - intrinsics.cy) / intrinsics.fy
+        directions_camera = np.stack([x, y, np.ones_like(x)], axis=1)
+        return room.cast(T_world_camera[:3, 3], directions_camera @ T_world_camera[:3, :3].T)
+
+    depth, colors, index = cast(columns, rows)
     image, surfaces = colors.reshape(height, width, 3), index.reshape(height, width)
-    rough = np.flatnonzero(_needs_refinement(image, surfaces))
+    rough = np.flatnonzero(_rough(image, surfaces))
     if len(rough):
         # One call for all samples: culling and shading cost per call, not only per ray.
         columns4 = np.concatenate([columns[rough] + dx for dx, _ in _SUBPIXELS])
         rows4 = np.concatenate([rows[rough] + dy for _, dy in _SUBPIXELS])
-        _, samples, _ = _cast(room, intrinsics, T_world_camera, columns4, rows4)
+        _, samples, _ = cast(columns4, rows4)
         colors[rough] = samples.reshape(4, -1, 3).mean(axis=0)
     pixels = np.round(255.0 * image).astype(np.uint8)
     return pixels, depth.reshape(height, width), surfaces
 
 
-def _cast(
-    room: Room,
-    intrinsics: Intrinsics,
-    T_world_camera: Float[np.ndarray, "4 4"],
-    columns: np.ndarray,
-    rows: np.ndarray,
-) -> tuple[Values, Points, Int[np.ndarray, "n"]]:
-    # `camera.pixel_directions` is single precision, too coarse for an exact depth.
-    x = (columns + 0.5 - intrinsics.cx) / intrinsics.fx
-    y = (rows + 0.5 - intrinsics.cy) / intrinsics.fy
-    directions_camera = np.stack([x, y, np.ones_like(x)], axis=1)
-    return room.cast(T_world_camera[:3, 3], directions_camera @ T_world_camera[:3, :3].T)
-
-
-def _needs_refinement(
-    image: Float[np.ndarray, "h w 3"], surfaces: Int[np.ndarray, "h w"]
-) -> Bool[np.ndarray, "h w"]:
+def _rough(image: Float[np.ndarray, "h w 3"], surfaces: Surfaces) -> Bool[np.ndarray, "h w"]:
     """Pixels that differ from a neighbor in surface or color."""
     rough = np.zeros(surfaces.shape, dtype=bool)
-    across = (surfaces[:, 1:] != surfaces[:, :-1]) | (
-        np.abs(image[:, 1:] - image[:, :-1]).max(axis=2) > _CONTRAST
-    )
-    down = (surfaces[1:] != surfaces[:-1]) | (
-        np.abs(image[1:] - image[:-1]).max(axis=2) > _CONTRAST
-    )
-    rough[:, 1:] |= across
-    rough[:, :-1] |= across
-    rough[1:] |= down
-    rough[:-1] |= down
+    for axis in (0, 1):
+        change = np.abs(np.diff(image, axis=axis)).max(axis=2) > _CONTRAST
+        change |= np.diff(surfaces, axis=axis) != 0
+        lines, change = np.moveaxis(rough, axis, 0), np.moveaxis(change, axis, 0)
+        lines[1:] |= change
+        lines[:-1] |= change
     return rough

@@ -1,26 +1,28 @@
-"""A furnished room: exact signed distance, exact ray casting, colors, and points on its surface."""
+"""The furnished rooms of `rooms.toml`: exact distance, ray casting, colors, surface points."""
 
+import tomllib
 import zlib
 from dataclasses import dataclass
+from functools import cache, partial, reduce
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from nbtrack.core.errors import NumericalError
-from nbtrack.synthetic.closed_forms import Origins, Points, Values, row_dot
-from nbtrack.synthetic.materials import Light, Material
-from nbtrack.synthetic.primitives import Solid
-from nbtrack.synthetic.shell import RoomShell
+from nbtrack.core.errors import MissingError, NumericalError, nearest_name
+from nbtrack.synthetic import furniture, materials
+from nbtrack.synthetic.materials import Light, Pair, Part
+from nbtrack.synthetic.primitives import Array3, Indices, Points, RoomShell, Values, row_dot
 
+_TABLES = tomllib.loads(Path(__file__).with_name("rooms.toml").read_text(encoding="utf-8"))
+_PALETTE = _TABLES.pop("palette")
 _OPENNESS_RADIUS = 0.2  # m; how far contact shadows reach (our choice)
 
-
-@dataclass(frozen=True)
-class Part:
-    """A solid and what it is made of."""
-
-    solid: Solid
-    material: Material
+ROOMS: tuple[str, ...] = tuple(_TABLES)
+# Rooms whose numbers are reported, each with one kind of difficulty. On the others the settings
+# were chosen, so that numbers from there would be too good.
+REPORTED_ROOMS: tuple[str, ...] = tuple(n for n in ROOMS if not _TABLES[n].get("tuning", False))
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,11 @@ class Walk:
     1.0 to 1.3 m, so that wandering alone stays below the speed of a hand-held camera.
     """
 
-    center: tuple[float, float]  # m; x and z of the orbit's middle
+    center: Pair  # m; x and z of the orbit's middle
     start_yaw: float = 0.0  # rad; 0 looks along -z, positive turns left
     turn: int = 1  # +1 turns left, -1 right
     pitch: float = -0.3  # rad; mean tilt, negative looks down
-    end: tuple[float, float] | None = None  # m; x and z of the orbit's middle half a period later
+    end: Pair | None = None  # m; x and z of the orbit's middle half a period later
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,7 @@ class Room:
     """A shell with furniture. World frame: metres, y up, floor at y = 0."""
 
     name: str
-    description: str
-    shell: RoomShell
-    shell_material: Material
-    parts: tuple[Part, ...]
+    parts: tuple[Part, ...]  # the first is the `RoomShell`
     light: Light
     walk: Walk
 
@@ -58,131 +57,123 @@ class Room:
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
         """Lower and upper corner (m) of the room's inside."""
-        return np.array([self.shell.lower, self.shell.upper])
+        shell = self.parts[0].solid
+        half = np.asarray(shell.size) / 2
+        return np.asarray(shell.center) + np.array([-half, half])
 
-    def sdf(self, points_world: Points) -> Values:
-        """Signed distance (m) to the nearest surface, positive in free space.
+    def sdf(self, points: Points) -> Values:
+        """Signed distance (m) to the nearest surface, positive in free space and exact there.
 
-        Exact in free space: the distance to a union of closed bodies is the least of the
-        distances to each. Within matter it is negative and exact for a body that stands alone;
-        where bodies touch or overlap (a leg let into its table top) the true depth below the
-        surface is at least as large.
+        Within matter it is exact for a body that stands alone; where bodies touch or overlap (a
+        leg let into its table top) the true depth below the surface is at least as large.
         """
-        distance = self.shell.sdf(points_world)
-        for part in self.parts:
-            np.minimum(distance, part.solid.sdf(points_world), out=distance)
-        return distance
+        return reduce(np.minimum, (part.solid.sdf(points) for part in self.parts))
 
-    def sdf_up_to(self, points_world: Points, limit: float) -> Values:
+    def sdf_up_to(self, points: Points, limit: float) -> Values:
         """`min(sdf, limit)`, fast for small limits: far solids are skipped by bounding spheres."""
-        distance = np.minimum(self.shell.sdf(points_world), limit)
+        distance = np.full(len(points), limit)
         spheres = [part.solid.bounding_sphere() for part in self.parts]
         centers = np.array([center for center, _ in spheres])
         reach = np.array([radius for _, radius in spheres]) + limit
         # |p - c|² < reach² for all pairs by one product; the slack covers its rounding.
-        squared = row_dot(points_world, points_world)[:, None] - 2 * points_world @ centers.T
+        squared = row_dot(points, points)[:, None] - 2 * points @ centers.T
         near = squared < reach**2 - row_dot(centers, centers) + 1e-6
         for part, chosen in zip(self.parts, near.T, strict=True):
             rows = np.flatnonzero(chosen)
-            if len(rows):
-                distance[rows] = np.minimum(distance[rows], part.solid.sdf(points_world[rows]))
+            distance[rows] = np.minimum(distance[rows], part.solid.sdf(points[rows]))
         return distance
 
-    def first_hit(
-        self, origins: Origins, directions: Points
-    ) -> tuple[Values, Int[np.ndarray, "n"]]:
-        """Ray parameter and index of the first surface: 0 the shell, i + 1 `parts[i]`.
-
-        Args:
-            origins: (3,) for all rays, or (n, 3); in free space.
-            directions: (n, 3), of any length; with z = 1 in the camera the parameter is z-depth.
-        """
-        t = self.shell.hit(origins, directions)
+    def first_hit(self, origin: Array3, directions: Points) -> tuple[Values, Indices]:
+        """Ray parameter and index in `parts` of the first surface from a point in free space."""
+        t = np.full(len(directions), np.inf)
         index = np.zeros(len(directions), dtype=np.int64)
         lengths = np.sqrt(row_dot(directions, directions))
-        for number, part in enumerate(self.parts, start=1):
-            rays = _rays_near(part.solid, origins, directions, lengths)
-            if len(rays) == 0:
-                continue
-            from_where = origins if origins.ndim == 1 else origins[rays]
-            candidate = part.solid.hit(from_where, directions[rays])
+        for number, part in enumerate(self.parts):
+            center, radius = part.solid.bounding_sphere()
+            towards = center - origin
+            # Only rays in the cone around the solid may meet it; from within the sphere, all. The
+            # tangent is taken slightly short, so that rounding never drops a ray that grazes.
+            squared = float(towards @ towards) - (radius * 1.001) ** 2
+            least = lengths * np.sqrt(squared) if squared > 0.0 else -np.inf
+            rays = np.flatnonzero(directions @ towards >= least)
+            candidate = part.solid.hit(origin, directions[rays])
             closer = candidate < t[rays]
             t[rays[closer]] = candidate[closer]
             index[rays[closer]] = number
         return t, index
 
-    def colors(self, points_world: Points, index: Int[np.ndarray, "n"]) -> Points:
-        """Shaded RGB in [0, 1] of surface points, given the surface each lies on."""
-        albedo, normals = np.empty_like(points_world), np.empty_like(points_world)
-        surfaces = [(self.shell, self.shell_material)]
-        surfaces += [(part.solid, part.material) for part in self.parts]
+    def cast(self, origin: Array3, directions: Points) -> tuple[Values, Points, Indices]:
+        """Ray parameter, shaded RGB in [0, 1] and index in `parts` of what is seen along rays.
+
+        Directions may have any length; with z = 1 in the camera the parameter is z-depth.
+        """
+        t, index = self.first_hit(origin, directions)
+        points = origin + t[:, None] * directions
+        albedo, normals = np.empty_like(points), np.empty_like(points)
         for number in np.unique(index):
-            solid, material = surfaces[number]
-            chosen = np.flatnonzero(index == number)
-            normals[chosen] = solid.normals(points_world[chosen])
-            albedo[chosen] = material.albedo(points_world[chosen], normals[chosen])
-        lifted = points_world + _OPENNESS_RADIUS * normals
+            part, chosen = self.parts[number], np.flatnonzero(index == number)
+            normals[chosen] = part.solid.normals(points[chosen])
+            albedo[chosen] = part.material(points[chosen])
+        lifted = points + _OPENNESS_RADIUS * normals
         openness = np.maximum(self.sdf_up_to(lifted, _OPENNESS_RADIUS), 0.0) / _OPENNESS_RADIUS
-        return self.light.shade(albedo, points_world, normals, openness)
-
-    def cast(
-        self, origins: Origins, directions: Points
-    ) -> tuple[Values, Points, Int[np.ndarray, "n"]]:
-        """Ray parameter, RGB in [0, 1] and surface index (`first_hit`) seen along rays."""
-        t, index = self.first_hit(origins, directions)
-        return t, self.colors(origins + t[:, None] * directions, index), index
+        return t, self.light.shade(albedo, points, normals, openness), index
 
 
-def _rays_near(
-    solid: Solid, origins: Origins, directions: Points, lengths: Values
-) -> Int[np.ndarray, "m"]:
-    """Rays that may meet the solid; for a shared origin those within its bounding cone."""
-    everything = np.arange(len(directions))
-    if origins.ndim > 1:
-        return everything
-    center, radius = solid.bounding_sphere()
-    towards = center - origins
-    # The tangent's length; slightly short, so that rounding never drops a ray that grazes.
-    squared = float(towards @ towards) - (radius * 1.001) ** 2
-    if squared <= 0.0:
-        return everything
-    return np.flatnonzero(directions @ towards >= lengths * np.sqrt(squared))
+@cache
+def build_room(name: str) -> Room:
+    """The synthetic room of that name. Raises `MissingError` with the nearest of all names."""
+    if name not in ROOMS:
+        raise MissingError(f"no synthetic room '{name}'; {nearest_name(name, list(ROOMS))}")
+    table = _TABLES[name]
+    named: dict[str, Any] = {}  # a material, or one for each of `seeds`
+    for label, fields in (_PALETTE | table["materials"]).items():
+        options = fields.copy()
+        kind, seeds = options.pop("kind"), options.pop("seeds", None)
+        made = partial(getattr(materials, kind), **_resolved(options, named))
+        named[label] = tuple(partial(made, seed=seed) for seed in seeds) if seeds else made
+    width, height, depth = table["size"]
+    shell = RoomShell((0.0, height / 2, 0.0), (width, height, depth))
+    lining = partial(materials.lining, shell=shell, **_resolved(table["surfaces"], named))
+    parts = [Part(shell, lining)]
+    for piece, *arguments in table["parts"]:
+        made = getattr(furniture, piece)(*_resolved(arguments, named))
+        parts += [made] if isinstance(made, Part) else made
+    light, walk = (_resolved(table[key], named) for key in ("light", "walk"))
+    return Room(name, tuple(parts), Light(**light), Walk(**walk))
+
+
+def _resolved(value: Any, named: dict[str, Any]) -> Any:
+    """A value of the file with its material names looked up and its lists as tuples."""
+    if isinstance(value, dict):
+        return {key: _resolved(item, named) for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_resolved(item, named) for item in value)
+    return named[value] if isinstance(value, str) else value
 
 
 def true_surface_points(room: Room, n: int, seed: int) -> Points:
     """`n` world points (m), uniform over the surface that borders free space.
 
     Points are drawn on every solid in proportion to its area and kept where a step of a
-    millimetre along the normal leads into free space. That leaves out what stands on the floor,
-    hangs on the wall or is let into another body: surface that no camera could ever see.
-
-    Raises:
-        NumericalError: nearly no surface borders free space.
+    millimetre along the normal leads into free space: no camera could see the others.
+    Raises `NumericalError` where nearly no surface borders free space.
     """
-    rng = np.random.default_rng(seed)
+    rng, step = np.random.default_rng(seed), 1e-3
+    solids = [part.solid for part in room.parts]
+    areas = np.array([solid.area() for solid in solids])
     kept = np.empty((0, 3))
     for _ in range(20):
-        kept = np.concatenate([kept, _exposed_points(room, n, rng)])
+        counts = rng.multinomial(n, areas / areas.sum()).tolist()
+        drawn = [solid.sample_surface(k, rng) for solid, k in zip(solids, counts, strict=True)]
+        normals = [solid.normals(points) for solid, points in zip(solids, drawn, strict=True)]
+        points = np.concatenate(drawn)
+        # Where two surfaces meet at an angle the step may pass nearer to the other one.
+        exposed = room.sdf(points + step * np.concatenate(normals)) > step / 4
+        exposed &= np.abs(room.sdf(points)) < 1e-6
+        kept = np.concatenate([kept, rng.permutation(points[exposed])])
         if len(kept) >= n:
             return kept[:n]
     raise NumericalError(
         f"room '{room.name}': only {len(kept)} of {n} surface points border free space; "
         "solids must not fill the shell; check their places"
     )
-
-
-def _exposed_points(room: Room, n: int, rng: np.random.Generator) -> Points:
-    """Draw `n` points over all solids and return, in random order, those that are exposed."""
-    step = 1e-3
-    solids: list[Solid] = [room.shell, *(part.solid for part in room.parts)]
-    areas = np.array([solid.area() for solid in solids])
-    counts = rng.multinomial(n, areas / areas.sum())
-    drawn = [
-        solid.sample_surface(int(count), rng) for solid, count in zip(solids, counts, strict=True)
-    ]
-    normals = [solid.normals(points) for solid, points in zip(solids, drawn, strict=True)]
-    points = np.concatenate(drawn)
-    lifted = points + step * np.concatenate(normals)
-    # Where two surfaces meet at an angle the step may pass nearer to the other one.
-    exposed = (room.sdf(lifted) > step / 4) & (np.abs(room.sdf(points)) < 1e-6)
-    return rng.permutation(points[exposed])

@@ -22,12 +22,9 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     Lookups jitter sideways; disparity gets Gaussian noise and is rounded to an eighth of a pixel,
     which makes depth steps and errors grow with the square of depth (2.7 cm steps at 3 m); pixels
     at depth edges, at grazing incidence and out of range are lost. All pixel constants hold at a
-    width of 640; other widths are treated as the same camera's image made smaller.
-
-    Args:
-        depth: exact z-depth (m); 0 or not finite = nothing seen.
-        focal: of this image (pixels).
-        rng: advanced by a fixed number of draws, whatever the depth.
+    width of 640; other widths are treated as the same camera's image made smaller. Where the exact
+    depth is 0 or not finite nothing is seen. `focal` (pixels) is that of this image; `rng` advances
+    by a fixed number of draws.
 
     Source: Khoshelham & Elberink, Sensors 2012 (disparity model); Nguyen et al., 3DIMPVT 2012
     (growth with incidence); Handa et al., ICRA 2014 (jitter, rounding). Dropout probability and
@@ -53,15 +50,11 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
 
 def _is_edge(disparity: Depth) -> Bool[np.ndarray, "h w"]:
     """Pixels where disparity bends sharply: it is affine on planes, however slanted they are."""
-    padded = np.pad(disparity, 1, mode="edge")
-    # At the border the bend is unknown; repeating the last slope makes it zero.
-    padded[0], padded[-1] = 2 * padded[1] - padded[2], 2 * padded[-2] - padded[-3]
-    padded[:, 0] = 2 * padded[:, 1] - padded[:, 2]
-    padded[:, -1] = 2 * padded[:, -2] - padded[:, -3]
-    middle = 2 * padded[1:-1, 1:-1]
-    down = np.abs(padded[2:, 1:-1] + padded[:-2, 1:-1] - middle)
-    across = np.abs(padded[1:-1, 2:] + padded[1:-1, :-2] - middle)
-    return np.maximum(down, across) > EDGE_JUMP
+    bend = np.zeros_like(disparity)  # stays zero at the border, where it is unknown
+    for values, out in ((disparity, bend), (disparity.T, bend.T)):
+        inner = np.abs(values[2:] + values[:-2] - 2 * values[1:-1])
+        np.maximum(out[1:-1], inner, out=out[1:-1])
+    return bend > EDGE_JUMP
 
 
 def _is_grazing(disparity: Depth, focal: float) -> Bool[np.ndarray, "h w"]:
@@ -91,13 +84,10 @@ def _gentler_slope(values: Depth) -> Depth:
 def filter_depth(depth: Depth, sigma_px: float = 2.0, sigma_range: float = 0.1) -> Depth:
     """Bilateral filter of depth (m); invalid pixels (0) stay invalid and influence none.
 
-    Args:
-        sigma_px: spatial standard deviation (pixels at a width of 640). It shrinks with the
-            image, but not below 0.7 pixels of it, so that small images are smoothed at all.
-        sigma_range: standard deviation (m) of the weight on depth differences.
+    Standard deviations are in space (pixels at a width of 640) and of depth differences (m). The
+    first shrinks with the image, but not below 0.7 pixels of it: small images are smoothed too.
 
-    Source: Neural RGB-D filters its noisy depth with these two values; the lower limit is our
-    choice.
+    Source: Neural RGB-D filters its noisy depth with these values; the lower limit is our choice.
     """
     sigma = max(sigma_px * depth.shape[1] / 640.0, 0.7)
     valid = depth > 0
