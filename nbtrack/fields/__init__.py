@@ -1,29 +1,42 @@
-"""Neural fields. A module in this folder that registers a field makes it known everywhere."""
+"""Neural fields, and the registry of their names."""
 
-import importlib
-import pkgutil
+import torch
 
-from nbtrack.data.pixels import Rays
-from nbtrack.fields.base import (
-    FIELDS,
-    Field,
-    LearnedField,
-    Linearization,
-    field_class,
-    make_field,
-    supervised_field,
-)
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.errors import ConfigError, nearest_name
+from nbtrack.fields.base import Field, LearnedField, Linearization, MappingSettings
+from nbtrack.fields.imap import IMapField
+from nbtrack.fields.mlp import NetworkSettings
+from nbtrack.fields.neus import NeuSField, NeusMapping
+from nbtrack.fields.neus_plus import NeuSPlusField, NeusPlusMapping
+from nbtrack.fields.points import PointCloud, PointMapping
 
-for _module in pkgutil.iter_modules(__path__):
-    importlib.import_module(f"{__name__}.{_module.name}")
+FIELDS: dict[str, type[Field | PointCloud]] = {
+    kind.name: kind for kind in (IMapField, NeuSField, NeuSPlusField, PointCloud)
+}
+"""What can be mapped, by name. A field of your own joins by `FIELDS["mine"] = MyField`."""
 
-__all__ = [
-    "FIELDS",
-    "Field",
-    "LearnedField",
-    "Linearization",
-    "Rays",
-    "field_class",
-    "make_field",
-    "supervised_field",
-]
+
+def field_class(name: str) -> type[Field | PointCloud]:
+    """The field of a name. Raises ConfigError, naming the nearest, for any other."""
+    if name not in FIELDS:
+        raise ConfigError(f"unknown field {name!r}: {nearest_name(name, sorted(FIELDS))}")
+    return FIELDS[name]
+
+
+def supervised_field(name: str, supervision: str) -> str:
+    """The field that is `name` under a supervision ("rendering+sdf"), or ConfigError."""
+    kind = field_class(name)
+    variants = {
+        FIELDS[other].supervision: other for other in FIELDS if issubclass(FIELDS[other], kind)
+    }
+    variants[kind.supervision] = name
+    if supervision not in variants:
+        nearest = nearest_name(supervision, sorted(variants))
+        raise ConfigError(f"field {name!r} knows no supervision {supervision!r}: {nearest}")
+    return variants[supervision]
+
+
+def make_field(name: str, network: NetworkSettings, bounds: SceneBounds, seed: int) -> Field:
+    """A fresh, seeded field inside `bounds`."""
+    return field_class(name)(network, bounds, torch.Generator().manual_seed(seed))

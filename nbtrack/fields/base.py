@@ -1,41 +1,64 @@
-"""What every field offers to mapping and tracking, and the registry of fields."""
+"""What every field offers to mapping and tracking."""
 
 import abc
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor, nn
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
 
+from nbtrack.core.arrays import Colors, Frames, Points, Pose, RayColors, RaySamples, Scalar, Values
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.config import FieldConfig, MappingConfig
-from nbtrack.core.errors import ConfigError, nearest_name
+from nbtrack.core.camera import Intrinsics, pixel_directions
+from nbtrack.core.settings import may_be_zero
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.rendering import Rendering
+from nbtrack.fields.rendering import Rendering, importance_depths, stratified_depths
 
 LUMA = torch.tensor([0.299, 0.587, 0.114])
 """Weights of red, green and blue in the intensity that trackers compare (ITU-R BT.601)."""
+NEAR = 0.05  # m, z-depth before which nothing is looked for: closer than any depth camera measures
+
+# Samples a ray in pictures: twice those of mapping, and in fixed places, so that an image shows the
+# field and not the luck of the draw.
+_N_STRATIFIED, _N_IMPORTANCE, _RAYS_AT_ONCE = 48, 24, 4096
+
+Losses = dict[str, Scalar]
+Draw = Callable[..., Rays]  # of n_rays, and whether with tangent_planes: random measured pixels
 
 
 @dataclass(frozen=True)
-class Batch:
-    """What one iteration of mapping looks at."""
+class MappingSettings:
+    """Fitting a field to posed frames. The paper gives none of these figures."""
 
-    rays: Rays
-    depths: Float[Tensor, "rays samples"]  # ascending z-depths (m) of the samples on them
-    surface: Rays | None = None  # through further pixels, of whose points only the last counts
+    iterations: int = 20_000
+    n_rays: int = 1024  # a batch, drawn over all mapping frames
+    n_stratified: int = 32  # samples a ray, spread evenly (iMAP)
+    # Samples a ray at the surface: iMAP's second pass, or around the measured depth (NeuS).
+    n_surface: int = may_be_zero(12)
+    learning_rate: float = 1e-3  # Adam's, at the start; falls to a twentieth along a cosine (NeuS)
+    lambda_color: float = 5.0  # iMAP's, whose depth errors are relative to their deviation
+    holdout_every: int = may_be_zero(10)  # every n-th frame is only scored
+
+
+@dataclass(frozen=True)
+class View:
+    """What a camera sees of a field."""
+
+    color: Float[np.ndarray, "height width 3"]  # in [0, 1]
+    depth: Float[np.ndarray, "height width"]  # z-depth, m
 
 
 @dataclass(frozen=True)
 class Linearization:
     """A field's value and intensity at points, with their spatial gradients; all without graph."""
 
-    value: Float[Tensor, "n"]  # signed distance, m
+    value: Values  # signed distance, m
     value_gradient: Float[Tensor, "n 3"]  # no unit, length 1 for a true distance
-    intensity: Float[Tensor, "n"]  # luma of the colour, in [0, 1]
+    intensity: Values  # luma of the colour, in [0, 1]
     intensity_gradient: Float[Tensor, "n 3"]  # 1/m
 
 
@@ -45,23 +68,20 @@ class Field(nn.Module, abc.ABC):
     name: str  # on the command line and in file names
     label: str  # in tables and figures
     supervision: str = "rendering"  # what teaches it: tells variants of one field apart
+    is_distance: bool = True  # whether its value is a signed distance (m), else a density
+    surface_level: float  # the value whose isosurface is drawn as the scene's surface
+    Settings: type[MappingSettings] = MappingSettings  # of mapping
 
     def __init__(self, bounds: SceneBounds) -> None:
         super().__init__()
         self.bounds = bounds
 
     @abc.abstractmethod
-    def forward(
-        self, points_world: Float[Tensor, "n 3"]
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour in [0, 1] and the field's value at points (m, world frame)."""
 
-    def linearize(self, points_world: Float[Tensor, "n 3"]) -> Linearization:
-        """Value and intensity with their gradients at points (m), by automatic differentiation.
-
-        Fields that second-order trackers use override it: writing the derivatives out saves the
-        bookkeeping, which costs more than the arithmetic of a small network.
-        """
+    def linearize(self, points_world: Points) -> Linearization:
+        """Value and intensity with their gradients at points (m), by automatic differentiation."""
         points = points_world.detach().requires_grad_()
         with torch.enable_grad():
             color, value = self(points)
@@ -71,101 +91,106 @@ class Field(nn.Module, abc.ABC):
         return Linearization(value.detach(), value_gradient, intensity.detach(), intensity_gradient)
 
     @property
-    @abc.abstractmethod
-    def surface_level(self) -> float:
-        """The value whose isosurface is drawn as the scene's surface."""
+    def device(self) -> torch.device:
+        """Where its tensors lie."""
+        tensors = itertools.chain(self.parameters(), self.buffers())
+        return next(tensors, torch.empty(0)).device
 
 
 class LearnedField(Field):
     """A field that is fitted to posed frames by gradient descent, and can be rendered."""
 
-    # Whether mapping may place its samples by the measured depth. A field that is tracked by
-    # rendering must not: tracking has no such help, and the map would be thinner than its rays see.
-    depth_guided: bool = True
-    # Whether mapping's batches hold tangent planes and surface points: four more depths a ray, and
-    # more pixels.
-    is_taught_distances: bool = False
-
     @abc.abstractmethod
     def composite(
-        self,
-        colors: Float[Tensor, "rays samples 3"],
-        values: Float[Tensor, "rays samples"],
-        rays: Rays,
-        depths: Float[Tensor, "rays samples"],
+        self, colors: RayColors, values: RaySamples, rays: Rays, depths: RaySamples
     ) -> Rendering:
         """Volume rendering from what the field answered at ascending z-depths (m)."""
 
-    def along(
-        self, rays: Rays, depths: Float[Tensor, "rays samples"]
-    ) -> tuple[Float[Tensor, "rays samples 3"], Float[Tensor, "rays samples"]]:
-        """Colour and value at z-depths (m) along rays."""
-        colors, values = self(rays.points(depths).flatten(0, 1))
-        return colors.view(*depths.shape, 3), values.view_as(depths)
-
-    def render(self, rays: Rays, depths: Float[Tensor, "rays samples"]) -> Rendering:
-        """Volume rendering with samples at ascending z-depths (m)."""
-        return self.composite(*self.along(rays, depths), rays, depths)
-
     @abc.abstractmethod
-    def mapping_losses(
-        self, batch: Batch, config: MappingConfig, generator: torch.Generator
-    ) -> dict[str, Float[Tensor, ""]]:
-        """Weighted loss terms of one batch by name; their sum is minimised."""
+    def mapping_losses(self, draw: Draw, settings: MappingSettings, generator: Generator) -> Losses:
+        """Weighted loss terms of random rays, by name; their sum is minimised."""
 
-    def prepare(self, sequence: RgbdSequence, frames: Int[np.ndarray, "frames"]) -> None:
+    def prepare(self, sequence: RgbdSequence, frames: Frames) -> None:
         """Take from the frames to be mapped what the losses need besides the rays of a batch."""
 
     def diagnostics(self) -> dict[str, float]:
         """Scalars worth a curve over training, beside the losses."""
         return {}
 
+    def along(self, rays: Rays, depths: RaySamples) -> tuple[RayColors, RaySamples]:
+        """Colour and value at z-depths (m) along rays."""
+        colors, values = self(rays.points(depths).flatten(0, 1))
+        return colors.view(*depths.shape, 3), values.view_as(depths)
 
-FIELDS: dict[str, type[Field]] = {}
+    def render(self, rays: Rays, depths: RaySamples) -> Rendering:
+        """Volume rendering with samples at ascending z-depths (m)."""
+        return self.composite(*self.along(rays, depths), rays, depths)
+
+    @torch.no_grad()
+    def two_pass_depths(
+        self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None = None
+    ) -> RaySamples:
+        """Ascending sample depths (m): spread over the scene, and more where those found something.
+
+        Without a generator nothing is random. Source: iMAP, Sec. 3.2 (32 and 12 samples).
+        """
+        spread = self._first_pass(rays, n_stratified, generator)
+        answers = self.along(rays, spread)
+        extra = self._second_pass(*answers, rays, spread, n_importance, generator)
+        return torch.cat([spread, extra], dim=-1).sort(dim=-1).values
+
+    def render_in_two_passes(
+        self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None = None
+    ) -> Rendering:
+        """What `render` gives at `two_pass_depths`, with every sample asked for once."""
+        spread = self._first_pass(rays, n_stratified, generator)
+        colors, values = self.along(rays, spread)
+        extra = self._second_pass(colors, values, rays, spread, n_importance, generator)
+        more_colors, more_values = self.along(rays, extra)
+        depths, order = torch.cat([spread, extra], dim=-1).sort(dim=-1)
+        colors = torch.cat([colors, more_colors], dim=1)
+        colors = colors.gather(1, order[..., None].expand_as(colors))
+        values = torch.cat([values, more_values], dim=-1).gather(-1, order)
+        return self.composite(colors, values, rays, depths)
+
+    def render_view(self, camera: Intrinsics, T_world_camera: Pose) -> View:
+        """Colour and z-depth image (m) from a camera pose. Nothing in it is random."""
+        pose = torch.from_numpy(T_world_camera).float().to(self.device)
+        shape = (camera.height, camera.width)
+        rows, columns = torch.ones(shape, device=self.device).nonzero(as_tuple=True)
+        directions_world = pixel_directions(camera, columns, rows) @ pose[:3, :3].T
+        color, depth = self.render_rays(pose[:3, 3].expand_as(directions_world), directions_world)
+        return View(color.cpu().view(*shape, 3).numpy(), depth.cpu().view(shape).numpy())
+
+    @torch.no_grad()
+    def render_rays(self, origins_world: Points, directions_world: Points) -> tuple[Colors, Values]:
+        """Colour and z-depth (m) of rays, by two passes with fixed samples."""
+        parts = []
+        for start in range(0, len(origins_world), _RAYS_AT_ONCE):
+            place = [x[start : start + _RAYS_AT_ONCE] for x in (origins_world, directions_world)]
+            rays = Rays(*place, torch.zeros_like(place[0]), place[0].new_zeros(len(place[0])))
+            parts.append(self.render_in_two_passes(rays, _N_STRATIFIED, _N_IMPORTANCE))
+        color = torch.cat([part.color.clamp(0, 1) for part in parts])
+        return color, torch.cat([part.depth for part in parts])
+
+    @torch.no_grad()  # where samples lie is given: a pose does not move them along
+    def _first_pass(self, rays: Rays, n_samples: int, generator: Generator | None) -> RaySamples:
+        return stratified_depths(NEAR, rays_end(rays, self.bounds), n_samples, generator)
+
+    @torch.no_grad()
+    def _second_pass(self, colors, values, rays, depths, n_samples, generator) -> Tensor:
+        weights = self.composite(colors, values, rays, depths).weights
+        if weights.shape != depths.shape:  # NeuS weighs sections: both ends of one get a share
+            weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
+        return importance_depths(depths, weights, n_samples, generator)
 
 
-def register_field(field_class: type[Field]) -> type[Field]:
-    """Class decorator that makes a field known under its name."""
-    FIELDS[field_class.name] = field_class
-    return field_class
+def rays_end(rays: Rays, bounds: SceneBounds) -> Values:
+    """Z-depth (m) at which rays leave the scene, at least a little in front of the camera."""
+    exit_depth = bounds.exit_depth(rays.origins_world, rays.directions_world)
+    return exit_depth.clamp_min(2 * NEAR)
 
 
-def field_class(name: str) -> type[Field]:
-    """The registered field of a name. Raises ConfigError, naming the nearest, for any other."""
-    if name not in FIELDS:
-        raise ConfigError(f"unknown field {name!r}: {nearest_name(name, sorted(FIELDS))}")
-    return FIELDS[name]
-
-
-def supervised_field(name: str, supervision: str) -> str:
-    """The name of the field that is `name` under a supervision ("rendering", "rendering+sdf").
-
-    Raises:
-        ConfigError: the field or the supervision is unknown, or they do not go together.
-    """
-    if field_class(name).supervision == supervision:
-        return name
-    variants = {
-        variant.supervision: other
-        for other, variant in FIELDS.items()
-        if issubclass(variant, field_class(name))
-    }
-    if supervision not in variants:
-        raise ConfigError(
-            f"field {name!r} knows no supervision {supervision!r}: "
-            f"{nearest_name(supervision, sorted(variants))}"
-        )
-    return variants[supervision]
-
-
-def make_field(name: str, config: FieldConfig, bounds: SceneBounds, seed: int) -> Field:
-    """A fresh, seeded field inside `bounds`."""
-    constructor: Callable[..., Field] = field_class(name)
-    return constructor(config, bounds, torch.Generator().manual_seed(seed))
-
-
-def measured_mean(
-    error: Float[Tensor, "rays"], measured: Float[Tensor, "rays"]
-) -> Float[Tensor, ""]:
-    """Mean error over the rays with a depth measurement (mask of 0 and 1); 0 if there is none."""
+def measured_mean(error: Float[Tensor, "*some"], measured: Float[Tensor, "*some"]) -> Scalar:
+    """Mean error where there is a measurement (a mask of 0 and 1); 0 if there is none."""
     return (error * measured).sum() / measured.sum().clamp_min(1)

@@ -1,50 +1,59 @@
-"""The network that both fields share: iMAP's multilayer perceptron."""
+"""The network that all fields share: iMAP's multilayer perceptron, and its derivatives."""
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
+from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.config import FieldConfig
+
+_LAYER_SIZE = 2**18  # numbers that are worked on at once: 1 MB, which a core's cache holds
+
+Activation = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """The network that all fields share."""
+
+    width: int = 256  # hidden units a layer (iMAP)
+    n_frequencies: int = 93  # learnable sines of the embedding (iMAP)
+    # Standard deviation of the sines' first frequencies, rad/m. 2.5 is iMAP's own: 25 on
+    # coordinates scaled by 1/10.
+    embedding_sigma: float = 2.5
 
 
 class FourierMlp(nn.Module):
     """Four hidden layers on 93 learnable sines; position in, colour logits and one value out.
 
-    The embedding is sin(B x) with B learnable, drawn from a Gaussian, sine only; it enters once
-    more beside the input of the third layer. At full size (256 wide) it has 246,555 parameters.
-
-    Source: Sucar et al. 2021 (iMAP); paper, implementation details ("the same network
-    architecture as iMAP for both methods"). iMAP scales coordinates by 1/10; here the scene's own
-    size normalises them, while the frequencies are drawn per metre, so that detail has one size in
-    rooms of any size (our choice).
+    The embedding is sin(B x) with B learnable, drawn from a Gaussian; it enters once more beside
+    the input of the third layer. At full size (256 wide) it has 246,555 parameters.
+    Source: Sucar et al. 2021 (iMAP); paper, implementation details. iMAP scales coordinates by
+    1/10; here the scene's own size normalises them, while the frequencies are drawn per metre, so
+    that detail has one size in rooms of any size (our choice).
     """
 
     def __init__(
-        self,
-        config: FieldConfig,
-        bounds: SceneBounds,
-        activation: Callable[[Tensor], Tensor],
-        generator: torch.Generator,
+        self, settings: NetworkSettings, bounds: SceneBounds, act: Activation, generator: Generator
     ) -> None:
         super().__init__()
-        width, n_frequencies = config.width, config.n_frequencies
-        self.activation = activation
+        width, n_frequencies = settings.width, settings.n_frequencies
+        self.activation = act
         self.register_buffer("center", torch.tensor(bounds.center, dtype=torch.float32))
         self.metres_per_unit = bounds.metres_per_unit
-        frequencies = torch.randn(3, n_frequencies, generator=generator)
-        sigma = config.embedding_sigma * self.metres_per_unit
-        self.frequencies = nn.Parameter(sigma * frequencies)
+        sigma = settings.embedding_sigma * self.metres_per_unit
+        self.frequencies = nn.Parameter(sigma * torch.randn(3, n_frequencies, generator=generator))
         self.layer_1 = _linear(n_frequencies, width, generator)
         self.layer_2 = _linear(width, width, generator)
         self.layer_3 = _linear(width + n_frequencies, width, generator)
         self.layer_4 = _linear(width, width, generator)
         self.head = _linear(width, 4, generator)
 
-    def features(self, points_world: Float[Tensor, "n 3"]) -> Float[Tensor, "n width"]:
+    def features(self, points_world: Points) -> Float[Tensor, "n width"]:
         """Activations of the last hidden layer at points (m, world frame)."""
         normalized = (points_world - self.center) / self.metres_per_unit
         embedding = torch.sin(normalized @ self.frequencies)
@@ -53,15 +62,55 @@ class FourierMlp(nn.Module):
         hidden = self.activation(self.layer_3(torch.cat([hidden, embedding], dim=-1)))
         return self.activation(self.layer_4(hidden))
 
-    def forward(
-        self, points_world: Float[Tensor, "n 3"]
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Raw colour and the raw fourth output, before a field gives them a meaning."""
-        raw = self.head(self.features(points_world))
+        # Parts of a layer that fit the cache: value and gradient of 16,384 points, asked of a
+        # finished network, cost 273 ms instead of 369 (256 wide, one busy core).
+        n_at_once = max(1, len(points_world))
+        if not (self.head.weight.requires_grad or points_world.is_cuda):
+            n_at_once = max(1, _LAYER_SIZE // self.head.in_features)
+        parts = points_world.split(n_at_once)
+        raw = torch.cat([self.head(self.features(part)) for part in parts])
         return raw[:, :3], raw[:, 3]
 
+    @torch.no_grad()
+    def linearize(
+        self, points_world: Points, slopes: Callable[[Tensor], Float[Tensor, "k n 4"]]
+    ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "k n 3"]]:
+        """Raw outputs, and the spatial gradients (1/m) of k functions of them, as matrix products.
 
-def _linear(n_in: int, n_out: int, generator: torch.Generator) -> nn.Linear:
+        The activation must be SiLU; `slopes` gives the functions' derivatives g by the outputs y:
+
+            forward     a_l = h_l-1 W_l' + b_l,  h_l = act(a_l),  y = h_4 W_y' + b_y,
+                        with e = sin(x B) in layers 1 and 3
+            backward    g_4 = g W_y,          d_l = g_l * act'(a_l),
+                        g_3 = d_4 W_4,        [g_2, s] = d_3 W_3,        g_1 = d_2 W_2,
+                        dx = ((s + d_1 W_1) * cos(x B)) B'
+
+        512 points, two functions, one core: 3.4 ms against autograd's 4.1 (96 units).
+        """
+
+        def slope(x: Tensor) -> Tensor:
+            return torch.ops.aten.silu_backward(torch.ones_like(x), x)
+
+        act = self.activation
+        phase = (points_world - self.center) / self.metres_per_unit @ self.frequencies
+        embedding = phase.sin()
+        a_1 = self.layer_1(embedding)
+        a_2 = self.layer_2(act(a_1))
+        a_3 = self.layer_3(torch.cat([act(a_2), embedding], dim=-1))
+        a_4 = self.layer_4(act(a_3))
+        raw = self.head(act(a_4))
+        g_4 = slopes(raw) @ self.head.weight
+        g_3 = (g_4 * slope(a_4)) @ self.layer_4.weight
+        both = (g_3 * slope(a_3)) @ self.layer_3.weight
+        g_2, skipped = both.split([a_2.shape[1], embedding.shape[1]], dim=-1)
+        g_1 = (g_2 * slope(a_2)) @ self.layer_2.weight
+        of_embedding = skipped + (g_1 * slope(a_1)) @ self.layer_1.weight
+        return raw, (of_embedding * phase.cos()) @ self.frequencies.T / self.metres_per_unit
+
+
+def _linear(n_in: int, n_out: int, generator: Generator) -> nn.Linear:
     """Kaiming-uniform weights for a rectifier and zero bias, drawn from a generator of our own."""
     layer = nn.Linear(n_in, n_out)
     bound = math.sqrt(6.0 / n_in)

@@ -1,80 +1,108 @@
-"""Points: a fused point cloud as a field. No network; classical registration aligns with it."""
+"""Points: the measured pixels of posed frames, averaged by voxel, for classical registration."""
 
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
-from torch import Tensor, nn
 
+from nbtrack.core.arrays import Colors, Frames, Points, Values, WorldPoints
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.config import FieldConfig
+from nbtrack.core.settings import may_be_zero
+from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.base import Field, register_field
-from nbtrack.fields.fusion import fuse_points
+
+_FRAMES_AT_ONCE = 8  # frames whose voxels wait to be merged: what the memory is bounded by
 
 
-@register_field
-class PointField(Field):
-    """The measured points themselves, one a voxel: what a map costs that learns nothing.
+@dataclass(frozen=True)
+class PointMapping:
+    """Fusing points."""
 
-    A fresh field is empty: `fuse` or a stored state fills it.
+    voxel: float = 0.02  # edge of the cells whose measured points are averaged, m
+    holdout_every: int = may_be_zero(10)  # every n-th frame is left out
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Measured points with their colours, one a voxel. Made by `fuse_points`."""
+
+    name: ClassVar[str] = "points"  # this and what follows: as fields have it
+    label: ClassVar[str] = "Points"
+    supervision: ClassVar[str] = "rendering"
+    Settings: ClassVar[type[PointMapping]] = PointMapping
+
+    points: Points  # m, world frame
+    colors: Colors  # in [0, 1]
+    voxel: float  # m
+    bounds: SceneBounds
+
+    @property
+    def device(self) -> torch.device:
+        """Where the points lie."""
+        return self.points.device
+
+    def to(self, device: torch.device | str) -> "PointCloud":
+        """The same points on a device."""
+        return replace(self, points=self.points.to(device), colors=self.colors.to(device))
+
+    def distance(self, points_world: Points) -> Values:
+        """Distance (m, without sign) of points (m) from the nearest point."""
+        return torch.from_numpy(self._tree.query(points_world.cpu().numpy())[0]).to(points_world)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points.cpu().numpy())
+
+
+def fuse_points(
+    sequence: RgbdSequence, frames: Frames, bounds: SceneBounds, voxel: float
+) -> PointCloud:
+    """One point a voxel (m): mean position (m, world frame) and mean colour (in [0, 1]).
+
+    All of the frames' measured pixels inside the bounds count. The mean takes noise off, and leaves
+    planes where they are. Memory grows with the surface that was seen, not with the frames.
     """
+    low = np.array(bounds.minimum)
+    shape = np.floor((np.array(bounds.maximum) - low) / voxel).astype(np.int64) + 1
+    # Sorted voxel numbers, and for each the sums of x, y, z (m), red, green, blue, and one a pixel.
+    parts = [(np.empty(0, np.int64), np.empty((0, 7)))]
+    for count, index in enumerate(frames.tolist(), start=1):
+        points, colors = measured_points(sequence[index])
+        voxels, inside = cells_of(points, low, shape, voxel)
+        values = np.concatenate([points, colors, np.ones((len(points), 1))], axis=1)[inside]
+        parts.append(_summed(voxels, values))
+        if count % _FRAMES_AT_ONCE == 0 or count == len(frames):
+            parts = [_summed(*map(np.concatenate, zip(*parts, strict=True)))]
+    sums = parts[0][1]
+    means = torch.from_numpy((sums[:, :6] / sums[:, 6:]).astype(np.float32))
+    return PointCloud(means[:, :3].contiguous(), means[:, 3:].contiguous(), voxel, bounds)
 
-    name = "points"
-    label = "Points"
 
-    points: Float[Tensor, "n 3"]  # m, world frame
-    colors: Float[Tensor, "n 3"]  # in [0, 1]
+def _summed(voxels, values):
+    """Sums of the rows that share a voxel."""
+    distinct, which = np.unique(voxels, return_inverse=True)
+    columns = [np.bincount(which, column, len(distinct)) for column in values.T]
+    return distinct, np.stack(columns, axis=1)
 
-    def __init__(
-        self, config: FieldConfig, bounds: SceneBounds, generator: torch.Generator
-    ) -> None:
-        """Nothing of the network's settings is used, nor anything random."""
-        super().__init__(bounds)
-        self.register_buffer("points", torch.empty(0, 3))
-        self.register_buffer("colors", torch.empty(0, 3))
-        # Edge of the voxels, m. A parameter that nobody fits, so that whoever asks a field's
-        # parameters for its device gets an answer.
-        self.voxel = nn.Parameter(torch.zeros(1), requires_grad=False)
-        self._tree: cKDTree | None = None
 
-    def fuse(self, sequence: RgbdSequence, frames: Int[np.ndarray, "frames"], voxel: float) -> None:
-        """Replace the points by those of some frames, one a voxel of an edge in metres."""
-        points, colors = fuse_points(sequence, frames, self.bounds, voxel)
-        self.points = torch.from_numpy(points).to(self.voxel.device)
-        self.colors = torch.from_numpy(colors).to(self.voxel.device)
-        self.voxel.fill_(voxel)
-        self._tree = None
+def cells_of(
+    points: WorldPoints, low: Float[np.ndarray, "3"], shape: Int[np.ndarray, "3"], voxel: float
+) -> tuple[Int[np.ndarray, "_"], np.ndarray]:
+    """Numbers of the grid's cells that hold points, z fastest; and which points lie inside."""
+    cells = np.floor((points - low) / voxel).astype(np.int64)
+    inside = ((cells >= 0) & (cells < shape)).all(axis=1)
+    return np.ravel_multi_index(tuple(cells[inside].T), tuple(shape)), inside
 
-    def forward(
-        self, points_world: Float[Tensor, "n 3"]
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-        """Colour of the nearest point, and the distance to it (m), which has no sign."""
-        if self._tree is None:
-            self._tree = cKDTree(self.points.cpu().numpy())
-        distance, nearest = self._tree.query(points_world.detach().cpu().numpy())
-        nearest = torch.from_numpy(nearest).to(self.colors.device)
-        return self.colors[nearest], torch.from_numpy(distance).float().to(points_world)
 
-    @property
-    def surface_level(self) -> float:
-        """Half a voxel: a thin shell around the points."""
-        return self.voxel.item() / 2
-
-    @property
-    def n_bytes(self) -> int:
-        """Memory of positions and colours; a search tree over them comes on top."""
-        return self.points.nbytes + self.colors.nbytes
-
-    def _load_from_state_dict(
-        self, state_dict: dict[str, Any], prefix: str, *arguments: Any
-    ) -> None:
-        """Take the stored points, however many they are."""
-        for name in ("points", "colors"):
-            if prefix + name in state_dict:
-                stored = state_dict[prefix + name]
-                setattr(self, name, torch.empty_like(stored, device=self.voxel.device))
-        self._tree = None
-        super()._load_from_state_dict(state_dict, prefix, *arguments)
+def measured_points(frame: Frame, stride: int = 1) -> tuple[WorldPoints, WorldPoints]:
+    """World points (m) and colours (in [0, 1]) of measured pixels, `stride` apart."""
+    pixels = frame.measured_pixels()
+    rows, columns = pixels[:, (pixels % stride == 0).all(dim=0)]
+    points_camera = frame.points(rows, columns)[0].double().numpy()
+    T_world_camera = frame.T_world_camera
+    points = points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    return points, frame.color[rows, columns].numpy() / 255.0

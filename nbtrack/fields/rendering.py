@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Generator, Tensor
+
+from nbtrack.core.arrays import RayColors, RaySamples, Scalar
 
 
 @dataclass(frozen=True)
@@ -19,24 +21,17 @@ class Rendering:
     depth: Float[Tensor, "rays"]  # z-depth, m
     depth_variance: Float[Tensor, "rays"]  # m^2
     opacity: Float[Tensor, "rays"]  # sum of the weights, at most 1
-    weights: Float[Tensor, "rays samples"]
+    weights: RaySamples
 
 
 def weights_from_density(
-    density: Float[Tensor, "rays samples"],
-    depths: Float[Tensor, "rays samples"],
-    ray_lengths: Float[Tensor, "rays"],
-) -> Float[Tensor, "rays samples"]:
+    density: RaySamples, depths: RaySamples, ray_lengths: Float[Tensor, "rays"]
+) -> RaySamples:
     """Termination probabilities w_i = o_i prod_{j<i} (1 - o_j), o_i = 1 - exp(-density_i delta_i).
 
-    Args:
-        density: 1/m at the samples.
-        depths: z-depths (m) of the samples, ascending along each ray.
-        ray_lengths: metres along the ray for one metre of z-depth.
-
+    Densities in 1/m, ascending z-depths in m, and the metres along a ray for one metre of z-depth.
     Source: Sucar et al. 2021 (iMAP), Sec. 3.2. The last sample has no successor; it gets the
-    section length of the one before it (our choice: a wall there stays opaque, and free space
-    does not turn into a wall at the far end).
+    section length of the one before it (our choice: a wall stays opaque, and free space free).
     """
     sections = depths.diff(dim=-1)
     sections = torch.cat([sections, sections[:, -1:]], dim=-1) * ray_lengths[:, None]
@@ -47,9 +42,7 @@ def weights_from_density(
     return opacity * transmittance
 
 
-def weights_from_sdf(
-    sdf: Float[Tensor, "rays samples"], inverse_deviation: Float[Tensor, ""]
-) -> Float[Tensor, "rays sections"]:
+def weights_from_sdf(sdf: RaySamples, inverse_deviation: Scalar) -> Float[Tensor, "rays sections"]:
     """NeuS's unbiased, occlusion-aware weights of the sections between neighbouring samples.
 
     alpha_i = max((Phi(f_i) - Phi(f_{i+1})) / Phi(f_i), 0) with Phi(f) = sigmoid(s f) and weights
@@ -59,16 +52,9 @@ def weights_from_sdf(
     inside something is dark. NeuS lets such rays leave the solid unharmed, for it looks at
     objects from outside; in rooms seen from inside the camera's own surroundings then filled up.
 
-    Args:
-        sdf: signed distance (m, positive in free space) at `samples` depths along each ray.
-        inverse_deviation: s (1/m), the s-density's inverse standard deviation.
-
-    Returns:
-        Weights of `samples - 1` sections.
-
-    Source: Wang et al. 2021 (NeuS), Eq. 13. Distances enter through f alone, so rays of any
-    length need no factor. The published code extrapolates f from section mid-points along its
-    gradient; using the samples' own values is the paper's formula and spares second derivatives.
+    The signed distance f is in m, positive in free space, `inverse_deviation` s in 1/m. Source:
+    Wang et al. 2021 (NeuS), Eq. 13; the published code extrapolates f from mid-points, where the
+    paper's own formula spares second derivatives.
     """
     # Phi(f_i+1) / Phi(f_i) in logarithms: a plain quotient is 0/0 deep inside objects.
     log_phi = torch.nn.functional.logsigmoid(inverse_deviation * sdf)
@@ -77,11 +63,7 @@ def weights_from_sdf(
     return -torch.expm1(log_ratio) * torch.exp(passed)
 
 
-def composite(
-    weights: Float[Tensor, "rays samples"],
-    colors: Float[Tensor, "rays samples 3"],
-    depths: Float[Tensor, "rays samples"],
-) -> Rendering:
+def composite(weights: RaySamples, colors: RayColors, depths: RaySamples) -> Rendering:
     """Expected colour, z-depth and depth variance: sum w c, sum w d and sum w (D - d)^2.
 
     Source: Sucar et al. 2021 (iMAP), Sec. 3.2. Light that passes the last sample adds nothing.
@@ -97,11 +79,8 @@ def composite(
 
 
 def stratified_depths(
-    near: float,
-    far: Float[Tensor, "rays"],
-    n_samples: int,
-    generator: torch.Generator | None = None,
-) -> Float[Tensor, "rays samples"]:
+    near: float, far: Float[Tensor, "rays"], n_samples: int, generator: Generator | None = None
+) -> RaySamples:
     """One uniformly random z-depth (m) in each of `n_samples` equal parts of [near, far].
 
     Without a generator the samples lie in the middle of their parts.
@@ -115,10 +94,7 @@ def stratified_depths(
 
 
 def importance_depths(
-    depths: Float[Tensor, "rays samples"],
-    weights: Float[Tensor, "rays samples"],
-    n_samples: int,
-    generator: torch.Generator | None = None,
+    depths: RaySamples, weights: RaySamples, n_samples: int, generator: Generator | None = None
 ) -> Float[Tensor, "rays new_samples"]:
     """Z-depths (m) drawn from the piecewise-constant density that `weights` describe.
 
