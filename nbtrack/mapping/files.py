@@ -1,182 +1,163 @@
-"""Maps as files: the folder that mapping writes, and one small file that opens anywhere.
-
-The file holds tensors and plain values only, and is read without running any code that it might
-contain. Everything in it is checked: it may come from anybody.
-"""
+"""A finished map, and the one file that holds it: safetensors, which run no code; all checked."""
 
 import hashlib
-import io
-import math
-from dataclasses import asdict, dataclass
+import json
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
+import pandas as pd
+import safetensors
+import safetensors.torch
+from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.config import FieldConfig
-from nbtrack.core.errors import ConfigError, DataError, MissingError
-from nbtrack.core.files import naming_damaged, read_checkpoint, read_json, write_bytes_atomic
-from nbtrack.core.provenance import fingerprint
-from nbtrack.fields import Field, field_class, make_field
-from nbtrack.mapping.fits import MapFit
-from nbtrack.mapping.seen_volume import SeenVolume
+from nbtrack.core.errors import MissingError
+from nbtrack.core.files import naming_damaged, write_together
+from nbtrack.fields import FIELDS, Field, NetworkSettings, PointCloud, make_field
 
-MAP_FILE, SUMMARY_FILE = "map.pt", "map.json"  # of a folder: weights and checkpoint; the rest
-FORMAT, FORMAT_VERSION = "nbtrack map", 1
-_ADVICE = "write a new one with `nbtrack export MAP_FOLDER --to map FILE`"
-_PARTS = {"field": str, "network": dict, "bounds": list, "camera": dict, "state": dict,
-          "made": dict, "seen": dict}  # fmt: skip
-_MADE = ("scene", "frames", "seed", "key", "seconds", "device", "versions")
-# A network wider than this would take a gigabyte before its weights are even looked at.
-_WIDEST = 8192
+MAP_FILE, HISTORY_FILE = "map.safetensors", "history.csv"
+MESH_FILE = "mesh.ply"  # what a map's frames have seen
+CHECKPOINT_FILE = "mapping.pt"  # of a map in the making
+_FORMAT, _VERSION = "nbtrack map", 2
+_AGAIN = "map again, and give the folder or its map.safetensors; an earlier nbtrack's are none"
+_LARGEST = 8192  # of networks (a wider one takes a gigabyte), images (pixels) and rooms (m)
+AnyField = Field | PointCloud
 
 
 @dataclass(frozen=True)
-class StoredMap:
-    """A finished map, ready for tracking, with what is known of how it was made."""
+class Map:
+    """A mapped scene, ready for tracking, with what is known of how it was made."""
 
-    field: Field
-    network: FieldConfig
+    field: AnyField
     camera: Intrinsics  # of the frames it was made from
-    # Scene, frames, seed, key, seconds, device and versions; plain values.
+    # Plain values: scene, n_frames, seed, network, settings, seconds, misfit_m, device, versions;
+    # and whatever its maker adds: quality, for one.
     made: dict[str, Any]
-    usual_fit: MapFit | None  # how it fits the frames it was made from; None: not at all
-    seen: SeenVolume  # where these frames have seen surfaces
+    # One row an iteration: weighted loss terms and diagnostics. Empty where it was not kept.
+    history: pd.DataFrame = field(default_factory=pd.DataFrame)
+
+    @property
+    def seconds(self) -> float:
+        """Time spent in iterations, before and after a resume together."""
+        return self.made["seconds"]
+
+    @property
+    def quality(self) -> dict[str, float | None]:
+        """Scores by name; empty where the map was not scored."""
+        return self.made.get("quality", {})
+
+    @property
+    def network(self) -> NetworkSettings:
+        """Settings of the field's network."""
+        return NetworkSettings(**self.made["network"])
 
     @cached_property
     def key(self) -> str:
         """Twelve hexadecimal digits that change with the field, its bounds and its weights."""
-        weights = hashlib.sha256()
-        for name, tensor in self.field.state_dict().items():
-            weights.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
-        return fingerprint(
-            self.field.name, self.network, asdict(self.field.bounds), weights.hexdigest()
-        )
+        parts = [self.field.name, self.made["network"], asdict(self.field.bounds)]
+        return _digest(parts, _tensors(self.field))[:12]
 
 
-def read_map(path: Path | str) -> StoredMap:
-    """A map from the folder that `map` has written, or from a single file, on the CPU.
-
-    Raises:
-        MissingError: there is nothing at the path, or no finished map in the folder.
-        DataError: the file is damaged, of another format version, or no map at all.
-    """
-    path = Path(path)
-    if path.is_dir():
-        return _read_folder(path)
-    if not path.is_file():
-        raise MissingError(f"no map {path}: give a folder that `map --out` wrote, or a map file")
-    content = read_checkpoint(path, "map file", _ADVICE)
-    if content.get("format") != FORMAT:
-        if {"settings", "field", "iteration"} <= set(content):
-            raise DataError(f"{path} is mapping's own checkpoint: give its folder {path.parent}")
-        raise DataError(f"{path} is not a map file (no format {FORMAT!r} in it): {_ADVICE}")
-    if content.get("format_version") != FORMAT_VERSION:
-        raise DataError(
-            f"{path} has map format {content.get('format_version')!r}, and this nbtrack reads "
-            f"{FORMAT_VERSION}: {_ADVICE} of the same nbtrack"
-        )
-    with naming_damaged(path, "map file", _ADVICE):
-        stored = _opened(content)
-        if stored.key != content["key"]:  # a bit that flipped on a disk shows nowhere else
-            raise ValueError("its content is not what was written")
-    return stored
-
-
-def write_map(path: Path, stored: StoredMap) -> None:
-    """Writes a map as one file, about 1 MB for the paper's network.
+def write_map(path: Path, finished: Map) -> None:
+    """Writes a map as one file, about 1 MB for the paper's network, and its history beside it.
 
     Weights keep every bit, so that tracking in the file gives the trajectory of the map itself.
     """
-    bounds = stored.field.bounds
-    buffer = io.BytesIO()
-    torch.save(
-        {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "field": stored.field.name,
-            "network": asdict(stored.network),
-            "bounds": [list(bounds.minimum), list(bounds.maximum)],
-            "camera": asdict(stored.camera),
-            "state": {
-                name: tensor.cpu().clone() for name, tensor in stored.field.state_dict().items()
-            },
-            "key": stored.key,
-            "made": stored.made,
-            "usual_fit": stored.usual_fit and stored.usual_fit.to_dict(),
-            "seen": stored.seen.to_dict(),
-        },
-        buffer,
-    )
-    write_bytes_atomic(path, buffer.getvalue())
+    path, tensors, bounds = Path(path), _tensors(finished.field), finished.field.bounds
+    header = {
+        "format_version": _VERSION,
+        "field": finished.field.name,
+        "bounds": [list(bounds.minimum), list(bounds.maximum)],
+        "camera": asdict(finished.camera),
+        "made": finished.made,
+    }
+    header["digest"] = _digest(header, tensors)
+    content = safetensors.torch.save(tensors, {_FORMAT: json.dumps(header, allow_nan=False)})
+    history = {} if finished.history.empty else {HISTORY_FILE: finished.history.to_csv().encode()}
+    write_together(path.parent, {**history, path.name: content})
 
 
-def _read_folder(folder: Path) -> StoredMap:
-    if not (folder / SUMMARY_FILE).is_file():
-        found = "an unfinished map: run its `map` command again" if (
-            folder / MAP_FILE
-        ).is_file() else "no map: give a folder that `map --out` wrote"  # fmt: skip
-        raise MissingError(f"{folder} holds {found}")
-    summary = read_json(folder / SUMMARY_FILE)
-    if "seen" not in summary:
-        raise DataError(f"{folder} was mapped by an earlier nbtrack: map again into a new folder")
-    state = read_checkpoint(folder / MAP_FILE)
-    with naming_damaged(folder / MAP_FILE):
-        return _opened({
-            "field": state["settings"]["field"],
-            "network": state["settings"]["field_config"],
-            "bounds": [list(corner) for corner in state["bounds"]],
-            "camera": summary["camera"],
-            "state": state["field"],
-            "made": {name: summary[name] for name in _MADE},
-            "usual_fit": summary["usual_fit"],
-            "seen": summary["seen"],
-        })  # fmt: skip
+def read_map(path: Path | str) -> Map:
+    """A map from the folder that `map` has written, or from a single file, on the CPU.
+
+    A single file comes without a history. Raises MissingError where there is no finished map, and
+    DataError where a file is damaged, of another format version, or no map at all.
+    """
+    path = Path(path)
+    file, history = (path / MAP_FILE, path / HISTORY_FILE) if path.is_dir() else (path, None)
+    if not file.is_file():
+        if (path / CHECKPOINT_FILE).is_file():
+            raise MissingError(f"{path} holds an unfinished map: run its `map` command again")
+        raise MissingError(
+            f"{path} holds no map of this nbtrack: give a folder or file that it wrote"
+        )
+    with naming_damaged(file, "map file", _AGAIN):
+        stored = _read_file(file)
+    if history is None or not history.is_file():
+        return stored
+    with naming_damaged(history, "history", "remove it, or map again"):
+        return replace(stored, history=pd.read_csv(history, index_col="iteration"))
 
 
-def _opened(content: dict[str, Any]) -> StoredMap:
-    """The map that checked content describes. Raises ValueError or another if it is not sound."""
-    for name, kind in _PARTS.items():
-        if not isinstance(content[name], kind):
-            raise ValueError(f"{name} is a {type(content[name]).__name__}")
-    _check_numbers(content)
+def _read_file(file: Path) -> Map:
+    """The map of a file. Raises ValueError, KeyError and others if it is not sound."""
     try:
-        field_class(content["field"])
-    except ConfigError as error:
-        raise DataError(f"the map needs a field that this nbtrack lacks: {error}") from None
-    network, camera = FieldConfig(**content["network"]), Intrinsics(**content["camera"])
-    low, high = (tuple(map(float, corner)) for corner in content["bounds"])
-    stored_field = make_field(content["field"], network, SceneBounds(low, high), seed=0)
-    stored_field.load_state_dict(content["state"])
-    stored_field.eval().requires_grad_(False)
-    # Weights of a wrong shape that loading lets pass would only be met in tracking.
-    stored_field(torch.tensor([low, high]).mean(dim=0, keepdim=True))
-    made = {name: content["made"][name] for name in _MADE}
-    fit = content["usual_fit"]
-    return StoredMap(
-        stored_field, network, camera, made, fit and MapFit(**fit),
-        SeenVolume.from_dict(content["seen"]),
-    )  # fmt: skip
+        with safetensors.safe_open(file, "pt") as opened:
+            header = dict(json.loads((opened.metadata() or {})[_FORMAT]))
+            names = list(opened.keys())
+            tensors = {name: opened.get_tensor(name).clone().float() for name in names}
+    except (safetensors.SafetensorError, OSError) as error:
+        raise ValueError(error) from None
+    if header.get("format_version") != _VERSION:
+        raise ValueError(f"format {header.get('format_version')!r}; this nbtrack reads {_VERSION}")
+    _check_numbers(header, tensors)
+    digest, name, made = header.pop("digest"), header["field"], header["made"]
+    bounds = SceneBounds(*(tuple(map(float, corner)) for corner in header["bounds"]))
+    if name not in FIELDS:
+        raise ValueError(f"this nbtrack has no field {name!r}")
+    if FIELDS[name] is PointCloud:
+        points, colors = tensors["points"], tensors["colors"]
+        if points.shape != colors.shape or points.shape[1:] != (3,):
+            raise ValueError(f"{tuple(points.shape)} points, {tuple(colors.shape)} colours")
+        mapped = PointCloud(points, colors, float(made["settings"]["voxel"]), bounds)
+    else:
+        mapped = make_field(name, NetworkSettings(**made["network"]), bounds, seed=0)
+        mapped.load_state_dict(tensors)
+        mapped.eval().requires_grad_(False)
+    if digest != _digest(header, tensors):  # a bit that flipped on a disk shows nowhere else
+        raise ValueError("its content is not what was written")
+    return Map(mapped, Intrinsics(**header["camera"]), made)
 
 
-def _check_numbers(content: dict[str, Any]) -> None:
-    """Raises ValueError for what would build a giant network, or spread NaN later."""
-    for name in ("width", "n_frequencies"):
-        size = content["network"][name]
-        if type(size) is not int or not 1 <= size <= _WIDEST:
-            raise ValueError(f"network.{name} is {size!r}")
-    bounds = content["bounds"]
-    if [len(corner) for corner in bounds] != [3, 3]:
-        raise ValueError("bounds are not two corners")
-    numbers = [*bounds[0], *bounds[1], *content["camera"].values(), content["made"]["seconds"]]
-    if not all(isinstance(n, int | float) and math.isfinite(n) for n in numbers):
-        raise ValueError("bounds, camera or seconds are not finite numbers")
-    if not all(low < high for low, high in zip(*bounds, strict=True)):
-        raise ValueError(f"bounds {bounds} are empty")
-    if min(content["camera"][name] for name in ("width", "height", "fx", "fy")) <= 0:
-        raise ValueError("the camera has no size")
-    if not all(bool(tensor.isfinite().all()) for tensor in content["state"].values()):
-        raise ValueError("weights are not finite")
+def _check_numbers(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    """Raises ValueError or TypeError for what would build a giant network, or spread NaN later."""
+    camera, made = header["camera"], header["made"]
+    low, high = np.reshape(header["bounds"], (2, 3))
+    sizes = [made["network"][name] for name in ("width", "n_frequencies")]
+    sizes += [*(camera[name] for name in ("width", "height", "fx", "fy")), *(high - low)]
+    others = [*low, camera["cx"], camera["cy"], made["seconds"], made["misfit_m"]]
+    if not all(0 < size <= _LARGEST for size in sizes) or not np.isfinite(others).all():
+        raise ValueError(f"network, camera and bounds of {sizes}, further numbers {others}")
+    for name, tensor in tensors.items():
+        if not tensor.isfinite().all():
+            raise ValueError(f"{name} is not finite")
+
+
+def _tensors(mapped: AnyField) -> dict[str, Tensor]:
+    """All that was learnt, by name, on the CPU."""
+    is_cloud = isinstance(mapped, PointCloud)
+    names = ("points", "colors")
+    state = {n: getattr(mapped, n) for n in names} if is_cloud else mapped.state_dict()
+    return {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
+
+
+def _digest(plain: Any, tensors: dict[str, Tensor]) -> str:
+    """SHA-256 over plain values and tensors, whatever the order of names."""
+    found = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        found.update(f"{name} {tuple(tensor.shape)}".encode() + tensor.numpy().tobytes())
+    return found.hexdigest()

@@ -1,163 +1,167 @@
-"""How good a map is: held-out images, and distances and meshes against the exact surface."""
-
-from dataclasses import asdict, dataclass
+"""How good a map is, against held-out images and the exact surface; and whether it belongs."""
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from nbtrack.core.arrays import Frames
+from nbtrack.core.camera import pixel_directions
 from nbtrack.core.errors import DataError
+from nbtrack.core.geometry import transform_points
+from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields import Field, LearnedField
-from nbtrack.fields.points import PointField
-from nbtrack.fields.views import render_rays
-from nbtrack.mapping.meshes import extract_mesh, keep_seen, query_field, seen_by
+from nbtrack.fields import Field, LearnedField, PointCloud
+from nbtrack.mapping.files import AnyField, Map
+from nbtrack.mapping.meshes import extract_mesh, query_field, seen_by
 from nbtrack.synthetic import Room, true_surface_points
 
-Frames = Int[np.ndarray, "frames"]
+Scores = dict[str, float | None]
+SCORES = (
+    "psnr_db",  # of held-out colour
+    "depth_l1_m",  # of held-out depth
+    "sdf_near_m",  # mean |error| where the true distance is below 5 cm
+    "sdf_free_m",  # mean |error| elsewhere in seen free space
+    "mesh_accuracy_m",  # mean distance of the mesh from the true surface
+    "mesh_completion_m",  # mean distance of the true surface from the mesh
+    "mesh_f_score",  # at 5 cm, in [0, 1]
+)
+NEAR = 0.05  # m: distances below this count as near a surface, and as found by the F-score
+POINTS_SCORED = 20_000  # on surfaces and along rays; as many pixels
+_MISFIT_PIXELS, _MISFIT_FRAMES = 500, 10
+# A map is refused where its misfit exceeds both. Measured on nine maps of three rooms (one a real
+# recording): frames of the same room 0.024 m at most, of other rooms 0.095 m at least.
+MISFIT_FACTOR, MISFIT_ALLOWED = 3.0, 0.05  # times what is usual in the map's own frames; m
 
-F_SCORE_THRESHOLD = 0.05  # m
-NEAR_SURFACE = 0.05  # m: distances below this count as near a surface
-_PIXELS_SCORED = 20_000
-_POINTS_SCORED = 20_000
 
+def split_holdout(n_frames: int, every: int) -> tuple[Frames, Frames]:
+    """Indices of the frames to map and of those kept back for scoring.
 
-@dataclass(frozen=True)
-class MapQuality:
-    """Scores of one map. None where the truth is not known, or the field has no such answer.
+    Every `every`-th frame is kept back, beginning in the middle of the first stretch; with
+    `every` = 0, or too few frames, none is.
 
-    A cloud of points is no mesh and cannot be rendered: its points take the mesh's place.
+    >>> split_holdout(6, 3)
+    (array([0, 2, 3, 5]), array([1, 4]))
     """
-
-    psnr_db: float | None = None  # of held-out colour
-    depth_l1_m: float | None = None  # of held-out depth
-    sdf_near_m: float | None = None  # mean |error| where the true distance is below 5 cm
-    sdf_free_m: float | None = None  # mean |error| elsewhere in seen free space
-    mesh_accuracy_m: float | None = None  # mean distance of the mesh from the true surface
-    mesh_completion_m: float | None = None  # mean distance of the true surface from the mesh
-    mesh_f_score: float | None = None  # at 5 cm, in [0, 1]
-
-    def to_dict(self) -> dict[str, float | None]:
-        """The fields by name, for JSON and tables."""
-        return asdict(self)
+    indices = np.arange(n_frames)
+    if every < 2 or n_frames < every:
+        return indices, indices[:0]
+    held_out = indices[every // 2 :: every]
+    return np.setdiff1d(indices, held_out), held_out
 
 
-def score_map(
-    field: Field,
-    sequence: RgbdSequence,
-    mapped: Int[np.ndarray, "mapped"],
-    held_out: Int[np.ndarray, "held_out"],
-    room: Room | None,
-    voxel: float = 0.05,
-) -> MapQuality:
-    """All scores that the data allow.
+def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -> Scores:
+    """`SCORES` of a map of a sequence; None where its field has no such answer, or without truth.
 
-    Args:
-        mapped: indices of the frames the field was fitted to: they say what has been seen.
-        held_out: indices of the frames kept back; may be empty.
-        room: the exact scene, if it is a synthetic one.
+    What has been seen is told by the mapped frames; the truth is known of synthetic rooms.
     """
-    scores: dict[str, float] = {}
+    field, scores = finished.field, dict.fromkeys(SCORES)
+    mapped, held_out = split_holdout(len(sequence), finished.made["settings"]["holdout_every"])
     if len(held_out) and isinstance(field, LearnedField):
-        scores |= score_images(field, sequence, held_out)
+        scores |= _score_images(field, sequence, held_out)
     if room is not None:
         if hasattr(field, "sdf_gradient"):
-            scores |= score_sdf(field, sequence, mapped, room)
-        if isinstance(field, PointField):
-            scores |= score_points(field, sequence, mapped, room)
-        else:
-            scores |= score_mesh(field, sequence, mapped, room, voxel)
-    return MapQuality(**scores)
+            scores |= _score_sdf(field, sequence, mapped, room)
+        scores |= _score_surface(field, sequence, mapped, room)
+    return scores
 
 
-def score_images(field: Field, sequence: RgbdSequence, held_out: Frames) -> dict[str, float]:
+def _score_images(field: LearnedField, sequence: RgbdSequence, held_out: Frames) -> Scores:
     """PSNR (dB) and depth L1 (m) over random measured pixels of held-out frames."""
-    device = next(field.parameters()).device
-    sampler = PixelSampler(sequence, device)
-    generator = torch.Generator(device).manual_seed(0)
-    frames = torch.from_numpy(held_out).to(device)
-    rays = sampler.draw(_PIXELS_SCORED, generator, frames)
-    squares, errors = [], []
-    for part in torch.nonzero(rays.depth > 0).squeeze(-1).split(4096):
-        color, depth = render_rays(field, rays.origins_world[part], rays.directions_world[part])
-        squares.append((color - rays.color[part]).square())
-        errors.append((depth - rays.depth[part]).abs())
-    mean_square = torch.cat(squares).mean().item()
-    return {
-        "psnr_db": -10 * float(np.log10(mean_square)),
-        "depth_l1_m": torch.cat(errors).mean().item(),
-    }
+    generator = torch.Generator(field.device).manual_seed(0)
+    frames = torch.from_numpy(held_out).to(field.device)
+    rays = PixelSampler(sequence, field.device).draw(POINTS_SCORED, generator, frames)
+    hit = rays.depth > 0
+    if not hit.any():
+        return {}
+    color, depth = field.render_rays(rays.origins_world[hit], rays.directions_world[hit])
+    psnr_db = -10 * float(np.log10((color - rays.color[hit]).square().mean().item()))
+    return {"psnr_db": psnr_db, "depth_l1_m": (depth - rays.depth[hit]).abs().mean().item()}
 
 
-def score_sdf(field: Field, sequence: RgbdSequence, mapped: Frames, room: Room) -> dict[str, float]:
+def _score_sdf(field: Field, sequence: RgbdSequence, mapped: Frames, room: Room) -> Scores:
     """Mean |error| (m) of the signed distance near surfaces and in free space that was seen.
 
-    Points lie on rays of the mapped frames: half of them between camera and surface, half within
-    5 cm of the measured surface. What counts as near is decided by the true distance.
+    Points lie on rays of mapped frames: half between camera and surface, half near the surface.
     """
-    points = _points_along_rays(sequence, mapped)
+    generator = torch.Generator().manual_seed(0)
+    sampler = PixelSampler(sequence, torch.device("cpu"))
+    rays = sampler.draw(POINTS_SCORED, generator, torch.from_numpy(mapped))
+    offsets = torch.rand(len(rays.depth), generator=generator)
+    is_in_front = torch.arange(len(rays.depth)) % 2 == 0
+    around = rays.depth + NEAR * (2 * offsets - 1)
+    depths = torch.where(is_in_front, rays.depth * offsets, around)
+    points = rays.points(depths[:, None])[:, 0][rays.depth > 0].double().numpy()
     true_sdf = room.sdf(points)
-    error = np.abs(query_field(field, points)[1] - true_sdf)
-    near = np.abs(true_sdf) < NEAR_SURFACE
-    return {
-        "sdf_near_m": float(error[near].mean()),
-        "sdf_free_m": float(error[~near & (true_sdf > 0)].mean()),
-    }
+    error, is_near = np.abs(query_field(field, points)[1] - true_sdf), np.abs(true_sdf) < NEAR
+    is_free = ~is_near & (true_sdf > 0)
+    return {"sdf_near_m": float(error[is_near].mean()), "sdf_free_m": float(error[is_free].mean())}
 
 
-def score_mesh(
-    field: Field, sequence: RgbdSequence, mapped: Frames, room: Room, voxel: float
-) -> dict[str, float]:
-    """Accuracy, completion (m) and F-score at 5 cm of the seen part of the mesh.
-
-    Accuracy needs no sampling of the truth: the exact distance at each point of the mesh is its
-    distance from the surface. A map that has no surface yet gets no scores.
-    """
+def _score_surface(field: AnyField, sequence, mapped: Frames, room: Room) -> Scores:
+    """Accuracy, completion (m) and F-score of the seen part of a map's surface, if it has one."""
     try:
-        mesh = keep_seen(extract_mesh(field, voxel), sequence, mapped)
+        mesh = extract_mesh(field, sequence, mapped)
     except DataError:
         return {}
-    if len(mesh.faces) == 0:
-        return {}
-    return _score_surface(mesh.sample(_POINTS_SCORED, seed=0), sequence, mapped, room)
-
-
-def score_points(
-    field: PointField, sequence: RgbdSequence, mapped: Frames, room: Room
-) -> dict[str, float]:
-    """The scores of a mesh, of the map's points: as many as are drawn on a mesh."""
-    order = np.random.default_rng(0).permutation(len(field.points))[:_POINTS_SCORED]
-    points = field.points.cpu().double().numpy()[order]
-    return _score_surface(points, sequence, mapped, room) if len(points) else {}
-
-
-def _score_surface(
-    points: Float[np.ndarray, "n 3"], sequence: RgbdSequence, mapped: Frames, room: Room
-) -> dict[str, float]:
-    to_truth = np.abs(room.sdf(points))
-    truth = true_surface_points(room, _POINTS_SCORED, seed=0)
-    truth = truth[seen_by(truth, sequence, mapped)]
-    to_mesh = cKDTree(points).query(truth)[0]
-    precision = float((to_truth < F_SCORE_THRESHOLD).mean())
-    recall = float((to_mesh < F_SCORE_THRESHOLD).mean())
+    if isinstance(field, PointCloud):
+        points = np.random.default_rng(0).permutation(mesh.vertices)[:POINTS_SCORED]
+    else:
+        points = mesh.sample(POINTS_SCORED, seed=0)
+    true_points = true_surface_points(room, POINTS_SCORED, seed=0)
+    true_points = true_points[seen_by(true_points, sequence, mapped)]
+    to_truth, to_map = np.abs(room.sdf(points)), cKDTree(points).query(true_points)[0]
+    precision, recall = float((to_truth < NEAR).mean()), float((to_map < NEAR).mean())
     return {
         "mesh_accuracy_m": float(to_truth.mean()),
-        "mesh_completion_m": float(to_mesh.mean()),
+        "mesh_completion_m": float(to_map.mean()),
         "mesh_f_score": 2 * precision * recall / max(precision + recall, 1e-9),
     }
 
 
-def _points_along_rays(sequence: RgbdSequence, mapped: Frames) -> Float[np.ndarray, "n 3"]:
-    """World points (m, float64) in seen free space and around seen surfaces."""
-    generator = torch.Generator().manual_seed(0)
-    sampler = PixelSampler(sequence, torch.device("cpu"))
-    rays = sampler.draw(_POINTS_SCORED, generator, torch.from_numpy(mapped))
-    offsets = torch.rand(len(rays.depth), generator=generator)
-    in_front = rays.depth * offsets
-    around = rays.depth + NEAR_SURFACE * (2 * offsets - 1)
-    half = torch.arange(len(rays.depth)) % 2 == 0
-    depths = torch.where(half, in_front, around)
-    points = rays.points(depths[:, None])[:, 0]
-    return points[rays.depth > 0].double().numpy()
+def map_misfit(field: AnyField, frame: Frame) -> float:
+    """How far (m) a map is from what a frame measured, at the frame's given pose.
+
+    The median over random pixels of |rendered depth - measured depth|; of points, which cannot be
+    rendered, the distance from what was measured. NaN where nothing was.
+    """
+    if not frame.has_depth:
+        return float("nan")
+    frame = frame.to(field.device)
+    pixels = frame.measured_pixels()
+    order = torch.randperm(pixels.shape[1], generator=torch.Generator().manual_seed(0))
+    rows, columns = pixels[:, order[:_MISFIT_PIXELS].to(pixels.device)]
+    T_world_camera = torch.from_numpy(frame.T_world_camera).float().to(rows.device)
+    if isinstance(field, PointCloud):
+        points_world = transform_points(T_world_camera, frame.points(rows, columns)[0])
+        return float(field.distance(points_world).median())
+    directions = pixel_directions(frame.camera, columns, rows) @ T_world_camera[:3, :3].T
+    origins, measured = T_world_camera[:3, 3].expand_as(directions), frame.at(rows, columns)[1]
+    return float((field.render_rays(origins, directions)[1] - measured).abs().median())
+
+
+def usual_misfit(field: AnyField, sequence: RgbdSequence, mapped: Frames) -> float:
+    """The median misfit (m) of some of the mapped frames, evenly spread; 0 if none has a depth."""
+    spread = np.linspace(0, len(mapped) - 1, min(_MISFIT_FRAMES, len(mapped))).round().astype(int)
+    frames = [sequence[index] for index in mapped[spread].tolist()]
+    return float(np.median([map_misfit(field, f) for f in frames if f.has_depth] or [0.0]))
+
+
+def check_belongs(finished: Map, frame: Frame) -> str | None:
+    """A warning where it cannot be told whether a map belongs to a frame; None where it does.
+
+    The rule: its misfit is at most 5 cm, or three times what is usual in the map's own frames.
+    Raises DataError if it is more.
+    """
+    name, usual = f"the map of {finished.made['scene']}", finished.made["misfit_m"]
+    found = map_misfit(finished.field, frame)
+    if np.isnan(found):
+        return f"{frame.name} has no depth: whether {name} belongs to it cannot be told"
+    allowed = max(MISFIT_ALLOWED, MISFIT_FACTOR * usual)
+    if found > allowed:
+        raise DataError(
+            f"at its given pose {frame.name} is off {name} by {found:.3f} m (usual in this map "
+            f"{usual:.3f} m, allowed {allowed:.3f} m): give the room's own map, poses in the map's "
+            "world frame, or begin where it was mapped"
+        )
+    return None
