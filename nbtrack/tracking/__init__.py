@@ -1,0 +1,62 @@
+"""Tracking: a camera's pose, frame by frame, in a field that is known."""
+
+import importlib.util
+
+from nbtrack.core.arrays import Pose
+from nbtrack.core.errors import ConfigError, MissingError, nearest_name
+from nbtrack.fields import FIELDS, Field, PointCloud, field_class
+from nbtrack.fields.grid import BakedField
+from nbtrack.tracking.budget import Budget, ClockBudget, StepBudget, make_budget, paper_steps
+from nbtrack.tracking.icp import IcpSettings, IcpTracker
+from nbtrack.tracking.lm import LmSettings, LmTracker
+from nbtrack.tracking.paper import AdamTracker, SdfSettings, SdfTracker, VrSettings, VrTracker
+from nbtrack.tracking.tracker import Tracker, TrackerSettings
+from nbtrack.tracking.trajectories import Trajectory, track_sequence
+
+TRACKERS = {"vr": VrTracker, "sdf": SdfTracker, "lm": LmTracker, "icp": IcpTracker}
+"""What can track, by name. A tracker of your own joins by `TRACKERS["mine"] = MyTracker`."""
+
+
+def tracker_class(name: str) -> type[Tracker]:
+    """The tracker of a name. Raises ConfigError, naming the nearest, for any other."""
+    if name not in TRACKERS:
+        raise ConfigError(f"unknown tracker {name!r}: {nearest_name(name, sorted(TRACKERS))}")
+    return TRACKERS[name]
+
+
+def check_pair(tracker_name: str, field: str | type) -> None:
+    """Raises ConfigError if a tracker or a field is unknown, or they do not go together.
+
+    MissingError, if a package that the tracker needs is not installed.
+    """
+    tracker = tracker_class(tracker_name)
+    kind = field_class(field) if isinstance(field, str) else field
+    if not tracker.works_in(kind):
+        fits = ", ".join(name for name, other in FIELDS.items() if tracker.works_in(other))
+        raise ConfigError(
+            f"tracker {tracker_name!r} does not work on field {kind.name!r}: take one of {fits}"
+        )
+    if tracker.package and importlib.util.find_spec(tracker.package) is None:
+        extra = f"pip install 'nbtrack[{tracker_name}]'"
+        raise MissingError(f"tracker {tracker_name} needs the package {tracker.package}: {extra}")
+
+
+def make_tracker(
+    name: str,
+    field: Field | PointCloud,
+    T_world_camera: Pose,
+    budget: Budget,
+    settings: TrackerSettings | None = None,
+    seed: int = 0,
+) -> Tracker:
+    """A tracker by name, for one trajectory; `tracker.track(frame)` then gives pose after pose.
+
+    The arguments are those of `Tracker`; a field is baked first if the settings say so. Raises
+    ConfigError or MissingError as `check_pair` does, and DataError for a pose that is none.
+    """
+    check_pair(name, type(field))
+    settings = settings or tracker_class(name).Settings()
+    voxel = getattr(settings, "bake_voxel", 0.0)
+    if voxel and not isinstance(field, BakedField):
+        field = BakedField(field, voxel)
+    return tracker_class(name)(field, T_world_camera, budget, settings, seed)

@@ -1,9 +1,10 @@
 """Points against a field by second-order steps: residuals, robust weights, normal equations.
 
-Pure functions; the search that uses them is `nbtrack.tracking.trackers.lm`. A pose changes by
-a twist
-(omega, v) seen from the camera's centre t, with world axes: x -> t + v + exp(omega) (x - t). So
-rotation and translation stay apart however far the camera is from the world's origin.
+Pure functions. Every point has two residuals, of distance (m) and of intensity (luma, in [0, 1]),
+along the first axis of tensors; a scale is where the robust weight of one falls to a quarter.
+
+A pose changes by a twist (omega, v) about the camera's centre t, with world axes:
+x -> t + v + exp(omega) (x - t), so that rotation and translation stay apart wherever the camera is.
 """
 
 from dataclasses import dataclass
@@ -12,98 +13,47 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nbtrack.core.arrays import Points, Scalar, Transform, Values
 from nbtrack.core.geometry import make_transform, rotation_vector_to_matrix, transform_points
-from nbtrack.fields.base import LUMA, Field
+from nbtrack.fields import Field
 
 # Gradient lengths between which a signed distance is taken at its word (PIN-SLAM: 0.5 to 2).
 _LEAST_SLOPE, _MOST_SLOPE = 0.3, 2.0
-# Fields continue a little beyond their bounds (m), where walls lie of which the pose is off.
-_MARGIN = 0.3
 _SLOPE_SCALE = 0.5  # a gradient so much longer or shorter than 1 counts for a quarter
+_MARGIN = 0.3  # m beyond a field's bounds, where walls lie of which the pose is off
+LEAST_SCALES = torch.tensor([0.02, 0.05])  # maps and depth cameras are off by that (our choice)
+_MEDIANS = 3.0  # of its residuals in a scale: two standard deviations, were they normal
+_DEVIATIONS = 0.6745 * _MEDIANS
+INLIER_DISTANCE = 0.05  # m: a point that near the surface fits
+# A pull towards the start of the frame's search, so weak that it decides only where the frame says
+# nothing, as along a corridor: one point's worth, at a twist of 0.5 rad or 0.5 m (our choice).
+START_PULL = 1 / 0.5**2
 
-
-@dataclass(frozen=True)
-class Observation:
-    """The points of one frame that all steps of its search look at."""
-
-    points_camera: Float[Tensor, "n 3"]  # m
-    intensity: Float[Tensor, "n"]  # luma, in [0, 1]
-
-    @classmethod
-    def of(cls, points_camera: Float[Tensor, "n 3"], color: Float[Tensor, "n 3"]) -> "Observation":
-        """Points with the luma of their colours in [0, 1]."""
-        return cls(points_camera, color @ LUMA.to(color))
-
-    def first(self, n_points: int) -> "Observation":
-        """Only the first so many points: a random share, as they are drawn at random."""
-        return Observation(self.points_camera[:n_points], self.intensity[:n_points])
+Observed = tuple[Points, Values]  # in the camera frame (m); their luma
+Scales = Float[Tensor, "2"]
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Two residuals a point and their derivatives with respect to the twist (omega, v)."""
+    """Residuals of n points and their derivatives with respect to the twist (omega, v)."""
 
-    distance: Float[Tensor, "n"]  # f / |grad f|, m
-    distance_jacobian: Float[Tensor, "n 6"]
-    intensity: Float[Tensor, "n"]  # the field's minus the observed one
-    intensity_jacobian: Float[Tensor, "n 6"]
-    reliability: Float[Tensor, "n"]  # in [0, 1]: 0 out of bounds or where the gradient is absurd
-
-
-@dataclass(frozen=True)
-class Scales:
-    """Residuals at which the robust weight falls to a quarter."""
-
-    distance: Float[Tensor, ""]  # m
-    intensity: Float[Tensor, ""]
-
-
-# The narrowest scales: what maps and depth cameras are off by in any case (our choice).
-LEAST_SCALES = Scales(torch.tensor(0.02), torch.tensor(0.05))
-# A scale is so many medians of its residuals: two standard deviations, were they normal.
-_MEDIANS = 3.0
-_DEVIATIONS = 0.6745 * _MEDIANS
-INLIER_DISTANCE = 0.05  # m: a point that near the surface fits
-
-
-@dataclass(frozen=True)
-class Uncertainty:
-    """How well points hold a pose, by the curvature of their cost at it.
-
-    Deviations take the residuals for independent; errors of the map are not, so that they are lower
-    bounds: good for telling poses apart, not for error bars.
-    """
-
-    covariance: Float[Tensor, "6 6"]  # of the twist (omega, v): rad, m
-    condition_number: float  # of the points' own curvature, rotation at an arm of 1 m
-    weakest_twist: Float[Tensor, "6"]  # unit twist that the points resist the least
-
-    @property
-    def position_deviation(self) -> float:
-        """Standard deviation (m) of the position along its least certain direction."""
-        return float(torch.linalg.eigvalsh(self.covariance[3:, 3:])[-1].sqrt())
-
-    @property
-    def rotation_deviation_deg(self) -> float:
-        """Standard deviation (degrees) about the least certain axis."""
-        return float(torch.linalg.eigvalsh(self.covariance[:3, :3])[-1].sqrt().rad2deg())
+    value: Float[Tensor, "2 n"]  # f / |grad f|, and the field's intensity minus the observed one
+    jacobian: Float[Tensor, "2 n 6"]
+    reliability: Values  # in [0, 1]: 0 out of bounds or where the gradient is absurd
 
 
 def residuals_at(
-    field: Field,
-    observation: Observation,
-    T_world_camera: Float[Tensor, "4 4"],
-    divide_by_slope: bool = True,
+    field: Field, observed: Observed, T_world_camera: Transform, divide_by_slope: bool = True
 ) -> Residuals:
-    """Both residuals of all points at a pose.
+    """Both residuals of observed points at a pose.
 
-    The distance is divided by the gradient's length, which corrects fields that grow too fast or
-    too slowly to first order, and its Jacobian is the unit gradient accordingly; unless
-    `divide_by_slope` is False: then both stay as the field gives them. Source: paper,
-    Eq. 2, for the residuals; f / |grad f| as an option in PIN-SLAM (Pan et al. 2024).
+    Dividing the distance by the gradient's length, which makes its Jacobian the unit gradient,
+    corrects fields that grow too fast or too slowly to first order. Source: paper, Eq. 2;
+    f / |grad f| is an option in PIN-SLAM (Pan et al. 2024).
     """
-    T_world_camera = T_world_camera.to(observation.points_camera)
-    points_world = transform_points(T_world_camera, observation.points_camera)
+    points_camera, intensity = observed
+    T_world_camera = T_world_camera.to(points_camera)
+    points_world = transform_points(T_world_camera, points_camera)
     field_at = field.linearize(points_world)
     slope = field_at.value_gradient.norm(dim=-1)
     is_usable = (slope > _LEAST_SLOPE) & (slope < _MOST_SLOPE)
@@ -111,66 +61,27 @@ def residuals_at(
     # A distance field's gradient has length 1; the farther from it, the less it is trusted.
     reliability = is_usable / (1 + ((slope - 1) / _SLOPE_SCALE).square()).square()
     slope = slope.clamp_min(_LEAST_SLOPE) if divide_by_slope else torch.ones_like(slope)
+    value = torch.stack([field_at.value / slope, field_at.intensity - intensity])
+    gradient = field_at.value_gradient / slope[:, None], field_at.intensity_gradient
+    # d g(x) / d(omega, v) = [(arm x gradient)', gradient'], from dx = v + omega x arm.
     arm = points_world - T_world_camera[:3, 3]
-    return Residuals(
-        field_at.value / slope,
-        _twist_jacobian(arm, field_at.value_gradient / slope[:, None]),
-        field_at.intensity - observation.intensity,
-        _twist_jacobian(arm, field_at.intensity_gradient),
-        reliability,
-    )
+    jacobian = [torch.cat([torch.linalg.cross(arm, g), g], dim=-1) for g in gradient]
+    return Residuals(value, torch.stack(jacobian), reliability)
 
 
-def _twist_jacobian(
-    arm: Float[Tensor, "n 3"], gradient: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 6"]:
-    """d g(x) / d(omega, v) = [(arm x gradient)', gradient'], from dx = v + omega x arm."""
-    return torch.cat([torch.linalg.cross(arm, gradient), gradient], dim=-1)
-
-
-def scales_of(residuals: Residuals, before: Scales | None = None) -> Scales:
+def scales_of(residuals: Residuals, before: Scales) -> Scales:
     """Scales for residuals: some medians wide, never below the least, nor above those before."""
-    scales = []
-    for name in ("distance", "intensity"):
-        scale = _MEDIANS * getattr(residuals, name).abs().median()
-        scale = torch.maximum(scale, getattr(LEAST_SCALES, name).to(scale))
-        scales.append(scale if before is None else torch.minimum(scale, getattr(before, name)))
-    return Scales(*scales)
+    scales = _MEDIANS * residuals.value.abs().median(dim=1).values
+    return scales.maximum(LEAST_SCALES.to(scales)).minimum(before.to(scales))
 
 
-def inlier_ratio(residuals: Residuals) -> float:
-    """Share of the points that lie near the field's surface."""
-    is_inlier = (residuals.distance.abs() < INLIER_DISTANCE) & (residuals.reliability > 0)
-    return float(is_inlier.float().mean())
+def robust_cost(residuals: Residuals, scales: Scales, intensity_weight: float) -> Scalar:
+    """Mean Geman-McClure cost u^2 / (1 + u^2) over the points, with u = residual / scale.
 
-
-def uncertainty(
-    residuals: Residuals, scales: Scales, intensity_weight: float, start_scale: float
-) -> Uncertainty:
-    """Covariance, condition and weakest twist of a pose.
-
-    Args:
-        start_scale: twist (rad and m) at which the pull to the start weighs as much as one point
-            whose residual is one scale.
+    A point that is not usable costs the most, 1: no pose gets cheaper by moving points out of it.
     """
-    matrix, _ = normal_equations(residuals, scales, intensity_weight)
-    values, vectors = torch.linalg.eigh(matrix)
-    pulled = matrix + torch.eye(6).to(matrix) / start_scale**2
-    return Uncertainty(
-        torch.linalg.inv(pulled) / _DEVIATIONS**2,
-        float(values[-1] / values[0].clamp_min(1e-9)),
-        vectors[:, 0],
-    )
-
-
-def robust_cost(residuals: Residuals, scales: Scales, intensity_weight: float) -> Float[Tensor, ""]:
-    """Mean Geman-McClure cost over the points; one that is not usable costs the most, 1.
-
-    rho(u) = u^2 / (1 + u^2) with u = residual / scale. So no pose gets cheaper by moving points
-    out of the field's bounds.
-    """
-    distance = _geman_mcclure(residuals.distance / scales.distance)
-    intensity = _geman_mcclure(residuals.intensity / scales.intensity)
+    square = (residuals.value / scales.to(residuals.value)[:, None]).square()
+    distance, intensity = square / (1 + square)
     cost = distance + intensity_weight * intensity
     worst = 1 + intensity_weight
     return (residuals.reliability * cost + (1 - residuals.reliability) * worst).mean()
@@ -183,25 +94,36 @@ def normal_equations(
 
     W holds Geman-McClure's weights 1 / (1 + u^2)^2 times the points' reliability.
     """
-    rows, values = [], []
-    for residual, jacobian, scale, weight in (
-        (residuals.distance, residuals.distance_jacobian, scales.distance, 1.0),
-        (residuals.intensity, residuals.intensity_jacobian, scales.intensity, intensity_weight),
-    ):
-        u = residual / scale
-        root = (weight * residuals.reliability).sqrt() / (1 + u.square())
-        rows.append(jacobian * (root / scale)[:, None])
-        values.append(u * root)
-    jacobian, value = torch.cat(rows).double(), torch.cat(values).double()
-    return jacobian.T @ jacobian, jacobian.T @ value
+    scales = scales.to(residuals.value)[:, None]
+    u = residuals.value / scales
+    weights = torch.stack([residuals.reliability, intensity_weight * residuals.reliability])
+    root = weights.sqrt() / (1 + u.square())
+    jacobian = (residuals.jacobian * (root / scales)[..., None]).flatten(0, 1).double()
+    return jacobian.T @ jacobian, jacobian.T @ (u * root).flatten().double()
 
 
-def moved(T_world_camera: Float[Tensor, "4 4"], twist: Float[Tensor, "6"]) -> Float[Tensor, "4 4"]:
+def certainty(residuals: Residuals, scales: Scales, intensity_weight: float) -> dict[str, float]:
+    """The share of points near the surface, and how well the curvature of their cost holds a pose.
+
+    Deviations are along the least certain direction, the condition number without the pull to the
+    start, rotations at an arm of 1 m. Errors of the map are not independent, as residuals are here
+    taken to be: these are lower bounds, good for telling poses apart, not for error bars.
+    """
+    is_inlier = (residuals.value[0].abs() < INLIER_DISTANCE) & (residuals.reliability > 0)
+    matrix, _ = normal_equations(residuals, scales, intensity_weight)
+    values = torch.linalg.eigvalsh(matrix)
+    pulled = matrix + START_PULL * torch.eye(6).to(matrix)
+    covariance = torch.linalg.inv(pulled) / _DEVIATIONS**2  # rad, m
+    rotation, position = covariance[:3, :3], covariance[3:, 3:]
+    return {
+        "inlier_ratio": float(is_inlier.float().mean()),
+        "position_deviation_m": float(torch.linalg.eigvalsh(position)[-1].sqrt()),
+        "rotation_deviation_deg": float(torch.linalg.eigvalsh(rotation)[-1].sqrt().rad2deg()),
+        "condition_number": float(values[-1] / values[0].clamp_min(1e-9)),
+    }
+
+
+def moved(T_world_camera: Transform, twist: Float[Tensor, "6"]) -> Transform:
     """The pose after a twist (omega in rad, v in m; world axes, about the camera's centre)."""
     rotation = rotation_vector_to_matrix(twist[:3]) @ T_world_camera[:3, :3]
     return make_transform(rotation, T_world_camera[:3, 3] + twist[3:])
-
-
-def _geman_mcclure(u: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    square = u.square()
-    return square / (1 + square)

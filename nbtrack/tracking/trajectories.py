@@ -1,100 +1,135 @@
-"""Trajectories as text files that evaluation tools read; the only place with q_xyzw."""
+"""Trajectories: tracked through a recorded sequence, and as text files for evaluation tools."""
 
+import io
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
+import torch
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from nbtrack.core import files
+from nbtrack.core.arrays import Poses
+from nbtrack.core.device import advise_on_memory
 from nbtrack.core.errors import DataError, MissingError
-from nbtrack.core.files import write_text_atomic
-from nbtrack.data.sequence import FRAMES_PER_SECOND
+from nbtrack.data.sequence import FRAMES_PER_SECOND, RgbdSequence
+from nbtrack.data.text_files import read_poses
+from nbtrack.tracking.metrics import pose_errors
+from nbtrack.tracking.tracker import Estimate, Tracker
 
+CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 
-def write_tum(
-    path: Path, frame_ids: Int[np.ndarray, "n"], T_world_camera: Float[np.ndarray, "n 4 4"]
-) -> None:
-    """Writes `tum_text` to a file."""
-    write_text_atomic(path, tum_text(frame_ids, T_world_camera))
+@dataclass(frozen=True)
+class Trajectory:
+    """Estimated and true poses of a tracked sequence, the given first frame included."""
+
+    T_estimated: Poses  # camera to world, OpenCV axes
+    T_true: Poses
+    frames: pd.DataFrame  # a row each: id, steps, seconds, loss, errors, without_depth, report
 
 
-def tum_text(frame_ids: Int[np.ndarray, "n"], T_world_camera: Float[np.ndarray, "n 4 4"]) -> str:
-    """Camera-to-world poses (m, OpenCV camera axes) in TUM format, one frame a line.
+def track_sequence(
+    tracker: Tracker,
+    sequence: RgbdSequence,
+    checkpoint: Path | None = None,
+    on_frame: Callable[[int, float], None] | None = None,
+) -> Trajectory:
+    """Estimate every frame's pose from the first frame's true one, wherever the tracker was.
 
-    Numbers have the digits that restore the same double. A quaternion's sign is chosen so that
-    qw >= 0.
+    Source: paper, Sec. I-A and the evaluation protocol: every frame is processed, none is dropped.
+    A checkpoint of this run is written every few seconds and resumed from; `on_frame` is told the
+    index in the sequence and the translation error (m). Raises DataError if there are fewer than
+    two frames, or none of them has a measured depth.
+    """
+    _check_trackable(sequence)
+    tracker.restart(sequence.T_world_camera[0])
+    given = Estimate(sequence.T_world_camera[0], without_depth=not sequence[0].has_depth)
+    rows = [_row(sequence, 0, given)]
+    if checkpoint and checkpoint.exists():
+        state = files.read_checkpoint(checkpoint)
+        with files.naming_damaged(checkpoint):
+            tracker.restore(state["tracker"])
+            rows = state["rows"]
+    last_saved = time.perf_counter()
+    with advise_on_memory(f"tracking.{tracker.name}.n_pixels={tracker.settings.n_pixels}"):
+        for index in range(len(rows), len(sequence)):
+            rows.append(_row(sequence, index, tracker.track(sequence[index])))
+            if on_frame:
+                on_frame(index, rows[-1]["translation_error_m"])
+            if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
+                buffer = io.BytesIO()
+                torch.save({"rows": rows, "tracker": tracker.state()}, buffer)
+                files.write_bytes_atomic(checkpoint, buffer.getvalue())
+                last_saved = time.perf_counter()
+    return Trajectory(np.stack(tracker.estimates), sequence.T_world_camera, pd.DataFrame(rows))
 
-    Args:
-        frame_ids: frame numbers in the sequence; the timestamp (s) is the number
-            divided by 30, the recordings' frame rate, whatever rate tracking ran at.
 
-    Source: TUM RGB-D benchmark, trajectory format.
+def _check_trackable(sequence: RgbdSequence) -> None:
+    if len(sequence) < 2:
+        raise DataError(f"{sequence!r} is too short to track: give at least two frames")
+    if not sequence.depths_mm.any():
+        raise DataError(
+            f"no frame of {sequence.name} has a measured depth: check the depth folder and its "
+            "unit (uint16 millimetres), or choose other --frames"
+        )
+
+
+def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
+    T_true = sequence.T_world_camera[index : index + 1]
+    (translation_error,), (rotation_error,) = pose_errors(estimate.T_world_camera[None], T_true)
+    return {
+        "frame_id": int(sequence.frame_ids[index]),
+        "steps": estimate.steps,
+        "seconds": estimate.seconds,
+        "loss": estimate.loss,
+        "translation_error_m": float(translation_error),
+        "rotation_error_deg": float(rotation_error),
+        "without_depth": estimate.without_depth,
+        **estimate.report,
+    }
+
+
+def tum_text(frame_ids: Int[np.ndarray, "n"], T_world_camera: Poses) -> str:
+    """Camera-to-world poses (m, OpenCV camera axes) in TUM format, one frame a line, qw >= 0.
+
+    Numbers have the digits that restore the same double. The timestamp (s) is the frame's number
+    divided by 30, the recordings' rate, whatever rate tracking ran at. Source: TUM RGB-D benchmark.
     """
     T_world_camera = np.asarray(T_world_camera, dtype=np.float64)
     q_xyzw = Rotation.from_matrix(T_world_camera[:, :3, :3]).as_quat(canonical=True)
-    # Adding zero turns -0.0 into 0.0.
-    rows = np.column_stack([frame_ids / FRAMES_PER_SECOND, T_world_camera[:, :3, 3], q_xyzw]) + 0.0
-    lines = [f"# {_COLUMNS}"] + [" ".join(map(repr, row)) for row in rows.tolist()]
-    return "\n".join(lines) + "\n"
+    times = frame_ids / FRAMES_PER_SECOND
+    return f"# {_COLUMNS}\n" + _lines(np.column_stack([times, T_world_camera[:, :3, 3], q_xyzw]))
 
 
-def write_kitti(path: Path, T_world_camera: Float[np.ndarray, "n 4 4"]) -> None:
-    """Writes camera-to-world poses (m, OpenCV camera axes) in KITTI's format.
+def write_kitti(path: Path, T_world_camera: Poses) -> None:
+    """Writes camera-to-world poses (m, OpenCV camera axes) as rows of 3 x 4 matrices, untimed.
 
-    Twelve numbers a line: the upper three rows of the matrix, row by row, with the digits that
-    restore the same double. There are no time stamps, so a frame is known by its line alone.
-
-    Source: KITTI odometry benchmark. Its own files begin at the identity; ours keep the world
-    frame (our choice: `evo_ape kitti` aligns if it is asked to).
+    Source: KITTI odometry benchmark, whose files begin at the identity; ours keep the world frame.
     """
-    rows = np.asarray(T_world_camera, dtype=np.float64)[:, :3].reshape(-1, 12) + 0.0
-    write_text_atomic(path, "\n".join(" ".join(map(repr, row)) for row in rows.tolist()) + "\n")
+    rows = np.asarray(T_world_camera, dtype=np.float64)[:, :3].reshape(-1, 12)
+    files.write_text_atomic(path, _lines(rows))
 
 
-def read_tum(path: Path) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 4 4"]]:
+def _lines(rows: Float[np.ndarray, "n numbers"]) -> str:
+    # Adding zero turns -0.0 into 0.0.
+    return "".join(" ".join(map(repr, row)) + "\n" for row in (rows + 0.0).tolist())
+
+
+def read_tum(path: Path) -> tuple[Float[np.ndarray, "n"], Poses]:
     """Timestamps (s) and camera-to-world poses (m) of a TUM file; `#` lines are skipped.
 
-    Raises:
-        MissingError: there is no such file.
-        DataError: a line does not hold eight finite numbers and a unit quaternion, or the file
-            holds no pose; names the file and the line.
+    Raises MissingError if it is not there, DataError, naming file and place, for any other content.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise MissingError(
-            f"no file {path}; expected a trajectory in TUM format; track a sequence to make one"
-        )
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    rows = [
-        _parse_line(line, f"{path}, line {number}")
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not rows:
-        raise DataError(f"{path} holds no pose; expected lines of `{_COLUMNS}`; write it anew")
-    numbers = np.array(rows)
-    T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_world_camera[:, :3, :3] = Rotation.from_quat(numbers[:, 4:]).as_matrix()
-    T_world_camera[:, :3, 3] = numbers[:, 1:4]
-    return numbers[:, 0], T_world_camera
-
-
-def _parse_line(line: str, where: str) -> list[float]:
-    """The eight numbers of a line; `where` names it in errors."""
-    words = line.split()
-    advice = f"expected `{_COLUMNS}` separated by blanks; correct or remove the line"
-    if len(words) != 8:
-        raise DataError(f"{where} has {len(words)} columns; {advice}")
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        raise DataError(f"{where} holds a word that is not a number; {advice}") from None
-    if not np.isfinite(numbers).all():
-        raise DataError(f"{where} holds a number that is not finite; {advice}")
-    norm = float(np.linalg.norm(numbers[4:]))
-    # Files rounded to four decimals miss the unit norm by up to 1e-4; a mixed-up column by more.
-    if abs(norm - 1) > 1e-2:
-        raise DataError(f"{where} has a quaternion of norm {norm:.3g}; {advice} (norm 1)")
-    return numbers
+    if not Path(path).is_file():
+        raise MissingError(f"no file {path}: give a trajectory in TUM format, as `track` writes it")
+    T_world_camera, times = read_poses(Path(path))
+    if times is None or not np.isfinite(T_world_camera).all():
+        raise DataError(f"{path}: not a finite pose in every line, `{_COLUMNS}`; write it anew")
+    return times, T_world_camera

@@ -1,0 +1,97 @@
+"""ICP: each frame is aligned with a fused point cloud, without any network."""
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nbtrack.core.arrays import Scalar
+from nbtrack.data.frame import Frame
+from nbtrack.fields import PointCloud
+from nbtrack.tracking.tracker import Tracker, TrackerSettings
+
+# How far from the map a point may be to have a partner there, m: first wide, to get home from
+# where the motion model errs, then so narrow that what was not mapped pulls no more.
+_REACHES = (0.3, 0.1)
+_SOURCE_VOXEL = 0.01  # m: pixels drawn twice, and close ones, count once
+_NEIGHBOURS = 20  # points that tell a point's plane
+_LEAST_POINTS, _LEAST_INLIERS = 20, 0.5  # a number and a share; below, a frame is lost
+# A move of less than the epsilons (rad, m) ends a search.
+_OPTIONS = {"registration_type": "GICP", "num_threads": 1, "max_iterations": 30}
+_OPTIONS |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}
+
+
+@dataclass(frozen=True)
+class IcpSettings(TrackerSettings):
+    """`n_pixels` are points a frame."""
+
+    motion_model: str = "constant_velocity"
+
+
+class IcpTracker(Tracker):
+    """Generalised ICP, plane to plane, from the first start. One step is the whole alignment.
+
+    Source: Segal, Haehnel, Thrun, "Generalized-ICP", RSS 2009, as in the package small_gicp (Koide
+    2024). Reaches, neighbours and voxels: our choice, tried on synthetic and real rooms.
+    """
+
+    name = "icp"
+    package = "small_gicp"
+    Settings = IcpSettings
+    copes_without_depth = True
+
+    def __init__(self, field: PointCloud, *arguments: Any, **settings: Any) -> None:
+        """Prepare the map: planes of its points, and a search tree."""
+        super().__init__(field, *arguments, **settings)
+        self.small_gicp = importlib.import_module(self.package)
+        points = field.points.cpu().double().numpy()
+        self.target, self.target_tree = self._with_planes(self.small_gicp.PointCloud(points))
+
+    @classmethod
+    def works_in(cls, field: type) -> bool:
+        """Only in measured points."""
+        return issubclass(field, PointCloud)
+
+    def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
+        """Draw the frame's points and find their planes; the first pose is the start."""
+        self.T_world_camera, self.source = T_starts[0], None
+        self.is_converged, self.inlier_ratio = False, 0.0
+        measured = frame.measured_pixels()
+        if measured.numel():
+            points = frame.points(*self.drawn_of(measured))[0].cpu().double().numpy()
+            thinned = self.small_gicp.voxelgrid_sampling(points, _SOURCE_VOXEL)
+            self.source, _ = self._with_planes(thinned)
+
+    def step(self) -> Scalar:
+        """Align the frame; returns half the mean squared Mahalanobis distance of the inliers.
+
+        Where too little was measured, or no point has a partner, the start remains.
+        """
+        self.is_converged = True
+        if self.source is None or self.source.size() < _LEAST_POINTS:
+            return torch.tensor(float("nan"))
+        T_world_camera = self.T_world_camera.cpu().double().numpy()
+        map_and_frame = self.target, self.source, self.target_tree
+        for reach in _REACHES:
+            options = {**_OPTIONS, "max_correspondence_distance": reach}
+            result = self.small_gicp.align(*map_and_frame, T_world_camera, **options)
+            if not result.num_inliers or not np.isfinite(result.T_target_source).all():
+                return torch.tensor(float("nan"))
+            T_world_camera = result.T_target_source
+        self.T_world_camera = torch.from_numpy(T_world_camera.copy()).to(self.T_world_camera)
+        self.inlier_ratio = result.num_inliers / self.source.size()
+        return torch.tensor(result.error / result.num_inliers)
+
+    def report(self) -> dict[str, float | bool]:
+        """The share of the points that lie near the map; lost where most do not."""
+        return {"inlier_ratio": self.inlier_ratio, "lost": self.inlier_ratio < _LEAST_INLIERS}
+
+    def _with_planes(self, cloud: Any) -> tuple[Any, Any]:
+        """A cloud of small_gicp with covariances, and its tree."""
+        tree = self.small_gicp.KdTree(cloud)
+        self.small_gicp.estimate_covariances(cloud, tree, _NEIGHBOURS)
+        return cloud, tree

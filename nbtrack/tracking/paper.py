@@ -1,0 +1,140 @@
+"""The paper's two trackers on one optimiser; a tracker of one's own needs a `loss` only."""
+
+import abc
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nbtrack.core import geometry
+from nbtrack.core.arrays import Colors, Scalar, Transform, Values
+from nbtrack.core.camera import pixel_directions
+from nbtrack.core.settings import may_be_zero
+from nbtrack.data.frame import Frame
+from nbtrack.data.pixels import Rays
+from nbtrack.fields.imap import rendering_losses
+from nbtrack.tracking.tracker import Tracker, TrackerSettings
+
+
+@dataclass(frozen=True)
+class AdamSettings(TrackerSettings):
+    """Adam's learning rates (paper, implementation details)."""
+
+    position_rate: float = 5e-4  # of the position, m
+    orientation_rate: float = 1e-3  # of the unit quaternion
+
+
+class AdamTracker(Tracker):
+    """Adam on a position and a unit quaternion, new pixels every step.
+
+    Source: paper, implementation details. Each frame starts with a fresh Adam: momentum of the
+    frame before would carry the pose on where the camera stands still (our choice).
+    """
+
+    Settings = AdamSettings
+
+    @abc.abstractmethod
+    def loss(self, T_world_camera: Transform, pixels: Int[Tensor, "2 n"]) -> Scalar:
+        """The loss of some pixels (rows, columns) of `self.frame` at a pose."""
+
+    def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
+        """Take up a frame; of several starts, that with the lowest loss on the same pixels."""
+        self.frame, self.measured = frame, frame.measured_pixels()
+        T_start = T_starts[0]
+        if len(T_starts) > 1:
+            pixels = self.drawn_of(self.measured)
+            with torch.no_grad():
+                losses = torch.stack([self.loss(T, pixels) for T in T_starts])
+            T_start = T_starts[losses.argmin()]
+        self.position = T_start[:3, 3].clone().requires_grad_()
+        self.q_wxyz = geometry.matrix_to_quaternion(T_start[:3, :3]).requires_grad_()
+        position = {"params": [self.position], "lr": self.settings.position_rate}
+        orientation = {"params": [self.q_wxyz], "lr": self.settings.orientation_rate}
+        self.optimizer = torch.optim.Adam([position, orientation])
+
+    def step(self) -> Scalar:
+        """Draw pixels, lower their loss by one step of Adam, renormalise the quaternion."""
+        self.optimizer.zero_grad()
+        loss = self.loss(self.T_world_camera, self.drawn_of(self.measured))
+        loss.backward()
+        self.optimizer.step()
+        with torch.no_grad():
+            self.q_wxyz.copy_(geometry.normalize_quaternion(self.q_wxyz))
+        return loss.detach()
+
+    @property
+    def T_world_camera(self) -> Transform:
+        """The present estimate; gradients flow to position and quaternion."""
+        rotation = geometry.quaternion_to_matrix(self.q_wxyz)
+        return geometry.make_transform(rotation, self.position)
+
+
+@dataclass(frozen=True)
+class VrSettings(AdamSettings):
+    """Tracking by volume rendering."""
+
+    n_pixels: int = 512  # (paper)
+    lambda_color: float = 5.0  # (iMAP)
+    n_stratified: int = 32  # samples of the first pass (iMAP)
+    n_importance: int = may_be_zero(12)  # of the second pass (iMAP)
+
+
+class VrTracker(AdamTracker):
+    """Matches rendered to observed colour and depth. Paper, Sec. II-B.1; iMAP, Sec. 3.3."""
+
+    name = "vr"
+    Settings = VrSettings
+    renders = True
+
+    def loss(self, T_world_camera: Transform, pixels: Int[Tensor, "2 n"]) -> Scalar:
+        """iMAP's loss of rendered pixels; gradients reach the pose through every sample."""
+        rows, columns = pixels
+        directions_camera = pixel_directions(self.frame.camera, columns, rows)
+        directions_world = directions_camera @ T_world_camera[:3, :3].T
+        origins_world = T_world_camera[:3, 3].expand_as(directions_world)
+        rays = Rays(origins_world, directions_world, *self.frame.at(rows, columns))
+        n_samples = self.settings.n_stratified, self.settings.n_importance
+        rendering = self.field.render_in_two_passes(rays, *n_samples, self.generator)
+        terms = rendering_losses(rendering, rays, self.settings.lambda_color)
+        return terms["depth"] + terms["color"]
+
+
+@dataclass(frozen=True)
+class SdfSettings(AdamSettings):
+    """Tracking by signed distances; the paper gives no weights."""
+
+    lambda_sdf: float = 1.0  # per metre
+    lambda_color: float = 0.3
+    bake_voxel: float = 0.0  # m; the field is asked on a grid of such cells, 0: itself
+
+
+class SdfTracker(AdamTracker):
+    """Pulls observed points onto the zero level of the signed distance. Paper, Sec. II-B.2."""
+
+    name = "sdf"
+    Settings = SdfSettings
+
+    def loss(self, T_world_camera: Transform, pixels: Int[Tensor, "2 n"]) -> Scalar:
+        """Paper, Eq. 2, for the pixels' back-projected points."""
+        points_camera, color = self.frame.points(*pixels)
+        points_world = geometry.transform_points(T_world_camera, points_camera)
+        field_color, field_sdf = self.field(points_world)
+        weights = self.settings.lambda_sdf, self.settings.lambda_color
+        return sdf_loss(field_sdf, field_color, color, *weights)
+
+
+def sdf_loss(
+    field_sdf: Values, field_color: Colors, color: Colors, lambda_sdf: float, lambda_color: float
+) -> Scalar:
+    """lambda_sdf mean|d| + lambda_color mean|c - c_observed|, the latter over the 3n channels.
+
+    Of the signed distances (m) and colours (in [0, 1]) that the field gives at the observed points,
+    and the observed colours. Source: paper, Eq. 2.
+
+    >>> import torch
+    >>> zeros = torch.zeros(2, 3)
+    >>> sdf_loss(torch.tensor([0.1, -0.3]), zeros, zeros + 0.5, 1.0, 0.1).item()
+    0.25
+    """
+    return lambda_sdf * field_sdf.abs().mean() + lambda_color * (field_color - color).abs().mean()

@@ -1,0 +1,191 @@
+"""What every tracker is: it takes frame after frame and says where the camera was."""
+
+import abc
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nbtrack.core.arrays import Pose, Poses, Scalar, Transform
+from nbtrack.core.device import suitable_threads, synchronize
+from nbtrack.core.errors import ConfigError, NumericalError, nearest_name
+from nbtrack.data.frame import Frame
+from nbtrack.data.text_files import checked_poses
+from nbtrack.fields import Field, LearnedField, PointCloud
+from nbtrack.tracking.budget import Budget
+
+MOTION_MODELS = ("previous_pose", "constant_velocity", "better_of_both")
+
+
+def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
+    """Where a frame's search may start, given the poses found so far.
+
+    At the previous pose (the paper does not say); at constant velocity as the camera sees it,
+    T_k-1 (T_k-2^-1 T_k-1) (ORB-SLAM); or at both, for the tracker to choose: hands start and stop
+    within a frame. Raises ConfigError, naming the nearest, for any other model.
+    """
+    if motion_model not in MOTION_MODELS:
+        advice = nearest_name(motion_model, [*MOTION_MODELS])
+        raise ConfigError(f"unknown motion model {motion_model!r}: {advice}")
+    last = estimates[-1]
+    if len(estimates) < 2 or motion_model == "previous_pose":
+        return [last]
+    moved_on = last @ np.linalg.inv(estimates[-2]) @ last
+    return [moved_on] if motion_model == "constant_velocity" else [moved_on, last]
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """What all trackers share."""
+
+    n_pixels: int = 4096  # random pixels a step, or a frame where they are drawn once
+    motion_model: str = "previous_pose"  # one of MOTION_MODELS
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the search for one frame's pose came to."""
+
+    T_world_camera: Pose  # camera to world, m, OpenCV axes; never NaN
+    without_depth: bool  # nothing was measured; without a verdict the pose is the expected one
+    steps: int = 0
+    seconds: float = 0.0
+    loss: float = float("nan")  # before the last step; NaN without any
+    # What the tracker itself says, by column name; `lost` where it has a verdict.
+    report: dict[str, float | bool] = field(default_factory=dict)
+
+    @property
+    def lost(self) -> bool:
+        """Not to be relied on; a tracker without a verdict fails only frames without depth."""
+        return self.without_depth or bool(self.report.get("lost", False))
+
+
+class Tracker(abc.ABC):
+    """Follows a camera through a fixed field, one frame a call: `tracker.track(frame)`.
+
+    A subclass searches one frame by `begin` and `step`, which keep the estimate `T_world_camera`.
+    """
+
+    name: str  # on the command line and in file names
+    Settings: type[TrackerSettings] = TrackerSettings
+    renders: bool = False  # whether it renders the field, rather than asking it for distances
+    package: str | None = None  # what it needs beside this project's own requirements
+    copes_without_depth: bool = False  # whether it is shown frames without any measured depth
+    remembers: tuple[str, ...] = ()  # attributes that one frame leaves to the next
+    is_converged: bool = False  # whether further steps would change nothing: the rest is spared
+    T_world_camera: Transform
+
+    def __init__(
+        self,
+        field: Field | PointCloud,
+        T_world_camera: Pose,
+        budget: Budget,
+        settings: TrackerSettings | None = None,
+        seed: int = 0,
+    ) -> None:
+        """In a map, from a pose before the first frame (m), with a budget of its own.
+
+        Raises ConfigError for an unknown motion model, DataError for a pose that is not rigid.
+        """
+        self.settings = settings or self.Settings()
+        weights = []  # of a grid or a cloud of points, which one thread serves best
+        if isinstance(field, Field):
+            weights = [*field.eval().requires_grad_(False).parameters()]
+        self._width = max((len(weight) for weight in weights if weight.dim()), default=0)
+        self.field, self.device, self.budget = field, field.device, budget
+        self.generator = torch.Generator(self.device).manual_seed(seed)
+        self._is_warm = False
+        self.restart(T_world_camera)
+
+    @classmethod
+    def works_in(cls, field: type) -> bool:
+        """Whether it can track in maps of this kind: rendering needs rays, others distances."""
+        if cls.renders:
+            return issubclass(field, LearnedField)
+        return getattr(field, "is_distance", False)
+
+    @abc.abstractmethod
+    def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
+        """Take up a frame; its search starts at the best of some poses."""
+
+    @abc.abstractmethod
+    def step(self) -> Scalar:
+        """One optimisation step; returns the loss before it, still on the device."""
+
+    def report(self) -> dict[str, float | bool]:
+        """What it says about its estimate, by column name; `lost`, where given, is its verdict."""
+        return {}
+
+    def track(self, frame: Frame) -> Estimate:
+        """The camera's pose at the next frame; NumericalError if it is not finite.
+
+        Without any measured depth, and where the tracker does not cope with that, it is the one
+        that the motion model expects: the frames after it still can be found (our choice).
+        """
+        T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
+        estimate = Estimate(T_starts[0], without_depth=True)
+        if frame.has_depth or self.copes_without_depth:
+            with suitable_threads(self._width):
+                estimate = self._search(frame.to(self.device), T_starts)
+        self.estimates.append(estimate.T_world_camera)
+        return estimate
+
+    def restart(self, T_world_camera: Pose) -> None:
+        """Go on from another pose (m), as after an interruption; velocities are forgotten."""
+        pose = np.array(T_world_camera, dtype=np.float64)
+        pose[~np.isfinite(pose)] = np.finfo(pose.dtype).max  # which no rigid transform has
+        self.estimates = [*checked_poses(pose[None], Path("T_world_camera"))]
+        expected_poses(self.settings.motion_model, self.estimates)  # a wrong name is told now
+
+    def state(self) -> dict[str, Any]:
+        """What the frames so far leave to the next one; tensors and plain values."""
+        return {
+            "estimates": torch.from_numpy(np.stack(self.estimates)),
+            "budget": self.budget.memory,
+            "generator": self.generator.get_state(),
+            **{name: getattr(self, name) for name in self.remembers},
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take up what `state` returned, so that a resumed run goes on as if uninterrupted."""
+        self.estimates = [*state["estimates"].numpy()]
+        self.budget.memory = state["budget"]
+        self.generator.set_state(state["generator"])
+        for name in self.remembers:
+            setattr(self, name, state[name])
+
+    def drawn_of(self, pixels: Int[Tensor, "2 n"]) -> Int[Tensor, "2 drawn"]:
+        """`n_pixels` random ones of some pixels (rows, columns); one may come twice."""
+        size = (self.settings.n_pixels,)
+        drawn = torch.randint(pixels.shape[1], size, generator=self.generator, device=self.device)
+        return pixels[:, drawn]
+
+    def _search(self, frame: Frame, T_starts: Poses) -> Estimate:
+        starts = torch.from_numpy(T_starts).float().to(self.device)
+        if frame.has_depth and not self._is_warm:
+            # One step that counts nowhere: first calls load and allocate for a second or more.
+            state, self._is_warm = self.state(), True
+            self.begin(frame, starts[:1])
+            self.step()
+            self.restore(state)
+            synchronize(self.device)
+        began = time.perf_counter()
+        self.begin(frame, starts)
+        steps, loss = 0, torch.tensor(float("nan"))
+        for _ in self.budget.frame():
+            loss = self.step()
+            steps += 1
+            if self.is_converged:
+                break
+        synchronize(self.device)
+        seconds = time.perf_counter() - began
+        pose = self.T_world_camera.detach().cpu().double().numpy()
+        if not np.isfinite(pose).all():
+            advice = "lower the learning rates or map for longer"
+            raise NumericalError(f"the pose of {frame.name} is not finite any more: {advice}")
+        return Estimate(pose, not frame.has_depth, steps, seconds, float(loss), self.report())
