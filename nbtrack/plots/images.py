@@ -1,31 +1,37 @@
-"""Pictures of what a camera saw beside what a field renders, and of a sequence as a whole."""
+"""What a camera saw beside what a field renders."""
 
-from collections.abc import Iterable
-from collections.abc import Sequence as Many
+from collections.abc import Sequence
 
 import matplotlib
 import numpy as np
-from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
-from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from scipy.spatial.transform import Rotation
 
+from nbtrack.data.frame import MILLIMETRE
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.views import View
-from nbtrack.plots.style import NOT_MEASURED, WIDTH, bare, new_figure, styled
+from nbtrack.fields.base import View
+from nbtrack.plots.style import WIDTH, new_axes, styled
 
-_COLUMNS = (
-    "observed colour", "rendered colour", "observed depth", "rendered depth", "|depth error|",
-)  # fmt: skip
-_DEPTH_COLORS, _ERROR_COLORS = "viridis", "magma"
-_CENTIMETRES = 100
+
+@styled
+def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figure:
+    """Colour and depth (m) of the frame at a position of a sequence; unmeasured pixels are grey.
+
+    With a slider, where `fixed` is that of ipywidgets: `interact(plot_frame,
+    sequence=fixed(sequence), index=(0, len(sequence) - 1), title=fixed("A room"))`.
+    """
+    some = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
+    left, right = new_axes(title, 0.4 + 0.5 * _height(sequence), 1, 2, "compressed")[0]
+    _show(left, sequence.color(index), f"frame {sequence.frame_ids[index]}: colour")
+    image = _show(right, _measured(sequence.depth(index)), "depth", MILLIMETRE * _most(some))
+    right.figure.colorbar(image, ax=right, label="depth (m)", extend="max", aspect=25, pad=0.02)
+    return right.figure
 
 
 @styled
 def plot_views(
-    sequence: RgbdSequence, indices: Many[int], views: Many[View], title: str = ""
+    sequence: RgbdSequence, indices: Sequence[int], views: Sequence[View], title: str = ""
 ) -> Figure:
     """Observed and rendered colour and depth of some frames, one a row; unmeasured pixels grey.
 
@@ -36,98 +42,42 @@ def plot_views(
         indices: positions in the sequence.
         views: what the field renders from the same poses.
     """
-    depths = [_masked(sequence.depth(index)) for index in indices]
-    errors = [
-        _CENTIMETRES * np.abs(view.depth - depth) for view, depth in zip(views, depths, strict=True)
-    ]
-    farthest, worst = _quantile(depths), _quantile(errors)
-    shape = sequence.intrinsics.height / sequence.intrinsics.width
-    figure = new_figure(title, 1.15 + len(views) * WIDTH / 5.15 * shape, layout="compressed")
-    grid = figure.subplots(len(views), 5, squeeze=False)
+    depths = np.ma.stack([_measured(sequence.depth(index)) for index in indices])
+    errors = 100 * np.abs(np.stack([view.depth for view in views]) - depths)
+    far, worst = _most(depths), _most(errors)
+    height = 0.9 + len(views) * (0.2 + 0.2 * _height(sequence))
+    grid = new_axes(title, height, len(views), 5, "compressed")
     for row, index, view, depth, error in zip(grid, indices, views, depths, errors, strict=True):
-        _show(row[0], sequence.color(index))
-        _show(row[1], view.color)
-        _show(row[2], depth, _DEPTH_COLORS, farthest)
-        depth_image = _show(row[3], view.depth, _DEPTH_COLORS, farthest)
-        error_image = _show(row[4], error, _ERROR_COLORS, worst)
-        row[0].set_ylabel(f"frame {sequence.frame_ids[index]}")
-    for axes, name in zip(grid[0], _COLUMNS, strict=True):
-        axes.set_title(name)
+        _show(row[0], sequence.color(index), f"frame {sequence.frame_ids[index]}")
+        _show(row[1], view.color, "rendered colour")
+        _show(row[2], depth, "depth", far)
+        depth_image = _show(row[3], view.depth, "rendered depth", far)
+        error_image = _show(row[4], error, "|error|", worst, "magma")
     bars = {"location": "bottom", "pad": 0.02, "aspect": 30, "extend": "max"}
-    figure.colorbar(depth_image, ax=grid[:, 2:4], label="depth (m)", shrink=0.6, **bars)
-    figure.colorbar(error_image, ax=grid[:, 4:], label="error (cm)", shrink=0.95, **bars)
-    return figure
-
-
-@styled
-def plot_room_overview(sequence: RgbdSequence, title: str = "", n_frames: int = 5) -> Figure:
-    """Some frames of a sequence, colour over depth, and how far the camera moves between frames.
-
-    Args:
-        n_frames: pictures, evenly spread over the sequence.
-    """
-    indices = np.linspace(0, len(sequence) - 1, min(n_frames, len(sequence))).round()
-    indices = indices.astype(int).tolist()
-    depths = [_masked(sequence.depth(index)) for index in indices]
-    farthest = _quantile(depths)
-    shape = sequence.intrinsics.height / sequence.intrinsics.width
-    pictures_height = 0.35 + 2 * WIDTH / (len(indices) + 0.45) * shape
-    figure = new_figure(title, 2.6 + pictures_height)
-    above, below = figure.subfigures(2, 1, height_ratios=[pictures_height, 2.0], hspace=0.04)
-    grid = above.subplots(2, len(indices), squeeze=False)
-    for column, index, depth in zip(grid.T, indices, depths, strict=True):
-        _show(column[0], sequence.color(index)).axes.set_title(f"frame {sequence.frame_ids[index]}")
-        depth_image = _show(column[1], depth, _DEPTH_COLORS, farthest)
-    grid[0, 0].set_ylabel("colour")
-    grid[1, 0].set_ylabel("depth")
-    above.colorbar(depth_image, ax=grid, label="depth (m)", aspect=25, pad=0.01, extend="max")
-    _plot_motion(below.subplots(1, 2), sequence)
-    return figure
-
-
-def _plot_motion(panels: Iterable[Axes], sequence: RgbdSequence) -> None:
-    """Histograms of the motion from each frame to the next."""
-    T_between = np.linalg.inv(sequence.T_world_camera[:-1]) @ sequence.T_world_camera[1:]
-    moved_cm = _CENTIMETRES * np.linalg.norm(T_between[:, :3, 3], axis=1)
-    turned_deg = np.degrees(Rotation.from_matrix(T_between[:, :3, :3]).magnitude())
-    named = (("translation", "cm", moved_cm), ("rotation", "degrees", turned_deg))
-    for axes, (name, unit, values) in zip(panels, named, strict=True):
-        n_bins = min(30, max(5, len(values) // 5))
-        # From zero to a little more than the largest, also where all are equal.
-        edges = np.linspace(0, 1.02 * float(values.max()) + 1e-3, n_bins + 1)
-        axes.hist(values, edges, color="#9aa5b1")
-        mean = float(values.mean())
-        axes.axvline(mean, color="black", linewidth=1.2)
-        axes.annotate(
-            f"mean {mean:.2f} {unit}", (mean, 0.97), xycoords=("data", "axes fraction"),
-            xytext=(5, 0), textcoords="offset points", va="top",
-        )  # fmt: skip
-        axes.set(xlabel=f"{name} per frame ({unit})", ylabel="number of frames")
-        axes.set_xlim(left=0)
+    depth_image.figure.colorbar(depth_image, ax=grid[:, 2:4], label="depth (m)", **bars)
+    error_image.figure.colorbar(error_image, ax=grid[:, 4:], label="depth error (cm)", **bars)
+    return error_image.figure
 
 
 def _show(
-    axes: Axes,
-    image: Float[np.ndarray, "height width *channels"],
-    colors: str | None = None,
-    largest: float | None = None,
+    axes: Axes, image: np.ndarray, title: str, most: float | None = None, colors: str = "viridis"
 ) -> AxesImage:
-    bare(axes)
-    if colors is None:
-        return axes.imshow(image)
-    return axes.imshow(image, cmap=_with_grey(colors), vmin=0, vmax=largest)
+    """An image without ticks, grid and frame; unknown pixels are grey."""
+    axes.set_title(title)
+    axes.set_axis_off()
+    cmap = matplotlib.colormaps[colors].with_extremes(bad="#bdbdbd")
+    return axes.imshow(image, cmap=cmap, vmin=0, vmax=most)
 
 
-def _with_grey(colors: str) -> Colormap:
-    """A colour map that shows missing values grey."""
-    return matplotlib.colormaps[colors].with_extremes(bad=NOT_MEASURED)
+def _height(sequence: RgbdSequence) -> float:
+    """Inches of an image as wide as a figure."""
+    return WIDTH * sequence.intrinsics.height / sequence.intrinsics.width
 
 
-def _masked(depth: Float[np.ndarray, "height width"]) -> np.ma.MaskedArray:
-    unmeasured: Bool[np.ndarray, "height width"] = depth == 0
-    return np.ma.masked_array(depth, unmeasured)
+def _measured(depth: np.ndarray) -> np.ma.MaskedArray:
+    return np.ma.masked_equal(depth, 0)
 
 
-def _quantile(images: Many[np.ma.MaskedArray]) -> float:
-    values = np.concatenate([image.compressed() for image in images])
+def _most(images: np.ndarray) -> float:
+    values = _measured(images).compressed()
     return float(np.quantile(values, 0.98)) if len(values) else 1.0

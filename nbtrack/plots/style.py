@@ -1,46 +1,40 @@
-"""One look for all figures: colours by method, a clean style, and figures without global state."""
+"""One look for all figures: colours by label, axes, figures without global state."""
 
 import io
 import textwrap
-from collections.abc import Callable, Iterable
-from functools import wraps
-from typing import ParamSpec
+from collections.abc import Iterable, Mapping
+from itertools import cycle
 
 import matplotlib
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator
 
-from nbtrack.tracking.trackers import TRACKERS
+from nbtrack.core.arrays import Poses
 
-TRUE_COLOR, TRACKED_COLOR = "#1a9641", "#d7191c"
-"""Green and red of the true and the tracked trajectory, as in the paper's first figure."""
-
-_IMAP, _NEUS = "#3b6fb6", "#e08214"
-METHOD_COLORS = {
-    "iMAP with VR": _IMAP, "iMAP": _IMAP, "VR": _IMAP,
-    "NeuS with SDF": _NEUS, "NeuS": _NEUS, "SDF": _NEUS,
-}  # fmt: skip
-"""The paper's methods, and their fields and trackers alone; other methods: `method_colors`."""
-_OTHER_COLORS = ("#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d4d4d", "#6a6acd", "#a6911a")
-TRUE_LABEL = "true"
-
+PALETTE = (
+    "#3b6fb6", "#e08214", "#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d4d4d", "#a6911a",
+)  # fmt: skip
+_FIXED = {
+    **dict.fromkeys(["iMAP with VR", "iMAP", "VR"], PALETTE[0]),
+    **dict.fromkeys(["NeuS with SDF", "NeuS", "SDF"], PALETTE[1]),
+    "true": "#1a9641",
+    "tracked": "#d7191c",  # as in the paper's first figure
+}
+TRUE_COLOR = _FIXED["true"]
 WIDTH = 9.0  # inches of every figure: a notebook's text width
-NOT_MEASURED = "#bdbdbd"  # grey of pixels without a value
-_TITLE_CHARACTERS = 100
-STYLE = {
-    "figure.dpi": 90, "figure.facecolor": "white", "figure.titlesize": 11,
-    "figure.titleweight": "bold", "font.size": 9, "axes.titlesize": 9.5, "axes.labelsize": 9,
-    "axes.titlelocation": "left", "axes.spines.top": False, "axes.spines.right": False,
-    "axes.edgecolor": "#555555", "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.6, "xtick.labelsize": 8, "ytick.labelsize": 8, "xtick.color": "#333333",
-    "ytick.color": "#333333", "legend.frameon": False, "legend.fontsize": 8.5,
-    "lines.linewidth": 1.6, "lines.solid_capstyle": "round", "image.interpolation": "nearest",
+DASHED = {"color": "0.3", "linestyle": "--", "linewidth": 1}
+_STYLE = {
+    "figure.dpi": 90, "figure.titlesize": 11, "figure.titleweight": "bold", "font.size": 9,
+    "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.spines.top": False,
+    "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e4e4e4",
+    "xtick.labelsize": 8, "ytick.labelsize": 8, "legend.frameon": False, "legend.fontsize": 8.5,
+    "image.interpolation": "nearest",
 }  # fmt: skip
 
-P = ParamSpec("P")
+styled = matplotlib.rc_context(_STYLE)
+"""Decorator: draw in the house style and leave matplotlib's own settings as they were."""
 
 
 class NotebookFigure(Figure):
@@ -48,73 +42,47 @@ class NotebookFigure(Figure):
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
-        # Notebooks are committed with their figures: worth the time that small files take.
-        self.savefig(buffer, format="png", pil_kwargs={"optimize": True})
+        self.savefig(buffer, format="png", pil_kwargs={"optimize": True})  # notebooks stay small
         return buffer.getvalue()
 
 
-def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorator: draw in the house style and leave matplotlib's own settings as they were."""
-
-    @wraps(draw)
-    def draw_in_style(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        with matplotlib.rc_context(STYLE):
-            return draw(*args, **kwargs)
-
-    return draw_in_style
-
-
-def new_figure(title: str, height: float, layout: str = "constrained") -> Figure:
-    """An empty figure of the usual width with its finding as title.
-
-    Args:
-        height: inches.
-        layout: matplotlib's layout engine; "compressed" suits grids of images.
-    """
+def new_axes(
+    title: str, height: float, rows: int = 1, columns: int = 1, layout: str = "constrained", **share
+) -> np.ndarray:
+    """A grid of axes in a new figure of a height (inches), with its finding as title."""
     figure = NotebookFigure(figsize=(WIDTH, height), layout=layout)
     if title:
-        figure.suptitle(textwrap.fill(title, _TITLE_CHARACTERS), x=0.01, ha="left")
-    return figure
+        figure.suptitle(textwrap.fill(title, 100), x=0.01, ha="left")
+    return figure.subplots(rows, columns, squeeze=False, **share)
 
 
 def method_colors(labels: Iterable[str]) -> dict[str, str]:
-    """One colour a method, the same in every figure.
-
-    The paper's methods have theirs in `METHOD_COLORS`. Registered trackers follow in the order of
-    registration, then whatever else is among the labels, in the order given.
-    """
-    labels = list(labels)
-    names = dict.fromkeys([*(tracker.label for tracker in TRACKERS.values()), *labels])
-    others = [name for name in names if name not in METHOD_COLORS]
-    taken = {name: _OTHER_COLORS[i % len(_OTHER_COLORS)] for i, name in enumerate(others)}
-    return {label: METHOD_COLORS.get(label) or taken[label] for label in labels}
+    """One colour a label: those of the paper's methods stay, others get the next that is free."""
+    free = cycle(color for color in PALETTE if color not in _FIXED.values())
+    return {label: _FIXED.get(label) or next(free) for label in dict.fromkeys(labels)}
 
 
-def path_colors(labels: Iterable[str]) -> dict[str, str]:
-    """Colours of trajectories: "true" green; one estimate red, several by method."""
-    estimates = [label for label in labels if label != TRUE_LABEL]
-    colors = dict.fromkeys(estimates, TRACKED_COLOR)
-    if len(estimates) > 1:
-        colors = method_colors(estimates)
-    return {TRUE_LABEL: TRUE_COLOR} | colors
+def log_axes(axes: Axes, names: str) -> None:
+    """Make "x", "y" or "xy" logarithmic, with plain numbers at 1, 2 and 5."""
+    for name in names:
+        axes.set(**{f"{name}scale": "log"})
+        axis = getattr(axes, f"{name}axis")
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")
 
 
-def camera_positions(T_world_camera: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 3"]:
-    """Camera centres (m, world frame) of camera-to-world poses."""
-    return T_world_camera[:, :3, 3]
+def draw_paths(axes: Axes, T_paths: Mapping[str, Poses], to_page: np.ndarray) -> None:
+    """Trajectories by label on a page, (2, 3), with a dot at the start."""
+    for label, color in method_colors(T_paths).items():
+        path = T_paths[label][:, :3, 3] @ to_page.T
+        look = {"linewidth": 2.6 if label == "true" else 1.4, "zorder": 3}
+        axes.plot(*path.T, color=color, label=label, **look)
+        axes.plot(*path[0], "o", color="black", markersize=5, zorder=4)
 
 
-def bare(axes: Axes) -> None:
-    """Take ticks, grid and frame off an image's axes: pixels speak for themselves."""
-    axes.set(xticks=[], yticks=[])
-    axes.grid(False)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def label_few(axes: Axes) -> None:
-    """Plain numbers at 1, 2 and 5 of each decade of two logarithmic axes."""
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
+def legend_below(figure: Figure) -> None:
+    """The first panel's legend for the whole figure."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    ncols = 3 if sum(map(len, labels)) > 100 else len(labels)
+    figure.legend(handles, labels, loc="outside lower center", ncols=ncols)

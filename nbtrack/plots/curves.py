@@ -1,0 +1,156 @@
+"""Numbers as curves and bars: along a ray, over mapping, over time, over a setting, by table."""
+
+from collections.abc import Mapping
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from nbtrack.core.arrays import Values
+from nbtrack.data.sequence import FRAMES_PER_SECOND
+from nbtrack.plots.style import DASHED, legend_below, log_axes, method_colors, new_axes, styled
+from nbtrack.tables import table_1
+from nbtrack.tracking.metrics import LOST_THRESHOLD_M
+
+
+@styled
+def plot_along_ray(
+    depths: Values, curves: Mapping[str, Values], measured_depth: float, title: str = ""
+) -> Figure:
+    """Quantities along one ray, below each other over the same z-depths (m).
+
+    Args:
+        curves: by label with its unit, as "density (1/m)": a value a sample; the last samples may
+            be left out, as by the weights of sections between samples.
+    """
+    panels = new_axes(title, 0.9 + 1.3 * len(curves), len(curves), sharex=True)[:, 0]
+    for axes, (label, color) in zip(panels, method_colors(curves).items(), strict=True):
+        values = curves[label].detach().cpu()
+        axes.plot(depths.cpu()[: len(values)], values, ".-", markersize=4, color=color)
+        axes.axvline(measured_depth, label="measured depth", **DASHED)
+        axes.set_ylabel(label)
+    panels[0].legend()
+    panels[-1].set_xlabel("depth (m)")
+    return panels[0].figure
+
+
+@styled
+def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
+    """Every loss term over mapping: each iteration pale, the running median on top.
+
+    Args:
+        histories: of maps by label; loss terms are the columns before "total". A term that several
+            maps share is one panel, though its unit may differ: iMAP divides depth errors by
+            their deviation.
+    """
+    terms = {label: history.loc[:, :"total"].iloc[:, :-1] for label, history in histories.items()}
+    names = dict.fromkeys(name for losses in terms.values() for name in losses)
+    panels = new_axes(title, 3.0, 1, len(names), sharex=True)[0]
+    for axes, name in zip(panels, names, strict=True):
+        for label, color in method_colors(terms).items():
+            values = terms[label].get(name, pd.Series(dtype=float))
+            # A twentieth of the series, centred, cut short at the ends.
+            window = values.rolling(max(5, len(values) // 20), center=True, min_periods=1)
+            axes.plot(values, color=color, alpha=0.22, linewidth=0.6)
+            axes.plot(window.median(), color=color, label=label)
+        axes.set(yscale="log", xlabel="mapping iteration", ylabel=f"weighted {name} loss (no unit)")
+    panels[0].legend()
+    return panels[0].figure
+
+
+@styled
+def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
+    """Errors of every frame over time: position (cm, logarithmic) and orientation (degrees).
+
+    Above the dashed line, 0.2 m, the paper calls the camera lost. The first frame, whose pose was
+    given, is left out.
+
+    Args:
+        frames: by method, with columns frame_id, translation_error_m and rotation_error_deg.
+    """
+    above, below = new_axes(title, 4.9, 2, sharex=True)[:, 0]
+    for label, color in method_colors(frames).items():
+        tracked = frames[label].iloc[1:]
+        seconds = tracked["frame_id"] / FRAMES_PER_SECOND
+        above.plot(seconds, 100 * tracked["translation_error_m"], color=color, label=label)
+        below.plot(seconds, tracked["rotation_error_deg"], color=color)
+    above.axhline(100 * LOST_THRESHOLD_M, label="lost above 0.2 m", **DASHED)
+    above.set_ylabel("translation error (cm)")
+    below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
+    log_axes(above, "y")
+    legend_below(above.figure)
+    return above.figure
+
+
+@styled
+def plot_curves(
+    table: pd.DataFrame, x: str, y: str, group: str | list[str], title: str = "", log: str = "xy"
+) -> Figure:
+    """One column over another, a line a group; a group of one row is a point.
+
+    Args:
+        x, y: columns, named as the axes are to be labelled: "time a frame (ms)". Text on x is
+            drawn in the order of its first appearance.
+        group: column or columns of labels; methods get their colours.
+        log: which axes are logarithmic: "x", "y", "xy" or "".
+    """
+    axes = new_axes(title, 3.6)[0, 0]
+    labels = table[[group] if isinstance(group, str) else group].agg(", ".join, axis=1)
+    for index, (label, color) in enumerate(method_colors(labels).items()):
+        rows = table[labels == label]
+        axes.plot(rows[x], rows[y], marker="os^Dv"[index % 5], color=color, label=label)
+    axes.set(xlabel=x, ylabel=y)
+    log_axes(axes, log)
+    axes.figure.legend(loc="outside right center")
+    return axes.figure
+
+
+@styled
+def plot_ate_bars(results: pd.DataFrame, title: str = "") -> Figure:
+    """Table I as bars: mean ATE (m, logarithmic) by rate and method, a panel a scene.
+
+    A bar that crosses the dashed line at 0.2 m is a lost camera, which the table prints red; a
+    missing bar is a run without result. Thin lines span a deviation over seeds either way.
+
+    Args:
+        results: long form with columns rate_hz, method, scene, ate_m, see `table_1`.
+    """
+    means, deviations = table_1(results), table_1(results, "ate_deviation_m")
+    rows = -(-len(means.columns) // 5)
+    panels = new_axes(title, 0.9 + 2.1 * rows, rows, min(5, len(means.columns)), sharey=True).flat
+    for axes, scene in zip(panels, means, strict=False):
+        bars = means[scene].unstack(sort=False).rename("{:g}".format)
+        look = {"width": 0.8, "rot": 0, "legend": False, "color": method_colors(bars)}
+        bars.plot.bar(ax=axes, yerr=deviations[scene].unstack(sort=False).to_numpy().T, **look)
+        axes.axhline(LOST_THRESHOLD_M, label="lost above 0.2 m", **DASHED)
+        axes.set(title=scene.replace("_", " "), xlabel="rate (Hz)", ylabel="ATE (m)")
+        log_axes(axes, "y")
+    for axes in panels[len(means.columns) :]:
+        axes.remove()
+    panels[0].set_ylim(bottom=min(0.002, 0.7 * means.min(axis=None)))
+    legend_below(panels[0].figure)
+    return panels[0].figure
+
+
+@styled
+def plot_steps(steps: pd.DataFrame, published: pd.DataFrame, title: str = "") -> Figure:
+    """Table II as curves: steps that fit into a budget, a panel a tracker, a line a number n.
+
+    Stronger is more pixels n. Filled points are this machine's, hollow ones the paper's.
+
+    Args:
+        steps, published: with columns tracker, n_pixels, budget_ms, steps.
+    """
+    colors = method_colors(steps["tracker"])
+    panels = new_axes(title, 4.3, 1, len(colors), sharey=True)[0]
+    sources = {"this machine": (steps, "o-", None), "paper": (published, "o:", "white")}
+    for axes, (tracker, color) in zip(panels, colors.items(), strict=True):
+        for source, (cells, line, fill) in sources.items():
+            groups = cells[cells["tracker"] == tracker].groupby("n_pixels")
+            for index, (n_pixels, rows) in enumerate(groups, start=1):
+                look = {"color": color, "alpha": index / len(groups), "markerfacecolor": fill}
+                look["label"] = f"n = {n_pixels}, {source}"
+                axes.plot(rows["budget_ms"], rows["steps"], line, **look)
+        axes.set(title=tracker, xlabel="budget a frame (ms)", ylabel="optimization steps (number)")
+        log_axes(axes, "xy")
+        axes.legend()
+    return panels[0].figure
