@@ -1,32 +1,172 @@
 """The command line: a thin face over the functions that the notebooks call."""
 
 import argparse
+import importlib
 import os
+import re
 import sys
-from collections.abc import Sequence as Texts
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
 
-from nbtrack.cli_data import add_data, add_format
-from nbtrack.cli_options import (
-    Parser,
-    a_path,
-    a_seed,
-    add_device,
-    add_field,
-    add_preset,
-    field_of,
-    preset_of,
-    set_device,
-    words_of,
-)
-from nbtrack.core.errors import ConfigError, NbtrackError
+from nbtrack.core.errors import ConfigError, NbtrackError, nearest_name
 
 
-def main(arguments: Texts[str] | None = None) -> int:
+def a_path(text: str) -> Path:
+    """A path; an empty one would be the working folder by accident."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("the path is empty")
+    return Path(text)
+
+
+def a_seed(text: str) -> int:
+    """A seed: what every generator in use takes."""
+    if not (text.isdecimal() and int(text) < 2**63):
+        raise argparse.ArgumentTypeError(f"{text!r} is no seed: give a whole number from 0 on")
+    return int(text)
+
+
+def a_count(text: str) -> int:
+    """A number of things, of which there is at least one."""
+    if not text.lstrip("-").isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not allowed: it must be 1 or more")
+    return int(text)
+
+
+_FLAG = {"action": "store_true"}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "sequence": {"help": "a folder, or the name of a room or dataset scene"},
+    "folder": {"type": a_path, "help": "a recording"},
+    "room": {"help": "its name"},
+    "source": {"type": a_path, "help": "folder of a run or a map, or a map file"},
+    "out": {"type": a_path, "help": "file or folder to write"},
+    "--format": {
+        "metavar": "NAME",
+        "help": "how the folder is laid out, as neural_rgbd, tum, replica, 7scenes, scannet or "
+        "plain (default: told by its files)",
+    },
+    "--field": {"help": "imap, neus or another"},
+    "--supervision": {
+        "help": "rendering, as in the paper (default); rendering+sdf teaches NeuS the distances too"
+    },
+    "--tracker": {"help": "vr, sdf, lm or another"},
+    "--rate": {"type": float, "metavar": "HZ", "help": "frames a second, by the clock"},
+    "--steps": {"type": float, "metavar": "N", "help": "optimisation steps a frame"},
+    "--pixels": {"type": int, "metavar": "N", "help": "pixels a step"},
+    "--bake": {
+        "type": float,
+        "metavar": "METRES",
+        "help": "ask the field on a grid of such cells, for example 0.04, not the network",
+    },
+    "--frames": {"default": ":", "help": "Python slice of frames, A:B:S"},
+    "--map-frames": {"help": "Python slice of frames to map (default: all)"},
+    "--map-from": {
+        "type": a_path,
+        "metavar": "MAP",
+        "help": "track in this map, of another recording of the room: a folder or a map file",
+    },
+    "--to": {
+        "metavar": "FORMAT",
+        "help": "tum, kitti: trajectory; ply, glb: coloured mesh; map: one file that opens "
+        "anywhere",
+    },
+    "--budget": {
+        "choices": ("steps", "clock"),
+        "default": "steps",
+        "help": "the paper's step counts (default), or this machine's own speed",
+    },
+    "--scenes": {"metavar": "A,B", "help": "only these scenes of the preset's kind"},
+    "--trackers": {"metavar": "A,B", "help": "rows (default: the paper's, vr,sdf)"},
+    "--beyond": {**_FLAG, "help": "Table III instead: the paper's methods and ours, 30 Hz too"},
+    "--seeds": {
+        "type": a_count,
+        "default": 1,
+        "metavar": "K",
+        "help": "K maps and runs a cell: mean ± deviation",
+    },
+    "--workers": {
+        "type": a_count,
+        "metavar": "N",
+        "help": "cells side by side (default: one a core, or one on a GPU)",
+    },
+    "--dask": {"metavar": "ADDRESS", "help": "run on a Dask cluster, as tcp://HOST:8786"},
+    "--in-place": {**_FLAG, "help": "store the outputs in the committed notebooks too"},
+    "--n-frames": {"type": int, "default": 300},
+    "--width": {"type": int, "default": 640, "help": "pixels; the height is 3/4 of it"},
+    "--depth-folder": {"help": "default: the format's; filtered before raw depth"},
+    "--poses": {"metavar": "FILE", "help": "pose file (default: the format's)"},
+    "--seed": {"type": a_seed, "default": 0},
+    "--out": {"type": a_path, "help": "where to write (default: in the cache or paper_tables)"},
+    "--device": {"help": "cuda, cuda:1, mps or cpu (default: the first there is)"},
+    "--threads": {"type": a_count, "metavar": "N", "help": "CPU threads (default: all cores)"},
+    "--preset": {"help": "smoke (default), synthetic or paper"},
+    "--config": {"type": a_path, "help": "TOML file of settings"},
+    "--set": {
+        "action": "append",
+        "default": [],
+        "metavar": "KEY=VALUE",
+        "dest": "settings",
+        "help": "one setting, for example mapping.neus.iterations=500; may be repeated",
+    },
+}
+_PRESET, _DEVICE = " --preset --config --set", " --device --threads"
+_PARTS = " --format --depth-folder --poses"
+# By name: the function in `commands`, what it does, and its options; ! marks those that must be.
+COMMANDS = {
+    "map": (
+        "map_command", "fit a field to a sequence with known poses",
+        "sequence --field! --supervision --format --frames --seed --out" + _DEVICE + _PRESET,
+    ),
+    "track": (
+        "track_command", "track a camera; maps first where no map fits",
+        "sequence --field --supervision --format --tracker! --rate --steps --pixels --bake "
+        "--map-frames --map-from --frames --seed --out" + _DEVICE + _PRESET,
+    ),
+    "export": ("export_command", "a run's trajectory or a map elsewhere", "source out --to!"),
+    "tables": (
+        "tables_command", "the paper's tables, and one beyond, CSV and LaTeX",
+        "--budget --scenes --trackers --beyond --seeds --workers --dask --out" + _DEVICE + _PRESET,
+    ),
+    "notebooks": (
+        "notebooks_command", "run all notebooks headless, with HTML copies", "--in-place" + _PRESET,
+    ),
+    "data make": (
+        "make_command", "write a synthetic room in the dataset's layout",
+        "room --out! --n-frames --width --seed",
+    ),
+    "data check": ("check_command", "what is wrong with a recording", "folder --out" + _PARTS),
+    "data convert": (
+        "convert_command", "write a recording in the Neural RGB-D layout",
+        "folder out --frames" + _PARTS,
+    ),
+    "bench": (
+        "bench_command", "Table II and step times on this machine, full-size networks",
+        "--out" + _DEVICE + _PRESET,
+    ),
+}  # fmt: skip
+_ON_TABLES = ("tables_command", "bench_command")
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, with the nearest name, as every other user error does."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise a mistake in place of leaving the program."""
+        wrong = re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message)
+        if wrong:
+            choices = [choice.strip("' ") for choice in wrong[2].split(",")]
+            message = f"unknown {wrong[1]!r}: {nearest_name(wrong[1], choices)}"
+        raise ConfigError(f"{message}; see {self.prog} --help")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status: 0, or 2 after a user's mistake."""
     try:
-        options = _parser().parse_args(arguments)
-        set_device(options)
-        options.command(options)
+        options = _parsed(arguments)
+        _set_device(options)
+        module = "commands_tables" if options.command in _ON_TABLES else "commands"
+        commands = importlib.import_module(f"nbtrack.experiments.{module}")
+        getattr(commands, options.command)(options)
     except NbtrackError as error:
         print(f"nbtrack: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -44,197 +184,37 @@ def main(arguments: Texts[str] | None = None) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
-    _add_map(commands)
-    _add_track(commands)
-    _add_export(commands)
-    _add_tables(commands)
-    _add_notebooks(commands)
-    add_data(commands, Parser)
-    _add_bench(commands)
-    return parser
+    groups = {"": parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)}
+    for name, (function, about, options) in COMMANDS.items():
+        *group, last = name.split()
+        if group and group[0] not in groups:
+            part = groups[""].add_parser(group[0], help="make rooms; check or convert a recording")
+            groups[group[0]] = part.add_subparsers(
+                required=True, metavar="ACTION", parser_class=Parser
+            )
+        command = groups["".join(group)].add_parser(last, help=about, description=about)
+        for word in options.split():
+            option = OPTIONS[word.rstrip("!")]
+            must = {"required": True} if word.endswith("!") else {}
+            command.add_argument(word.rstrip("!"), **option, **must)
+        command.set_defaults(command=function, parser=command)
+    found, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        known = [option for option in found.parser._option_string_actions if option[:2] == "--"]
+        found.parser.error(f"unknown argument {unknown[0]!r}: {nearest_name(unknown[0], known)}")
+    return found
 
 
-def _add_map(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser("map", help="fit a field to a sequence with known poses")
-    parser.add_argument("sequence", help="a folder, or the name of a room or dataset scene")
-    add_format(parser)
-    add_field(parser)
-    parser.add_argument("--frames", default=":", help="Python slice of frames, A:B:S")
-    parser.add_argument("--seed", type=a_seed, default=0)
-    parser.add_argument("--out", type=a_path, help="folder for the map (default: in the cache)")
-    add_device(parser)
-    add_preset(parser)
-    parser.set_defaults(command=_map)
+def _set_device(options: argparse.Namespace) -> None:
+    """Where and with how many threads this process and its workers compute."""
+    if getattr(options, "device", None):
+        from nbtrack.core.device import named_device
 
+        named_device(options.device)
+        os.environ["NBTRACK_DEVICE"] = options.device
+    if getattr(options, "threads", None):
+        import torch
 
-def _map(options: argparse.Namespace) -> None:
-    from nbtrack.experiments.commands import map_command
-
-    map_command(
-        options.sequence, field_of(options), preset_of(options), options.frames, options.seed,
-        options.out, options.format,
-    )  # fmt: skip
-
-
-def _add_track(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser("track", help="track a camera; maps first where no map fits")
-    parser.add_argument("sequence", help="a folder, or the name of a room or dataset scene")
-    add_format(parser)
-    add_field(parser, required=False)
-    parser.add_argument("--tracker", required=True, help="vr, sdf, lm or another")
-    budget = parser.add_mutually_exclusive_group(required=True)
-    budget.add_argument("--rate", type=float, metavar="HZ", help="frames a second, by the clock")
-    budget.add_argument("--steps", type=float, metavar="N", help="optimisation steps a frame")
-    parser.add_argument("--pixels", type=int, metavar="N", help="pixels a step")
-    parser.add_argument(
-        "--bake", type=float, metavar="METRES",
-        help="ask the field on a grid of such cells instead of the network, for example 0.04",
-    )  # fmt: skip
-    parser.add_argument("--map-frames", help="Python slice of frames to map (default: all)")
-    parser.add_argument(
-        "--map-from", type=a_path, metavar="MAP",
-        help="track in this map, of another recording of the room: a folder or a map file",
-    )  # fmt: skip
-    parser.add_argument("--frames", default=":", help="Python slice of frames to track")
-    parser.add_argument("--seed", type=a_seed, default=0)
-    parser.add_argument("--out", type=a_path, help="folder for the results (default: in the cache)")
-    add_device(parser)
-    add_preset(parser)
-    parser.set_defaults(command=_track)
-
-
-def _track(options: argparse.Namespace) -> None:
-    from nbtrack.experiments.commands import track_command
-
-    if options.pixels is not None:
-        options.settings.append(f"tracking.{options.tracker}.n_pixels={options.pixels}")
-    if options.bake is not None:
-        options.settings.append(f"tracking.{options.tracker}.bake_voxel={options.bake}")
-    if options.field is None and options.map_from is None:
-        raise ConfigError("track needs --field, or --map-from with a map that knows its own")
-    if options.field is None and options.supervision is not None:
-        raise ConfigError("--supervision belongs to --field: name that too, or leave both out")
-    track_command(
-        options.sequence, field_of(options) if options.field else None, options.tracker,
-        preset_of(options), steps=options.steps, rate_hz=options.rate,
-        map_frames=options.map_frames, frames=options.frames, seed=options.seed, out=options.out,
-        map_from=options.map_from, format=options.format,
-    )  # fmt: skip
-
-
-def _add_export(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser("export", help="a run's trajectory or a map in another format")
-    parser.add_argument("source", type=a_path, help="folder of a run or a map, or a map file")
-    parser.add_argument(
-        "--to", required=True, metavar="FORMAT",
-        help="tum, kitti: trajectory; ply, glb: coloured mesh; map: one file that opens anywhere",
-    )  # fmt: skip
-    parser.add_argument("out", type=a_path, help="file to write")
-    parser.set_defaults(command=_export)
-
-
-def _export(options: argparse.Namespace) -> None:
-    from nbtrack.experiments.commands import export_command
-
-    export_command(options.source, options.to, options.out)
-
-
-def _add_tables(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser("tables", help="the paper's tables, and one beyond, CSV and LaTeX")
-    parser.add_argument(
-        "--budget", default="steps",
-        help="steps: the paper's step counts (default); clock: this machine's own speed; both",
-    )  # fmt: skip
-    parser.add_argument("--scenes", metavar="A,B", help="only these scenes of the preset's kind")
-    parser.add_argument(
-        "--trackers", metavar="A,B", default="", help="rows (default: the paper's, vr,sdf)"
-    )
-    parser.add_argument(
-        "--beyond", action="store_true",
-        help="Table III instead: the paper's trackers and ours, at 30 Hz too",
-    )  # fmt: skip
-    parser.add_argument(
-        "--seeds", type=int, default=1, metavar="K", help="K maps and runs a cell: mean ± deviation"
-    )
-    parser.add_argument(
-        "--workers", type=int, metavar="N",
-        help="cells side by side (default: one a core, or one on a GPU)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--dask", metavar="ADDRESS", help="run the cells on a Dask cluster, as tcp://HOST:8786"
-    )
-    parser.add_argument(
-        "--explain", nargs=2, metavar=("ROW", "COLUMN"),
-        help="where one cell of Table I comes from: '10 sdf' living_room",
-    )  # fmt: skip
-    parser.add_argument(
-        "--measure-again", action="store_true", help="measure Table II although it is cached"
-    )
-    parser.add_argument("--out", type=a_path, help="folder (default: paper_tables/PRESET)")
-    add_device(parser, "of each cell (default: the cores divided by the workers)")
-    add_preset(parser)
-    parser.set_defaults(command=_tables)
-
-
-def _tables(options: argparse.Namespace) -> None:
-    from nbtrack.experiments.commands_tables import beyond_command, explain_command, tables_command
-    from nbtrack.experiments.parallel import Execution
-
-    if options.scenes:
-        options.settings.append(f"scenes.names={words_of(options.scenes)}")
-    preset, trackers = preset_of(options), tuple(words_of(options.trackers))
-    if options.beyond and (trackers or options.measure_again):
-        raise ConfigError("--beyond has rows of its own: leave --trackers and --measure-again out")
-    if options.explain:
-        explain_command(
-            preset, options.budget, options.seeds, trackers, *options.explain, options.beyond
-        )
-        return
-    if options.workers is not None and options.workers < 1:
-        raise ConfigError(f"--workers {options.workers}: it must be 1 or more, or left out")
-    execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
-    if options.beyond:
-        beyond_command(preset, options.budget, options.seeds, execution, options.out)
-        return
-    tables_command(
-        preset, options.budget, options.seeds, trackers, execution, options.measure_again,
-        options.out,
-    )  # fmt: skip
-
-
-def _add_notebooks(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser("notebooks", help="run all notebooks headless, with HTML copies")
-    parser.add_argument(
-        "--in-place", action="store_true", help="store the outputs in the committed notebooks too"
-    )
-    add_preset(parser)
-    parser.set_defaults(command=_notebooks)
-
-
-def _notebooks(options: argparse.Namespace) -> None:
-    from nbtrack.experiments.notebooks import run_notebooks
-
-    preset = preset_of(options)  # refuse a wrong setting before the first kernel starts
-    run_notebooks(preset.name, options.config, tuple(options.settings), options.in_place)
-
-
-def _add_bench(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "bench", help="Table II, step times and mapping speed on this machine, full-size networks"
-    )
-    parser.add_argument("--out", type=a_path, help="folder of CSV files (default: in the cache)")
-    add_device(parser)
-    add_preset(parser)
-    parser.set_defaults(command=_bench)
-
-
-def _bench(options: argparse.Namespace) -> None:
-    from nbtrack.experiments.commands_bench import bench_command
-
-    # The paper's sizes unless something else is asked for: small networks measure bookkeeping.
-    if "NBTRACK_PRESET" not in os.environ:
-        options.preset = options.preset or "synthetic"
-    bench_command(preset_of(options), options.out)
+        torch.set_num_threads(options.threads)

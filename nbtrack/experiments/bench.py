@@ -1,40 +1,46 @@
-"""Table II on the machine at hand: optimisation steps that fit in a time budget."""
+"""Table II on the machine at hand: optimisation steps that fit in a time budget, and their time."""
 
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import torch
-from jaxtyping import Float
-from torch import Tensor
-from tqdm import tqdm
 
-from nbtrack.core.config import FieldConfig, Preset, as_dict
-from nbtrack.core.device import advise_on_memory, device_name, suitable_threads, synchronize
-from nbtrack.core.device_lock import alone_on
-from nbtrack.core.files import write_text_atomic
-from nbtrack.core.paths import runs_folder
-from nbtrack.core.provenance import code_fingerprint, fingerprint, versions
-from nbtrack.data.pixels import PixelSampler
+from nbtrack.core.device import (
+    advise_on_memory,
+    choose_device,
+    device_name,
+    suitable_threads,
+    synchronize,
+)
+from nbtrack.core.files import (
+    fingerprint,
+    foreign_source,
+    runs_folder,
+    sources_fingerprint,
+    versions,
+    write_text_atomic,
+)
+from nbtrack.core.progress import ProgressBar
+from nbtrack.core.settings import as_dict
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
+from nbtrack.experiments.methods import TABLE_1, Method, find_methods, tracker_label
+from nbtrack.experiments.presets import Preset
 from nbtrack.fields import make_field
-from nbtrack.tables.layout import COLUMNS_2
-from nbtrack.tracking.budget import ClockBudget
-from nbtrack.tracking.trackers import TRACKERS, Tracker, paper_trackers
+from nbtrack.tracking import StepBudget, Tracker, make_budget, make_tracker, tracker_class
 
-ENGINE_LABELS = {"plain": "", "fast": ", engine"}
-"""What follows a tracker's name in Table II: the paper's trackers are in plain torch."""
+_LEAST_STEPS, _MOST_STEPS, _SECONDS_A_ROW = 5, 200, 4.0
 
 
 def measure_steps(
     preset: Preset,
     sequence: RgbdSequence,
-    device: torch.device,
+    methods: Sequence[str | Method] = TABLE_1,
     frames_per_cell: int = 3,
-    progress: bool = True,
-    engines: tuple[str, ...] = tuple(ENGINE_LABELS),
 ) -> pd.DataFrame:
-    """Steps within each budget for every tracker, its pixel counts n, and both engines.
+    """Steps within each budget for every method's tracker and its pixel counts n.
 
     The fields are untrained: a step costs the same whatever the weights are. Each tracker first
     spends one frame that is not counted, so that allocations and compilations are done.
@@ -44,110 +50,110 @@ def measure_steps(
         frames_per_cell: frames that a cell's mean is taken over.
 
     Returns:
-        One row a cell: tracker ("VR", "SDF", ... in plain torch, as the paper's; "VR, engine" and
-        so on), n_pixels, budget_ms, steps (mean over frames), steps_deviation (over frames).
+        One row a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames),
+        steps_deviation (over frames).
 
     Source: paper, Table II and evaluation protocol.
     """
-    T_start = torch.from_numpy(sequence.T_world_camera[0]).float().to(device)
-    make_tracker = TrackerMaker(preset, sequence, device)
-    cells = [
-        (name, engine, n_pixels, budget_ms)
-        for engine in engines
-        for name in paper_trackers()
-        for n_pixels in preset.tables.pixels_of(name)
-        for budget_ms in preset.tables.budgets_ms
-    ]
-    rows = []
-    for name, engine, n_pixels, budget_ms in tqdm(
-        cells, "Table II", unit="cell", disable=not progress
-    ):
-        with (
-            advise_on_memory(f"tables.pixels.{name}={n_pixels}"),
-            suitable_threads(network_of(preset, name).width),
-            alone_on(device, tqdm.write),
-        ):
-            tracker = make_tracker(name, n_pixels, engine)
-            steps = _count_steps(tracker, T_start, budget_ms, frames_per_cell, device)
-        mean, deviation = float(steps.mean()), float(steps.std())
-        rows.append((row_label(name, engine), n_pixels, budget_ms, mean, deviation))
-    return pd.DataFrame(rows, columns=[*COLUMNS_2, "steps_deviation"])
+    rows, frame = [], sequence[0]
+    for method, n_pixels in _rows(preset, methods, "Table II"):
+        for budget_ms in preset.tables.budgets_ms:
+            tracker = _tracker(preset, sequence, method, n_pixels, budget_ms)
+            counts = []
+            for _ in range(frames_per_cell + 1):
+                tracker.restart(sequence.T_world_camera[0])
+                counts.append(tracker.track(frame).steps)
+            steps = np.array(counts[1:], dtype=float)
+            place = (tracker_label(method.tracker), n_pixels, budget_ms)
+            rows.append((*place, float(steps.mean()), float(steps.std())))
+    columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_deviation"]
+    return pd.DataFrame(rows, columns=columns)
 
 
-def obtain_steps(
-    preset: Preset, sequence: RgbdSequence, device: torch.device, measure_again: bool = False
+def measured_steps(
+    preset: Preset, sequence: RgbdSequence, methods: Sequence[str | Method] = TABLE_1
 ) -> pd.DataFrame:
-    """Table II of this device as it was measured last, or measured now; see `measure_steps`.
-
-    Args:
-        measure_again: measure although there is a measurement of the same code and settings.
-    """
-    trackers = [TRACKERS[name] for name in paper_trackers()]
-    intrinsics = sequence.intrinsics
+    """Table II of this device as it was measured last, or measured now; see `measure_steps`."""
+    camera = sequence.intrinsics
+    trackers = [tracker_class(method.tracker) for method in find_methods(methods)]
     key = fingerprint(
-        code_fingerprint(measure_steps, *trackers), device_name(device), torch.get_num_threads(),
+        sources_fingerprint("fields", "tracking"), [foreign_source(t) for t in trackers],
+        [t.name for t in trackers], device_name(choose_device()), torch.get_num_threads(),
         versions(), [as_dict(preset)[part] for part in ("network", "tracking", "tables")],
-        [intrinsics.width, intrinsics.height],
+        [camera.width, camera.height],
     )  # fmt: skip
     path = runs_folder() / "bench" / f"{preset.name}-{key}.csv"
-    if measure_again or not path.is_file():
-        cells = measure_steps(preset, sequence, device)
+    if not path.is_file():
+        cells = measure_steps(preset, sequence, methods)
         write_text_atomic(path, cells.to_csv(index=False))
     return pd.read_csv(path)
 
 
-def default_pixels(preset: Preset) -> dict[str, int]:
-    """The n that each tracker of Table II uses for Table I, by its label."""
-    return {
-        row_label(name, engine): preset.tracking_of(name).n_pixels
-        for name in paper_trackers()
-        for engine in ENGINE_LABELS
-    }
+def default_pixels(preset: Preset, methods: Sequence[str | Method] = TABLE_1) -> dict[str, int]:
+    """The n that each tracker uses for Table I, by its label in Table II."""
+    trackers = [method.tracker for method in find_methods(methods)]
+    return {tracker_label(name): preset.tracking_of(name).n_pixels for name in trackers}
 
 
-class TrackerMaker:
-    """Makes trackers in untrained fields, which cost a step as much as trained ones."""
+def measure_step_times(
+    preset: Preset, sequence: RgbdSequence, methods: Sequence[str | Method] = TABLE_1
+) -> pd.DataFrame:
+    """Time of a step for every method's tracker and its pixel counts n.
 
-    def __init__(self, preset: Preset, sequence: RgbdSequence, device: torch.device) -> None:
-        self.preset, self.device = preset, device
-        self.sampler = PixelSampler(sequence, device)
-        self.bounds = observed_bounds(sequence)
-
-    def __call__(self, name: str, n_pixels: int, engine: str) -> Tracker:
-        """A tracker by name, with n pixels a step, on an engine."""
-        network = network_of(self.preset, name)
-        field = make_field(TRACKERS[name].field_name, network, self.bounds, seed=0)
-        field.to(self.device).eval().requires_grad_(False)
-        config = replace(self.preset.tracking_of(name), n_pixels=n_pixels, engine=engine)
-        generator = torch.Generator(self.device).manual_seed(0)
-        return TRACKERS[name](field, self.sampler, config, generator)
-
-
-def row_label(tracker_name: str, engine: str) -> str:
-    """A tracker's name in Table II: the paper's, and a further one on the engine."""
-    return TRACKERS[tracker_name].short_label + ENGINE_LABELS[engine]
-
-
-def network_of(preset: Preset, tracker_name: str) -> FieldConfig:
-    """Network of the field that a tracker works in."""
-    return preset.network_of(TRACKERS[tracker_name].field_name)
-
-
-def _count_steps(
-    tracker: Tracker,
-    T_start: Float[Tensor, "4 4"],
-    budget_ms: float,
-    n_frames: int,
-    device: torch.device,
-) -> Float[np.ndarray, "frames"]:
-    """Steps of each counted frame; the same image serves all of them."""
-    budget = ClockBudget(1000 / budget_ms, synchronize=lambda: synchronize(device))
-    counts = []
-    for _ in range(n_frames + 1):
-        tracker.start_frame(0, T_start[None])
-        steps = 0
-        for _ in budget.frame():
+    Returns:
+        A row each: tracker, n_pixels, ms_per_step (median), ms_low and ms_high (quartiles).
+    """
+    rows, device = [], choose_device()
+    T_start = torch.from_numpy(sequence.T_world_camera[:1]).float().to(device)
+    for method, n_pixels in _rows(preset, methods, "step times"):
+        tracker = _tracker(preset, sequence, method, n_pixels)
+        tracker.begin(sequence[0].to(device), T_start)
+        tracker.step()
+        seconds: list[float] = []
+        while len(seconds) < _LEAST_STEPS or sum(seconds) < _SECONDS_A_ROW:
+            synchronize(device)
+            start = time.perf_counter()
             tracker.step()
-            steps += 1
-        counts.append(steps)
-    return np.array(counts[1:], dtype=float)
+            synchronize(device)
+            seconds.append(time.perf_counter() - start)
+            if len(seconds) == _MOST_STEPS:
+                break
+        low, median, high = 1e3 * np.quantile(seconds, [0.25, 0.5, 0.75])
+        rows.append((tracker_label(method.tracker), n_pixels, median, low, high))
+    columns = ["tracker", "n_pixels", "ms_per_step", "ms_low", "ms_high"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _rows(
+    preset: Preset, methods: Sequence[str | Method], title: str
+) -> Iterator[tuple[Method, int]]:
+    """Each method and pixel count in turn, under a bar, with suitable threads and advice."""
+    plan = [(m, n) for m in find_methods(methods) for n in preset.tables.pixels_of(m.tracker)]
+    with ProgressBar(title, len(plan)) as bar:
+        for done, (method, n_pixels) in enumerate(plan):
+            name = f"{method.tracker}={n_pixels}"
+            bar.move_to(done, name)
+            with (
+                advise_on_memory(f"tables.pixels.{name}"),
+                suitable_threads(preset.network_of(method.field).width),
+            ):
+                yield method, n_pixels
+        bar.move_to(len(plan))
+
+
+def _tracker(
+    preset: Preset,
+    sequence: RgbdSequence,
+    method: Method,
+    n_pixels: int,
+    budget_ms: float | None = None,
+) -> Tracker:
+    """A tracker in an untrained field, which costs a step as much as a trained one."""
+    device = choose_device()
+    network = preset.network_of(method.field)
+    field = make_field(method.field, network, observed_bounds(sequence), seed=0).to(device)
+    budget = StepBudget(1)
+    if budget_ms is not None:
+        budget = make_budget(None, 1000 / budget_ms)
+    settings = replace(preset.tracking_of(method.tracker), n_pixels=n_pixels)
+    return make_tracker(method.tracker, field, sequence.T_world_camera[0], budget, settings)

@@ -1,61 +1,63 @@
-"""The cells of a grid: maps and tracked runs, each named by everything that it depends on."""
+"""Maps as cells: each is named by all that it depends on, and made once."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import torch
 from filelock import FileLock, Timeout
 
-from nbtrack.core.config import Preset
-from nbtrack.core.device import choose_device, device_name, synchronize
-from nbtrack.core.errors import ConfigError
-from nbtrack.core.files import read_json
-from nbtrack.core.paths import runs_folder
-from nbtrack.core.provenance import code_fingerprint, fingerprint
+from nbtrack.core.device import advise_on_memory, choose_device
+from nbtrack.core.files import fingerprint, foreign_source, runs_folder, sources_fingerprint
+from nbtrack.core.settings import as_dict
+from nbtrack.experiments.board import Cell, Report
+from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
-from nbtrack.fields.grid import bake_field
-from nbtrack.mapping.files import SUMMARY_FILE, StoredMap
+from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.mapping.quality import score_map
-from nbtrack.tracking.budget import Budget, ClockBudget, StepBudget
-from nbtrack.tracking.metrics import trajectory_metrics
-from nbtrack.tracking.sequence import track_sequence
-from nbtrack.tracking.trackers import tracker_class
 
-RUN_FILE, METRICS_FILE = "run.pt", "metrics.json"
+SHARED_SOURCES = ("core.geometry", "core.camera", "core.bounds", "data", "fields")
+"""What maps and runs both go through, beside their own rooms."""
+
+_RECENT: dict[tuple[Path, str], Map] = {}  # maps that this process has made or read lately
+_MOST_RECENT = 4
 
 
 @dataclass(frozen=True)
-class MapCell:
-    """One map: a field fitted to some frames of a scene."""
+class MapCell(Cell):
+    """One map: a field fitted to some frames of a scene, or a map made earlier in its place."""
 
     scene: Scene
-    field_name: str
+    field: str
     preset: Preset
     frames: str = ":"
     seed: int = 0
     out: Path | None = None  # where to keep it instead of in the cache
+    given: Map | None = None  # the scene is tracked in this one, read from:
+    given_path: Path | None = None
+
+    needs = None
 
     @cached_property
     def key(self) -> str:
         """Changes with everything that the map depends on: code, device, data, settings, seed."""
-        field = field_class(self.field_name)
+        if self.given:
+            return fingerprint(self.given.key, choose_device().type, self.scene.fingerprint)
+        code = sources_fingerprint(*SHARED_SOURCES, "mapping")
+        network, settings = self.preset.network_of(self.field), self.preset.mapping_of(self.field)
         return fingerprint(
-            code_fingerprint(map_sequence, score_map, field), choose_device().type,
-            self.scene.fingerprint,
-            self.field_name, self.preset.network_of(self.field_name),
-            self.preset.mapping_of(self.field_name), self.frames, self.seed,
+            code, foreign_source(field_class(self.field)), choose_device().type,
+            self.scene.fingerprint, self.field, network, settings, self.frames, self.seed,
         )  # fmt: skip
 
     @property
     def name(self) -> str:
         """A readable name: scene and field, and the seed if it is not the first."""
-        return f"{self.scene.name}-{self.field_name}{_seed_suffix(self.seed)}"
+        return f"{self.scene.name}-{self.field}{seed_suffix(self.seed)}"
 
     @property
     def folder(self) -> Path:
@@ -63,152 +65,72 @@ class MapCell:
         return self.out or runs_folder() / "maps" / f"{self.name}-{self.key}"
 
     @property
+    def units(self) -> int:
+        """Iterations."""
+        return getattr(self.preset.mapping_of(self.field), "iterations", 1)
+
+    @property
+    def cost(self) -> float:
+        """Points that the network is asked for, all told: a measure of the work."""
+        settings = self.preset.mapping_of(self.field)
+        if not hasattr(settings, "n_rays"):
+            return 1e6
+        samples = settings.n_stratified + settings.n_surface
+        return float(settings.iterations * settings.n_rays * samples)
+
+    @property
     def is_done(self) -> bool:
         """Whether the map is finished and scored; in a folder of the user's, whether it is this."""
-        path = self.folder / SUMMARY_FILE
-        if self.out is None or not path.is_file():
-            return path.is_file()
-        return read_json(path).get("key") == self.key
+        if self.given or not (self.folder / MAP_FILE).is_file():
+            return self.given is not None
+        return self.out is None or read_map(self.folder).made.get("key") == self.key
 
-    @property
-    def evaluations(self) -> float:
-        """Points that the network is asked for, all told: a measure of the work."""
-        config = self.preset.mapping_of(self.field_name)
-        samples = config.n_stratified + config.n_surface
-        return float(config.iterations * config.n_rays * samples)
+    def result(self) -> dict[str, Any]:
+        """How the finished map was made, and its scores."""
+        return self.map().made
 
+    def map(self) -> Map:
+        """The finished map, ready for tracking; from disk only where another process made it."""
+        if self.given:
+            return replace(self.given, field=self.given.field.to(choose_device()))
+        place = (self.folder, self.key)
+        if place not in _RECENT:
+            found = read_map(self.folder)
+            _remember(place, replace(found, field=found.field.to(choose_device())))
+        return _RECENT[place]
 
-@dataclass(frozen=True)
-class GivenMap:
-    """A map made earlier in the place of a scene's own: in it the scene is tracked."""
+    def make(self, report: Report) -> dict[str, Any]:
+        """Map now, or resume, or wait for the process that does; returns `result`."""
+        with cell_lock(self.folder, report):
+            if not self.is_done:
+                self._make(report)
+        return self.result()
 
-    scene: Scene
-    preset: Preset  # its network is the map's
-    stored: StoredMap
-
-    @property
-    def field_name(self) -> str:
-        """The map's field."""
-        return self.stored.field.name
-
-    @property
-    def frames(self) -> str:
-        """The slice of frames, of its own scene, that the map was made from."""
-        return self.stored.made["frames"]
-
-    @property
-    def seed(self) -> int:
-        """The seed that the map was made with."""
-        return self.stored.made["seed"]
-
-    @cached_property
-    def key(self) -> str:
-        """Changes with the map's weights and with the scene that is tracked."""
-        return fingerprint(self.stored.key, choose_device().type, self.scene.fingerprint)
-
-
-@dataclass(frozen=True)
-class TrackCell:
-    """One tracked run in a map, under one budget: so many steps a frame, or a rate by the clock."""
-
-    map_cell: MapCell | GivenMap
-    tracker_name: str
-    steps: float | None = None
-    rate_hz: float | None = None
-    frames: str = ":"
-    seed: int = 0
-
-    @cached_property
-    def key(self) -> str:
-        """Changes with everything that the run depends on; by the clock, with the machine too."""
-        tracker = tracker_class(self.tracker_name)
-        config = self.map_cell.preset.tracking_of(self.tracker_name)
-        machine = (device_name(choose_device()), torch.get_num_threads())
-        clock = None if self.rate_hz is None else (self.rate_hz, *machine)
-        baking = (bake_field,) if config.bake_voxel else ()
-        return fingerprint(
-            code_fingerprint(track_sequence, trajectory_metrics, tracker, *baking),
-            self.map_cell.key,
-            self.tracker_name, config, self.steps, clock, self.frames, self.seed,
-        )  # fmt: skip
-
-    @property
-    def scene_name(self) -> str:
-        """The tracked scene."""
-        return self.map_cell.scene.name
-
-    @property
-    def name(self) -> str:
-        """A readable name: scene, tracker and budget, and the seed if it is not the first."""
-        budget = f"{self.rate_hz:g}hz" if self.rate_hz else f"{self.steps:g}steps"
-        return f"{self.scene_name}-{self.tracker_name}-{budget}{_seed_suffix(self.seed)}"
-
-    @property
-    def folder(self) -> Path:
-        """Where the run's files are kept."""
-        return runs_folder() / "tracks" / f"{self.name}-{self.key}"
-
-    @property
-    def is_done(self) -> bool:
-        """Whether the run is finished."""
-        return (self.folder / METRICS_FILE).is_file()
-
-    @property
-    def n_frames(self) -> int:
-        """Frames to track, after the first one, whose pose is given."""
-        return len(self.map_cell.scene.frame_numbers(self.frames)) - 1
-
-    @property
-    def evaluations(self) -> float:
-        """Points that the network is asked for with a step budget: a measure of the work."""
-        config = self.map_cell.preset.tracking_of(self.tracker_name)
-        a_pixel = tracker_class(self.tracker_name).evaluations_per_pixel(config)
-        return float(self.n_frames * (self.steps or 0) * config.n_pixels * a_pixel)
-
-    def budget(self, device: torch.device) -> Budget:
-        """A fresh budget: each run needs its own."""
-        return make_budget(self.steps, self.rate_hz, device)
-
-    def metrics(self) -> dict[str, Any]:
-        """What a finished run keeps: errors, speed, device, versions, settings."""
-        return read_json(self.folder / METRICS_FILE)
+    def _make(self, report: Report) -> None:
+        settings = self.preset.mapping_of(self.field)
+        checkpoint = self.folder / CHECKPOINT_FILE
+        with advise_on_memory(f"frames {self.frames} of {self.scene.name}"):
+            sequence = self.scene.read(self.frames)
+            made = map_sequence(
+                self.field, sequence, self.preset.network_of(self.field), settings, self.seed,
+                choose_device(), checkpoint, lambda done, losses: report(done, _told(losses)),
+            )  # fmt: skip
+            quality = score_map(made, sequence, self.scene.room)
+        told = {"quality": quality, "frames": self.frames, "key": self.key}
+        finished = replace(made, made={**made.made, **told, "config": as_dict(self.preset)})
+        write_map(self.folder / MAP_FILE, finished)
+        checkpoint.unlink(missing_ok=True)
+        _remember((self.folder, self.key), finished)
 
 
-def make_budget(
-    steps: float | int | None, rate_hz: float | int | None, device: torch.device | None = None
-) -> Budget:
-    """A budget by the clock of a device if there is a rate (Hz), else of so many steps a frame.
-
-    Raises:
-        ConfigError: the number is not above zero.
-    """
-    if rate_hz is None:
-        return StepBudget(steps)
-    wait = partial(synchronize, device) if device else None
-    return ClockBudget(rate_hz, synchronize=wait)
-
-
-def check_pair(tracker_name: str, field_name: str, bake_voxel: float) -> None:
-    """Whether a tracker works in the maps of a field, baked or not.
-
-    Raises:
-        ConfigError: one is unknown, or they do not go together.
-    """
-    tracker, field = tracker_class(tracker_name), field_class(field_name)
-    if not issubclass(field, field_class(tracker.field_name)):
-        raise ConfigError(
-            f"tracker {tracker_name!r} does not work on field {field_name!r}: "
-            f"{tracker.label} needs --field {tracker.field_name}"
-        )
-    if bake_voxel and tracker.renders:
-        raise ConfigError(
-            f"tracker {tracker_name!r} renders, which a baked field cannot: leave --bake out, or "
-            "take --tracker sdf or lm"
-        )
+def _remember(place: tuple[Path, str], found: Map) -> None:
+    while len(_RECENT) >= _MOST_RECENT:
+        _RECENT.pop(next(iter(_RECENT)))
+    _RECENT[place] = found
 
 
 @contextmanager
-def cell_lock(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
+def cell_lock(folder: Path, report: Report) -> Iterator[None]:
     """Keep a cell to one process at a time; the system frees it when that process ends.
 
     Whoever comes second waits, says so, and then finds the cell done.
@@ -219,7 +141,7 @@ def cell_lock(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        say("waits for another process that makes the same")
+        report(0, "waits for another process that makes the same")
         lock.acquire()
     try:
         yield
@@ -227,5 +149,10 @@ def cell_lock(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
         lock.release()
 
 
-def _seed_suffix(seed: int) -> str:
+def _told(losses: dict[str, float | int]) -> str:
+    return " ".join(f"{name} {value:.3f}" for name, value in losses.items())
+
+
+def seed_suffix(seed: int) -> str:
+    """Part of a cell's name: nothing for the first seed."""
     return f"-seed{seed}" if seed else ""

@@ -1,126 +1,19 @@
 """What each command does and prints."""
 
 import os
-import sys
+from argparse import Namespace
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import torch
-from tqdm.auto import tqdm
-
-from nbtrack.core.config import Preset
-from nbtrack.core.device import choose_device
 from nbtrack.core.errors import ConfigError, DataError
-from nbtrack.data.sequence import RgbdSequence, parse_frames
-from nbtrack.experiments.cells import (
-    GivenMap,
-    MapCell,
-    TrackCell,
-    cell_lock,
-    check_pair,
-    make_budget,
-)
-from nbtrack.experiments.export import MESH_FILE, export
-from nbtrack.experiments.parallel import Execution, Job, Report, run_jobs
-from nbtrack.experiments.results import map_summary, obtain_map, run_track
-from nbtrack.experiments.scenes import Scene, find_scene
-from nbtrack.fields import field_class
-from nbtrack.mapping.files import StoredMap, read_map
-from nbtrack.mapping.meshes import extract_mesh, keep_seen, write_mesh
-from nbtrack.tracking.trackers import tracker_class
-
-
-def map_command(
-    sequence: str,
-    field_name: str,
-    preset: Preset,
-    frames: str,
-    seed: int,
-    out: Path | None,
-    format: str | None = None,
-) -> None:
-    """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
-    field_class(field_name)
-    parse_frames(frames)
-    cell = MapCell(_scene(sequence, preset, format), field_name, preset, frames, seed, out)
-    _map_with_bar(cell)
-    summary = map_summary(cell)
-    print(f"{cell.folder}: {field_class(field_name).label} map of {cell.scene.name}")
-    print(f"  mapped in {summary['seconds']:.0f} s on {summary['device']}")
-    for name, value in summary["quality"].items():
-        if value is not None:
-            print(f"  {_with_unit(name, value)}")
-    try:
-        mesh = keep_seen(extract_mesh(obtain_map(cell).field), _every_tenth(cell))
-    except DataError as error:
-        print(f"  no mesh: {error}")
-    else:
-        write_mesh(cell.folder / MESH_FILE, mesh)
-        print(f"  mesh of what was seen: {cell.folder / MESH_FILE}")
-
-
-def track_command(
-    sequence: str,
-    field_name: str | None,
-    tracker_name: str,
-    preset: Preset,
-    steps: float | None,
-    rate_hz: float | None,
-    map_frames: str | None,
-    frames: str,
-    seed: int,
-    out: Path | None,
-    format: str | None = None,
-    map_from: Path | None = None,
-) -> None:
-    """Track a sequence in its map, made first where none fits, or in a given one; print the errors.
-
-    Args:
-        field_name: the map's field; None to take a given map as it is.
-        map_from: folder or file of a map made earlier, which then stands for the sequence's own.
-    """
-    tracker = tracker_class(tracker_name)
-    stored = None if map_from is None else _given_map(map_from, field_name, map_frames)
-    field_name = field_name if stored is None else stored.field.name
-    check_pair(tracker_name, field_name, preset.tracking_of(tracker_name).bake_voxel)
-    parse_frames(frames)
-    map_frames = map_frames or ":"
-    parse_frames(map_frames)
-    budget = make_budget(steps, rate_hz)  # a wrong one is told before a room is made
-    scene = _scene(sequence, preset, format)
-    n_frames = len(scene.frame_numbers(frames))
-    scene.frame_numbers(map_frames)
-    if stored is None:
-        map_cell = MapCell(scene, field_name, preset, map_frames, seed)
-    else:
-        network = {**preset.network, field_name: stored.network}
-        map_cell = GivenMap(scene, replace(preset, network=network), stored)
-    cell = TrackCell(map_cell, tracker_name, steps, rate_hz, frames, seed)
-    device = choose_device()
-    if stored is None:
-        _map_with_bar(map_cell)
-    folder = out or cell.folder
-    job = Job(cell.name, n_frames - 1, _track_job, (cell, folder, device))
-    (tracked,) = run_jobs([job], "tracking", Execution(workers=1))
-    print(f"{folder}: {tracker.label}, {budget}")
-    _print_metrics(tracked)
-
-
-def _print_metrics(tracked: dict[str, Any]) -> None:
-    for name in _PRINTED:
-        print(f"  {_with_unit(name, tracked[name])}")
-    if tracked["frames_without_depth"]:
-        print(f"  frames without any depth, not searched: {tracked['frames_without_depth']}")
-    print(f"  on {tracked['device']}")
-    if tracked.get("map_warning"):
-        print(f"nbtrack: warning: {tracked['map_warning']}", file=sys.stderr)
-
-
-def export_command(source: Path, format_name: str, out: Path) -> None:
-    """Write a run's trajectory or a map in another format; print what was written."""
-    print(f"{out}: {export(source, format_name, out)}")
-
+from nbtrack.core.files import write_bytes_atomic
+from nbtrack.core.progress import ProgressBar, tell
+from nbtrack.data.sequence import parse_frames
+from nbtrack.experiments.cells import MapCell
+from nbtrack.experiments.grid import Execution, run_cells
+from nbtrack.experiments.presets import Preset, load_preset
+from nbtrack.experiments.scenes import open_scene
+from nbtrack.fields import field_class, supervised_field
 
 _PRINTED = (
     "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
@@ -129,55 +22,185 @@ _PRINTED = (
 _UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": ("s", 0)}
 
 
-def _with_unit(name: str, value: float | int) -> str:
-    for suffix, (unit, digits) in _UNITS.items():
-        if name.endswith(suffix):
-            return f"{name.removesuffix(suffix).replace('_', ' ')}: {value:.{digits}f} {unit}"
-    return f"{name.replace('_', ' ')}: {value:.4g}"
+def map_command(options: Namespace) -> None:
+    """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
+    from nbtrack.mapping.files import MESH_FILE
+    from nbtrack.mapping.meshes import extract_mesh
+
+    field = supervised_field(options.field, options.supervision or "rendering")
+    parse_frames(options.frames)
+    scene = open_scene(options.sequence, preset_of(options), options.format)
+    cell = MapCell(scene, field, preset_of(options), options.frames, options.seed, options.out)
+    scene.count(options.frames)
+    _map(cell)
+    found = cell.map()
+    print(f"{cell.folder}: {found.field.label} map of {scene.name}")
+    print(f"  mapped in {found.seconds:.0f} s on {found.made['device']}")
+    _print_numbers({k: v for k, v in found.quality.items() if v is not None})
+    try:
+        # Every tenth frame says enough of what has been seen: neighbours see the same.
+        sequence = scene.read(options.frames)
+        mesh = extract_mesh(found.field, sequence.select(slice(None, None, 10)))
+    except DataError as error:
+        print(f"  no mesh: {error}")
+    else:
+        write_bytes_atomic(cell.folder / MESH_FILE, mesh.export(file_type="ply"))
+        print(f"  mesh of what was seen: {cell.folder / MESH_FILE}")
 
 
-def _scene(sequence: str, preset: Preset, format: str | None = None) -> Scene:
-    """The scene, with a bar while a room has to be made."""
-    config = preset.scenes
-    with tqdm(total=config.n_frames, desc="room", unit="frame", delay=1.0, leave=False) as bar:
-        # Small rooms are made sooner than processes start.
-        workers = (os.cpu_count() or 1) if config.width >= 320 else 1
-        return find_scene(
-            sequence, config, lambda done, total: bar.update(done - bar.n), workers, format
-        )
+def track_command(options: Namespace) -> None:
+    """Track a sequence in its map, made first where none fits, or in a given one."""
+    from nbtrack.experiments.runs import TrackCell
+    from nbtrack.tracking import check_pair, make_budget
+
+    field, given = _asked_field(options), None
+    preset = preset_of(options)
+    if options.map_from is not None:
+        given = _given_map(options, field)
+        field = given.field.name
+        network = {**preset.network, field: given.network}
+        preset = replace(preset, network=network)
+    check_pair(options.tracker, field)
+    budget = make_budget(options.steps, options.rate)  # told before a room is made
+    map_frames = options.map_frames or ":"
+    for frames in (options.frames, map_frames):
+        parse_frames(frames)
+    scene = open_scene(options.sequence, preset, options.format)
+    scene.count(options.frames)
+    scene.count(map_frames)
+    cell = MapCell(
+        scene, field, preset, map_frames, options.seed, given=given, given_path=options.map_from
+    )
+    run = TrackCell(
+        cell, options.tracker, options.steps, options.rate, options.frames, options.seed,
+        options.out,
+    )  # fmt: skip
+    if given is None:
+        _map(cell)
+    run = replace(run, out=run.folder)  # made anew, whatever the cache holds
+    (metrics,) = run_cells([run], f"tracking {scene.name}", Execution(workers=1))
+    print(f"{run.folder}: {options.tracker} in {field_class(field).label}, {budget}")
+    _print_numbers({name: metrics[name] for name in _PRINTED})
+    if metrics["frames_without_depth"]:
+        print(f"  frames without any depth, not searched: {metrics['frames_without_depth']}")
+    print(f"  on {metrics['device']}")
+    if metrics.get("map_warning"):
+        tell(f"nbtrack: warning: {metrics['map_warning']}")
 
 
-def _given_map(path: Path, field_name: str | None, map_frames: str | None) -> StoredMap:
-    """The map at a path. Raises ConfigError if it is not what else was asked for."""
-    if map_frames is not None:
-        raise ConfigError("--map-from names a map that is made: leave --map-frames out")
-    stored = read_map(path)
-    found = stored.field.name
-    if field_name is not None and not issubclass(field_class(found), field_class(field_name)):
-        raise ConfigError(f"{path} is a map of field {found!r}, not {field_name!r}: leave it out")
-    return stored
+def export_command(options: Namespace) -> None:
+    """Write a run's trajectory or a map in another format; print what was written."""
+    from nbtrack.experiments.export import export
+
+    print(f"{options.out}: {export(options.source, options.to, options.out)}")
 
 
-def _every_tenth(cell: MapCell) -> RgbdSequence:
-    """Some frames of a map, enough to say what has been seen: neighbours see the same."""
-    numbers = cell.scene.frame_numbers(cell.frames)
-    return cell.scene.read(slice(numbers.start, numbers.stop, 10 * numbers.step))
+def notebooks_command(options: Namespace) -> None:
+    """Run all notebooks headless."""
+    from nbtrack.experiments.notebooks import run_notebooks
+
+    preset = preset_of(options)  # a wrong setting is refused before the first kernel starts
+    run_notebooks(preset.name, options.config, options.settings, options.in_place)
 
 
-def _map_with_bar(cell: MapCell) -> None:
-    if cell.is_done:
-        tqdm.write(f"map found in {cell.folder}")
+def make_command(options: Namespace) -> None:
+    """Write a synthetic room as a sequence folder."""
+    from nbtrack.synthetic import make_room
+
+    size = (options.width, options.width * 3 // 4)
+    with ProgressBar(options.room, options.n_frames) as bar:
+        make_room(
+            options.room, options.out, options.n_frames, *size, options.seed, os.cpu_count() or 1,
+            lambda done, total: bar.move_to(done),
+        )  # fmt: skip
+    told = f"{options.n_frames} frames of {size[0]}x{size[1]}, seed {options.seed}"
+    print(f"{options.out}: {options.room}, {told}")
+
+
+def check_command(options: Namespace) -> None:
+    """Validate a recording; print what it holds and what is wrong, and draw it if asked to."""
+    from nbtrack.data.check import check_recording
+    from nbtrack.data.recording import open_recording
+
+    recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
+    report = check_recording(recording, progress=True)
+    print(report)
+    if options.out is None:
         return
-    tqdm.write(f"no finished map in {cell.folder}: mapping")
-    total = cell.preset.mapping_of(cell.field_name).iterations
-    run_jobs([Job(cell.scene.name, total, _map_job, (cell,))], "mapping", Execution(workers=1))
+    from nbtrack.plots import plot_recording
+
+    path = options.out
+    path = path if path.suffix.lower() == ".png" else path / "check.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    T_world_camera = recording.T_world_camera[recording.has_pose]
+    apart = f"surfaces of two frames lie {1e3 * report.readings[0].median_m:.1f} mm apart (median)"
+    plot_recording(report.cloud, T_world_camera, f"{recording.name}: {apart}").savefig(path)
+    print(f"  picture         {path}")
 
 
-def _map_job(cell: MapCell, report: Report) -> None:
-    obtain_map(cell, report=report)
+def convert_command(options: Namespace) -> None:
+    """Write a recording in the Neural RGB-D layout; print what became of it."""
+    from nbtrack.data.recording import open_recording
+    from nbtrack.data.writer import convert_sequence
+
+    recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
+    print(convert_sequence(recording, options.out, parse_frames(options.frames), progress=True))
 
 
-def _track_job(cell: TrackCell, folder: Path, device: torch.device, report: Report) -> dict:
-    # `tables` may be at the same cell.
-    with cell_lock(cell.folder, lambda status: report(0, status)):
-        return run_track(cell, folder, device, report)
+def preset_of(options: Namespace, *settings: str) -> Preset:
+    """The preset with all that changes it."""
+    settings = (*options.settings, *settings)
+    if getattr(options, "pixels", None) is not None:
+        settings += (f"tracking.{options.tracker}.n_pixels={options.pixels}",)
+    if getattr(options, "bake", None) is not None:
+        settings += (f"tracking.{options.tracker}.bake_voxel={options.bake}",)
+    return load_preset(options.preset, options.config, settings)
+
+
+def _asked_field(options: Namespace) -> str | None:
+    """The field with its supervision; None where a given map has its own."""
+    from nbtrack.tracking import tracker_class
+
+    if tracker_class(options.tracker).renders and options.bake is not None:
+        raise ConfigError(
+            f"tracker {options.tracker!r} renders, which a baked field cannot: leave --bake out, "
+            "or take --tracker sdf or lm"
+        )
+    if options.field is None and options.map_from is None:
+        raise ConfigError("track needs --field, or --map-from with a map that knows its own")
+    if options.field is None and options.supervision is not None:
+        raise ConfigError("--supervision belongs to --field: name that too, or leave both out")
+    if options.field is None:
+        return None
+    return supervised_field(options.field, options.supervision or "rendering")
+
+
+def _given_map(options: Namespace, field: str | None) -> Any:
+    """The map at a path. Raises ConfigError if it is not what else was asked for."""
+    from nbtrack.mapping.files import read_map
+
+    if options.map_frames is not None:
+        raise ConfigError("--map-from names a map that is made: leave --map-frames out")
+    found = read_map(options.map_from)
+    name = found.field.name
+    if field is not None and not issubclass(field_class(name), field_class(field)):
+        raise ConfigError(
+            f"{options.map_from} is a map of field {name!r}, not {field!r}: leave it out"
+        )
+    return found
+
+
+def _map(cell: MapCell) -> None:
+    if cell.is_done:
+        print(f"map found in {cell.folder}")
+        return
+    print(f"no finished map in {cell.folder}: mapping")
+    run_cells([cell], f"mapping {cell.scene.name}", Execution(workers=1))
+
+
+def _print_numbers(numbers: dict[str, float | int]) -> None:
+    for name, value in numbers.items():
+        suffix = next((s for s in _UNITS if name.endswith(s)), "")
+        unit, digits = _UNITS.get(suffix, ("", 0))
+        text = f"{value:.{digits}f} {unit}" if unit else f"{value:.4g}"
+        print(f"  {name.removesuffix(suffix).replace('_', ' ')}: {text}")

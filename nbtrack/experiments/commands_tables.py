@@ -1,186 +1,133 @@
-"""The `tables` command: fill the grid, write the tables, or tell where a number comes from."""
+"""What the commands `tables` and `bench` do and print."""
 
-import sys
+import os
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
 import torch
-from tqdm import tqdm
 
-from nbtrack.core.config import Preset
 from nbtrack.core.device import choose_device, device_name
-from nbtrack.core.errors import ConfigError, NbtrackError, nearest_name
-from nbtrack.core.files import write_text_atomic
-from nbtrack.core.paths import PAPER_TABLES
+from nbtrack.core.errors import ConfigError, NbtrackError
+from nbtrack.core.files import runs_folder, tables_folder, write_text_atomic
 from nbtrack.core.settings import changed_settings
-from nbtrack.experiments.bench import default_pixels, obtain_steps
-from nbtrack.experiments.beyond import plan_table_3
-from nbtrack.experiments.explain import explain_run, find_cells
-from nbtrack.experiments.grid import BUDGETS, plan_table_1, prepare_scenes, table_1_results
-from nbtrack.experiments.parallel import Execution
-from nbtrack.tables.comparison import beside_published, write_comparisons
-from nbtrack.tables.latex import TableNotes, write_table_3, write_tables
-from nbtrack.tables.layout import (
-    average_over_seeds,
-    deviations_1,
-    deviations_2,
-    error_texts,
-    step_texts,
-    table_1,
-    table_2,
+from nbtrack.experiments.bench import (
+    default_pixels,
+    measure_step_times,
+    measure_steps,
+    measured_steps,
+)
+from nbtrack.experiments.commands import preset_of
+from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, find_methods
+from nbtrack.experiments.presets import PRESETS, Preset
+from nbtrack.experiments.results import BUDGETS, track_scenes
+from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
+from nbtrack.tables import (
+    beside_published,
+    style_table_1,
+    style_table_2,
+    write_table_3,
+    write_tables,
 )
 
-# What a cell's row tells beside its place; none of it depends on how fast the machine was.
+# What a run's row tells beside its place; none of it depends on how fast the machine was.
 _CELL_COLUMNS = (
     "rate_hz", "method", "scene", "seed", "ate_m", "ate_rmse_aligned_m", "rotation_rmse_deg",
     "max_error_m", "frames", "lost_frames", "steps_per_frame", "run", "failure",
 )  # fmt: skip
 
 
-def tables_command(
-    preset: Preset,
-    budget: str = "steps",
-    seeds: int = 1,
-    trackers: tuple[str, ...] = (),
-    execution: Execution | None = None,
-    measure_again: bool = False,
-    out: Path | None = None,
-) -> None:
-    """Fill both tables of a preset and write them as CSV and LaTeX.
+def tables_command(options: Namespace) -> None:
+    """Fill the tables of a preset and write them as CSV and LaTeX.
 
     Raises:
         NbtrackError: some cells failed; the tables are written all the same, with gaps.
     """
-    budgets = _budgets(budget)
-    _check_seeds(seeds)
-    execution = execution or Execution(keep_going=True)
-    # A bad name is told before a room is made.
-    plan_table_1(preset, [], budgets[0], seeds, trackers)
-    scenes = prepare_scenes(preset, _tell)
-    results_of = {
-        kind: table_1_results(plan_table_1(preset, scenes, kind, seeds, trackers), _tell, execution)
-        for kind in budgets
-    }
-    cells_2 = obtain_steps(preset, scenes[0].read(slice(0, 1)), choose_device(), measure_again)
-    for kind, results in results_of.items():
-        _write(_folder(preset, kind, budgets, out), preset, kind, results, cells_2)
-    _raise_failures(list(results_of.values()))
-
-
-def beyond_command(
-    preset: Preset,
-    budget: str = "steps",
-    seeds: int = 1,
-    execution: Execution | None = None,
-    out: Path | None = None,
-) -> None:
-    """Fill Table III of a preset and write it as CSV and LaTeX.
-
-    Raises:
-        NbtrackError: some cells failed; the table is written all the same, with gaps.
-    """
-    budgets = _budgets(budget)
-    _check_seeds(seeds)
-    execution = execution or Execution(keep_going=True)
-    scenes = prepare_scenes(preset, _tell)
-    all_results = []
-    for kind in budgets:
-        results = table_1_results(plan_table_3(preset, scenes, kind, seeds=seeds), _tell, execution)
-        all_results.append(results)
-        cells = average_over_seeds(results)
-        folder = _folder(preset, kind, budgets, out)
-        paths = write_table_3(folder, cells, _notes(preset, kind))
-        paths.append(_write_cells(folder / "table_3_cells.csv", results))
-        print(f"Table III: ATE (m), {_notes(preset, kind)}")
-        print(error_texts(table_1(cells), deviations_1(cells)).to_string())
-        print("\n".join(str(path) for path in paths))
-    _raise_failures(all_results)
-
-
-def explain_command(
-    preset: Preset,
-    budget: str,
-    seeds: int,
-    trackers: tuple[str, ...],
-    row: str,
-    column: str,
-    beyond: bool = False,
-) -> None:
-    """Print where one cell of Table I (or III) comes from, and the command that makes it again."""
-    (kind,) = _budgets(budget) if budget != "both" else ("steps",)
-    _check_seeds(seeds)
-    scenes = prepare_scenes(preset, _tell, make=False)
-    if beyond:
-        cells = plan_table_3(preset, scenes, kind, seeds=seeds)
+    names = [f"scenes.names={_words(options.scenes)}"] if options.scenes else []
+    preset = preset_of(options, *names)
+    if options.beyond and options.trackers:
+        raise ConfigError("--beyond has rows of its own: leave --trackers out")
+    methods = _words(options.trackers) or (TABLE_3 if options.beyond else TABLE_1)
+    find_methods(methods)  # a bad name is told before a room is made
+    execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
+    scenes, clock = open_scenes(preset), options.budget == "clock"
+    results = track_scenes(
+        scenes, methods, preset, RATES_3_HZ if options.beyond else None, clock=clock,
+        seeds=options.seeds, execution=execution,
+    )  # fmt: skip
+    folder = options.out or tables_folder() / (preset.name + "_clock" * clock)
+    number, note = "III" if options.beyond else "I", _note(preset, BUDGETS[options.budget])
+    print(f"Table {number}: ATE (m), {note}")
+    print(style_table_1(results))
+    if options.beyond:
+        paths = write_table_3(folder, results, note)
     else:
-        cells = plan_table_1(preset, scenes, kind, seeds, trackers)
-    for cell in find_cells(cells, row, column):
-        print(explain_run(cell.run))
-
-
-def _budgets(budget: str) -> tuple[str, ...]:
-    allowed = {**{name: (name,) for name in BUDGETS}, "both": tuple(BUDGETS)}
-    if budget not in allowed:
-        raise ConfigError(f"unknown budget {budget!r}: {nearest_name(budget, [*allowed])}")
-    return allowed[budget]
-
-
-def _check_seeds(seeds: int) -> None:
-    if seeds < 1:
-        raise ConfigError(f"--seeds {seeds}: it must be 1 or more; 3 gives a mean and a spread")
-
-
-def _write(
-    folder: Path, preset: Preset, budget: str, results: pd.DataFrame, cells_2: pd.DataFrame
-) -> None:
-    cells_1 = average_over_seeds(results)
-    notes = _notes(preset, budget)
-    paths = write_tables(folder, cells_1, cells_2, notes, default_pixels(preset))
-    paths += write_comparisons(folder, cells_1, cells_2)
-    paths.append(_write_cells(folder / "table_1_cells.csv", results))
-    where = f", on {notes.device}" if budget == "clock" else ""
-    print(f"Table I: ATE (m), {BUDGETS[budget]}{where}")
-    print(error_texts(table_1(cells_1), deviations_1(cells_1)).to_string())
-    print("Table I beside the paper's")
-    print(beside_published(cells_1).to_string(float_format="%.3f", na_rep="–"))
-    print(f"Table II: steps, on {notes.device}, {torch.get_num_threads()} threads")
-    print(step_texts(table_2(cells_2), deviations_2(cells_2)).to_string())
+        paths = _write_both(folder, preset, scenes, methods, results, note)
+    cells = results[[name for name in _CELL_COLUMNS if name in results]]
+    paths.append(folder / f"table_{len(number)}_cells.csv")
+    write_text_atomic(paths[-1], cells.to_csv(index=False, lineterminator="\n"))
     print("\n".join(str(path) for path in paths))
-
-
-def _folder(preset: Preset, kind: str, budgets: tuple[str, ...], out: Path | None) -> Path:
-    """Where the tables of one kind of budget go."""
-    name = preset.name if kind == "steps" else f"{preset.name}_clock"
-    return out / name if out and len(budgets) > 1 else out or PAPER_TABLES / name
-
-
-def _notes(preset: Preset, budget: str) -> TableNotes:
-    # Which scenes there are the columns tell.
-    changed = [text for text in changed_settings(preset) if not text.startswith("scenes.names")]
-    return TableNotes(preset.name, BUDGETS[budget], device_name(choose_device()), tuple(changed))
-
-
-def _write_cells(path: Path, results: pd.DataFrame) -> Path:
-    told = results[[name for name in _CELL_COLUMNS if name in results]]
-    write_text_atomic(path, told.to_csv(index=False, lineterminator="\n"))
-    return path
-
-
-def _raise_failures(all_results: Sequence[pd.DataFrame]) -> None:
-    failures = [
-        failure
-        for results in all_results
-        for failure in results.loc[results["failure"] != "", ["run", "failure"]].values.tolist()
-    ]
-    if failures:
-        run, reason = failures[0]
+    failed = results[results["failure"] != ""]
+    if len(failed):
         raise NbtrackError(
-            f"{len(failures)} cells of the table failed and are empty, the first of them {run}: "
-            f"{reason}; mend the cause and run the same command again, the rest is kept"
+            f"{len(failed)} cells of the table failed and are empty, the first of them "
+            f"{failed['run'].iloc[0]}: {failed['failure'].iloc[0]}; mend the cause and run the "
+            "same command again, the rest is kept"
         )
 
 
-def _tell(text: str) -> None:
-    """To standard error: it is news, not a result."""
-    tqdm.write(text, file=sys.stderr)
+def _write_both(
+    folder: Path,
+    preset: Preset,
+    scenes: Sequence[Scene],
+    methods: Sequence[str],
+    results: pd.DataFrame,
+    note: str,
+) -> list[Path]:
+    """Table I as it was filled, and Table II as it is measured."""
+    steps = measured_steps(preset, scenes[0].read(":1"), methods)
+    pixels = default_pixels(preset, methods)
+    print("Table I beside the paper's")
+    print(beside_published(results).to_string(float_format="%.3f", na_rep="–"))
+    print(f"Table II: steps, on {_device()}, {torch.get_num_threads()} threads")
+    print(style_table_2(steps, default_pixels=pixels))
+    return write_tables(folder, results, steps, note, pixels)
+
+
+def bench_command(options: Namespace) -> None:
+    """Measure and print Table II and step times; write them as CSV."""
+    # The paper's sizes unless something else is asked for: small networks measure bookkeeping.
+    if "NBTRACK_PRESET" not in os.environ:
+        options.preset = options.preset or "synthetic"
+    preset = preset_of(options, "scenes.n_frames=2")  # one image is enough
+    sequence = open_scene(preset.scenes.names[0], preset).read(":1")
+    out, device = options.out or runs_folder() / "bench" / preset.name, choose_device()
+    print(f"{preset.name} networks, on {device_name(device)}, {torch.get_num_threads()} threads")
+    times = measure_step_times(preset, sequence)
+    print(times.to_string(index=False, float_format="%.4g"))
+    steps = measure_steps(preset, sequence)
+    print("Table II: steps within a budget")
+    print(style_table_2(steps, default_pixels=default_pixels(preset)))
+    for name, table in (("step_times", times), ("table_2", steps)):
+        text = table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+        write_text_atomic(out / f"{name}.csv", text)
+    print(f"written to {out}")
+
+
+def _note(preset: Preset, budget: str) -> str:
+    """How the numbers came about, in a sentence. Which scenes there are the columns tell."""
+    changed = changed_settings(preset, PRESETS[preset.name])
+    changed = [setting for setting in changed if not setting.startswith("scenes.names")]
+    told = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name
+    return f"Preset: {told}; budget: {budget}; device: {_device()}."
+
+
+def _device() -> str:
+    return device_name(choose_device())
+
+
+def _words(text: str | None) -> list[str]:
+    """The parts of a list with commas."""
+    return [word.strip() for word in (text or "").split(",") if word.strip()]

@@ -1,32 +1,24 @@
 """Run the numbered notebooks without a browser and keep executed and HTML copies."""
 
+import importlib.util
 import os
 import shlex
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
-import nbformat
-from nbclient import NotebookClient
-from nbclient.exceptions import CellExecutionError
-from nbconvert import HTMLExporter
-from tqdm.auto import tqdm
-
-from nbtrack.core.errors import NbtrackError
-from nbtrack.core.files import write_text_atomic
-from nbtrack.core.paths import PROJECT_ROOT, runs_folder
-
-NOTEBOOKS = PROJECT_ROOT / "notebooks"
+from nbtrack.core.errors import MissingError, NbtrackError
+from nbtrack.core.files import project_folder, runs_folder, write_text_atomic
+from nbtrack.core.progress import ProgressBar
 
 
 def run_notebooks(
     preset: str,
     config_file: Path | None = None,
-    settings: tuple[str, ...] = (),
+    settings: Sequence[str] = (),
     in_place: bool = False,
 ) -> list[Path]:
-    """Execute every notebook in order; returns the HTML copies.
+    """Execute every notebook in order, as `jupyter nbconvert --execute`; returns the HTML copies.
 
     Copies go to `runs/notebooks/<preset>/`. Settings reach the kernels through the environment,
     where each notebook's settings cell finds them.
@@ -36,64 +28,47 @@ def run_notebooks(
             they are: for a change of theirs, on the smoke preset.
 
     Raises:
+        MissingError: there are no notebooks here, or Jupyter is not installed.
         NbtrackError: a cell failed; the copy up to there is kept.
     """
-    folder = runs_folder() / "notebooks" / preset
-    paths = sorted(NOTEBOOKS.glob("[0-9A]*_*.ipynb"))
-    pages = []
-    with _environment(NBTRACK_PRESET=preset, **_overrides(config_file, settings)):
-        for path in paths:
-            start = time.perf_counter()
-            notebook = execute_notebook(path, folder)
-            if in_place:
-                write_text_atomic(path, nbformat.writes(notebook) + "\n")
-            pages.append(folder / f"{path.stem}.html")
-            write_text_atomic(pages[-1], HTMLExporter().from_notebook_node(notebook)[0])
-            tqdm.write(f"{pages[-1]}: {time.perf_counter() - start:.0f} s")
+    if any(importlib.util.find_spec(name) is None for name in ("nbconvert", "ipykernel")):
+        raise MissingError("notebooks need Jupyter: pip install 'nbtrack[notebooks]'")
+    paths = sorted((project_folder() / "notebooks").glob("[0-9A]*_*.ipynb"))
+    if not paths:
+        raise MissingError(f"no notebooks in {project_folder()}: run the command in a checkout")
+    os.environ["NBTRACK_PRESET"] = preset
+    if config_file:
+        os.environ["NBTRACK_CONFIG"] = str(config_file.resolve())
+    before = os.environ.get("NBTRACK_SET", "")
+    os.environ["NBTRACK_SET"] = f"{before} {shlex.join(settings)}".strip()
+    folder, pages = runs_folder() / "notebooks" / preset, []
+    with ProgressBar("notebooks", len(paths)) as bar:
+        for done, path in enumerate(paths):
+            bar.move_to(done, path.stem)
+            pages.append(_run_notebook(path, folder, in_place))
+        bar.move_to(len(paths))
     return pages
 
 
-def execute_notebook(path: Path, folder: Path) -> nbformat.NotebookNode:
-    """Run one notebook in a fresh kernel, with a bar over its cells; the copy goes to `folder`.
+def _run_notebook(path: Path, folder: Path, in_place: bool) -> Path:
+    """Run one notebook in a fresh kernel; its copies go to the folder."""
+    import nbformat
+    from nbconvert import HTMLExporter
+    from nbconvert.preprocessors import CellExecutionError, ExecutePreprocessor
 
-    Raises:
-        NbtrackError: a cell failed; names it, with the error's last line.
-    """
-    notebook = nbformat.read(path, as_version=4)
-    total = sum(cell.cell_type == "code" for cell in notebook.cells)
-    with tqdm(total=total, desc=path.stem, unit="cell") as bar:
-        client = NotebookClient(
-            notebook, timeout=None, kernel_name="python3", record_timing=False,
-            resources={"metadata": {"path": str(path.parent)}},
-            on_cell_executed=lambda **_: bar.update(),
-        )  # fmt: skip
-        try:
-            client.execute()
-        except CellExecutionError as error:
-            raise NbtrackError(
-                f"{path.name} failed with {error.ename}: {error.evalue}; see the last cell of "
-                f"{folder / path.name}, mend what it names and run again"
-            ) from None
-        finally:
-            write_text_atomic(folder / path.name, nbformat.writes(notebook))
-    return notebook
-
-
-def _overrides(config_file: Path | None, settings: tuple[str, ...]) -> dict[str, str]:
-    overrides = {"NBTRACK_CONFIG": str(config_file.resolve())} if config_file else {}
-    if settings:
-        already = os.environ.get("NBTRACK_SET", "")
-        overrides["NBTRACK_SET"] = f"{already} {shlex.join(settings)}".strip()
-    return overrides
-
-
-@contextmanager
-def _environment(**variables: str) -> Iterator[None]:
-    """Environment variables for the kernels that are started inside, put back afterwards."""
-    before = dict(os.environ)
-    os.environ.update(variables)
+    notebook, page, start = nbformat.read(path, 4), folder / f"{path.stem}.html", time.monotonic()
+    run = ExecutePreprocessor(timeout=None, kernel_name="python3", record_timing=False)
     try:
-        yield
+        run.preprocess(notebook, {"metadata": {"path": str(path.parent)}})
+    except CellExecutionError as error:
+        raise NbtrackError(
+            f"{path.name} failed with {error.ename}: {error.evalue}; see the last cell of "
+            f"{folder / path.name}, mend what it names and run again"
+        ) from None
     finally:
-        os.environ.clear()
-        os.environ.update(before)
+        write_text_atomic(folder / path.name, nbformat.writes(notebook) + "\n")
+    if in_place:
+        write_text_atomic(path, nbformat.writes(notebook) + "\n")
+    write_text_atomic(page, HTMLExporter().from_notebook_node(notebook)[0])
+    print(f"{page}: {time.monotonic() - start:.0f} s")
+    return page

@@ -1,32 +1,31 @@
 """From what a user calls a sequence to a folder on disk: a path, a room, a scene of the dataset."""
 
-import hashlib
+import os
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from filelock import FileLock
 
-from nbtrack.core.config import ScenesConfig
-from nbtrack.core.errors import DataError, MissingError, nearest_name
-from nbtrack.core.paths import data_folder, runs_folder
-from nbtrack.core.provenance import code_fingerprint, fingerprint
-from nbtrack.data.readers import FORMATS, Recording, open_recording
-from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames
+from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
+from nbtrack.core.files import data_folder, fingerprint, runs_folder, sources_fingerprint
+from nbtrack.core.progress import ProgressBar, tell
+from nbtrack.data.recording import Recording, open_recording
+from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames, select_frames
+from nbtrack.experiments.presets import Preset, ScenesConfig
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of
+from nbtrack.tables import PAPER_SCENE_LABELS
 
-DATASET_SCENES = (
-    "breakfast_room", "complete_kitchen", "green_room", "grey_white_room", "kitchen",
-    "morning_apartment", "staircase", "thin_geometry", "whiteroom",
-)  # fmt: skip
+DATASET_SCENES = tuple(PAPER_SCENE_LABELS)
 """Folders of the Neural RGB-D dataset, in the order of the paper's Table I."""
+
+_SMALL_WIDTH = 320  # pixels; smaller rooms are made sooner than processes start
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A sequence on disk, read when it is needed."""
+    """A sequence on disk, opened when it is first needed."""
 
     name: str
     folder: Path
@@ -37,85 +36,50 @@ class Scene:
         """The exact geometry, if the scene is a synthetic room."""
         return room_of(self.folder)
 
-    def open(self) -> Recording:
+    @cached_property
+    def recording(self) -> Recording:
         """Its files, poses and calibration. Raises as `open_recording` does."""
         return open_recording(self.folder, self.format)
 
-    def read(self, frames: slice = slice(None), progress: bool = False) -> RgbdSequence:
-        """The scene's frames. Raises DataError or MissingError as `read_sequence` does."""
-        return read_frames(self.open(), frames, progress)
-
-    def frame_numbers(self, frames: str) -> range:
-        """Which frames a slice such as `10:50:2` selects, those with a NaN pose included.
-
-        Raises DataError if it selects none.
-        """
-        total = len(self.open())
-        selected = range(total)[parse_frames(frames)]
-        if not selected:
-            raise DataError(
-                f"frames {frames} select nothing of the {total} frames in {self.folder}: choose a "
-                f"range within 0:{total}"
-            )
-        return selected
-
     @cached_property
     def fingerprint(self) -> str:
-        """Changes with what was read and how: texts, the images' names and sizes, and the reader.
+        """Changes with what is read and how it is read."""
+        return fingerprint(*self.recording.contents(), sources_fingerprint("data"))
 
-        An image that changes in place and keeps its size is not noticed.
+    def read(self, frames: str = ":") -> RgbdSequence:
+        """The frames of a slice such as `10:50:2`. Raises as `read_sequence` does."""
+        return read_frames(self.recording, parse_frames(frames))
+
+    def count(self, frames: str) -> int:
+        """How many frames a slice selects, those with a NaN pose included.
+
+        Raises DataError if none of them has a pose.
         """
-        recording = self.open()
-        texts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in recording.text_files]
-        reader = code_fingerprint(FORMATS[recording.declared.format].open)
-        return fingerprint(recording.file_sizes, texts, recording.declared, reader)
+        return len(select_frames(self.recording, parse_frames(frames)))
 
 
-def room_folder(name: str, config: ScenesConfig) -> Path:
-    """Where a synthetic room of this size, length and seed lies, made or not yet."""
-    size = f"{config.n_frames}x{config.width}"
-    return runs_folder() / "rooms" / f"{name}-{size}-seed{config.seed}" / name
-
-
-def find_scene(
-    sequence: str | Path,
-    config: ScenesConfig,
-    progress: Callable[[int, int], None] | None = None,
-    workers: int = 1,
-    format: str | None = None,
-) -> Scene:
+def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) -> Scene:
     """The scene that a user means.
 
     Args:
         sequence: a folder in a supported layout, the name of a synthetic room (made here at the
-            size that `config` gives, unless it is there already), or of a scene of the Neural
+            size that the preset gives, unless it is there already), or of a scene of the Neural
             RGB-D dataset below the data folder.
-        progress: called with frames done and in all while a room is made.
-        workers: processes that make it.
         format: of the folder; by default told by its files.
 
     Raises:
         MissingError: there is no such folder, room or scene.
     """
-    text = str(sequence)
-    folder = Path(text)
+    text, folder = str(sequence), Path(sequence)
     if text not in ROOMS and text not in DATASET_SCENES:
         if folder.is_dir():
             return Scene(folder.resolve().name, folder.resolve(), format)
-        names = [*ROOMS, *DATASET_SCENES]
         raise MissingError(
             f"no sequence {text!r}: it is neither a folder nor a known scene; "
-            f"{nearest_name(text, names)}"
+            f"{nearest_name(text, [*ROOMS, *DATASET_SCENES])}"
         )
-    if text in ROOMS and (config.synthetic or text not in DATASET_SCENES):
-        folder = room_folder(text, config)
-        if not folder.is_dir():
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            # Another command may want the same room: it waits, and finds it made.
-            with FileLock(folder.with_suffix(".lock")):
-                if not folder.is_dir():
-                    _make_room(text, folder, config, workers, progress)
-        return Scene(text, folder)
+    if text in ROOMS and (preset.scenes.synthetic or text not in DATASET_SCENES):
+        return Scene(text, _made_room(text, preset.scenes))
     folder = data_folder() / text
     if not folder.is_dir():
         raise MissingError(
@@ -125,15 +89,64 @@ def find_scene(
     return Scene(text, folder, format)
 
 
-def _make_room(
-    name: str,
-    folder: Path,
-    config: ScenesConfig,
-    workers: int,
-    progress: Callable[[int, int], None] | None,
-) -> None:
-    """Make a room of the cache; what a killed attempt has left is removed first."""
-    for unfinished in folder.parent.glob(f".{folder.name}.*.unfinished"):
-        shutil.rmtree(unfinished, ignore_errors=True)
-    height = config.width * 3 // 4
-    make_room(name, folder, config.n_frames, config.width, height, config.seed, workers, progress)
+def open_scenes(preset: Preset) -> list[Scene]:
+    """The preset's scenes; synthetic rooms that are not there are made.
+
+    Scenes that lack a folder, or whose folder is damaged, are named at once, and the others
+    returned.
+
+    Raises:
+        ConfigError: no name is given, or one is given twice or unknown.
+        MissingError, DataError: no scene is there, or none is whole; that of the first.
+    """
+    names = preset.scenes.names
+    _check_names(names)
+    scenes, missing = [], {}
+    for name in names:
+        try:
+            scene = open_scene(name, preset)
+            scene.count(":")  # so that a damaged folder is told here
+            scenes.append(scene)
+        except (MissingError, DataError) as error:
+            missing[name] = error
+    if not scenes:
+        raise missing[names[0]]
+    if missing:
+        tell(f"missing, and left out: {', '.join(missing)} ({next(iter(missing.values()))})")
+    return scenes
+
+
+def _check_names(names: tuple[str, ...]) -> None:
+    known = [*ROOMS, *DATASET_SCENES]
+    if not names:
+        raise ConfigError(f"no scene is named: give some of {', '.join(known)}")
+    for name in names:
+        if name not in known and not Path(name).is_dir():
+            raise ConfigError(
+                f"unknown scene {name!r}, and no such folder: {nearest_name(name, known)}"
+            )
+    if len({Path(name).resolve().name for name in names}) < len(names):
+        raise ConfigError(f"scenes {', '.join(names)}: two have one name; give each once")
+
+
+def _made_room(name: str, config: ScenesConfig) -> Path:
+    """The folder of a room of this size, length and seed, made if it is not there."""
+    size = f"{config.n_frames}x{config.width}"
+    folder = runs_folder() / "rooms" / f"{name}-{size}-seed{config.seed}" / name
+    if folder.is_dir():
+        return folder
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    # Another command may want the same room: it waits, and finds it made.
+    with FileLock(folder.with_suffix(".lock")):
+        if folder.is_dir():
+            return folder
+        for unfinished in folder.parent.glob(f".{name}.*.unfinished"):  # of a killed attempt
+            shutil.rmtree(unfinished, ignore_errors=True)
+        workers = 1 if config.width < _SMALL_WIDTH else os.cpu_count() or 1
+        height = config.width * 3 // 4
+        with ProgressBar(f"room {name}", config.n_frames) as bar:
+            make_room(
+                name, folder, config.n_frames, config.width, height, config.seed, workers,
+                lambda done, total: bar.move_to(done),
+            )  # fmt: skip
+    return folder

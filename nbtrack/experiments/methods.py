@@ -1,0 +1,64 @@
+"""Methods: a tracker in a field, with settings of its own. Each is a row of a table."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from nbtrack.core.errors import ConfigError, nearest_name
+from nbtrack.tracking import check_pair, paper_steps, tracker_class
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of Table I or III."""
+
+    label: str
+    field: str
+    tracker: str
+    settings: tuple[str, ...] = ()  # key=value, over those of the preset
+
+    def paper_steps(self, rate_hz: float | int) -> float:
+        """Steps a frame on the paper's hardware: of VR for what renders, else of SDF."""
+        return paper_steps("vr" if tracker_class(self.tracker).renders else "sdf", rate_hz)
+
+
+METHODS = {
+    "vr": Method("iMAP with VR", "imap", "vr"),
+    "sdf": Method("NeuS with SDF", "neus", "sdf"),
+    "vr_neus": Method("NeuS with VR", "neus", "vr"),
+    "sdf_plus": Method("NeuS+ with SDF (Adam)", "neus_plus", "sdf"),
+    "lm": Method("NeuS+ with SDF (LM)", "neus_plus", "lm"),
+    "baked": Method("NeuS+ baked (LM)", "neus_plus", "lm", ("tracking.lm.bake_voxel=0.04",)),
+    "icp": Method("ICP", "points", "icp"),
+}
+"""By name. A method of your own joins by `METHODS["mine"] = Method(...)`."""
+
+TABLE_1 = ("vr", "sdf")
+"""The rows of the paper's Table I."""
+TABLE_3 = ("vr", "vr_neus", "sdf", "sdf_plus", "lm", "baked", "icp")
+"""The paper's methods beside those that go beyond it."""
+RATES_3_HZ = (30.0, 10.0, 5.0, 2.0)
+"""The rates of Table III: the paper's, and that of the camera itself."""
+
+
+def find_methods(methods: Sequence[str | Method]) -> list[Method]:
+    """Methods by their names; those that are one already stay.
+
+    Raises:
+        ConfigError: a name is unknown, or its field and tracker do not go together.
+    """
+    found = []
+    for method in dict.fromkeys(methods):
+        if isinstance(method, str) and method not in METHODS:
+            raise ConfigError(f"unknown method {method!r}: {nearest_name(method, [*METHODS])}")
+        found.append(METHODS[method] if isinstance(method, str) else method)
+        check_pair(found[-1].tracker, found[-1].field)
+    return found
+
+
+def tracker_label(tracker: str) -> str:
+    """A tracker's name in Table II.
+
+    >>> tracker_label("vr")
+    'VR'
+    """
+    return tracker.upper().replace("_", " ")

@@ -1,0 +1,174 @@
+"""Presets: everything that a run depends on, apart from the data and the seed.
+
+Precedence: preset < TOML file (`NBTRACK_CONFIG` or `--config`) < `NBTRACK_SET` < `--set key=value`.
+"""
+
+import dataclasses
+import os
+import shlex
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from nbtrack.core.errors import ConfigError, MissingError, nearest_name
+from nbtrack.core.settings import may_be_zero, not_a_setting, with_settings, with_values
+from nbtrack.fields import (
+    FIELDS,
+    MappingSettings,
+    NetworkSettings,
+    NeusMapping,
+    NeusPlusMapping,
+    PointMapping,
+    field_class,
+)
+from nbtrack.synthetic import REPORTED_ROOMS
+from nbtrack.tables import PAPER_SCENE_LABELS
+from nbtrack.tracking import TRACKERS, SdfSettings, TrackerSettings, VrSettings, tracker_class
+
+
+@dataclass(frozen=True)
+class ScenesConfig:
+    """Which sequences a preset maps and tracks, and how synthetic rooms are made."""
+
+    names: tuple[str, ...] = ()  # synthetic rooms, or folders below the data folder
+    synthetic: bool = True  # made by this package; otherwise read from the data folder
+    n_frames: int = 300
+    width: int = 640  # pixels; the height is three quarters of it
+    track_frames: str = ":"  # the Python slice of frames that is tracked
+    seed: int = may_be_zero(0)
+
+
+@dataclass(frozen=True)
+class TablesConfig:
+    """What the two tables ask of the cells."""
+
+    rates_hz: tuple[float, ...] = (10.0, 5.0, 2.0)  # paper, Table I
+    budgets_ms: tuple[float, ...] = (50.0, 100.0, 500.0)  # paper, Table II
+    # Pixels n of each tracker in Table II (paper); others take those of the SDF tracker.
+    pixels: dict[str, tuple[int, ...]] = field(
+        default_factory=lambda: {"vr": (128, 512, 1024), "sdf": (2048, 4096, 16384)}
+    )
+
+    def pixels_of(self, tracker_name: str) -> tuple[int, ...]:
+        """Pixel counts of a tracker's rows in Table II."""
+        return self.pixels.get(tracker_name, self.pixels["sdf"])
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Everything that a run depends on, apart from the data and the seed."""
+
+    name: str = not_a_setting()
+    # A density gains from finer detail; a distance must start smooth, or ripples satisfy the
+    # eikonal term: at 4 rad/m in place of 2.5 it was off by 19 cm in free space, not by 5.
+    network: dict[str, NetworkSettings] = field(
+        default_factory=lambda: {
+            "imap": NetworkSettings(embedding_sigma=4.0),
+            "neus": NetworkSettings(),
+        }
+    )
+    mapping: dict[str, MappingSettings | PointMapping] = field(
+        default_factory=lambda: {name: known.Settings() for name, known in FIELDS.items()}
+    )
+    tracking: dict[str, TrackerSettings] = field(
+        default_factory=lambda: {name: known.Settings() for name, known in TRACKERS.items()}
+    )
+    scenes: ScenesConfig = ScenesConfig()
+    tables: TablesConfig = TablesConfig()
+
+    def network_of(self, field_name: str) -> NetworkSettings:
+        """Network of a field; a field without its own takes that of NeuS."""
+        return self.network.get(field_name, self.network["neus"])
+
+    def mapping_of(self, field_name: str) -> MappingSettings | PointMapping:
+        """Mapping settings of a field; a field without its own takes what it shares with NeuS."""
+        own = self.mapping.get(field_name)
+        return own or _shared(field_class(field_name).Settings, self.mapping["neus"])
+
+    def tracking_of(self, tracker_name: str) -> TrackerSettings:
+        """Settings of a tracker; one without its own takes what it shares with SDF tracking."""
+        own = self.tracking.get(tracker_name)
+        return own or _shared(tracker_class(tracker_name).Settings, self.tracking["sdf"])
+
+
+def _shared(settings: type, other: Any) -> Any:
+    names = [f.name for f in dataclasses.fields(settings) if hasattr(other, f.name)]
+    return settings(**{name: getattr(other, name) for name in names})
+
+
+# Pixel counts of `smoke` are the paper's divided by eight: the ratio of VR to SDF stays.
+_SMOKE = Preset(
+    "smoke",
+    network={
+        "imap": NetworkSettings(width=96, embedding_sigma=4.0),
+        "neus": NetworkSettings(width=96),
+    },
+    mapping={
+        "imap": MappingSettings(1200, n_rays=96, learning_rate=3e-3),
+        "neus": NeusMapping(2000, n_rays=128, n_stratified=16, n_surface=8, learning_rate=3e-3),
+        "neus_plus": NeusPlusMapping(
+            1400, n_rays=96, n_stratified=8, n_surface=8, n_surface_points=1024, learning_rate=3e-3
+        ),
+        "points": PointMapping(),
+    },
+    tracking={
+        **{name: known.Settings() for name, known in TRACKERS.items()},
+        "vr": VrSettings(n_pixels=64),
+        "sdf": SdfSettings(n_pixels=512),
+    },
+    scenes=ScenesConfig(("living_room", "office"), n_frames=240, width=96, track_frames=":120"),
+    tables=TablesConfig(pixels={"vr": (16, 64, 128), "sdf": (256, 512, 2048)}),
+)
+_SYNTHETIC = Preset("synthetic", scenes=ScenesConfig(REPORTED_ROOMS))
+_PAPER = Preset("paper", scenes=ScenesConfig(tuple(PAPER_SCENE_LABELS), synthetic=False))
+PRESETS = {preset.name: preset for preset in (_SMOKE, _SYNTHETIC, _PAPER)}
+
+
+def load_preset(
+    name: str | None = None, config_file: Path | None = None, settings: Sequence[str] = ()
+) -> Preset:
+    """The preset with all overrides applied.
+
+    Args:
+        name: a preset's name; by default `NBTRACK_PRESET`, else `smoke`.
+        config_file: TOML file of overrides; by default the one `NBTRACK_CONFIG` names, if any.
+        settings: `key=value` texts, applied last, after those in `NBTRACK_SET`.
+
+    Raises:
+        ConfigError: an unknown preset or key, or a value of the wrong type.
+        MissingError: the file does not exist.
+    """
+    name = name or os.environ.get("NBTRACK_PRESET", "smoke")
+    if name not in PRESETS:
+        raise ConfigError(f"unknown preset {name!r}: {nearest_name(name, list(PRESETS))}")
+    preset = PRESETS[name]
+    preset = replace(  # fields and trackers that somebody has added have settings too
+        preset,
+        mapping={known: preset.mapping_of(known) for known in FIELDS},
+        tracking={known: preset.tracking_of(known) for known in TRACKERS},
+    )
+    file_name = config_file or os.environ.get("NBTRACK_CONFIG")
+    if file_name:
+        preset = with_values(preset, _read_toml(Path(file_name)))
+    return with_settings(preset, *_environment_settings(), *settings)
+
+
+def _environment_settings() -> list[str]:
+    text = os.environ.get("NBTRACK_SET", "")
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise ConfigError(
+            f"NBTRACK_SET={text!r} cannot be split ({error}): quote each setting as in a shell"
+        ) from None
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise MissingError(f"no config file {path}: give a TOML file of settings")
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is no TOML: {error}; write lines like 'width = 128'") from None
