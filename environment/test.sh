@@ -12,6 +12,7 @@ export NBTRACK_RUNS
 unset NBTRACK_PRESET NBTRACK_CONFIG NBTRACK_SET NBTRACK_DATA
 
 step "Style" "$venv_python" -m ruff check
+step "Formatting" "$venv_python" -m ruff format --check --quiet
 # One process a core with one thread each: tests are too small to share.
 step "Unit tests" env OMP_NUM_THREADS=1 "$venv_python" -m pytest -q -n auto --dist loadfile
 step "Notebooks against their stored outputs" "$venv_python" -m pytest --nbval notebooks -q
