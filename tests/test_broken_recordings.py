@@ -1,7 +1,6 @@
-"""Broken recordings of every format: one clear line and exit status 2, never a traceback."""
+"""Broken recordings of every format: one clear line, never a traceback, a guess or chatter."""
 
 import json
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,200 +11,195 @@ import pytest
 from recordings import WRITERS, write_recording
 
 from nbtrack.cli import main
+from nbtrack.core.errors import NbtrackError
+from nbtrack.data.sequence import read_sequence
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 Damage = Callable[[Path], object]
 
 
+def changed(pattern: str, change: Callable[[bytes], bytes]) -> Damage:
+    """Change the content of all files that a pattern names."""
+    return lambda folder: [p.write_bytes(change(p.read_bytes())) for p in folder.glob(pattern)]
+
+
 def text(name: str, content: str | bytes) -> Damage:
-    """Put this into a file."""
     raw = content.encode() if isinstance(content, str) else content
     return lambda folder: (folder / name).write_bytes(raw)
 
 
-def without(name: str) -> Damage:
-    return lambda folder: (folder / name).unlink()
+def without(pattern: str) -> Damage:
+    return lambda folder: [path.unlink() for path in list(folder.glob(pattern))]
+
+
+def renamed(name: str, to: str) -> Damage:
+    return lambda folder: (folder / name).rename(folder / to)
 
 
 def cut(name: str) -> Damage:
     """Only the first half is left."""
-
-    def damage(folder: Path) -> None:
-        content = (folder / name).read_bytes()
-        (folder / name).write_bytes(content[: len(content) // 2])
-
-    return damage
+    return changed(name, lambda content: content[: len(content) // 2])
 
 
 def image(name: str, pixels: np.ndarray) -> Damage:
     return lambda folder: cv2.imwrite(str(folder / name), pixels)
 
 
-def line(name: str, number: int, content: str | None) -> Damage:
-    """Replace a line, counted from 0, or drop it."""
+def line(name: str, number: int, *contents: str) -> Damage:
+    """Replace a line, counted from 0, by others or by none."""
 
-    def damage(folder: Path) -> None:
-        lines = (folder / name).read_text().splitlines()
-        lines[number : number + 1] = [] if content is None else [content]
-        (folder / name).write_text("\n".join(lines) + "\n")
+    def change(content: bytes) -> bytes:
+        lines = content.decode().splitlines()
+        return "\n".join([*lines[:number], *contents, *lines[number + 1 :], ""]).encode()
 
-    return damage
+    return changed(name, change)
 
 
-def camera(**values: object) -> Damage:
-    """Change `intrinsics.json`; None drops a key."""
+def camera(name: str = "intrinsics.json", **values: object) -> Damage:
+    """Change values of a JSON file's object, or of its `camera`; None drops a key."""
 
-    def damage(folder: Path) -> None:
-        content = json.loads((folder / "intrinsics.json").read_text()) | values
-        kept = {key: value for key, value in content.items() if value is not None}
-        (folder / "intrinsics.json").write_text(json.dumps(kept))
+    def change(content: bytes) -> bytes:
+        camera = json.loads(content)
+        camera = {k: v for k, v in (camera.get("camera", camera) | values).items() if v is not None}
+        return json.dumps({"camera": camera}).encode()
 
-    return damage
+    return changed(name, change)
 
 
 def toml(content: str) -> Damage:
     return text("sequence.toml", content)
 
 
+BINARY = bytes(range(256))
 EIGHT_BIT, SMALL = np.ones((36, 48), np.uint8), np.ones((18, 24), np.uint16)
 THREE_CHANNELS = np.ones((36, 48, 3), np.uint16)
 SKEWED = "1 0.5 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
 FAR = "1 0 0 1e300 0 1 0 0 0 0 1 0 0 0 0 1"
-NOT_RIGID = "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
-TUM_ROW = "1305031102.675 0 0 0 0 0 0"
+JPEG = cv2.imencode(".jpg", THREE_CHANNELS.astype(np.uint8))[1].tobytes()
+ROW = "1305031102.675 0 0 0 0 0 0"
+K = "intrinsic/intrinsic_depth.txt"
+DEPTH_1 = "depth_filtered/depth1.png"
+FLIPPED = changed(DEPTH_1, lambda c: c[:99] + bytes([c[99] ^ 1]) + c[100:])
+MIDDLE_CUT_OUT = changed("images/img1.png", lambda c: c[: len(c) // 2] + c[-12:])
 
-BROKEN: dict[str, dict[str, tuple[Damage, str]]] = {
+# What the message must say; None where the recording can be read all the same.
+BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
     "tum": {
-        "no list": (without("rgb.txt"), "no file .*rgb.txt: the TUM layout needs it"),
+        "no list": (without("rgb.txt"), "no images in .*TUM RGB-D needs rgb.txt"),
         "empty list": (text("depth.txt", "# nothing\n"), "depth.txt is empty: every line holds"),
         "no timestamp": (line("rgb.txt", 1, "rgb/a.png"), "rgb.txt line 2 is 'rgb/a.png': every"),
         "timestamp NaN": (line("rgb.txt", 1, "nan rgb/a.png"), "line 2 is 'nan rgb/a.png'"),
-        "file not there": (line("depth.txt", 2, "1.0 depth/no.png"), "no file .*no.png.* line 3"),
-        "binary list": (text("rgb.txt", bytes(range(256))), "rgb.txt line 1 is "),
+        "file not there": (line("depth.txt", 2, "1.0 depth/no.png"), "no file .*no.png.* named in"),
         "other clock": (text("depth.txt", "1.0 depth/odd.png\n"), "no times within 0.02 s"),
-        "poses of another clock": (
-            text("groundtruth.txt", "5 0 0 0 0 0 0 1\n"), "no pose within 0.02 s of an image"
-        ),
-        "7 columns": (line("groundtruth.txt", 3, TUM_ROW), "line 4 is '1305031102.675 0"),
-        "zero quaternion": (
-            line("groundtruth.txt", 3, TUM_ROW + " 0"), "pose 1 has a quaternion of norm 0:"
-        ),
-        "NaN timestamp": (line("groundtruth.txt", 3, "nan 0 0 0 0 0 0 1"), "no finite timestamp"),
-        "no calibration": (without("calibration.txt"), "no calibration for .*freiburg1"),
+        "poses of another clock": (text("groundtruth.txt", "5 0 0 0 0 0 0 1"), "no pose within"),
+        "7 columns": (line("groundtruth.txt", 3, ROW), "line 4 is '1305031102.675 0"),
+        "zero quaternion": (line("groundtruth.txt", 3, ROW + " 0"), "pose 1 .* norm 0:"),
+        "NaN timestamp": (line("groundtruth.txt", 3, "nan 0 0 0 0 0 0 1"), "needs finite timest"),
+        "no calibration": (without("calibration.txt"), "no calibration in .*freiburg1"),
         "5 numbers": (text("calibration.txt", "1 2 3 4 5"), "calibration.txt line 1 is '1 2 3 4"),
         "cut image": (cut("rgb/odd.png"), None),  # not used, hence no error
         "cut depth": (cut("depth/1305031102.186000.png"), "damaged or not a complete PNG"),
     },
     "replica": {
-        "no trajectory": (without("traj.txt"), "no file .*traj.txt: the Replica layout needs it"),
+        "no trajectory": (without("traj.txt"), "no poses in .*Replica .* needs traj.txt"),
         "15 numbers": (line("traj.txt", 2, "1 " * 15), "traj.txt line 3 is '1 1"),
-        "a word": (line("traj.txt", 0, "one " * 16), "traj.txt line 1 is 'one one"),
         "no rotation": (line("traj.txt", 1, SKEWED), "traj.txt frame 1 is no rigid transform"),
-        "out of this world": (line("traj.txt", 1, FAR), "frame 1 lies 1e\\+300 m from the origin"),
-        "a pose less": (line("traj.txt", 1, None), "traj.txt has 5 poses but there are 6 images"),
-        "all NaN": (text("traj.txt", ("nan " * 16 + "\n") * 6), "poses in .*traj.txt are NaN"),
-        "no camera": (without("../cam_params.json"), "no file .*cam_params.json"),
-        "camera is a list": (text("../cam_params.json", "[1, 2]"), "holds a list: it must be an"),
+        "out of this world": (line("traj.txt", 1, FAR), "frame 1 is no .*1e.300.* t up to 1e.07"),
+        "a pose less": (line("traj.txt", 1), "traj.txt has 5 poses but there are 6 images"),
+        "no camera": (without("../cam_params.json"), "no calibration in .*cam_params.json"),
+        "camera is a list": (text("../cam_params.json", "[1, 2]"), r"holds \[1, 2\]: it must be"),
         "camera is no JSON": (text("../cam_params.json", "{w: 1200}"), "is no JSON"),
         "deep JSON": (text("../cam_params.json", "[" * 100_000), "is no JSON"),
-        "other scale": (
-            lambda f: text("../cam_params.json", json.dumps({"camera": json.loads(
-                (f / "../cam_params.json").read_text())["camera"] | {"scale": 1000.0}}))(f),
-            "scale is '1000.0' but 6553.5 depth values a metre are in use",
-        ),
-        "depth is a JPEG": (
-            image("results/depth000002.png", THREE_CHANNELS), "depth000002.png is uint16 of shape"
-        ),
-        "an image less": (without("results/frame000003.jpg"), "has 5 images but 6 depth maps"),
-        "cut JPEG": (cut("results/frame000003.jpg"), "frame000003.jpg is damaged"),
+        "other scale": (camera("../cam_params.json", scale=1000.0), "'1000.0' but 6553.5 depth"),
+        "depth is a JPEG": (image("results/depth000002.png", THREE_CHANNELS), "is uint16 of"),
+        "an image less": (without("results/frame000003.jpg"), r"has 5 images but .* 6 .png.* \[3"),
     },
     "7scenes": {
-        "pose missing": (without("frame-000002.pose.txt"), "has 6 images but 5 poses"),
-        "no poses": (
-            lambda f: [p.unlink() for p in f.glob("*.pose.txt")], "no files in .*needs files like"
-        ),
-        "3 rows": (line("frame-000001.pose.txt", 3, None), None),  # 3x4: as good as 4x4
+        "pose missing": (without("frame-000002.pose.txt"), r"6 images but .* 5 .txt .*\[2\]"),
+        "no poses": (without("*.pose.txt"), r"no file .*pose.txt \(.txt\): "),
+        "3 rows": (line("frame-000001.pose.txt", 3), None),  # 3x4: as good as 4x4
         "2 rows": (text("frame-000001.pose.txt", "1 0 0 0\n0 1 0 0\n"), "has 2 rows: it needs"),
-        "no rotation": (text("frame-000001.pose.txt", NOT_RIGID), "frame 1 is no rigid transform"),
-        "8-bit depth": (image("frame-000001.depth.png", EIGHT_BIT), "depth.png is uint8"),
-        "small depth": (image("frame-000004.depth.png", SMALL), "depth.png is 24x18 but"),
-        "empty image": (text("frame-000000.color.png", b""), r"not a complete PNG or JPEG \(0"),
-        "binary pose": (text("frame-000001.pose.txt", bytes(range(256))), "pose.txt line 1 is"),
+        "small depth": (image("frame-000004.depth.png", SMALL), r"depth.png is .*\(18, 24\): it"),
     },
     "scannet": {
-        "no intrinsics": (without("intrinsic/intrinsic_depth.txt"), "no file .*intrinsic_depth"),
-        "zero focal": (
-            text("intrinsic/intrinsic_depth.txt", "0 0 1 0\n0 0 1 0\n0 0 1 0\n0 0 0 1\n"),
-            "gives focal lengths 0 and 0: they must be positive",
-        ),
-        "NaN focal": (
-            text("intrinsic/intrinsic_depth.txt", "nan 0 1\n0 5 1\n0 0 1\n"), "focal lengths nan"
-        ),
-        "skew": (
-            text("intrinsic/intrinsic_depth.txt", "5 1 1\n0 5 1\n0 0 1\n"), "is no camera matrix"
-        ),
-        "infinite centre": (
-            text("intrinsic/intrinsic_depth.txt", "5 0 inf\n0 5 1\n0 0 1\n"), "must be finite"
-        ),
-        "odd numbers": (
-            lambda f: (f / "depth/5.png").rename(f / "depth/9.png"), "frame numbers in the names"
-        ),
-        "all poses lost": (
-            lambda f: [p.write_text(4 * "-inf -inf -inf -inf\n") for p in (f / "pose").iterdir()],
-            "poses in .*pose are NaN",
-        ),
-        "empty pose": (text("pose/3.txt", ""), "3.txt is empty: every line holds four numbers"),
+        "no intrinsics": (without("intrinsic/*"), "no calibration in .*intrinsic_depth"),
+        "zero focal": (text(K, "0 0 1 0\n0 0 1 0\n0 0 1 0\n0 0 0 1\n"), r"camera matrix \[\[0.0"),
+        "one NaN": (text(K, "5 nan 5 5"), r"camera matrix .*\[0.0, nan, 5.0\]"),
+        "NaN focal": (text(K, "nan 0 1\n0 5 1\n0 0 1\n"), r"camera matrix \[\[nan"),
+        "skew": (text(K, "5 1 1\n0 5 1\n0 0 1\n"), r"camera matrix \[\[5.0, 1.0, 1.0\]"),
+        "infinite centre": (text(K, "5 0 inf\n0 5 1\n0 0 1\n"), r"camera matrix .*, inf\]"),
+        "odd numbers": (renamed("depth/5.png", "depth/9.png"), r"frame numbers .*\[5, 9\]"),
+        "all poses lost": (changed("pose/*", lambda _: 4 * b"-inf -inf -inf -inf\n"), "no pose in"),
+        "empty pose": (text("pose/3.txt", ""), "3.txt is empty: every line holds"),
         "pose of UTF-16": (text("pose/3.txt", "1 0 0 0\n".encode("utf-16")), "3.txt line 1 is"),
     },
     "plain": {
-        "unknown key": (toml("depth_scal = 1000\n"), "unknown key 'depth_scal': did you mean 'dep"),
+        "unknown key": (toml("depth_scal = 1000\n"), "unknown config key 'depth_scal': did"),
         "no TOML": (toml("depth_scale 1000\n"), "sequence.toml is no TOML"),
-        "scale zero": (toml("depth_scale = 0\n"), "depth_scale = '0': it must be a positive"),
-        "scale text": (toml('depth_scale = "mm"\n'), "depth_scale = 'mm': it must be a positive"),
-        "scale true": (toml("depth_scale = true\n"), "depth_scale = 'True': it must be a positive"),
-        "scale NaN": (toml("depth_scale = nan\n"), "depth_scale = 'nan': it must be a positive"),
-        "scale huge": (toml("depth_scale = 1" + "0" * 400), "must be a positive"),
+        "scale zero": (toml("depth_scale = 0\n"), "depth_scale = 0.0: write 1e-08 to"),
+        "scale text": (toml('depth_scale = "mm"\n'), "depth_scale = 'mm' is of type str"),
+        "scale true": (toml("depth_scale = true\n"), "depth_scale = True is of type bool"),
+        "scale NaN": (toml("depth_scale = nan\n"), "depth_scale = nan: it must be 0 or more"),
+        "scale huge": (toml("depth_scale = 1" + "0" * 400), "is of type int: it must be float"),
         "axes": (toml('camera_axes = "up up up"\n'), "camera_axes = 'up up up': write 'opencv'"),
-        "axes a list": (toml("camera_axes = [1]\n"), "camera_axes = '': write 'opencv'"),
         "direction": (toml('poses = "c2w"\n'), "poses = 'c2w': write 'camera-to-world' or 'world"),
         "order": (toml('quaternion = "wxzy"\n'), "quaternion = 'wxzy': write 'xyzw' or 'wxyz'"),
-        "no_depth": (toml("no_depth = 65536\n"), "no_depth = '65536': it must be a whole number"),
+        "no_depth": (toml("no_depth = 65536\n"), "no_depth = 65536: write 0 to 65535"),
         "format": (toml('format = "tumm"\n'), "unknown format 'tumm': did you mean 'tum'"),
-        "format a number": (toml("format = 7\n"), "format = '7': it must be a format's name"),
-        "wrong scale": (toml("depth_scale = 1\n"), None),  # diagnosed, not refused
-        "no camera": (without("intrinsics.json"), "no file .*intrinsics.json: a plain recording"),
-        "no fx": (camera(fx=None), "intrinsics.json: fx is 'None': it must be a number"),
-        "fx negative": (camera(fx=-5), "gives focal lengths -5 and"),
-        "fx a word": (camera(fx="525"), "fx is '525': it must be a number"),
-        "fx NaN": (camera(fx=float("nan")), "fx is 'nan': it must be a number"),
-        "fx huge": (camera(fx=10**400), "it must be a number"),
+        "wrong scale": (toml("depth_scale = 1\n"), "1 depth values a metre: at most 65.535 m"),
+        "no camera": (without("intrinsics.json"), "no calibration in .*plain folder needs"),
+        "no fx": (camera(fx=None), "intrinsics.json: fx is 'None': write 1 finite"),
+        "fx negative": (camera(fx=-5), r"gives the camera matrix \[\[-5.0"),
+        "fx a word": (camera(fx="525"), "fx is '525': write 1 finite"),
+        "fx NaN": (camera(fx=float("nan")), "fx is 'nan': write 1 finite"),
+        "fx huge": (camera(fx=10**400), "fx is '1000.*: write 1 finite"),
         "width broken": (camera(width=47.5), "gives a size of 47.5 x 36"),
+        "no height": (camera(height=None), "height is 'None': write 1 finite"),
         "proportions": (camera(height=48), "is 48x36 but .* is for 48x48"),
-        "distortion": (camera(distortion=[1, 2, 3]), "distortion has 3 numbers: write OpenCV's"),
-        "distortion a word": (camera(distortion="no"), "distortion is 'no': write a list"),
-        "matrix of eight": (camera(intrinsic_matrix=[1] * 8), "intrinsic_matrix has 8 numbers"),
+        "distortion": (camera(distortion=[1, 2, 3]), r"distortion is '\[1, 2, 3\]': write 0 or 4"),
+        "matrix of eight": (camera(intrinsic_matrix=[1] * 8), "intrinsic_matrix is .*: write 9"),
         "no poses": (without("trajectory.txt"), "no poses in .*trajectory.txt or poses.txt"),
         "two pose files": (text("poses.txt", "1 2 3"), "has trajectory.txt and poses.txt: choose"),
         "9 columns": (text("trajectory.txt", "1 2 3 4 5 6 7 8 9\n"), "trajectory.txt line 1 is"),
-        "a line less": (text("trajectory.txt", "0.5001 0 0 0 0 0 0 1\n"), "has 1 poses but"),
-        "order of columns": (
-            text("trajectory.txt", "0 0 0 0 1 2 3 4\n" * 6), "quaternion of norm 5.48: columns"
-        ),
+        "a line less": (text("trajectory.txt", "0.5001 0 0 0 0 0 0 1\n"), "no pose within 0.001"),
+        "order of columns": (text("trajectory.txt", "0 0 0 0 1 2 3 4\n" * 6), "norm 5.48: columns"),
         "rows of two kinds": (
             text("trajectory.txt", "0 0 0 0 0 0 0 1\n" * 5 + "0 0 0 0 0 0 1\n"), "line 6 is '0 0"
         ),
-        "no colour": (
-            lambda f: [p.unlink() for p in (f / "color").iterdir()], "no images in .*color"
-        ),
-        "an image of text": (text("color/000001.png", "hello"), "000001.png is damaged"),
-        "small colour": (image("color/000003.png", SMALL), "000003.png is 24x18 but"),
     },
     "neural_rgbd": {
         "ten numbers": (text("intrinsics.txt", "5 0 1 0 5 1 0 0 1 2\n"), "intrinsics.txt line 1"),
-        "two rows": (text("intrinsics.txt", "5 0 1\n0 5 1\n"), "intrinsics.txt holds 2x3 numbers"),
-        "tiny focal": (text("focal.txt", "1e-300"), "focal.txt holds '1e-300': it must be one"),
-        "binary poses": (text("poses.txt", bytes(range(256))), "poses.txt line 1 is"),
-        "binary focal": (text("focal.txt", bytes(range(256))), "focal.txt holds "),
+        "two rows": (text("intrinsics.txt", "5 0 1\n0 5 1\n"), "intrinsics.txt holds 6 numbers"),
+        "tiny focal": (text("focal.txt", "1e-300"), r"focal.txt gives .* matrix \[\[1e-300"),
+        "binary poses": (text("poses.txt", BINARY), "poses.txt line 1 is"),
+        "folder missing": (shutil.rmtree, "no folder .*recording"),
+        "no images": (without("images/*"), "no file .*recording/images"),
+        "no depth folder": (renamed("depth_filtered", "depths"), "no depth in .*recording"),
+        "3 images, 2 depths": (without("depth_filtered/depth2.png"), "6 images but .* has 5 .png"),
+        "other frame numbers": (renamed(DEPTH_1, "depth_filtered/depth7.png"), r"\[1, 7\]"),
+        "depth of another size": (image(DEPTH_1, SMALL), r"depth1.png is .* of shape \(18, 24\)"),
+        "8-bit depth": (image(DEPTH_1, EIGHT_BIT), "depth1.png is uint8"),
+        "colour of another size": (image("images/img2.png", SMALL), r"img2.png is .*\(18, 24, 3\)"),
+        "colour cut in half": (cut("images/img1.png"), "img1.png is damaged"),
+        "middle cut out": (MIDDLE_CUT_OUT, "img1.png is damaged"),
+        "one bit flipped": (FLIPPED, "depth1.png is damaged"),
+        "empty image": (text("images/img1.png", b""), r"img1.png .* PNG or JPEG \(0 bytes"),
+        "text instead of an image": (text("images/img0.png", "version 1"), "img0.png is damaged"),
+        "JPEG cut short": (changed("images/img1.png", lambda _: JPEG[:-20]), "img1.png is damaged"),
+        "focal missing": (without("focal.txt"), "no calibration in .*focal.txt"),
+        "focal empty": (text("focal.txt", " \n"), "focal.txt is empty"),
+        "focal negative": (text("focal.txt", "-525"), r"focal.txt gives the .*\[\[-525"),
+        "focal text": (text("focal.txt", "five hundred"), "focal.txt line 1 is 'five hundred'"),
+        "focal of two numbers": (text("focal.txt", "525\n525"), "focal.txt holds 2 numbers"),
+        "poses missing": (without("poses.txt"), "no poses in .*poses.txt"),
+        "poses empty": (text("poses.txt", ""), "poses.txt is empty"),
+        "row of 3 numbers": (line("poses.txt", 4, "1 0 0"), "poses.txt line 5"),
+        "row with a word": (line("poses.txt", 4, "1 0 O 0"), "poses.txt line 5"),
+        "a row too few": (line("poses.txt", 23), "poses.txt has 23 rows"),
+        "a pose too few": (changed("poses.txt", lambda c: c.split(b"\n", 4)[4]), "has 5 poses but"),
+        "all poses NaN": (text("poses.txt", 24 * "nan nan nan nan\n"), "no pose in .*not NaN"),
+        "scaled pose": (line("poses.txt", 0, "2 0 0 0"), "poses.txt frame 0 is no rigid"),
+        "mirrored pose": (line("poses.txt", 0, "-9 0 0 0"), "poses.txt frame 0 is no"),
     },
 }  # fmt: skip
 CASES = [(format, case) for format, cases in BROKEN.items() for case in cases]
@@ -217,48 +211,45 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Path], Pat
     base = tmp_path_factory.mktemp("whole")
     for format in WRITERS:
         write_recording(format, base / format / "recording")
-
-    def copy(format: str, to: Path) -> Path:
-        shutil.copytree(base / format, to)
-        return to / "recording"
-
-    return copy
+    return lambda format, to: shutil.copytree(base / format, to) / "recording"
 
 
 @pytest.mark.parametrize(("format", "case"), CASES)
 def test_one_line(whole, tmp_path: Path, capfd, format: str, case: str) -> None:
-    """Catches tracebacks, garbage read in silence, and messages without file, limit or advice."""
+    """Catches other errors, garbage read in silence, and messages without file, limit or advice."""
     damage, expected = BROKEN[format][case]
     folder = whole(format, tmp_path / "copy")
     damage(folder)
-    arguments = ["data", "check", str(folder)]
-    if not case.startswith("format"):
-        arguments += ["--format", format]
-    status = main(arguments)
-    error = capfd.readouterr().err
+    named = None if case.startswith("format") else format
     if expected is None:
-        assert (status, error) == (0, "")
-        return
-    assert status == 2
-    assert error.startswith("nbtrack: ")
-    assert error.count("\n") == 1
-    assert len(error) < 700
-    assert re.search(expected, error), error
-    assert ": " in error.removeprefix("nbtrack: ")  # what was found: what is allowed
+        read_sequence(folder, format=named)
+    else:
+        with pytest.raises(NbtrackError, match=expected) as caught:
+            read_sequence(folder, format=named)
+        message = str(caught.value)
+        assert "\n" not in message
+        assert len(message) < 690
+        assert ": " in message  # what was found: what is allowed
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("format", WRITERS)
-def test_windows_text(whole, tmp_path: Path, capfd, format: str) -> None:
-    """Catches a byte-order mark or CRLF line ends taken for part of the numbers."""
+def test_command(whole, tmp_path: Path, capfd, format: str) -> None:
+    """Catches tracebacks of the command, and Windows line ends or marks taken for numbers."""
     folder = whole(format, tmp_path / "copy")
     for path in [*folder.rglob("*.txt"), *folder.parent.rglob("*.json")]:
         content = path.read_text().replace("\n", "\r\n")
         path.write_bytes(b"\xef\xbb\xbf" + content.encode())
     assert main(["data", "check", str(folder)]) == 0
     assert capfd.readouterr().err == ""
+    toml("depth_scal = 1")(folder)
+    assert main(["data", "check", str(folder)]) == 2
+    error = capfd.readouterr().err
+    assert error.startswith("nbtrack: ")
+    assert error.count("\n") == 1
 
 
 def test_there_are_enough_cases() -> None:
-    """Catches cases that vanish: at least forty, and some for every format."""
-    assert len(CASES) >= 40
+    """Catches cases that vanish: at least a hundred, and some for every format."""
+    assert len(CASES) >= 100
     assert set(BROKEN) == set(WRITERS)

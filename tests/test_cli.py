@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from recordings import write_recording
 
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
@@ -34,9 +35,9 @@ def folder(tmp_path: Path) -> Path:
     path = tmp_path / "scene"
     with SequenceWriter(path, Intrinsics.from_focal(16, 12, 14.0), ("depth",)) as writer:
         for number in range(3):
-            color = np.full((12, 16, 3), 50 * number, np.uint8)
             pose = np.eye(4)
             pose[0, 3] = 0.01 * number
+            color = np.full((12, 16, 3), 50 * number, np.uint8)
             writer.add(color, {"depth": np.full((12, 16), 2000, np.uint16)}, pose)
     return path
 
@@ -52,9 +53,8 @@ def failure(capsys: pytest.CaptureFixture, *arguments: str) -> str:
 
 def track(path: Path | str, *more: str) -> list[str]:
     """A tracking command for a folder."""
-    return [
-        "track", str(path), "--field", "neus", "--tracker", "sdf", "--steps", "2", *TINY, *more
-    ]  # fmt: skip
+    words = ["track", str(path), "--field", "neus", "--tracker", "sdf", "--steps", "2"]
+    return [*words, *TINY, *more]
 
 
 def _cut_in_half(path: Path) -> None:
@@ -66,14 +66,20 @@ def _resize(path: Path) -> None:
 
 
 SPOILT = {
-    "no images": (lambda f: [p.unlink() for p in (f / "images").iterdir()], "no images in"),
-    "one depth less": (lambda f: (f / "depth/depth2.png").unlink(), "3 images but 2 depth maps"),
-    "other size": (lambda f: _resize(f / "depth/depth1.png"), "depth1.png is 8x6"),
+    "no images": (lambda f: [p.unlink() for p in (f / "images").iterdir()], "no file "),
+    "one depth less": (
+        lambda f: (f / "depth/depth2.png").unlink(),
+        "but depth/ has 2 .png",
+    ),
+    "other size": (
+        lambda f: _resize(f / "depth/depth1.png"),
+        "depth1.png is uint16 of shape (6",
+    ),
     "cut colour": (lambda f: _cut_in_half(f / "images/img1.png"), "img1.png"),
-    "empty focal": (lambda f: (f / "focal.txt").write_text(""), "focal.txt holds ''"),
-    "negative focal": (lambda f: (f / "focal.txt").write_text("-5"), "focal.txt holds '-5'"),
+    "empty focal": (lambda f: (f / "focal.txt").write_text(""), "focal.txt is empty"),
+    "negative focal": (lambda f: (f / "focal.txt").write_text("-5"), "camera matrix [[-5.0"),
     "short row": (lambda f: (f / "poses.txt").write_text("1 0 0\n" * 12), "line 1 is '1 0 0'"),
-    "nan poses": (lambda f: (f / "poses.txt").write_text("nan nan nan nan\n" * 12), "are NaN"),
+    "nan poses": (lambda f: (f / "poses.txt").write_text("nan nan nan nan\n" * 12), "not NaN"),
 }
 
 
@@ -86,104 +92,62 @@ def test_spoilt_folders(case: str, folder: Path, capsys: pytest.CaptureFixture) 
     assert message in failure(capsys, "data", "check", str(folder))
 
 
+ROOM = "track living_room --field neus"
 WRONG = {
-    "no folder": (track("does/not/exist"), "no sequence 'does/not/exist'"),
-    "room": (track("living_rom"), "did you mean 'living_room'"),
-    "preset": (["tables", "--preset", "smok"], "did you mean 'smoke'"),
-    "supervision": (
-        ["map", "living_room", "--field", "imap", "--supervision", "rendering+sdf"],
-        "'imap' knows no supervision 'rendering+sdf'",
-    ),
-    "baked and rendered": (
-        [
-            "track",
-            "living_room",
-            "--field",
-            "neus",
-            "--tracker",
-            "vr_neus",
-            "--steps",
-            "2",
-            "--bake",
-            "0.04",
-        ],
-        "renders, which a baked field cannot",
-    ),
-    "bake": (
-        [
-            "track",
-            "living_room",
-            "--field",
-            "neus",
-            "--tracker",
-            "lm",
-            "--steps",
-            "2",
-            "--bake",
-            "-1",
-        ],
-        "tracking.lm.bake_voxel = -1.0: it must be 0 or more",
-    ),
-    "field": (["map", "living_room", "--field", "imapp"], "did you mean 'imap'"),
-    "tracker": (
-        ["track", "living_room", "--field", "neus", "--tracker", "sfd", "--steps", "2"],
-        "did you mean 'sdf'",
-    ),
-    "pair": (
-        ["track", "living_room", "--field", "imap", "--tracker", "sdf", "--steps", "2"],
-        "needs --field neus",
-    ),
-    "key": (
-        ["map", "living_room", "--field", "neus", "--set", "mapping.neus.iteration=3"],
-        "did you mean 'mapping.neus.iterations'",
-    ),
-    "rate": (
-        ["track", "living_room", "--field", "neus", "--tracker", "sdf", "--rate", "0"],
-        "rate_hz is 0",
-    ),
-    "steps": (
-        ["track", "living_room", "--field", "neus", "--tracker", "sdf", "--steps", "-1"],
-        "steps_per_frame is -1",
-    ),
-    "no budget": (
-        ["track", "living_room", "--field", "neus", "--tracker", "sdf"],
-        "--rate --steps",
-    ),
-    "both budgets": (track("living_room", "--rate", "2"), "not allowed with"),
-    "budget": (["tables", "--budget", "time"], "unknown budget 'time'"),
-    "command": (["trak", "living_room"], "trak"),
-    "pixels": (track("living_room", "--pixels", "0"), "n_pixels"),
-}
+    "no folder": ("track does/not/exist --field neus --tracker sdf --steps 2",
+                  "no sequence 'does/not/exist'"),
+    "room": ("track living_rom --field neus --tracker sdf --steps 2", "did you mean 'living_room'"),
+    "preset": ("tables --preset smok", "did you mean 'smoke'"),
+    "supervision": ("map living_room --field imap --supervision rendering+sdf",
+                    "'imap' knows no supervision 'rendering+sdf'"),
+    "baked and rendered": (f"{ROOM} --tracker vr --steps 2 --bake 0.04", "a baked field cannot"),
+    "bake": (f"{ROOM} --tracker lm --steps 2 --bake -1",
+             "tracking.lm.bake_voxel = -1.0: it must be 0 or more"),
+    "field": ("map living_room --field imapp", "did you mean 'imap'"),
+    "tracker": (f"{ROOM} --tracker sfd --steps 2", "did you mean 'sdf'"),
+    "pair": ("track living_room --field imap --tracker sdf --steps 2", "take one of neus"),
+    "key": ("map living_room --field neus --set mapping.neus.iteration=3",
+            "did you mean 'mapping.neus.iterations'"),
+    "rate": (f"{ROOM} --tracker sdf --rate 0", "rate_hz is 0"),
+    "steps": (f"{ROOM} --tracker sdf --steps -1", "steps_per_frame is -1"),
+    "no budget": (f"{ROOM} --tracker sdf", "give one of the two"),
+    "both budgets": (f"{ROOM} --tracker sdf --steps 2 --rate 2", "give one of the two"),
+    "budget": ("tables --budget tick", "unknown 'tick'"),
+    "method": ("tables --trackers vr,sfd", "did you mean 'sdf'"),
+    "command": ("trak living_room", "did you mean 'track'"),
+    "action": ("data chekc room", "did you mean 'check'"),
+    "option": (f"{ROOM} --tracker sdf --stpes 2", "did you mean '--steps'"),
+    "pixels": (f"{ROOM} --tracker sdf --steps 2 --pixels 0", "n_pixels"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_wrong_arguments(case: str, capsys: pytest.CaptureFixture) -> None:
+def test_wrong_arguments(case: str, capsys: pytest.CaptureFixture, runs: Path) -> None:
     """Catches usage dumps, tracebacks and guesses; the nearest valid name is offered."""
     arguments, message = WRONG[case]
-    assert message in failure(capsys, *arguments)
+    assert message in failure(capsys, *arguments.split())
+    assert not runs.exists()
 
 
 def test_frames_that_select_nothing(folder: Path, capsys: pytest.CaptureFixture) -> None:
     """Catches an empty run that looks like a success."""
     for option in ("--frames", "--map-frames"):
-        assert "select nothing" in failure(capsys, *track(folder, option, "10:20"))
-    assert "is not a slice" in failure(capsys, *track(folder, "--frames", "abc"))
+        assert "select 0 of" in failure(capsys, *track(folder, option, "10:20"))
+    assert "is no slice" in failure(capsys, *track(folder, "--frames", "abc"))
 
 
-def test_track_writes_what_it_promises(
-    tmp_path: Path, capsys: pytest.CaptureFixture, runs: Path
-) -> None:
+def test_track_writes_what_it_promises(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Catches missing files and keys, and an error that the trajectories do not bear out."""
     out = tmp_path / "result"
     assert main(track("living_room", "--out", str(out), "--seed", "3")) == 0
     assert "ate rmse" in capsys.readouterr().out
     metrics = json.loads((out / "metrics.json").read_text())
-    for key in (
+    promised = (
         "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
         "lost_frames", "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
-        "device", "field", "tracker", "seed", "config",
-    ):  # fmt: skip
-        assert key in metrics, key
+        "device", "field", "tracker", "seed", "config", "command",
+    )  # fmt: skip
+    assert set(promised) <= set(metrics)
     assert (metrics["frames"], metrics["steps_per_frame"], metrics["seed"]) == (5, 2.0, 3)
     times, estimated = read_tum(out / "trajectory.txt")
     _, true = read_tum(out / "groundtruth.txt")
@@ -195,25 +159,20 @@ def test_track_writes_what_it_promises(
     assert len(rows) == 7
 
 
-def test_a_second_run_finds_the_map(capsys: pytest.CaptureFixture) -> None:
+def test_a_second_run_finds_the_map(capsys: pytest.CaptureFixture, runs: Path) -> None:
     """Catches maps that are made again although nothing changed, or not although it did."""
-    assert main(track("living_room")) == 0
-    capsys.readouterr()
-    assert main(track("living_room")) == 0
-    captured = capsys.readouterr()
-    assert "map found in" in captured.out + captured.err
-    assert main(track("living_room", "--set", "mapping.neus.n_rays=17")) == 0
-    captured = capsys.readouterr()
-    assert "no finished map" in captured.out + captured.err
+    said = []
+    for more in ([], [], ["--set", "mapping.neus.n_rays=17"]):
+        assert main(track("living_room", *more)) == 0
+        said.append(capsys.readouterr().out.splitlines()[0].partition(" in ")[0])
+    assert said == ["no finished map", "map found", "no finished map"]
 
 
 def test_map_prints_scores_and_place(capsys: pytest.CaptureFixture, runs: Path) -> None:
     """Catches a map whose quality or folder is not told."""
     assert main(["map", "living_room", "--field", "neus", *TINY]) == 0
     printed = capsys.readouterr().out
-    assert str(runs) in printed
-    assert "sdf near" in printed
-    assert "mesh" in printed
+    assert all(text in printed for text in (str(runs), "sdf near", "mesh"))
 
 
 def test_data_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -224,3 +183,18 @@ def test_data_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture) -> N
     assert main(["data", "check", str(out)]) == 0
     assert "12 frames" in capsys.readouterr().out
     assert "exists" in failure(capsys, *make)
+
+
+def test_tracking_command_reads_any_format(tmp_path: Path, monkeypatch, capsys) -> None:
+    """Catches a --format that the command line drops on its way to map and track."""
+    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
+    folder = write_recording("tum", tmp_path / "r")
+    command = [
+        "track", str(folder), "--field", "neus", "--tracker", "sdf", "--steps", "1",
+        "--set", "mapping.neus.iterations=2", "--set", "mapping.neus.n_rays=8",
+        "--set", "network.neus.width=16", "--set", "tracking.sdf.n_pixels=16",
+    ]  # fmt: skip
+    assert main([*command, "--format", "tum"]) == 0
+    capsys.readouterr()
+    assert main([*command, "--format", "plain"]) == 2
+    assert "no file " in capsys.readouterr().err

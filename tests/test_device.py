@@ -1,17 +1,10 @@
-"""Choosing a device, its memory, and keeping it to oneself."""
-
-import subprocess
-import sys
-import threading
+"""Choosing a device, its memory."""
 
 import pytest
 import torch
 
 from nbtrack.core.device import advise_on_memory, choose_device, has_room_for
-from nbtrack.core.device_lock import alone_on, beside_others_on
 from nbtrack.core.errors import ConfigError, OutOfMemory
-
-ELSEWHERE = torch.device("cpu", 7)  # a name that no run uses
 
 
 def test_a_named_device_is_taken_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,38 +37,3 @@ def test_other_errors_keep_their_name() -> None:
 def test_host_memory_is_not_asked_twice() -> None:
     """Catches images that are copied on a CPU, where they already are."""
     assert has_room_for(torch.device("cpu"), 2**60)
-
-
-HOLD = """
-import sys, torch
-from nbtrack.core.device_lock import beside_others_on
-with beside_others_on(torch.device("cpu", 7), print):
-    print("held", flush=True)
-    sys.stdin.read()
-"""
-
-
-def test_a_run_by_the_clock_waits_until_it_is_alone() -> None:
-    """Catches a clock that measures its neighbours, and a wait without a word."""
-    other = subprocess.Popen(
-        [sys.executable, "-c", HOLD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert other.stdout.readline() == "held\n"
-    said, order = [], []
-
-    def run_by_clock() -> None:
-        with alone_on(ELSEWHERE, said.append):
-            order.append("ran")
-
-    clock = threading.Thread(target=run_by_clock)
-    clock.start()
-    clock.join(timeout=0.5)
-    assert clock.is_alive()
-    assert said == ["by the clock: waits until no other run is on this device"]
-    order.append("other ended")
-    other.kill()  # however it ends, its hold ends with it
-    other.communicate()
-    clock.join(timeout=20)
-    assert order == ["other ended", "ran"]
-    with beside_others_on(ELSEWHERE, said.append):
-        assert len(said) == 1

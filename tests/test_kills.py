@@ -15,9 +15,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-import torch
 from tiny import TINY
 
+from nbtrack.mapping.files import MAP_FILE, read_map
 from nbtrack.tracking.trajectories import read_tum
 
 KILLS = int(os.environ.get("NBTRACK_TEST_KILLS", "3"))
@@ -27,10 +27,10 @@ KILLS = int(os.environ.get("NBTRACK_TEST_KILLS", "3"))
 _FORKER = """
 import json, os, signal, sys, time
 import torch._dynamo, trimesh  # else every child would import them by itself
-import nbtrack.experiments.commands, nbtrack.experiments.commands_tables
-import nbtrack.mapping.fit, nbtrack.tracking.sequence
+import nbtrack.experiments.commands_tables, nbtrack.experiments.runs
+import nbtrack.mapping.fit, nbtrack.tracking.trajectories
 from nbtrack.cli import main
-nbtrack.mapping.fit.CHECKPOINT_SECONDS = nbtrack.tracking.sequence.CHECKPOINT_SECONDS = 0.0
+nbtrack.mapping.fit.CHECKPOINT_SECONDS = nbtrack.tracking.trajectories.CHECKPOINT_SECONDS = 0.0
 for line in sys.stdin:
     folder, arguments, seconds = json.loads(line)
     start = time.monotonic()
@@ -110,9 +110,8 @@ def result(folder: Path) -> dict[str, object]:
             found[path.name] = path.read_bytes()
         elif path.name == "frames.csv":
             found[path.name] = pd.read_csv(path).drop(columns="seconds").to_csv()
-        elif path.name == "map.pt":
-            state = torch.load(path, weights_only=True)["field"]
-            found[path.name] = {name: value.numpy().tobytes() for name, value in state.items()}
+        elif path.name == MAP_FILE:
+            found[path.name] = read_map(path).key
         elif path.name.startswith("table_1") and path.suffix in (".csv", ".tex"):
             found[path.name] = path.read_bytes()
         else:

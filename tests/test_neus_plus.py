@@ -8,16 +8,14 @@ import torch
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.config import PRESETS, FieldConfig, MappingConfig
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields import supervised_field
-from nbtrack.fields.neus_plus import distance_targets
-from nbtrack.fields.observed_distance import ObservedDistance
+from nbtrack.fields import NetworkSettings, NeusPlusMapping, supervised_field
+from nbtrack.fields.neus_plus import ObservedDistance, distance_targets
 from nbtrack.mapping.fit import map_sequence
 
-CONFIG = PRESETS["smoke"].mapping["neus_plus"]
+CONFIG = NeusPlusMapping()
 CAMERA = Intrinsics.from_focal(64, 48, 48.0)
 
 
@@ -34,26 +32,19 @@ def slanted_wall(n_frames: int = 1) -> RgbdSequence:
 
 
 def test_plane_distance_of_a_slanted_wall() -> None:
-    """Catches distances along the ray or along z: the plane's own is smaller by the cosine.
+    """Catches distances along the ray or along z, where the plane's own is smaller by the cosine;
+    planes through two surfaces, through missing depth, or beyond the image.
 
     From depth d on a ray (x, y, 1) the plane z = 2 + x is (D - d)(1 - x) / sqrt(2) away.
     """
-    sampler = PixelSampler(slanted_wall(), torch.device("cpu"))
-    rows, columns = torch.tensor([10, 24, 40]), torch.tensor([20, 32, 40])
-    per_depth = sampler.plane_distance_per_depth(torch.zeros_like(rows), rows, columns)
-    x = (columns + 0.5 - 32) / 48
-    torch.testing.assert_close(per_depth, (1 - x) / 2**0.5, atol=5e-3, rtol=0)
-
-
-def test_plane_distance_is_unknown_at_edges_and_borders() -> None:
-    """Catches planes through two surfaces, through missing depth, or beyond the image."""
     sequence = slanted_wall()
     sequence.depths_mm[0, :, 40:] = 900
     sequence.depths_mm[0, 20, 10] = 0
     sampler = PixelSampler(sequence, torch.device("cpu"))
-    rows, columns = torch.tensor([10, 20, 20, 0]), torch.tensor([39, 11, 30, 30])
-    per_depth = sampler.plane_distance_per_depth(torch.zeros_like(rows), rows, columns)
-    assert (per_depth > 0).tolist() == [False, False, True, False]
+    rows, columns = torch.tensor([10, 24, 20, 10, 20, 0]), torch.tensor([20, 32, 30, 39, 11, 30])
+    found = sampler.plane_distance_per_depth(torch.zeros_like(rows), rows, columns)
+    expected = (1 - (columns + 0.5 - 32) / 48) / 2**0.5 * (torch.arange(6) < 3)
+    torch.testing.assert_close(found, expected, atol=5e-3, rtol=0)
 
 
 def test_targets_by_hand() -> None:
@@ -81,16 +72,15 @@ def test_observed_distance_from_a_wall() -> None:
     observed = ObservedDistance(slanted_wall(4), frames, bounds, torch.device("cpu"))
     points = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.1, 0.1, 0.1], [0.0, 0.0, -9.0]])
     found = observed(points)
-    torch.testing.assert_close(
-        found[:3], torch.tensor([0.707, 0.0, 1.414]), atol=observed.voxel, rtol=0
-    )
+    expected = torch.tensor([0.707, 0.0, 1.414])
+    torch.testing.assert_close(found[:3], expected, atol=observed.voxel, rtol=0)
     assert torch.isfinite(found).all()
 
 
 def test_distances_are_learned_sooner_than_by_rendering_alone() -> None:
     """Catches supervision that is not wired in: after a few steps it must be nearer the truth."""
-    sequence, network = slanted_wall(10), FieldConfig(width=32)
-    base = MappingConfig(60, n_rays=48, n_stratified=8, n_surface=8, learning_rate=3e-3)
+    sequence, network = slanted_wall(10), NetworkSettings(width=32)
+    base = NeusPlusMapping(60, n_rays=48, n_stratified=8, n_surface=8, learning_rate=3e-3)
     errors = {}
     for name in ("neus", "neus_plus"):
         field = map_sequence(name, sequence, network, replace(base, n_surface_points=128)).field

@@ -8,12 +8,11 @@ import pytest
 from tiny import TINY
 
 from nbtrack.cli import main
-from nbtrack.data.readers.neural_rgbd import read_poses
+from nbtrack.data.text_files import read_poses
 from nbtrack.data.writer import SequenceWriter
 from nbtrack.experiments.scenes import DATASET_SCENES
-from nbtrack.synthetic import build_room
-from nbtrack.synthetic.generate import room_frames, room_intrinsics
-from nbtrack.tables.layout import PAPER_SCENE_LABELS
+from nbtrack.synthetic import build_room, room_frames, room_intrinsics
+from nbtrack.tables import PAPER_SCENE_LABELS
 
 N_FRAMES = 13  # so that img10 would come before img2 if sorted as text
 WIDTH, HEIGHT = 32, 24
@@ -29,7 +28,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with SequenceWriter(folder / name, room_intrinsics(WIDTH, HEIGHT), depth_folders) as writer:
             for frame in frames:
                 writer.add(frame.color, frame.depths_mm, frame.T_world_camera)
-        poses = read_poses(folder / name / "poses.txt")
+        poses = read_poses(folder / name / "poses.txt")[0]
         poses[3:5] = np.nan  # as where BundleFusion lost the camera
         np.savetxt(folder / name / "trainval_poses.txt", poses.reshape(-1, 4))
     return folder

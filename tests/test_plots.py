@@ -1,6 +1,6 @@
 """Figures: every axis has its unit, every line lies where the data are, nothing leaks."""
 
-from pathlib import Path
+from dataclasses import replace
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -9,107 +9,68 @@ import pandas as pd
 import pytest
 import torch
 import trimesh
+from ipywidgets import fixed, interactive
 from matplotlib.axis import Axis
+from matplotlib.container import BarContainer
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
+from trimesh.viewer.notebook import scene_to_notebook
 
 from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields import LearnedField
-from nbtrack.fields.views import View
-from nbtrack.plots.doll_house import screen_axes
-from nbtrack.plots.style import path_colors
-from nbtrack.plots.top_view import TopView
-from nbtrack.plots.training import loss_terms, running_median
-from nbtrack.synthetic import Room, build_room
-from nbtrack.tables.layout import published_table_1, published_table_2
-
-RADIUS = 1.5  # m
+from nbtrack.fields import Field
+from nbtrack.fields.base import View
+from nbtrack.plots.rooms import screen_axes
+from nbtrack.plots.style import PALETTE, method_colors
+from nbtrack.synthetic import build_room
+from nbtrack.tables import published_table_1, published_table_2
 
 
-class AnalyticField(LearnedField):
-    """A field without a network."""
+class AnalyticField(Field):
+    """A field without a network, of a function of points (m)."""
 
     name, label = "analytic", "Analytic"
 
-    def __init__(self, bounds: SceneBounds) -> None:
-        super().__init__(bounds)
+    def __init__(self, value, low=(-2.0,) * 3, high=(2.0,) * 3, level=0.0) -> None:
+        super().__init__(SceneBounds(tuple(low), tuple(high)))
         self.unused = torch.nn.Parameter(torch.zeros(1))  # says on which device the field lives
-
-    def value(self, points_world: torch.Tensor) -> torch.Tensor:
-        """Distance to a hollow sphere around the origin, positive inside."""
-        return RADIUS - points_world.norm(dim=-1)
+        self.value, self.surface_level = value, level
 
     def forward(self, points_world: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return torch.full_like(points_world, 0.5), self.value(points_world)
 
-    def composite(self, colors, values, rays, depths):
-        raise NotImplementedError
 
-    def mapping_losses(self, batch, config, generator):
-        raise NotImplementedError
-
-    @property
-    def surface_level(self) -> float:
-        return 0.0
-
-
-class DensityField(AnalyticField):
-    """A density (1/m) that rises through 20 at the sphere."""
-
-    def value(self, points_world: torch.Tensor) -> torch.Tensor:
-        return 20 * torch.exp(-5 * super().value(points_world))
-
-    @property
-    def surface_level(self) -> float:
-        return 20.0
+# A hollow sphere around the origin: the distance, positive inside, and a density (1/m).
+SPHERE = AnalyticField(lambda points: 1.5 - points.norm(dim=-1))
+FOG = AnalyticField(lambda p: 20 * torch.exp(5 * (p.norm(dim=-1) - 1.5)), level=20.0)
+SWEEP = pd.DataFrame({"time (ms)": [1.0, 9.0], "ATE (cm)": [2.0, 0.5], "method": ["VR", "SDF"]})
+CELLS = pd.DataFrame({
+    "rate_hz": [2.0, 10.0, 2.0, 2.0], "method": ["A", "A", "B", "B"], "scene": "whiteroom",
+    "ate_m": [0.1, 0.4, 0.15, 0.25], "seed": [0, 0, 0, 1],
+})  # fmt: skip
+FALLING = 1 / (1 + np.arange(40.0))
+IMAP = pd.DataFrame({"depth": FALLING, "color": FALLING, "total": FALLING, "deviation_m": FALLING})
+HISTORIES = {"iMAP": IMAP, "NeuS": IMAP.copy()}
+HISTORIES["NeuS"].insert(2, "eikonal", FALLING)
+FRAMES = pd.DataFrame({
+    "frame_id": [30, 33, 36], "translation_error_m": [0.0, 0.01, 0.3],
+    "rotation_error_deg": [0.0, 0.1, 0.2],
+})  # fmt: skip
 
 
-class RoomField(AnalyticField):
-    """The exact distance of a synthetic room."""
-
-    def __init__(self, room: Room) -> None:
-        low, high = room.bounds
-        super().__init__(SceneBounds(tuple((low - 0.1).tolist()), tuple((high + 0.1).tolist())))
-        self.room = room
-
-    def value(self, points_world: torch.Tensor) -> torch.Tensor:
-        return torch.from_numpy(self.room.sdf(points_world.double().numpy())).float()
-
-
-@pytest.fixture
-def sphere() -> AnalyticField:
-    return AnalyticField(SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0)))
-
-
-@pytest.fixture
+@pytest.fixture(scope="module")
 def sequence() -> RgbdSequence:
     """Six frames from the origin along +z, everything at 1 m but one pixel without depth."""
     n, height, width = 6, 12, 16
     colors = np.random.default_rng(0).integers(0, 256, (n, height, width, 3), dtype=np.uint8)
     depths_mm = np.full((n, height, width), 1000, np.uint16)
     depths_mm[:, 2, 3] = 0
-    T_world_camera = np.tile(np.eye(4), (n, 1, 1))
+    T_world_camera = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (n, 1, 1))  # upright, y is up
     T_world_camera[:, 0, 3] = 0.01 * np.arange(n)
     intrinsics = Intrinsics.from_focal(width, height, 12.0)
     return RgbdSequence("six", intrinsics, colors, depths_mm, T_world_camera, np.arange(n) + 30)
-
-
-@pytest.fixture
-def histories() -> dict[str, pd.DataFrame]:
-    falling = 1 / (1 + np.arange(40.0))
-    imap = pd.DataFrame({"depth": falling, "color": falling, "total": 2 * falling})
-    neus = imap.assign(eikonal=falling, deviation_m=0.05 * falling)
-    return {"iMAP": imap, "NeuS": neus[["depth", "color", "eikonal", "total", "deviation_m"]]}
-
-
-@pytest.fixture
-def frames() -> dict[str, pd.DataFrame]:
-    columns = {"frame_id": [30, 33, 36], "translation_error_m": [0.0, 0.01, 0.3]}
-    rows = pd.DataFrame(columns).assign(rotation_error_deg=[0.0, 0.1, 0.2])
-    return {"iMAP with VR": rows, "NeuS with SDF": rows}
 
 
 def room_mesh() -> trimesh.Trimesh:
@@ -120,204 +81,234 @@ def room_mesh() -> trimesh.Trimesh:
     return mesh
 
 
-def all_figures(sequence, sphere, histories, frames) -> dict[str, Figure]:
-    view = View(sequence.color(0), sequence.depth(0) + np.float32(0.02))
-    paths = {"NeuS with SDF": sequence.T_world_camera}
-    return {
-        "views": plots.plot_views(sequence, [0, 3], [view, view], "close"),
-        "overview": plots.plot_room_overview(sequence, "slow"),
-        "losses": plots.plot_losses(histories, "fall"),
-        "deviation": plots.plot_deviation(histories["NeuS"], "sharper"),
-        "slice": plots.plot_slice(sphere, sequence, 0.0, title="round"),
-        "density": plots.plot_slice(DensityField(sphere.bounds), sequence, 0.0, title="round"),
-        "mesh": plots.plot_mesh(room_mesh(), paths, "room"),
-        "paths": plots.plot_trajectories(sequence.T_world_camera, paths, "near", room_mesh()),
-        "errors": plots.plot_errors(frames, "lost"),
-        "ate": plots.plot_ate_bars(published_table_1(), "rates matter"),
-        "steps": plots.plot_steps(published_table_2(), published_table_2(), "cheap"),
-    }
+def ray(factor: float = 1.0) -> torch.Tensor:
+    return torch.linspace(1, -1, 20).mul(factor).requires_grad_()
+
+
+def cloud(offset: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    points = torch.tensor([[0.5, 0.0, -1.0], [-0.5, 0.2, -2.0]])
+    return points, torch.tensor([offset, -0.01]), torch.diag(torch.tensor([1.0, -1, -1, 1]))
+
+
+FIGURES = {
+    "frame": lambda s: plots.plot_frame(s, 3, "one"),
+    "views": lambda s: plots.plot_views(s, [0, 3], [View(s.color(0), s.depth(0) + 0.02)] * 2, "x"),
+    "ray": lambda s: plots.plot_along_ray(
+        torch.linspace(0, 2, 20), {"density (1/m)": ray(), "w (share)": ray()[:-1]}, 1.0, "ends"
+    ),
+    "losses": lambda s: plots.plot_losses(HISTORIES, "fall"),
+    "slice": lambda s: plots.plot_slice(SPHERE, s, 0.0, title="round"),
+    "density": lambda s: plots.plot_slice(FOG, s, 0.0, title="round"),
+    "points": lambda s: plots.plot_points({"before": cloud(0.05), "after": cloud(0.02)}, "closer"),
+    "mesh": lambda s: plots.plot_mesh(room_mesh(), {"SDF": s.T_world_camera}, "room"),
+    "paths": lambda s: plots.plot_trajectories(s.T_world_camera, {"SDF": s.T_world_camera}, "near"),
+    "recording": lambda s: plots.plot_recording(
+        pd.DataFrame(np.random.default_rng(0).uniform(0, 1, (50, 6)), columns=[*"xyz", *COLORS]),
+        s.T_world_camera, "thin",
+    ),
+    "errors": lambda s: plots.plot_errors({"VR": FRAMES, "SDF": FRAMES}, "lost"),
+    "curves": lambda s: plots.plot_curves(SWEEP, *SWEEP, "fast"),
+    "ate": lambda s: plots.plot_ate_bars(published_table_1(), "rates matter"),
+    "steps": lambda s: plots.plot_steps(published_table_2(), published_table_2(), "cheap"),
+}  # fmt: skip
+COLORS = ["red", "green", "blue"]
 
 
 def is_labelled(axis: Axis) -> bool:
     """Whether an axis without numbers, or with a label that names a unit or what it counts."""
     shows_numbers = any(t.get_text() and t.get_visible() for t in axis.get_ticklabels())
     label = axis.label.get_text()
-    return not shows_numbers or label.endswith(")") or label in COUNTED
+    return not shows_numbers or label.endswith(")") or label == "mapping iteration"
 
 
-COUNTED = ("mapping iteration", "number of frames")
-
-
-def test_every_axis_has_a_unit_and_every_figure_a_title(
-    sequence, sphere, histories, frames
-) -> None:
-    """Catches an unlabelled axis or colour bar, a lost title, a figure too large for a notebook."""
-    for name, figure in all_figures(sequence, sphere, histories, frames).items():
-        png = figure._repr_png_()
-        assert png.startswith(b"\x89PNG"), name
-        assert len(png) < 150_000, name
-        assert figure.get_suptitle(), name
-        for axes in figure.axes:
-            if axes.axison and axes.get_visible():
-                assert is_labelled(axes.xaxis), (name, axes.get_xlabel())
-                assert is_labelled(axes.yaxis), (name, axes.get_ylabel())
-
-
-def test_drawing_leaves_no_global_state(sequence, sphere, histories, frames) -> None:
-    """Catches figures shown twice by pyplot, and a style that leaks into the user's own plots."""
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_axis_has_a_unit_and_nothing_leaks(name: str, sequence) -> None:
+    """Catches an unlabelled axis, a lost title, a figure too large for a notebook or shown twice by
+    pyplot, an address in its text, and a style that leaks into a user's own plots."""
     before = dict(matplotlib.rcParams)
-    figures = all_figures(sequence, sphere, histories, frames)
-    assert plt.get_fignums() == []
+    figure = FIGURES[name](sequence)
     assert dict(matplotlib.rcParams) == before
-    assert " at 0x" not in repr(figures["slice"])
+    png = figure._repr_png_()
+    assert png.startswith(b"\x89PNG")
+    assert len(png) < 150_000
+    assert figure.get_suptitle()
+    assert " at 0x" not in repr(figure)
+    for axes in figure.axes:
+        if axes.axison:
+            assert is_labelled(axes.xaxis), axes.get_xlabel()
+            assert is_labelled(axes.yaxis), axes.get_ylabel()
+    assert plt.get_fignums() == []
 
 
-def contour_points(figure: Figure, gid: str) -> np.ndarray:
-    (lines,) = [c for c in figure.axes[0].collections if c.get_gid() == gid]
-    return np.concatenate([path.vertices for path in lines.get_paths()])
+def test_a_frame_has_one_slider(sequence) -> None:
+    """Catches a text box for every further argument, and a frame that the slider does not reach."""
+    box = interactive(
+        plots.plot_frame, sequence=fixed(sequence), index=(0, 5), title=fixed("A room")
+    )
+    assert [type(child).__name__ for child in box.children] == ["IntSlider", "Output"]
+    assert plots.plot_frame(sequence, 5).axes[0].get_title(loc="left") == "frame 35: colour"
 
 
-@pytest.mark.parametrize("kind", [AnalyticField, DensityField])
+def test_curves_along_a_ray_share_their_depths() -> None:
+    """Catches values beside another sample's depth, where a section has none."""
+    depths = torch.linspace(0, 2, 20)
+    figure = plots.plot_along_ray(depths, {"a (m)": ray(), "b (m)": ray(2)[:-1]}, 1.25)
+    for axes, n in zip(figure.axes, (20, 19), strict=True):
+        assert axes.lines[0].get_xdata() == pytest.approx(depths[:n].numpy())
+        assert list(axes.lines[1].get_xdata()) == [1.25, 1.25]
+
+
+def test_points_share_one_scale_in_centimetres() -> None:
+    """Catches panels that cannot be compared, and metres called centimetres."""
+    figure = plots.plot_points({"before": cloud(0.05), "after": cloud(0.02)})
+    before, after = (axes.collections[0] for axes in figure.axes[:2])
+    assert before.get_array().tolist() == pytest.approx([5.0, -1.0])
+    assert before.get_clim() == after.get_clim()
+    assert before.get_offsets()[1].tolist() == pytest.approx([-0.5, -2.0])  # x to the right, z
+    assert figure.axes[1].get_title(loc="left") == "after: mean |distance| 1.50 cm"
+
+
+def test_curves_of_methods_and_sweeps() -> None:
+    """Catches a group without its own line or colour, and text sorted by letters."""
+    colors = [line.get_color() for line in plots.plot_curves(SWEEP, *SWEEP).axes[0].lines]
+    assert colors == [PALETTE[0], PALETTE[1]]
+    words = SWEEP.assign(method="A", how=["b", "a"]).replace({"time (ms)": {1.0: "b", 9.0: "a"}})
+    figure = plots.plot_curves(words, "time (ms)", "ATE (cm)", ["method", "how"], log="y")
+    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["b", "a"]
+    assert figure.axes[0].get_yscale() == "log"
+    assert [line.get_label() for line in figure.axes[0].lines] == ["A, b", "A, a"]
+
+
+def held(sequence: RgbdSequence, up: tuple[float, float, float]) -> RgbdSequence:
+    """The same frames, with the cameras held upright in a world whose up is another."""
+    T_world_camera, right = sequence.T_world_camera.copy(), np.roll(up, 1)
+    T_world_camera[:, :3, :3] = np.stack([right, -np.array(up), -np.cross(right, up)], axis=1)
+    return replace(sequence, T_world_camera=T_world_camera)
+
+
+def contours(figure: Figure) -> list[np.ndarray]:
+    lines = [c for c in figure.axes[0].collections if isinstance(c, ContourSet)]
+    return [np.concatenate([path.vertices for path in c.get_paths()]) for c in lines]
+
+
+@pytest.mark.parametrize("field", [SPHERE, FOG])
 @pytest.mark.parametrize(("height", "up"), [(0.0, (0, 1, 0)), (0.9, (0, -1, 0)), (0.9, (0, 0, 1))])
-def test_the_zero_level_lies_on_the_sphere(sphere, sequence, kind, height, up) -> None:
-    """Catches swapped grid axes, a wrong height or level, and pixels off by half."""
-    field = kind(sphere.bounds)
-    figure = plots.plot_slice(field, sequence, height, title="circle", up=up)
-    points = contour_points(figure, "invented surface")
-    radii = np.linalg.norm(points, axis=1)
-    assert radii == pytest.approx(np.sqrt(RADIUS**2 - height**2), abs=2e-3)
-
-
-def test_the_slice_is_taken_at_its_height(sequence) -> None:
-    """Catches a height along the wrong axis or with the wrong sign of up."""
-
-    class Ramp(AnalyticField):
-        def value(self, points_world: torch.Tensor) -> torch.Tensor:
-            return points_world[:, 1] + 0.01 * points_world[:, 0]
-
-    ramp = Ramp(SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
-    for up, mean in (((0, 1, 0), 0.7), ((0, -1, 0), -0.7)):
-        axes = plots.plot_slice(ramp, sequence, 0.7, up=up).axes[0]
-        (values,) = [c for c in axes.collections if c.get_gid() == "values"]
-        assert values.get_array().mean() == pytest.approx(mean, abs=1e-4)
+def test_the_zero_level_lies_on_the_sphere(sequence, field, height, up) -> None:
+    """Catches swapped grid axes, a height along the wrong axis or with the wrong sign, a wrong
+    level, and pixels off by half."""
+    (circle,) = contours(plots.plot_slice(field, held(sequence, up), height))
+    assert np.linalg.norm(circle, axis=1) == pytest.approx(np.sqrt(1.5**2 - height**2), abs=2e-3)
+    along = AnalyticField(lambda points: points @ torch.tensor(up, dtype=torch.float32))
+    values = plots.plot_slice(along, held(sequence, up), height).axes[0].collections[0].get_array()
+    assert values.mean() == pytest.approx(height, abs=1e-4)
 
 
 def test_a_true_field_lies_on_the_true_surface(sequence) -> None:
     """Catches a field and a room drawn in different frames."""
     room = build_room("bedroom")
-    figure = plots.plot_slice(RoomField(room), sequence, 0.4, room)
-    for line in ("invented surface", "true surface"):
-        right, ahead = contour_points(figure, line).T
-        points = np.stack([right, np.full(len(right), 0.4), ahead], axis=1)
+    low, high = room.bounds
+    sdf = AnalyticField(None, (low - 0.1).tolist(), (high + 0.1).tolist())
+    sdf.value = lambda points: torch.from_numpy(room.sdf(points.double().numpy())).float()
+    lines = contours(plots.plot_slice(sdf, sequence, 0.4, room))
+    assert len(lines) == 2
+    for line in lines:
+        points = np.insert(line, 1, 0.4, axis=1)
         # Between grid points, 2 cm apart, the line is straight.
         assert np.abs(room.sdf(points)).max() < 0.02
 
 
-def test_the_unseen_is_pale(sphere, sequence) -> None:
-    """Catches inventions shown as if measured: behind the camera, and behind what it measured."""
-    axes = plots.plot_slice(sphere, sequence, 0.0).axes[0]
+@pytest.mark.parametrize(
+    ("x", "z", "is_pale"),
+    [(0.03, -0.5, 0), (0.03, -1.05, 0), (0.03, -1.3, 1), (0.03, 0.5, 1), (1.5, -0.5, 1)],
+    ids=["before the surface", "just behind", "far behind", "behind the camera", "out of view"],
+)
+def test_what_was_not_seen_is_pale(x, z, is_pale, sequence) -> None:
+    """Catches a veil that is mirrored, shifted, or over what the frames have measured."""
+    axes = plots.plot_slice(SPHERE, sequence, 0.0).axes[0]
     (veil,) = [c for c in axes.collections if c.get_gid() == "unseen"]
     opacity = veil.get_array()[..., 3]
-
-    def opacity_at(x: float, z: float) -> float:
-        rows, columns = opacity.shape  # the bounds are [-2, 2] both ways
-        return float(opacity[round((z + 2) / 4 * (rows - 1)), round((x + 2) / 4 * (columns - 1))])
-
-    assert opacity_at(0.03, 0.5) == 0  # in front of the camera, before the surface
-    assert opacity_at(0.03, 1.05) == 0  # just behind what it measured
-    assert opacity_at(0.03, 1.3) > 0.5  # far behind
-    assert opacity_at(0.03, -0.5) > 0.5  # behind the camera
-    assert opacity_at(1.5, 0.5) > 0.5  # outside of the view
-    surface = [c for c in axes.collections if c.get_gid() == "surface"]
-    assert sum(len(path.vertices) for c in surface for path in c.get_paths()) == 0
+    row, column = (round((place + 2) / 4 * 240) for place in (z, x))  # bounds are [-2, 2]
+    assert (opacity[row, column] > 0.5) == is_pale
 
 
-@pytest.mark.parametrize(
-    "up", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (-1, 0, 0), (0, -1, 0), (0, 0, -1)]
-)
-def test_no_top_view_is_mirrored(up) -> None:
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_no_top_view_is_mirrored(axis: int, sign: int, sequence) -> None:
     """Catches rooms whose left and right are exchanged on the page."""
-    view = TopView.along(up)
-    right, page_up = np.zeros(3), np.zeros(3)
-    right[view.right], page_up[view.ahead] = 1, 1 if view.ahead_is_upwards else -1
-    assert np.cross(right, page_up) == pytest.approx(np.array(up))
-    axes = Figure().subplots()
-    view.finish(axes)
-    assert axes.yaxis_inverted() != view.ahead_is_upwards
-
-
-@pytest.mark.parametrize("up", [(0, 1, 0), (0.1, -1.0, 0.2)])
-@pytest.mark.parametrize("elevation_deg", [20.0, 90.0])
-def test_the_doll_house_is_seen_from_above(up, elevation_deg) -> None:
-    """Catches mirrored or skewed pictures, and a viewer below the floor."""
-    axes = screen_axes(up, 35.0, elevation_deg)
-    assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-12)
-    assert np.linalg.det(axes) == pytest.approx(1)
-    upward = np.array(up) / np.linalg.norm(up)
-    assert axes[2] @ upward == pytest.approx(np.sin(np.radians(elevation_deg)))
-    assert axes[0] @ upward == pytest.approx(0, abs=1e-12)
+    up = sign * np.eye(3)[axis]
+    T_true = held(sequence, tuple(up)).T_world_camera
+    axes = plots.plot_trajectories(T_true, {}).axes[0]
+    right, page_up = (
+        np.eye(3)["xyz".index(a.get_label_text()[0])] for a in (axes.xaxis, axes.yaxis)
+    )
+    assert np.cross(right, page_up * (-1 if axes.yaxis_inverted() else 1)) == pytest.approx(up)
 
 
 @pytest.mark.parametrize("inverted", [False, True])
-def test_one_looks_into_the_doll_house(inverted) -> None:
-    """Catches near walls or a ceiling left in the way, whichever way the faces are oriented."""
+def test_one_looks_into_the_doll_house(inverted, sequence) -> None:
+    """Catches near walls or a ceiling left in the way, whichever way the faces are oriented,
+    mirrored or skewed pictures, and a viewer below the floor."""
     mesh = room_mesh()
     if inverted:
         mesh.invert()
-    (faces,) = plots.plot_mesh(mesh, azimuth_deg=30.0).axes[0].collections
+    (faces,) = plots.plot_mesh(mesh, {"true": sequence.T_world_camera}).axes[0].collections
     # Two triangles each of the floor and of the two far walls.
     assert len(faces.get_paths()) == 6
+    screen = screen_axes(np.array([0, 0, -1]), 35.0)
+    assert screen @ screen.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(screen) == pytest.approx(1)
+    assert screen[:, 2] == pytest.approx([0, -(0.5**0.5), -(0.5**0.5)])
 
 
-def test_the_viewer_holds_mesh_and_paths(sequence) -> None:
-    """Catches paths that are lost on the way to the interactive scene."""
-    scene = plots.mesh_viewer(room_mesh(), {"true": sequence.T_world_camera})
+def test_the_viewer_holds_mesh_and_paths_and_stays_small(sequence) -> None:
+    """Catches paths lost on the way to the viewer, and notebooks of many megabytes."""
+    fine = trimesh.creation.icosphere(subdivisions=6, radius=2.0)
+    fine.visual.vertex_colors = np.full((len(fine.vertices), 4), 200, np.uint8)
+    scene = plots.mesh_viewer(fine, {"true": sequence.T_world_camera})
     assert len(scene.geometry) == 2
     assert scene.geometry["true"].vertices[:, 0].max() == pytest.approx(0.05)
+    coarse = scene.geometry["geometry_0"]
+    assert len(fine.faces) == 81_920
+    assert 4_000 < len(coarse.faces) < 12_000
+    assert np.linalg.norm(coarse.vertices, axis=1) == pytest.approx(2.0, abs=1e-3)
+    assert len(scene_to_notebook(scene).data) < 1_100_000
 
 
 def test_a_method_keeps_its_color() -> None:
-    """Catches colours that depend on the company a method is in."""
-    colors = plots.method_colors(["new", "NeuS with SDF", "iMAP with VR", "SDF", "NeuS"])
+    """Catches colours of the paper's methods that depend on the company they are in."""
+    colors = method_colors(["new", "NeuS with SDF", "iMAP with VR", "SDF", "NeuS", "newer"])
     assert colors["NeuS with SDF"] == colors["SDF"] == colors["NeuS"]
-    assert colors["new"] == plots.method_colors(["SDF", "new"])["new"]
-    assert len({colors["new"], colors["SDF"], colors["iMAP with VR"]}) == 3
-    alone = path_colors(["true", "iMAP with VR"])
-    assert alone == {"true": plots.TRUE_COLOR, "iMAP with VR": plots.TRACKED_COLOR}
-    both = path_colors(["true", "iMAP with VR", "NeuS with SDF"])
-    assert both["iMAP with VR"] == plots.METHOD_COLORS["iMAP with VR"]
+    assert colors["new"] == method_colors(["SDF", "new"])["new"]
+    assert len(set(colors.values())) == 4
 
 
-def test_losses_show_the_terms_and_no_diagnostics(histories) -> None:
+def test_losses_show_the_terms_and_no_diagnostics() -> None:
     """Catches sums or lengths drawn as losses, and a median that is shifted."""
-    assert loss_terms(histories["NeuS"]) == ["depth", "color", "eikonal"]
-    figure = plots.plot_losses(histories)
-    assert [len(axes.lines) for axes in figure.axes] == [4, 4, 2]  # raw and median each
-    values = pd.Series([1.0, 2.0, 90.0, 4.0, 5.0, 6.0])
-    assert running_median(values).iloc[2] == 4.0
-    with pytest.raises(DataError, match="deviation_m"):
-        plots.plot_deviation(histories["iMAP"])
+    spike = pd.Series([1.0, 2.0, 90.0, 4.0, 5.0, 6.0])
+    spikes = {"spike": pd.DataFrame({"depth": spike, "total": spike})}
+    depth, color, eikonal = plots.plot_losses(HISTORIES | spikes).axes
+    drawn = [
+        sum(len(line.get_xdata()) > 0 for line in axes.lines) for axes in (depth, color, eikonal)
+    ]
+    assert drawn == [6, 4, 2]  # raw and median each
+    assert depth.lines[5].get_ydata()[2] == 4.0
 
 
-def test_errors_run_in_seconds_without_the_given_frame(frames) -> None:
+def test_errors_run_in_seconds_without_the_given_frame() -> None:
     """Catches frame numbers taken for seconds, metres for centimetres, and a counted first row."""
-    line = plots.plot_errors(frames).axes[0].lines[0]
+    line = plots.plot_errors({"VR": FRAMES}).axes[0].lines[0]
     assert line.get_xdata() == pytest.approx([1.1, 1.2])
     assert line.get_ydata() == pytest.approx([1.0, 30.0])
 
 
 def test_bars_are_the_errors_of_their_cell() -> None:
-    """Catches bars in the wrong group, and a missing run drawn as a perfect one."""
-    cells = pd.DataFrame({
-        "rate_hz": [2.0, 10.0, 2.0], "method": ["A", "A", "B"], "scene": ["whiteroom"] * 3,
-        "ate_m": [0.1, 0.4, 0.2],
-    })  # fmt: skip
-    (axes,) = plots.plot_ate_bars(cells).axes
-    first, second = axes.containers
+    """Catches bars in the wrong group, a missing run drawn as a perfect one, seeds not averaged."""
+    (axes,) = plots.plot_ate_bars(CELLS).axes
+    first, second = (c for c in axes.containers if isinstance(c, BarContainer))
     assert [bar.get_height() for bar in first] == [0.4, 0.1]  # 10 Hz stands left
-    assert [bar.get_height() for bar in second][1] == 0.2
-    crosses = axes.lines[1]  # B has no result at 10 Hz
-    assert crosses.get_xdata() == pytest.approx([0.2])
+    assert [bar.get_height() for bar in second] == pytest.approx([0, 0.2])  # none at 10 Hz
+    (spread,) = second.errorbar.lines[2][0].get_segments()[1:]
+    assert np.ptp(spread[:, 1]) == pytest.approx(2 * 0.05 * 2**0.5)
     assert axes.get_title(loc="left") == "Whiteroom"
 
 
@@ -334,13 +325,6 @@ def test_steps_stand_beside_the_published_ones() -> None:
 def test_unmeasured_pixels_are_not_errors(sequence) -> None:
     """Catches missing depth taken for a depth of zero."""
     view = View(sequence.color(0), np.full((12, 16), 1.02, np.float32))
-    figure = plots.plot_views(sequence, [0], [view])
-    error_cm = figure.axes[4].images[0].get_array()
+    error_cm = plots.plot_views(sequence, [0], [view]).axes[4].images[0].get_array()
     assert error_cm.mask.sum() == 1
     assert error_cm.compressed() == pytest.approx(2.0, abs=1e-3)
-
-
-def test_figures_can_be_saved(tmp_path: Path, histories) -> None:
-    """Catches figures that only a notebook can show."""
-    plots.plot_losses(histories, "fall").savefig(tmp_path / "losses.pdf")
-    assert (tmp_path / "losses.pdf").stat().st_size > 1000

@@ -1,67 +1,57 @@
 """Keys follow the code: what changes a result changes its key, what does not leaves it alone."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 
-from nbtrack.core import provenance
-from nbtrack.core.provenance import code_fingerprint, versions
-from nbtrack.tracking.sequence import track_sequence
-from nbtrack.tracking.trackers import TRACKERS
+from nbtrack.core import files
 
 
 @pytest.fixture
-def changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A function that pretends that a module's source reads otherwise."""
-    original = provenance._file_of
-
-    def change(module: str, old: str, new: str) -> None:
-        text = original(module).read_text(encoding="utf-8")
-        assert old in text
-        path = tmp_path / f"{module}.py"
-        path.write_text(text.replace(old, new), encoding="utf-8")
-        monkeypatch.setattr(provenance, "_file_of", lambda m: path if m == module else original(m))
-        provenance._modules_fingerprint.cache_clear()
-
-    provenance._modules_fingerprint.cache_clear()
-    yield change
-    provenance._modules_fingerprint.cache_clear()
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the package's sources, to be edited."""
+    copy = tmp_path / "nbtrack"
+    shutil.copytree(files.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(files, "PACKAGE", copy)
+    return copy
 
 
-def keys() -> tuple[str, str]:
-    """Of runs with both trackers of the paper."""
-    return tuple(code_fingerprint(track_sequence, TRACKERS[name]) for name in ("vr", "sdf"))
+def key() -> str:
+    files.sources_fingerprint.cache_clear()
+    return files.sources_fingerprint("core.geometry", "fields")
 
 
-def test_a_changed_tracker_is_computed_again(changed) -> None:
-    """Catches a researcher's edited loss that is answered with the old, cached result."""
-    vr, sdf = keys()
-    changed("nbtrack.tracking.trackers.sdf", "field_sdf.abs().mean()", "field_sdf.square().mean()")
-    assert keys()[1] != sdf
-    assert keys()[0] == vr
+@pytest.mark.parametrize(
+    ("file", "old", "new", "counts"),
+    [
+        ("fields/rendering.py", "weights", "wights", True),
+        ("core/geometry.py", "clamp_min(0)", "clamp_min(1)", True),
+        ("fields/rendering.py", '"""Volume', '"""Another docstring. ', False),
+        ("fields/rendering.py", "import torch\n", "import torch  # a comment\n\n", False),
+        ("core/errors.py", "did you mean", "perhaps", False),
+        ("tracking/budget.py", "yield", "return", False),
+    ],
+)
+def test_what_changes_a_key(package: Path, file: str, old: str, new: str, counts: bool) -> None:
+    """Catches an edited loss answered from the cache, and days of results lost for a comment."""
+    before = key()
+    text = (package / file).read_text()
+    assert old in text
+    (package / file).write_text(text.replace(old, new))
+    assert (key() != before) == counts
 
 
-def test_a_module_behind_an_import_counts(changed) -> None:
-    """Catches imports that are not followed: rendering is three imports away from tracking."""
-    before = keys()
-    changed("nbtrack.fields.rendering", "weights", "wights")
-    assert keys()[0] != before[0]
+def test_a_class_of_somebody_else_counts() -> None:
+    """Catches a tracker or field outside the package whose edit is answered from the cache."""
+    assert files.foreign_source(files.DataError) == ""
+    assert "class Mine" in files.foreign_source(Mine)
 
 
-def test_words_do_not_count(changed) -> None:
-    """Catches days of results thrown away for a comment or a docstring."""
-    before = keys()
-    changed("nbtrack.tracking.trackers.sdf", "Paper, Sec. II-B.2.", "See the paper.  # and more")
-    assert keys() == before
-
-
-def test_modules_that_only_tell_do_not_count(changed) -> None:
-    """Catches results thrown away for the wording of an error."""
-    before = keys()
-    changed("nbtrack.core.errors", "did you mean", "perhaps")
-    assert keys() == before
+class Mine:
+    """Stands for a tracker in a file of its own."""
 
 
 def test_versions_name_what_results_depend_on() -> None:
     """Catches results that do not tell the torch they were made with."""
-    assert set(versions()) == {"nbtrack", "torch", "python"}
+    assert set(files.versions()) == {"nbtrack", "torch", "python"}

@@ -20,7 +20,8 @@ from hypothesis import strategies as st
 from recordings import WRITERS, source, write_recording
 
 from nbtrack.core.errors import NbtrackError
-from nbtrack.data.check import check_sequence
+from nbtrack.data.check import check_recording
+from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import read_sequence
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -113,7 +114,7 @@ def test_only_our_own_errors(tmp_path_factory: pytest.TempPathFactory, data) -> 
         assert np.isfinite(sequence.T_world_camera).all()
         assert np.isfinite([sequence.intrinsics.fx, sequence.intrinsics.cx]).all()
         if data.draw(st.integers(0, 19)) == 0:
-            str(check_sequence(folder, format=format))
+            str(check_recording(open_recording(folder, format)))
     except NbtrackError as error:
         message = str(error)
     finally:

@@ -1,0 +1,349 @@
+"""Every format is read back as it was written: poses, depth, colour, camera."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from recordings import (
+    CAMERA,
+    N_FRAMES,
+    START,
+    WRITERS,
+    Source,
+    camera_matrix,
+    matrix_text,
+    source,
+    tum_lines,
+    write_image,
+    write_images,
+    write_recording,
+)
+
+from nbtrack.cli import main
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.errors import ConfigError, DataError, MissingError
+from nbtrack.data.formats import FORMATS
+from nbtrack.data.recording import open_recording
+from nbtrack.data.sequence import RgbdSequence, parse_frames, read_sequence
+from nbtrack.data.writer import convert_sequence
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+LOSSY = ("replica", "scannet")  # colour is JPEG
+
+
+def check_equal(sequence: RgbdSequence, data: Source, lossy: bool = False) -> None:
+    """The sequence is the source, to rounding; JPEG colours to a few levels on average."""
+    np.testing.assert_allclose(sequence.T_world_camera, data.poses, rtol=0, atol=1e-9)
+    assert np.array_equal(sequence.depths_mm, data.depths_mm)
+    difference = np.abs(sequence.colors.astype(int) - data.colors)
+    assert difference.max() == 0 or (lossy and difference.mean() < 6)
+    found, wanted = sequence.intrinsics, data.camera
+    assert (found.width, found.height) == (wanted.width, wanted.height)
+    for name in ("fx", "fy", "cx", "cy"):
+        assert getattr(found, name) == pytest.approx(getattr(wanted, name), abs=1e-9), name
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    return write_recording("neural_rgbd", tmp_path / "scene")
+
+
+@pytest.fixture
+def plain(tmp_path: Path) -> Path:
+    return write_recording("plain", tmp_path / "plain")
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_round_trip(tmp_path: Path, format: str) -> None:
+    """Catches wrong axes, a wrong depth factor, half a pixel, swapped colours, a wrong guess."""
+    folder = write_recording(format, tmp_path / "recording")
+    assert open_recording(folder).declared.format == format
+    check_equal(read_sequence(folder), source(), format in LOSSY)
+    check_equal(read_sequence(folder, format=format), source(), format in LOSSY)
+    part = read_sequence(folder, slice(1, 5, 2))
+    assert part.frame_ids.tolist() == [1, 3]
+    np.testing.assert_allclose(part.T_world_camera, source().poses[1:5:2], atol=1e-9)
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_converted_is_the_same(tmp_path: Path, format: str) -> None:
+    """Catches depth or poses that change on their way into the layout."""
+    folder, out = write_recording(format, tmp_path / "recording"), tmp_path / "out"
+    assert main(["data", "convert", str(folder), str(out), "--format", format]) == 0
+    assert open_recording(out).declared.format == "neural_rgbd"
+    check_equal(read_sequence(out), source(), format in LOSSY)
+    assert (out / "focal.txt").is_file()
+    assert not (out / "intrinsics.txt").exists()
+
+
+def test_natural_order_with_unpadded_and_padded_numbers(tmp_path: Path) -> None:
+    """Catches alphabetical order: img10 before img2 gives frames the poses of others."""
+    data = source(n_frames=12)
+    folder = write_recording("neural_rgbd", tmp_path / "scene", data)
+    check_equal(read_sequence(folder), data)
+    for path in (folder / "images").iterdir():
+        path.rename(path.with_name(f"frame-{int(path.stem[3:]):06}.color.png"))
+    check_equal(read_sequence(folder), data)
+
+
+def test_a_sequence(scene: Path) -> None:
+    """Catches units mixed up, frames selected in file order, and copies of what could be shared."""
+    sequence = read_sequence(scene)
+    assert repr(sequence) == "RgbdSequence('scene', 6 frames of 48x36)"
+    np.testing.assert_allclose(sequence.depth(1), sequence.depths_mm[1] / 1000.0, rtol=1e-6)
+    np.testing.assert_allclose(sequence.color(1) * 255, sequence.colors[1], atol=1e-4)
+    chosen = sequence.select(np.array([2, 0]))
+    assert chosen.frame_ids.tolist() == [2, 0]
+    for name in ("colors", "depths_mm", "T_world_camera"):
+        assert np.array_equal(getattr(chosen, name), getattr(sequence, name)[[2, 0]])
+    assert np.shares_memory(sequence.select(slice(1, 3)).colors, sequence.colors)
+
+
+def test_frames_without_a_pose_are_left_out_and_counted(scene: Path) -> None:
+    """Catches NaN poses that reach the optimizer, and images that slip against the poses."""
+    lines = (scene / "poses.txt").read_text().splitlines(keepends=True)
+    lines[4:8] = lines[16:20] = 4 * ["nan nan nan nan\n"]
+    (scene / "poses.txt").write_text("".join(lines))
+    sequence = read_sequence(scene)
+    assert sequence.frame_ids.tolist() == [0, 2, 3, 5]
+    assert "2 without pose" in repr(sequence)
+    assert np.isfinite(sequence.T_world_camera).all()
+    assert np.array_equal(sequence.colors, source().colors[[0, 2, 3, 5]])
+    # Only the frames asked for count: of 0 to 2 one has no pose.
+    assert read_sequence(scene, slice(0, 3)).excluded_frames == 1
+
+
+def test_poses_that_are_not_there(tmp_path: Path) -> None:
+    """Catches ScanNet's -inf and a line of NaN taken for poses, also where it is converted."""
+    folder = write_recording("scannet", tmp_path / "scannet")
+    (folder / "pose/2.txt").write_text("-inf -inf -inf -inf\n" * 4)
+    assert read_sequence(folder).frame_ids.tolist() == [0, 1, 3, 4, 5]
+    folder = write_recording("replica", tmp_path / "replica" / "r")
+    lines = (folder / "traj.txt").read_text().splitlines()
+    (folder / "traj.txt").write_text("\n".join([" ".join(["nan"] * 16), *lines[1:]]))
+    assert read_sequence(folder).frame_ids.tolist() == [1, 2, 3, 4, 5]
+    said = convert_sequence(open_recording(folder), tmp_path / "out")
+    assert "6 frames (1 without a pose) of 48x36, read as Replica" in said
+    assert read_sequence(tmp_path / "out").frame_ids.tolist() == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("text", [":", "2:", ":3", "1:5:2", "-2:", "::3", "3:100"])
+def test_frame_slices_are_pythons(scene: Path, text: str) -> None:
+    """Catches a slice that is applied after NaN frames are gone, or an end that is included."""
+    frames = parse_frames(text)
+    sequence = read_sequence(scene, frames)
+    assert sequence.frame_ids.tolist() == list(range(6))[frames]
+    assert np.array_equal(sequence.depths_mm, source().depths_mm[frames])
+
+
+@pytest.mark.parametrize("text", ["", "5", "a:b", "1:2:3:4", "1.5:2", "0:10:0", "0:10:-1", "1-5"])
+def test_text_that_is_no_slice(text: str) -> None:
+    """Catches a misread range: a single number, a dash, a step that stands still or goes back."""
+    with pytest.raises(DataError, match=f"^frames '{text}' .*: "):
+        parse_frames(text)
+
+
+def test_frame_range_that_selects_nothing(scene: Path) -> None:
+    """Catches an empty sequence that fails somewhere in the mathematics later."""
+    with pytest.raises(DataError, match=r"frames 7:9: select 0 of the 6 .*: choose others of 0:6"):
+        read_sequence(scene, slice(7, 9))
+
+
+def test_depth_folder_and_pose_file_are_chosen(scene: Path) -> None:
+    """Catches a choice that is ignored or replaced, and a default that prefers the wrong depth."""
+    for i, depth in enumerate(source().depths_mm):
+        write_image(scene / f"depth/depth{i}.png", depth + 1)
+    shifted = source().poses @ np.diag([1.0, -1, -1, 1])
+    shifted[:, 0, 3] += 1
+    (scene / "other.txt").write_text(matrix_text(shifted.reshape(-1, 4)))
+    check_equal(read_sequence(scene), source())
+    # A folder may lie anywhere.
+    sequence = read_sequence(scene, slice(None), str(scene / "depth"), "other.txt")
+    assert np.array_equal(sequence.depths_mm, source().depths_mm + 1)
+    np.testing.assert_allclose(sequence.T_world_camera[:, 0, 3], source().poses[:, 0, 3] + 1)
+    with pytest.raises(MissingError, match=r"it needs a folder depth_with_noise$"):
+        read_sequence(scene, depth_folder="depth_with_noise")
+    with pytest.raises(MissingError, match=r"needs pose\.txt;"):
+        read_sequence(scene, pose_file="pose.txt")
+
+
+PLAIN_TEXTS = {
+    "4x4 in a line": lambda f, d: (f / "poses.txt").write_text(
+        matrix_text(d.poses.reshape(-1, 16))
+    ),
+    "3x4 in a line": lambda f, d: (f / "poses.txt").write_text(
+        matrix_text(d.poses[:, :3].reshape(-1, 12)).replace(" ", ", ")
+    ),
+    "a file a frame": lambda f, d: [
+        (f / "poses").mkdir(),
+        *((f / f"poses/{i:04}.txt").write_text(matrix_text(p)) for i, p in enumerate(d.poses)),
+    ],
+    "BOM and CRLF": lambda f, d: (f / "trajectory.txt").write_bytes(
+        b"\xef\xbb\xbf# timestamp ...\r\n"
+        + tum_lines(np.zeros(N_FRAMES), d.poses).replace("\n", "\r\n").encode()
+    ),
+}
+
+
+@pytest.mark.parametrize("case", PLAIN_TEXTS)
+def test_poses_of_a_plain_folder(tmp_path: Path, case: str) -> None:
+    """Catches pose files of one shape read as another, and Windows line ends refused."""
+    write_images(tmp_path, source())
+    (tmp_path / "intrinsics.txt").write_text(matrix_text(camera_matrix(CAMERA)))
+    PLAIN_TEXTS[case](tmp_path, source())
+    check_equal(read_sequence(tmp_path), source())
+
+
+def test_own_trajectory_names_frames_by_time(plain: Path) -> None:
+    """Catches a trajectory without its first frame that slips by one, and one at another rate."""
+    text = tum_lines(np.arange(1, N_FRAMES) / 30, source().poses[1:])
+    (plain / "trajectory.txt").write_text(text)
+    sequence = read_sequence(plain)
+    assert sequence.frame_ids.tolist() == [1, 2, 3, 4, 5]
+    np.testing.assert_allclose(sequence.T_world_camera, source().poses[1:], atol=1e-9)
+    (plain / "trajectory.txt").write_text(tum_lines(np.arange(5) / 25, source().poses[1:]))
+    with pytest.raises(DataError, match="5 poses but there are 6 images"):
+        read_sequence(plain)
+
+
+def test_times_of_tum(tmp_path: Path) -> None:
+    """Catches streams paired by position: odd images, and poses of other moments, are left out."""
+    folder = write_recording("tum", tmp_path / "r")
+    recording = open_recording(folder)
+    np.testing.assert_allclose(recording.times, START + np.arange(N_FRAMES) / 10, atol=1e-5)
+    assert recording.rate_hz == pytest.approx(10, abs=1e-3)
+    lines = (folder / "groundtruth.txt").read_text().splitlines()
+    (folder / "groundtruth.txt").write_text("\n".join(lines[:2] + lines[4:]) + "\n")
+    sequence = read_sequence(folder)  # the first pose is gone, and with it the first frame
+    assert sequence.frame_ids.tolist() == [1, 2, 3, 4, 5]
+    np.testing.assert_allclose(sequence.T_world_camera, source().poses[1:], atol=1e-9)
+
+
+@pytest.mark.parametrize(("camera", "fx", "cy"), [("1", 517.3, 255.3), ("3", 535.4, 247.6)])
+def test_calibration_by_the_folders_name(tmp_path: Path, camera: str, fx: float, cy: float) -> None:
+    """Catches another camera's numbers, the half pixel, and a lens that is not corrected."""
+    folder = write_recording("tum", tmp_path / f"rgbd_dataset_freiburg{camera}_desk")
+    (folder / "calibration.txt").unlink()
+    sequence = read_sequence(folder)
+    assert sequence.intrinsics.fx == pytest.approx(fx * 48 / 640)
+    assert sequence.intrinsics.cy == pytest.approx((cy + 0.5) * 48 / 640)
+    is_straight = np.array_equal(sequence.depths_mm, source().depths_mm)
+    assert is_straight == (camera == "3")
+
+
+def test_everything_declared_otherwise(tmp_path: Path) -> None:
+    """Catches a key of `sequence.toml` that is ignored, or applied the wrong way round."""
+    data = source()
+    rows, columns = np.indices(data.depths_mm.shape[1:])
+    x, y = (columns + 0.5 - CAMERA.cx) / CAMERA.fx, (rows + 0.5 - CAMERA.cy) / CAMERA.fy
+    raw = np.rint(4 * data.depths_mm * np.sqrt(1 + x**2 + y**2)).astype(np.uint16)
+    raw = np.where(data.depths_mm == 0, np.uint16(60000), raw)
+    write_images(tmp_path, data._replace(depths_mm=raw))
+    opengl = np.linalg.inv(data.poses @ np.diag([1.0, -1, -1, 1]))
+    (tmp_path / "poses.txt").write_text(tum_lines(np.arange(N_FRAMES) / 10, opengl, "wxyz"))
+    K = camera_matrix(CAMERA)
+    open3d = {"width": 48, "height": 36, "intrinsic_matrix": K.T.ravel().tolist()}
+    (tmp_path / "camera_intrinsic.json").write_text(json.dumps(open3d))
+    (tmp_path / "sequence.toml").write_text(
+        'depth_scale = 4000\nno_depth = 60000\ndepth_along = "ray"\ncamera_axes = "opengl"\n'
+        'poses = "world-to-camera"\nquaternion = "wxyz"\nframe_rate = 10\n'
+    )
+    check_equal(read_sequence(tmp_path), data)
+    assert open_recording(tmp_path).rate_hz == 10
+
+
+@pytest.mark.parametrize("axes", ["forward left up", "right up forward"])
+def test_axes_in_words(plain: Path, axes: str) -> None:
+    """Catches axes of robots and left-handed engines misread: the motion must be the same."""
+    rows = {"forward": [0, 0, 1.0], "left": [-1.0, 0, 0], "right": [1.0, 0, 0], "up": [0, -1.0, 0]}
+    T_file_opencv = np.eye(4)
+    T_file_opencv[:3, :3] = [rows[word] for word in axes.split()]
+    mirror = np.eye(4) if np.linalg.det(T_file_opencv) > 0 else np.diag([1.0, 1, -1, 1])
+    poses = mirror @ source().poses @ np.linalg.inv(T_file_opencv)
+    (plain / "trajectory.txt").write_text(matrix_text(poses.reshape(-1, 16)))
+    (plain / "sequence.toml").write_text(f'camera_axes = "{axes}"\n')
+    check_equal(read_sequence(plain), source())
+
+
+def change_camera(folder: Path, **values: object) -> None:
+    content = json.loads((folder / "intrinsics.json").read_text()) | values
+    (folder / "intrinsics.json").write_text(json.dumps(content))
+
+
+def test_a_lens_is_corrected(tmp_path: Path) -> None:
+    """Catches a correction that goes the wrong way: a distorted grid must come out straight.
+
+    A lens with k1 < 0 pulls the corners inwards: what a pinhole camera shows at x = 0.5 it shows
+    at x (1 + k1 x²) = 0.475.
+    """
+    camera = Intrinsics.from_focal(200, 160, 100.0)
+    depth = np.full((160, 200), 1000, np.uint16)
+    depth[:, round(100 + 100 * 0.475) :] = 2000
+    color = np.zeros((160, 200, 3), np.uint8)
+    data = Source(color[None], depth[None], np.eye(4)[None], camera)
+    folder = write_recording("plain", tmp_path / "r", data)
+    change_camera(folder, distortion=[-0.2, 0, 0, 0])
+    row = read_sequence(folder).depths_mm[0, 80]
+    assert abs(int((row == 1000).sum()) - 150) <= 1
+
+
+def test_calibration_for_another_size(plain: Path) -> None:
+    """Catches full-size intrinsics used for reduced images, and cropped images scaled."""
+    large = {"width": 96, "height": 72, "fx": 2 * CAMERA.fx, "fy": 2 * CAMERA.fy}
+    change_camera(plain, **large, cx=47.5, cy=35.5)
+    check_equal(read_sequence(plain), source())
+    change_camera(plain, width=48, height=40)
+    with pytest.raises(DataError, match=r"48x36 but .* is for 48x40"):
+        read_sequence(plain)
+
+
+def test_images_of_other_kinds(plain: Path) -> None:
+    """Catches gray images refused or copied into one channel, and whole JPEG files refused."""
+    cv2.imwrite(str(plain / "color/000000.png"), np.full((36, 48), 77, np.uint8))
+    (plain / "color/000001.png").unlink()
+    write_image(plain / "color/000001.jpg", source().colors[1])
+    colors = read_sequence(plain).colors
+    assert (colors[0] == 77).all()
+    assert np.abs(colors[1].astype(int) - source().colors[1]).mean() < 6
+
+
+def test_formats_are_told_apart(plain: Path, tmp_path: Path) -> None:
+    """Catches a guess where two formats are whole, a declared format ignored, a misspelt name."""
+    write_recording("7scenes", tmp_path / "seven")
+    for path in (tmp_path / "seven").iterdir():
+        path.rename(plain / path.name)
+    with pytest.raises(DataError, match=r"read as 7scenes or plain: choose with --format"):
+        read_sequence(plain)
+    check_equal(read_sequence(plain, format="7scenes"), source())
+    (plain / "sequence.toml").write_text('format = "plain"\n')
+    assert open_recording(plain).declared.format == "plain"
+    with pytest.raises(ConfigError, match="did you mean 'replica'"):
+        read_sequence(plain, format="replika")
+    with pytest.raises(MissingError, match=r"needs the files of neural.*; of a scene in parts"):
+        read_sequence(tmp_path / "seven")
+
+
+def test_a_new_format_is_one_entry(plain: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches formats listed anywhere but in the table."""
+    monkeypatch.setitem(FORMATS, "own", replace(FORMATS["plain"], color="rgb/*"))
+    (plain / "color").rename(plain / "rgb")
+    check_equal(read_sequence(plain), source())
+    assert open_recording(plain).declared.format == "own"
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_contents_of_every_format(tmp_path: Path, format: str) -> None:
+    """Catches maps that are not made anew when poses, calibration or declaration change."""
+    folder = write_recording(format, tmp_path / "r")
+    seen = [open_recording(folder).contents()]
+    assert open_recording(folder).contents() == seen[0]
+    for text in open_recording(folder).text_files:
+        text.write_text(text.read_text() + "\n")
+        seen.append(open_recording(folder).contents())
+    (folder / "sequence.toml").write_text("frame_rate = 5\n")
+    seen.append(open_recording(folder).contents())
+    assert all(a != b for i, a in enumerate(seen) for b in seen[:i])
+    assert len(seen) >= 4

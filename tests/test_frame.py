@@ -1,0 +1,166 @@
+"""One frame: a camera's images, sound or not, and a tracker that is fed them."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from test_lm import furnished
+from test_tracking import BoxRoom, walk
+
+from nbtrack.core.errors import DataError
+from nbtrack.data.frame import Frame
+from nbtrack.data.sequence import RgbdSequence
+from nbtrack.tracking import LmSettings, StepBudget, make_tracker
+
+SETTINGS = LmSettings(n_restarts=2)
+Images = tuple[np.ndarray, np.ndarray]
+
+
+def error_m(found: np.ndarray, sequence: RgbdSequence, index: int) -> float:
+    return float(np.linalg.norm(found[:3, 3] - sequence.T_world_camera[index, :3, 3]))
+
+
+def test_units_and_types_are_what_they_say() -> None:
+    """Catches metres taken for millimetres: both kinds of depth and colour are one frame."""
+    sequence = walk(2)
+    color, depth_mm = sequence.colors[1], sequence.depths_mm[1]
+    read_only = color.copy()
+    read_only.flags.writeable = False
+    kinds = [
+        (color, depth_mm),
+        (color, depth_mm / 1000),
+        (color / 255, depth_mm / 1000),
+        (color.astype(np.float32) / 255, (depth_mm / 1000).astype(np.float32)),
+        (read_only, depth_mm),
+    ]
+    for kind in kinds:
+        frame = Frame.of_images(sequence.intrinsics, *kind)
+        assert torch.equal(frame.color, sequence[1].color)
+        assert torch.equal(frame.depth_mm, sequence[1].depth_mm)
+
+
+WRONG_IMAGES: dict[str, tuple[Callable, str]] = {
+    "depth as integers": (lambda c, d: (c, d.astype(np.int32)), "depth is int32 of shape"),
+    "millimetres as float": (lambda c, d: (c, d.astype(float)), "or floating point in metres"),
+    "colour as integers": (lambda c, d: (c.astype(np.int64), d), "color is int64 of shape"),
+    "colour to 255 as float": (lambda c, d: (c.astype(float), d), "or floating point in [0, 1]"),
+    "grey": (lambda c, d: (c[..., 0], d), "color is uint8 of shape (24, 32"),
+    "alpha": (lambda c, d: (np.dstack([c, c[..., 0]]), d), "color is uint8 of shape (24, 32"),
+    "other size": (lambda c, d: (c, d[::2, ::2]), "depth is uint16 of shape (12, 16)"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_IMAGES)
+def test_wrong_images_are_refused(case: str) -> None:
+    """Catches silent repair of units."""
+    spoil, message = WRONG_IMAGES[case]
+    sequence = walk(1)
+    with pytest.raises(DataError) as raised:
+        Frame.of_images(sequence.intrinsics, *spoil(sequence.colors[0], sequence.depths_mm[0]))
+    assert message in str(raised.value)
+
+
+def test_points_lie_where_the_pixels_look() -> None:
+    """Catches rows for columns, and millimetres: the box's walls are at 1, 0.8 and 1.2 m."""
+    frame = walk(1)[0]
+    points, color = frame.points(*frame.measured_pixels())
+    wall = (torch.tensor([1.0, 0.8, 1.2]) - points.abs()).amin(dim=-1)
+    assert wall.abs().max() < 1e-3
+    torch.testing.assert_close(color, 0.5 + 0.4 * torch.sin(3 * points), atol=0.01, rtol=0)
+
+
+def test_smooth_points_avoid_borders_and_edges() -> None:
+    """Catches points whose depth may belong to either side of an edge, and global draws."""
+    frame = walk(1)[0]
+    frame.depth_mm[:, :16], frame.depth_mm[:, 16:], frame.depth_mm[3:6] = 1000, 2000, 0
+    draws = [frame.smooth_points(200, torch.Generator().manual_seed(s))[0] for s in (1, 1, 2)]
+    assert torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+    columns = draws[0][:, 0] / draws[0][:, 2] * 24 + 16 - 0.5
+    rows = draws[0][:, 1] / draws[0][:, 2] * 24 + 12 - 0.5
+    for values, allowed in ((columns, {*range(1, 15), *range(17, 31)}), (rows, {1, *range(7, 23)})):
+        assert set(values.round().int().tolist()) == allowed
+
+
+def _some_nan(color: np.ndarray, depth: np.ndarray) -> Images:
+    color, depth = color / 255, depth / 1000
+    color[::3], depth[:, ::4] = np.nan, np.nan
+    depth[:, 1::8], depth[:, 2::16] = np.inf, -1.0
+    return color, depth
+
+
+def _occluded(color: np.ndarray, depth: np.ndarray) -> Images:
+    color, depth = color.copy(), depth.copy()
+    color[:, : color.shape[1] // 2], depth[:, : depth.shape[1] // 2] = 40, 450
+    return color, depth
+
+
+def _dropout(color: np.ndarray, depth: np.ndarray) -> Images:
+    gone = np.random.default_rng(0).random(depth.shape) < 0.3
+    return color, np.where(gone, np.uint16(0), depth)
+
+
+def _noise(color: np.ndarray, depth: np.ndarray) -> Images:
+    return color, np.random.default_rng(0).integers(300, 9000, depth.shape).astype(np.uint16)
+
+
+LOST = 0.2  # m: the paper's rule of what counts as lost, and must not pass for good
+# How the frame is spoilt, and whether it must be flagged; None: either verdict may be honest.
+SPOILT: dict[str, tuple[Callable[..., Images], bool | None]] = {
+    "black": (lambda c, d: (np.zeros_like(c), d), False),
+    "white": (lambda c, d: (np.full_like(c, 255), d), False),
+    "no depth": (lambda c, d: (c, np.zeros_like(d)), True),
+    "NaN depth": (lambda c, d: (c, np.full(d.shape, np.nan)), True),
+    "NaN colour": (lambda c, d: (np.full(c.shape, np.nan), d), True),
+    "some NaN": (_some_nan, None),
+    "half occluded": (_occluded, None),
+    "30 % dropout": (_dropout, None),
+    "noise": (_noise, True),
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_a_spoilt_frame_is_survived_and_flagged(case: str) -> None:
+    """Catches NaN in poses, a bad pose that passes for a good one, and a run that ends there."""
+    spoil, must_flag = SPOILT[case]
+    field, sequence = furnished()
+    tracker = make_tracker("lm", field, sequence.T_world_camera[0], StepBudget(60), SETTINGS)
+    for turn, index in enumerate((1, 2, 1, 0, 1)):
+        images = sequence.colors[index], sequence.depths_mm[index]
+        images = spoil(*images) if turn == 2 else images
+        estimate = tracker.track(Frame.of_images(sequence.intrinsics, *images))
+        assert np.isfinite(estimate.T_world_camera).all()
+        if turn == 2:
+            assert must_flag is None or estimate.lost is must_flag
+            assert estimate.lost or error_m(estimate.T_world_camera, sequence, index) < LOST
+    assert not estimate.lost
+    assert error_m(estimate.T_world_camera, sequence, index) < 0.01
+
+
+def test_a_gap_of_two_seconds_is_found_again_or_flagged() -> None:
+    """Catches a jump that passes for tracking: 12 cm and 11 degrees between two frames."""
+    field, sequence = furnished()
+    jumped = sequence.T_world_camera[2].copy()
+    jumped[:3, 3] += 0.12
+    turn = torch.linalg.matrix_exp(0.15 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
+    jumped[:3, :3] = turn.double().numpy() @ jumped[:3, :3]
+    estimate = make_tracker("lm", field, jumped, StepBudget(80)).track(sequence[2])
+    assert estimate.lost or error_m(estimate.T_world_camera, sequence, 2) < 0.02
+
+
+def test_tracking_does_not_need_a_recording() -> None:
+    """Catches a camera's frames that are tracked unlike the same ones of a recording."""
+    sequence = walk(3)
+    paths = []
+    for frames in (
+        [sequence[i] for i in range(1, 3)],
+        [
+            Frame.of_images(sequence.intrinsics, sequence.colors[i], sequence.depths_mm[i] / 1000)
+            for i in range(1, 3)
+        ],
+    ):
+        tracker = make_tracker("lm", BoxRoom(), np.eye(4), StepBudget(20), SETTINGS)
+        paths.append([tracker.track(frame).T_world_camera for frame in frames])
+    np.testing.assert_array_equal(*paths)
+    assert error_m(paths[0][-1], sequence, 2) < 0.005

@@ -1,0 +1,65 @@
+"""Installed elsewhere: everything below the current folder, and missing extras told in a line."""
+
+import importlib.util
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from nbtrack.cli import main
+from nbtrack.core import files
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty current folder, and no checkout around the package."""
+    for name in ("RUNS", "DATA", "PRESET", "CONFIG", "SET"):
+        monkeypatch.delenv(f"NBTRACK_{name}", raising=False)
+    monkeypatch.setattr(files, "PACKAGE", tmp_path / "site-packages" / "nbtrack")
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return tmp_path / "work"
+
+
+def test_folders(elsewhere: Path) -> None:
+    """Catches caches in site-packages, or beside whatever folder the package lies in."""
+    assert files.runs_folder() == elsewhere / "runs"
+    assert files.data_folder() == elsewhere / "data"
+    assert files.tables_folder() == elsewhere / "paper_tables"
+
+
+@pytest.mark.parametrize(
+    ("missing", "arguments", "told"),
+    [
+        ("distributed", ["tables", "--workers", "2"], "pip install 'nbtrack[cluster]'"),
+        ("distributed", ["tables", "--dask", "tcp://h:1"], "pip install 'nbtrack[cluster]'"),
+        ("small_gicp", ["track", "office", "--field", "points", "--tracker", "icp", "--steps", "1"],
+         "pip install 'nbtrack[icp]'"),
+        ("nbconvert", ["notebooks"], "pip install 'nbtrack[notebooks]'"),
+    ],
+)  # fmt: skip
+def test_a_missing_extra_is_told_before_any_work(
+    elsewhere: Path, missing: str, arguments: list[str], told: str,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture,
+) -> None:  # fmt: skip
+    """Catches minutes of work that end in a traceback of imports."""
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name, *a: None if name == missing else found(name, *a)
+    )
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+    assert not list(elsewhere.iterdir())
+
+
+def test_help_is_quick_and_needs_no_torch(tmp_path: Path) -> None:
+    """Catches an import at the top that makes every typing mistake cost seconds."""
+    shutil.copytree(files.PACKAGE, tmp_path / "nbtrack")
+    (tmp_path / "torch.py").write_text("raise ImportError('no torch here')")
+    command = [sys.executable, "-m", "nbtrack", "track", "--help"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "--map-from" in done.stdout

@@ -1,0 +1,65 @@
+"""A room of the package imports only rooms before it, and nothing imports in a circle."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "nbtrack"
+ORDER = [
+    "core", "data", "synthetic", "fields", "mapping", "tracking", "tables", "plots",
+    "experiments", "cli", "__main__",
+]  # fmt: skip
+MODULES = {
+    ".".join(["nbtrack", *path.relative_to(PACKAGE).with_suffix("").parts]): path
+    for path in PACKAGE.rglob("*.py")
+}
+
+
+def imports(path: Path) -> set[str]:
+    """Modules of the package that a module imports anywhere, in its functions too."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{path} imports relatively"
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    packages = {name: f"{name}.__init__" for name in found}
+    return {m for name in found for m in (name, packages[name]) if m in MODULES}
+
+
+def test_rooms_import_earlier_rooms_only() -> None:
+    """Catches a step back up: an earlier room gets what it needs as an argument."""
+    for name, path in MODULES.items():
+        room = name.split(".")[1]
+        if room != "__init__":  # the public face
+            later = ORDER[ORDER.index(room) + 1 :]
+            wrong = [other for other in imports(path) if other.split(".")[1] in later]
+            assert not wrong, f"{name} imports {wrong}"
+
+
+def test_no_circle() -> None:
+    """Catches two modules that import each other, by however long a way."""
+    waiting = {n: imports(p) - {n} for n, p in MODULES.items() if n != "nbtrack.__init__"}
+    # Whoever imports from a room's front imports what is behind it: the front itself comes last.
+    for name, found in waiting.items():
+        own = name.rpartition(".")[0]
+        waiting[name] = {m for m in found if m in waiting and m != f"{own}.__init__"}
+    while free := [name for name, needed in waiting.items() if not needed]:
+        for name in free:
+            del waiting[name]
+        for needed in waiting.values():
+            needed -= set(free)
+    assert not waiting
+
+
+@pytest.mark.parametrize("path", MODULES.values(), ids=MODULES)
+def test_modules_and_functions_are_small(path: Path) -> None:
+    """Catches a module of more than 250 lines, and a function of more than 40."""
+    text = path.read_text()
+    assert text.count("\n") <= 250
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            lines = node.end_lineno - node.lineno + 1
+            assert lines <= 40, f"{node.name} has {lines} lines"

@@ -1,0 +1,205 @@
+"""Settings: who overrides whom, and that a misspelt key can never pass for a valid one."""
+
+import copy
+import json
+from pathlib import Path
+
+import pytest
+
+from nbtrack.core.errors import ConfigError, MissingError
+from nbtrack.core.files import fingerprint
+from nbtrack.core.settings import as_dict, changed_settings, with_settings
+from nbtrack.experiments.methods import METHODS, TABLE_1
+from nbtrack.experiments.presets import PRESETS, Preset, load_preset
+from nbtrack.fields import NetworkSettings
+from nbtrack.synthetic import REPORTED_ROOMS
+
+KEY = "mapping.neus.iterations"
+
+
+@pytest.fixture(autouse=True)
+def clean_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The settings of whoever runs the tests must not count."""
+    for name in ("NBTRACK_PRESET", "NBTRACK_CONFIG", "NBTRACK_SET"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def iterations(preset: Preset) -> int:
+    return preset.mapping["neus"].iterations
+
+
+def toml_file(folder: Path, text: str) -> Path:
+    (folder / "settings.toml").write_text(text)
+    return folder / "settings.toml"
+
+
+def refused(*settings: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_preset(settings=settings)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_presets_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches another default than smoke, and an environment that outdoes an explicit name."""
+    assert load_preset() == PRESETS["smoke"]
+    monkeypatch.setenv("NBTRACK_PRESET", "synthetic")
+    assert load_preset() == PRESETS["synthetic"]
+    assert load_preset("paper") == PRESETS["paper"]
+    with pytest.raises(ConfigError, match="'papper': did you mean 'paper'"):
+        load_preset("papper")
+
+
+def test_papers_figures() -> None:
+    """Catches a drifted default: what the paper states, the paper's preset must say."""
+    paper = PRESETS["paper"]
+    assert (paper.tracking["vr"].n_pixels, paper.tracking["sdf"].n_pixels) == (512, 4096)
+    for name in TABLE_1:
+        tracking = paper.tracking[METHODS[name].tracker]
+        assert (tracking.position_rate, tracking.orientation_rate) == (5e-4, 1e-3)
+        assert tracking.motion_model == "previous_pose"
+    assert paper.tables.rates_hz == (10.0, 5.0, 2.0)
+    assert paper.tables.budgets_ms == (50.0, 100.0, 500.0)
+    assert paper.scenes.names[:2] == ("breakfast_room", "complete_kitchen")
+    assert [METHODS[name].paper_steps(2) for name in TABLE_1] == [36.1, 79.3]
+    assert METHODS["vr_neus"].paper_steps(10) == 6.8
+    assert METHODS["lm"].paper_steps(10) == 15.3
+
+
+def test_nothing_is_tuned_on_what_is_reported() -> None:
+    """Catches a preset that reports a room on which settings were chosen, or leaves one out."""
+    assert PRESETS["synthetic"].scenes.names == REPORTED_ROOMS
+    assert set(PRESETS["smoke"].scenes.names) <= set(REPORTED_ROOMS)
+
+
+def test_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a wrong order: preset < file < environment < explicit; presets never change."""
+    before = copy.deepcopy(PRESETS)
+    path = toml_file(tmp_path, "[mapping.neus]\niterations = 11\nn_rays = 12\n")
+    assert iterations(load_preset(config_file=path)) == 11
+    monkeypatch.setenv("NBTRACK_SET", f"{KEY}=22")
+    assert iterations(load_preset(config_file=path)) == 22
+    resolved = load_preset(config_file=path, settings=(f"{KEY}=33",))
+    assert iterations(resolved) == 33
+    assert resolved.mapping["neus"].n_rays == 12  # the file's other line still counts
+    assert resolved.mapping["imap"] == PRESETS["smoke"].mapping["imap"]
+    assert iterations(load_preset(settings=(f"{KEY}=1", f"{KEY}=2"))) == 2
+    monkeypatch.setenv("NBTRACK_SET", "")
+    monkeypatch.setenv("NBTRACK_CONFIG", str(path))
+    assert iterations(load_preset()) == 11
+    (tmp_path / "other.toml").write_text(f"{KEY} = 6")
+    assert iterations(load_preset(config_file=tmp_path / "other.toml")) == 6
+    assert before == PRESETS
+
+
+def test_several_settings_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a split at commas or within quotes."""
+    monkeypatch.setenv("NBTRACK_SET", """scenes.n_frames=7 "scenes.names=['office', 'bedroom']" """)
+    scenes = load_preset().scenes
+    assert (scenes.n_frames, scenes.names) == (7, ("office", "bedroom"))
+
+
+def test_values_take_the_type_of_the_preset() -> None:
+    """Catches integers left in real settings, and single values where several are allowed."""
+    settings = (
+        "mapping.neus.learning_rate=1", "scenes.names=office", "tables.rates_hz=[4, 2.5]",
+        "scenes.synthetic=false", "scenes.track_frames=0:10:2", "scenes.width = 64",
+        "mapping.neus.holdout_every=0",
+    )  # fmt: skip
+    resolved = load_preset(settings=settings)
+    assert type(resolved.mapping["neus"].learning_rate) is float
+    assert resolved.mapping["neus"].holdout_every == 0
+    assert resolved.scenes.names == ("office",)
+    assert [type(rate) for rate in resolved.tables.rates_hz] == [float, float]
+    assert resolved.scenes.synthetic is False
+    assert (resolved.scenes.track_frames, resolved.scenes.width) == ("0:10:2", 64)
+
+
+@pytest.mark.parametrize(
+    ("key", "nearest"),
+    [
+        ("mapping.neus.iteration", KEY),
+        ("tracking.sdf.npixels", "tracking.sdf.n_pixels"),
+        ("scene.names", "scenes.names"),
+        ("tracking.lm.lambda_color", "tracking.vr.lambda_color"),  # which LM does not have
+    ],
+)
+def test_unknown_key_names_the_nearest(key: str, nearest: str) -> None:
+    """Catches a misspelt or unused key that is silently added."""
+    assert f"unknown config key '{key}': did you mean '{nearest}'?" in refused(f"{key}=5")
+
+
+@pytest.mark.parametrize("key", ["name", "mapping", "mapping.neus", "", "__class__"])
+def test_keys_that_are_no_settings(key: str) -> None:
+    """Catches a whole branch, the preset's own name or an attribute replaced by a number."""
+    assert f"unknown config key '{key}'" in refused(f"{key}=5")
+
+
+@pytest.mark.parametrize(
+    ("setting", "wanted"),
+    [
+        (f"{KEY}=1.5", "int"),
+        (f"{KEY}=many", "int"),
+        (f"{KEY}=true", "int"),
+        (f"{KEY}=", "int"),
+        ("mapping.neus.learning_rate=false", "float"),
+        ("scenes.synthetic=1", "bool"),
+        ("scenes.track_frames=10", "str"),
+        ("scenes.names=[1, 2]", "str"),
+        ("tables.rates_hz=['fast']", "float"),
+        ("tables.pixels.vr=[1.5]", "int"),
+    ],
+)
+def test_wrong_type(setting: str, wanted: str) -> None:
+    """Catches values that would fail, or worse would not, somewhere in a run of hours."""
+    message = refused(setting)
+    assert setting.partition("=")[0] in message
+    assert f"it must be {wanted}, for example" in message
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        (f"{KEY}=-1", "1 or more"),
+        ("mapping.imap.learning_rate=-1e-3", "0 or more"),
+        ("tables.rates_hz=[5, -1]", "0 or more"),
+        ("mapping.neus.lambda_eikonal=nan", "0 or more"),
+        (KEY, "write key=value"),
+        ("scenes.names=[office,bedroom]", "is no TOML"),
+    ],
+)
+def test_values_that_are_not_allowed(setting: str, says: str) -> None:
+    """Catches a sign that turns a loss into a reward, and a list whose quotes the shell ate."""
+    assert says in refused(setting)
+
+
+def test_bad_files(tmp_path: Path) -> None:
+    """Catches a missing or broken file that is passed over, or checked less than settings are."""
+    with pytest.raises(MissingError, match=r"nowhere\.toml"):
+        load_preset(config_file=tmp_path / "nowhere.toml")
+    with pytest.raises(ConfigError, match=r"did you mean 'mapping\.neus\.n_rays'"):
+        load_preset(config_file=toml_file(tmp_path, "[mapping.neus]\nn_ray = 5"))
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_changed_settings_are_those_that_were_changed(name: str) -> None:
+    """Catches settings that cannot be given again: every kind of value makes the round trip."""
+    settings = (
+        f"{KEY}=7", "tracking.sdf.motion_model=constant_velocity", "scenes.names=['a', 'b']",
+        "tables.rates_hz=[3.5]", "network.imap.embedding_sigma=1.25", "tables.pixels.vr=[9]",
+    )  # fmt: skip
+    preset = with_settings(PRESETS[name], *settings)
+    changed = changed_settings(preset, PRESETS[name])
+    assert len(changed) == len(settings)
+    assert with_settings(PRESETS[name], *changed) == preset
+    assert changed_settings(load_preset(name), PRESETS[name]) == []
+    assert json.loads(json.dumps(as_dict(preset))) == as_dict(preset)
+
+
+def test_fingerprint() -> None:
+    """Catches a cache that mixes up settings, or forgets them between two runs."""
+    found = {fingerprint(NetworkSettings(), 0) for _ in range(2)}
+    found |= {fingerprint(NetworkSettings(), 1), fingerprint(NetworkSettings(width=255), 0)}
+    assert len(found) == 3
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
+    assert {len(text) for text in found} == {12}

@@ -1,0 +1,110 @@
+"""The Neural RGB-D layout as it is written: whole or not at all, and nothing lost."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import source, write_recording
+
+from nbtrack.cli import main
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.errors import DataError
+from nbtrack.data.sequence import read_sequence
+from nbtrack.data.text_files import read_calibration, read_poses
+from nbtrack.data.writer import SequenceWriter
+
+CAMERA = Intrinsics(12, 8, 10.123456789012345, 10.123456789012345, 6.0, 4.0)
+RNG = np.random.default_rng(0)
+COLOR = RNG.integers(0, 256, (8, 12, 3), dtype=np.uint8)
+DEPTH = RNG.integers(0, 1 << 16, (8, 12), dtype=np.uint16)
+
+
+def write_scene(folder: Path, n_frames: int = 1, camera: Intrinsics = CAMERA) -> None:
+    with SequenceWriter(folder, camera, ("depth", "depth_filtered")) as writer:
+        for i in range(n_frames):
+            depths = {"depth": DEPTH, "depth_filtered": DEPTH + np.uint16(i)}
+            writer.add(COLOR + np.uint8(i), depths, source().poses[i])
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    """Catches swapped colours, lost depth bits, rounded numbers, axes converted only one way."""
+    write_scene(tmp_path / "scene", 3)
+    sequence = read_sequence(tmp_path / "scene")
+    assert np.array_equal(sequence.colors[2], COLOR + np.uint8(2))
+    assert np.array_equal(sequence.depths_mm[2], DEPTH + np.uint16(2))
+    np.testing.assert_allclose(sequence.T_world_camera, source().poses[:3], rtol=0, atol=1e-12)
+    assert sequence.intrinsics == CAMERA
+    assert read_calibration(tmp_path / "scene/focal.txt").fx == CAMERA.fx
+    # On disk, y and z columns have the other sign: OpenGL's axes.
+    on_disk = read_poses(tmp_path / "scene/poses.txt")[0]
+    np.testing.assert_array_equal(on_disk, sequence.T_world_camera * [1.0, -1, -1, 1])
+
+
+def test_camera_that_the_layout_cannot_say(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches a focal length or a principal point that is dropped in silence."""
+    camera = Intrinsics(48, 36, 43.0, 44.5, 25.25, 17.0)
+    folder = write_recording("plain", tmp_path / "r", source()._replace(camera=camera))
+    out = tmp_path / "out"
+    assert main(["data", "convert", str(folder), str(out)]) == 0
+    assert "more than focal.txt can say: it is in intrinsics.txt" in capsys.readouterr().out
+    assert not (out / "focal.txt").exists()
+    assert read_sequence(out).intrinsics == camera
+
+
+def test_converter_refuses_and_selects(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches an overwritten folder, and a slice that is ignored."""
+    folder = write_recording("7scenes", tmp_path / "r")
+    convert = ["data", "convert", str(folder)]
+    assert main([*convert, str(tmp_path / "out"), "--frames", "2:5"]) == 0
+    assert np.array_equal(read_sequence(tmp_path / "out").depths_mm, source().depths_mm[2:5])
+    capsys.readouterr()
+    assert main([*convert, str(tmp_path / "out")]) == 2
+    assert "exists" in capsys.readouterr().err
+    assert main([*convert, str(tmp_path / "new"), "--frames", "9:"]) == 2
+    assert "select 0 of the 6 frames" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path) -> None:
+    """Catches a half-written scene that a later run would take for a whole one."""
+
+    def write_and_stop() -> None:
+        with SequenceWriter(tmp_path / "scene", CAMERA, ("depth",)) as writer:
+            writer.add(COLOR, {"depth": DEPTH}, np.eye(4))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_and_stop()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_writer_clears_what_a_killed_one_left(tmp_path: Path) -> None:
+    """Catches frames of a killed run that stay among those of the next."""
+    killed = SequenceWriter(tmp_path / "scene", CAMERA, ("depth", "depth_filtered"))
+    killed.__enter__()
+    for _ in range(2):
+        killed.add(COLOR, {"depth": DEPTH, "depth_filtered": DEPTH}, np.eye(4))
+    write_scene(tmp_path / "scene")
+    assert len(read_sequence(tmp_path / "scene")) == 1
+
+
+def test_writer_refuses(tmp_path: Path) -> None:
+    """Catches a scene that is overwritten or empty, and frames that do not fit the camera."""
+    with pytest.raises(DataError, match=r"exists: choose another"):
+        SequenceWriter(tmp_path, CAMERA)
+    smaller = Intrinsics.from_focal(6, 4, 5.0)
+    with pytest.raises(DataError, match=r"of shape \(8, 12, 3\) but the camera \(4, 6\): "):
+        write_scene(tmp_path / "other", 1, smaller)
+    with pytest.raises(DataError, match="no frame"):
+        write_scene(tmp_path / "empty", 0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_two_writers_of_one_scene(tmp_path: Path) -> None:
+    """Catches two commands that spoil each other's files of one room: the first one stands."""
+    with SequenceWriter(tmp_path / "room", CAMERA, ("depth",)) as late:
+        late._unfinished = late._unfinished.with_name(".room.other.unfinished")
+        late.__enter__()
+        late.add(COLOR, {"depth": DEPTH}, np.eye(4))
+        write_scene(tmp_path / "room", 2)
+    assert len(read_sequence(tmp_path / "room")) == 2
