@@ -1,0 +1,139 @@
+"""The larger results that notebooks 6 and A1 read: CSV in paper_tables/beyond and open_questions.
+
+    python benchmarks/beyond.py
+
+On the two rooms of the `smoke` preset, with the paper's step counts; ten minutes on two CPU cores.
+Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed run goes on.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from nbtrack import METHODS, Method, load_preset, map_scenes, open_scenes, track_scenes
+from nbtrack.core.device import choose_device, device_name
+from nbtrack.core.files import tables_folder, write_text_atomic
+from nbtrack.core.settings import with_settings
+from nbtrack.experiments.basin import find_from_afar
+from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.methods import RATES_3_HZ, TABLE_3
+from nbtrack.experiments.presets import Preset
+from nbtrack.experiments.scenes import Scene
+from nbtrack.tables import write_table_3
+
+_COLUMNS = ["rate_hz", "method", "scene", "frames", "steps_per_frame", "seconds_per_frame", "ate_m"]
+_FIRST_60 = ":60"
+
+INGREDIENTS = (
+    METHODS["lm"],
+    Method("without colour", "neus_plus", "lm", ("tracking.lm.lambda_intensity=0",)),
+    Method("with narrow scales throughout", "neus_plus", "lm", ("tracking.lm.anneal=false",)),
+    Method("with f in place of f/|∇f|", "neus_plus", "lm", ("tracking.lm.divide_by_slope=false",)),
+    Method(
+        "from the previous pose", "neus_plus", "lm", ("tracking.lm.motion_model=previous_pose",)
+    ),
+    Method(
+        "from constant velocity", "neus_plus", "lm", ("tracking.lm.motion_model=constant_velocity",)
+    ),
+    Method("with four times the points", "neus_plus", "lm", ("tracking.lm.n_pixels=2048",)),
+    Method(
+        "in NeuS+ without rendering", "neus_plus", "lm", ("mapping.neus_plus.lambda_rendering=0",)
+    ),
+    Method("in NeuS, as in the paper", "neus", "lm"),
+)
+"""LM with one thing changed at a time."""
+
+STARTS = tuple(
+    Method(f"{method.label}, constant velocity", method.field, method.tracker, (setting,))
+    for method, setting in (
+        (METHODS["vr"], "tracking.vr.motion_model=constant_velocity"),
+        (METHODS["sdf"], "tracking.sdf.motion_model=constant_velocity"),
+    )
+)
+
+
+def write(folder: str, name: str, table: pd.DataFrame) -> None:
+    """One file of paper_tables/."""
+    path: Path = tables_folder() / folder / f"{name}.csv"
+    write_text_atomic(path, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+    print(f"{folder}/{path.name}: {len(table)} rows")
+
+
+def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
+    """Table III, the basin of convergence, and what each ingredient of LM adds."""
+    results = track_scenes(scenes, TABLE_3, preset, RATES_3_HZ, frames=_FIRST_60)
+    write("beyond", "table_3_cells", results[_COLUMNS])
+    note = f"Preset: smoke; budget: the paper's step counts; first 60 frames; {device()}."
+    write_table_3(tables_folder() / "beyond", results, note)
+    # Times count: one run after the other. Other frames than above, so that none is cached.
+    speed = track_scenes(scenes, TABLE_3, preset, [10], frames=":40", execution=Execution(1, 1))
+    write("beyond", "speed", speed[_COLUMNS])
+    searches = find_from_afar(scenes[0], {"sdf_plus": 79, "lm": 30, "baked": 30}, preset)
+    write("beyond", "basin", searches)
+    parts = [
+        track_scenes(scenes[:1], INGREDIENTS, preset, steps=30, frames=frames).assign(kept=frames)
+        for frames in (":", "::8")
+    ]
+    ingredients = pd.concat(parts)[["method", "scene", "kept", "steps_per_frame", "ate_m"]]
+    write("beyond", "ingredients", ingredients)
+
+
+def open_questions(scenes: Sequence[Scene], preset: Preset) -> None:
+    """Steps against learning rates, the start of the search, VR in both maps, cost of mapping."""
+    write("open_questions", "steps_and_rates", steps_and_rates(scenes[:1], preset))
+    starts = track_scenes(scenes, ["vr", "sdf", *STARTS], preset, rates_hz=[10])
+    write("open_questions", "starts", starts[_COLUMNS])
+    both = track_scenes(scenes, ["vr", "sdf", "vr_neus"], preset, rates_hz=[2], frames=_FIRST_60)
+    write("open_questions", "vr_in_both_maps", both[_COLUMNS])
+    write("open_questions", "mapping_time", mapping_time(scenes[:1], preset))
+
+
+def steps_and_rates(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
+    """More steps with the paper's learning rates, and larger steps with those of 10 Hz.
+
+    `reach_mm` is how far Adam can move the position along an axis in a frame.
+    """
+    parts = []
+    for name in ("vr", "sdf"):
+        method, rates = METHODS[name], (5e-4, 1e-3)
+        more = track_scenes(scenes, [method], preset).assign(how="more steps", factor=1.0)
+        parts.append(more)
+        for factor in (1.0, 2.0, 4.0):
+            keys = (
+                f"tracking.{method.tracker}.position_rate",
+                f"tracking.{method.tracker}.orientation_rate",
+            )
+            settings = tuple(f"{k}={factor * r!r}" for k, r in zip(keys, rates, strict=True))
+            larger = Method(method.label, method.field, method.tracker, settings)
+            found = track_scenes(scenes, [larger], preset, rates_hz=[10])
+            parts.append(found.assign(how="larger steps", factor=factor))
+    table = pd.concat(parts)
+    table["reach_mm"] = 0.5 * table["steps"] * table["factor"]
+    return table[["method", "how", "scene", "steps", "factor", "reach_mm", "ate_m"]]
+
+
+def mapping_time(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
+    """Held-out depth error against mapping time; every row is a map made from start to end."""
+    parts = []
+    for field in ("imap", "neus"):
+        whole = preset.mapping_of(field)
+        for share in (0.125, 0.35, 0.9):  # a whole one is cached, made beside another
+            iterations = round(share * whole.iterations)
+            shorter = with_settings(preset, f"mapping.{field}.iterations={iterations}")
+            samples = whole.n_rays * (whole.n_stratified + whole.n_surface)
+            made = map_scenes(scenes, [field], shorter, execution=Execution(1, 1))
+            parts.append(made.assign(iterations=iterations, samples=samples))
+    return pd.concat(parts)[["field", "scene", "iterations", "samples", "seconds", "depth_l1_m"]]
+
+
+def device() -> str:
+    """What measured."""
+    return device_name(choose_device())
+
+
+if __name__ == "__main__":
+    smoke = load_preset("smoke")
+    rooms = open_scenes(smoke)
+    beyond(rooms, smoke)
+    open_questions(rooms, smoke)
