@@ -1,19 +1,11 @@
-"""The pinhole camera: pixels and points are each other's inverse, and axes turn only twice."""
+"""The pinhole camera: pixels and points are each other's inverse."""
 
 import math
 
-import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
-from nbtrack.core.camera import (
-    Intrinsics,
-    backproject,
-    pixel_directions,
-    project,
-    swap_opengl_opencv,
-)
+from nbtrack.core.camera import Intrinsics, backproject, pixel_directions, project
 
 CAMERA = Intrinsics(640, 480, 500.0, 510.0, 300.0, 250.0)
 
@@ -88,33 +80,3 @@ def test_gradient_reaches_depth() -> None:
     point = backproject(CAMERA, torch.tensor([10]), torch.tensor([20]), depth)
     point[0, 0].backward()
     assert depth.grad.item() == pytest.approx((10.5 - 300) / 500)
-
-
-@pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3)], ids=str)
-def test_axis_swap_is_an_involution(shape: tuple[int, ...]) -> None:
-    """Catches an axis that is swapped once too often: twice is nothing, to the last bit."""
-    rng = np.random.default_rng(0)
-    n_poses = int(np.prod(shape))
-    poses = np.tile(np.eye(4), (n_poses, 1, 1))
-    poses[:, :3, :3] = Rotation.random(n_poses, random_state=rng).as_matrix().reshape(-1, 3, 3)
-    poses[:, :3, 3] = rng.normal(size=(n_poses, 3))
-    poses = poses.reshape(*shape, 4, 4)
-    swapped = swap_opengl_opencv(poses)
-    assert np.array_equal(swap_opengl_opencv(swapped), poses)
-    # The camera's place and its x axis stay, in the same world; the rotation stays right-handed.
-    assert np.array_equal(swapped[..., [0, 3]], poses[..., [0, 3]])
-    np.testing.assert_allclose(np.linalg.det(swapped[..., :3, :3]), 1)
-
-
-def test_axis_swap_leaves_the_world_as_it_is() -> None:
-    """Catches a swap on the left side, which would turn the world instead of the camera.
-
-    The same world point: one metre ahead is (0, 0, 1) with OpenCV axes and (0, 0, -1) with OpenGL.
-    """
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
-    pose[:3, 3] = [1.0, 2.0, 3.0]
-    swapped = swap_opengl_opencv(pose)
-    same_points = [([0, 0, 1], [0, 0, -1]), ([0, 1, 0], [0, -1, 0]), ([1, 0, 0], [1, 0, 0])]
-    for opencv, opengl in same_points:
-        np.testing.assert_allclose(pose @ [*opencv, 1], swapped @ [*opengl, 1], atol=1e-15)

@@ -10,7 +10,7 @@ from recordings import write_recording
 
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
-from nbtrack.data.writer import SequenceWriter
+from nbtrack.data.writer import write_sequence
 from nbtrack.tracking.trajectories import read_tum
 
 TINY = [
@@ -33,12 +33,11 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def folder(tmp_path: Path) -> Path:
     """A sound sequence of three frames, to be spoilt."""
     path = tmp_path / "scene"
-    with SequenceWriter(path, Intrinsics.from_focal(16, 12, 14.0), ("depth",)) as writer:
-        for number in range(3):
-            pose = np.eye(4)
-            pose[0, 3] = 0.01 * number
-            color = np.full((12, 16, 3), 50 * number, np.uint8)
-            writer.add(color, {"depth": np.full((12, 16), 2000, np.uint16)}, pose)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = 0.01 * np.arange(3)
+    depths_mm = {"depth": np.full((12, 16), 2000, np.uint16)}
+    frames = ((np.full((12, 16, 3), 50 * i, np.uint8), depths_mm, poses[i]) for i in range(3))
+    write_sequence(path, Intrinsics.from_focal(16, 12, 14.0), frames)
     return path
 
 

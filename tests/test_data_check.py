@@ -24,10 +24,11 @@ from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.core.errors import DataError
 from nbtrack.core.settings import with_settings
 from nbtrack.data.check import DataReport, check_recording
-from nbtrack.data.conventions import CONVENTIONS, WORLD_TO_CAMERA
+from nbtrack.data.formats import WORLD_TO_CAMERA
+from nbtrack.data.readings import CONVENTIONS
 from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import read_sequence
-from nbtrack.data.writer import SequenceWriter
+from nbtrack.data.writer import write_sequence
 from nbtrack.experiments.presets import load_preset
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -61,14 +62,14 @@ def write_box(folder: Path, poses: np.ndarray, depth_scale: float = 1.0) -> Path
     """Bare walls with exact depth: rays end where they leave the box."""
     rows, columns = torch.from_numpy(np.indices((48, 64)))
     directions_camera = pixel_directions(BOX_CAMERA, columns, rows).flatten(0, 1)
-    gray = np.full((48, 64, 3), 128, np.uint8)
-    with SequenceWriter(folder, BOX_CAMERA, ("depth",)) as writer:
-        for pose in poses:
-            T = torch.from_numpy(pose).float()
-            directions = directions_camera @ T[:3, :3].T
-            metres = BOX.exit_depth(T[:3, 3].expand_as(directions), directions)
-            depth = depth_scale * (1000 * metres).round().numpy().reshape(48, 64)
-            writer.add(gray, {"depth": depth.astype(np.uint16)}, pose)
+    gray, frames = np.full((48, 64, 3), 128, np.uint8), []
+    for pose in poses:
+        T = torch.from_numpy(pose).float()
+        directions = directions_camera @ T[:3, :3].T
+        metres = BOX.exit_depth(T[:3, 3].expand_as(directions), directions)
+        depth = depth_scale * (1000 * metres).round().numpy().reshape(48, 64)
+        frames.append((gray, {"depth": depth.astype(np.uint16)}, pose))
+    write_sequence(folder, BOX_CAMERA, frames)
     return folder
 
 

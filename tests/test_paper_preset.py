@@ -9,7 +9,7 @@ from tiny import TINY
 
 from nbtrack.cli import main
 from nbtrack.data.text_files import read_poses
-from nbtrack.data.writer import SequenceWriter
+from nbtrack.data.writer import write_sequence
 from nbtrack.experiments.scenes import DATASET_SCENES
 from nbtrack.synthetic import build_room, room_frames, room_intrinsics
 from nbtrack.tables import PAPER_SCENE_LABELS
@@ -24,10 +24,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("neural_rgbd")
     frames = list(room_frames(build_room("living_room"), N_FRAMES, WIDTH, HEIGHT, seed=0))
     for name in DATASET_SCENES:
-        depth_folders = ("depth", "depth_with_noise", "depth_filtered")
-        with SequenceWriter(folder / name, room_intrinsics(WIDTH, HEIGHT), depth_folders) as writer:
-            for frame in frames:
-                writer.add(frame.color, frame.depths_mm, frame.T_world_camera)
+        write_sequence(folder / name, room_intrinsics(WIDTH, HEIGHT), frames)
         poses = read_poses(folder / name / "poses.txt")[0]
         poses[3:5] = np.nan  # as where BundleFusion lost the camera
         np.savetxt(folder / name / "trainval_poses.txt", poses.reshape(-1, 4))

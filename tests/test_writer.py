@@ -1,5 +1,6 @@
 """The Neural RGB-D layout as it is written: whole or not at all, and nothing lost."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import read_sequence
 from nbtrack.data.text_files import read_calibration, read_poses
-from nbtrack.data.writer import SequenceWriter
+from nbtrack.data.writer import WrittenFrame, write_sequence
 
 CAMERA = Intrinsics(12, 8, 10.123456789012345, 10.123456789012345, 6.0, 4.0)
 RNG = np.random.default_rng(0)
@@ -19,24 +20,23 @@ COLOR = RNG.integers(0, 256, (8, 12, 3), dtype=np.uint8)
 DEPTH = RNG.integers(0, 1 << 16, (8, 12), dtype=np.uint16)
 
 
-def write_scene(folder: Path, n_frames: int = 1, camera: Intrinsics = CAMERA) -> None:
-    with SequenceWriter(folder, camera, ("depth", "depth_filtered")) as writer:
-        for i in range(n_frames):
-            depths = {"depth": DEPTH, "depth_filtered": DEPTH + np.uint16(i)}
-            writer.add(COLOR + np.uint8(i), depths, source().poses[i])
+def frames(number: int) -> Iterator[WrittenFrame]:
+    for i in range(number):
+        depths = {"depth": DEPTH, "depth_filtered": DEPTH + np.uint16(i)}
+        yield COLOR + np.uint8(i), depths, source().poses[i]
 
 
 def test_round_trip(tmp_path: Path) -> None:
     """Catches swapped colours, lost depth bits, rounded numbers, axes converted only one way."""
-    write_scene(tmp_path / "scene", 3)
-    sequence = read_sequence(tmp_path / "scene")
+    write_sequence(tmp_path / "new/scene", CAMERA, frames(3))
+    sequence = read_sequence(tmp_path / "new/scene")
     assert np.array_equal(sequence.colors[2], COLOR + np.uint8(2))
     assert np.array_equal(sequence.depths_mm[2], DEPTH + np.uint16(2))
     np.testing.assert_allclose(sequence.T_world_camera, source().poses[:3], rtol=0, atol=1e-12)
     assert sequence.intrinsics == CAMERA
-    assert read_calibration(tmp_path / "scene/focal.txt").fx == CAMERA.fx
+    assert read_calibration(tmp_path / "new/scene/focal.txt").fx == CAMERA.fx
     # On disk, y and z columns have the other sign: OpenGL's axes.
-    on_disk = read_poses(tmp_path / "scene/poses.txt")[0]
+    on_disk = read_poses(tmp_path / "new/scene/poses.txt")[0]
     np.testing.assert_array_equal(on_disk, sequence.T_world_camera * [1.0, -1, -1, 1])
 
 
@@ -68,43 +68,37 @@ def test_converter_refuses_and_selects(tmp_path: Path, capsys: pytest.CaptureFix
 def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path) -> None:
     """Catches a half-written scene that a later run would take for a whole one."""
 
-    def write_and_stop() -> None:
-        with SequenceWriter(tmp_path / "scene", CAMERA, ("depth",)) as writer:
-            writer.add(COLOR, {"depth": DEPTH}, np.eye(4))
-            raise KeyboardInterrupt
+    def interrupted() -> Iterator[WrittenFrame]:
+        yield from frames(2)
+        raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_and_stop()
+        write_sequence(tmp_path / "scene", CAMERA, interrupted())
     assert list(tmp_path.iterdir()) == []
-
-
-def test_writer_clears_what_a_killed_one_left(tmp_path: Path) -> None:
-    """Catches frames of a killed run that stay among those of the next."""
-    killed = SequenceWriter(tmp_path / "scene", CAMERA, ("depth", "depth_filtered"))
-    killed.__enter__()
-    for _ in range(2):
-        killed.add(COLOR, {"depth": DEPTH, "depth_filtered": DEPTH}, np.eye(4))
-    write_scene(tmp_path / "scene")
-    assert len(read_sequence(tmp_path / "scene")) == 1
 
 
 def test_writer_refuses(tmp_path: Path) -> None:
     """Catches a scene that is overwritten or empty, and frames that do not fit the camera."""
     with pytest.raises(DataError, match=r"exists: choose another"):
-        SequenceWriter(tmp_path, CAMERA)
+        write_sequence(tmp_path, CAMERA, frames(1))
     smaller = Intrinsics.from_focal(6, 4, 5.0)
     with pytest.raises(DataError, match=r"of shape \(8, 12, 3\) but the camera \(4, 6\): "):
-        write_scene(tmp_path / "other", 1, smaller)
+        write_sequence(tmp_path / "other", smaller, frames(1))
     with pytest.raises(DataError, match="no frame"):
-        write_scene(tmp_path / "empty", 0)
+        write_sequence(tmp_path / "empty", CAMERA, frames(0))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_two_writers_of_one_scene(tmp_path: Path) -> None:
-    """Catches two commands that spoil each other's files of one room: the first one stands."""
-    with SequenceWriter(tmp_path / "room", CAMERA, ("depth",)) as late:
-        late._unfinished = late._unfinished.with_name(".room.other.unfinished")
-        late.__enter__()
-        late.add(COLOR, {"depth": DEPTH}, np.eye(4))
-        write_scene(tmp_path / "room", 2)
+    """Catches commands that spoil each other's files of one room, or take up what a killed one
+    left: the first to finish stands."""
+
+    def late() -> Iterator[WrittenFrame]:
+        yield from frames(1)
+        write_sequence(tmp_path / "room", CAMERA, frames(2))
+
+    killed = tmp_path / ".room.killed.unfinished/scene/images"
+    killed.mkdir(parents=True)
+    (killed / "img7.png").write_bytes(b"")
+    write_sequence(tmp_path / "room", CAMERA, late())
     assert len(read_sequence(tmp_path / "room")) == 2

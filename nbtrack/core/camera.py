@@ -1,4 +1,4 @@
-"""The pinhole camera: intrinsics, rays, back-projection, and the one place that converts axes.
+"""The pinhole camera: intrinsics, rays, back-projection.
 
 Inside the package every camera frame has OpenCV's axes: x right, y down, z forward. Pixel centres
 lie at integer + 0.5, so an image of width W spans [0, W].
@@ -6,7 +6,6 @@ lie at integer + 0.5, so an image of width W spans [0, W].
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float, Real
 from torch import Tensor
@@ -73,16 +72,3 @@ def project(
     columns = intrinsics.fx * x / depth + intrinsics.cx - 0.5
     rows = intrinsics.fy * y / depth + intrinsics.cy - 0.5
     return columns, rows, depth
-
-
-# OpenGL's camera looks along -z with y up. The matrix is its own inverse, so one function
-# converts both ways.
-_FLIP_Y_Z = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def swap_opengl_opencv(T_world_camera: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
-    """Camera-to-world poses with OpenGL camera axes, given OpenCV's, and the other way round.
-
-    The world frame stays as it is: only the camera's own axes change.
-    """
-    return T_world_camera @ _FLIP_Y_Z

@@ -10,12 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
 from nbtrack.core.settings import may_be_zero, with_values
-from nbtrack.data.conventions import CAMERA_TO_WORLD, WORLD_TO_CAMERA, camera_axes_in_opencv
 from nbtrack.data.text_files import Calibration, read_object
 
 DECLARATION_FILE = "sequence.toml"
+CAMERA_TO_WORLD, WORLD_TO_CAMERA = "camera-to-world", "world-to-camera"
+SPELLED_AXES = {"opencv": "right down forward", "opengl": "right up backward"}
+# Where an axis may point, seen from behind the camera, in OpenCV's x, y and z.
+_DIRECTIONS = dict(zip(("right", "down", "forward"), np.eye(3), strict=True))
+_DIRECTIONS |= dict(zip(("left", "up", "backward"), 0 - np.eye(3), strict=True))
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,28 @@ class Declaration:
             if not (value in (first, last) if is_text else first <= value <= last):
                 allowed = f"{first!r} {'or' if is_text else 'to'} {last!r}"
                 raise ConfigError(f"{key} = {value!r}: write {allowed}")
-        camera_axes_in_opencv(self.camera_axes)  # raises where the axes are none
+        if len(self._axes) != 3 or not np.linalg.det(self._axes):
+            raise ConfigError(
+                f"camera_axes = {self.camera_axes!r}: write 'opencv', 'opengl', or where x, y and "
+                "z point, as in 'right up forward' (of right/left, up/down, forward/backward)"
+            )
+
+    @property
+    def _axes(self) -> np.ndarray:
+        """The file's x, y and z axes with OpenCV's, one a row; zeros for unknown words."""
+        words = SPELLED_AXES.get(self.camera_axes, self.camera_axes).split()
+        return np.array([_DIRECTIONS.get(word, np.zeros(3)) for word in words])
+
+    def poses_to_opencv(self, file_poses: Poses) -> Poses:
+        """Camera-to-world poses with OpenCV's camera axes, of a file's; NaN poses stay NaN."""
+        T, axes = file_poses.copy(), self._axes
+        if self.poses == WORLD_TO_CAMERA:
+            # A transpose, unlike a solver, takes NaN and never fails.
+            T[:, :3, :3] = file_poses[:, :3, :3].mT
+            T[:, :3, 3:] = -T[:, :3, :3] @ file_poses[:, :3, 3:]
+        T[:, :3, :3] = T[:, :3, :3] @ axes
+        T[:, 2] *= np.linalg.det(axes)  # left-handed cameras come with a mirrored world
+        return T
 
 
 # Two choices, or limits: far beyond any camera's, and what 16 bits hold.

@@ -13,8 +13,7 @@ from torch.nn.functional import grid_sample
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.camera import Intrinsics, pixel_directions, project
-from nbtrack.data.conventions import CONVENTIONS, convention_name, poses_to_opencv
-from nbtrack.data.formats import Declaration
+from nbtrack.data.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA, Declaration
 from nbtrack.data.recording import Recording
 
 _HIDDEN_BEHIND = 0.25  # m behind a surface points are hidden: several times a camera's noise
@@ -28,6 +27,32 @@ _LEAST_OVERLAP = 0.15  # share of points below which a median tells nothing (our
 # mm; and metres and micrometres, which 16 bits hold badly.
 _SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 256.0, 100.0, 1.0, 1e6)
 _ALONG = {"axis": "depth along the optical axis", "ray": "distances along the ray, not z-depth"}
+# The common camera axes first: where several fit alike, the first is named.
+_USUAL = {
+    "right up backward": "OpenGL axes",
+    "right down forward": "OpenCV axes",
+    "forward left up": "robot axes",
+    "right up forward": "left-handed axes",
+    "left up forward": "PyTorch3D axes",
+    "left down backward": "right-handed axes",
+    "left down forward": "left-handed axes",
+    "left up backward": "left-handed axes",
+    "right down backward": "left-handed axes",
+}
+
+
+def _convention_name(camera_axes: str, poses: str) -> str:
+    """For people: `OpenGL axes (x right, y up, z backward), camera-to-world`."""
+    words = SPELLED_AXES.get(camera_axes, camera_axes)
+    return "{} (x {}, y {}, z {}), {}".format(_USUAL.get(words, "axes"), *words.split(), poses)
+
+
+_SHORT = {words: name for name, words in SPELLED_AXES.items()}
+CONVENTIONS = {  # by name: what `sequence.toml` says of it
+    _convention_name(axes, poses): {"camera_axes": _SHORT.get(axes, axes), "poses": poses}
+    for poses in (CAMERA_TO_WORLD, WORLD_TO_CAMERA)
+    for axes in _USUAL
+}
 
 
 @dataclass(frozen=True)
@@ -62,12 +87,12 @@ class Reading:
             # Numbers a b c d read as xyzw that are wxyz: x y z w is b c d a.
             q = np.roll(Rotation.from_matrix(T[:, :3, :3]).as_quat(), 1 - 2 * (order == "xyzw"), 1)
             T[:, :3, :3] = Rotation.from_quat(q).as_matrix()
-        return poses_to_opencv(T, self.declared.camera_axes, self.declared.poses)
+        return self.declared.poses_to_opencv(T)
 
 
 def readings(declared: Declaration, camera: Intrinsics) -> list[Reading]:
     """The declared reading first, then the usual mistakes, common ones first."""
-    own = convention_name(declared.camera_axes, declared.poses)
+    own = _convention_name(declared.camera_axes, declared.poses)
     declared = replace(declared, **CONVENTIONS.get(own, {}))  # `opencv` for `right down forward`
     conventions = {own: {}} | CONVENTIONS
     table = [("poses", *convention) for convention in conventions.items()]

@@ -11,7 +11,6 @@ from jaxtyping import Bool
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import DataError, MissingError
-from nbtrack.data.conventions import poses_to_opencv
 from nbtrack.data.formats import DECLARATION_FILE, FORMATS, Declaration, Format, declaration
 from nbtrack.data.pairs import check_paired, listed_pairs, numbered_files, numbers_of, posed_by_time
 from nbtrack.data.text_files import Calibration, Times, checked_poses, read_calibration, read_poses
@@ -39,7 +38,7 @@ class Recording:
     @cached_property
     def T_world_camera(self) -> Poses:
         """Camera-to-world poses with OpenCV's camera axes; NaN where there is none."""
-        return poses_to_opencv(self.file_poses, self.declared.camera_axes, self.declared.poses)
+        return self.declared.poses_to_opencv(self.file_poses)
 
     @cached_property
     def has_pose(self) -> Bool[np.ndarray, "frames"]:

@@ -1,100 +1,97 @@
 """Write frames, or a recording of any format, in the Neural RGB-D layout."""
 
-import os
-import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import astuple
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from nbtrack.core.arrays import ColorImage, DepthImage, Pose
-from nbtrack.core.camera import Intrinsics, swap_opengl_opencv
+from nbtrack.core.arrays import ColorImage, DepthImage, Frames, Pose, Poses
+from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.progress import ProgressBar
+from nbtrack.data.formats import FORMATS
 from nbtrack.data.images import decode
 from nbtrack.data.recording import Recording
 from nbtrack.data.sequence import select_frames
 from nbtrack.data.text_files import camera_matrix
 
-DEPTH_FOLDERS = ("depth_filtered", "depth", "depth_with_noise")
+# RGB colour, depth maps (mm) by depth folder, and pose with OpenCV camera axes.
+WrittenFrame = tuple[ColorImage, dict[str, DepthImage], Pose]
 _FRAMES_AT_ONCE = 32  # converted: 50 MB at 640x480
 _SAME_CAMERA = 1e-6  # pixels: rounding, not another camera
 
 
-class SequenceWriter:
-    """Context manager that collects frames in a hidden folder and puts it in place at the end.
+def write_sequence(
+    folder: Path,
+    camera: Intrinsics,
+    frames: Iterable[WrittenFrame],
+    notes: Mapping[str, str] | None = None,
+    progress: Callable[[int], object] = lambda done: None,
+) -> None:
+    """Write frames in a hidden folder and put it in place at the end.
 
-    A run that is killed, or ends with an exception, leaves no half-written scene behind. Raises
-    DataError if the folder exists, a frame has another size, or no frame was added.
+    A run that is killed, or ends with an exception, leaves no half-written scene behind.
+
+    Args:
+        notes: texts of small files beside the layout's own, by name.
+        progress: called after each frame with how many are written.
+
+    Raises:
+        DataError: the folder exists, a frame has another size than the camera, or there is none.
     """
-
-    def __init__(
-        self, folder: Path, intrinsics: Intrinsics, depth_folders: tuple[str, ...] = DEPTH_FOLDERS
-    ) -> None:
-        if folder.exists():
-            raise DataError(f"{folder} exists: choose another folder or remove it first")
-        self.folder, self.intrinsics, self.depth_folders = folder, intrinsics, depth_folders
-        # A sibling, so that the final rename stays within one file system.
-        # The process id keeps two commands that make one scene out of each other's way.
-        self._unfinished = folder.with_name(f".{folder.name}.{os.getpid()}.unfinished")
-        self._poses: list[Pose] = []
-
-    def __enter__(self) -> "SequenceWriter":
-        shutil.rmtree(self._unfinished, ignore_errors=True)
-        for name in ("images", *self.depth_folders):
-            (self._unfinished / name).mkdir(parents=True)
-        return self
-
-    def add(
-        self, color: ColorImage, depths_mm: dict[str, DepthImage], T_world_camera: Pose
-    ) -> None:
-        """Append one frame: RGB colour, one depth map a depth folder, pose with OpenCV axes."""
-        number, size = len(self._poses), (self.intrinsics.height, self.intrinsics.width)
-        images = {"images/img": cv2.cvtColor(color, cv2.COLOR_RGB2BGR)}
-        images |= {f"{name}/depth": depths_mm[name] for name in self.depth_folders}
-        for prefix, image in images.items():
-            if image.shape[:2] != size:
-                raise DataError(
-                    f"frame {number} is of shape {image.shape} but the camera {size}: write frames "
-                    "of one size"
-                )
-            # The fastest compression: rooms are made often and read from a local disk.
-            encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-            encoded.tofile(self._unfinished / f"{prefix}{number}.png")
-        self._poses.append(T_world_camera)
-
-    def write_text(self, name: str, text: str) -> None:
-        """Put a small text file beside the layout's own."""
-        (self._unfinished / name).write_text(text, encoding="utf-8")
-
-    def __exit__(self, exception_type: type[BaseException] | None, *_: object) -> None:
+    if folder.exists():
+        raise DataError(f"{folder} exists: choose another folder or remove it first")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    # A sibling, so that the final rename stays within one file system.
+    with TemporaryDirectory(".unfinished", f".{folder.name}.", folder.parent) as hidden:
+        unfinished = Path(hidden) / "scene"
+        (unfinished / "images").mkdir(parents=True)
+        poses = []
+        for number, (color, depths_mm, T_world_camera) in enumerate(frames):
+            images = {"images/img": cv2.cvtColor(color, cv2.COLOR_RGB2BGR)}
+            images |= {f"{name}/depth": depth for name, depth in depths_mm.items()}
+            for prefix, image in images.items():
+                _write_image(unfinished / f"{prefix}{number}.png", image, camera)
+            poses.append(T_world_camera)
+            progress(len(poses))
+        if not poses:
+            raise DataError(f"no frame was added to {folder}: a scene needs at least one")
+        for name, text in (_texts(camera, np.stack(poses)) | dict(notes or {})).items():
+            (unfinished / name).write_text(text, encoding="utf-8")
         try:
-            if exception_type is None:
-                self._finish()
-        finally:
-            shutil.rmtree(self._unfinished, ignore_errors=True)
-
-    def _finish(self) -> None:
-        if not self._poses:
-            raise DataError(f"no frame was added to {self.folder}: a scene needs at least one")
-        camera = self.intrinsics
-        if _is_told_by_focal(camera):
-            self.write_text("focal.txt", f"{float(camera.fx)!r}\n")
-        else:
-            # Programs that know only `focal.txt` then stop, instead of reading another camera.
-            K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
-            self.write_text("intrinsics.txt", _text(K))
-        poses = _text(swap_opengl_opencv(np.stack(self._poses)).reshape(-1, 4))
-        self.write_text("poses.txt", poses)
-        self.write_text("trainval_poses.txt", poses)
-        try:
-            self._unfinished.rename(self.folder)
+            unfinished.rename(folder)
         except OSError:
             # Another command may have finished the same scene meanwhile: then that one stands.
-            if not self.folder.is_dir():
+            if not folder.is_dir():
                 raise
+
+
+def _write_image(path: Path, image: np.ndarray, camera: Intrinsics) -> None:
+    size = (camera.height, camera.width)
+    if image.shape[:2] != size:
+        raise DataError(
+            f"{path.name} is of shape {image.shape} but the camera {size}: write frames of one size"
+        )
+    path.parent.mkdir(exist_ok=True)
+    # The fastest compression: rooms are made often and read from a local disk.
+    cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tofile(path)
+
+
+def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
+    """The camera and the poses, by file."""
+    # Turning OpenCV's axes into the layout's is what turns those into OpenCV's.
+    T_file = FORMATS["neural_rgbd"].declared.poses_to_opencv(T_world_camera)
+    poses = _text(T_file.reshape(-1, 4))
+    texts = {"poses.txt": poses, "trainval_poses.txt": poses}
+    if _is_told_by_focal(camera):
+        return texts | {"focal.txt": f"{float(camera.fx)!r}\n"}
+    # Programs that know only `focal.txt` then stop, instead of reading another camera.
+    K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
+    return texts | {"intrinsics.txt": _text(K)}
 
 
 def _text(rows: Float[np.ndarray, "n m"]) -> str:
@@ -118,14 +115,8 @@ def convert_sequence(
     """
     numbers = select_frames(recording, frames)
     camera, _, _ = decode(recording, numbers[:1])
-    bar = ProgressBar("converting", len(numbers), progress)
-    with bar, SequenceWriter(out, camera, ("depth",)) as writer:
-        for start in range(0, len(numbers), _FRAMES_AT_ONCE):
-            part = numbers[start : start + _FRAMES_AT_ONCE]
-            _, colors, depths = decode(recording, part)
-            for color, depth, T in zip(colors, depths, recording.T_world_camera[part], strict=True):
-                writer.add(color, {"depth": depth}, T)
-            bar.move_to(start + len(part))
+    with ProgressBar("converting", len(numbers), progress) as bar:
+        write_sequence(out, camera, _frames(recording, numbers), progress=bar.move_to)
     n_lost = int((~recording.has_pose[numbers]).sum())
     lost = f" ({n_lost} without a pose)" if n_lost else ""
     said = f"{out}: {len(numbers)} frames{lost} of {camera.width}x{camera.height}"
@@ -137,3 +128,10 @@ def convert_sequence(
         f"({camera.cx:.2f}, {camera.cy:.2f})) is more than focal.txt can say: it is in "
         "intrinsics.txt, which nbtrack reads and other programs do not know"
     )
+
+
+def _frames(recording: Recording, numbers: Frames) -> Iterator[WrittenFrame]:
+    for part in np.split(numbers, range(_FRAMES_AT_ONCE, len(numbers), _FRAMES_AT_ONCE)):
+        _, colors, depths = decode(recording, part)
+        for color, depth, T in zip(colors, depths, recording.T_world_camera[part], strict=True):
+            yield color, {"depth": depth}, T

@@ -111,7 +111,7 @@ def make_command(options: Namespace) -> None:
     with ProgressBar(options.room, options.n_frames) as bar:
         make_room(
             options.room, options.out, options.n_frames, *size, options.seed, os.cpu_count() or 1,
-            lambda done, total: bar.move_to(done),
+            bar.move_to,
         )  # fmt: skip
     told = f"{options.n_frames} frames of {size[0]}x{size[1]}, seed {options.seed}"
     print(f"{options.out}: {options.room}, {told}")

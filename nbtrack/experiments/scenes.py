@@ -147,6 +147,6 @@ def _made_room(name: str, config: ScenesConfig) -> Path:
         with ProgressBar(f"room {name}", config.n_frames) as bar:
             make_room(
                 name, folder, config.n_frames, config.width, height, config.seed, workers,
-                lambda done, total: bar.move_to(done),
+                bar.move_to,
             )  # fmt: skip
     return folder

@@ -16,7 +16,7 @@ from jaxtyping import UInt8, UInt16
 from nbtrack.core.arrays import Pose
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError, DataError
-from nbtrack.data.writer import SequenceWriter
+from nbtrack.data.writer import write_sequence
 from nbtrack.synthetic.motion import handheld_trajectory
 from nbtrack.synthetic.render import render_frame
 from nbtrack.synthetic.room import Room, build_room
@@ -88,14 +88,14 @@ def make_room(
     height: int,
     seed: int = 0,
     workers: int = 1,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int], object] = lambda done: None,
 ) -> Path:
     """Write a synthetic scene as the Neural RGB-D dataset does; returns `folder`.
 
     Clean depth goes to `depth/`, the sensor's to `depth_with_noise/` and `depth_filtered/`; the
     poses are exact in both pose files. `room.json` records how the scene was made. The same
     arguments give the same bytes. The folder, which must not exist yet, appears when it is
-    complete. `progress` is called with (frames done, frames in all) after each frame.
+    complete. `progress` is called with the number of frames done after each.
 
     Raises `MissingError` (no such room), `ConfigError` (a number is too small), `DataError`
     (the folder exists).
@@ -103,13 +103,9 @@ def make_room(
     room = build_room(name)
     record = {"room": name, "version": ROOM_VERSION, "seed": seed, "frames": n_frames}
     record |= {"width": width, "height": height}
-    with SequenceWriter(folder, room_intrinsics(width, height)) as writer:
-        writer.write_text(ROOM_FILE, json.dumps(record, indent=2) + "\n")
-        frames = room_frames(room, n_frames, width, height, seed, workers)
-        for done, frame in enumerate(frames, start=1):
-            writer.add(*frame)
-            if progress is not None:
-                progress(done, n_frames)
+    frames = room_frames(room, n_frames, width, height, seed, workers)
+    notes = {ROOM_FILE: json.dumps(record, indent=2) + "\n"}
+    write_sequence(folder, room_intrinsics(width, height), frames, notes, progress)
     return folder
 
 
