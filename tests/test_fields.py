@@ -11,9 +11,8 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.pixels import Rays
 from nbtrack.fields import FIELDS, NetworkSettings, NeusMapping, field_class, make_field
-from nbtrack.fields.base import measured_mean
+from nbtrack.fields.base import LUMA, measured_mean, rendered_losses
 from nbtrack.fields.imap import LEAST_DEVIATION, rendering_losses
-from nbtrack.fields.neus import rendered_losses
 from nbtrack.fields.rendering import Rendering
 
 ROOM = SceneBounds((-1.0, -1.2, 0.5), (3.0, 1.3, 3.7))  # 4 x 2.5 x 3.2 m
@@ -103,25 +102,28 @@ def test_neus_starts_as_an_empty_room(seed: int) -> None:
     for axis, side in itertools.product(range(3), (-1, 1)):
         offsets = 0.3 * half * (2 * torch.rand(300, 3, generator=generator) - 1)
         offsets[:, axis] = side * (half[axis] - 0.2)
-        _, gradient = field.sdf_gradient(torch.tensor(ROOM.center).float() + offsets)
+        gradient = field.linearize(torch.tensor(ROOM.center).float() + offsets).value_gradient
         assert (-side * gradient[:, axis]).mean() > 0.3
 
 
-def test_sdf_gradient() -> None:
-    """Catches a gradient per normalized unit instead of per metre, an eikonal term without second
-    derivatives, and trackers that fail in no_grad."""
+def test_gradients_of_a_field() -> None:
+    """Catches a gradient per normalized unit instead of per metre, one that fails in no_grad or
+    drags a graph along, and an eikonal term without second derivatives."""
     field = make_field("neus", SMALL, ROOM, seed=0).double()
-    points = points_inside(ROOM, 20).double()
-    sdf, gradient = field.sdf_gradient(points)
-    torch.testing.assert_close(sdf, field(points)[1])
-    step = 1e-5 * torch.eye(3).double()
-    slopes = [(field(points + s)[1] - field(points - s)[1]) / 2e-5 for s in step]
-    torch.testing.assert_close(gradient, torch.stack(slopes, dim=-1), rtol=1e-5, atol=1e-6)
-
+    points, step = points_inside(ROOM, 20).double(), 1e-5 * torch.eye(3).double()
     with torch.no_grad():
-        assert not field.sdf_gradient(points)[1].requires_grad
-    gradient = field.sdf_gradient(points, create_graph=True)[1]
-    gradient.square().sum().backward()
+        found = field.linearize(points)
+        around = [(field(points + s), field(points - s)) for s in step]
+    slopes = [(after[1] - before[1]) / 2e-5 for after, before in around]
+    of_luma = [(after[0] - before[0]) @ LUMA.double() / 2e-5 for after, before in around]
+    for gradient, expected in ((found.value_gradient, slopes), (found.intensity_gradient, of_luma)):
+        torch.testing.assert_close(gradient, torch.stack(expected, -1), rtol=1e-5, atol=1e-6)
+    assert not any(part.requires_grad for part in vars(found).values())
+    torch.testing.assert_close(found.value, field(points)[1].detach())
+    make_field("neus", SMALL, ROOM, seed=0).linearize(torch.zeros(0, 3))
+    rays = random_rays(5, 1.0)
+    field = field.float()
+    field.mapping_losses(lambda n_rays: rays, SETTINGS, seeded(3))["eikonal"].backward()
     assert field.mlp.layer_1.weight.grad.abs().max() > 0
 
 
@@ -180,7 +182,7 @@ def test_rendered_losses_by_hand() -> None:
     assert LEAST_DEVIATION == 0.02
     assert terms["depth"].item() == pytest.approx((1 + 5) / 2, rel=1e-4)
     assert terms["color"].item() == pytest.approx(5 * (0.2 + 0.4) / 2, rel=1e-4)
-    of_neus = rendered_losses(rendering, rays, SETTINGS)
+    of_neus = rendered_losses(rendering, rays, 2.0)
     assert list(map(float, of_neus.values())) == pytest.approx([0.3, 0.6], rel=1e-4)
     assert not terms["depth"].requires_grad  # the deviation is a weight, not something to enlarge
     assert measured_mean(torch.ones(3), torch.zeros(3)).item() == 0

@@ -29,7 +29,7 @@ class ShiftedRoom(LearnedField):
     """The exact room, its distance off by a constant: the surface moves by as much."""
 
     name, label, surface_level = "shifted", "shifted", 0.0
-    sdf_gradient = composite = mapping_losses = None  # not asked for
+    composite = mapping_losses = None  # not asked for
 
     def __init__(self, sequence: RgbdSequence, shift: float) -> None:
         super().__init__(observed_bounds(sequence))

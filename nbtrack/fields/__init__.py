@@ -27,10 +27,8 @@ def field_class(name: str) -> type[Field | PointCloud]:
 def supervised_field(name: str, supervision: str) -> str:
     """The field that is `name` under a supervision ("rendering+sdf"), or ConfigError."""
     kind = field_class(name)
-    variants = {
-        FIELDS[other].supervision: other for other in FIELDS if issubclass(FIELDS[other], kind)
-    }
-    variants[kind.supervision] = name
+    kin = [other for other in FIELDS if issubclass(FIELDS[other], kind)]
+    variants = {FIELDS[other].supervision: other for other in (*kin, name)}
     if supervision not in variants:
         nearest = nearest_name(supervision, sorted(variants))
         raise ConfigError(f"field {name!r} knows no supervision {supervision!r}: {nearest}")

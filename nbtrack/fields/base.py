@@ -134,24 +134,19 @@ class LearnedField(Field):
 
         Without a generator nothing is random. Source: iMAP, Sec. 3.2 (32 and 12 samples).
         """
-        spread = self._first_pass(rays, n_stratified, generator)
-        answers = self.along(rays, spread)
-        extra = self._second_pass(*answers, rays, spread, n_importance, generator)
+        spread, _, extra = self._two_passes(rays, n_stratified, n_importance, generator)
         return torch.cat([spread, extra], dim=-1).sort(dim=-1).values
 
     def render_in_two_passes(
         self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None = None
     ) -> Rendering:
         """What `render` gives at `two_pass_depths`, with every sample asked for once."""
-        spread = self._first_pass(rays, n_stratified, generator)
-        colors, values = self.along(rays, spread)
-        extra = self._second_pass(colors, values, rays, spread, n_importance, generator)
-        more_colors, more_values = self.along(rays, extra)
+        spread, answers, extra = self._two_passes(rays, n_stratified, n_importance, generator)
         depths, order = torch.cat([spread, extra], dim=-1).sort(dim=-1)
-        colors = torch.cat([colors, more_colors], dim=1)
+        both = zip(answers, self.along(rays, extra), strict=True)
+        colors, values = (torch.cat(parts, dim=1) for parts in both)
         colors = colors.gather(1, order[..., None].expand_as(colors))
-        values = torch.cat([values, more_values], dim=-1).gather(-1, order)
-        return self.composite(colors, values, rays, depths)
+        return self.composite(colors, values.gather(1, order), rays, depths)
 
     def render_view(self, camera: Intrinsics, T_world_camera: Pose) -> View:
         """Colour and z-depth image (m) from a camera pose. Nothing in it is random."""
@@ -173,16 +168,18 @@ class LearnedField(Field):
         color = torch.cat([part.color.clamp(0, 1) for part in parts])
         return color, torch.cat([part.depth for part in parts])
 
-    @torch.no_grad()  # where samples lie is given: a pose does not move them along
-    def _first_pass(self, rays: Rays, n_samples: int, generator: Generator | None) -> RaySamples:
-        return stratified_depths(NEAR, rays_end(rays, self.bounds), n_samples, generator)
-
-    @torch.no_grad()
-    def _second_pass(self, colors, values, rays, depths, n_samples, generator) -> Tensor:
-        weights = self.composite(colors, values, rays, depths).weights
-        if weights.shape != depths.shape:  # NeuS weighs sections: both ends of one get a share
-            weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
-        return importance_depths(depths, weights, n_samples, generator)
+    def _two_passes(self, rays: Rays, n_stratified: int, n_importance: int, generator) -> tuple:
+        """Z-depths (m) of the first pass, the field's answers there, and z-depths of the second."""
+        with torch.no_grad():  # where samples lie is given: a pose does not move them along
+            far = rays_end(rays, self.bounds)
+            spread = stratified_depths(NEAR, far, n_stratified, generator)
+        answers = self.along(rays, spread)
+        with torch.no_grad():
+            weights = self.composite(*answers, rays, spread).weights
+            if weights.shape != spread.shape:  # NeuS weighs sections: both ends of one get a share
+                weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
+            extra = importance_depths(spread, weights, n_importance, generator)
+        return spread, answers, extra
 
 
 def rays_end(rays: Rays, bounds: SceneBounds) -> Values:
@@ -194,3 +191,23 @@ def rays_end(rays: Rays, bounds: SceneBounds) -> Values:
 def measured_mean(error: Float[Tensor, "*some"], measured: Float[Tensor, "*some"]) -> Scalar:
     """Mean error where there is a measurement (a mask of 0 and 1); 0 if there is none."""
     return (error * measured).sum() / measured.sum().clamp_min(1)
+
+
+def rendered_losses(
+    rendering: Rendering,
+    rays: Rays,
+    lambda_color: float,
+    lambda_depth: float = 1.0,
+    deviation: Values | float = 1.0,
+) -> Losses:
+    """Weighted L1 errors of rendered depth (m, over a deviation) and colour.
+
+    Rays without a depth measurement take part in neither term.
+    """
+    measured = (rays.depth > 0).float()
+    depth_error = (rendering.depth - rays.depth).abs() / deviation
+    color_error = (rendering.color - rays.color).abs().mean(dim=-1)
+    return {
+        "depth": lambda_depth * measured_mean(depth_error, measured),
+        "color": lambda_color * measured_mean(color_error, measured),
+    }

@@ -6,7 +6,7 @@ from torch import Generator
 from nbtrack.core.arrays import Colors, Points, RayColors, RaySamples, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.pixels import Rays
-from nbtrack.fields.base import Draw, LearnedField, Losses, MappingSettings, measured_mean
+from nbtrack.fields.base import Draw, LearnedField, Losses, MappingSettings, rendered_losses
 from nbtrack.fields.mlp import FourierMlp, NetworkSettings
 from nbtrack.fields.rendering import Rendering, composite, weights_from_density
 
@@ -57,14 +57,8 @@ def rendering_losses(rendering: Rendering, rays: Rays, lambda_color: float) -> L
 
     L = mean(|D - D_rendered| / sqrt(variance)) + lambda_color mean|I - I_rendered|.
 
-    The deviation is detached, as in NICE-SLAM: its gradient would reward blurred surfaces. Rays
-    without a depth measurement take part in neither term. Source: iMAP, Sec. 3.3.
+    The deviation is detached, as in NICE-SLAM: its gradient would reward blurred surfaces.
+    Source: iMAP, Sec. 3.3.
     """
-    measured = (rays.depth > 0).float()
     deviation = rendering.depth_variance.detach().sqrt().clamp_min(LEAST_DEVIATION)
-    depth_error = (rendering.depth - rays.depth).abs() / deviation
-    color_error = (rendering.color - rays.color).abs().mean(dim=-1)
-    return {
-        "depth": measured_mean(depth_error, measured),
-        "color": lambda_color * measured_mean(color_error, measured),
-    }
+    return rendered_losses(rendering, rays, lambda_color, deviation=deviation)

@@ -1,4 +1,4 @@
-"""The network that all fields share: iMAP's multilayer perceptron, and its derivatives."""
+"""The network that all fields share: iMAP's multilayer perceptron."""
 
 import math
 from collections.abc import Callable
@@ -72,42 +72,6 @@ class FourierMlp(nn.Module):
         parts = points_world.split(n_at_once)
         raw = torch.cat([self.head(self.features(part)) for part in parts])
         return raw[:, :3], raw[:, 3]
-
-    @torch.no_grad()
-    def linearize(
-        self, points_world: Points, slopes: Callable[[Tensor], Float[Tensor, "k n 4"]]
-    ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "k n 3"]]:
-        """Raw outputs, and the spatial gradients (1/m) of k functions of them, as matrix products.
-
-        The activation must be SiLU; `slopes` gives the functions' derivatives g by the outputs y:
-
-            forward     a_l = h_l-1 W_l' + b_l,  h_l = act(a_l),  y = h_4 W_y' + b_y,
-                        with e = sin(x B) in layers 1 and 3
-            backward    g_4 = g W_y,          d_l = g_l * act'(a_l),
-                        g_3 = d_4 W_4,        [g_2, s] = d_3 W_3,        g_1 = d_2 W_2,
-                        dx = ((s + d_1 W_1) * cos(x B)) B'
-
-        512 points, two functions, one core: 3.4 ms against autograd's 4.1 (96 units).
-        """
-
-        def slope(x: Tensor) -> Tensor:
-            return torch.ops.aten.silu_backward(torch.ones_like(x), x)
-
-        act = self.activation
-        phase = (points_world - self.center) / self.metres_per_unit @ self.frequencies
-        embedding = phase.sin()
-        a_1 = self.layer_1(embedding)
-        a_2 = self.layer_2(act(a_1))
-        a_3 = self.layer_3(torch.cat([act(a_2), embedding], dim=-1))
-        a_4 = self.layer_4(act(a_3))
-        raw = self.head(act(a_4))
-        g_4 = slopes(raw) @ self.head.weight
-        g_3 = (g_4 * slope(a_4)) @ self.layer_4.weight
-        both = (g_3 * slope(a_3)) @ self.layer_3.weight
-        g_2, skipped = both.split([a_2.shape[1], embedding.shape[1]], dim=-1)
-        g_1 = (g_2 * slope(a_2)) @ self.layer_2.weight
-        of_embedding = skipped + (g_1 * slope(a_1)) @ self.layer_1.weight
-        return raw, (of_embedding * phase.cos()) @ self.frequencies.T / self.metres_per_unit
 
 
 def _linear(n_in: int, n_out: int, generator: Generator) -> nn.Linear:

@@ -3,14 +3,13 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nbtrack.core.arrays import Colors, Points, RayColors, RaySamples, Scalar, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.pixels import Rays
 from nbtrack.fields import base
-from nbtrack.fields.base import LUMA, Draw, LearnedField, Linearization, Losses, measured_mean
+from nbtrack.fields.base import Draw, LearnedField, Losses, rendered_losses
 from nbtrack.fields.mlp import FourierMlp, NetworkSettings
 from nbtrack.fields.rendering import Rendering, composite, stratified_depths, weights_from_sdf
 
@@ -55,31 +54,6 @@ class NeuSField(LearnedField):
         raw_color, raw_sdf = self.mlp(points_world)
         return torch.sigmoid(raw_color), raw_sdf * self.mlp.metres_per_unit
 
-    def sdf_gradient(
-        self, points_world: Points, create_graph: bool = False
-    ) -> tuple[Values, Float[Tensor, "n 3"]]:
-        """Signed distance (m) and its spatial gradient (no unit, length 1 for a true distance)."""
-        points = points_world.detach().requires_grad_()
-        with torch.enable_grad():
-            sdf = self(points)[1]
-            (gradient,) = torch.autograd.grad(sdf.sum(), points, create_graph=create_graph)
-        return sdf, gradient
-
-    @torch.no_grad()
-    def linearize(self, points_world: Points) -> Linearization:
-        """Value and intensity with their gradients, without automatic differentiation."""
-        metres = self.mlp.metres_per_unit
-
-        def slopes(raw: Float[Tensor, "n 4"]) -> Float[Tensor, "2 n 4"]:
-            color, slopes = torch.sigmoid(raw[:, :3]), raw.new_zeros(2, len(raw), 4)
-            slopes[0, :, 3] = metres
-            slopes[1, :, :3] = LUMA.to(raw) * color * (1 - color)
-            return slopes
-
-        raw, (of_sdf, of_intensity) = self.mlp.linearize(points_world, slopes)
-        intensity = raw[:, :3].sigmoid() @ LUMA.to(raw)
-        return Linearization(raw[:, 3] * metres, of_sdf, intensity, of_intensity)
-
     def composite(
         self, colors: RayColors, values: RaySamples, rays: Rays, depths: RaySamples
     ) -> Rendering:
@@ -96,7 +70,9 @@ class NeuSField(LearnedField):
         rays = draw(settings.n_rays)
         depths = guided_depths(rays, self.bounds, settings, generator)
         return {
-            **rendered_losses(self.render(rays, depths), rays, settings),
+            **rendered_losses(
+                self.render(rays, depths), rays, settings.lambda_color, settings.lambda_depth
+            ),
             "eikonal": self._eikonal(rays.points(depths), settings, generator),
         }
 
@@ -105,7 +81,8 @@ class NeuSField(LearnedField):
         points = points_world.flatten(0, 1)
         n_points = max(1, round(settings.eikonal_share * len(points)))
         chosen = torch.randint(len(points), (n_points,), generator=generator, device=points.device)
-        _, gradient = self.sdf_gradient(points[chosen], create_graph=True)
+        points = points[chosen].detach().requires_grad_()
+        (gradient,) = torch.autograd.grad(self(points)[1].sum(), points, create_graph=True)
         return settings.lambda_eikonal * (gradient.norm(dim=-1) - 1).square().mean()
 
     def diagnostics(self) -> dict[str, float]:
@@ -147,14 +124,3 @@ def guided_depths(
     center = torch.where(measured, rays.depth, exit_depth)
     around = (center[:, None] + settings.surface_band * around).clamp_min(base.NEAR)
     return torch.cat([spread, around], dim=-1).sort(dim=-1).values
-
-
-def rendered_losses(rendering: Rendering, rays: Rays, settings: NeusMapping) -> Losses:
-    """Weighted L1 errors of rendered depth (m) and colour, over the rays with a measured depth."""
-    measured = (rays.depth > 0).float()
-    color_error = (rendering.color - rays.color).abs().mean(dim=-1)
-    depth_error = (rendering.depth - rays.depth).abs()
-    return {
-        "depth": settings.lambda_depth * measured_mean(depth_error, measured),
-        "color": settings.lambda_color * measured_mean(color_error, measured),
-    }

@@ -11,8 +11,8 @@ from nbtrack.core.arrays import Frames, Points, RaySamples, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.base import Draw, Losses, measured_mean
-from nbtrack.fields.neus import NeuSField, NeusMapping, guided_depths, rendered_losses
+from nbtrack.fields.base import Draw, Losses, measured_mean, rendered_losses
+from nbtrack.fields.neus import NeuSField, NeusMapping, guided_depths
 from nbtrack.fields.points import cells_of, measured_points
 
 _LEAST_VOXEL = 0.05  # m; finer cells hold too few points to tell a surface from noise
@@ -55,13 +55,15 @@ class NeuSPlusField(NeuSField):
         colors, sdf = self.along(rays, depths)
         nearest = self.observed(rays.points(depths).flatten(0, 1)).view_as(depths)
         target, known = distance_targets(rays, depths, nearest, self.observed.voxel, settings)
-        rendered = rendered_losses(self.composite(colors, sdf, rays, depths), rays, settings)
+        lambdas = settings.lambda_color, settings.lambda_depth
+        lambdas = (settings.lambda_rendering * weight for weight in lambdas)
+        rendering = self.composite(colors, sdf, rays, depths)
         # At measured points the distance is zero, and the colour is that of the pixel.
         surface_color, surface_sdf = self(surface.points(surface.depth[:, None])[:, 0])
         measured = (surface.depth > 0).float()
         color_error = (surface_color - surface.color).abs().mean(dim=-1)
         return {
-            **{name: settings.lambda_rendering * loss for name, loss in rendered.items()},
+            **rendered_losses(rendering, rays, *lambdas),
             "sdf": settings.lambda_sdf * measured_mean((sdf - target).abs(), known),
             "surface": settings.lambda_sdf * measured_mean(surface_sdf.abs(), measured),
             "surface_color": settings.lambda_color * measured_mean(color_error, measured),

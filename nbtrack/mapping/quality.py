@@ -60,7 +60,7 @@ def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -
     if len(held_out) and isinstance(field, LearnedField):
         scores |= _score_images(field, sequence, held_out)
     if room is not None:
-        if hasattr(field, "sdf_gradient"):
+        if getattr(field, "is_distance", False):
             scores |= _score_sdf(field, sequence, mapped, room)
         scores |= _score_surface(field, sequence, mapped, room)
     return scores
