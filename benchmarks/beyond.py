@@ -13,7 +13,7 @@ import pandas as pd
 
 from nbtrack import METHODS, Method, load_preset, map_scenes, open_scenes, track_scenes
 from nbtrack.core.device import choose_device, device_name
-from nbtrack.core.files import tables_folder, write_text_atomic
+from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.basin import find_from_afar
 from nbtrack.experiments.grid import Execution
@@ -56,7 +56,7 @@ STARTS = tuple(
 def write(folder: str, name: str, table: pd.DataFrame) -> None:
     """One file of paper_tables/."""
     path: Path = tables_folder() / folder / f"{name}.csv"
-    write_text_atomic(path, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+    write_atomic(path, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     print(f"{folder}/{path.name}: {len(table)} rows")
 
 

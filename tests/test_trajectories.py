@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.errors import DataError, MissingError
-from nbtrack.core.files import write_bytes_atomic, write_json_atomic, write_text_atomic
+from nbtrack.core.files import json_text, write_atomic
 from nbtrack.tracking.trajectories import read_tum, tum_text
 
 GOOD_LINE = "0.5 1 2 3 0 0 0 1"
@@ -28,7 +28,7 @@ def test_round_trip(tmp_path: Path) -> None:
         assert line == " ".join(line.split())
         assert "-0.0 " not in line
         assert float(line.split()[7]) >= 0
-    write_text_atomic(tmp_path / "new" / "t.txt", text)
+    write_atomic(tmp_path / "new" / "t.txt", text)
     timestamps, read = read_tum(tmp_path / "new" / "t.txt")
     np.testing.assert_allclose(read, poses, atol=1e-12, rtol=0)
     np.testing.assert_array_equal(timestamps, frame_ids / 30)
@@ -85,9 +85,9 @@ def test_rounded_and_commented_files_of_others(tmp_path: Path) -> None:
 def test_atomic_writes(tmp_path: Path) -> None:
     """Catches missing parents, changed line ends, and files left aside."""
     folder = tmp_path / "a" / "b"
-    write_text_atomic(folder / "t.txt", "–\n1\n")
-    write_bytes_atomic(folder / "t.bin", b"\x00\r\n")
-    write_json_atomic(folder / "t.json", {"b": 1.5, "a": [None, "ü"]})
+    write_atomic(folder / "t.txt", "–\n1\n")
+    write_atomic(folder / "t.bin", b"\x00\r\n")
+    write_atomic(folder / "t.json", json_text({"b": 1.5, "a": [None, "ü"]}))
     assert (folder / "t.txt").read_bytes() == "–\n1\n".encode()
     assert (folder / "t.bin").read_bytes() == b"\x00\r\n"
     assert list(json.loads((folder / "t.json").read_text(encoding="utf-8"))) == ["b", "a"]
@@ -97,9 +97,9 @@ def test_atomic_writes(tmp_path: Path) -> None:
 def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a result destroyed by a full disk, or by a NaN that JSON cannot hold."""
     path = tmp_path / "metrics.json"
-    write_json_atomic(path, {"ate": 1})
+    write_atomic(path, json_text({"ate": 1}))
     with pytest.raises(ValueError, match="JSON"):
-        write_json_atomic(path, {"ate": float("nan")})
+        json_text({"ate": float("nan")})
 
     def full_disk(self: Path, content: bytes) -> int:
         with self.open("wb") as file:
@@ -108,6 +108,6 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(Path, "write_bytes", full_disk)
     with pytest.raises(OSError, match="no space left"):
-        write_json_atomic(path, {"ate": 2})
+        write_atomic(path, json_text({"ate": 2}))
     assert json.loads(path.read_text()) == {"ate": 1}
     assert [entry.name for entry in tmp_path.iterdir()] == ["metrics.json"]

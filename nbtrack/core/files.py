@@ -25,7 +25,6 @@ from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.settings import as_dict
 
 PACKAGE = Path(nbtrack.__file__).resolve().parent
-_AGAIN = "remove it and run the same command again"
 
 
 def project_folder() -> Path:
@@ -100,114 +99,75 @@ def versions() -> dict[str, str]:
     }
 
 
-def write_bytes_atomic(path: Path, content: bytes) -> None:
+def write_atomic(path: Path, content: str | bytes) -> None:
     """Replaces the file at `path` by `content` in one move; missing parent folders are made.
+
+    Text is UTF-8 with the given line ends on every system.
 
     Raises:
         OSError: the folder cannot be made or written; an existing file is then left as it was.
     """
-    path = Path(path)
-    _write_aside_and_move({path: content}, path)
+    write_together(path.parent, {path.name: content})
 
 
-def write_together(folder: Path, contents: Mapping[str, bytes]) -> None:
+def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
     """Replaces several files of a folder, the last one as the sign that all of them are there.
 
     All are written aside before the first is moved, so that a disk that fills up leaves the
     earlier ones as they were. Whoever is killed between two moves leaves a folder without the last.
 
     Raises:
-        OSError: the folder cannot be made or written.
+        OSError: the folder cannot be made or written; it names the last file.
     """
-    folder = Path(folder)
-    _write_aside_and_move({folder / name: content for name, content in contents.items()}, folder)
-
-
-def _write_aside_and_move(contents: Mapping[Path, bytes], called: Path) -> None:
     # The process id keeps two writers of one path from moving each other's half-written file.
-    asides = {path: path.with_name(f".{path.name}.{os.getpid()}.tmp") for path in contents}
-    *_, last = contents
+    asides = {folder / name: folder / f".{name}.{os.getpid()}.tmp" for name in contents}
+    *_, last = asides
     try:
-        last.parent.mkdir(parents=True, exist_ok=True)
-        for path, content in contents.items():
-            asides[path].write_bytes(content)
+        folder.mkdir(parents=True, exist_ok=True)
+        for aside, content in zip(asides.values(), contents.values(), strict=True):
+            aside.write_bytes(content.encode() if isinstance(content, str) else content)
         if len(contents) > 1:
             last.unlink(missing_ok=True)
         for path, aside in asides.items():
             os.replace(aside, path)
     except OSError as error:  # a write that finds the disk full has no name of its own
-        raise OSError(error.errno, error.strerror or str(error), str(called)) from None
+        raise OSError(error.errno, error.strerror or str(error), str(last)) from None
     finally:
         for aside in asides.values():
             with contextlib.suppress(OSError):  # what went wrong before is what users must hear
                 aside.unlink(missing_ok=True)
 
 
-def write_text_atomic(path: Path, text: str) -> None:
-    """As `write_bytes_atomic`, for text: UTF-8 with the given line ends on every system."""
-    write_bytes_atomic(path, text.encode("utf-8"))
-
-
-def write_json_atomic(path: Path, content: Any) -> None:
-    """As `write_bytes_atomic`, for JSON as `json_bytes` gives it."""
-    write_bytes_atomic(path, json_bytes(content))
-
-
-def json_bytes(content: Any) -> bytes:
+def json_text(content: Any) -> str:
     """JSON, indented, keys in the given order, newline at the end.
 
     Raises:
         ValueError: a number is NaN or infinite, for which JSON has no word; pass None instead.
     """
-    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
-    return (text + "\n").encode("utf-8")
+    return json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """An object from a JSON file of a finished result. Raises DataError if it is none."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise DataError(f"{path} is not readable JSON ({error}): {_AGAIN}") from None
-    if not isinstance(content, dict):
-        raise DataError(f"{path} holds no object: {_AGAIN}")
-    return content
-
-
-def read_checkpoint(path: Path, kind: str = "checkpoint", advice: str = _AGAIN) -> dict[str, Any]:
-    """What `torch.save` wrote: tensors and plain values only, on the CPU; no code is run.
-
-    Args:
-        kind, advice: what the file should be and what to do if it is not, for the message.
-
-    Raises:
-        DataError: the file is damaged or something else.
-    """
-    # Bytes of any other kind make the reader stumble in many ways; an interruption is none of them.
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise _damaged(path, kind, type(error).__name__, advice) from None
-    if not isinstance(content, dict):
-        raise _damaged(path, kind, f"holds a {type(content).__name__}", advice)
-    return content
+    with naming_damaged(path, "JSON object"):
+        return {**json.loads(path.read_text(encoding="utf-8"))}
 
 
 @contextlib.contextmanager
-def naming_damaged(path: Path, kind: str = "checkpoint", advice: str = _AGAIN) -> Iterator[None]:
-    """Turn what goes wrong in taking up a file's content into one line that names the file.
+def naming_damaged(
+    path: Path, kind: str = "checkpoint", advice: str = "remove it and run the same command again"
+) -> Iterator[None]:
+    """Turn what goes wrong in reading a file and taking up its content into one line that names it.
+
+    Bytes of any other kind make readers stumble in many ways; an interruption is none of them.
 
     Raises:
-        DataError: the block met a part that is missing, or of another kind or shape.
+        DataError: the block met bytes it cannot read, or a part that is missing or of another kind.
     """
     try:
         yield
-    except (LookupError, TypeError, AttributeError, ValueError, RuntimeError) as error:
-        if isinstance(error, NbtrackError):
-            raise
-        raise _damaged(path, kind, f"{type(error).__name__}: {error}", advice) from None
-
-
-def _damaged(path: Path, kind: str, reason: str, advice: str) -> DataError:
-    reason = " ".join(reason.split())[:120]
-    return DataError(f"{path} is not a readable {kind} ({reason}): {advice}")
+    except (NbtrackError, MemoryError):
+        raise
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:120]
+        raise DataError(f"{path} is not a readable {kind} ({reason}): {advice}") from None

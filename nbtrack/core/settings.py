@@ -52,7 +52,7 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
         ConfigError: an unknown key, or a value of the wrong type.
     """
     valid = [key for key, _ in _leaves(config)]
-    for key, value in _flatten(values):
+    for key, value in _leaves(dict(values)):
         if key not in valid:
             raise ConfigError(f"unknown config key {key!r}: {nearest_name(key, valid)}")
         config = _replaced(config, key.split("."), key, value)
@@ -70,7 +70,7 @@ def changed_settings(config: Config, original: Config) -> list[str]:
 
 
 def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and values of all settings."""
+    """Dotted keys and values of all settings, or of a tree of them."""
     if dataclasses.is_dataclass(node):
         fields = [f for f in dataclasses.fields(node) if f.metadata.get("is_setting", True)]
         node = {f.name: getattr(node, f.name) for f in fields}
@@ -79,14 +79,6 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         return
     for name, value in node.items():
         yield from _leaves(value, f"{prefix}.{name}" if prefix else name)
-
-
-def _flatten(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            yield from _flatten(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def _parse_value(text: str) -> Any:

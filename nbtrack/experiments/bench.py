@@ -21,7 +21,7 @@ from nbtrack.core.files import (
     runs_folder,
     sources_fingerprint,
     versions,
-    write_text_atomic,
+    write_atomic,
 )
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import as_dict
@@ -85,7 +85,7 @@ def measured_steps(
     path = runs_folder() / "bench" / f"{preset.name}-{key}.csv"
     if not path.is_file():
         cells = measure_steps(preset, sequence, methods)
-        write_text_atomic(path, cells.to_csv(index=False))
+        write_atomic(path, cells.to_csv(index=False))
     return pd.read_csv(path)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from nbtrack.core.errors import ConfigError, DataError
-from nbtrack.core.files import write_bytes_atomic
+from nbtrack.core.files import write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.sequence import parse_frames
 from nbtrack.experiments.cells import MapCell
@@ -44,7 +44,7 @@ def map_command(options: Namespace) -> None:
     except DataError as error:
         print(f"  no mesh: {error}")
     else:
-        write_bytes_atomic(cell.folder / MESH_FILE, mesh.export(file_type="ply"))
+        write_atomic(cell.folder / MESH_FILE, mesh.export(file_type="ply"))
         print(f"  mesh of what was seen: {cell.folder / MESH_FILE}")
 
 

@@ -10,7 +10,7 @@ import torch
 
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.errors import ConfigError, NbtrackError
-from nbtrack.core.files import runs_folder, tables_folder, write_text_atomic
+from nbtrack.core.files import runs_folder, tables_folder, write_atomic
 from nbtrack.core.settings import changed_settings
 from nbtrack.experiments.bench import (
     default_pixels,
@@ -67,7 +67,7 @@ def tables_command(options: Namespace) -> None:
         paths = _write_both(folder, preset, scenes, methods, results, note)
     cells = results[[name for name in _CELL_COLUMNS if name in results]]
     paths.append(folder / f"table_{len(number)}_cells.csv")
-    write_text_atomic(paths[-1], cells.to_csv(index=False, lineterminator="\n"))
+    write_atomic(paths[-1], cells.to_csv(index=False, lineterminator="\n"))
     print("\n".join(str(path) for path in paths))
     failed = results[results["failure"] != ""]
     if len(failed):
@@ -112,7 +112,7 @@ def bench_command(options: Namespace) -> None:
     print(style_table_2(steps, default_pixels=default_pixels(preset)))
     for name, table in (("step_times", times), ("table_2", steps)):
         text = table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
-        write_text_atomic(out / f"{name}.csv", text)
+        write_atomic(out / f"{name}.csv", text)
     print(f"written to {out}")
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import trimesh
 
 from nbtrack.core.errors import ConfigError, MissingError, nearest_name
-from nbtrack.core.files import naming_damaged, write_bytes_atomic
+from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.experiments.runs import METRICS_FILE
 from nbtrack.fields import PointCloud
 from nbtrack.mapping.files import MAP_FILE, MESH_FILE, read_map
@@ -30,13 +30,13 @@ def export(source: Path, format_name: str, out: Path) -> str:
     found, seen = read_map(source), source / MESH_FILE
     if format_name == "map":
         content = (source / MAP_FILE if source.is_dir() else source).read_bytes()
-        write_bytes_atomic(out, content)
+        write_atomic(out, content)
         return f"{found.field.label} map of {found.made['scene']}, {len(content) / 1e6:.2f} MB"
     is_seen = seen.is_file() and not isinstance(found.field, PointCloud)
     with naming_damaged(seen, "mesh", "remove it and map again"):
         mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(found.field)
         content = mesh.export(file_type=format_name)
-    write_bytes_atomic(out, content)
+    write_atomic(out, content)
     return f"{len(mesh.vertices)} coloured vertices of {'what was seen' if is_seen else 'all'}"
 
 
@@ -48,5 +48,5 @@ def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
     if format_name == "kitti":
         write_kitti(out, T_world_camera)
         return f"{len(T_world_camera)} poses, KITTI: three rows of the matrix (m), no time stamps"
-    write_bytes_atomic(out, path.read_bytes())
+    write_atomic(out, path.read_bytes())
     return f"{len(T_world_camera)} poses, TUM: timestamp (s), position (m), quaternion xyzw"

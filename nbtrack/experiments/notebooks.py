@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nbtrack.core.errors import MissingError, NbtrackError
-from nbtrack.core.files import project_folder, runs_folder, write_text_atomic
+from nbtrack.core.files import project_folder, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
 
 
@@ -66,9 +66,9 @@ def _run_notebook(path: Path, folder: Path, in_place: bool) -> Path:
             f"{folder / path.name}, mend what it names and run again"
         ) from None
     finally:
-        write_text_atomic(folder / path.name, nbformat.writes(notebook) + "\n")
+        write_atomic(folder / path.name, nbformat.writes(notebook) + "\n")
     if in_place:
-        write_text_atomic(path, nbformat.writes(notebook) + "\n")
-    write_text_atomic(page, HTMLExporter().from_notebook_node(notebook)[0])
+        write_atomic(path, nbformat.writes(notebook) + "\n")
+    write_atomic(page, HTMLExporter().from_notebook_node(notebook)[0])
     print(f"{page}: {time.monotonic() - start:.0f} s")
     return page

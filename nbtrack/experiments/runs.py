@@ -13,7 +13,7 @@ from nbtrack.core.device import advise_on_memory, choose_device, device_name
 from nbtrack.core.files import (
     fingerprint,
     foreign_source,
-    json_bytes,
+    json_text,
     read_json,
     runs_folder,
     sources_fingerprint,
@@ -151,10 +151,10 @@ class TrackCell(Cell):
         ids = tracked.frames["frame_id"].to_numpy()[1:]
         # The metrics come last: where they stand, the run is complete.
         write_together(self.folder, {
-            "trajectory.txt": tum_text(ids, tracked.T_estimated[1:]).encode(),
-            "groundtruth.txt": tum_text(ids, tracked.T_true[1:]).encode(),
-            "frames.csv": tracked.frames.to_csv(index=False).encode(),
-            METRICS_FILE: json_bytes(metrics),
+            "trajectory.txt": tum_text(ids, tracked.T_estimated[1:]),
+            "groundtruth.txt": tum_text(ids, tracked.T_true[1:]),
+            "frames.csv": tracked.frames.to_csv(index=False),
+            METRICS_FILE: json_text(metrics),
         })  # fmt: skip
         checkpoint.unlink(missing_ok=True)
         return metrics

@@ -14,7 +14,7 @@ import torch
 
 from nbtrack.core.device import advise_on_memory, device_name, suitable_threads
 from nbtrack.core.errors import DataError, NumericalError
-from nbtrack.core.files import naming_damaged, read_checkpoint, versions, write_bytes_atomic
+from nbtrack.core.files import naming_damaged, versions, write_atomic
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import LearnedField, MappingSettings, NetworkSettings, PointMapping, make_field
@@ -143,11 +143,11 @@ class _Fit:
         state |= {"field": self.field.state_dict(), "optimizer": self.optimizer.state_dict()}
         buffer = io.BytesIO()
         torch.save({**state, "generator": self.generator.get_state()}, buffer)
-        write_bytes_atomic(checkpoint, buffer.getvalue())
+        write_atomic(checkpoint, buffer.getvalue())
 
     def _load(self, checkpoint: Path) -> None:
-        state = read_checkpoint(checkpoint)
         with naming_damaged(checkpoint):
+            state = torch.load(checkpoint, map_location="cpu", weights_only=True)
             _check_recipe(checkpoint, state["recipe"], self.recipe)
             self.field.load_state_dict(state["field"])
             self.optimizer.load_state_dict(state["optimizer"])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 from pandas.io.formats.style import Styler
 
-from nbtrack.core.files import write_text_atomic
+from nbtrack.core.files import write_atomic
 from nbtrack.tables import layout
 from nbtrack.tables.layout import PAPER_PIXELS, table_1, table_2
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
@@ -186,10 +186,10 @@ def _texts(wide: pd.DataFrame, form: str, missing: str = "") -> pd.DataFrame:
 
 
 def _write_csv(path: Path, table: pd.DataFrame, index: bool = False) -> Path:
-    write_text_atomic(path, table.to_csv(index=index, float_format="%.6g", lineterminator="\n"))
+    write_atomic(path, table.to_csv(index=index, float_format="%.6g", lineterminator="\n"))
     return path
 
 
 def _write_latex(path: Path, styler: TableStyler, kind: str, note: str) -> Path:
-    write_text_atomic(path, latex_file(styler, path, kind, note))
+    write_atomic(path, latex_file(styler, path, kind, note))
     return path

@@ -53,8 +53,8 @@ def track_sequence(
     given = Estimate(sequence.T_world_camera[0], without_depth=not sequence[0].has_depth)
     rows = [_row(sequence, 0, given)]
     if checkpoint and checkpoint.exists():
-        state = files.read_checkpoint(checkpoint)
         with files.naming_damaged(checkpoint):
+            state = torch.load(checkpoint, map_location="cpu", weights_only=True)
             tracker.restore(state["tracker"])
             rows = state["rows"]
     last_saved = time.perf_counter()
@@ -66,7 +66,7 @@ def track_sequence(
             if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
                 buffer = io.BytesIO()
                 torch.save({"rows": rows, "tracker": tracker.state()}, buffer)
-                files.write_bytes_atomic(checkpoint, buffer.getvalue())
+                files.write_atomic(checkpoint, buffer.getvalue())
                 last_saved = time.perf_counter()
     return Trajectory(np.stack(tracker.estimates), sequence.T_world_camera, pd.DataFrame(rows))
 
@@ -114,7 +114,7 @@ def write_kitti(path: Path, T_world_camera: Poses) -> None:
     Source: KITTI odometry benchmark, whose files begin at the identity; ours keep the world frame.
     """
     rows = np.asarray(T_world_camera, dtype=np.float64)[:, :3].reshape(-1, 12)
-    files.write_text_atomic(path, _lines(rows))
+    files.write_atomic(path, _lines(rows))
 
 
 def _lines(rows: Float[np.ndarray, "n numbers"]) -> str:
