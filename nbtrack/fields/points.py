@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Frames, Points, Values, WorldPoints
 from nbtrack.core.bounds import SceneBounds
@@ -48,6 +49,10 @@ class PointCloud:
     def to(self, device: torch.device | str) -> "PointCloud":
         """The same points on a device."""
         return replace(self, points=self.points.to(device), colors=self.colors.to(device))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What a map's file keeps, by name."""
+        return {"points": self.points, "colors": self.colors}
 
     def distance(self, points_world: Points) -> Values:
         """Distance (m, without sign) of points (m) from the nearest point."""

@@ -14,6 +14,8 @@ from nbtrack.fields import Field, PointCloud
 from nbtrack.mapping.files import AnyField
 
 _POINTS_AT_ONCE = 65_536
+_SEEN_BEHIND = 0.1  # m behind the measured depth that still count as seen
+_ASKED_EVERY = 5  # frames
 Mesh = trimesh.Trimesh | trimesh.PointCloud
 
 
@@ -65,24 +67,17 @@ def query_field(
 
 
 def seen_by(
-    points_world: Float[np.ndarray, "n 3"],
-    sequence: RgbdSequence,
-    frames: Frames | None = None,
-    tolerance: float = 0.1,
-    every: int = 5,
+    points_world: Float[np.ndarray, "n 3"], sequence: RgbdSequence, frames: Frames | None = None
 ) -> Bool[np.ndarray, "n"]:
     """Whether a point (m) lies in some frame's view and not behind what that frame measured.
 
-    Args:
-        frames: indices of the frames to ask; by default all.
-        tolerance: how far (m) behind the measured depth a point may lie.
-        every: only each `every`-th frame is asked: neighbours see the same.
+    Of the given frames, by default all, every fifth is asked: neighbours see the same.
     """
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32))
     seen = torch.zeros(len(points), dtype=torch.bool)
     camera = sequence.intrinsics
     frames = np.arange(len(sequence)) if frames is None else frames
-    for index in frames[::every].tolist():
+    for index in frames[::_ASKED_EVERY].tolist():
         T_world_camera = torch.from_numpy(sequence.T_world_camera[index]).float()
         points_camera = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
         columns, rows, depth = project(camera, points_camera)
@@ -91,5 +86,5 @@ def seen_by(
         inside &= (columns < camera.width) & (rows < camera.height)
         measured = torch.from_numpy(sequence.depth(index))
         at_pixel = measured[rows[inside].long(), columns[inside].long()]
-        seen[inside] |= (at_pixel > 0) & (depth[inside] < at_pixel + tolerance)
+        seen[inside] |= (at_pixel > 0) & (depth[inside] < at_pixel + _SEEN_BEHIND)
     return seen.numpy()
