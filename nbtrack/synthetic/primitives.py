@@ -18,7 +18,6 @@ Rows = Float[np.ndarray, "n k"]
 Vectors = Float[np.ndarray, "... k"]
 Origins = Float[np.ndarray, "... 3"]  # one origin for all rays, (3,), or one each, (n, 3)
 Interval = tuple[Values, Values]  # ray parameters between which a ray is inside; none: near > far
-Sphere3 = tuple[Array3, float]  # center (world) and radius (m)
 
 
 def row_dot(first: Vectors, second: Vectors) -> Float[np.ndarray, "..."]:
@@ -29,12 +28,6 @@ def row_dot(first: Vectors, second: Vectors) -> Float[np.ndarray, "..."]:
 def _row_max(rows: Rows) -> Values:
     """Largest entry of each row; for short rows several times as fast as `rows.max(axis=1)`."""
     return reduce(np.maximum, rows.T)
-
-
-def _box_distance(excess: Rows) -> Values:
-    """Signed distance to a k-dimensional box from `|local| - half_size`, exact on both sides."""
-    beyond = np.maximum(excess, 0.0)
-    return np.sqrt(row_dot(beyond, beyond)) + np.minimum(_row_max(excess), 0.0)
 
 
 def _slab_interval(origins: Vectors, directions: Rows, half: Vectors) -> Interval:
@@ -59,12 +52,23 @@ def _round_interval(offsets: Origins, directions: Points, radius: float) -> Inte
 
 
 class Solid:
-    """A closed convex body.
+    """A closed convex body that is a box in coordinates of its own.
 
-    Each has `sdf`, the exact signed distance (m) outside and inside; `_crossing`, where endless
-    lines are inside; `normals`, unit and outward, at points on the surface; `bounding_sphere`,
-    which holds it; `area` of its surface (m²); and `sample_surface`, uniform points there.
+    Each has its `center` (world); `_coordinates` of points (m, at least 0), and `_half`, up to
+    which they are inside; `_crossing`, where endless lines are inside; `normals`, unit and outward,
+    at points on the surface; `area` of it (m²); and `sample_surface`, uniform points there.
     """
+
+    @property
+    def reach(self) -> float:
+        """Radius (m) of the sphere around the center that holds the solid."""
+        return float(np.linalg.norm(self._half))
+
+    def sdf(self, points: Points) -> Values:
+        """Exact signed distance (m) outside and inside."""
+        excess = self._coordinates(points) - self._half
+        beyond = np.maximum(excess, 0.0)
+        return np.sqrt(row_dot(beyond, beyond)) + np.minimum(_row_max(excess), 0.0)
 
     def hit(self, origins: Origins, directions: Points) -> Values:
         """Ray parameter at which a ray from outside enters the solid; inf for a miss.
@@ -84,36 +88,28 @@ class Box(Solid):
     size: Vector3  # full edge lengths (m) along its own x, y, z
     yaw: float = 0.0  # rad, counter-clockwise seen from above
 
-    def _rotation_world_box(self) -> Float[np.ndarray, "3 3"]:
-        cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
-        return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
-
+    @property
     def _half(self) -> Array3:
         return np.asarray(self.size) / 2
 
-    def _turned(self, vectors: Origins) -> Origins:
-        return vectors @ self._rotation_world_box() if self.yaw else vectors
+    @property
+    def _axes(self) -> Float[np.ndarray, "3 3"]:
+        """World from box: the rotation by its yaw."""
+        cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
+        return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
-    def _to_box(self, points: Origins) -> Origins:
-        return self._turned(points - np.asarray(self.center))
-
-    def sdf(self, points: Points) -> Values:
-        """Exact signed distance (m)."""
-        return _box_distance(np.abs(self._to_box(points)) - self._half())
+    def _coordinates(self, points: Points) -> Points:
+        return np.abs((points - self.center) @ self._axes)
 
     def _crossing(self, origins: Origins, directions: Points) -> Interval:
-        return _slab_interval(self._to_box(origins), self._turned(directions), self._half())
+        offsets = (origins - self.center) @ self._axes
+        return _slab_interval(offsets, directions @ self._axes, self._half)
 
     def normals(self, points: Points) -> Points:
         """Unit normals of the face that lies nearest."""
-        local = self._to_box(points)
-        axis = (np.abs(local) - self._half()).argmax(axis=1)
-        normals = np.eye(3)[axis] * np.where(local < 0, -1.0, 1.0)
-        return normals @ self._rotation_world_box().T if self.yaw else normals
-
-    def bounding_sphere(self) -> Sphere3:
-        """Center and half the diagonal."""
-        return np.asarray(self.center), float(np.linalg.norm(self._half()))
+        local = (points - self.center) @ self._axes
+        axis = (np.abs(local) - self._half).argmax(axis=1)
+        return np.eye(3)[axis] * np.where(local < 0, -1.0, 1.0) @ self._axes.T
 
     def area(self) -> float:
         """Surface area (m²)."""
@@ -122,16 +118,18 @@ class Box(Solid):
 
     def sample_surface(self, n: int, rng: np.random.Generator) -> Points:
         """Uniform points on the six faces."""
-        half = self._half()
-        face_areas = np.array([half[1] * half[2], half[0] * half[2], half[0] * half[1]])
+        x, y, z = half = self._half
+        face_areas = np.array([y * z, x * z, x * y])
         axes = rng.choice(3, size=n, p=face_areas / face_areas.sum())
         local = rng.uniform(-1.0, 1.0, (n, 3)) * half
         local[np.arange(n), axes] = rng.choice([-1.0, 1.0], n) * half[axes]
-        return local @ self._rotation_world_box().T + np.asarray(self.center)
+        return local @ self._axes.T + self.center
 
 
 class RoomShell(Box):
     """Walls, floor and ceiling: the solid is everything outside a cuboid, normals point inwards."""
+
+    reach = np.inf
 
     def sdf(self, points: Points) -> Values:
         """Exact signed distance (m), positive inside the room."""
@@ -146,10 +144,6 @@ class RoomShell(Box):
         """Unit normals, into the room, of the nearest wall, floor or ceiling."""
         return -super().normals(points)
 
-    def bounding_sphere(self) -> Sphere3:
-        """All of space."""
-        return np.asarray(self.center), np.inf
-
 
 @dataclass(frozen=True)
 class Sphere(Solid):
@@ -158,21 +152,20 @@ class Sphere(Solid):
     center: Vector3
     radius: float
 
-    def sdf(self, points: Points) -> Values:
-        """Exact signed distance (m)."""
-        offset = points - np.asarray(self.center)
-        return np.sqrt(row_dot(offset, offset)) - self.radius
+    @property
+    def _half(self) -> Float[np.ndarray, "1"]:
+        return np.array([self.radius])
+
+    def _coordinates(self, points: Points) -> Float[np.ndarray, "n 1"]:
+        offset = points - self.center
+        return np.sqrt(row_dot(offset, offset))[:, None]
 
     def _crossing(self, origins: Origins, directions: Points) -> Interval:
-        return _round_interval(origins - np.asarray(self.center), directions, self.radius)
+        return _round_interval(origins - self.center, directions, self.radius)
 
     def normals(self, points: Points) -> Points:
         """Unit radial directions."""
-        return (points - np.asarray(self.center)) / self.radius
-
-    def bounding_sphere(self) -> Sphere3:
-        """The sphere itself."""
-        return np.asarray(self.center), self.radius
+        return (points - self.center) / self.radius
 
     def area(self) -> float:
         """Surface area (m²)."""
@@ -182,7 +175,7 @@ class Sphere(Solid):
         """Uniform points, as normalised Gaussian vectors."""
         vectors = rng.normal(size=(n, 3))
         scale = self.radius / np.linalg.norm(vectors, axis=1, keepdims=True)
-        return vectors * scale + np.asarray(self.center)
+        return vectors * scale + self.center
 
 
 @dataclass(frozen=True)
@@ -193,58 +186,61 @@ class Cylinder(Solid):
     end: Vector3  # center of the other cap
     radius: float
 
-    def _frame(self) -> tuple[Array3, Array3, float]:
-        start, end = np.asarray(self.start), np.asarray(self.end)
-        length = float(np.linalg.norm(end - start))
-        return (start + end) / 2, (end - start) / length, length / 2
+    @property
+    def center(self) -> Array3:
+        """Middle of the axis."""
+        return (np.asarray(self.start) + self.end) / 2
 
-    def _excess(self, points: Points) -> tuple[Float[np.ndarray, "n 2"], Points, Values]:
-        center, axis, half = self._frame()
-        axial = (points - center) @ axis
-        radial = points - center - axial[:, None] * axis
-        sideways = np.sqrt(row_dot(radial, radial)) - self.radius
-        return np.stack([sideways, np.abs(axial) - half], axis=1), radial, axial
+    @property
+    def _axis(self) -> Array3:
+        along = np.asarray(self.end) - self.start
+        return along / float(np.linalg.norm(along))
 
-    def sdf(self, points: Points) -> Values:
-        """Exact signed distance (m): a rectangle's, in the plane of radius and axis."""
-        return _box_distance(self._excess(points)[0])
+    @property
+    def _half(self) -> Float[np.ndarray, "2"]:
+        """Radius and half the length (m)."""
+        length = float(np.linalg.norm(np.asarray(self.end) - self.start))
+        return np.array([self.radius, length / 2])
+
+    def _split(self, vectors: Origins) -> tuple[Float[np.ndarray, "..."], Origins]:
+        """Lengths along the axis, and what of the vectors is across it."""
+        along = np.asarray(vectors @ self._axis)
+        return along, vectors - along[..., None] * self._axis
+
+    def _coordinates(self, points: Points) -> Float[np.ndarray, "n 2"]:
+        """Distances (m) from the axis, and from the center along it."""
+        along, across = self._split(points - self.center)
+        return np.stack([np.sqrt(row_dot(across, across)), np.abs(along)], axis=1)
 
     def _crossing(self, origins: Origins, directions: Points) -> Interval:
-        center, axis, half = self._frame()
-        offset_along, slope_along = (origins - center) @ axis, directions @ axis
-        offset_side = origins - center - offset_along[..., None] * axis
-        slope_side = directions - slope_along[:, None] * axis
-        side = _round_interval(offset_side, slope_side, self.radius)
-        caps = _slab_interval(offset_along[..., None], slope_along[:, None], np.array([half]))
+        offset_along, offset_across = self._split(origins - self.center)
+        slope_along, slope_across = self._split(directions)
+        side = _round_interval(offset_across, slope_across, self.radius)
+        caps = _slab_interval(offset_along[..., None], slope_along[:, None], self._half[1:])
         return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
 
     def normals(self, points: Points) -> Points:
         """Unit normals of the side or the cap, whichever lies nearer."""
-        _, axis, _ = self._frame()
-        excess, radial, axial = self._excess(points)
-        lengths = np.maximum(np.linalg.norm(radial, axis=1, keepdims=True), 1e-12)
-        cap = np.where(axial < 0, -1.0, 1.0)[:, None] * axis
-        return np.where((excess[:, 1] > excess[:, 0])[:, None], cap, radial / lengths)
-
-    def bounding_sphere(self) -> Sphere3:
-        """Middle of the axis and the distance to a cap's rim."""
-        center, _, half = self._frame()
-        return center, float(np.hypot(half, self.radius))
+        along, across = self._split(points - self.center)
+        from_side, from_cap = (self._coordinates(points) - self._half).T[:, :, None]
+        lengths = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        cap = np.where(along < 0, -1.0, 1.0)[:, None] * self._axis
+        return np.where(from_cap > from_side, cap, across / lengths)
 
     def area(self) -> float:
         """Surface area (m²), caps included."""
-        return 2 * np.pi * self.radius * (2 * self._frame()[2] + self.radius)
+        return 2 * np.pi * self.radius * (2 * self._half[1] + self.radius)
 
     def sample_surface(self, n: int, rng: np.random.Generator) -> Points:
         """Uniform points on side and caps."""
-        center, axis, half = self._frame()
+        axis, (radius, half) = self._axis, self._half
         # The coordinate axis least aligned with the cylinder spans the plane of its caps.
         first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         first /= np.linalg.norm(first)
         second = np.cross(axis, first)
         angles = rng.uniform(0.0, 2 * np.pi, n)
-        on_side = rng.uniform(size=n) < 2 * half / (2 * half + self.radius)
-        radii = self.radius * np.where(on_side, 1.0, np.sqrt(rng.uniform(size=n)))
+        on_side = rng.uniform(size=n) < 2 * half / (2 * half + radius)
+        radii = radius * np.where(on_side, 1.0, np.sqrt(rng.uniform(size=n)))
         heights = half * np.where(on_side, rng.uniform(-1.0, 1.0, n), rng.choice([-1.0, 1.0], n))
         rings = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
-        return center + radii[:, None] * rings + heights[:, None] * axis
+        return self.center + radii[:, None] * rings + heights[:, None] * axis

@@ -37,23 +37,17 @@ def render_frame(
     depth, colors, index = cast(columns, rows)
     image, surfaces = colors.reshape(height, width, 3), index.reshape(height, width)
     rough = np.flatnonzero(_rough(image, surfaces))
-    if len(rough):
-        # One call for all samples: culling and shading cost per call, not only per ray.
-        columns4 = np.concatenate([columns[rough] + dx for dx, _ in _SUBPIXELS])
-        rows4 = np.concatenate([rows[rough] + dy for _, dy in _SUBPIXELS])
-        _, samples, _ = cast(columns4, rows4)
-        colors[rough] = samples.reshape(4, -1, 3).mean(axis=0)
+    # One call for all samples: culling and shading cost per call, not only per ray.
+    dx, dy = np.array(_SUBPIXELS).T[:, :, None]
+    _, samples, _ = cast((columns[rough] + dx).ravel(), (rows[rough] + dy).ravel())
+    colors[rough] = samples.reshape(4, -1, 3).mean(axis=0)
     pixels = np.round(255.0 * image).astype(np.uint8)
     return pixels, depth.reshape(height, width), surfaces
 
 
 def _rough(image: Float[np.ndarray, "h w 3"], surfaces: Surfaces) -> Bool[np.ndarray, "h w"]:
     """Pixels that differ from a neighbor in surface or color."""
-    rough = np.zeros(surfaces.shape, dtype=bool)
-    for axis in (0, 1):
-        change = np.abs(np.diff(image, axis=axis)).max(axis=2) > _CONTRAST
-        change |= np.diff(surfaces, axis=axis) != 0
-        lines, change = np.moveaxis(rough, axis, 0), np.moveaxis(change, axis, 0)
-        lines[1:] |= change
-        lines[:-1] |= change
-    return rough
+    looks = np.dstack([image, surfaces])  # another surface differs by one or more
+    steep = [np.abs(np.diff(looks, axis=axis)).max(axis=2) > _CONTRAST for axis in (0, 1)]
+    below, right = np.pad(steep[0], ((1, 1), (0, 0))), np.pad(steep[1], ((0, 0), (1, 1)))
+    return below[1:] | below[:-1] | right[:, 1:] | right[:, :-1]

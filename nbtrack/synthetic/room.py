@@ -72,9 +72,8 @@ class Room:
     def sdf_up_to(self, points: Points, limit: float) -> Values:
         """`min(sdf, limit)`, fast for small limits: far solids are skipped by bounding spheres."""
         distance = np.full(len(points), limit)
-        spheres = [part.solid.bounding_sphere() for part in self.parts]
-        centers = np.array([center for center, _ in spheres])
-        reach = np.array([radius for _, radius in spheres]) + limit
+        centers = np.array([part.solid.center for part in self.parts])
+        reach = np.array([part.solid.reach for part in self.parts]) + limit
         # |p - c|² < reach² for all pairs by one product; the slack covers its rounding.
         squared = row_dot(points, points)[:, None] - 2 * points @ centers.T
         near = squared < reach**2 - row_dot(centers, centers) + 1e-6
@@ -89,11 +88,10 @@ class Room:
         index = np.zeros(len(directions), dtype=np.int64)
         lengths = np.sqrt(row_dot(directions, directions))
         for number, part in enumerate(self.parts):
-            center, radius = part.solid.bounding_sphere()
-            towards = center - origin
+            towards = part.solid.center - origin
             # Only rays in the cone around the solid may meet it; from within the sphere, all. The
             # tangent is taken slightly short, so that rounding never drops a ray that grazes.
-            squared = float(towards @ towards) - (radius * 1.001) ** 2
+            squared = float(towards @ towards) - (part.solid.reach * 1.001) ** 2
             least = lengths * np.sqrt(squared) if squared > 0.0 else -np.inf
             rays = np.flatnonzero(directions @ towards >= least)
             candidate = part.solid.hit(origin, directions[rays])
