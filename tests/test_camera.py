@@ -22,10 +22,7 @@ def test_pixels_by_hand() -> None:
     corner = backproject(camera, torch.tensor([0]), torch.tensor([0]), torch.tensor([2.0]))
     expected = torch.tensor([[2 * -319.5 / 500, 2 * -239.5 / 500, 2.0]])
     torch.testing.assert_close(corner, expected)
-
-
-def test_ray_length_that_the_docstring_gives() -> None:
-    """Catches a normalized direction: with 60 degrees over 640 pixels a corner ray is 1.23 long."""
+    # No direction of length one: 60 degrees over 640 pixels make the docstring's 1.23.
     camera = Intrinsics.from_focal(640, 480, 320 / math.tan(math.radians(30)))
     corner = pixel_directions(camera, torch.tensor(0), torch.tensor(0))
     assert corner.norm().item() == pytest.approx(1.23, abs=0.005)
@@ -47,16 +44,14 @@ def test_project_undoes_backproject(shape: tuple[int, ...]) -> None:
 
 
 def test_backproject_undoes_project() -> None:
-    """Catches real-valued pixels that are rounded between the two."""
+    """Catches real-valued pixels that are rounded between the two, and an absolute depth: callers
+    mask points behind the camera by the sign."""
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(100, 3, generator=generator) + torch.tensor([0.0, 0.0, 6.0])
-    torch.testing.assert_close(backproject(CAMERA, *project(CAMERA, points)), points)
-
-
-def test_points_behind_are_told_by_their_depth() -> None:
-    """Catches an absolute value: callers mask by the sign."""
-    depth = project(CAMERA, torch.tensor([[0.1, 0.2, -1.0]]))[2]
-    assert depth.item() == -1.0
+    points[0, 2] = -1.0
+    columns, rows, depth = project(CAMERA, points)
+    assert depth[0].item() == -1.0
+    torch.testing.assert_close(backproject(CAMERA, columns, rows, depth), points)
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0, 0.25])
@@ -72,11 +67,3 @@ def test_scaled_camera_sees_the_same(factor: float) -> None:
         pixel_directions(small, factor * (columns + 0.5) - 0.5, factor * (rows + 0.5) - 0.5),
         pixel_directions(CAMERA, columns, rows),
     )
-
-
-def test_gradient_reaches_depth() -> None:
-    """Catches a detached direction: the point moves by its direction for one metre of depth."""
-    depth = torch.tensor([2.0], requires_grad=True)
-    point = backproject(CAMERA, torch.tensor([10]), torch.tensor([20]), depth)
-    point[0, 0].backward()
-    assert depth.grad.item() == pytest.approx((10.5 - 300) / 500)

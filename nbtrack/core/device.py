@@ -15,7 +15,7 @@ _WIDTH_FOR_THREADS = 192
 
 
 def choose_device() -> torch.device:
-    """The device that `NBTRACK_DEVICE` names, else the first there is of CUDA, MPS and the CPU.
+    """The device that `NBTRACK_DEVICE` names, else the accelerator there is, else the CPU.
 
     Raises:
         ConfigError: the named device is unknown, or not there.
@@ -23,20 +23,7 @@ def choose_device() -> torch.device:
     name = os.environ.get("NBTRACK_DEVICE")
     if name:
         return named_device(name)
-    if torch.cuda.is_available():
-        return torch.device("cuda")
-    if torch.backends.mps.is_available():
-        return torch.device("mps")
-    return torch.device("cpu")
-
-
-def device_name(device: torch.device) -> str:
-    """What to call the device in results: the GPU's name, or the processor's and its cores."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    if device.type == "mps":
-        return f"Apple GPU ({platform.machine()})"
-    return f"{_processor_name()}, {os.cpu_count()} cores"
+    return torch.accelerator.current_accelerator(check_available=True) or torch.device("cpu")
 
 
 def named_device(name: str) -> torch.device:
@@ -45,12 +32,25 @@ def named_device(name: str) -> torch.device:
         device = torch.device(name)
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, NotImplementedError):
-        there = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
-        there += ["mps"] if torch.backends.mps.is_available() else []
+        kind = torch.accelerator.current_accelerator(check_available=True)
+        there = ["cpu", *(f"{kind}:{i}" for i in range(torch.accelerator.device_count()))]
         raise ConfigError(
             f"device {name!r} is not there: this machine has {', '.join(there)}"
         ) from None
     return device
+
+
+def device_name(device: torch.device) -> str:
+    """What to call the device in results: the GPU's name, or the processor's and its cores."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    if device.type == "mps":
+        return f"Apple GPU ({platform.machine()})"
+    name = platform.processor() or platform.machine()
+    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
+        names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+        name = next(names, name)
+    return f"{name}, {os.cpu_count()} cores"
 
 
 @contextlib.contextmanager
@@ -97,7 +97,10 @@ def advise_on_memory(setting: str) -> Iterator[None]:
     except OutOfMemory:
         raise  # somebody nearer has named the setting
     except (RuntimeError, MemoryError) as error:
-        if not _is_out_of_memory(error):
+        # Only CUDA has a class of its own for it; the CPU's allocator and MPS say it in words.
+        words = ("can't allocate memory", "not enough memory", "out of memory")
+        is_told = any(word in str(error) for word in words)
+        if not (is_told or isinstance(error, MemoryError | torch.OutOfMemoryError)):
             raise
         raise OutOfMemory(
             f"out of memory with {setting}: lower it with --set, or use a device with more; what "
@@ -105,25 +108,7 @@ def advise_on_memory(setting: str) -> Iterator[None]:
         ) from None
 
 
-def _is_out_of_memory(error: Exception) -> bool:
-    # Only CUDA has a class of its own for it; the CPU's allocator and MPS say it in words.
-    words = ("can't allocate memory", "not enough memory", "out of memory")
-    return isinstance(error, MemoryError | torch.OutOfMemoryError) or any(
-        word in str(error) for word in words
-    )
-
-
 def synchronize(device: torch.device) -> None:
     """Wait until everything queued on the device is done, so that a clock reading means it."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    elif device.type == "mps":
-        torch.mps.synchronize()
-
-
-def _processor_name() -> str:
-    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
-        for line in lines:
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    if device.type != "cpu":
+        torch.accelerator.synchronize(device)

@@ -87,12 +87,6 @@ def make_transform(
     return torch.cat([torch.cat([rotation, translation.unsqueeze(-1)], dim=-1), bottom], dim=-2)
 
 
-def invert_transform(T_a_b: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """`T_b_a` of a rigid `T_a_b`, by transposing: exact where a matrix inverse is not."""
-    rotation_b_a = T_a_b[..., :3, :3].transpose(-1, -2)
-    return make_transform(rotation_b_a, -(rotation_b_a @ T_a_b[..., :3, 3:]).squeeze(-1))
-
-
 def transform_points(
     T_a_b: Float[Tensor, "4 4"], points_b: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
