@@ -13,5 +13,11 @@ from nbtrack.plots.curves import (
     plot_steps,
 )
 from nbtrack.plots.images import plot_frame, plot_views
-from nbtrack.plots.rooms import mesh_viewer, plot_mesh
-from nbtrack.plots.top_views import plot_points, plot_recording, plot_slice, plot_trajectories
+from nbtrack.plots.rooms import (
+    mesh_viewer,
+    plot_mesh,
+    plot_points,
+    plot_recording,
+    plot_slice,
+    plot_trajectories,
+)

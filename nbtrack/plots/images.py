@@ -22,7 +22,7 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     sequence=fixed(sequence), index=(0, len(sequence) - 1), title=fixed("A room"))`.
     """
     some = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
-    left, right = new_axes(title, 0.4 + 0.5 * _height(sequence), 1, 2, "compressed")[0]
+    left, right = new_axes(title, 0.4 + 0.5 * _height(sequence), 1, 2)[0]
     _show(left, sequence.color(index), f"frame {sequence.frame_ids[index]}: colour")
     image = _show(right, _measured(sequence.depth(index)), "depth", MILLIMETRE * _most(some))
     right.figure.colorbar(image, ax=right, label="depth (m)", extend="max", aspect=25, pad=0.02)
@@ -46,7 +46,7 @@ def plot_views(
     errors = 100 * np.abs(np.stack([view.depth for view in views]) - depths)
     far, worst = _most(depths), _most(errors)
     height = 0.9 + len(views) * (0.2 + 0.2 * _height(sequence))
-    grid = new_axes(title, height, len(views), 5, "compressed")
+    grid = new_axes(title, height, len(views), 5)
     for row, index, view, depth, error in zip(grid, indices, views, depths, errors, strict=True):
         _show(row[0], sequence.color(index), f"frame {sequence.frame_ids[index]}")
         _show(row[1], view.color, "rendered colour")

@@ -2,7 +2,7 @@
 
 import io
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from itertools import cycle
 
 import matplotlib
@@ -10,8 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
-
-from nbtrack.core.arrays import Poses
 
 PALETTE = (
     "#3b6fb6", "#e08214", "#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d4d4d", "#a6911a",
@@ -22,7 +20,6 @@ _FIXED = {
     "true": "#1a9641",
     "tracked": "#d7191c",  # as in the paper's first figure
 }
-TRUE_COLOR = _FIXED["true"]
 WIDTH = 9.0  # inches of every figure: a notebook's text width
 DASHED = {"color": "0.3", "linestyle": "--", "linewidth": 1}
 _STYLE = {
@@ -46,11 +43,9 @@ class NotebookFigure(Figure):
         return buffer.getvalue()
 
 
-def new_axes(
-    title: str, height: float, rows: int = 1, columns: int = 1, layout: str = "constrained", **share
-) -> np.ndarray:
+def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **share) -> np.ndarray:
     """A grid of axes in a new figure of a height (inches), with its finding as title."""
-    figure = NotebookFigure(figsize=(WIDTH, height), layout=layout)
+    figure = NotebookFigure(figsize=(WIDTH, height), layout="compressed")
     if title:
         figure.suptitle(textwrap.fill(title, 100), x=0.01, ha="left")
     return figure.subplots(rows, columns, squeeze=False, **share)
@@ -70,15 +65,6 @@ def log_axes(axes: Axes, names: str) -> None:
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter("")
-
-
-def draw_paths(axes: Axes, T_paths: Mapping[str, Poses], to_page: np.ndarray) -> None:
-    """Trajectories by label on a page, (2, 3), with a dot at the start."""
-    for label, color in method_colors(T_paths).items():
-        path = T_paths[label][:, :3, 3] @ to_page.T
-        look = {"linewidth": 2.6 if label == "true" else 1.4, "zorder": 3}
-        axes.plot(*path.T, color=color, label=label, **look)
-        axes.plot(*path[0], "o", color="black", markersize=5, zorder=4)
 
 
 def legend_below(figure: Figure) -> None:
