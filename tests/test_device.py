@@ -26,10 +26,7 @@ def test_running_out_of_memory_names_the_setting() -> None:
         torch.empty(2**55)
     with pytest.raises(OutOfMemory), advise_on_memory("x"):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
-
-
-def test_other_errors_keep_their_name() -> None:
-    """Catches a wrong shape that is called a lack of memory."""
+    # A wrong shape is no lack of memory.
     with pytest.raises(RuntimeError, match="size of tensor"), advise_on_memory("x"):
         torch.ones(2) + torch.ones(3)
 

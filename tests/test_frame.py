@@ -125,7 +125,7 @@ def test_a_spoilt_frame_is_survived_and_flagged(case: str) -> None:
     """Catches NaN in poses, a bad pose that passes for a good one, and a run that ends there."""
     spoil, must_flag = SPOILT[case]
     field, sequence = furnished()
-    tracker = make_tracker("lm", field, sequence.T_world_camera[0], StepBudget(60), SETTINGS)
+    tracker = make_tracker("lm", field, sequence.T_world_camera[0], StepBudget(25), SETTINGS)
     for turn, index in enumerate((1, 2, 1, 0, 1)):
         images = sequence.colors[index], sequence.depths_mm[index]
         images = spoil(*images) if turn == 2 else images

@@ -75,43 +75,35 @@ def generator() -> torch.Generator:
 
 
 def test_ray_ends_at_the_observed_point(generator: torch.Generator) -> None:
-    """Catches rows for columns, the pose of another frame, and a direction of length one."""
+    """Catches rows for columns, the pose of another frame, a direction of length one, and signed
+    16 bit: 40,000 mm must not become -25.5 m, nor 65,535 no measurement."""
     sequence = random_sequence(4)
-    sampler = PixelSampler(sequence, CPU)
-    frame = 2
-    rows = torch.randint(CAMERA.height, (30,), generator=generator)
-    columns = torch.randint(CAMERA.width, (30,), generator=generator)
-    rays = sampler.rays(torch.full((30,), frame), rows, columns)
-    depth_m = torch.from_numpy(sequence.depth(frame))[rows, columns]
+    sequence.depths_mm[2, 0, :4] = [0, 32_767, 40_000, 65_535]
+    columns, rows = torch.cartesian_prod(torch.arange(16), torch.arange(12)).T
+    rays = PixelSampler(sequence, CPU).rays(torch.full((192,), 2), rows, columns)
+    depth_m = torch.from_numpy(sequence.depth(2))[rows, columns]
     torch.testing.assert_close(rays.depth, depth_m)
-    torch.testing.assert_close(rays.color, torch.from_numpy(sequence.color(frame))[rows, columns])
-    points_camera = backproject(CAMERA, columns, rows, depth_m)
-    T_world_camera = torch.from_numpy(sequence.T_world_camera[frame]).float()
-    torch.testing.assert_close(
-        rays.points(rays.depth[:, None])[:, 0], transform_points(T_world_camera, points_camera),
-        rtol=1e-4, atol=1e-4,
-    )  # fmt: skip
+    torch.testing.assert_close(rays.color, torch.from_numpy(sequence.color(2))[rows, columns])
+    color, depth = sequence[2].at(rows, columns)
+    assert torch.equal(rays.depth, depth)
+    assert torch.equal(rays.color, color)
+    assert len(sequence[2].measured_pixels()[0]) == torch.count_nonzero(depth_m)
+    T_world_camera = torch.from_numpy(sequence.T_world_camera[2]).float()
+    points_world = transform_points(T_world_camera, backproject(CAMERA, columns, rows, depth_m))
+    found = rays.points(rays.depth[:, None])[:, 0]
+    torch.testing.assert_close(found, points_world, rtol=1e-4, atol=1e-4)
 
 
-def test_depths_above_32_metres(generator: torch.Generator) -> None:
-    """Catches signed 16 bit: 40,000 mm must not become -25.5 m, nor 65,535 no measurement."""
-    sequence = random_sequence(1)
-    sequence.depths_mm[0, 0, :4] = [0, 32_767, 40_000, 65_535]
-    sampler = PixelSampler(sequence, CPU)
-    zeros = torch.zeros(4, dtype=torch.int64)
-    _, depth = sampler.measurements(zeros, zeros, torch.arange(4))
-    torch.testing.assert_close(depth, torch.tensor([0.0, 32.767, 40.0, 65.535]))
-    torch.testing.assert_close(sequence[0].at(zeros, torch.arange(4))[1], depth)
-    rows, columns = sequence[0].measured_pixels()
-    assert len(rows) == np.count_nonzero(sequence.depths_mm[0])
-    assert sequence.depths_mm[0][rows, columns].min() > 0
-
-
-def test_draw_covers_only_the_given_frames(generator: torch.Generator) -> None:
-    """Catches held-out frames that are mapped, and corners or frames that are never drawn."""
+def test_draw_covers_only_the_given_frames() -> None:
+    """Catches held-out frames that are mapped, corners or frames that are never drawn, and draws
+    from the global generator, which no seed of a run reaches."""
     sequence = random_sequence(5)
-    sampler = PixelSampler(sequence, CPU)
-    rays = sampler.draw(6000, generator, torch.tensor([1, 3]))
+    sampler, frames = PixelSampler(sequence, CPU), torch.tensor([1, 3])
+    rays, again, other = (
+        sampler.draw(6000, torch.Generator().manual_seed(seed), frames) for seed in (0, 0, 1)
+    )
+    assert torch.equal(rays.directions_world, again.directions_world)
+    assert not torch.equal(rays.directions_world, other.directions_world)
     expected = torch.from_numpy(sequence.T_world_camera[[1, 3], None, :3, 3]).float()
     first, second = (rays.origins_world == expected).all(dim=-1)
     assert (first ^ second).all()
@@ -121,41 +113,28 @@ def test_draw_covers_only_the_given_frames(generator: torch.Generator) -> None:
     assert len(torch.unique(both, dim=0)) == 2 * 16 * 12
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU besides the host")
-def test_images_on_the_host_give_the_same_rays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches other draws, or rays left behind, where the images do not fit the device."""
-    device, drawn = torch.device("cuda"), []
-    for has_room in (True, False):
-        monkeypatch.setattr("nbtrack.data.pixels.has_room_for", lambda *size: has_room)  # noqa: B023
+@pytest.mark.parametrize("name", ["meta", "cuda"])
+def test_images_stay_on_the_host_where_the_device_is_full(name: str, monkeypatch) -> None:
+    """Catches a long sequence that is copied to a small device: images stay, as 5 bytes a pixel;
+    on a GPU also other draws, or rays left behind."""
+    if name == "cuda" and not torch.cuda.is_available():
+        pytest.skip("needs a GPU besides the host")
+    device, asked, drawn = torch.device(name), [], []
+    for has_room in (False, True):
+        monkeypatch.setattr(
+            "nbtrack.data.pixels.has_room_for",
+            lambda *question, answer=has_room: asked.append(question) or answer,
+        )
         sampler = PixelSampler(random_sequence(3), device)
-        generator = torch.Generator(device).manual_seed(0)
-        drawn.append(sampler.draw(100, generator, torch.arange(3, device=device)))
-        assert drawn[-1].color.device.type == "cuda"
-    torch.testing.assert_close(drawn[0].depth, drawn[1].depth, rtol=0, atol=0)
-
-
-def test_images_stay_on_the_host_where_the_device_is_full(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a long sequence that is copied to a small device: images stay, as 5 bytes a pixel."""
-    asked = []
-    monkeypatch.setattr(
-        "nbtrack.data.pixels.has_room_for", lambda device, size: asked.append((device, size))
-    )
-    sampler = PixelSampler(random_sequence(3), torch.device("meta"))
-    assert asked == [(torch.device("meta"), 5 * 3 * CAMERA.width * CAMERA.height)]
-    assert sampler.colors.device == sampler.depths_mm.device == CPU
-    assert sampler.T_world_camera.device.type == "meta"
-
-
-def test_draw_follows_the_generator() -> None:
-    """Catches draws from the global generator, which no seed of a run reaches."""
-    sampler = PixelSampler(random_sequence(3), CPU)
-    frames = torch.arange(3)
-    first = sampler.draw(20, torch.Generator().manual_seed(1), frames)
-    torch.manual_seed(99)
-    again = sampler.draw(20, torch.Generator().manual_seed(1), frames)
-    other = sampler.draw(20, torch.Generator().manual_seed(2), frames)
-    assert torch.equal(first.directions_world, again.directions_world)
-    assert not torch.equal(first.directions_world, other.directions_world)
+        images = {sampler.colors.device.type, sampler.depths_mm.device.type}
+        assert images == {name if has_room else "cpu"}
+        assert sampler.T_world_camera.device.type == name
+        if name == "cuda":
+            generator = torch.Generator(device).manual_seed(0)
+            drawn.append(sampler.draw(100, generator, torch.arange(3, device=device)))
+            assert drawn[-1].color.device.type == drawn[-1].depth.device.type == name
+            torch.testing.assert_close(drawn[0].depth, drawn[-1].depth, rtol=0, atol=0)
+    assert asked == 2 * [(device, 5 * 3 * CAMERA.width * CAMERA.height)]
 
 
 def test_guided_depths(generator: torch.Generator) -> None:

@@ -28,18 +28,6 @@ def iterations(preset: Preset) -> int:
     return preset.mapping["neus"].iterations
 
 
-def toml_file(folder: Path, text: str) -> Path:
-    (folder / "settings.toml").write_text(text)
-    return folder / "settings.toml"
-
-
-def refused(*settings: str) -> str:
-    with pytest.raises(ConfigError) as caught:
-        load_preset(settings=settings)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
 def test_presets_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches another default than smoke, and an environment that outdoes an explicit name."""
     assert load_preset() == PRESETS["smoke"]
@@ -48,6 +36,8 @@ def test_presets_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert load_preset("paper") == PRESETS["paper"]
     with pytest.raises(ConfigError, match="'papper': did you mean 'paper'"):
         load_preset("papper")
+    with pytest.raises(MissingError, match=r"nowhere\.toml"):
+        load_preset(config_file=Path("nowhere.toml"))
 
 
 def test_papers_figures() -> None:
@@ -75,7 +65,8 @@ def test_nothing_is_tuned_on_what_is_reported() -> None:
 def test_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a wrong order: preset < file < environment < explicit; presets never change."""
     before = copy.deepcopy(PRESETS)
-    path = toml_file(tmp_path, "[mapping.neus]\niterations = 11\nn_rays = 12\n")
+    path = tmp_path / "settings.toml"
+    path.write_text("[mapping.neus]\niterations = 11\nn_rays = 12\n")
     assert iterations(load_preset(config_file=path)) == 11
     monkeypatch.setenv("NBTRACK_SET", f"{KEY}=22")
     assert iterations(load_preset(config_file=path)) == 22
@@ -115,70 +106,46 @@ def test_values_take_the_type_of_the_preset() -> None:
     assert (resolved.scenes.track_frames, resolved.scenes.width) == ("0:10:2", 64)
 
 
-@pytest.mark.parametrize(
-    ("key", "nearest"),
-    [
-        ("mapping.neus.iteration", KEY),
-        ("tracking.sdf.npixels", "tracking.sdf.n_pixels"),
-        ("scene.names", "scenes.names"),
-        ("tracking.lm.lambda_color", "tracking.vr.lambda_color"),  # which LM does not have
-    ],
-)
-def test_unknown_key_names_the_nearest(key: str, nearest: str) -> None:
-    """Catches a misspelt or unused key that is silently added."""
-    assert f"unknown config key '{key}': did you mean '{nearest}'?" in refused(f"{key}=5")
+REFUSED = {
+    # A misspelt or unused key that would be silently added.
+    "mapping.neus.iteration=5": f"'mapping.neus.iteration': did you mean '{KEY}'?",
+    "tracking.sdf.npixels=5": "did you mean 'tracking.sdf.n_pixels'?",
+    "scene.names=5": "did you mean 'scenes.names'?",
+    "tracking.lm.lambda_color=5": "did you mean 'tracking.vr.lambda_color'?",  # LM has none
+    # A whole branch, the preset's own name or an attribute replaced by a number.
+    "name=5": "unknown config key 'name'",
+    "mapping=5": "unknown config key 'mapping'",
+    "mapping.neus=5": "unknown config key 'mapping.neus'",
+    "=5": "unknown config key ''",
+    "__class__=5": "unknown config key '__class__'",
+    # Values that would fail, or worse would not, somewhere in a run of hours.
+    f"{KEY}=1.5": f"{KEY} = 1.5 is of type float: it must be int, for example",
+    f"{KEY}=many": "it must be int, for example",
+    f"{KEY}=true": "it must be int, for example",
+    f"{KEY}=": "it must be int, for example",
+    "mapping.neus.learning_rate=false": "it must be float, for example",
+    "scenes.synthetic=1": "it must be bool, for example",
+    "scenes.track_frames=10": "it must be str, for example",
+    "scenes.names=[1, 2]": "it must be str, for example",
+    "tables.rates_hz=['fast']": "it must be float, for example",
+    "tables.pixels.vr=[1.5]": "it must be int, for example",
+    # A sign that turns a loss into a reward, and a list whose quotes the shell ate.
+    f"{KEY}=-1": "it must be 1 or more",
+    "mapping.imap.learning_rate=-1e-3": "it must be 0 or more",
+    "tables.rates_hz=[5, -1]": "it must be 0 or more",
+    "mapping.neus.lambda_eikonal=nan": "it must be 0 or more",
+    KEY: "write key=value",
+    "scenes.names=[office,bedroom]": "is no TOML",
+}
 
 
-@pytest.mark.parametrize("key", ["name", "mapping", "mapping.neus", "", "__class__"])
-def test_keys_that_are_no_settings(key: str) -> None:
-    """Catches a whole branch, the preset's own name or an attribute replaced by a number."""
-    assert f"unknown config key '{key}'" in refused(f"{key}=5")
-
-
-@pytest.mark.parametrize(
-    ("setting", "wanted"),
-    [
-        (f"{KEY}=1.5", "int"),
-        (f"{KEY}=many", "int"),
-        (f"{KEY}=true", "int"),
-        (f"{KEY}=", "int"),
-        ("mapping.neus.learning_rate=false", "float"),
-        ("scenes.synthetic=1", "bool"),
-        ("scenes.track_frames=10", "str"),
-        ("scenes.names=[1, 2]", "str"),
-        ("tables.rates_hz=['fast']", "float"),
-        ("tables.pixels.vr=[1.5]", "int"),
-    ],
-)
-def test_wrong_type(setting: str, wanted: str) -> None:
-    """Catches values that would fail, or worse would not, somewhere in a run of hours."""
-    message = refused(setting)
-    assert setting.partition("=")[0] in message
-    assert f"it must be {wanted}, for example" in message
-
-
-@pytest.mark.parametrize(
-    ("setting", "says"),
-    [
-        (f"{KEY}=-1", "1 or more"),
-        ("mapping.imap.learning_rate=-1e-3", "0 or more"),
-        ("tables.rates_hz=[5, -1]", "0 or more"),
-        ("mapping.neus.lambda_eikonal=nan", "0 or more"),
-        (KEY, "write key=value"),
-        ("scenes.names=[office,bedroom]", "is no TOML"),
-    ],
-)
-def test_values_that_are_not_allowed(setting: str, says: str) -> None:
-    """Catches a sign that turns a loss into a reward, and a list whose quotes the shell ate."""
-    assert says in refused(setting)
-
-
-def test_bad_files(tmp_path: Path) -> None:
-    """Catches a missing or broken file that is passed over, or checked less than settings are."""
-    with pytest.raises(MissingError, match=r"nowhere\.toml"):
-        load_preset(config_file=tmp_path / "nowhere.toml")
-    with pytest.raises(ConfigError, match=r"did you mean 'mapping\.neus\.n_rays'"):
-        load_preset(config_file=toml_file(tmp_path, "[mapping.neus]\nn_ray = 5"))
+@pytest.mark.parametrize("setting", REFUSED)
+def test_settings_that_are_refused(setting: str) -> None:
+    """Catches what is said beside each kind of them, and messages of several lines."""
+    with pytest.raises(ConfigError) as caught:
+        load_preset(settings=(setting,))
+    assert REFUSED[setting] in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", PRESETS)
