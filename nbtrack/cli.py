@@ -109,42 +109,39 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "help": "one setting, for example mapping.neus.iterations=500; may be repeated",
     },
 }
-_PRESET, _DEVICE = " --preset --config --set", " --device --threads"
+_PRESET = " --preset --config --set"
+_RUN = " --device --threads" + _PRESET
+_MADE = "--frames --seed --out" + _RUN
 _PARTS = " --format --depth-folder --poses"
-# By name: the function in `commands`, what it does, and its options; ! marks those that must be.
+# By name: what it does, and its options; ! marks those that must be. `map` is done by the function
+# `map_command`, `data make` by `make_command`.
 COMMANDS = {
     "map": (
-        "map_command", "fit a field to a sequence with known poses",
-        "sequence --field! --supervision --format --frames --seed --out" + _DEVICE + _PRESET,
+        "fit a field to a sequence with known poses",
+        "sequence --field! --supervision --format " + _MADE,
     ),
     "track": (
-        "track_command", "track a camera; maps first where no map fits",
+        "track a camera; maps first where no map fits",
         "sequence --field --supervision --format --tracker! --rate --steps --pixels --bake "
-        "--map-frames --map-from --frames --seed --out" + _DEVICE + _PRESET,
+        "--map-frames --map-from " + _MADE,
     ),
-    "export": ("export_command", "a run's trajectory or a map elsewhere", "source out --to!"),
+    "export": ("a run's trajectory or a map elsewhere", "source out --to!"),
     "tables": (
-        "tables_command", "the paper's tables, and one beyond, CSV and LaTeX",
-        "--budget --scenes --trackers --beyond --seeds --workers --dask --out" + _DEVICE + _PRESET,
+        "the paper's tables, and one beyond, CSV and LaTeX",
+        "--budget --scenes --trackers --beyond --seeds --workers --dask --out" + _RUN,
     ),
-    "notebooks": (
-        "notebooks_command", "run all notebooks headless, with HTML copies", "--in-place" + _PRESET,
-    ),
+    "notebooks": ("run all notebooks headless, with HTML copies", "--in-place" + _PRESET),
     "data make": (
-        "make_command", "write a synthetic room in the dataset's layout",
+        "write a synthetic room in the dataset's layout",
         "room --out! --n-frames --width --seed",
     ),
-    "data check": ("check_command", "what is wrong with a recording", "folder --out" + _PARTS),
+    "data check": ("what is wrong with a recording", "folder --out" + _PARTS),
     "data convert": (
-        "convert_command", "write a recording in the Neural RGB-D layout",
+        "write a recording in the Neural RGB-D layout",
         "folder out --frames" + _PARTS,
     ),
-    "bench": (
-        "bench_command", "Table II and step times on this machine, full-size networks",
-        "--out" + _DEVICE + _PRESET,
-    ),
-}  # fmt: skip
-_ON_TABLES = ("tables_command", "bench_command")
+    "bench": ("Table II and step times on this machine, full-size networks", "--out" + _RUN),
+}
 
 
 class Parser(argparse.ArgumentParser):
@@ -164,9 +161,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = _parsed(arguments)
         _set_device(options)
-        module = "commands_tables" if options.command in _ON_TABLES else "commands"
+        module = "commands_tables" if options.command in ("tables", "bench") else "commands"
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
-        getattr(commands, options.command)(options)
+        getattr(commands, f"{options.command}_command")(options)
     except NbtrackError as error:
         print(f"nbtrack: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -187,7 +184,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
     groups = {"": parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)}
-    for name, (function, about, options) in COMMANDS.items():
+    for name, (about, options) in COMMANDS.items():
         *group, last = name.split()
         if group and group[0] not in groups:
             part = groups[""].add_parser(group[0], help="make rooms; check or convert a recording")
@@ -199,7 +196,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
             option = OPTIONS[word.rstrip("!")]
             must = {"required": True} if word.endswith("!") else {}
             command.add_argument(word.rstrip("!"), **option, **must)
-        command.set_defaults(command=function, parser=command)
+        command.set_defaults(command=last, parser=command)
     found, unknown = parser.parse_known_args(arguments)
     if unknown:
         known = [option for option in found.parser._option_string_actions if option[:2] == "--"]

@@ -3,13 +3,12 @@
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import pytest
 import torch
 from test_tracking import box_sequence
 
-from nbtrack.experiments.board import Cell, Report
+from nbtrack.experiments.cells import Cell, Report
 from nbtrack.experiments.grid import Execution, run_cells
 from nbtrack.fields import NetworkSettings, field_class
 from nbtrack.mapping.fit import map_sequence
@@ -61,16 +60,12 @@ class Digest(Cell):
     """The hash as a cell."""
 
     name: str
-    units, cost, needs, is_done = 1, 1.0, None, False
-
-    @property
-    def folder(self) -> Path:
-        return Path(self.name)
+    kind, key, units, cost, needs, is_done = "digests", "0", 1, 1.0, None, False
 
     def result(self) -> str:
         raise NotImplementedError
 
-    def make(self, report: Report) -> str:
+    def compute(self, report: Report) -> str:
         return digest_of(self.name, 3)
 
 

@@ -12,7 +12,7 @@ from tiny import TINY
 
 from nbtrack.cli import main
 from nbtrack.core.errors import DataError, NbtrackError
-from nbtrack.experiments.board import Cell, Report
+from nbtrack.experiments.cells import Cell, Report
 from nbtrack.experiments.grid import Execution, run_cells
 
 # Dask's own threads and sockets warn as they are torn down.
@@ -27,21 +27,16 @@ class Square(Cell):
     how: str = "well"
     needs: "Square | None" = None
     is_done: bool = False
-    units = 2
-    cost = 2.0
+    kind, key, units, cost = "squares", "0", 2, 2.0
 
     @property
     def name(self) -> str:
         return f"square {self.number}"
 
-    @property
-    def folder(self) -> Path:
-        return Path(self.name)
-
     def result(self) -> int:
         return self.number**2
 
-    def make(self, report: Report) -> int:
+    def compute(self, report: Report) -> int:
         if self.how == "badly":
             raise DataError(f"depth{self.number}.png is empty")
         if self.how == "deadly":

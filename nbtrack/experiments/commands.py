@@ -1,19 +1,28 @@
-"""What each command does and prints."""
+"""What each command does and prints; `tables` and `bench` have a module of their own."""
 
 import os
 from argparse import Namespace
 from dataclasses import replace
-from typing import Any
 
 from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.core.files import write_atomic
 from nbtrack.core.progress import ProgressBar, tell
+from nbtrack.data.check import check_recording
+from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import parse_frames
+from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.cells import MapCell
-from nbtrack.experiments.grid import Execution, run_cells
+from nbtrack.experiments.export import export
+from nbtrack.experiments.grid import run_cells
+from nbtrack.experiments.notebooks import run_notebooks
 from nbtrack.experiments.presets import Preset, load_preset
-from nbtrack.experiments.scenes import open_scene
+from nbtrack.experiments.runs import TrackCell
+from nbtrack.experiments.scenes import Scene, open_scene
 from nbtrack.fields import field_class, supervised_field
+from nbtrack.mapping.files import MESH_FILE, Map, read_map
+from nbtrack.mapping.meshes import extract_mesh
+from nbtrack.synthetic import make_room
+from nbtrack.tracking import check_pair, make_budget, tracker_class
 
 _PRINTED = (
     "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
@@ -24,14 +33,9 @@ _UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": 
 
 def map_command(options: Namespace) -> None:
     """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
-    from nbtrack.mapping.files import MESH_FILE
-    from nbtrack.mapping.meshes import extract_mesh
-
-    field = supervised_field(options.field, options.supervision or "rendering")
-    parse_frames(options.frames)
-    scene = open_scene(options.sequence, preset_of(options), options.format)
-    cell = MapCell(scene, field, preset_of(options), options.frames, options.seed, options.out)
-    scene.count(options.frames)
+    field, preset = _asked_field(options), preset_of(options)
+    scene = _checked_scene(options, preset, options.frames)
+    cell = MapCell(scene, field, preset, options.frames, options.seed, options.out)
     _map(cell)
     found = cell.map()
     print(f"{cell.folder}: {found.field.label} map of {scene.name}")
@@ -50,24 +54,13 @@ def map_command(options: Namespace) -> None:
 
 def track_command(options: Namespace) -> None:
     """Track a sequence in its map, made first where none fits, or in a given one."""
-    from nbtrack.experiments.runs import TrackCell
-    from nbtrack.tracking import check_pair, make_budget
-
-    field, given = _asked_field(options), None
-    preset = preset_of(options)
-    if options.map_from is not None:
-        given = _given_map(options, field)
-        field = given.field.name
-        network = {**preset.network, field: given.network}
-        preset = replace(preset, network=network)
+    field, given = _field_and_map(options)
+    preset, map_frames = preset_of(options), options.map_frames or ":"
+    if given is not None:
+        preset = replace(preset, network={**preset.network, field: given.network})
     check_pair(options.tracker, field)
     budget = make_budget(options.steps, options.rate)  # told before a room is made
-    map_frames = options.map_frames or ":"
-    for frames in (options.frames, map_frames):
-        parse_frames(frames)
-    scene = open_scene(options.sequence, preset, options.format)
-    scene.count(options.frames)
-    scene.count(map_frames)
+    scene = _checked_scene(options, preset, options.frames, map_frames)
     cell = MapCell(
         scene, field, preset, map_frames, options.seed, given=given, given_path=options.map_from
     )
@@ -78,7 +71,7 @@ def track_command(options: Namespace) -> None:
     if given is None:
         _map(cell)
     run = replace(run, out=run.folder)  # made anew, whatever the cache holds
-    (metrics,) = run_cells([run], f"tracking {scene.name}", Execution(workers=1))
+    (metrics,) = run_cells([run], f"tracking {scene.name}")
     print(f"{run.folder}: {options.tracker} in {field_class(field).label}, {budget}")
     _print_numbers({name: metrics[name] for name in _PRINTED})
     if metrics["frames_without_depth"]:
@@ -90,23 +83,17 @@ def track_command(options: Namespace) -> None:
 
 def export_command(options: Namespace) -> None:
     """Write a run's trajectory or a map in another format; print what was written."""
-    from nbtrack.experiments.export import export
-
     print(f"{options.out}: {export(options.source, options.to, options.out)}")
 
 
 def notebooks_command(options: Namespace) -> None:
     """Run all notebooks headless."""
-    from nbtrack.experiments.notebooks import run_notebooks
-
     preset = preset_of(options)  # a wrong setting is refused before the first kernel starts
     run_notebooks(preset.name, options.config, options.settings, options.in_place)
 
 
 def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
-    from nbtrack.synthetic import make_room
-
     size = (options.width, options.width * 3 // 4)
     with ProgressBar(options.room, options.n_frames) as bar:
         make_room(
@@ -119,18 +106,15 @@ def make_command(options: Namespace) -> None:
 
 def check_command(options: Namespace) -> None:
     """Validate a recording; print what it holds and what is wrong, and draw it if asked to."""
-    from nbtrack.data.check import check_recording
-    from nbtrack.data.recording import open_recording
-
-    recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
+    recording = _recording(options)
     report = check_recording(recording, progress=True)
     print(report)
     if options.out is None:
         return
     from nbtrack.plots import plot_recording
 
-    path = options.out
-    path = path if path.suffix.lower() == ".png" else path / "check.png"
+    is_picture = options.out.suffix.lower() == ".png"
+    path = options.out if is_picture else options.out / "check.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     T_world_camera = recording.T_world_camera[recording.has_pose]
     apart = f"surfaces of two frames lie {1e3 * report.readings[0].median_m:.1f} mm apart (median)"
@@ -140,27 +124,39 @@ def check_command(options: Namespace) -> None:
 
 def convert_command(options: Namespace) -> None:
     """Write a recording in the Neural RGB-D layout; print what became of it."""
-    from nbtrack.data.recording import open_recording
-    from nbtrack.data.writer import convert_sequence
-
-    recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
-    print(convert_sequence(recording, options.out, parse_frames(options.frames), progress=True))
+    frames = parse_frames(options.frames)
+    print(convert_sequence(_recording(options), options.out, frames, progress=True))
 
 
 def preset_of(options: Namespace, *settings: str) -> Preset:
     """The preset with all that changes it."""
     settings = (*options.settings, *settings)
-    if getattr(options, "pixels", None) is not None:
-        settings += (f"tracking.{options.tracker}.n_pixels={options.pixels}",)
-    if getattr(options, "bake", None) is not None:
-        settings += (f"tracking.{options.tracker}.bake_voxel={options.bake}",)
+    for option, key in (("pixels", "n_pixels"), ("bake", "bake_voxel")):
+        value = getattr(options, option, None)
+        settings += (f"tracking.{options.tracker}.{key}={value}",) if value is not None else ()
     return load_preset(options.preset, options.config, settings)
 
 
-def _asked_field(options: Namespace) -> str | None:
-    """The field with its supervision; None where a given map has its own."""
-    from nbtrack.tracking import tracker_class
+def _recording(options: Namespace) -> Recording:
+    return open_recording(options.folder, options.format, options.depth_folder, options.poses)
 
+
+def _checked_scene(options: Namespace, preset: Preset, *slices: str) -> Scene:
+    """The scene, from which all slices select something; a bad one is told before it is made."""
+    for frames in slices:
+        parse_frames(frames)
+    scene = open_scene(options.sequence, preset, options.format)
+    for frames in slices:
+        scene.count(frames)
+    return scene
+
+
+def _asked_field(options: Namespace) -> str:
+    return supervised_field(options.field, options.supervision or "rendering")
+
+
+def _field_and_map(options: Namespace) -> tuple[str, Map | None]:
+    """What to track in: a field under its supervision, or a given map, which knows its field."""
     if tracker_class(options.tracker).renders and options.bake is not None:
         raise ConfigError(
             f"tracker {options.tracker!r} renders, which a baked field cannot: leave --bake out, "
@@ -170,24 +166,18 @@ def _asked_field(options: Namespace) -> str | None:
         raise ConfigError("track needs --field, or --map-from with a map that knows its own")
     if options.field is None and options.supervision is not None:
         raise ConfigError("--supervision belongs to --field: name that too, or leave both out")
-    if options.field is None:
-        return None
-    return supervised_field(options.field, options.supervision or "rendering")
-
-
-def _given_map(options: Namespace, field: str | None) -> Any:
-    """The map at a path. Raises ConfigError if it is not what else was asked for."""
-    from nbtrack.mapping.files import read_map
-
+    asked = _asked_field(options) if options.field else None
+    if options.map_from is None:
+        return asked, None
     if options.map_frames is not None:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
-    found = read_map(options.map_from)
-    name = found.field.name
-    if field is not None and not issubclass(field_class(name), field_class(field)):
+    given = read_map(options.map_from)
+    name = given.field.name
+    if asked and not issubclass(field_class(name), field_class(asked)):
         raise ConfigError(
-            f"{options.map_from} is a map of field {name!r}, not {field!r}: leave it out"
+            f"{options.map_from} is a map of field {name!r}, not {asked!r}: leave it out"
         )
-    return found
+    return name, given
 
 
 def _map(cell: MapCell) -> None:
@@ -195,7 +185,7 @@ def _map(cell: MapCell) -> None:
         print(f"map found in {cell.folder}")
         return
     print(f"no finished map in {cell.folder}: mapping")
-    run_cells([cell], f"mapping {cell.scene.name}", Execution(workers=1))
+    run_cells([cell], f"mapping {cell.scene.name}")
 
 
 def _print_numbers(numbers: dict[str, float | int]) -> None:

@@ -2,8 +2,6 @@
 
 import os
 from argparse import Namespace
-from collections.abc import Sequence
-from pathlib import Path
 
 import pandas as pd
 import torch
@@ -22,8 +20,8 @@ from nbtrack.experiments.commands import preset_of
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, find_methods
 from nbtrack.experiments.presets import PRESETS, Preset
-from nbtrack.experiments.results import BUDGETS, track_scenes
-from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
+from nbtrack.experiments.results import track_scenes
+from nbtrack.experiments.scenes import open_scene, open_scenes
 from nbtrack.tables import (
     beside_published,
     style_table_1,
@@ -58,17 +56,27 @@ def tables_command(options: Namespace) -> None:
         seeds=options.seeds, execution=execution,
     )  # fmt: skip
     folder = options.out or tables_folder() / (preset.name + "_clock" * clock)
-    number, note = "III" if options.beyond else "I", _note(preset, BUDGETS[options.budget])
+    number, note = "III" if options.beyond else "I", _note(preset, clock)
     print(f"Table {number}: ATE (m), {note}")
     print(style_table_1(results))
     if options.beyond:
         paths = write_table_3(folder, results, note)
     else:
-        paths = _write_both(folder, preset, scenes, methods, results, note)
-    cells = results[[name for name in _CELL_COLUMNS if name in results]]
+        steps = measured_steps(preset, scenes[0].read(":1"), methods)
+        pixels = default_pixels(preset, methods)
+        print("Table I beside the paper's")
+        print(beside_published(results).to_string(float_format="%.3f", na_rep="–"))
+        print(f"Table II: steps, on {_machine()}")
+        print(style_table_2(steps, default_pixels=pixels))
+        paths = write_tables(folder, results, steps, note, pixels)
     paths.append(folder / f"table_{len(number)}_cells.csv")
+    cells = results[[name for name in _CELL_COLUMNS if name in results]]
     write_atomic(paths[-1], cells.to_csv(index=False, lineterminator="\n"))
     print("\n".join(str(path) for path in paths))
+    _check_complete(results)
+
+
+def _check_complete(results: pd.DataFrame) -> None:
     failed = results[results["failure"] != ""]
     if len(failed):
         raise NbtrackError(
@@ -78,24 +86,6 @@ def tables_command(options: Namespace) -> None:
         )
 
 
-def _write_both(
-    folder: Path,
-    preset: Preset,
-    scenes: Sequence[Scene],
-    methods: Sequence[str],
-    results: pd.DataFrame,
-    note: str,
-) -> list[Path]:
-    """Table I as it was filled, and Table II as it is measured."""
-    steps = measured_steps(preset, scenes[0].read(":1"), methods)
-    pixels = default_pixels(preset, methods)
-    print("Table I beside the paper's")
-    print(beside_published(results).to_string(float_format="%.3f", na_rep="–"))
-    print(f"Table II: steps, on {_device()}, {torch.get_num_threads()} threads")
-    print(style_table_2(steps, default_pixels=pixels))
-    return write_tables(folder, results, steps, note, pixels)
-
-
 def bench_command(options: Namespace) -> None:
     """Measure and print Table II and step times; write them as CSV."""
     # The paper's sizes unless something else is asked for: small networks measure bookkeeping.
@@ -103,8 +93,8 @@ def bench_command(options: Namespace) -> None:
         options.preset = options.preset or "synthetic"
     preset = preset_of(options, "scenes.n_frames=2")  # one image is enough
     sequence = open_scene(preset.scenes.names[0], preset).read(":1")
-    out, device = options.out or runs_folder() / "bench" / preset.name, choose_device()
-    print(f"{preset.name} networks, on {device_name(device)}, {torch.get_num_threads()} threads")
+    out = options.out or runs_folder() / "bench" / preset.name
+    print(f"{preset.name} networks, on {_machine()}")
     times = measure_step_times(preset, sequence)
     print(times.to_string(index=False, float_format="%.4g"))
     steps = measure_steps(preset, sequence)
@@ -116,16 +106,17 @@ def bench_command(options: Namespace) -> None:
     print(f"written to {out}")
 
 
-def _note(preset: Preset, budget: str) -> str:
+def _note(preset: Preset, clock: bool) -> str:
     """How the numbers came about, in a sentence. Which scenes there are the columns tell."""
     changed = changed_settings(preset, PRESETS[preset.name])
     changed = [setting for setting in changed if not setting.startswith("scenes.names")]
     told = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name
-    return f"Preset: {told}; budget: {budget}; device: {_device()}."
+    budget = "wall clock" if clock else "the paper's step counts"
+    return f"Preset: {told}; budget: {budget}; device: {device_name(choose_device())}."
 
 
-def _device() -> str:
-    return device_name(choose_device())
+def _machine() -> str:
+    return f"{device_name(choose_device())}, {torch.get_num_threads()} threads"
 
 
 def _words(text: str | None) -> list[str]:

@@ -5,7 +5,8 @@ Small networks gain nothing from a second thread, so scenes and methods share th
 
 import importlib.util
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,9 +15,9 @@ from typing import Any
 import torch
 
 from nbtrack.core.device import choose_device, threads
-from nbtrack.core.errors import MissingError
+from nbtrack.core.errors import MissingError, NbtrackError
 from nbtrack.core.progress import ProgressBar
-from nbtrack.experiments.board import Board, Cell, outcome_of
+from nbtrack.experiments.cells import Cell
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,7 @@ class Execution:
 
     def __post_init__(self) -> None:
         """Raises MissingError, before any work, if Dask is needed and not there."""
-        needs_dask = self.dask is not None or (self.workers or 1) > 1
-        if needs_dask and importlib.util.find_spec("distributed") is None:
+        if (self.dask is not None or (self.workers or 1) > 1) and not _has_dask():
             raise MissingError(
                 "several workers need Dask: pip install 'nbtrack[cluster]', or give --workers 1"
             )
@@ -58,26 +58,48 @@ def run_cells(cells: Sequence[Cell], title: str, execution: Execution | None = N
     results: dict[Path, Any] = {}
     if missing:
         with ProgressBar(title, sum(cell.cost for cell in missing.values())) as bar:
-            board = Board(bar, missing, results, execution.keep_going)
-            _run(board, execution)
+            _run(missing, results, bar, execution)
     return [results[c.folder] if c.folder in results else c.result() for c in cells]
 
 
-def _run(board: Board, execution: Execution) -> None:
-    workers = execution.workers or _usual_workers()
-    workers = min(workers, len(board.cells))
+def _run(
+    cells: dict[Path, Cell], results: dict[Path, Any], bar: ProgressBar, execution: Execution
+) -> None:
+    """Fill in the results, and move the bar to where each cell says it is."""
+    done = dict.fromkeys(cells, 0.0)
+
+    def show(folder: Path, units: int, status: str) -> None:
+        cell = cells[folder]
+        done[folder] = cell.cost * min(1.0, units / max(cell.units, 1))
+        ended = f"{len(results)} of {len(cells)} done"
+        bar.move_to(sum(done.values()), f"{ended}, {cell.name}: {status}")
+
+    with closing(_outcomes(cells, results, show, execution)) as outcomes:
+        for folder, outcome in outcomes:
+            if isinstance(outcome, NbtrackError) and not execution.keep_going:
+                raise outcome
+            results[folder] = outcome
+            show(folder, cells[folder].units, "done")
+
+
+def _outcomes(
+    cells: dict[Path, Cell], results: dict[Path, Any], show: Callable, execution: Execution
+) -> Iterator[tuple[Path, Any]]:
+    """What becomes of each cell, as they end; what a cell needs comes before it."""
+    usual = os.cpu_count() or 1 if _has_dask() and choose_device().type == "cpu" else 1
+    workers = min(execution.workers or usual, len(cells))
     if execution.dask is not None or workers > 1:
         from nbtrack.experiments.workers import run_on_workers
 
         share = 1 if execution.dask else max(1, torch.get_num_threads() // workers)
-        run_on_workers(board, execution.dask, workers, execution.threads or share)
+        n_threads = execution.threads or share
+        yield from run_on_workers(cells, show, execution.dask, workers, n_threads)
         return
     with threads(execution.threads or torch.get_num_threads()):
-        for folder, cell in board.cells.items():
-            needed = board.results.get(cell.needs.folder) if cell.needs else None
-            board.settle(folder, outcome_of(cell, needed, partial(board.show, folder)))
+        for folder, cell in cells.items():
+            needed = results.get(cell.needs.folder) if cell.needs else None
+            yield folder, cell.outcome(needed, partial(show, folder))
 
 
-def _usual_workers() -> int:
-    has_dask = importlib.util.find_spec("distributed") is not None
-    return os.cpu_count() or 1 if has_dask and choose_device().type == "cpu" else 1
+def _has_dask() -> bool:
+    return importlib.util.find_spec("distributed") is not None

@@ -3,29 +3,20 @@
 Precedence: preset < TOML file (`NBTRACK_CONFIG` or `--config`) < `NBTRACK_SET` < `--set key=value`.
 """
 
-import dataclasses
 import os
 import shlex
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from nbtrack.core.errors import ConfigError, MissingError, nearest_name
 from nbtrack.core.settings import may_be_zero, not_a_setting, with_settings, with_values
-from nbtrack.fields import (
-    FIELDS,
-    MappingSettings,
-    NetworkSettings,
-    NeusMapping,
-    NeusPlusMapping,
-    PointMapping,
-    field_class,
-)
+from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, PointMapping, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.tables import PAPER_SCENE_LABELS
-from nbtrack.tracking import TRACKERS, SdfSettings, TrackerSettings, VrSettings, tracker_class
+from nbtrack.tracking import TRACKERS, TrackerSettings, tracker_class
 
 
 @dataclass(frozen=True)
@@ -93,37 +84,41 @@ class Preset:
         return own or _shared(tracker_class(tracker_name).Settings, self.tracking["sdf"])
 
 
-def _shared(settings: type, other: Any) -> Any:
-    names = [f.name for f in dataclasses.fields(settings) if hasattr(other, f.name)]
-    return settings(**{name: getattr(other, name) for name in names})
+def _shared(kind: type, other: Any) -> Any:
+    return kind(**{f.name: getattr(other, f.name) for f in fields(kind) if hasattr(other, f.name)})
 
 
 # Pixel counts of `smoke` are the paper's divided by eight: the ratio of VR to SDF stays.
-_SMOKE = Preset(
-    "smoke",
-    network={
-        "imap": NetworkSettings(width=96, embedding_sigma=4.0),
-        "neus": NetworkSettings(width=96),
-    },
-    mapping={
-        "imap": MappingSettings(1200, n_rays=96, learning_rate=3e-3),
-        "neus": NeusMapping(2000, n_rays=128, n_stratified=16, n_surface=8, learning_rate=3e-3),
-        "neus_plus": NeusPlusMapping(
-            1400, n_rays=96, n_stratified=8, n_surface=8, n_surface_points=1024, learning_rate=3e-3
-        ),
-        "points": PointMapping(),
-    },
-    tracking={
-        **{name: known.Settings() for name, known in TRACKERS.items()},
-        "vr": VrSettings(n_pixels=64),
-        "sdf": SdfSettings(n_pixels=512),
-    },
-    scenes=ScenesConfig(("living_room", "office"), n_frames=240, width=96, track_frames=":120"),
-    tables=TablesConfig(pixels={"vr": (16, 64, 128), "sdf": (256, 512, 2048)}),
-)
-_SYNTHETIC = Preset("synthetic", scenes=ScenesConfig(REPORTED_ROOMS))
-_PAPER = Preset("paper", scenes=ScenesConfig(tuple(PAPER_SCENE_LABELS), synthetic=False))
-PRESETS = {preset.name: preset for preset in (_SMOKE, _SYNTHETIC, _PAPER)}
+_SMOKE = """
+network.imap.width = 96
+network.neus.width = 96
+[scenes]
+names = ["living_room", "office"]
+n_frames = 240
+width = 96
+track_frames = ":120"
+[mapping]
+imap = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
+neus = {iterations = 2000, n_rays = 128, n_stratified = 16, n_surface = 8, learning_rate = 3e-3}
+[mapping.neus_plus]
+iterations = 1400
+n_rays = 96
+n_stratified = 8
+n_surface = 8
+n_surface_points = 1024
+learning_rate = 3e-3
+[tracking]
+vr.n_pixels = 64
+sdf.n_pixels = 512
+[tables.pixels]
+vr = [16, 64, 128]
+sdf = [256, 512, 2048]
+"""
+PRESETS = {
+    "smoke": with_values(Preset("smoke"), tomllib.loads(_SMOKE)),
+    "synthetic": Preset("synthetic", scenes=ScenesConfig(REPORTED_ROOMS)),
+    "paper": Preset("paper", scenes=ScenesConfig(tuple(PAPER_SCENE_LABELS), synthetic=False)),
+}
 
 
 def load_preset(
@@ -149,20 +144,16 @@ def load_preset(
         mapping={known: preset.mapping_of(known) for known in FIELDS},
         tracking={known: preset.tracking_of(known) for known in TRACKERS},
     )
-    file_name = config_file or os.environ.get("NBTRACK_CONFIG")
+    file_name, text = config_file or os.environ.get("NBTRACK_CONFIG"), os.environ.get("NBTRACK_SET")
     if file_name:
         preset = with_values(preset, _read_toml(Path(file_name)))
-    return with_settings(preset, *_environment_settings(), *settings)
-
-
-def _environment_settings() -> list[str]:
-    text = os.environ.get("NBTRACK_SET", "")
     try:
-        return shlex.split(text)
+        before = shlex.split(text or "")
     except ValueError as error:
         raise ConfigError(
             f"NBTRACK_SET={text!r} cannot be split ({error}): quote each setting as in a shell"
         ) from None
+    return with_settings(preset, *before, *settings)
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

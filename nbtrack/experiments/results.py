@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +23,11 @@ from nbtrack.experiments.scenes import Scene
 from nbtrack.mapping.files import Map
 from nbtrack.tracking.trajectories import read_tum
 
-BUDGETS = {"steps": "the paper's step counts", "clock": "wall clock"}
-"""What ends a frame: as many steps as the paper's hardware had time for, or our own clock."""
-
 
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0, frames: str = ":") -> Map:
     """The map of a scene, from the cache or made now."""
     cell = MapCell(scene, field, preset, frames, seed)
-    if not cell.is_done:
-        run_cells([cell], f"mapping {cell.name}")
+    run_cells([cell], f"mapping {cell.name}")
     return cell.map()
 
 
@@ -46,17 +43,13 @@ def map_scenes(
     Returns:
         A row a map: field, scene, seed, seconds, and the scores, `SCORES`.
     """
-    cells = [
-        MapCell(scene, field, preset, seed=seed)
-        for field in fields
-        for seed in range(seeds)
-        for scene in scenes
-    ]
+    places = [*product(fields, range(seeds), scenes)]
+    cells = [MapCell(scene, field, preset, seed=seed) for field, seed, scene in places]
     made = run_cells(cells, "mapping", execution)
     return pd.DataFrame(
-        {"field": cell.field, "scene": cell.scene.name, "seed": cell.seed}
+        {"field": field, "scene": scene.name, "seed": seed}
         | {"seconds": found["seconds"], **found["quality"]}
-        for cell, found in zip(cells, made, strict=True)
+        for (field, seed, scene), found in zip(places, made, strict=True)
     )
 
 
@@ -80,26 +73,22 @@ def track_scenes(
         seeds: of map and run together: their spread is that of the whole method.
 
     Returns:
-        A row a run: rate_hz, steps, method, scene, seed, ate_m (NaN where it failed), failure
-        (why), run (its name) and the other metrics.
+        A row a run: rate_hz, steps, method, scene, seed, run (its name), ate_m (NaN where it
+        failed), failure (why) and the other metrics.
     """
-    plan = []
-    for method in find_methods(methods):
-        changed = with_settings(preset, *method.settings)
-        for seed in range(seeds):
-            for rate_hz in [None] if steps else rates_hz or preset.tables.rates_hz:
-                n_steps = steps or (None if clock else method.paper_steps(rate_hz))
-                for scene in scenes:
-                    cell = TrackCell(
-                        MapCell(scene, method.field, changed, seed=seed), method.tracker, n_steps,
-                        rate_hz if clock else None, frames or preset.scenes.track_frames, seed,
-                    )  # fmt: skip
-                    plan.append((rate_hz, method, cell))
-    found = _run([cell for *_, cell in plan], clock, execution or Execution())
-    return pd.DataFrame(
-        {"rate_hz": rate_hz, "steps": cell.steps, "method": method.label, **_told(cell, result)}
-        for (rate_hz, method, cell), result in zip(plan, found, strict=True)
-    )
+    rates, frames = rates_hz or preset.tables.rates_hz, frames or preset.scenes.track_frames
+    cells, rows = [], []
+    for method, seed, rate_hz, scene in product(
+        find_methods(methods), range(seeds), [None] if steps else rates, scenes
+    ):
+        map_cell = MapCell(scene, method.field, with_settings(preset, *method.settings), seed=seed)
+        n_steps = steps or (None if clock else method.paper_steps(rate_hz))
+        hz = rate_hz if clock else None
+        cells.append(TrackCell(map_cell, method.tracker, n_steps, hz, frames, seed))
+        place = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label}
+        rows.append(place | {"scene": scene.name, "seed": seed, "run": cells[-1].folder.name})
+    found = _run(cells, clock, execution or Execution())
+    return pd.DataFrame(row | _told(result) for row, result in zip(rows, found, strict=True))
 
 
 def _run(cells: Sequence[TrackCell], clock: bool, execution: Execution) -> list[Any]:
@@ -108,17 +97,16 @@ def _run(cells: Sequence[TrackCell], clock: bool, execution: Execution) -> list[
     if 0 < n_done < len(cells):
         tell(f"{n_done} of {len(cells)} runs are cached")
     if clock:
-        run_cells([cell.map_cell for cell in cells if not cell.is_done], "mapping", execution)
+        run_cells([cell.needs for cell in cells if not cell.is_done], "mapping", execution)
         execution = replace(execution, workers=1, dask=None)
     return run_cells(cells, "by the clock" if clock else "tracking", execution)
 
 
-def _told(cell: TrackCell, result: dict[str, Any] | NbtrackError) -> dict[str, Any]:
-    place = {"scene": cell.scene.name, "seed": cell.seed, "run": cell.folder.name}
+def _told(result: dict[str, Any] | NbtrackError) -> dict[str, Any]:
     if isinstance(result, NbtrackError):
-        return place | {"ate_m": float("nan"), "failure": str(result)}
-    metrics = {k: v for k, v in result.items() if k not in (*place, "config", "versions")}
-    return place | {"ate_m": result["ate_rmse_m"], "failure": ""} | metrics
+        return {"ate_m": float("nan"), "failure": str(result)}
+    metrics = {k: v for k, v in result.items() if k not in ("config", "versions")}
+    return {"ate_m": result["ate_rmse_m"], "failure": "", **metrics}
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Tracked runs as cells: each is named by all that it depends on, and made once."""
+"""Tracked runs as cells: one tracker in one map, under one budget."""
 
 import shlex
 import time
@@ -15,19 +15,15 @@ from nbtrack.core.files import (
     foreign_source,
     json_text,
     read_json,
-    runs_folder,
     sources_fingerprint,
     versions,
     write_together,
 )
 from nbtrack.core.settings import as_dict, changed_settings
-from nbtrack.experiments.board import Cell, Report
-from nbtrack.experiments.cells import SHARED_SOURCES, MapCell, cell_lock, seed_suffix
+from nbtrack.experiments.cells import SHARED_SOURCES, Cell, MapCell, Report, seed_suffix
 from nbtrack.experiments.presets import PRESETS
 from nbtrack.experiments.scenes import DATASET_SCENES, Scene
-from nbtrack.fields import Field, PointCloud
 from nbtrack.fields.grid import BakedField
-from nbtrack.mapping.files import Map
 from nbtrack.mapping.quality import check_belongs
 from nbtrack.synthetic import ROOMS
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
@@ -43,56 +39,43 @@ _NOT_PASSED_ON = ("scenes.names", "scenes.track_frames", "tables.")
 class TrackCell(Cell):
     """One tracked run in a map, under one budget: so many steps a frame, or a rate by the clock."""
 
-    map_cell: MapCell
+    needs: MapCell
     tracker: str
     steps: float | int | None = None
     rate_hz: float | int | None = None
     frames: str = ":"
     seed: int = 0
-    out: Path | None = None  # where to write the results instead of in the cache
+    out: Path | None = None
+
+    kind = "tracks"
 
     @property
     def settings(self) -> Any:
         """Settings of the tracker."""
-        return self.map_cell.preset.tracking_of(self.tracker)
+        return self.needs.preset.tracking_of(self.tracker)
 
     @cached_property
     def key(self) -> str:
-        """Changes with everything that the run depends on; by the clock, with the machine too."""
+        """Of code, map, tracker, budget, frames and seed; by the clock, of the machine too."""
         machine = (device_name(choose_device()), torch.get_num_threads())
         clock = None if self.rate_hz is None else (self.rate_hz, *machine)
         code = sources_fingerprint(*SHARED_SOURCES, "tracking")
         return fingerprint(
-            code, foreign_source(tracker_class(self.tracker)), self.map_cell.key, self.tracker,
+            code, foreign_source(tracker_class(self.tracker)), self.needs.key, self.tracker,
             self.settings, self.steps, clock, self.frames, self.seed,
         )  # fmt: skip
 
     @property
-    def needs(self) -> MapCell:
-        """The map."""
-        return self.map_cell
-
-    @property
     def scene(self) -> Scene:
         """The tracked scene."""
-        return self.map_cell.scene
+        return self.needs.scene
 
     @property
     def name(self) -> str:
-        """A readable name: scene, method and budget, and the seed if it is not the first."""
+        """Scene, method and budget, and the seed if it is not the first."""
         budget = f"{self.rate_hz:g}hz" if self.rate_hz else f"{self.steps:g}steps"
-        method = f"{self.map_cell.field}-{self.tracker}"
+        method = f"{self.needs.field}-{self.tracker}"
         return f"{self.scene.name}-{method}-{budget}{seed_suffix(self.seed)}"
-
-    @property
-    def cache(self) -> Path:
-        """Where a run of the cache is kept, and the checkpoint of any."""
-        return runs_folder() / "tracks" / f"{self.name}-{self.key}"
-
-    @property
-    def folder(self) -> Path:
-        """Where the run's files are kept."""
-        return self.out or self.cache
 
     @property
     def is_done(self) -> bool:
@@ -118,12 +101,7 @@ class TrackCell(Cell):
         """What a finished run keeps: errors, speed, device, versions, settings."""
         return read_json(self.folder / METRICS_FILE)
 
-    def make(self, report: Report) -> dict[str, Any]:
-        """Track now, or wait for the process that does; returns `result`."""
-        with cell_lock(self.cache, report):
-            return self.result() if self.is_done else self._make(report)
-
-    def _make(self, report: Report) -> dict[str, Any]:
+    def compute(self, report: Report) -> dict[str, Any]:
         """Track, or take a killed run up where its last checkpoint stands; write the files.
 
         `trajectory.txt` and `groundtruth.txt` (TUM) hold the tracked frames, without the first
@@ -132,22 +110,24 @@ class TrackCell(Cell):
         Raises:
             DataError: a given map does not fit the first frame at its given pose.
         """
-        made = self.map_cell.map()
+        made, notes = self.needs.map(), {}
         with advise_on_memory(f"frames {self.frames} of {self.scene.name}"):
             sequence = self.scene.read(self.frames)
-        notes = {}
-        if self.map_cell.given:
+        if self.needs.given:
             notes = {"map_from": made.made, "map_warning": check_belongs(made, sequence[0])}
-        field, baking = _field_to_track(made.field, self.settings)
-        budget = make_budget(self.steps, self.rate_hz)
+        budget, start = make_budget(self.steps, self.rate_hz), time.perf_counter()
         tracker = make_tracker(
-            self.tracker, field, sequence.T_world_camera[0], budget, self.settings, self.seed
+            self.tracker, made.field, sequence.T_world_camera[0], budget, self.settings, self.seed
         )
-        checkpoint = self.cache / RUN_FILE
+        if isinstance(tracker.field, BakedField):
+            notes["bake_seconds"] = time.perf_counter() - start
+            notes["grid_bytes"] = tracker.field.n_bytes
+        checkpoint = self.cache / RUN_FILE  # a folder of the user's holds results alone
         tracked = track_sequence(
             tracker, sequence, checkpoint, lambda done, m: report(done, f"off by {100 * m:.1f} cm")
         )
-        metrics = {**self._metrics(tracked, made), "budget": str(budget), **baking, **notes}
+        metrics = self._metrics(tracked) | {"map_seconds": made.seconds, "budget": str(budget)}
+        metrics |= notes
         ids = tracked.frames["frame_id"].to_numpy()[1:]
         # The metrics come last: where they stand, the run is complete.
         write_together(self.folder, {
@@ -159,62 +139,54 @@ class TrackCell(Cell):
         checkpoint.unlink(missing_ok=True)
         return metrics
 
-    def _metrics(self, tracked: Trajectory, made: Map) -> dict[str, Any]:
+    def _metrics(self, tracked: Trajectory) -> dict[str, Any]:
         metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
         rows = tracked.frames.iloc[1:]
         if "lost" in rows:
             errors = rows["translation_error_m"].to_numpy()
             metrics |= score_detection(rows["lost"].to_numpy(dtype=bool), errors)
-        steps, device = int(rows["steps"].sum()), choose_device()
+        steps, seconds, map_cell = int(rows["steps"].sum()), rows["seconds"], self.needs
         return {
             **metrics,
             "frames_without_depth": int(rows["without_depth"].sum()),
             "steps_per_frame": steps / len(rows),
-            "seconds_per_step": float(rows["seconds"].sum()) / max(steps, 1),
-            "seconds_per_frame": float(rows["seconds"].mean()),
-            "map_seconds": made.seconds,
-            "device": device_name(device),
+            "seconds_per_step": float(seconds.sum()) / max(steps, 1),
+            "seconds_per_frame": float(seconds.mean()),
+            "device": device_name(choose_device()),
             "threads": torch.get_num_threads(),
             "scene": self.scene.name,
-            "field": self.map_cell.field,
+            "field": map_cell.field,
             "tracker": self.tracker,
             "seed": self.seed,
             "key": self.key,
             "versions": versions(),
-            "command": self._command(device),
+            "command": self._command(),
             "config": {
-                "preset": as_dict(self.map_cell.preset),
-                "map_frames": self.map_cell.frames,
-                "map_seed": self.map_cell.seed,
+                "preset": as_dict(map_cell.preset),
+                "map_frames": map_cell.frames,
+                "map_seed": map_cell.seed,
                 "frames": self.frames,
                 "steps": self.steps,
                 "rate_hz": self.rate_hz,
             },
         }
 
-    def _command(self, device: torch.device) -> str:
+    def _command(self) -> str:
         """What makes this run anew, and its map where that is not cached."""
-        cell, preset = self.map_cell, self.map_cell.preset
+        cell, preset = self.needs, self.needs.preset
         is_known = self.scene.name in (*ROOMS, *DATASET_SCENES)
+        made = {"field": cell.field, "map-frames": cell.frames}
+        options = {
+            "format": self.scene.format,
+            **({"map-from": cell.given_path} if cell.given else made),
+            "tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps,
+            "frames": self.frames, "seed": self.seed, "device": choose_device().type,
+            "threads": torch.get_num_threads(), "preset": preset.name,
+        }  # fmt: skip
         words = ["python", "-m", "nbtrack", "track"]
         words += [self.scene.name if is_known else str(self.scene.folder)]
-        words += ["--format", self.scene.format] if self.scene.format else []
-        words += ["--map-from", str(cell.given_path)] if cell.given else [
-            "--field", cell.field, "--map-frames", cell.frames]  # fmt: skip
-        words += ["--tracker", self.tracker]
-        words += ["--rate", repr(self.rate_hz)] if self.rate_hz else ["--steps", repr(self.steps)]
-        words += ["--frames", self.frames, "--seed", str(self.seed), "--device", device.type]
-        words += ["--threads", str(torch.get_num_threads()), "--preset", preset.name]
+        for name, value in options.items():
+            words += [f"--{name}", str(value)] if value is not None else []
         for setting in changed_settings(preset, PRESETS[preset.name]):
-            if not setting.startswith(_NOT_PASSED_ON):
-                words += ["--set", setting]
+            words += ["--set", setting] if not setting.startswith(_NOT_PASSED_ON) else []
         return shlex.join([*words, "--out", f"again_{self.name}"])
-
-
-def _field_to_track(field: Field | PointCloud, settings: Any) -> tuple[Any, dict[str, Any]]:
-    """The field that a tracker asks: the map itself, or its copy on a grid; and what that took."""
-    if not getattr(settings, "bake_voxel", 0):
-        return field, {}
-    start = time.perf_counter()
-    baked = BakedField(field, settings.bake_voxel)
-    return baked, {"bake_seconds": time.perf_counter() - start, "grid_bytes": baked.n_bytes}

@@ -3,7 +3,7 @@
 import contextlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from distributed.scheduler import KilledWorker
 from nbtrack.core.device import threads
 from nbtrack.core.errors import MissingError, NbtrackError
 from nbtrack.core.files import data_folder, runs_folder
-from nbtrack.experiments.board import Board, Cell, outcome_of
+from nbtrack.experiments.cells import Cell
 from nbtrack.fields import FIELDS
 from nbtrack.tracking import TRACKERS
 
@@ -29,37 +29,40 @@ _LOCAL = {
 }
 
 
-def run_on_workers(board: Board, address: str | None, workers: int, n_threads: int) -> None:
-    """Run all cells, each as soon as what it needs is there.
+def run_on_workers(
+    cells: Mapping[Path, Cell],
+    show: Callable[[Path, int, str], None],
+    address: str | None,
+    workers: int,
+    n_threads: int,
+) -> Iterator[tuple[Path, Any]]:
+    """What becomes of each cell, as they end; each begins as soon as what it needs is there.
 
     Args:
+        show: told where a running cell is.
         address: of a Dask scheduler; by default local processes are started, `workers` of them.
     """
-    with _client(address, workers) as client:
-        _run(client, board, n_threads)
-
-
-def _run(client: Client, board: Board, n_threads: int) -> None:
-    topic, news = f"nbtrack-{os.getpid()}-{time.time_ns()}", []
-    client.subscribe_topic(topic, lambda event: news.append(event[1]))
-    settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
-    settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
-    waiting: dict[Path, Any] = {}
-    for priority, (folder, cell) in enumerate(board.cells.items()):
-        needed = waiting.get(cell.needs.folder) if cell.needs else None
-        waiting[folder] = client.submit(
-            _make_there, cell, needed, topic, settings, n_threads, _registered(),
-            key=f"{topic}-{folder.name}", pure=False, priority=-priority,
-        )  # fmt: skip
-    while waiting:
-        with contextlib.suppress(TimeoutError):
-            wait(list(waiting.values()), timeout=_REPORT_SECONDS, return_when="FIRST_COMPLETED")
-        while news:
-            folder, units, status = news.pop(0)
-            if Path(folder) in waiting:
-                board.show(Path(folder), units, status)
-        for folder in [folder for folder, future in waiting.items() if future.done()]:
-            board.settle(folder, _result(waiting.pop(folder), folder.name))
+    with _connected(address) if address is not None else _started(workers) as client:
+        topic, news = f"nbtrack-{os.getpid()}-{time.time_ns()}", []
+        client.subscribe_topic(topic, lambda event: news.append(event[1]))
+        settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
+        settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
+        waiting: dict[Path, Any] = {}
+        for priority, (folder, cell) in enumerate(cells.items()):
+            needed = waiting.get(cell.needs.folder) if cell.needs else None
+            waiting[folder] = client.submit(
+                _outcome_there, cell, needed, topic, settings, n_threads, (FIELDS, TRACKERS),
+                key=f"{topic}-{folder.name}", pure=False, priority=-priority,
+            )  # fmt: skip
+        while waiting:
+            with contextlib.suppress(TimeoutError):
+                wait([*waiting.values()], timeout=_REPORT_SECONDS, return_when="FIRST_COMPLETED")
+            while news:
+                name, units, status = news.pop(0)
+                if Path(name) in waiting:
+                    show(Path(name), units, status)
+            for folder in [folder for folder, future in waiting.items() if future.done()]:
+                yield folder, _result(waiting.pop(folder), folder.name)
 
 
 def _result(future: Any, name: str) -> Any:
@@ -73,13 +76,16 @@ def _result(future: Any, name: str) -> Any:
         )
 
 
-def _make_there(
-    cell: Cell, needed: Any, topic: str, settings: dict[str, str], n_threads: int, registered: Any
+def _outcome_there(
+    cell: Cell, needed: Any, topic: str, settings: dict[str, str], n_threads: int, known: Any
 ) -> Any:
-    """Runs in a worker, which may have been started with other folders, or for another device."""
+    """Runs in a worker, which may have been started with other folders, or for another device.
+
+    It may also know fewer fields and trackers: somebody adds them in the process that asks.
+    """
     os.environ |= settings
-    FIELDS.update(registered[0])
-    TRACKERS.update(registered[1])
+    FIELDS.update(known[0])
+    TRACKERS.update(known[1])
     worker, last = get_worker(), time.monotonic()
 
     def report(units: int, status: str) -> None:
@@ -89,25 +95,12 @@ def _make_there(
             worker.log_event(topic, [str(cell.folder), units, status])
 
     with threads(n_threads):
-        return outcome_of(cell, needed, report)
-
-
-def _registered() -> tuple[dict[str, type], dict[str, type]]:
-    """Fields and trackers that somebody has added in this process."""
-    foreign = [
-        {name: kind for name, kind in kinds.items() if not kind.__module__.startswith("nbtrack.")}
-        for kinds in (FIELDS, TRACKERS)
-    ]
-    return foreign[0], foreign[1]
+        return cell.outcome(needed, report)
 
 
 @contextlib.contextmanager
-def _client(address: str | None, workers: int) -> Iterator[Any]:
-    """Of a Dask cluster: of processes here, which end with this one, or at an address."""
-    if address is not None:
-        with _connected(address) as client:
-            yield client
-        return
+def _started(workers: int) -> Iterator[Client]:
+    """Of a cluster of processes here, which end with this one."""
     with (
         dask.config.set(_LOCAL),
         LocalCluster(
