@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+from basin import find_from_afar
 
 from nbtrack import METHODS, Method, load_preset, map_scenes, open_scenes, track_scenes
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments.basin import find_from_afar
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_3
 from nbtrack.experiments.presets import Preset

@@ -10,10 +10,10 @@ import sys
 
 import pandas as pd
 import torch
+from basin import find_from_afar
 
 from nbtrack import METHODS, Method, load_preset, map_scenes, open_scene, open_scenes, track_scenes
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments.basin import find_from_afar
 from nbtrack.experiments.grid import Execution
 
 _LONGER = "mapping.neus_plus.iterations=4000"

@@ -26,28 +26,22 @@ from nbtrack.core.files import (
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import as_dict
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
-from nbtrack.experiments.methods import TABLE_1, Method, find_methods, tracker_label
+from nbtrack.experiments.methods import TABLE_1, Method, find_methods
 from nbtrack.experiments.presets import Preset
 from nbtrack.fields import make_field
-from nbtrack.tracking import StepBudget, Tracker, make_budget, make_tracker, tracker_class
+from nbtrack.tracking import ClockBudget, StepBudget, Tracker, make_tracker, tracker_class
 
-_LEAST_STEPS, _MOST_STEPS, _SECONDS_A_ROW = 5, 200, 4.0
+_FRAMES_A_CELL = 3  # that a mean of steps is taken over
+_LEAST_STEPS, _MOST_STEPS, _SECONDS_A_ROW = 5, 200, 4.0  # that are timed
 
 
 def measure_steps(
-    preset: Preset,
-    sequence: RgbdSequence,
-    methods: Sequence[str | Method] = TABLE_1,
-    frames_per_cell: int = 3,
+    preset: Preset, sequence: RgbdSequence, methods: Sequence[str | Method] = TABLE_1
 ) -> pd.DataFrame:
     """Steps within each budget for every method's tracker and its pixel counts n.
 
-    The fields are untrained: a step costs the same whatever the weights are. Each tracker first
-    spends one frame that is not counted, so that allocations and compilations are done.
-
-    Args:
-        sequence: its first frame feeds the trackers.
-        frames_per_cell: frames that a cell's mean is taken over.
+    A tracker first spends one frame that is not counted, so that allocations and compilations are
+    done. The sequence's first frame feeds it.
 
     Returns:
         One row a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames),
@@ -55,17 +49,15 @@ def measure_steps(
 
     Source: paper, Table II and evaluation protocol.
     """
-    rows, frame = [], sequence[0]
-    for method, n_pixels in _rows(preset, methods, "Table II"):
+    rows = []
+    for name, n_pixels, tracker in _trackers(preset, sequence, methods, "Table II"):
         for budget_ms in preset.tables.budgets_ms:
-            tracker = _tracker(preset, sequence, method, n_pixels, budget_ms)
-            counts = []
-            for _ in range(frames_per_cell + 1):
+            tracker.budget, counts = ClockBudget(1000 / budget_ms), []
+            for _ in range(1 + _FRAMES_A_CELL):
                 tracker.restart(sequence.T_world_camera[0])
-                counts.append(tracker.track(frame).steps)
-            steps = np.array(counts[1:], dtype=float)
-            place = (tracker_label(method.tracker), n_pixels, budget_ms)
-            rows.append((*place, float(steps.mean()), float(steps.std())))
+                counts.append(tracker.track(sequence[0]).steps)
+            mean, deviation = float(np.mean(counts[1:])), float(np.std(counts[1:]))
+            rows.append((name, n_pixels, budget_ms, mean, deviation))
     columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_deviation"]
     return pd.DataFrame(rows, columns=columns)
 
@@ -92,7 +84,7 @@ def measured_steps(
 def default_pixels(preset: Preset, methods: Sequence[str | Method] = TABLE_1) -> dict[str, int]:
     """The n that each tracker uses for Table I, by its label in Table II."""
     trackers = [method.tracker for method in find_methods(methods)]
-    return {tracker_label(name): preset.tracking_of(name).n_pixels for name in trackers}
+    return {_label(name): preset.tracking_of(name).n_pixels for name in trackers}
 
 
 def measure_step_times(
@@ -105,55 +97,47 @@ def measure_step_times(
     """
     rows, device = [], choose_device()
     T_start = torch.from_numpy(sequence.T_world_camera[:1]).float().to(device)
-    for method, n_pixels in _rows(preset, methods, "step times"):
-        tracker = _tracker(preset, sequence, method, n_pixels)
+    for name, n_pixels, tracker in _trackers(preset, sequence, methods, "step times"):
         tracker.begin(sequence[0].to(device), T_start)
         tracker.step()
-        seconds: list[float] = []
-        while len(seconds) < _LEAST_STEPS or sum(seconds) < _SECONDS_A_ROW:
-            synchronize(device)
-            start = time.perf_counter()
+        synchronize(device)
+        times = [time.perf_counter()]
+        while len(times) <= _LEAST_STEPS or (
+            len(times) <= _MOST_STEPS and times[-1] - times[0] < _SECONDS_A_ROW
+        ):
             tracker.step()
             synchronize(device)
-            seconds.append(time.perf_counter() - start)
-            if len(seconds) == _MOST_STEPS:
-                break
-        low, median, high = 1e3 * np.quantile(seconds, [0.25, 0.5, 0.75])
-        rows.append((tracker_label(method.tracker), n_pixels, median, low, high))
+            times.append(time.perf_counter())
+        low, median, high = 1e3 * np.quantile(np.diff(times), [0.25, 0.5, 0.75])
+        rows.append((name, n_pixels, median, low, high))
     columns = ["tracker", "n_pixels", "ms_per_step", "ms_low", "ms_high"]
     return pd.DataFrame(rows, columns=columns)
 
 
-def _rows(
-    preset: Preset, methods: Sequence[str | Method], title: str
-) -> Iterator[tuple[Method, int]]:
-    """Each method and pixel count in turn, under a bar, with suitable threads and advice."""
+def _trackers(
+    preset: Preset, sequence: RgbdSequence, methods: Sequence[str | Method], title: str
+) -> Iterator[tuple[str, int, Tracker]]:
+    """Label, n and a tracker of each row in turn, under a bar, with suitable threads and advice.
+
+    The fields are untrained: a step costs the same whatever the weights are.
+    """
     plan = [(m, n) for m in find_methods(methods) for n in preset.tables.pixels_of(m.tracker)]
+    bounds, T_first = observed_bounds(sequence), sequence.T_world_camera[0]
     with ProgressBar(title, len(plan)) as bar:
         for done, (method, n_pixels) in enumerate(plan):
-            name = f"{method.tracker}={n_pixels}"
-            bar.move_to(done, name)
+            tracker, network = method.tracker, preset.network_of(method.field)
+            bar.move_to(done, f"{tracker}={n_pixels}")
             with (
-                advise_on_memory(f"tables.pixels.{name}"),
-                suitable_threads(preset.network_of(method.field).width),
+                advise_on_memory(f"tables.pixels.{tracker}={n_pixels}"),
+                suitable_threads(network.width),
             ):
-                yield method, n_pixels
+                field = make_field(method.field, network, bounds, seed=0).to(choose_device())
+                settings = replace(preset.tracking_of(tracker), n_pixels=n_pixels)
+                made = make_tracker(tracker, field, T_first, StepBudget(1), settings)
+                yield _label(tracker), n_pixels, made
         bar.move_to(len(plan))
 
 
-def _tracker(
-    preset: Preset,
-    sequence: RgbdSequence,
-    method: Method,
-    n_pixels: int,
-    budget_ms: float | None = None,
-) -> Tracker:
-    """A tracker in an untrained field, which costs a step as much as a trained one."""
-    device = choose_device()
-    network = preset.network_of(method.field)
-    field = make_field(method.field, network, observed_bounds(sequence), seed=0).to(device)
-    budget = StepBudget(1)
-    if budget_ms is not None:
-        budget = make_budget(None, 1000 / budget_ms)
-    settings = replace(preset.tracking_of(method.tracker), n_pixels=n_pixels)
-    return make_tracker(method.tracker, field, sequence.T_world_camera[0], budget, settings)
+def _label(tracker: str) -> str:
+    """A tracker's name in Table II: VR for vr."""
+    return tracker.upper().replace("_", " ")

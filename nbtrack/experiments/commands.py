@@ -1,12 +1,11 @@
 """What each command does and prints; `tables` and `bench` have a module of their own."""
 
-import os
 from argparse import Namespace
 from dataclasses import replace
 
 from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.core.files import write_atomic
-from nbtrack.core.progress import ProgressBar, tell
+from nbtrack.core.progress import tell
 from nbtrack.data.check import check_recording
 from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import parse_frames
@@ -15,13 +14,12 @@ from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.export import export
 from nbtrack.experiments.grid import run_cells
 from nbtrack.experiments.notebooks import run_notebooks
-from nbtrack.experiments.presets import Preset, load_preset
+from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
 from nbtrack.experiments.runs import TrackCell
-from nbtrack.experiments.scenes import Scene, open_scene
+from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.fields import field_class, supervised_field
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.mapping.meshes import extract_mesh
-from nbtrack.synthetic import make_room
 from nbtrack.tracking import check_pair, make_budget, tracker_class
 
 _PRINTED = (
@@ -94,13 +92,10 @@ def notebooks_command(options: Namespace) -> None:
 
 def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
-    size = (options.width, options.width * 3 // 4)
-    with ProgressBar(options.room, options.n_frames) as bar:
-        make_room(
-            options.room, options.out, options.n_frames, *size, options.seed, os.cpu_count() or 1,
-            bar.move_to,
-        )  # fmt: skip
-    told = f"{options.n_frames} frames of {size[0]}x{size[1]}, seed {options.seed}"
+    made = ScenesConfig(n_frames=options.n_frames, width=options.width, seed=options.seed)
+    write_room(options.room, options.out, made)
+    size = f"{options.width}x{options.width * 3 // 4}"
+    told = f"{options.n_frames} frames of {size}, seed {options.seed}"
     print(f"{options.out}: {options.room}, {told}")
 
 

@@ -53,12 +53,3 @@ def find_methods(methods: Sequence[str | Method]) -> list[Method]:
         found.append(METHODS[method] if isinstance(method, str) else method)
         check_pair(found[-1].tracker, found[-1].field)
     return found
-
-
-def tracker_label(tracker: str) -> str:
-    """A tracker's name in Table II.
-
-    >>> tracker_label("vr")
-    'VR'
-    """
-    return tracker.upper().replace("_", " ")

@@ -13,15 +13,12 @@ from nbtrack.core.progress import ProgressBar
 
 
 def run_notebooks(
-    preset: str,
-    config_file: Path | None = None,
-    settings: Sequence[str] = (),
-    in_place: bool = False,
-) -> list[Path]:
-    """Execute every notebook in order, as `jupyter nbconvert --execute`; returns the HTML copies.
+    preset: str, config_file: Path | None, settings: Sequence[str], in_place: bool
+) -> None:
+    """Execute every notebook in order, as `jupyter nbconvert --execute`.
 
-    Copies go to `runs/notebooks/<preset>/`. Settings reach the kernels through the environment,
-    where each notebook's settings cell finds them.
+    Copies, executed and HTML, go to `runs/notebooks/<preset>/`. Settings reach the kernels through
+    the environment, where each notebook's settings cell finds them.
 
     Args:
         in_place: store the outputs in the committed notebooks as well, which otherwise stay as
@@ -36,21 +33,20 @@ def run_notebooks(
     paths = sorted((project_folder() / "notebooks").glob("[0-9A]*_*.ipynb"))
     if not paths:
         raise MissingError(f"no notebooks in {project_folder()}: run the command in a checkout")
-    os.environ["NBTRACK_PRESET"] = preset
-    if config_file:
-        os.environ["NBTRACK_CONFIG"] = str(config_file.resolve())
     before = os.environ.get("NBTRACK_SET", "")
-    os.environ["NBTRACK_SET"] = f"{before} {shlex.join(settings)}".strip()
-    folder, pages = runs_folder() / "notebooks" / preset, []
+    os.environ |= {
+        "NBTRACK_PRESET": preset,
+        "NBTRACK_SET": f"{before} {shlex.join(settings)}".strip(),
+        **({"NBTRACK_CONFIG": str(config_file.resolve())} if config_file else {}),
+    }
     with ProgressBar("notebooks", len(paths)) as bar:
         for done, path in enumerate(paths):
             bar.move_to(done, path.stem)
-            pages.append(_run_notebook(path, folder, in_place))
+            _run_notebook(path, runs_folder() / "notebooks" / preset, in_place)
         bar.move_to(len(paths))
-    return pages
 
 
-def _run_notebook(path: Path, folder: Path, in_place: bool) -> Path:
+def _run_notebook(path: Path, folder: Path, in_place: bool) -> None:
     """Run one notebook in a fresh kernel; its copies go to the folder."""
     import nbformat
     from nbconvert import HTMLExporter
@@ -71,4 +67,3 @@ def _run_notebook(path: Path, folder: Path, in_place: bool) -> Path:
         write_atomic(path, nbformat.writes(notebook) + "\n")
     write_atomic(page, HTMLExporter().from_notebook_node(notebook)[0])
     print(f"{page}: {time.monotonic() - start:.0f} s")
-    return page

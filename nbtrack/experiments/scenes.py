@@ -71,22 +71,20 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
         MissingError: there is no such folder, room or scene.
     """
     text, folder = str(sequence), Path(sequence)
-    if text not in ROOMS and text not in DATASET_SCENES:
-        if folder.is_dir():
-            return Scene(folder.resolve().name, folder.resolve(), format)
-        raise MissingError(
-            f"no sequence {text!r}: it is neither a folder nor a known scene; "
-            f"{nearest_name(text, [*ROOMS, *DATASET_SCENES])}"
-        )
     if text in ROOMS and (preset.scenes.synthetic or text not in DATASET_SCENES):
-        return Scene(text, _made_room(text, preset.scenes))
-    folder = data_folder() / text
-    if not folder.is_dir():
+        return Scene(text, _room_folder(text, preset.scenes))
+    if text in DATASET_SCENES:
+        folder = data_folder() / text
+        if folder.is_dir():
+            return Scene(text, folder, format)
         raise MissingError(
             f"no folder {folder}: download the Neural RGB-D dataset there (see data/README.md), "
             f"or use a synthetic room, which needs no download: {', '.join(ROOMS)}"
         )
-    return Scene(text, folder, format)
+    if folder.is_dir():
+        return Scene(folder.resolve().name, folder.resolve(), format)
+    advice = nearest_name(text, [*ROOMS, *DATASET_SCENES])
+    raise MissingError(f"no sequence {text!r}: it is neither a folder nor a known scene; {advice}")
 
 
 def open_scenes(preset: Preset) -> list[Scene]:
@@ -99,8 +97,15 @@ def open_scenes(preset: Preset) -> list[Scene]:
         ConfigError: no name is given, or one is given twice or unknown.
         MissingError, DataError: no scene is there, or none is whole; that of the first.
     """
-    names = preset.scenes.names
-    _check_names(names)
+    names, known = preset.scenes.names, [*ROOMS, *DATASET_SCENES]
+    for name in names:
+        if name not in known and not Path(name).is_dir():
+            advice = nearest_name(name, known)
+            raise ConfigError(f"unknown scene {name!r}, and no such folder: {advice}")
+    if not names or len({Path(name).resolve().name for name in names}) < len(names):
+        raise ConfigError(
+            f"scenes {', '.join(names) or '(none)'}: give at least one, and of one name only one"
+        )
     scenes, missing = [], {}
     for name in names:
         try:
@@ -116,37 +121,26 @@ def open_scenes(preset: Preset) -> list[Scene]:
     return scenes
 
 
-def _check_names(names: tuple[str, ...]) -> None:
-    known = [*ROOMS, *DATASET_SCENES]
-    if not names:
-        raise ConfigError(f"no scene is named: give some of {', '.join(known)}")
-    for name in names:
-        if name not in known and not Path(name).is_dir():
-            raise ConfigError(
-                f"unknown scene {name!r}, and no such folder: {nearest_name(name, known)}"
-            )
-    if len({Path(name).resolve().name for name in names}) < len(names):
-        raise ConfigError(f"scenes {', '.join(names)}: two have one name; give each once")
+def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
+    """A room as a sequence folder, under a bar."""
+    workers = 1 if config.width < _SMALL_WIDTH else os.cpu_count() or 1
+    with ProgressBar(f"room {name}", config.n_frames) as bar:
+        make_room(
+            name, folder, config.n_frames, config.width, config.width * 3 // 4, config.seed,
+            workers, bar.move_to,
+        )  # fmt: skip
 
 
-def _made_room(name: str, config: ScenesConfig) -> Path:
+def _room_folder(name: str, config: ScenesConfig) -> Path:
     """The folder of a room of this size, length and seed, made if it is not there."""
     size = f"{config.n_frames}x{config.width}"
     folder = runs_folder() / "rooms" / f"{name}-{size}-seed{config.seed}" / name
-    if folder.is_dir():
-        return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    # Another command may want the same room: it waits, and finds it made.
-    with FileLock(folder.with_suffix(".lock")):
-        if folder.is_dir():
-            return folder
-        for unfinished in folder.parent.glob(f".{name}.*.unfinished"):  # of a killed attempt
-            shutil.rmtree(unfinished, ignore_errors=True)
-        workers = 1 if config.width < _SMALL_WIDTH else os.cpu_count() or 1
-        height = config.width * 3 // 4
-        with ProgressBar(f"room {name}", config.n_frames) as bar:
-            make_room(
-                name, folder, config.n_frames, config.width, height, config.seed, workers,
-                bar.move_to,
-            )  # fmt: skip
+    if not folder.is_dir():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        # Another command may want the same room: it waits, and finds it made.
+        with FileLock(folder.with_suffix(".lock")):
+            for unfinished in folder.parent.glob(f".{name}.*.unfinished"):  # of a killed attempt
+                shutil.rmtree(unfinished, ignore_errors=True)
+            if not folder.is_dir():
+                write_room(name, folder, config)
     return folder

@@ -6,17 +6,16 @@ from math import radians
 
 import pandas as pd
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
+from nbtrack import Method, make_tracker, map_scene
 from nbtrack.core.geometry import rotation_angle
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments.methods import Method, find_methods
+from nbtrack.experiments.methods import find_methods
 from nbtrack.experiments.presets import Preset
-from nbtrack.experiments.results import map_scene
 from nbtrack.experiments.scenes import Scene
-from nbtrack.tracking import StepBudget, Tracker, make_tracker
+from nbtrack.tracking import StepBudget
 from nbtrack.tracking.registration import moved
 
 OFFSETS = ((1, 1), (2, 2), (4, 4), (8, 6), (12, 9), (20, 15), (30, 20), (50, 30))
@@ -48,12 +47,17 @@ def find_from_afar(
     rows, sequence = [], scene.read(frames)
     searches = [(offset, start) for offset in offsets for start in range(n_starts)]
     for method, steps in zip(find_methods([*methods]), methods.values(), strict=True):
-        tracker = _tracker(scene, method, with_settings(preset, *method.settings), steps)
+        changed = with_settings(preset, *method.settings)
+        settings = changed.tracking_of(method.tracker)
+        if hasattr(settings, "n_restarts"):
+            settings = replace(settings, n_restarts=0)
+        field, T_first = map_scene(scene, method.field, changed).field, sequence.T_world_camera[0]
+        tracker = make_tracker(method.tracker, field, T_first, StepBudget(steps), settings)
         with ProgressBar(f"searches, {method.label}", len(searches)) as bar:
             for done, ((cm, degrees), start) in enumerate(searches, start=1):
                 frame = sequence[start % len(sequence)]
                 T_true = torch.from_numpy(frame.T_world_camera)
-                tracker.restart(moved(T_true, _twist(start, cm, degrees).double()).numpy())
+                tracker.restart(moved(T_true, twist(start, cm, degrees).double()).numpy())
                 found = tracker.track(frame)
                 T_found = torch.from_numpy(found.T_world_camera)
                 error_m = float((T_found - T_true)[:3, 3].norm())
@@ -66,16 +70,7 @@ def find_from_afar(
     return pd.DataFrame(rows, columns=columns)
 
 
-def _tracker(scene: Scene, method: Method, preset: Preset, steps: int) -> Tracker:
-    settings = preset.tracking_of(method.tracker)
-    if hasattr(settings, "n_restarts"):
-        settings = replace(settings, n_restarts=0)
-    field = map_scene(scene, method.field, preset).field
-    T_first = scene.read(":1").T_world_camera[0]
-    return make_tracker(method.tracker, field, T_first, StepBudget(steps), settings)
-
-
-def _twist(seed: int, offset_cm: int, offset_deg: int) -> Float[Tensor, "6"]:
+def twist(seed: int, offset_cm: int, offset_deg: int) -> Tensor:
     """A twist (omega in rad, v in m) in directions that depend on the seed alone."""
     generator = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator), dim=-1)
