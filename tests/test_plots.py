@@ -34,7 +34,7 @@ class AnalyticField(Field):
     name, label = "analytic", "Analytic"
 
     def __init__(self, value, low=(-2.0,) * 3, high=(2.0,) * 3, level=0.0) -> None:
-        super().__init__(SceneBounds(tuple(low), tuple(high)))
+        super().__init__(SceneBounds(tuple(map(float, low)), tuple(map(float, high))))
         self.unused = torch.nn.Parameter(torch.zeros(1))  # says on which device the field lives
         self.value, self.surface_level = value, level
 
@@ -50,6 +50,7 @@ CELLS = pd.DataFrame({
     "rate_hz": [2.0, 10.0, 2.0, 2.0], "method": ["A", "A", "B", "B"], "scene": "whiteroom",
     "ate_m": [0.1, 0.4, 0.15, 0.25], "seed": [0, 0, 0, 1],
 })  # fmt: skip
+AT, RAY = torch.linspace(0, 2, 20), torch.linspace(1, -1, 20).requires_grad_()
 FALLING = 1 / (1 + np.arange(40.0))
 IMAP = pd.DataFrame({"depth": FALLING, "color": FALLING, "total": FALLING, "deviation_m": FALLING})
 HISTORIES = {"iMAP": IMAP, "NeuS": IMAP.copy()}
@@ -81,10 +82,6 @@ def room_mesh() -> trimesh.Trimesh:
     return mesh
 
 
-def ray(factor: float = 1.0) -> torch.Tensor:
-    return torch.linspace(1, -1, 20).mul(factor).requires_grad_()
-
-
 def cloud(offset: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     points = torch.tensor([[0.5, 0.0, -1.0], [-0.5, 0.2, -2.0]])
     return points, torch.tensor([offset, -0.01]), torch.diag(torch.tensor([1.0, -1, -1, 1]))
@@ -93,9 +90,7 @@ def cloud(offset: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 FIGURES = {
     "frame": lambda s: plots.plot_frame(s, 3, "one"),
     "views": lambda s: plots.plot_views(s, [0, 3], [View(s.color(0), s.depth(0) + 0.02)] * 2, "x"),
-    "ray": lambda s: plots.plot_along_ray(
-        torch.linspace(0, 2, 20), {"density (1/m)": ray(), "w (share)": ray()[:-1]}, 1.0, "ends"
-    ),
+    "ray": lambda s: plots.plot_along_ray(AT, {"a (1/m)": RAY, "b (m)": RAY[:-1]}, 1.2, "end"),
     "losses": lambda s: plots.plot_losses(HISTORIES, "fall"),
     "slice": lambda s: plots.plot_slice(SPHERE, s, 0.0, title="round"),
     "density": lambda s: plots.plot_slice(FOG, s, 0.0, title="round"),
@@ -151,16 +146,14 @@ def test_a_frame_has_one_slider(sequence) -> None:
 
 def test_curves_along_a_ray_share_their_depths() -> None:
     """Catches values beside another sample's depth, where a section has none."""
-    depths = torch.linspace(0, 2, 20)
-    figure = plots.plot_along_ray(depths, {"a (m)": ray(), "b (m)": ray(2)[:-1]}, 1.25)
-    for axes, n in zip(figure.axes, (20, 19), strict=True):
-        assert axes.lines[0].get_xdata() == pytest.approx(depths[:n].numpy())
-        assert list(axes.lines[1].get_xdata()) == [1.25, 1.25]
+    for axes, n in zip(FIGURES["ray"](None).axes, (20, 19), strict=True):
+        assert axes.lines[0].get_xdata() == pytest.approx(np.linspace(0, 2, 20)[:n], abs=1e-6)
+        assert list(axes.lines[1].get_xdata()) == [1.2, 1.2]
 
 
 def test_points_share_one_scale_in_centimetres() -> None:
     """Catches panels that cannot be compared, and metres called centimetres."""
-    figure = plots.plot_points({"before": cloud(0.05), "after": cloud(0.02)})
+    figure = FIGURES["points"](None)
     before, after = (axes.collections[0] for axes in figure.axes[:2])
     assert before.get_array().tolist() == pytest.approx([5.0, -1.0])
     assert before.get_clim() == after.get_clim()
@@ -170,8 +163,8 @@ def test_points_share_one_scale_in_centimetres() -> None:
 
 def test_curves_of_methods_and_sweeps() -> None:
     """Catches a group without its own line or colour, and text sorted by letters."""
-    colors = [line.get_color() for line in plots.plot_curves(SWEEP, *SWEEP).axes[0].lines]
-    assert colors == [PALETTE[0], PALETTE[1]]
+    lines = FIGURES["curves"](None).axes[0].lines
+    assert [line.get_color() for line in lines] == [PALETTE[0], PALETTE[1]]
     words = SWEEP.assign(method="A", how=["b", "a"]).replace({"time (ms)": {1.0: "b", 9.0: "a"}})
     figure = plots.plot_curves(words, "time (ms)", "ATE (cm)", ["method", "how"], log="y")
     assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["b", "a"]
@@ -186,8 +179,10 @@ def held(sequence: RgbdSequence, up: tuple[float, float, float]) -> RgbdSequence
     return replace(sequence, T_world_camera=T_world_camera)
 
 
-def contours(figure: Figure) -> list[np.ndarray]:
+def contours(figure: Figure, n: int) -> list[np.ndarray]:
+    """Corners of the lines drawn at so many levels."""
     lines = [c for c in figure.axes[0].collections if isinstance(c, ContourSet)]
+    assert len(lines) == n
     return [np.concatenate([path.vertices for path in c.get_paths()]) for c in lines]
 
 
@@ -196,7 +191,7 @@ def contours(figure: Figure) -> list[np.ndarray]:
 def test_the_zero_level_lies_on_the_sphere(sequence, field, height, up) -> None:
     """Catches swapped grid axes, a height along the wrong axis or with the wrong sign, a wrong
     level, and pixels off by half."""
-    (circle,) = contours(plots.plot_slice(field, held(sequence, up), height))
+    (circle,) = contours(plots.plot_slice(field, held(sequence, up), height), 1)
     assert np.linalg.norm(circle, axis=1) == pytest.approx(np.sqrt(1.5**2 - height**2), abs=2e-3)
     along = AnalyticField(lambda points: points @ torch.tensor(up, dtype=torch.float32))
     values = plots.plot_slice(along, held(sequence, up), height).axes[0].collections[0].get_array()
@@ -207,11 +202,10 @@ def test_a_true_field_lies_on_the_true_surface(sequence) -> None:
     """Catches a field and a room drawn in different frames."""
     room = build_room("bedroom")
     low, high = room.bounds
-    sdf = AnalyticField(None, (low - 0.1).tolist(), (high + 0.1).tolist())
-    sdf.value = lambda points: torch.from_numpy(room.sdf(points.double().numpy())).float()
-    lines = contours(plots.plot_slice(sdf, sequence, 0.4, room))
-    assert len(lines) == 2
-    for line in lines:
+    field = AnalyticField(
+        lambda p: torch.from_numpy(room.sdf(p.double().numpy())).float(), low - 0.1, high + 0.1
+    )
+    for line in contours(plots.plot_slice(field, sequence, 0.4, room), 2):
         points = np.insert(line, 1, 0.4, axis=1)
         # Between grid points, 2 cm apart, the line is straight.
         assert np.abs(room.sdf(points)).max() < 0.02
@@ -287,16 +281,14 @@ def test_losses_show_the_terms_and_no_diagnostics() -> None:
     spike = pd.Series([1.0, 2.0, 90.0, 4.0, 5.0, 6.0])
     spikes = {"spike": pd.DataFrame({"depth": spike, "total": spike})}
     depth, color, eikonal = plots.plot_losses(HISTORIES | spikes).axes
-    drawn = [
-        sum(len(line.get_xdata()) > 0 for line in axes.lines) for axes in (depth, color, eikonal)
-    ]
-    assert drawn == [6, 4, 2]  # raw and median each
+    for axes, n in (depth, 6), (color, 4), (eikonal, 2):  # raw and median each
+        assert sum(len(line.get_xdata()) > 0 for line in axes.lines) == n
     assert depth.lines[5].get_ydata()[2] == 4.0
 
 
 def test_errors_run_in_seconds_without_the_given_frame() -> None:
     """Catches frame numbers taken for seconds, metres for centimetres, and a counted first row."""
-    line = plots.plot_errors({"VR": FRAMES}).axes[0].lines[0]
+    line = FIGURES["errors"](None).axes[0].lines[0]
     assert line.get_xdata() == pytest.approx([1.1, 1.2])
     assert line.get_ydata() == pytest.approx([1.0, 30.0])
 

@@ -16,11 +16,9 @@ from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 def plot_along_ray(
     depths: Values, curves: Mapping[str, Values], measured_depth: float, title: str = ""
 ) -> Figure:
-    """Quantities along one ray, below each other over the same z-depths (m).
+    """Quantities by label with its unit, below each other over the same z-depths (m) of a ray.
 
-    Args:
-        curves: by label with its unit, as "density (1/m)": a value a sample; the last samples may
-            be left out, as by the weights of sections between samples.
+    The last samples may be left out, as by the weights of sections between samples.
     """
     panels = new_axes(title, 0.9 + 1.3 * len(curves), len(curves), sharex=True)[:, 0]
     for axes, (label, color) in zip(panels, method_colors(curves).items(), strict=True):
@@ -37,11 +35,10 @@ def plot_along_ray(
 def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """Every loss term over mapping: each iteration pale, the running median on top.
 
-    Args:
-        histories: of maps by label; loss terms are the columns before "total". A term that several
-            maps share is one panel, though its unit may differ: iMAP divides depth errors by
-            their deviation.
+    `histories` are those of maps by label. A term that several maps share is one panel, though its
+    unit may differ: iMAP divides depth errors by their deviation.
     """
+    # Loss terms are the columns before their total; what is behind it are diagnostics.
     terms = {label: history.loc[:, :"total"].iloc[:, :-1] for label, history in histories.items()}
     names = dict.fromkeys(name for losses in terms.values() for name in losses)
     panels = new_axes(title, 3.0, 1, len(names), sharex=True)[0]
@@ -61,11 +58,8 @@ def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figur
 def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """Errors of every frame over time: position (cm, logarithmic) and orientation (degrees).
 
-    Above the dashed line, 0.2 m, the paper calls the camera lost. The first frame, whose pose was
-    given, is left out.
-
-    Args:
-        frames: by method, with columns frame_id, translation_error_m and rotation_error_deg.
+    `frames` are those of runs by method, as in frames.csv. The first, whose pose was given, is left
+    out. Above the dashed line, 0.2 m, the paper calls the camera lost.
     """
     above, below = new_axes(title, 4.9, 2, sharex=True)[:, 0]
     for label, color in method_colors(frames).items():
@@ -108,11 +102,9 @@ def plot_curves(
 def plot_ate_bars(results: pd.DataFrame, title: str = "") -> Figure:
     """Table I as bars: mean ATE (m, logarithmic) by rate and method, a panel a scene.
 
-    A bar that crosses the dashed line at 0.2 m is a lost camera, which the table prints red; a
-    missing bar is a run without result. Thin lines span a deviation over seeds either way.
-
-    Args:
-        results: long form with columns rate_hz, method, scene, ate_m, see `table_1`.
+    `results` are as `table_1` takes them. A bar that crosses the dashed line at 0.2 m is a lost
+    camera, which the table prints red; a missing bar is a run without result. Thin lines span a
+    deviation over seeds either way.
     """
     means, deviations = table_1(results), table_1(results, "ate_deviation_m")
     rows = -(-len(means.columns) // 5)
@@ -135,10 +127,8 @@ def plot_ate_bars(results: pd.DataFrame, title: str = "") -> Figure:
 def plot_steps(steps: pd.DataFrame, published: pd.DataFrame, title: str = "") -> Figure:
     """Table II as curves: steps that fit into a budget, a panel a tracker, a line a number n.
 
-    Stronger is more pixels n. Filled points are this machine's, hollow ones the paper's.
-
-    Args:
-        steps, published: with columns tracker, n_pixels, budget_ms, steps.
+    Stronger is more pixels n. Filled points are this machine's, hollow ones the paper's. Columns
+    are tracker, n_pixels, budget_ms, steps.
     """
     colors = method_colors(steps["tracker"])
     panels = new_axes(title, 4.3, 1, len(colors), sharey=True)[0]

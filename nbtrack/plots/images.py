@@ -36,11 +36,8 @@ def plot_views(
     """Observed and rendered colour and depth of some frames, one a row; unmeasured pixels grey.
 
     Depths (m) share one colour scale and errors (cm) another, cut at their 98 % quantiles, so
-    that a few wild pixels do not hide the rest.
-
-    Args:
-        indices: positions in the sequence.
-        views: what the field renders from the same poses.
+    that a few wild pixels do not hide the rest. `indices` are positions in the sequence, `views`
+    what the field renders from the same poses.
     """
     depths = np.ma.stack([_measured(sequence.depth(index)) for index in indices])
     errors = 100 * np.abs(np.stack([view.depth for view in views]) - depths)

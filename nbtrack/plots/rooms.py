@@ -37,11 +37,8 @@ def plot_slice(
 
     A signed distance is blue in free space and red in matter, a density logarithmic. Black is the
     surface (the field's `surface_level`), dashed green the true one. What no frame has seen is
-    pale: there the field invents.
-
-    Args:
-        sequence: the frames that the map was made of: their path is drawn, too.
-        room: the exact scene, if it is a synthetic one.
+    pale: there the field invents. `sequence` are the frames that the map was made of, `room` is the
+    exact scene, if it is a synthetic one.
     """
     axes = new_axes(title, 5.4)[0, 0]
     up = _draw_from_above(axes, {"camera path": sequence.T_world_camera})
@@ -76,11 +73,9 @@ def plot_points(points: Mapping[str, tuple[Points, Values, Transform]], title: s
     """Observed points by their signed distance (cm) in a map, a panel a pose.
 
     White points lie on the map's surface, blue ones in front of it, red ones behind it. All panels
-    share one scale, cut at the 95 % quantile of the first. The dot is the camera.
-
-    Args:
-        points: by label, as "before" and "after": points (m, world frame), their signed distances
-            (m), and the camera-to-world pose that placed them.
+    share one scale, cut at the 95 % quantile of the first. The dot is the camera. By label, as
+    "before" and "after": points (m, world frame), their signed distances (m), and the
+    camera-to-world pose that placed them.
     """
     panels = new_axes(title, 4.5, 1, len(points), sharex=True, sharey=True)[0]
     limit = 100 * float(next(iter(points.values()))[1].abs().quantile(0.95))
@@ -110,9 +105,7 @@ def plot_recording(cloud: pd.DataFrame, T_world_camera: Poses, title: str) -> Fi
     """A recording's coloured points (m) and the camera's path, without what is higher than it.
 
     Walls should be thin and straight: doubled or fanned ones mean that something is read wrongly.
-
-    Args:
-        cloud: with columns x, y, z (m, world frame), red, green, blue (0 to 255).
+    The cloud's columns are x, y, z (m, world frame), red, green, blue (0 to 255).
     """
     axes = new_axes(title, 6.0)[0, 0]
     up, places = _draw_from_above(axes, {"true": T_world_camera}), cloud[["x", "y", "z"]]
@@ -130,10 +123,8 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
     """A vertex-coloured mesh as a doll's house: the near walls and the ceiling are left out.
 
     Left out is every face that shows its back, so that one looks into a room from outside, from
-    where most surface shows. Parallel projection; lengths across the picture are true (m).
-
-    Args:
-        T_paths: camera-to-world poses by label, drawn on top; "true" is green, "tracked" red.
+    where most surface shows. Parallel projection; lengths across the picture are true (m). The
+    camera-to-world poses by label are drawn on top; "true" is green, "tracked" red.
     """
     mesh, up = _at_most(mesh, _MOST_FACES), up_of(*T_paths.values())
     # Marching cubes orients faces by the sign of the field, which differs between densities and
