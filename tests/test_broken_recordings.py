@@ -247,9 +247,3 @@ def test_command(whole, tmp_path: Path, capfd, format: str) -> None:
     error = capfd.readouterr().err
     assert error.startswith("nbtrack: ")
     assert error.count("\n") == 1
-
-
-def test_there_are_enough_cases() -> None:
-    """Catches cases that vanish: at least a hundred, and some for every format."""
-    assert len(CASES) >= 100
-    assert set(BROKEN) == set(WRITERS)

@@ -26,8 +26,6 @@ MAP = ["map", "living_room", "--field", "neus", "--out", "map", *SET]
 TRACK = ["track", "living_room", "--tracker", "sdf", "--steps", "2", "--out", "run", *SET]
 GIVEN = [*TRACK, "--map-from"]
 OWN = [*TRACK, "--field", "neus"]
-
-
 CHECKPOINT = "map/mapping.pt"
 
 
@@ -84,6 +82,22 @@ def assert_refused(work: Path, capsys: pytest.CaptureFixture, command: list[str]
     return error
 
 
+def _nothing() -> None:
+    """The command itself is the fault."""
+
+
+def _write(path: str, content: str | bytes) -> Callable[[], object]:
+    return lambda: Path(path).write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def _environment(name: str, value: str) -> Callable[[], None]:
+    return lambda: os.environ.update({f"NBTRACK_{name}": value})
+
+
+def _cut(path: str) -> Callable[[], object]:
+    return lambda: Path(path).write_bytes(Path(path).read_bytes()[: Path(path).stat().st_size // 2])
+
+
 # Settings: in a file, on the command line, in the environment.
 TOML = {
     "binary": (b"\x00\xff\xfe", "is no TOML"),
@@ -105,14 +119,6 @@ TOML = {
 }
 
 
-@pytest.mark.parametrize("case", TOML)
-def test_config_files(case: str, work: Path, capsys: pytest.CaptureFixture) -> None:
-    """Catches settings that are guessed, ignored, or met only in the middle of a run."""
-    content, says = TOML[case]
-    (work / "settings.toml").write_bytes(content)
-    assert_refused(work, capsys, [*MAP, "--config", "settings.toml"], says)
-
-
 SET_TEXTS = {
     "no value": ("mapping.neus.iterations", "has no value"),
     "empty value": ("mapping.neus.iterations=", "must be int"),
@@ -125,21 +131,6 @@ SET_TEXTS = {
 }
 
 
-@pytest.mark.parametrize("case", SET_TEXTS)
-@pytest.mark.parametrize("place", ["--set", "NBTRACK_SET"])
-def test_settings(
-    case: str, place: str, work: Path, capsys: pytest.CaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    """Catches one place of settings that is checked less than the other."""
-    text, says = SET_TEXTS[case]
-    if place == "--set":
-        assert_refused(work, capsys, [*MAP, "--set", text], says)
-    else:
-        monkeypatch.setenv("NBTRACK_SET", f"'{text}'")
-        assert_refused(work, capsys, MAP, says)
-
-
 ENVIRONMENT = {
     "unclosed quote": ("SET", "'a=3", "cannot be split"),
     "preset": ("PRESET", "smok", "did you mean 'smoke'"),
@@ -150,28 +141,7 @@ ENVIRONMENT = {
 }
 
 
-@pytest.mark.parametrize("case", ENVIRONMENT)
-def test_environment(
-    case: str, work: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches variables that only fail with a traceback."""
-    name, value, says = ENVIRONMENT[case]
-    monkeypatch.setenv(f"NBTRACK_{name}", value)
-    assert_refused(work, capsys, OWN, says)
-
-
 # Results that were spoilt. What a map file may hold instead of a map: test_map_files.py.
-def _cut(path: str) -> Callable[[], None]:
-    def cut() -> None:
-        Path(path).write_bytes(Path(path).read_bytes()[: Path(path).stat().st_size // 2])
-
-    return cut
-
-
-def _rewrite(path: str, text: str) -> Callable[[], None]:
-    return lambda: Path(path).write_text(text) and None
-
-
 def _resave(change: Callable[[dict], Any]) -> Callable[[], None]:
     def resave() -> None:
         torch.save(change(torch.load(CHECKPOINT, weights_only=True)), CHECKPOINT)
@@ -179,7 +149,7 @@ def _resave(change: Callable[[dict], Any]) -> Callable[[], None]:
     return resave
 
 
-def _unfinished(spoil: Callable[[], Any] = lambda: None) -> Callable[[], None]:
+def _unfinished(spoil: Callable[[], Any] = _nothing) -> Callable[[], None]:
     """Leave what a killed `map` leaves, then spoil it."""
 
     def leave() -> None:
@@ -222,19 +192,19 @@ def _forget_the_map() -> None:
 KITTI = ["export", "run", "--to", "kitti", "poses.txt"]
 ROW = "0.1 1 2 3 0 0 0 1"
 FILES = {
-    "no map": (lambda: None, [*GIVEN, "nowhere"], "nowhere holds no map"),
+    "no map": (_nothing, [*GIVEN, "nowhere"], "nowhere holds no map"),
     "empty folder": (_forget_the_map, [*GIVEN, "map"], "map holds no map"),
     "unfinished map": (_unfinished(), [*GIVEN, "map"], "map holds an unfinished map"),
-    "a run for a map": (lambda: None, [*GIVEN, "run"], "run holds no map"),
+    "a run for a map": (_nothing, [*GIVEN, "run"], "run holds no map"),
     "checkpoint for a map": (
-        lambda: None, [*GIVEN, "killed/mapping.pt"], "map again, and give the folder"),
+        _nothing, [*GIVEN, "killed/mapping.pt"], "map again, and give the folder"),
     "weights cut": (_cut("map/map.safetensors"), [*GIVEN, "map"], "not a readable map file"),
     "finished map cut": (_cut("map/map.safetensors"), MAP, "not a readable map file"),
-    "history cut": (_rewrite("map/history.csv", "a"), [*GIVEN, "map"], "not a readable history"),
+    "history cut": (_write("map/history.csv", "a"), [*GIVEN, "map"], "not a readable history"),
     "an earlier map": (_earlier_map, [*GIVEN, "map"], "map holds no map of this nbtrack"),
     "checkpoint cut": (_unfinished(_cut(CHECKPOINT)), MAP, "not a readable checkpoint"),
     "checkpoint is text": (
-        _unfinished(_rewrite(CHECKPOINT, "text")), MAP, "not a readable checkpoint"),
+        _unfinished(_write(CHECKPOINT, "text")), MAP, "not a readable checkpoint"),
     "checkpoint is empty": (
         _unfinished(_resave(lambda c: {})), MAP, "not a readable checkpoint"),
     "checkpoint without state": (
@@ -244,42 +214,34 @@ FILES = {
     "checkpoint of another seed": (
         _unfinished(), [*MAP, "--seed", "5"], "made with another seed"),
     "finished map of another seed": (
-        lambda: None, [*MAP, "--seed", "5"], "made with another seed"),
+        _nothing, [*MAP, "--seed", "5"], "made with another seed"),
     "run checkpoint is a list": (_run_checkpoint([1]), OWN, "run.pt is not a readable checkpoint"),
     "run checkpoint is empty": (_run_checkpoint({}), OWN, "run.pt is not a readable checkpoint"),
     "run checkpoint of words": (
         _run_checkpoint({"estimates": "here", "rows": [], "tracker": {}, "budget": {}}), OWN,
         "run.pt is not a readable checkpoint"),
     "trajectory gone": (lambda: Path("run/trajectory.txt").unlink(), KITTI, "no file run/traj"),
-    "trajectory empty": (_rewrite("run/trajectory.txt", " "), KITTI, "trajectory.txt is empty"),
-    "trajectory of comments": (_rewrite("run/trajectory.txt", "# a\n# b\n"), KITTI, "is empty"),
-    "a column less": (_rewrite("run/trajectory.txt", ROW[:-2]), KITTI, "line 1 is"),
-    "a column more": (_rewrite("run/trajectory.txt", f"{ROW} 1"), KITTI, "line 1 is"),
-    "a word": (_rewrite("run/trajectory.txt", ROW.replace("3", "x")), KITTI, "line 1 is"),
-    "a NaN": (_rewrite("run/trajectory.txt", ROW.replace("3", "nan")), KITTI, "not a finite pose"),
-    "no rotation": (_rewrite("run/trajectory.txt", ROW[:-1] + "0"), KITTI, "norm 0"),
+    "trajectory empty": (_write("run/trajectory.txt", " "), KITTI, "trajectory.txt is empty"),
+    "trajectory of comments": (_write("run/trajectory.txt", "# a\n# b\n"), KITTI, "is empty"),
+    "a column less": (_write("run/trajectory.txt", ROW[:-2]), KITTI, "line 1 is"),
+    "a column more": (_write("run/trajectory.txt", f"{ROW} 1"), KITTI, "line 1 is"),
+    "a word": (_write("run/trajectory.txt", ROW.replace("3", "x")), KITTI, "line 1 is"),
+    "a NaN": (_write("run/trajectory.txt", ROW.replace("3", "nan")), KITTI, "not a finite pose"),
+    "no rotation": (_write("run/trajectory.txt", ROW[:-1] + "0"), KITTI, "norm 0"),
     "second line": (
-        _rewrite("run/trajectory.txt", f"{ROW}\n{ROW[:-2]}"), KITTI, "line 2 is"),
+        _write("run/trajectory.txt", f"{ROW}\n{ROW[:-2]}"), KITTI, "line 2 is"),
     "a map for a run": (
-        lambda: None, ["export", "map", "--to", "tum", "p.txt"], "map holds no finished run"),
+        _nothing, ["export", "map", "--to", "tum", "p.txt"], "map holds no finished run"),
     "a run for a mesh": (
-        lambda: None, ["export", "run", "--to", "glb", "m.glb"], "run holds no map"),
+        _nothing, ["export", "run", "--to", "glb", "m.glb"], "run holds no map"),
     "unfinished run": (
         lambda: Path("run/metrics.json").unlink(), KITTI, "run holds no finished run"),
     "mesh cut": (
         _cut("map/mesh.ply"), ["export", "map", "--to", "glb", "m.glb"], "not a readable mesh"),
     "mesh is text": (
-        _rewrite("map/mesh.ply", "ply"), ["export", "map", "--to", "glb", "m.glb"],
+        _write("map/mesh.ply", "ply"), ["export", "map", "--to", "glb", "m.glb"],
         "not a readable mesh"),
 }  # fmt: skip
-
-
-@pytest.mark.parametrize("case", FILES)
-def test_damaged_results(case: str, work: Path, capsys: pytest.CaptureFixture) -> None:
-    """Catches results that are half there and taken for whole, or repaired in silence."""
-    spoil, command, says = FILES[case]
-    spoil()
-    assert_refused(work, capsys, command, says)
 
 
 ARGUMENTS = {
@@ -319,13 +281,6 @@ ARGUMENTS = {
 }
 
 
-@pytest.mark.parametrize("case", ARGUMENTS)
-def test_arguments(case: str, work: Path, capsys: pytest.CaptureFixture) -> None:
-    """Catches usage dumps, tracebacks, and mistakes that are met after earlier results are gone."""
-    command, says = ARGUMENTS[case]
-    assert_refused(work, capsys, command, says)
-
-
 OUTPUTS = {
     "run into a file": [*OWN, "--out", "room"],
     "run below a file": [*OWN, "--out", "room/run"],
@@ -339,12 +294,32 @@ OUTPUTS = {
 }
 
 
-@pytest.mark.parametrize("case", OUTPUTS)
-def test_places_that_cannot_be_written(
-    case: str, work: Path, capsys: pytest.CaptureFixture
-) -> None:
-    """Catches tracebacks of the system's errors, also for root, whom no permission bit stops."""
-    assert_refused(work, capsys, OUTPUTS[case], "nbtrack: ")
+Fault = tuple[Callable[[], object], list[str], str]  # what is spoilt, the command, what it says
+FAULTS: dict[str, Fault] = {
+    f"config file: {case}": (
+        _write("settings.toml", text),
+        [*MAP, "--config", "settings.toml"],
+        says,
+    )
+    for case, (text, says) in TOML.items()
+}
+for case, (text, says) in SET_TEXTS.items():
+    FAULTS[f"--set: {case}"] = (_nothing, [*MAP, "--set", text], says)
+    FAULTS[f"NBTRACK_SET: {case}"] = (_environment("SET", f"'{text}'"), MAP, says)
+for case, (name, value, says) in ENVIRONMENT.items():
+    FAULTS[f"environment: {case}"] = (_environment(name, value), OWN, says)
+FAULTS |= FILES | {case: (_nothing, *fault) for case, fault in ARGUMENTS.items()}
+FAULTS |= {case: (_nothing, command, "nbtrack: ") for case, command in OUTPUTS.items()}
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_faults(case: str, work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches tracebacks, also of the system and for root, whom no permission bit stops; settings
+    that are guessed, ignored or checked less in one place; results that are half there and taken
+    for whole or repaired in silence; and mistakes that are met after earlier results are gone."""
+    spoil, command, says = FAULTS[case]
+    spoil()
+    assert_refused(work, capsys, command, says)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes where permissions forbid it")
