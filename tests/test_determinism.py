@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from test_tracking import box_sequence
+from box_room import box_sequence
 
 from nbtrack.experiments.cells import Cell, Report
 from nbtrack.experiments.grid import Execution, run_cells

@@ -5,8 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from test_lm import furnished
-from test_tracking import BoxRoom, walk
+from box_room import BoxRoom, narrow_room, walk
 
 from nbtrack.core.errors import DataError
 from nbtrack.data.frame import Frame
@@ -124,8 +123,8 @@ SPOILT: dict[str, tuple[Callable[..., Images], bool | None]] = {
 def test_a_spoilt_frame_is_survived_and_flagged(case: str) -> None:
     """Catches NaN in poses, a bad pose that passes for a good one, and a run that ends there."""
     spoil, must_flag = SPOILT[case]
-    field, sequence = furnished()
-    tracker = make_tracker("lm", field, sequence.T_world_camera[0], StepBudget(25), SETTINGS)
+    sequence, budget = walk(3, narrow_room(), 48), StepBudget(25)
+    tracker = make_tracker("lm", narrow_room(), sequence.T_world_camera[0], budget, SETTINGS)
     for turn, index in enumerate((1, 2, 1, 0, 1)):
         images = sequence.colors[index], sequence.depths_mm[index]
         images = spoil(*images) if turn == 2 else images
@@ -140,12 +139,12 @@ def test_a_spoilt_frame_is_survived_and_flagged(case: str) -> None:
 
 def test_a_gap_of_two_seconds_is_found_again_or_flagged() -> None:
     """Catches a jump that passes for tracking: 12 cm and 11 degrees between two frames."""
-    field, sequence = furnished()
+    sequence = walk(3, narrow_room(), 48)
     jumped = sequence.T_world_camera[2].copy()
     jumped[:3, 3] += 0.12
     turn = torch.linalg.matrix_exp(0.15 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
     jumped[:3, :3] = turn.double().numpy() @ jumped[:3, :3]
-    estimate = make_tracker("lm", field, jumped, StepBudget(80)).track(sequence[2])
+    estimate = make_tracker("lm", narrow_room(), jumped, StepBudget(80)).track(sequence[2])
     assert estimate.lost or error_m(estimate.T_world_camera, sequence, 2) < 0.02
 
 

@@ -6,17 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from box_room import BoxRoom, box_sequence, walk
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
-from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.base import LearnedField
 from nbtrack.fields.grid import BakedField
-from nbtrack.fields.rendering import Rendering, composite, weights_from_density
 from nbtrack.tracking import (
     TRACKERS,
     AdamTracker,
@@ -33,52 +29,7 @@ from nbtrack.tracking import (
 )
 from nbtrack.tracking.tracker import MOTION_MODELS, expected_poses
 
-HALF = torch.tensor([1.0, 0.8, 1.2])  # half sides of the room, m
-SHIFT = 0.03  # m behind the wall at which the density is half its largest
 SETTINGS = {"vr": VrSettings(n_pixels=128), "sdf": SdfSettings(n_pixels=256, lambda_color=0.1)}
-
-
-class BoxRoom(LearnedField):
-    """The inside of a box with smoothly coloured walls; as a distance or as a steep density."""
-
-    name, label, surface_level = "box", "box", 0.0
-
-    def __init__(self, as_density: bool = False) -> None:
-        super().__init__(SceneBounds((-1.1, -0.9, -1.3), (1.1, 0.9, 1.3)))
-        self.as_density = as_density
-
-    def forward(self, points_world: Tensor) -> tuple[Tensor, Tensor]:
-        color = 0.5 + 0.4 * torch.sin(3 * points_world)
-        sdf = (HALF - points_world.abs()).amin(dim=-1)
-        # Light goes out at the wall on average: the shift was solved for numerically.
-        return color, 150 * torch.sigmoid((-sdf - SHIFT) / 0.02) if self.as_density else sdf
-
-    def composite(self, colors: Tensor, values: Tensor, rays: Rays, depths: Tensor) -> Rendering:
-        lengths = rays.directions_world.norm(dim=-1)
-        return composite(weights_from_density(values, depths, lengths), colors, depths)
-
-    def mapping_losses(self, *arguments: object) -> dict[str, Tensor]:
-        raise NotImplementedError
-
-
-def box_sequence(offsets: list[list[float]]) -> RgbdSequence:
-    """Exact images of the box room from cameras at offsets (m) from the middle, not rotated."""
-    intrinsics = Intrinsics.from_focal(32, 24, 24.0)
-    rows, columns = torch.meshgrid(torch.arange(24), torch.arange(32), indexing="ij")
-    directions = pixel_directions(intrinsics, columns, rows)
-    poses = np.tile(np.eye(4), (len(offsets), 1, 1))
-    poses[:, :3, 3] = offsets
-    offset = torch.tensor(offsets, dtype=torch.float32)[:, None, None]
-    depth = ((HALF * directions.sign() - offset) / directions).amin(dim=-1)
-    color = 0.5 + 0.4 * torch.sin(3 * (offset + depth[..., None] * directions))
-    colors, depths = (255 * color).round().byte().numpy(), (1000 * depth).round().numpy()
-    frame_ids = np.arange(len(offsets))
-    return RgbdSequence("box", intrinsics, colors, depths.astype(np.uint16), poses, frame_ids)
-
-
-def walk(n_frames: int) -> RgbdSequence:
-    """A camera that moves by 4 mm a frame."""
-    return box_sequence([[0.0036 * i, 0.0, 0.0018 * i] for i in range(n_frames)])
 
 
 def tracker_of(name: str, steps: float, settings: TrackerSettings | None = None) -> Tracker:
