@@ -8,15 +8,14 @@ from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from threading import Thread
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8, UInt16
 
 from nbtrack.core.arrays import Pose
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError, DataError
-from nbtrack.data.writer import write_sequence
+from nbtrack.core.files import json_text, naming_damaged
+from nbtrack.data.writer import WrittenFrame, write_sequence
 from nbtrack.synthetic.motion import handheld_trajectory
 from nbtrack.synthetic.render import render_frame
 from nbtrack.synthetic.room import Room, build_room
@@ -28,14 +27,6 @@ _AGAIN = "remove the folder and make the room again"
 FIELD_OF_VIEW = np.radians(60.0)  # horizontal, as in the Neural RGB-D dataset
 
 
-class RoomFrame(NamedTuple):
-    """What is written of one frame."""
-
-    color: UInt8[np.ndarray, "h w 3"]  # RGB
-    depths_mm: dict[str, UInt16[np.ndarray, "h w"]]  # by depth folder, 0 = invalid
-    T_world_camera: Pose  # OpenCV camera axes
-
-
 def room_intrinsics(width: int, height: int) -> Intrinsics:
     """The camera of all synthetic rooms: 60 degrees wide, square pixels, centered."""
     return Intrinsics.from_focal(width, height, float(width / (2 * np.tan(FIELD_OF_VIEW / 2))))
@@ -43,7 +34,7 @@ def room_intrinsics(width: int, height: int) -> Intrinsics:
 
 def room_frames(
     room: Room, n_frames: int, width: int, height: int, seed: int, workers: int = 1
-) -> Iterator[RoomFrame]:
+) -> Iterator[WrittenFrame]:
     """Render a room's frames one after the other; memory does not grow with their number.
 
     `seed` is that of the camera's path and of the depth noise. Every frame has its own random
@@ -71,13 +62,13 @@ def _end_with_parent() -> None:
     Thread(target=lambda: (parent_process().join(), os._exit(1)), daemon=True).start()
 
 
-def _make_frame(room: Room, camera: Intrinsics, seed: int, number: int, pose: Pose) -> RoomFrame:
+def _make_frame(room: Room, camera: Intrinsics, seed: int, number: int, pose: Pose) -> WrittenFrame:
     color, depth, _ = render_frame(room, camera, pose)
     rng = np.random.default_rng([seed, number, room.number])
     noisy = add_kinect_noise(depth, camera.fx, rng)
     maps = {"depth": depth, "depth_with_noise": noisy, "depth_filtered": filter_depth(noisy)}
     depths_mm = {name: np.rint(1e3 * values).astype(np.uint16) for name, values in maps.items()}
-    return RoomFrame(color, depths_mm, pose)
+    return color, depths_mm, pose
 
 
 def make_room(
@@ -104,7 +95,7 @@ def make_room(
     record = {"room": name, "version": ROOM_VERSION, "seed": seed, "frames": n_frames}
     record |= {"width": width, "height": height}
     frames = room_frames(room, n_frames, width, height, seed, workers)
-    notes = {ROOM_FILE: json.dumps(record, indent=2) + "\n"}
+    notes = {ROOM_FILE: json_text(record)}
     write_sequence(folder, room_intrinsics(width, height), frames, notes, progress)
     return folder
 
@@ -117,11 +108,9 @@ def room_of(folder: Path) -> Room | None:
     path = folder / ROOM_FILE
     if not path.is_file():
         return None
-    try:
+    with naming_damaged(path, "record of a room", _AGAIN):
         record = json.loads(path.read_text(encoding="utf-8"))
         name, version = record["room"], record["version"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path} cannot be read ({error!r}); {_AGAIN}") from error
     if version != ROOM_VERSION:
         raise DataError(f"{path} has version {version}; {ROOM_VERSION} is made here; {_AGAIN}")
     return build_room(name)
