@@ -66,11 +66,18 @@ def tum_lines(times: np.ndarray, poses: np.ndarray, order: str = "xyzw") -> str:
     return matrix_text(np.column_stack([times, poses[:, :3, 3], q]))
 
 
+def write_images(
+    folder: Path, data: Source, color: str = "color/{:06}.png", depth: str = "depth/{:06}.png"
+) -> None:
+    """By default those of a plain folder."""
+    for i, (rgb, values) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
+        write_image(folder / color.format(i), rgb)
+        write_image(folder / depth.format(i), values)
+
+
 def write_neural_rgbd(folder: Path, data: Source) -> None:
     opengl = data.poses @ np.diag([1.0, -1, -1, 1])
-    for i, (color, depth) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
-        write_image(folder / f"images/img{i}.png", color)
-        write_image(folder / f"depth_filtered/depth{i}.png", depth)
+    write_images(folder, data, "images/img{}.png", "depth_filtered/depth{}.png")
     (folder / "poses.txt").write_text(matrix_text(opengl.reshape(-1, 4)))
     (folder / "focal.txt").write_text(f"{data.camera.fx!r}\n")
 
@@ -104,10 +111,9 @@ def write_tum(folder: Path, data: Source) -> None:
 
 
 def write_replica(folder: Path, data: Source) -> None:
-    for i, (color, depth) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
-        write_image(folder / f"results/frame{i:06d}.jpg", color)
-        raw = np.rint(depth * 6.5535).astype(np.uint16)
-        write_image(folder / f"results/depth{i:06d}.png", raw)
+    raw = np.rint(data.depths_mm * 6.5535).astype(np.uint16)
+    names = "results/frame{:06}.jpg", "results/depth{:06}.png"
+    write_images(folder, data._replace(depths_mm=raw), *names)
     (folder / "traj.txt").write_text(matrix_text(data.poses.reshape(-1, 16)))
     camera = data.camera
     params = {
@@ -118,30 +124,24 @@ def write_replica(folder: Path, data: Source) -> None:
 
 
 def write_seven_scenes(folder: Path, data: Source) -> None:
-    for i, (color, depth) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
-        write_image(folder / f"frame-{i:06d}.color.png", color)
-        write_image(folder / f"frame-{i:06d}.depth.png", np.where(depth == 0, 65535, depth))
-        text = matrix_text(data.poses[i]).replace(" ", "\t ")
-        (folder / f"frame-{i:06d}.pose.txt").write_text(text)
+    raw = np.where(data.depths_mm == 0, np.uint16(65535), data.depths_mm)
+    names = "frame-{:06}.color.png", "frame-{:06}.depth.png"
+    write_images(folder, data._replace(depths_mm=raw), *names)
+    for i, pose in enumerate(data.poses):
+        text = matrix_text(pose).replace(" ", "\t ")
+        (folder / f"frame-{i:06}.pose.txt").write_text(text)
 
 
 def write_scannet(folder: Path, data: Source) -> None:
     """Colour twice as large as depth, as the real export's is larger."""
-    for i, (color, depth) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
-        write_image(folder / f"color/{i}.jpg", color.repeat(2, axis=0).repeat(2, axis=1))
-        write_image(folder / f"depth/{i}.png", depth)
-        (folder / "pose").mkdir(exist_ok=True)
-        (folder / f"pose/{i}.txt").write_text(matrix_text(data.poses[i]))
+    large = data.colors.repeat(2, axis=1).repeat(2, axis=2)
+    write_images(folder, data._replace(colors=large), "color/{}.jpg", "depth/{}.png")
+    (folder / "pose").mkdir()
+    for i, pose in enumerate(data.poses):
+        (folder / f"pose/{i}.txt").write_text(matrix_text(pose))
     (folder / "intrinsic").mkdir()
     text = matrix_text(camera_matrix(data.camera, 4))
     (folder / "intrinsic/intrinsic_depth.txt").write_text(text)
-
-
-def write_images(folder: Path, data: Source) -> None:
-    """Those of a plain folder."""
-    for i, (color, depth) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
-        write_image(folder / f"color/{i:06d}.png", color)
-        write_image(folder / f"depth/{i:06d}.png", depth)
 
 
 def write_plain(folder: Path, data: Source) -> None:

@@ -48,8 +48,7 @@ class ProgressBar:
 
     def __init__(self, title: str, total: float | int, is_shown: bool = True) -> None:
         is_notebook = _is_notebook()
-        self.title, self.total, self.done, self.is_shown = title, total, 0.0, is_shown
-        self._start = time.monotonic()
+        self.title, self.is_shown, self._start = title, is_shown, time.monotonic()
         # A notebook's kernel drops messages once a thousand wait to be read.
         self._bar = tqdm(
             total=total,
@@ -65,10 +64,9 @@ class ProgressBar:
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much is done, and a word on how it goes."""
         # Sums of fractions may end a rounding error above the total, which a bar does not like.
-        done = min(done, self.total)
+        done = min(done, self._bar.total)
         self._bar.set_postfix_str(status, refresh=False)
-        self._bar.update(done - self.done)
-        self.done = done
+        self._bar.update(done - self._bar.n)
 
     def __enter__(self) -> "ProgressBar":
         return self

@@ -68,13 +68,9 @@ def read_rows(
     return rows
 
 
-def _read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> np.ndarray:
-    """A table of numbers separated by blanks or commas; NaN and infinity are kept."""
-
-    def parse(line: str) -> list[float]:
-        return [float(word) for word in line.replace(",", " ").split()]
-
-    return np.array(read_rows(path, parse, columns, meaning), dtype=np.float64)
+def _numbers(line: str) -> list[float]:
+    """Separated by blanks or commas; NaN and infinity are kept."""
+    return [float(word) for word in line.replace(",", " ").split()]
 
 
 def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | None]:
@@ -83,7 +79,7 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
     Lines hold `timestamp tx ty tz` and a quaternion in the order that is given, a 4x4 or 3x4
     matrix, or one of the rows of a matrix; else DataError is raised. NaN gives NaN poses.
     """
-    numbers = _read_numbers(path, (4, 8, 12, 16), _POSE_LINE)
+    numbers = np.array(read_rows(path, _numbers, (4, 8, 12, 16), _POSE_LINE))
     if numbers.shape[1] == 8:
         return _from_quaternions(numbers[:, 1:], quaternion, path), numbers[:, 0]
     if numbers.shape == (3, 4):
@@ -96,23 +92,19 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
 
 
 def _from_quaternions(numbers: np.ndarray, order: str, path: Path) -> Poses:
-    """Poses of rows with a position and a quaternion."""
-    poses = np.full((len(numbers), 4, 4), np.nan)
-    known = np.flatnonzero(np.isfinite(numbers).all(axis=1))
-    positions, quaternions = np.split(numbers[known], [3], axis=1)
+    """Poses of rows with a position and a quaternion; NaN for a position if a number is none."""
+    is_known = np.isfinite(numbers).all(axis=1, keepdims=True)
+    positions, quaternions = np.split(np.where(is_known, numbers, 3 * [np.nan] + 4 * [0.5]), [3], 1)
     # Clipped, so that absurd numbers are refused below and overflow nothing here.
     norms = np.linalg.norm(quaternions.clip(-1e6, 1e6), axis=1)
     for i in np.flatnonzero(np.abs(norms - 1) > _RIGID):
         raise DataError(
-            f"{path} pose {known[i]} has a quaternion of norm {norms[i]:.3g}: columns must be "
+            f"{path} pose {i} has a quaternion of norm {norms[i]:.3g}: columns must be "
             f"tx ty tz and a unit quaternion ({' '.join('q' + axis for axis in order)})"
         )
-    # SciPy refuses an empty list of rotations.
-    if len(known):
-        q_xyzw = quaternions[:, [order.index(axis) for axis in "xyzw"]]
-        poses[known] = np.eye(4)
-        poses[known, :3, :3] = Rotation.from_quat(q_xyzw).as_matrix()
-        poses[known, :3, 3] = positions
+    q_xyzw = quaternions[:, [order.index(axis) for axis in "xyzw"]]
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_quat(q_xyzw).as_matrix(), positions
     return poses
 
 
@@ -121,20 +113,20 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
 
     Raises DataError if a pose is no rigid transform, or absurdly far from the origin.
     """
-    is_known = np.isfinite(poses).all(axis=(1, 2))
+    is_known = np.isfinite(poses).all(axis=(1, 2))[:, None, None]
     # Clipped, so that absurd numbers are refused and overflow nothing.
-    R = np.where(is_known[:, None, None], poses[:, :3, :3], np.eye(3)).clip(-1e6, 1e6)
-    is_rigid = np.abs(R @ R.mT - np.eye(3)).max(axis=(1, 2)) <= _RIGID
-    is_rigid &= np.abs(np.linalg.det(R) - 1) <= _RIGID
-    is_rigid &= np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1) <= _RIGID
-    is_rigid &= np.abs(poses[:, :3, 3]).max(axis=1) <= _FARTHEST
-    for i in np.flatnonzero(is_known & ~is_rigid):
+    T = np.where(is_known, poses, np.eye(4)).clip(-1e8, 1e8)
+    R, bottom, far = T[:, :3, :3], T[:, 3] - [0, 0, 0, 1], np.abs(T[:, :3, 3]) > _FARTHEST
+    is_wrong = (np.abs(R @ R.mT - np.eye(3)) > _RIGID).any(axis=(1, 2))
+    is_wrong |= np.abs(np.linalg.det(R) - 1) > _RIGID
+    is_wrong |= (np.abs(bottom) > _RIGID).any(axis=1) | far.any(axis=1)
+    for i in np.flatnonzero(is_wrong):
         found = " ".join(f"{number:.4g}" for number in poses[i].flat)
         raise DataError(
             f"{path} frame {i} is no rigid transform in metres ({found}): rows must be [R | t] "
             f"with a right-handed rotation R and t up to {_FARTHEST:g}, and 0 0 0 1"
         )
-    return np.where(is_known[:, None, None], poses, np.nan)
+    return np.where(is_known, poses, np.nan)
 
 
 @dataclass(frozen=True)
@@ -193,7 +185,7 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarra
 
 
 def _from_text(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
-    numbers = _read_numbers(path, (1, 3, 4, 9, 16), _CAMERA_LINE)
+    numbers = np.array(read_rows(path, _numbers, (1, 3, 4, 9, 16), _CAMERA_LINE))
     if numbers.size == 1:
         focal = numbers.item()
         return camera_matrix(focal, focal, 0.0, 0.0), {"principal_point": None}
@@ -208,6 +200,7 @@ def _from_text(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
 def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     content = read_object(path)
     camera = content["camera"] if isinstance(content.get("camera"), dict) else content
+    camera = {{"w": "width", "h": "height"}.get(key, key): camera[key] for key in camera}
 
     def numbers(key: str, *counts: int) -> list[float]:
         """A single one needs no list."""
@@ -224,10 +217,8 @@ def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     others: dict[str, Any] = {"depth_scale": camera.get("scale")}
     if "distortion" in camera:
         others["distortion"] = tuple(numbers("distortion", 0, 4, 5, 8))
-    for sides in (("width", "height"), ("w", "h")):
-        if not any(side in camera for side in sides):
-            continue
-        width, height = (numbers(side, 1)[0] for side in sides)
+    if camera.keys() & {"width", "height"}:
+        width, height = *numbers("width", 1), *numbers("height", 1)
         if not (width % 1 == height % 1 == 0 and min(width, height) > 0):
             raise DataError(f"{path} gives a size of {width} x {height}: whole pixels, 1 or more")
         others["size"] = (int(width), int(height))
