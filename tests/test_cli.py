@@ -7,17 +7,14 @@ import cv2
 import numpy as np
 import pytest
 from recordings import write_recording
+from tiny import tiny_words
 
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.writer import write_sequence
 from nbtrack.tracking.trajectories import read_tum
 
-TINY = [
-    "--set", "scenes.n_frames=6", "--set", "scenes.width=32", "--set", "mapping.neus.iterations=8",
-    "--set", "mapping.neus.n_rays=16", "--set", "network.neus.width=16",
-    "--set", "tracking.sdf.n_pixels=32",
-]  # fmt: skip
+TINY = tiny_words("scenes.n_frames=6", "tracking.sdf.n_pixels=32")
 
 
 @pytest.fixture(autouse=True)
@@ -66,14 +63,8 @@ def _resize(path: Path) -> None:
 
 SPOILT = {
     "no images": (lambda f: [p.unlink() for p in (f / "images").iterdir()], "no file "),
-    "one depth less": (
-        lambda f: (f / "depth/depth2.png").unlink(),
-        "but depth/ has 2 .png",
-    ),
-    "other size": (
-        lambda f: _resize(f / "depth/depth1.png"),
-        "depth1.png is uint16 of shape (6",
-    ),
+    "one depth less": (lambda f: (f / "depth/depth2.png").unlink(), "but depth/ has 2 .png"),
+    "other size": (lambda f: _resize(f / "depth/depth1.png"), "depth1.png is uint16 of shape (6"),
     "cut colour": (lambda f: _cut_in_half(f / "images/img1.png"), "img1.png"),
     "empty focal": (lambda f: (f / "focal.txt").write_text(""), "focal.txt is empty"),
     "negative focal": (lambda f: (f / "focal.txt").write_text("-5"), "camera matrix [[-5.0"),
@@ -159,41 +150,31 @@ def test_track_writes_what_it_promises(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_a_second_run_finds_the_map(capsys: pytest.CaptureFixture, runs: Path) -> None:
-    """Catches maps that are made again although nothing changed, or not although it did."""
-    said = []
-    for more in ([], [], ["--set", "mapping.neus.n_rays=17"]):
-        assert main(track("living_room", *more)) == 0
-        said.append(capsys.readouterr().out.splitlines()[0].partition(" in ")[0])
-    assert said == ["no finished map", "map found", "no finished map"]
-
-
-def test_map_prints_scores_and_place(capsys: pytest.CaptureFixture, runs: Path) -> None:
-    """Catches a map whose quality or folder is not told."""
+    """Catches maps that are made again although nothing changed, or not although it did, and a map
+    whose quality or folder is not told."""
     assert main(["map", "living_room", "--field", "neus", *TINY]) == 0
     printed = capsys.readouterr().out
     assert all(text in printed for text in (str(runs), "sdf near", "mesh"))
+    said = []
+    for more in ([], ["--set", "mapping.neus.n_rays=17"]):
+        assert main(track("living_room", *more)) == 0
+        said.append(capsys.readouterr().out.splitlines()[0].partition(" in ")[0])
+    assert said == ["map found", "no finished map"]
 
 
 def test_data_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Catches a made room that its own check would not accept."""
     out = tmp_path / "room"
-    make = ["data", "make", "office", "--out", str(out), "--n-frames", "12", "--width", "64"]
+    make = ["data", "make", "office", "--out", str(out), "--n-frames", "4", "--width", "48"]
     assert main(make) == 0
     assert main(["data", "check", str(out)]) == 0
-    assert "12 frames" in capsys.readouterr().out
+    assert "4 frames" in capsys.readouterr().out
     assert "exists" in failure(capsys, *make)
 
 
-def test_tracking_command_reads_any_format(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_tracking_command_reads_any_format(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Catches a --format that the command line drops on its way to map and track."""
-    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
     folder = write_recording("tum", tmp_path / "r")
-    command = [
-        "track", str(folder), "--field", "neus", "--tracker", "sdf", "--steps", "1",
-        "--set", "mapping.neus.iterations=2", "--set", "mapping.neus.n_rays=8",
-        "--set", "network.neus.width=16", "--set", "tracking.sdf.n_pixels=16",
-    ]  # fmt: skip
-    assert main([*command, "--format", "tum"]) == 0
+    assert main(track(folder, "--format", "tum")) == 0
     capsys.readouterr()
-    assert main([*command, "--format", "plain"]) == 2
-    assert "no file " in capsys.readouterr().err
+    assert "no file " in failure(capsys, *track(folder, "--format", "plain"))

@@ -1,28 +1,21 @@
-"""One seed, one result, byte for byte: on a CPU with a budget of steps."""
+"""One seed, one result, byte for byte: on a CPU with a budget of steps.
+
+The same on workers, here and on a cluster, is in `test_grid.py`.
+"""
 
 import hashlib
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pytest
 import torch
 from box_room import box_sequence
 
-from nbtrack.experiments.cells import Cell, Report
-from nbtrack.experiments.grid import Execution, run_cells
 from nbtrack.fields import NetworkSettings, field_class
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.tracking import StepBudget, make_tracker, track_sequence, tracker_class
 
 PAIRS = {"vr": "imap", "sdf": "neus", "lm": "neus_plus"}
 SMALL = {"iterations": 12, "n_rays": 64, "n_stratified": 8, "n_surface": 8, "n_surface_points": 64}
-
-
-@pytest.fixture(autouse=True)
-def threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def digest_of(tracker: str, seed: int) -> str:
@@ -53,25 +46,3 @@ def test_again_and_with_other_threads(tracker: str) -> None:
     assert digest_of(tracker, 2) != once
     torch.set_num_threads(2)
     assert digest_of(tracker, 1) == once
-
-
-@dataclass(frozen=True)
-class Digest(Cell):
-    """The hash as a cell."""
-
-    name: str
-    kind, key, units, cost, needs, is_done = "digests", "0", 1, 1.0, None, False
-
-    def result(self) -> str:
-        raise NotImplementedError
-
-    def compute(self, report: Report) -> str:
-        return digest_of(self.name, 3)
-
-
-@pytest.mark.filterwarnings("default")  # Dask's threads warn as they are torn down
-def test_with_one_and_two_workers() -> None:
-    """Catches results that depend on the process that computes them."""
-    cells = [Digest("sdf"), Digest("lm")]
-    alone = run_cells(cells, "alone", Execution(workers=1))
-    assert run_cells(cells, "side by side", Execution(workers=2)) == alone

@@ -1,14 +1,18 @@
 """Cells here and on Dask: order, progress, failures that are told, and nothing left running."""
 
 import os
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
-from tiny import TINY
+from tiny import tiny_words
 
 from nbtrack.cli import main
 from nbtrack.core.errors import DataError, NbtrackError
@@ -45,6 +49,12 @@ class Square(Cell):
             time.sleep(0.4 if self.how == "slowly" else 0)
             report(unit, "half")
         return self.result()
+
+
+@pytest.fixture(autouse=True)
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cache of its own."""
+    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
 
 
 @pytest.fixture(scope="module")
@@ -107,30 +117,64 @@ def test_the_bar_moves_within_a_cell(monkeypatch: pytest.MonkeyPatch, execution:
     assert max(done for done, _ in seen) == 4
 
 
-def tables(monkeypatch: pytest.MonkeyPatch, folder: Path, *options: str) -> int:
-    """The command for two rooms, with its own cache."""
-    monkeypatch.setenv("NBTRACK_RUNS", str(folder / "runs"))
-    settings = (*TINY, "tables.rates_hz=[10]")
-    words = [word for setting in settings for word in ("--set", setting)]
-    out = str(folder / "out")
-    return main(["tables", "--threads", "1", "--out", out, *words, *options])
+def words(folder: Path, *options: str) -> list[str]:
+    """The command for two rooms, and trackers of first and second order."""
+    settings = tiny_words("tables.rates_hz=[10]", "scenes.track_frames=:4")
+    out = ["--threads", "1", "--out", str(folder / "out")]
+    return ["tables", "--trackers", "sdf,lm", *out, *settings, *options]
 
 
-def test_a_cluster_makes_the_same_table(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def tables(folder: Path, *options: str) -> int:
+    """The command in this process, with its own cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NBTRACK_RUNS", str(folder / "runs"))
+        return main(words(folder, *options))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The table as one process makes it."""
+    folder = tmp_path_factory.mktemp("here")
+    assert tables(folder, "--workers", "1") == 0
+    return (folder / "out/table_1_cells.csv").read_bytes()
+
+
+def test_a_cluster_makes_the_same_table(address: str, tmp_path: Path, undisturbed: bytes) -> None:
     """Catches cells that the cluster computes otherwise, or keeps where nobody looks."""
-    for name, options in (("here", ["--workers", "1"]), ("there", ["--dask", address])):
-        assert tables(monkeypatch, tmp_path / name, *options) == 0
-    here, there = (tmp_path / name / "out/table_1_cells.csv" for name in ("here", "there"))
-    assert there.read_bytes() == here.read_bytes()
+    assert tables(tmp_path, "--dask", address) == 0
+    assert (tmp_path / "out/table_1_cells.csv").read_bytes() == undisturbed
     # A failure in a worker comes back as one line, and the other cells still run.
-    for file in (tmp_path / "there").rglob("office*/**/depth_filtered/depth1.png"):
+    for file in tmp_path.rglob("office*/**/depth_filtered/depth1.png"):
         file.write_bytes(b"no image")
-    assert tables(monkeypatch, tmp_path / "there", "--dask", address) == 2
-    text = (tmp_path / "there/out/table_1.csv").read_text()
+    assert tables(tmp_path, "--dask", address) == 2
+    text = (tmp_path / "out/table_1.csv").read_text()
     assert "living_room,\n" not in text
     assert text.count("office,\n") == 2
+
+
+def test_killed_with_two_workers_and_told_again(tmp_path: Path, undisturbed: bytes) -> None:
+    """Catches workers that outlive their parent, finished cells that are made again, and
+    half-written ones that count as done."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("NBTRACK_")}
+    # A short path for Dask's sockets, which may have 107 characters.
+    kept |= {"NBTRACK_RUNS": str(tmp_path / "runs"), "TMPDIR": "/tmp"}
+    command = [sys.executable, "-m", "nbtrack", *words(tmp_path, "--workers", "2")]
+    process = subprocess.Popen(
+        command, env=kept, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    while not any(tmp_path.rglob("map.safetensors")):
+        assert process.poll() is None, "it ended before its first map"
+        time.sleep(0.01)
+    workers = psutil.Process(process.pid).children(recursive=True)
+    assert len(workers) >= 2
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert psutil.wait_procs(workers, timeout=30)[1] == []
+    made = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("map.safetensors")}
+    assert len(made) < 4, "nothing was left to do"
+    assert tables(tmp_path, "--workers", "1") == 0
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+    assert (tmp_path / "out/table_1_cells.csv").read_bytes() == undisturbed
 
 
 def test_no_scheduler(
@@ -138,5 +182,5 @@ def test_no_scheduler(
 ) -> None:
     """Catches a traceback of sockets where the address is wrong."""
     monkeypatch.setattr("nbtrack.experiments.workers._SECONDS_TO_CONNECT", 0.5)
-    assert tables(monkeypatch, tmp_path, "--dask", "tcp://127.0.0.1:9") == 2
+    assert tables(tmp_path, "--dask", "tcp://127.0.0.1:9") == 2
     assert "no Dask scheduler at 'tcp://127.0.0.1:9'" in capsys.readouterr().err.splitlines()[-1]

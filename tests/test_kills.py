@@ -1,6 +1,6 @@
 """Mapping, tracking and tables killed at any moment, then told the same again: the same result.
 
-`test_resume.py` does so for tables with workers. Here one process that has imported everything
+`test_grid.py` does so for tables with workers. Here one process that has imported everything
 forks a child for each command, so that many kills are affordable: NBTRACK_TEST_KILLS=30.
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from tiny import TINY
+from tiny import tiny_words
 
 from nbtrack.mapping.files import MAP_FILE, read_map
 from nbtrack.tracking.trajectories import read_tum
@@ -52,10 +52,10 @@ for line in sys.stdin:
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     print(json.dumps([status, time.monotonic() - start]), flush=True)
 """
-SET = [word for setting in (*TINY, "mapping.neus.iterations=25", "mapping.imap.iterations=25",
-                            "mapping.neus.holdout_every=0", "mapping.imap.holdout_every=0",
-                            "scenes.n_frames=10", "tracking.lm.n_pixels=32")
-       for word in ("--set", setting)]  # fmt: skip
+SET = tiny_words(
+    "mapping.neus.iterations=25", "mapping.imap.iterations=25", "mapping.neus.holdout_every=0",
+    "mapping.imap.holdout_every=0", "scenes.n_frames=10", "tables.rates_hz=[10]",
+)  # fmt: skip
 COMMANDS = {
     "map": ["map", "living_room", "--field", "neus", "--out", "out", *SET],
     "track": ["track", "living_room", "--field", "neus", "--tracker", "lm", "--steps", "6",
@@ -70,8 +70,7 @@ class Forker:
 
     def __init__(self) -> None:
         kept = {k: v for k, v in os.environ.items() if not k.startswith("NBTRACK_")}
-        paths = [str(Path(__file__).parents[1]), kept.get("PYTHONPATH", "")]
-        kept["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+        kept["PYTHONPATH"] = str(Path(__file__).parents[1])
         self.process = subprocess.Popen(
             [sys.executable, "-c", _FORKER], text=True, stdin=subprocess.PIPE,
             stdout=subprocess.PIPE, env=kept,
@@ -104,18 +103,14 @@ def room(forker: Forker, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def result(folder: Path) -> dict[str, object]:
     """All of a result that the clock does not enter, by file and part."""
-    found: dict[str, object] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix in (".txt", ".ply") or path.name == "history.csv":
+    found: dict[str, object] = {path.name: "there" for path in folder.iterdir()}
+    for path in folder.iterdir():
+        if path.suffix in (".txt", ".ply") or path.name.startswith(("history", "table_1")):
             found[path.name] = path.read_bytes()
         elif path.name == "frames.csv":
             found[path.name] = pd.read_csv(path).drop(columns="seconds").to_csv()
         elif path.name == MAP_FILE:
             found[path.name] = read_map(path).key
-        elif path.name.startswith("table_1") and path.suffix in (".csv", ".tex"):
-            found[path.name] = path.read_bytes()
-        else:
-            found[path.name] = "there"
     return found
 
 

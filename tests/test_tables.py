@@ -23,7 +23,7 @@ from nbtrack.tables import (
     write_tables,
 )
 from nbtrack.tables.layout import average_over_seeds, beside
-from nbtrack.tables.styles import escape_latex, latex_file
+from nbtrack.tables.styles import latex_file
 
 PROJECT = Path(__file__).parent.parent
 PAPER_SOURCE = PROJECT / ".." / "shared" / "reference" / "paper.tex"
@@ -59,7 +59,7 @@ SEEDS = pd.DataFrame(
     [(10, m, "x", v, s) for s, v in enumerate((0.1, 0.2, 0.3)) for m, v in (("A", v), ("B", 1.0))],
     columns=[*COLUMNS_1, "seed"],
 )
-NOTE = "Preset: smoke; budget: the paper's step counts; device: CPU_1 & 50%."
+NOTE = r"Preset: smoke; budget: the paper's step counts; device: CPU_1 & 50% #1 $x {y} ~ ^ \z."
 
 
 def latex(styler) -> str:
@@ -132,20 +132,9 @@ def test_red_and_bold_together() -> None:
     assert re.findall(r"level1_row(\d)", bold) == ["1", "4"]
 
 
-def test_layout_of_our_own_cells() -> None:
-    """Catches dropped rows: rates fall, the new method C has a row at both rates, gaps are NaN."""
-    wide = table_1(OURS_1)
-    assert list(wide.index) == [(r, m) for r in (10, 5) for m in "ABC"]
-    assert list(wide.columns) == ["room_b", "room_a"]
-    assert wide.isna().sum().sum() == 6
-    assert wide.at[(5, "C"), "room_b"] == 0.05
-    named = OURS_1.replace({"room_a": "grey_white_room", "room_b": "thin_geometry"})
-    assert list(table_1(named).columns) == ["Thin Geo.", "Grey-white"]
-
-
 def test_marks_and_gaps_by_hand() -> None:
     """Catches ties that only one row wins, a lone value praised, 0.2 m called a failure, missing
-    cells that vanish, wrong row spans, unescaped underscores."""
+    cells and rows that vanish, rates that do not fall, wrong row spans, unescaped underscores."""
     text = latex(style_table_1(OURS_1))
     head, *rows = tabular_rows(text)
     assert head == ["", "", "room b", "room a"]
@@ -161,8 +150,13 @@ def test_marks_and_gaps_by_hand() -> None:
     ]
     assert text.count(r"\midrule") == 2
     assert "best at this rate). Preset: smoke; budget: the paper's step counts; device: " in text
-    assert r"CPU\_1 \& 50\%.}" in text
+    special = (
+        r"CPU\_1 \& 50\% \#1 \$x \{y\} \textasciitilde{} \textasciicircum{} \textbackslash{}z.}"
+    )
+    assert special in text
     assert f"% {NOTE}\n" in text
+    named = OURS_1.replace({"room_a": "grey_white_room", "room_b": "thin_geometry"})
+    assert list(table_1(named).columns) == ["Thin Geo.", "Grey-white"]
 
 
 def test_steps_of_our_own_cells() -> None:
@@ -268,13 +262,6 @@ def test_bad_cells(make, message: str) -> None:
     """Catches a table of averages or of nothing where the input is not one value per cell."""
     with pytest.raises(DataError, match=message):
         make()
-
-
-def test_escape_latex() -> None:
-    """Catches device and scene names that break or vanish from the document."""
-    assert escape_latex(r"a_b & 5% #1 $x {y} ~ ^ \z") == (
-        r"a\_b \& 5\% \#1 \$x \{y\} \textasciitilde{} \textasciicircum{} \textbackslash{}z"
-    )
 
 
 def latex_is_installed() -> bool:

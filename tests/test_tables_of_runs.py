@@ -4,12 +4,14 @@ import importlib
 import json
 import math
 import shlex
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import pandas as pd
 import pytest
-from tiny import TINY
+from tiny import TINY, tiny_words
 
 from nbtrack.cli import main
 from nbtrack.core.errors import ConfigError, MissingError, NbtrackError
@@ -20,31 +22,48 @@ from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, Method
 from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.results import map_scene, map_scenes, read_run, track_scenes
-from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
-
-HERE = Execution(workers=1, keep_going=True)
+from nbtrack.experiments.scenes import Scene, open_scenes
 
 
-@pytest.fixture
-def preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Preset:
-    """Two rooms of a few pixels, an empty cache, and one process for everything."""
-    for name in ("NBTRACK_PRESET", "NBTRACK_CONFIG", "NBTRACK_SET"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
-    monkeypatch.setattr("nbtrack.experiments.grid.os.cpu_count", lambda: 1)
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """One cache for all tests here, so that rooms and maps are made once, and one process."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("NBTRACK_PRESET", "NBTRACK_CONFIG", "NBTRACK_SET"):
+            patch.delenv(name, raising=False)
+        folder = tmp_path_factory.mktemp("runs")
+        patch.setenv("NBTRACK_RUNS", str(folder))
+        patch.setattr("nbtrack.experiments.grid.os.cpu_count", lambda: 1)
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def preset(cache: Path) -> Preset:
     return load_preset("smoke", settings=TINY)
 
 
+@pytest.fixture(scope="module")
+def scenes(preset: Preset) -> list[Scene]:
+    """Two rooms of a few pixels."""
+    return open_scenes(preset)
+
+
 @pytest.fixture
-def scene(preset: Preset) -> Scene:
-    return open_scene("office", preset)
+def own_scenes(
+    cache: Path, scenes: list[Scene], preset: Preset, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> list[Scene]:  # fmt: skip
+    """The rooms in an otherwise empty cache, to be spoilt."""
+    shutil.copytree(cache / "rooms", tmp_path / "rooms")
+    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path))
+    return open_scenes(preset)
 
 
 def test_table_1_is_complete_cached_and_repeatable(
-    preset: Preset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches missing cells, runs that are made again, and hidden randomness anywhere."""
-    cells = track_scenes(open_scenes(preset), TABLE_1, preset)
+    cells = track_scenes(scenes, TABLE_1, preset)
     assert len(cells) == 2 * 2 * 2  # methods, rates, rooms
     assert cells["ate_m"].notna().all()
     assert set(cells["method"]) == {"iMAP with VR", "NeuS with SDF"}
@@ -56,75 +75,73 @@ def test_table_1_is_complete_cached_and_repeatable(
             patch.delattr(f"nbtrack.experiments.{name}")
         again = track_scenes(open_scenes(preset), TABLE_1, preset)
     pd.testing.assert_frame_equal(again, cells)
-    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "other"))
-    elsewhere = track_scenes(open_scenes(preset), TABLE_1, preset)
-    assert elsewhere["ate_m"].tolist() == cells["ate_m"].tolist()
+    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path))
+    elsewhere = track_scenes(scenes[1:], TABLE_1, preset, [10])
+    here = cells[(cells["scene"] == scenes[1].name) & (cells["rate_hz"] == 10)]
+    assert elsewhere["ate_m"].tolist() == here["ate_m"].tolist()
 
 
-def test_keys_change_with_what_matters(preset: Preset, scene: Scene) -> None:
+def test_keys_change_with_what_matters(preset: Preset, scenes: list[Scene]) -> None:
     """Catches a cached result that is taken for one of another setting, seed or slice."""
     cells = [
-        MapCell(scene, "neus", preset),
-        MapCell(scene, "imap", preset),
-        MapCell(scene, "neus", preset, seed=1),
-        MapCell(scene, "neus", preset, frames=":3"),
-        MapCell(scene, "neus", with_settings(preset, "mapping.neus.n_rays=9")),
+        MapCell(scenes[0], "neus", preset),
+        MapCell(scenes[0], "imap", preset),
+        MapCell(scenes[0], "neus", preset, seed=1),
+        MapCell(scenes[0], "neus", preset, frames=":3"),
+        MapCell(scenes[0], "neus", with_settings(preset, "mapping.neus.n_rays=9")),
+        MapCell(scenes[1], "neus", preset),
     ]
-    assert len({cell.key for cell in cells}) == 5
+    assert len({cell.key for cell in cells}) == 6
     untouched = with_settings(preset, "tracking.sdf.n_pixels=17")
-    assert MapCell(scene, "neus", untouched).key == cells[0].key
+    assert MapCell(scenes[0], "neus", untouched).key == cells[0].key
 
 
-def test_maps_and_their_scores(preset: Preset) -> None:
+def test_maps_and_their_scores(preset: Preset, scenes: list[Scene]) -> None:
     """Catches scores that are missing for a room whose truth is known, and maps made twice."""
-    scenes = open_scenes(preset)
-    scores = map_scenes(scenes, ["neus", "neus_plus"], preset)
-    assert scores["scene"].tolist() == [*preset.scenes.names] * 2
+    scores = map_scenes(scenes[1:], ["neus", "neus_plus"], preset)
+    assert scores["field"].tolist() == ["neus", "neus_plus"]
     assert scores[["seconds", "sdf_near_m", "sdf_free_m"]].notna().all().all()
-    found = map_scene(scenes[0], "neus", preset)
+    found = map_scene(scenes[1], "neus", preset)
     assert found.seconds == scores["seconds"][0]
     assert len(found.history) == 6
 
 
-def test_budgets(preset: Preset, scene: Scene) -> None:
+def test_budgets(preset: Preset, scenes: list[Scene]) -> None:
     """Steps of the paper's hardware, so many steps, or the clock: then no step count at all."""
-    by_steps = track_scenes([scene], ["vr_neus", "sdf"], preset, [10])
+    by_steps = track_scenes(scenes[1:], ["vr_neus", "sdf"], preset, [10])
     assert by_steps["steps"].tolist() == [6.8, 15.3]
     assert by_steps["rate_hz"].tolist() == [10, 10]
-    fixed = track_scenes([scene], ["sdf"], preset, steps=3, frames=":3")
+    fixed = track_scenes(scenes[1:], ["sdf"], preset, steps=3, frames=":3")
     assert (fixed["steps"][0], fixed["frames"][0]) == (3, 2)
-    clock = track_scenes([scene], ["sdf"], preset, [10], clock=True)
+    clock = track_scenes(scenes[1:], ["sdf"], preset, [10], clock=True)
     assert "wall clock" in clock["budget"][0]
     assert clock["steps"].isna().all()
 
 
-def test_methods_carry_their_settings(preset: Preset, scene: Scene) -> None:
+def test_methods_carry_their_settings(preset: Preset, own_scenes: list[Scene]) -> None:
     """Catches settings of a method that reach neither the run nor the map, or reach both."""
     more = Method("more pixels", "neus", "sdf", ("tracking.sdf.n_pixels=32",))
-    runs = track_scenes([scene], ["sdf", more], preset, [10])
+    runs = track_scenes(own_scenes[1:], ["sdf", more], preset, [10])
     assert runs["run"].nunique() == 2
-    assert len(list((scene.folder.parents[2] / "maps").glob("*/map.safetensors"))) == 1
+    assert len(list(own_scenes[1].folder.parents[2].glob("maps/*/map.safetensors"))) == 1
 
 
-def test_table_3(preset: Preset, tmp_path: Path) -> None:
+def test_table_3(tmp_path: Path, scenes: list[Scene]) -> None:
     """Catches rows of Table III that are other runs than those of Table I, or go without a map."""
     assert [METHODS[name].field for name in TABLE_3].count("neus_plus") == 3
     assert set(TABLE_1) < set(TABLE_3)
     assert RATES_3_HZ[0] == 30
-    settings = ("tracking.lm.n_pixels=32", "tracking.lm.n_restarts=0", "scenes.names=office")
-    settings += ("scenes.track_frames=:2",)
-    words = [word for s in (*TINY, *settings) for word in ("--set", s)]
-    out = tmp_path / "out"
-    assert main(["tables", "--beyond", "--workers", "1", "--out", str(out), *words]) == 0
-    assert len(pd.read_csv(out / "table_3.csv")) == 7 * 4
-    assert (out / "table_3.tex").read_text().count("NeuS+ baked (LM)") == 4
+    words = tiny_words("scenes.names=office", "scenes.track_frames=:2")
+    assert main(["tables", "--beyond", "--workers", "1", "--out", str(tmp_path), *words]) == 0
+    assert len(pd.read_csv(tmp_path / "table_3.csv")) == 7 * 4
+    assert (tmp_path / "table_3.tex").read_text().count("NeuS+ baked (LM)") == 4
 
 
 def test_a_run_is_made_again_from_its_command(
-    preset: Preset, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a command that lacks a setting, a seed or a slice: its map is made anew too."""
-    runs = track_scenes([scene], ["sdf"], preset, [10], frames="1:4", seeds=2)
+    runs = track_scenes(scenes[1:], ["sdf"], preset, [10], frames="1:4", seeds=2)
     assert runs["ate_m"].nunique() == 2  # one a seed
     monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "elsewhere"))
     monkeypatch.chdir(tmp_path)
@@ -136,19 +153,19 @@ def test_a_run_is_made_again_from_its_command(
     assert metrics["seed"] == 1
 
 
-def test_table_2_of_this_machine(preset: Preset, scene: Scene) -> None:
+def test_table_2_of_this_machine(preset: Preset, scenes: list[Scene]) -> None:
     """Catches empty cells: even a slow machine fits a step of 16 points into 20 ms sometimes."""
-    steps = measure_steps(preset, scene.read(":1"))
+    first = scenes[0].read(":1")
+    steps = measure_steps(preset, first)
     assert steps[["tracker", "n_pixels"]].to_numpy().tolist() == [["VR", 4], ["SDF", 8]]
     assert (steps["steps"] >= 0).all()
     assert default_pixels(preset) == {"VR": 8, "SDF": 16}
-    monkey_times = measure_step_times(preset, scene.read(":1"))
-    assert (monkey_times["ms_low"] <= monkey_times["ms_high"]).all()
+    times = measure_step_times(preset, first)
+    assert (times["ms_low"] <= times["ms_high"]).all()
+    assert (times["ms_low"] > 0).all()
 
 
-def test_missing_dataset_scene_is_named(
-    preset: Preset, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_missing_dataset_scene_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Catches an unhelpful error where the dataset was not downloaded."""
     monkeypatch.setenv("NBTRACK_DATA", str(tmp_path / "nothing"))
     with pytest.raises(MissingError, match=r"no folder .*breakfast_room.*data/README.md"):
@@ -159,7 +176,7 @@ def test_missing_dataset_scene_is_named(
     ("names", "told"),
     [
         ("['living_rom']", "unknown scene 'living_rom', and no such folder: did you mean"),
-        ("['office', 'office']", "office, office: give at least one, and of one"),
+        ("['office', 'office']", "office, office: give at least one, and of one name only one"),
         ("[]", r"\(none\): give at least one"),
     ],
 )
@@ -171,31 +188,35 @@ def test_wrong_scenes_are_told_before_anything_is_made(
         open_scenes(with_settings(preset, f"scenes.names={names}"))
 
 
-def test_a_damaged_scene_leaves_the_others(preset: Preset, capsys: pytest.CaptureFixture) -> None:
+def test_a_damaged_scene_leaves_the_others(
+    preset: Preset, own_scenes: list[Scene], capsys: pytest.CaptureFixture
+) -> None:
     """Catches one bad folder that stops the whole grid."""
-    scenes = open_scenes(preset)
-    (scenes[0].folder / "images" / "img2.png").unlink()
+    (own_scenes[0].folder / "images" / "img2.png").unlink()
     assert [s.name for s in open_scenes(preset)] == ["office"]
     told = capsys.readouterr().err
     assert "left out: living_room" in told
     assert "only one has [2]" in told
 
 
-def test_a_failed_map_tells_why_in_every_cell(preset: Preset) -> None:
+def test_a_failed_map_tells_why_in_every_cell(preset: Preset, own_scenes: list[Scene]) -> None:
     """Catches a reason that is lost between the map that failed and the runs that need it."""
-    scenes = open_scenes(preset)
-    for depth in (scenes[0].folder / "depth_filtered").iterdir():
+    for depth in (own_scenes[0].folder / "depth_filtered").iterdir():
         cv2.imwrite(str(depth), 0 * cv2.imread(str(depth), cv2.IMREAD_UNCHANGED))
-    results = track_scenes(scenes, TABLE_1, preset, execution=HERE)
+    execution = Execution(workers=1, keep_going=True)
+    results = track_scenes(own_scenes, ["sdf"], preset, execution=execution)
     failed = results[results["scene"] == "living_room"]
+    assert len(failed) == 2
     assert failed["failure"].str.contains("no pixel of living_room has a depth").all()
     assert failed["ate_m"].isna().all()
     assert results.loc[results["scene"] == "office", "ate_m"].notna().all()
     with pytest.raises(NbtrackError, match="no pixel"):
-        track_scenes(scenes, TABLE_1, preset)
+        track_scenes(own_scenes, ["sdf"], preset)
 
 
-def test_searches_from_afar(preset: Preset, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_searches_from_afar(
+    preset: Preset, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches starts that are off by another amount than they say, and shares without a verdict."""
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
     basin = importlib.import_module("basin")
@@ -203,8 +224,8 @@ def test_searches_from_afar(preset: Preset, scene: Scene, monkeypatch: pytest.Mo
         twist = basin.twist(seed, 20, 15)
         assert float(twist[:3].norm()) == pytest.approx(math.radians(15), abs=1e-6)
         assert float(twist[3:].norm()) == pytest.approx(0.2, abs=1e-6)
-    small = with_settings(preset, "tracking.lm.n_pixels=64")
-    found = basin.find_from_afar(scene, {"sdf": 2, "lm": 2}, small, ((0, 0), (4, 4)), 2, "::2")
+    methods = {"sdf": 2, "lm": 2}
+    found = basin.find_from_afar(scenes[1], methods, preset, ((0, 0), (4, 4)), 2, "::2")
     assert len(found) == 2 * 2 * 2
     shares = found.groupby(["method", "offset"], sort=False)["recovered"].mean()
     assert shares.index[0] == ("NeuS with SDF", "0 cm, 0°")
