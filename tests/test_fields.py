@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.errors import ConfigError
 from nbtrack.data.pixels import Rays
-from nbtrack.fields import FIELDS, NetworkSettings, NeusMapping, field_class, make_field
+from nbtrack.fields import NetworkSettings, NeusMapping, make_field
 from nbtrack.fields.base import LUMA, measured_mean, rendered_losses
 from nbtrack.fields.imap import LEAST_DEVIATION, rendering_losses
 from nbtrack.fields.rendering import Rendering
@@ -150,19 +149,6 @@ def test_losses_are_finite_and_fall(name: str, depth: float) -> None:
         assert terms["depth"] == terms["color"] == 0
 
 
-@BOTH
-def test_rendered_sizes(name: str) -> None:
-    """Catches samples and sections mixed up, and a pose that gets no gradient."""
-    field, rays = make_field(name, SMALL, ROOM, seed=0), random_rays(7, 1.0)
-    rays = replace(rays, origins_world=rays.origins_world.clone().requires_grad_())
-    rendering = field.render(rays, torch.linspace(0.1, 1.2, 9).expand(7, 9))
-    assert rendering.weights.shape == (7, 9 if name == "imap" else 8)
-    assert rendering.color.shape == (7, 3)
-    assert rendering.opacity.max() <= 1 + 1e-5
-    rendering.depth.sum().backward()
-    assert rays.origins_world.grad.abs().max() > 0
-
-
 def test_rendered_losses_by_hand() -> None:
     """Catches the variance for the deviation, a sum over channels, and rays that do not count.
     Ray 1: |1.5 - 1| / sqrt(0.25) = 1; ray 2: the deviation 0 is raised to the least allowed,
@@ -186,12 +172,3 @@ def test_rendered_losses_by_hand() -> None:
     assert list(map(float, of_neus.values())) == pytest.approx([0.3, 0.6], rel=1e-4)
     assert not terms["depth"].requires_grad  # the deviation is a weight, not something to enlarge
     assert measured_mean(torch.ones(3), torch.zeros(3)).item() == 0
-
-
-def test_registry() -> None:
-    """Catches a field that is not found by its name, or stands under another's."""
-    for name, registered in FIELDS.items():
-        assert registered.name == name
-        assert field_class(name) is registered
-    with pytest.raises(ConfigError, match="unknown field 'nues': did you mean 'neus'"):
-        field_class("nues")

@@ -55,44 +55,29 @@ def test_rotation_by_hand() -> None:
     assert trajectory_metrics(estimated, true)["rotation_rmse_deg"] == pytest.approx(12.5**0.5)
 
 
-def test_unaligned_error_is_the_offset() -> None:
-    """Catches an alignment that slipped into the paper's formula."""
-    true = wandering(20)
+@pytest.mark.parametrize("true", [wandering(20), poses([[1, 2, 3]] * 5), poses([[1, 2, 3]] * 2)])
+def test_an_offset_counts_unless_aligned(true: np.ndarray) -> None:
+    """Catches an alignment that slipped into the paper's formula, and NaN where nothing moves."""
     estimated = true.copy()
     estimated[:, :3, 3] += [0.3, -0.4, 1.2]  # length 1.3
     metrics = trajectory_metrics(estimated, true)
     assert metrics["ate_rmse_m"] == pytest.approx(1.3)
     assert metrics["ate_rmse_aligned_m"] == pytest.approx(0, abs=1e-12)
-    assert metrics["lost_frames"] == 19
-    np.testing.assert_allclose(pose_errors(estimated, true)[0], 1.3)
+    assert metrics["lost_frames"] == len(true) - 1
 
 
-def test_aligned_error_ignores_rigid_motion() -> None:
-    """Catches an alignment that is transposed, scaled, or in the wrong order."""
+def test_aligned_error_ignores_rigid_motion_alone() -> None:
+    """Catches an alignment that is transposed, or that hides a wrong scale or a mirror image."""
     true, estimated = wandering(30), wandering(30)
     estimated[:, :3, 3] += np.random.default_rng(5).normal(scale=0.1, size=(30, 3))
     before = trajectory_metrics(estimated, true)
     after = trajectory_metrics(wandering(1, seed=3)[0] @ estimated, true)
     assert after["ate_rmse_aligned_m"] == pytest.approx(before["ate_rmse_aligned_m"], rel=1e-9)
     assert after["ate_rmse_m"] > 2 * before["ate_rmse_m"]
-    assert before["ate_rmse_aligned_m"] <= before["ate_rmse_m"]
-
-
-def test_alignment_neither_scales_nor_mirrors() -> None:
-    """Catches an alignment that hides a scale error or turns a left hand into a right one."""
-    points = np.random.default_rng(1).normal(size=(40, 3))
-    centred = points - points.mean(axis=0)
+    points = true[:, :3, 3]
     doubled = align_rigidly(2 * points, points)
-    np.testing.assert_allclose(doubled - points.mean(axis=0), 2 * centred, atol=1e-12)
+    np.testing.assert_allclose(doubled, 2 * points - points.mean(axis=0), atol=1e-12)
     assert np.abs(align_rigidly(points * [1, 1, -1], points) - points).max() > 0.1
-
-
-@pytest.mark.parametrize("frames", [2, 5])
-def test_coincident_positions(frames: int) -> None:
-    """Catches a division by zero or a NaN when the camera does not move."""
-    metrics = trajectory_metrics(poses([[1, 2, 4]] * frames), poses([[1, 2, 3]] * frames))
-    assert metrics["ate_rmse_m"] == pytest.approx(1)
-    assert metrics["ate_rmse_aligned_m"] == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize("position", [0, 1])
@@ -104,13 +89,10 @@ def test_nan_names_the_frame(position: int) -> None:
         trajectory_metrics(*pair)
 
 
-WRONG_NUMBERS = [(1, 6, "1 estimated and 6 true"), (0, 0, "0 estimated")]
-
-
-@pytest.mark.parametrize(("estimated", "true", "found"), WRONG_NUMBERS)
-def test_numbers_of_poses(estimated: int, true: int, found: str) -> None:
+@pytest.mark.parametrize(("estimated", "true"), [(1, 6), (0, 0)])
+def test_numbers_of_poses(estimated: int, true: int) -> None:
     """Catches silent broadcasting of one pose over a whole trajectory."""
-    with pytest.raises(DataError, match=found):
+    with pytest.raises(DataError, match=f"{estimated} estimated and {true} true"):
         trajectory_metrics(wandering(6)[:estimated], wandering(6)[:true])
 
 

@@ -115,15 +115,6 @@ def test_sdf_weights_are_unbiased(cosine: float, deviation: float) -> None:
     assert rendering.depth_variance.item() == pytest.approx(variance, rel=1e-2)
 
 
-def test_sdf_weights_peak_at_the_zero_crossing(generator: torch.Generator) -> None:
-    """Catches weights that peak before the surface, as those of naive densities do."""
-    depths = ascending_depths(200, 40, generator)
-    surface = depths[:, 5] + torch.rand(200, generator=generator) * (depths[:, -2] - depths[:, 5])
-    sdf = surface[:, None] - depths
-    peak = weights_from_sdf(sdf, torch.tensor(30.0)).argmax(dim=-1)
-    assert torch.equal(peak, (sdf > 0).sum(dim=-1) - 1)
-
-
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e3])
 def test_extreme_values_stay_finite(scale: float, generator: torch.Generator) -> None:
     """Catches 0/0 deep inside objects and overflow in walls, in values and in gradients; negative
