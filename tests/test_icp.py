@@ -39,7 +39,7 @@ def two_pixel_sequence(depths_mm: list[list[int]], shades: list[list[int]]) -> R
 def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
     """A few clean frames of a furnished room, and their points."""
     folder = tmp_path_factory.mktemp("data") / "bedroom"
-    make_room("bedroom", folder, 12, 96, 72)
+    make_room("bedroom", folder, 8, 80, 60)
     sequence = read_sequence(folder, depth_folder="depth")
     return sequence, map_sequence("points", sequence, NetworkSettings(), PointMapping())
 

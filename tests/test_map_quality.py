@@ -21,7 +21,7 @@ ROOM = build_room("bedroom")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> RgbdSequence:
     """What a camera sees of it, with clean depth."""
     folder = tmp_path_factory.mktemp("data") / "bedroom"
-    make_room("bedroom", folder, 30, 48, 36)
+    make_room("bedroom", folder, 15, 40, 30)
     return read_sequence(folder, depth_folder="depth")
 
 
@@ -72,7 +72,7 @@ def test_a_map_without_surface_is_scored_without_mesh(sequence: RgbdSequence) ->
 
 def test_seen_points(sequence: RgbdSequence) -> None:
     """Catches wrong visibility: what a pixel measured is seen, what lies far behind it is not."""
-    T_world_camera, depth = sequence.T_world_camera[0], float(sequence.depth(0)[18, 24])
+    T_world_camera, depth = sequence.T_world_camera[0], float(sequence.depth(0)[15, 20])
     ahead = np.array([depth, depth / 2, depth + 0.5, -1.0])
     points = T_world_camera[:3, 3] + ahead[:, None] * T_world_camera[:3, 2]
     assert seen_by(points, sequence.select(slice(1))).tolist() == [True, True, False, False]

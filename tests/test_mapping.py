@@ -19,8 +19,8 @@ NETWORK = NetworkSettings(width=48, n_frequencies=32)
 
 
 def settings_of(field_name: str, **changes: float) -> MappingSettings:
-    """Few rays and samples; 30 iterations if nothing else is asked for."""
-    small = {"iterations": 30, "n_rays": 32, "n_stratified": 8, "n_surface": 4}
+    """Few rays and samples; 20 iterations if nothing else is asked for."""
+    small = {"iterations": 20, "n_rays": 32, "n_stratified": 8, "n_surface": 4}
     return field_class(field_name).Settings(**{**small, "learning_rate": 3e-3, **changes})
 
 
@@ -42,7 +42,7 @@ def wall_sequence(n_frames: int = 6, distance: float = 2.0) -> RgbdSequence:
 @cache
 def finished_wall() -> Map:
     """A NeuS map of the wall."""
-    settings = settings_of("neus", iterations=200, holdout_every=0)
+    settings = settings_of("neus", iterations=150, holdout_every=0)
     return map_sequence("neus", wall_sequence(), NETWORK, settings)
 
 
@@ -59,7 +59,7 @@ def test_neus_finds_a_wall() -> None:
 
 def test_imap_renders_a_wall() -> None:
     """Catches densities that do not absorb: the rendered depth must be the wall's."""
-    settings = settings_of("imap", iterations=200, n_rays=32, n_stratified=24, n_surface=8)
+    settings = settings_of("imap", iterations=120, n_stratified=20, n_surface=8)
     sequence = wall_sequence()
     mapped = map_sequence("imap", sequence, NETWORK, settings)
     view = mapped.field.render_view(sequence.intrinsics, sequence.T_world_camera[2])
@@ -114,9 +114,9 @@ def test_resume_equals_uninterrupted(field_name: str, tmp_path: Path) -> None:
     """Catches a checkpoint that forgets anything: batches, Adam's moments, the learning rate."""
     checkpoint, seen = tmp_path / "mapping.pt", []
     whole = map_wall(field_name, None)
-    map_killed(field_name, checkpoint, at=20)
+    map_killed(field_name, checkpoint, at=10)
     resumed = map_wall(field_name, checkpoint, lambda done, losses: seen.append(done))
-    assert seen == [21, 30]
+    assert seen == [11, 20]
     assert np.array_equal(resumed.history.to_numpy(), whole.history.to_numpy())
     assert resumed.key == whole.key
 
@@ -124,7 +124,7 @@ def test_resume_equals_uninterrupted(field_name: str, tmp_path: Path) -> None:
 def test_a_checkpoint_that_is_not_this_maps(tmp_path: Path) -> None:
     """Catches a silent continuation of another map, and a traceback from a damaged file."""
     checkpoint = tmp_path / "mapping.pt"
-    map_killed("neus", checkpoint, at=20)
+    map_killed("neus", checkpoint, at=10)
     with pytest.raises(DataError, match="made with another seed: remove it"):
         map_wall("neus", checkpoint, seed=1)
     with pytest.raises(DataError, match="made with another field, settings: remove it"):

@@ -79,8 +79,8 @@ def test_observed_distance_from_a_wall() -> None:
 
 def test_distances_are_learned_sooner_than_by_rendering_alone() -> None:
     """Catches supervision that is not wired in: after a few steps it must be nearer the truth."""
-    sequence, network = slanted_wall(10), NetworkSettings(width=32)
-    base = NeusPlusMapping(60, n_rays=48, n_stratified=8, n_surface=8, learning_rate=3e-3)
+    sequence, network = slanted_wall(4), NetworkSettings(width=32)
+    base = NeusPlusMapping(40, n_rays=48, n_stratified=8, n_surface=8, learning_rate=3e-3)
     errors = {}
     for name in ("neus", "neus_plus"):
         field = map_sequence(name, sequence, network, replace(base, n_surface_points=128)).field
