@@ -18,7 +18,7 @@ from nbtrack.synthetic.make import _end_with_parent
 from nbtrack.synthetic.motion import CROSSING_FRAMES, handheld_trajectory, motion_statistics
 from nbtrack.synthetic.primitives import Box, Cylinder, RoomShell, Sphere
 from nbtrack.synthetic.render import render_frame
-from nbtrack.synthetic.room import REPORTED_ROOMS, ROOMS, build_room, true_surface_points
+from nbtrack.synthetic.room import REPORTED_ROOMS, ROOMS, Room, build_room, true_surface_points
 from nbtrack.synthetic.sensor import add_kinect_noise, filter_depth
 
 SOLIDS = {
@@ -31,7 +31,8 @@ SOLIDS = {
 }
 FOCAL = 554.2562584220407  # 640 / (2 tan 30°)
 each_solid = pytest.mark.parametrize("solid", [*SOLIDS.values()], ids=SOLIDS)
-each_room = pytest.mark.parametrize("room", [*map(build_room, ROOMS)], ids=ROOMS)
+EACH_ROOM = {name: build_room(name) for name in ROOMS}
+each_room = pytest.mark.parametrize("room", [*EACH_ROOM.values()], ids=ROOMS)
 
 
 def numerical_gradient(sdf, points, step=1e-6):
@@ -40,18 +41,27 @@ def numerical_gradient(sdf, points, step=1e-6):
     return np.stack([sdf(points + o) - sdf(points - o) for o in offsets], axis=1) / (2 * step)
 
 
-@each_solid
-def test_solid_sdf_is_the_distance_to_its_surface(solid):
-    """Catches a distance that is only a bound, samples off the surface, an inside-out solid."""
+@pytest.mark.parametrize("body", [*SOLIDS.values(), *EACH_ROOM.values()], ids=[*SOLIDS, *ROOMS])
+def test_sdf_is_the_distance_to_the_surface(body):
+    """Catches a distance that is only a bound, a part left out, samples off the surface or of a
+    surface that nobody can see."""
     rng = np.random.default_rng(0)
-    surface = solid.sample_surface(30_000, rng)
-    assert np.abs(solid.sdf(surface)).max() < 1e-12
-    points = rng.uniform(-1.2, 1.2, (1000, 3))
-    excess = cKDTree(surface).query(points)[0] - np.abs(solid.sdf(points))
+    if isinstance(body, Room):
+        surface, points = true_surface_points(body, 20_000, 0), rng.uniform(*body.bounds, (500, 3))
+        points = points[body.sdf(points) > 1e-3]  # where bodies overlap it is a bound
+        nearby = np.minimum(body.sdf(points), 0.3)
+        np.testing.assert_allclose(body.sdf_up_to(points, 0.3), nearby, atol=1e-12)
+    else:
+        surface, points = body.sample_surface(20_000, rng), rng.uniform(-1.2, 1.2, (500, 3))
+    assert surface.shape == (20_000, 3)
+    assert np.abs(body.sdf(surface)).max() < 1e-6
+    excess = cKDTree(surface).query(points)[0] - np.abs(body.sdf(points))
     assert excess.min() > -1e-9
-    assert excess.max() < 0.04
-    inside, outside = solid.sdf(np.array([solid.center, [5.0, 5.0, 5.0]]))
-    assert (inside > 0 > outside) if isinstance(solid, RoomShell) else (inside < 0 < outside)
+    assert excess.max() < (0.25 if isinstance(body, Room) else 0.05)  # no wider hole in the samples
+    assert excess.mean() < 0.02
+    norms = np.linalg.norm(numerical_gradient(body.sdf, points), axis=1)
+    # Within a step of a place equally far from two surfaces the difference quotient is less.
+    assert (np.abs(norms - 1) < 1e-6).mean() > 0.995
 
 
 def test_values_by_hand():
@@ -92,25 +102,6 @@ def test_rays_stop_at_the_first_surface(solid):
     outward = numerical_gradient(solid.sdf, points + 1e-4 * normals)
     # The rest lies within the step of an edge.
     assert ((outward * normals).sum(axis=1) > 1 - 1e-6).mean() > 0.99
-
-
-@each_room
-def test_room_sdf_is_the_distance_to_the_true_surface(room):
-    """Catches a part left out, surface points that miss or invent surface, merely a bound."""
-    surface = true_surface_points(room, 20_000, 0)
-    assert surface.shape == (20_000, 3)
-    assert np.abs(room.sdf(surface)).max() < 1e-6
-    points = np.random.default_rng(2).uniform(*room.bounds, size=(500, 3))
-    points = points[room.sdf(points) > 1e-3]
-    distance = room.sdf(points)
-    excess = cKDTree(surface).query(points)[0] - distance
-    assert excess.min() > -1e-9
-    assert excess.max() < 0.25  # no hole between samples is wider
-    assert excess.mean() < 0.02
-    norms = np.linalg.norm(numerical_gradient(room.sdf, points), axis=1)
-    # Within a step of a place equally far from two surfaces the difference quotient is less.
-    assert (np.abs(norms - 1) < 1e-6).mean() > 0.995
-    np.testing.assert_allclose(room.sdf_up_to(points, 0.3), np.minimum(distance, 0.3), atol=1e-12)
 
 
 RECORDED = {  # camera's position (m), mean depth (m) and mean color of one view
