@@ -7,7 +7,7 @@ Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed run go
 """
 
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import replace
 
 import pandas as pd
 from basin import find_from_afar
@@ -25,37 +25,26 @@ from nbtrack.tables import write_table_3
 _COLUMNS = ["rate_hz", "method", "scene", "frames", "steps_per_frame", "seconds_per_frame", "ate_m"]
 _FIRST_60 = ":60"
 
-INGREDIENTS = (
+_CHANGES = {
+    "without colour": "tracking.lm.lambda_intensity=0",
+    "with narrow scales throughout": "tracking.lm.anneal=false",
+    "with f in place of f/|∇f|": "tracking.lm.divide_by_slope=false",
+    "from the previous pose": "tracking.lm.motion_model=previous_pose",
+    "from constant velocity": "tracking.lm.motion_model=constant_velocity",
+    "with four times the points": "tracking.lm.n_pixels=2048",
+    "in NeuS+ without rendering": "mapping.neus_plus.lambda_rendering=0",
+}
+# LM with one thing changed at a time.
+INGREDIENTS = [
     METHODS["lm"],
-    Method("without colour", "neus_plus", "lm", ("tracking.lm.lambda_intensity=0",)),
-    Method("with narrow scales throughout", "neus_plus", "lm", ("tracking.lm.anneal=false",)),
-    Method("with f in place of f/|∇f|", "neus_plus", "lm", ("tracking.lm.divide_by_slope=false",)),
-    Method(
-        "from the previous pose", "neus_plus", "lm", ("tracking.lm.motion_model=previous_pose",)
-    ),
-    Method(
-        "from constant velocity", "neus_plus", "lm", ("tracking.lm.motion_model=constant_velocity",)
-    ),
-    Method("with four times the points", "neus_plus", "lm", ("tracking.lm.n_pixels=2048",)),
-    Method(
-        "in NeuS+ without rendering", "neus_plus", "lm", ("mapping.neus_plus.lambda_rendering=0",)
-    ),
+    *(Method(label, "neus_plus", "lm", (setting,)) for label, setting in _CHANGES.items()),
     Method("in NeuS, as in the paper", "neus", "lm"),
-)
-"""LM with one thing changed at a time."""
-
-STARTS = tuple(
-    Method(f"{method.label}, constant velocity", method.field, method.tracker, (setting,))
-    for method, setting in (
-        (METHODS["vr"], "tracking.vr.motion_model=constant_velocity"),
-        (METHODS["sdf"], "tracking.sdf.motion_model=constant_velocity"),
-    )
-)
+]
 
 
 def write(folder: str, name: str, table: pd.DataFrame) -> None:
     """One file of paper_tables/."""
-    path: Path = tables_folder() / folder / f"{name}.csv"
+    path = tables_folder() / folder / f"{name}.csv"
     write_atomic(path, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     print(f"{folder}/{path.name}: {len(table)} rows")
 
@@ -64,7 +53,8 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     """Table III, the basin of convergence, and what each ingredient of LM adds."""
     results = track_scenes(scenes, TABLE_3, preset, RATES_3_HZ, frames=_FIRST_60)
     write("beyond", "table_3_cells", results[_COLUMNS])
-    note = f"Preset: smoke; budget: the paper's step counts; first 60 frames; {device()}."
+    device = device_name(choose_device())
+    note = f"Preset: smoke; budget: the paper's step counts; first 60 frames; {device}."
     write_table_3(tables_folder() / "beyond", results, note)
     # Times count: one run after the other. Other frames than above, so that none is cached.
     speed = track_scenes(scenes, TABLE_3, preset, [10], frames=":40", execution=Execution(1, 1))
@@ -81,8 +71,13 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
 
 def open_questions(scenes: Sequence[Scene], preset: Preset) -> None:
     """Steps against learning rates, the start of the search, VR in both maps, cost of mapping."""
+    from_velocity = []
+    for method in (METHODS["vr"], METHODS["sdf"]):
+        setting = f"tracking.{method.tracker}.motion_model=constant_velocity"
+        label = f"{method.label}, constant velocity"
+        from_velocity.append(replace(method, label=label, settings=(setting,)))
     write("open_questions", "steps_and_rates", steps_and_rates(scenes[:1], preset))
-    starts = track_scenes(scenes, ["vr", "sdf", *STARTS], preset, rates_hz=[10])
+    starts = track_scenes(scenes, ["vr", "sdf", *from_velocity], preset, rates_hz=[10])
     write("open_questions", "starts", starts[_COLUMNS])
     both = track_scenes(scenes, ["vr", "sdf", "vr_neus"], preset, rates_hz=[2], frames=_FIRST_60)
     write("open_questions", "vr_in_both_maps", both[_COLUMNS])
@@ -96,16 +91,13 @@ def steps_and_rates(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
     """
     parts = []
     for name in ("vr", "sdf"):
-        method, rates = METHODS[name], (5e-4, 1e-3)
+        method = METHODS[name]
         more = track_scenes(scenes, [method], preset).assign(how="more steps", factor=1.0)
         parts.append(more)
         for factor in (1.0, 2.0, 4.0):
-            keys = (
-                f"tracking.{method.tracker}.position_rate",
-                f"tracking.{method.tracker}.orientation_rate",
-            )
-            settings = tuple(f"{k}={factor * r!r}" for k, r in zip(keys, rates, strict=True))
-            larger = Method(method.label, method.field, method.tracker, settings)
+            rates = {"position_rate": factor * 5e-4, "orientation_rate": factor * 1e-3}
+            settings = tuple(f"tracking.{method.tracker}.{k}={v!r}" for k, v in rates.items())
+            larger = replace(method, settings=settings)
             found = track_scenes(scenes, [larger], preset, rates_hz=[10])
             parts.append(found.assign(how="larger steps", factor=factor))
     table = pd.concat(parts)
@@ -125,11 +117,6 @@ def mapping_time(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
             made = map_scenes(scenes, [field], shorter, execution=Execution(1, 1))
             parts.append(made.assign(iterations=iterations, samples=samples))
     return pd.concat(parts)[["field", "scene", "iterations", "samples", "seconds", "depth_l1_m"]]
-
-
-def device() -> str:
-    """What measured."""
-    return device_name(choose_device())
 
 
 if __name__ == "__main__":
