@@ -172,16 +172,12 @@ def _run_checkpoint(content: Any) -> Callable[[], None]:
     return write
 
 
-def _no_optimizer(content: dict) -> dict:
-    return {**content, "optimizer": {"state": {}, "param_groups": []}, "iteration": 2}
-
-
-def _without_generator(content: dict) -> dict:
+def _no_generator(content: dict) -> dict:
     return {name: value for name, value in content.items() if name != "generator"}
 
 
 def _earlier_map() -> None:
-    Path("map/map.safetensors").rename("map/map.json")
+    Path(MAP_FILE).rename("map/map.json")
 
 
 def _forget_the_map() -> None:
@@ -190,57 +186,46 @@ def _forget_the_map() -> None:
 
 
 KITTI = ["export", "run", "--to", "kitti", "poses.txt"]
+MESH = ["export", "map", "--to", "glb", "m.glb"]
+NO_OPTIMIZER = {"optimizer": {"state": {}, "param_groups": []}, "iteration": 2}
+RUN_OF_WORDS = {"estimates": "here", "rows": [], "tracker": {}, "budget": {}}
+CUT = "not a readable checkpoint"
+TRAJECTORY, MAP_FILE = "run/trajectory.txt", "map/map.safetensors"
 ROW = "0.1 1 2 3 0 0 0 1"
 FILES = {
     "no map": (_nothing, [*GIVEN, "nowhere"], "nowhere holds no map"),
     "empty folder": (_forget_the_map, [*GIVEN, "map"], "map holds no map"),
     "unfinished map": (_unfinished(), [*GIVEN, "map"], "map holds an unfinished map"),
     "a run for a map": (_nothing, [*GIVEN, "run"], "run holds no map"),
-    "checkpoint for a map": (
-        _nothing, [*GIVEN, "killed/mapping.pt"], "map again, and give the folder"),
-    "weights cut": (_cut("map/map.safetensors"), [*GIVEN, "map"], "not a readable map file"),
-    "finished map cut": (_cut("map/map.safetensors"), MAP, "not a readable map file"),
+    "checkpoint for a map": (_nothing, [*GIVEN, "killed/mapping.pt"], "map again, and give"),
+    "weights cut": (_cut(MAP_FILE), [*GIVEN, "map"], "not a readable map file"),
+    "finished map cut": (_cut(MAP_FILE), MAP, "not a readable map file"),
     "history cut": (_write("map/history.csv", "a"), [*GIVEN, "map"], "not a readable history"),
     "an earlier map": (_earlier_map, [*GIVEN, "map"], "map holds no map of this nbtrack"),
-    "checkpoint cut": (_unfinished(_cut(CHECKPOINT)), MAP, "not a readable checkpoint"),
-    "checkpoint is text": (
-        _unfinished(_write(CHECKPOINT, "text")), MAP, "not a readable checkpoint"),
-    "checkpoint is empty": (
-        _unfinished(_resave(lambda c: {})), MAP, "not a readable checkpoint"),
-    "checkpoint without state": (
-        _unfinished(_resave(_without_generator)), MAP, "KeyError: 'generator'"),
-    "checkpoint of another optimiser": (
-        _unfinished(_resave(_no_optimizer)), MAP, "not a readable checkpoint"),
-    "checkpoint of another seed": (
-        _unfinished(), [*MAP, "--seed", "5"], "made with another seed"),
-    "finished map of another seed": (
-        _nothing, [*MAP, "--seed", "5"], "made with another seed"),
-    "run checkpoint is a list": (_run_checkpoint([1]), OWN, "run.pt is not a readable checkpoint"),
-    "run checkpoint is empty": (_run_checkpoint({}), OWN, "run.pt is not a readable checkpoint"),
-    "run checkpoint of words": (
-        _run_checkpoint({"estimates": "here", "rows": [], "tracker": {}, "budget": {}}), OWN,
-        "run.pt is not a readable checkpoint"),
-    "trajectory gone": (lambda: Path("run/trajectory.txt").unlink(), KITTI, "no file run/traj"),
-    "trajectory empty": (_write("run/trajectory.txt", " "), KITTI, "trajectory.txt is empty"),
-    "trajectory of comments": (_write("run/trajectory.txt", "# a\n# b\n"), KITTI, "is empty"),
-    "a column less": (_write("run/trajectory.txt", ROW[:-2]), KITTI, "line 1 is"),
-    "a column more": (_write("run/trajectory.txt", f"{ROW} 1"), KITTI, "line 1 is"),
-    "a word": (_write("run/trajectory.txt", ROW.replace("3", "x")), KITTI, "line 1 is"),
-    "a NaN": (_write("run/trajectory.txt", ROW.replace("3", "nan")), KITTI, "not a finite pose"),
-    "no rotation": (_write("run/trajectory.txt", ROW[:-1] + "0"), KITTI, "norm 0"),
-    "second line": (
-        _write("run/trajectory.txt", f"{ROW}\n{ROW[:-2]}"), KITTI, "line 2 is"),
-    "a map for a run": (
-        _nothing, ["export", "map", "--to", "tum", "p.txt"], "map holds no finished run"),
-    "a run for a mesh": (
-        _nothing, ["export", "run", "--to", "glb", "m.glb"], "run holds no map"),
-    "unfinished run": (
-        lambda: Path("run/metrics.json").unlink(), KITTI, "run holds no finished run"),
-    "mesh cut": (
-        _cut("map/mesh.ply"), ["export", "map", "--to", "glb", "m.glb"], "not a readable mesh"),
-    "mesh is text": (
-        _write("map/mesh.ply", "ply"), ["export", "map", "--to", "glb", "m.glb"],
-        "not a readable mesh"),
+    "checkpoint cut": (_unfinished(_cut(CHECKPOINT)), MAP, CUT),
+    "checkpoint is text": (_unfinished(_write(CHECKPOINT, "text")), MAP, CUT),
+    "checkpoint is empty": (_unfinished(_resave(lambda c: {})), MAP, CUT),
+    "checkpoint without state": (_unfinished(_resave(_no_generator)), MAP, "KeyError: 'gener"),
+    "checkpoint of another optimiser": (_unfinished(_resave(lambda c: c | NO_OPTIMIZER)), MAP, CUT),
+    "checkpoint of another seed": (_unfinished(), [*MAP, "--seed", "5"], "made with another seed"),
+    "finished map of another seed": (_nothing, [*MAP, "--seed", "5"], "made with another seed"),
+    "run checkpoint is a list": (_run_checkpoint([1]), OWN, "run.pt is " + CUT),
+    "run checkpoint is empty": (_run_checkpoint({}), OWN, "run.pt is " + CUT),
+    "run checkpoint of words": (_run_checkpoint(RUN_OF_WORDS), OWN, "run.pt is " + CUT),
+    "trajectory gone": (lambda: Path(TRAJECTORY).unlink(), KITTI, "no file run/traj"),
+    "trajectory empty": (_write(TRAJECTORY, " "), KITTI, "trajectory.txt is empty"),
+    "trajectory of comments": (_write(TRAJECTORY, "# a\n# b\n"), KITTI, "is empty"),
+    "a column less": (_write(TRAJECTORY, ROW[:-2]), KITTI, "line 1 is"),
+    "a column more": (_write(TRAJECTORY, f"{ROW} 1"), KITTI, "line 1 is"),
+    "a word": (_write(TRAJECTORY, ROW.replace("3", "x")), KITTI, "line 1 is"),
+    "a NaN": (_write(TRAJECTORY, ROW.replace("3", "nan")), KITTI, "not a finite pose"),
+    "no rotation": (_write(TRAJECTORY, ROW[:-1] + "0"), KITTI, "norm 0"),
+    "second line": (_write(TRAJECTORY, f"{ROW}\n{ROW[:-2]}"), KITTI, "line 2 is"),
+    "a map for a run": (_nothing, ["export", "map", "--to", "tum", "p"], "map holds no finished"),
+    "a run for a mesh": (_nothing, ["export", "run", "--to", "glb", "m.glb"], "run holds no map"),
+    "unfinished run": (lambda: Path("run/metrics.json").unlink(), KITTI, "run holds no finished"),
+    "mesh cut": (_cut("map/mesh.ply"), MESH, "not a readable mesh"),
+    "mesh is text": (_write("map/mesh.ply", "ply"), MESH, "not a readable mesh"),
 }  # fmt: skip
 
 
@@ -295,14 +280,10 @@ OUTPUTS = {
 
 
 Fault = tuple[Callable[[], object], list[str], str]  # what is spoilt, the command, what it says
-FAULTS: dict[str, Fault] = {
-    f"config file: {case}": (
-        _write("settings.toml", text),
-        [*MAP, "--config", "settings.toml"],
-        says,
-    )
-    for case, (text, says) in TOML.items()
-}
+FAULTS: dict[str, Fault] = {}
+for case, (content, says) in TOML.items():
+    command = [*MAP, "--config", "settings.toml"]
+    FAULTS[f"config file: {case}"] = (_write("settings.toml", content), command, says)
 for case, (text, says) in SET_TEXTS.items():
     FAULTS[f"--set: {case}"] = (_nothing, [*MAP, "--set", text], says)
     FAULTS[f"NBTRACK_SET: {case}"] = (_environment("SET", f"'{text}'"), MAP, says)
