@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
+import pandas as pd
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
@@ -73,25 +74,18 @@ def fuse_points(
     """
     low = np.array(bounds.minimum)
     shape = np.floor((np.array(bounds.maximum) - low) / voxel).astype(np.int64) + 1
-    # Sorted voxel numbers, and for each the sums of x, y, z (m), red, green, blue, and one a pixel.
-    parts = [(np.empty(0, np.int64), np.empty((0, 7)))]
+    # For each voxel's number the sums of x, y, z (m), red, green, blue, and one a pixel.
+    parts = []
     for count, index in enumerate(frames.tolist(), start=1):
         points, colors = measured_points(sequence[index])
         voxels, inside = cells_of(points, low, shape, voxel)
         values = np.concatenate([points, colors, np.ones((len(points), 1))], axis=1)[inside]
-        parts.append(_summed(voxels, values))
+        parts.append(pd.DataFrame(values, voxels))
         if count % _FRAMES_AT_ONCE == 0 or count == len(frames):
-            parts = [_summed(*map(np.concatenate, zip(*parts, strict=True)))]
-    sums = parts[0][1]
+            parts = [pd.concat(parts).groupby(level=0).sum()]
+    sums = parts[0].to_numpy()
     means = torch.from_numpy((sums[:, :6] / sums[:, 6:]).astype(np.float32))
     return PointCloud(means[:, :3].contiguous(), means[:, 3:].contiguous(), voxel, bounds)
-
-
-def _summed(voxels, values):
-    """Sums of the rows that share a voxel."""
-    distinct, which = np.unique(voxels, return_inverse=True)
-    columns = [np.bincount(which, column, len(distinct)) for column in values.T]
-    return distinct, np.stack(columns, axis=1)
 
 
 def cells_of(

@@ -101,13 +101,10 @@ def read_map(path: Path | str) -> Map:
 
 def _read_file(file: Path) -> Map:
     """The map of a file. Raises ValueError, KeyError and others if it is not sound."""
-    try:
-        with safetensors.safe_open(file, "pt") as opened:
-            header = dict(json.loads((opened.metadata() or {})[_FORMAT]))
-            names = list(opened.keys())
-            tensors = {name: opened.get_tensor(name).clone().float() for name in names}
-    except (safetensors.SafetensorError, OSError) as error:
-        raise ValueError(error) from None
+    with safetensors.safe_open(file, "pt") as opened:
+        header = dict(json.loads((opened.metadata() or {})[_FORMAT]))
+        names = list(opened.keys())
+        tensors = {name: opened.get_tensor(name).clone().float() for name in names}
     if header.get("format_version") != _VERSION:
         raise ValueError(f"format {header.get('format_version')!r}; this nbtrack reads {_VERSION}")
     # A bit that flipped on a disk, or a number edited by hand, shows nowhere else.
