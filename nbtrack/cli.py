@@ -33,81 +33,80 @@ def a_count(text: str) -> int:
     return int(text)
 
 
-_FLAG = {"action": "store_true"}
-OPTIONS: dict[str, dict[str, Any]] = {
-    "sequence": {"help": "a folder, or the name of a room or dataset scene"},
-    "folder": {"type": a_path, "help": "a recording"},
-    "room": {"help": "its name"},
-    "source": {"type": a_path, "help": "folder of a run or a map, or a map file"},
-    "out": {"type": a_path, "help": "file or folder to write"},
-    "--format": {
-        "metavar": "NAME",
-        "help": "how the folder is laid out, as neural_rgbd, tum, replica, 7scenes, scannet or "
-        "plain (default: told by its files)",
-    },
-    "--field": {"help": "imap, neus or another"},
-    "--supervision": {
-        "help": "rendering, as in the paper (default); rendering+sdf teaches NeuS the distances too"
-    },
-    "--tracker": {"help": "vr, sdf, lm or another"},
-    "--rate": {"type": float, "metavar": "HZ", "help": "frames a second, by the clock"},
-    "--steps": {"type": float, "metavar": "N", "help": "optimisation steps a frame"},
-    "--pixels": {"type": int, "metavar": "N", "help": "pixels a step"},
-    "--bake": {
-        "type": float,
-        "metavar": "METRES",
-        "help": "ask the field on a grid of such cells, for example 0.04, not the network",
-    },
-    "--frames": {"default": ":", "help": "Python slice of frames, A:B:S"},
-    "--map-frames": {"help": "Python slice of frames to map (default: all)"},
-    "--map-from": {
-        "type": a_path,
-        "metavar": "MAP",
-        "help": "track in this map, of another recording of the room: a folder or a map file",
-    },
-    "--to": {
-        "metavar": "FORMAT",
-        "help": "tum, kitti: trajectory; ply, glb: coloured mesh; map: one file that opens "
-        "anywhere",
-    },
-    "--budget": {
-        "choices": ("steps", "clock"),
-        "default": "steps",
-        "help": "the paper's step counts (default), or this machine's own speed",
-    },
-    "--scenes": {"metavar": "A,B", "help": "only these scenes of the preset's kind"},
-    "--trackers": {"metavar": "A,B", "help": "rows (default: the paper's, vr,sdf)"},
-    "--beyond": {**_FLAG, "help": "Table III instead: the paper's methods and ours, 30 Hz too"},
-    "--seeds": {
-        "type": a_count,
-        "default": 1,
-        "metavar": "K",
-        "help": "K maps and runs a cell: mean ± deviation",
-    },
-    "--workers": {
-        "type": a_count,
-        "metavar": "N",
-        "help": "cells side by side (default: one a core, or one on a GPU)",
-    },
-    "--dask": {"metavar": "ADDRESS", "help": "run on a Dask cluster, as tcp://HOST:8786"},
-    "--in-place": {**_FLAG, "help": "store the outputs in the committed notebooks too"},
-    "--n-frames": {"type": int, "default": 300},
-    "--width": {"type": int, "default": 640, "help": "pixels; the height is 3/4 of it"},
-    "--depth-folder": {"help": "default: the format's; filtered before raw depth"},
-    "--poses": {"metavar": "FILE", "help": "pose file (default: the format's)"},
-    "--seed": {"type": a_seed, "default": 0},
-    "--out": {"type": a_path, "help": "where to write (default: in the cache or paper_tables)"},
-    "--device": {"help": "cuda, cuda:1, mps or cpu (default: the first there is)"},
-    "--threads": {"type": a_count, "metavar": "N", "help": "CPU threads (default: all cores)"},
-    "--preset": {"help": "smoke (default), synthetic or paper"},
-    "--config": {"type": a_path, "help": "TOML file of settings"},
-    "--set": {
-        "action": "append",
-        "default": [],
-        "metavar": "KEY=VALUE",
-        "dest": "settings",
-        "help": "one setting, for example mapping.neus.iterations=500; may be repeated",
-    },
+def _option(help: str, **more: Any) -> dict[str, Any]:
+    return {"help": help, **more}
+
+
+OPTIONS = {
+    "sequence": _option("a folder, or the name of a room or dataset scene"),
+    "folder": _option("a recording", type=a_path),
+    "room": _option("its name"),
+    "source": _option("folder of a run or a map, or a map file", type=a_path),
+    "out": _option("file or folder to write", type=a_path),
+    "--format": _option(
+        "how the folder is laid out, as neural_rgbd, tum, replica, 7scenes, scannet or plain "
+        "(default: told by its files)",
+        metavar="NAME",
+    ),
+    "--field": _option("imap, neus or another"),
+    "--supervision": _option(
+        "rendering, as in the paper (default); rendering+sdf teaches NeuS the distances too"
+    ),
+    "--tracker": _option("vr, sdf, lm or another"),
+    "--rate": _option("frames a second, by the clock", type=float, metavar="HZ"),
+    "--steps": _option("optimisation steps a frame", type=float, metavar="N"),
+    "--pixels": _option("pixels a step", type=int, metavar="N"),
+    "--bake": _option(
+        "ask the field on a grid of such cells, for example 0.04, not the network",
+        type=float,
+        metavar="METRES",
+    ),
+    "--frames": _option("Python slice of frames, A:B:S", default=":"),
+    "--map-frames": _option("Python slice of frames to map (default: all)"),
+    "--map-from": _option(
+        "track in this map, of another recording of the room: a folder or a map file",
+        type=a_path,
+        metavar="MAP",
+    ),
+    "--to": _option(
+        "tum, kitti: trajectory; ply, glb: coloured mesh; map: one file that opens anywhere",
+        metavar="FORMAT",
+    ),
+    "--budget": _option(
+        "the paper's step counts (default), or this machine's own speed",
+        choices=("steps", "clock"),
+        default="steps",
+    ),
+    "--scenes": _option("only these scenes of the preset's kind", metavar="A,B"),
+    "--trackers": _option("rows (default: the paper's, vr,sdf)", metavar="A,B"),
+    "--beyond": _option(
+        "Table III instead: the paper's methods and ours, 30 Hz too", action="store_true"
+    ),
+    "--seeds": _option(
+        "K maps and runs a cell: mean ± deviation", type=a_count, default=1, metavar="K"
+    ),
+    "--workers": _option(
+        "cells side by side (default: one a core, or one on a GPU)", type=a_count, metavar="N"
+    ),
+    "--dask": _option("run on a Dask cluster, as tcp://HOST:8786", metavar="ADDRESS"),
+    "--in-place": _option("store the outputs in the committed notebooks too", action="store_true"),
+    "--n-frames": _option("how many (default: 300)", type=int, default=300),
+    "--width": _option("pixels; the height is 3/4 of it", type=int, default=640),
+    "--depth-folder": _option("default: the format's; filtered before raw depth"),
+    "--poses": _option("pose file (default: the format's)", metavar="FILE"),
+    "--seed": _option("of all random numbers (default: 0)", type=a_seed, default=0),
+    "--out": _option("where to write (default: in the cache or paper_tables)", type=a_path),
+    "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
+    "--threads": _option("CPU threads (default: all cores)", type=a_count, metavar="N"),
+    "--preset": _option("smoke (default), synthetic or paper"),
+    "--config": _option("TOML file of settings", type=a_path),
+    "--set": _option(
+        "one setting, for example mapping.neus.iterations=500; may be repeated",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="settings",
+    ),
 }
 _PRESET = " --preset --config --set"
 _RUN = " --device --threads" + _PRESET

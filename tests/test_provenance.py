@@ -42,16 +42,13 @@ def test_what_changes_a_key(package: Path, file: str, old: str, new: str, counts
     assert (key() != before) == counts
 
 
-def test_a_class_of_somebody_else_counts() -> None:
-    """Catches a tracker or field outside the package whose edit is answered from the cache."""
+def test_what_else_counts() -> None:
+    """Catches a tracker or field outside the package whose edit is answered from the cache, and
+    results that do not tell the torch they were made with."""
     assert files.foreign_source(files.DataError) == ""
     assert "class Mine" in files.foreign_source(Mine)
+    assert set(files.versions()) == {"nbtrack", "torch", "python"}
 
 
 class Mine:
     """Stands for a tracker in a file of its own."""
-
-
-def test_versions_name_what_results_depend_on() -> None:
-    """Catches results that do not tell the torch they were made with."""
-    assert set(files.versions()) == {"nbtrack", "torch", "python"}

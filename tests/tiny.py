@@ -8,6 +8,7 @@ TINY = (
     "mapping.neus_plus.n_surface_points=16", "tracking.vr.n_pixels=8", "tracking.sdf.n_pixels=16",
     "tracking.lm.n_pixels=32", "tracking.lm.n_restarts=0",
     "tracking.vr.n_stratified=4", "tracking.icp.n_pixels=64",
+    "network.imap.n_frequencies=8", "network.neus.n_frequencies=8",
     "tables.pixels.vr=[4]", "tables.pixels.sdf=[8]",
 )  # fmt: skip
 
