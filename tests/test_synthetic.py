@@ -47,17 +47,17 @@ def test_sdf_is_the_distance_to_the_surface(body):
     surface that nobody can see."""
     rng = np.random.default_rng(0)
     if isinstance(body, Room):
-        surface, points = true_surface_points(body, 20_000, 0), rng.uniform(*body.bounds, (500, 3))
+        surface, points = true_surface_points(body, 10_000, 0), rng.uniform(*body.bounds, (500, 3))
         points = points[body.sdf(points) > 1e-3]  # where bodies overlap it is a bound
         nearby = np.minimum(body.sdf(points), 0.3)
         np.testing.assert_allclose(body.sdf_up_to(points, 0.3), nearby, atol=1e-12)
     else:
-        surface, points = body.sample_surface(20_000, rng), rng.uniform(-1.2, 1.2, (500, 3))
-    assert surface.shape == (20_000, 3)
+        surface, points = body.sample_surface(10_000, rng), rng.uniform(-1.2, 1.2, (500, 3))
+    assert surface.shape == (10_000, 3)
     assert np.abs(body.sdf(surface)).max() < 1e-6
     excess = cKDTree(surface).query(points)[0] - np.abs(body.sdf(points))
     assert excess.min() > -1e-9
-    assert excess.max() < (0.25 if isinstance(body, Room) else 0.05)  # no wider hole in the samples
+    assert excess.max() < (0.25 if isinstance(body, Room) else 0.06)  # no wider hole in the samples
     assert excess.mean() < 0.02
     norms = np.linalg.norm(numerical_gradient(body.sdf, points), axis=1)
     # Within a step of a place equally far from two surfaces the difference quotient is less.
