@@ -110,7 +110,6 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "camera is a list": (text("../cam_params.json", "[1, 2]"), r"holds \[1, 2\]: it must be"),
         "camera is no JSON": (text("../cam_params.json", "{w: 1200}"), "is no JSON"),
         "deep JSON": (text("../cam_params.json", "[" * 100_000), "is no JSON"),
-        "other scale": (camera("../cam_params.json", scale=1000.0), "'1000.0' but 6553.5 depth"),
         "depth is a JPEG": (image("results/depth000002.png", THREE_CHANNELS), "is uint16 of"),
         "an image less": (without("results/frame000003.jpg"), r"has 5 images but .* 6 .png.* \[3"),
     },

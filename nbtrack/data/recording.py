@@ -91,7 +91,7 @@ def open_recording(
         times = (numbers_of(colors) - numbers_of(colors[:1])) / declared.frame_rate
     poses, pose_files = _poses(folder, declared, pose_file, colors, times)
     pose_path = pose_files[0] if len(pose_files) == 1 else pose_files[0].parent
-    camera = _calibration(folder, declared)
+    camera = _calibration(folder, layout)
     texts = [*lists, *pose_files, camera.source, folder / DECLARATION_FILE]
     texts = [path for path in texts if path.is_file()]
     poses, what = checked_poses(poses, pose_path), (folder.resolve().name, layout, declared)
@@ -108,21 +108,13 @@ def _first_there(folder: Path, names: tuple[str, ...], what: str, layout: Format
     )
 
 
-def _calibration(folder: Path, declared: Declaration) -> Calibration:
+def _calibration(folder: Path, layout: Format) -> Calibration:
     """From the folder's own file, else that of a camera which is in the folder's name."""
-    layout = FORMATS[declared.format]
     known = [c for c in layout.known_cameras if c.source.name in folder.resolve().name]
     if known and not any((folder / name).is_file() for name in layout.cameras):
         return replace(known[0], source=folder / known[0].source)
     named = tuple(f"{c.source} in the folder's name" for c in layout.known_cameras)
-    path = _first_there(folder, layout.cameras + named, "calibration", layout)
-    camera, scale = read_calibration(path), declared.depth_scale
-    if camera.depth_scale not in (None, scale):
-        raise DataError(
-            f"{path}: scale is {str(camera.depth_scale)[:40]!r} but {scale:g} depth values a metre "
-            f"are in use: correct scale, or set depth_scale in {DECLARATION_FILE}"
-        )
-    return camera
+    return read_calibration(_first_there(folder, layout.cameras + named, "calibration", layout))
 
 
 def _poses(

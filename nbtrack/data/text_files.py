@@ -139,7 +139,6 @@ class Calibration:
     principal_point: tuple[float, float] | None = None  # None: the middle of the image
     size: tuple[int, int] | None = None  # width, height that the numbers hold for; None: any
     distortion: tuple[float, ...] = ()  # OpenCV's coefficients k1 k2 p1 p2 k3 ...; empty: none
-    depth_scale: Any = None  # depth values a metre, as some files state it beside the camera
 
     def for_size(self, width: int, height: int, image: Path) -> Intrinsics:
         """The camera of images of a size: scaled where the calibration is for another one.
@@ -162,9 +161,9 @@ def read_calibration(path: Path) -> Calibration:
 
     Text holds `fx fy cx cy` in a line, OpenCV's 3x3 camera matrix, that within a 4x4 matrix, or
     one focal length. JSON holds an object with fx, fy, cx, cy or Open3D's `intrinsic_matrix` (nine
-    numbers column by column) and, if known, width and height (or w and h), `distortion` and
-    `scale`; it may be the value of `camera`, as in Replica's files. Raises DataError if something
-    is missing, no number, or impossible.
+    numbers column by column) and, if known, width and height (or w and h) and `distortion`; it may
+    be the value of `camera`, as in Replica's files. Raises DataError if something is missing, no
+    number, or impossible.
     """
     K, others = _from_json(path) if path.suffix.lower() == ".json" else _from_text(path)
     fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
@@ -214,7 +213,7 @@ def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
             raise DataError(f"{text}, as in {_CAMERA}")
         return [float(value) for value in values]
 
-    others: dict[str, Any] = {"depth_scale": camera.get("scale")}
+    others: dict[str, Any] = {}
     if "distortion" in camera:
         others["distortion"] = tuple(numbers("distortion", 0, 4, 5, 8))
     if camera.keys() & {"width", "height"}:
