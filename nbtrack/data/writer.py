@@ -49,13 +49,10 @@ def write_sequence(
     # A sibling, so that the final rename stays within one file system.
     with TemporaryDirectory(".unfinished", f".{folder.name}.", folder.parent) as hidden:
         unfinished = Path(hidden) / "scene"
-        (unfinished / "images").mkdir(parents=True)
+        unfinished.mkdir()
         poses = []
-        for number, (color, depths_mm, T_world_camera) in enumerate(frames):
-            images = {"images/img": cv2.cvtColor(color, cv2.COLOR_RGB2BGR)}
-            images |= {f"{name}/depth": depth for name, depth in depths_mm.items()}
-            for prefix, image in images.items():
-                _write_image(unfinished / f"{prefix}{number}.png", image, camera)
+        for color, depths_mm, T_world_camera in frames:
+            _write_images(unfinished, len(poses), camera, color, depths_mm)
             poses.append(T_world_camera)
             progress(len(poses))
         if not poses:
@@ -70,15 +67,20 @@ def write_sequence(
                 raise
 
 
-def _write_image(path: Path, image: np.ndarray, camera: Intrinsics) -> None:
-    size = (camera.height, camera.width)
-    if image.shape[:2] != size:
-        raise DataError(
-            f"{path.name} is of shape {image.shape} but the camera {size}: write frames of one size"
-        )
-    path.parent.mkdir(exist_ok=True)
-    # The fastest compression: rooms are made often and read from a local disk.
-    cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tofile(path)
+def _write_images(
+    folder: Path, number: int, camera: Intrinsics, color: ColorImage, depths: dict[str, DepthImage]
+) -> None:
+    images = {"images/img": cv2.cvtColor(color, cv2.COLOR_RGB2BGR)}
+    for prefix, image in (images | {f"{name}/depth": depths[name] for name in depths}).items():
+        path, size = folder / f"{prefix}{number}.png", (camera.height, camera.width)
+        if image.shape[:2] != size:
+            raise DataError(
+                f"{path.name} is of shape {image.shape} but the camera {size}: write frames of one "
+                "size"
+            )
+        path.parent.mkdir(exist_ok=True)
+        # The fastest compression: rooms are made often and read from a local disk.
+        cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tofile(path)
 
 
 def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
