@@ -102,7 +102,7 @@ def test_maps_and_their_scores(preset: Preset, scenes: list[Scene]) -> None:
     assert scores["field"].tolist() == ["neus", "neus_plus"]
     assert scores[["seconds", "sdf_near_m", "sdf_free_m"]].notna().all().all()
     found = map_scene(scenes[1], "neus", preset)
-    assert found.seconds == scores["seconds"][0]
+    assert found.made["seconds"] == scores["seconds"][0]
     assert len(found.history) == 6
 
 

@@ -17,7 +17,7 @@ from nbtrack.experiments.notebooks import run_notebooks
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
 from nbtrack.experiments.runs import TrackCell
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
-from nbtrack.fields import field_class, supervised_field
+from nbtrack.fields import NetworkSettings, field_class, supervised_field
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.mapping.meshes import extract_mesh
 from nbtrack.tracking import check_pair, make_budget, tracker_class
@@ -37,8 +37,8 @@ def map_command(options: Namespace) -> None:
     _map(cell)
     found = cell.map()
     print(f"{cell.folder}: {found.field.label} map of {scene.name}")
-    print(f"  mapped in {found.seconds:.0f} s on {found.made['device']}")
-    _print_numbers({k: v for k, v in found.quality.items() if v is not None})
+    print(f"  mapped in {found.made['seconds']:.0f} s on {found.made['device']}")
+    _print_numbers({k: v for k, v in found.made["quality"].items() if v is not None})
     try:
         # Every tenth frame says enough of what has been seen: neighbours see the same.
         sequence = scene.read(options.frames)
@@ -55,7 +55,8 @@ def track_command(options: Namespace) -> None:
     field, given = _field_and_map(options)
     preset, map_frames = preset_of(options), options.map_frames or ":"
     if given is not None:
-        preset = replace(preset, network={**preset.network, field: given.network})
+        network = NetworkSettings(**given.made["network"])
+        preset = replace(preset, network={**preset.network, field: network})
     check_pair(options.tracker, field)
     budget = make_budget(options.steps, options.rate)  # told before a room is made
     scene = _checked_scene(options, preset, options.frames, map_frames)

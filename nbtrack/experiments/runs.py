@@ -126,7 +126,10 @@ class TrackCell(Cell):
         tracked = track_sequence(
             tracker, sequence, checkpoint, lambda done, m: report(done, f"off by {100 * m:.1f} cm")
         )
-        metrics = self._metrics(tracked) | {"map_seconds": made.seconds, "budget": str(budget)}
+        metrics = self._metrics(tracked) | {
+            "map_seconds": made.made["seconds"],
+            "budget": str(budget),
+        }
         metrics |= notes
         ids = tracked.frames["frame_id"].to_numpy()[1:]
         # The metrics come last: where they stand, the run is complete.

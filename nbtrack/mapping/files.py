@@ -32,26 +32,11 @@ class Map:
 
     field: AnyField
     camera: Intrinsics  # of the frames it was made from
-    # Plain values: scene, n_frames, seed, network, settings, seconds, misfit_m, device, versions;
-    # and whatever its maker adds: quality, for one.
+    # Plain values: scene, n_frames, seed, network, settings, misfit_m, device, versions, seconds
+    # spent in iterations; and whatever its maker adds, as `quality`, scores by name.
     made: dict[str, Any]
     # One row an iteration: weighted loss terms and diagnostics. Empty where it was not kept.
     history: pd.DataFrame = field(default_factory=pd.DataFrame)
-
-    @property
-    def seconds(self) -> float:
-        """Time spent in iterations, before and after a resume together."""
-        return self.made["seconds"]
-
-    @property
-    def quality(self) -> dict[str, float | None]:
-        """Scores by name; empty where the map was not scored."""
-        return self.made.get("quality", {})
-
-    @property
-    def network(self) -> NetworkSettings:
-        """Settings of the field's network."""
-        return NetworkSettings(**self.made["network"])
 
     @cached_property
     def key(self) -> str:

@@ -177,9 +177,8 @@ class Tracker(abc.ABC):
         began = time.perf_counter()
         self.begin(frame, starts)
         steps, loss = 0, torch.tensor(float("nan"))
-        for _ in self.budget.frame():
-            loss = self.step()
-            steps += 1
+        for step in self.budget.frame():
+            loss, steps = self.step(), step + 1
             if self.is_converged:
                 break
         synchronize(self.device)

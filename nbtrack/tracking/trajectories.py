@@ -48,7 +48,13 @@ def track_sequence(
     index in the sequence and the translation error (m). Raises DataError if there are fewer than
     two frames, or none of them has a measured depth.
     """
-    _check_trackable(sequence)
+    if len(sequence) < 2:
+        raise DataError(f"{sequence!r} is too short to track: give at least two frames")
+    if not sequence.depths_mm.any():
+        raise DataError(
+            f"no frame of {sequence.name} has a measured depth: check the depth folder and its "
+            "unit (uint16 millimetres), or choose other --frames"
+        )
     tracker.restart(sequence.T_world_camera[0])
     given = Estimate(sequence.T_world_camera[0], without_depth=not sequence[0].has_depth)
     rows = [_row(sequence, 0, given)]
@@ -69,16 +75,6 @@ def track_sequence(
                 files.write_atomic(checkpoint, buffer.getvalue())
                 last_saved = time.perf_counter()
     return Trajectory(np.stack(tracker.estimates), sequence.T_world_camera, pd.DataFrame(rows))
-
-
-def _check_trackable(sequence: RgbdSequence) -> None:
-    if len(sequence) < 2:
-        raise DataError(f"{sequence!r} is too short to track: give at least two frames")
-    if not sequence.depths_mm.any():
-        raise DataError(
-            f"no frame of {sequence.name} has a measured depth: check the depth folder and its "
-            "unit (uint16 millimetres), or choose other --frames"
-        )
 
 
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
