@@ -1,4 +1,6 @@
-"""A box seen from inside: a field whose answers are known exactly, and exact images of it."""
+"""Fields whose answers are known exactly, among them a box seen from inside; and exact images."""
+
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -9,53 +11,92 @@ from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import LearnedField
-from nbtrack.fields.rendering import Rendering, composite, weights_from_density
+from nbtrack.fields.rendering import Rendering, composite, weights_from_density, weights_from_sdf
 
 SHIFT = 0.03  # m behind the wall at which the density is half its largest
 
 
-class BoxRoom(LearnedField):
+def grey(points_world: Tensor) -> Tensor:
+    return torch.full_like(points_world, 0.5)
+
+
+class Formula(LearnedField):
+    """A distance (m) or density (1/m) and a colour, by formulas of points (n x 3)."""
+
+    name, label, surface_level = "formula", "Formula", 0.0
+    mapping_losses = None  # not asked for
+
+    def __init__(
+        self,
+        value: Callable[[Tensor], Tensor],
+        bounds: SceneBounds,
+        color: Callable[[Tensor], Tensor] = grey,
+        as_density: bool = False,
+    ) -> None:
+        super().__init__(bounds)
+        self.value, self.color, self.as_density = value, color, as_density
+
+    def forward(self, points_world: Tensor) -> tuple[Tensor, Tensor]:
+        return self.color(points_world), self.value(points_world)
+
+    def composite(self, colors: Tensor, values: Tensor, rays: Rays, depths: Tensor) -> Rendering:
+        if self.as_density:
+            lengths = rays.directions_world.norm(dim=-1)
+            return composite(weights_from_density(values, depths, lengths), colors, depths)
+        weights = weights_from_sdf(values, torch.tensor(50.0))
+        return composite(weights, colors[:, 1:], (depths[:, 1:] + depths[:, :-1]) / 2)
+
+
+class BoxRoom(Formula):
     """The inside of a box with smoothly coloured walls; as a distance or as a steep density."""
 
-    name, label, surface_level = "box", "box", 0.0
-    mapping_losses = None  # not asked for
+    name = label = "box"
 
     def __init__(self, as_density=False, half=(1.0, 0.8, 1.2), contrast=0.4) -> None:
         """Of half sides in metres."""
+        self.half = torch.tensor(half)
+
+        def distance(points: Tensor) -> Tensor:
+            return (self.half - points.abs()).amin(dim=-1)
+
+        def density(points: Tensor) -> Tensor:
+            # Light goes out at the wall on average: the shift was solved for numerically.
+            return 150 * torch.sigmoid((-distance(points) - SHIFT) / 0.02)
+
+        def color(points: Tensor) -> Tensor:
+            return 0.5 + contrast * torch.sin(3 * points)
+
         edges = tuple(side + 0.1 for side in half)
-        super().__init__(SceneBounds(tuple(-edge for edge in edges), edges))
-        self.as_density, self.half, self.contrast = as_density, torch.tensor(half), contrast
-
-    def color(self, points_world: Tensor) -> Tensor:
-        return 0.5 + self.contrast * torch.sin(3 * points_world)
-
-    def forward(self, points_world: Tensor) -> tuple[Tensor, Tensor]:
-        sdf = (self.half - points_world.abs()).amin(dim=-1)
-        # Light goes out at the wall on average: the shift was solved for numerically.
-        value = 150 * torch.sigmoid((-sdf - SHIFT) / 0.02) if self.as_density else sdf
-        return self.color(points_world), value
-
-    def composite(self, colors: Tensor, values: Tensor, rays: Rays, depths: Tensor) -> Rendering:
-        lengths = rays.directions_world.norm(dim=-1)
-        return composite(weights_from_density(values, depths, lengths), colors, depths)
+        bounds = SceneBounds(tuple(-edge for edge in edges), edges)
+        super().__init__(density if as_density else distance, bounds, color, as_density)
 
 
-def box_sequence(
-    offsets: list[list[float]], room: BoxRoom | None = None, height: int = 24
+def sequence_of(
+    depths_mm: np.ndarray, camera: Intrinsics, colors=None, poses=None, name="room"
 ) -> RgbdSequence:
-    """Exact images of a box room from cameras at offsets (m) from the middle, not rotated."""
-    room, width = room or BoxRoom(), height * 4 // 3
+    """Depth maps (frames, height, width) with grey images, from the origin along z, if not said."""
+    n, *size = depths_mm.shape
+    colors = np.full((n, *size, 3), 128, np.uint8) if colors is None else colors
+    poses = np.tile(np.eye(4), (n, 1, 1)) if poses is None else poses
+    depths_mm = depths_mm.round().astype(np.uint16)
+    return RgbdSequence(name, camera, colors, depths_mm, poses, np.arange(n))
+
+
+def box_sequence(places, room: BoxRoom | None = None, height: int = 24) -> RgbdSequence:
+    """Exact images of a box room, from offsets (n x 3, m) of its middle or poses (n x 4 x 4)."""
+    room, width, poses = room or BoxRoom(), height * 4 // 3, np.asarray(places, dtype=float)
+    if poses.ndim == 2:
+        poses = np.tile(np.eye(4), (len(places), 1, 1))
+        poses[:, :3, 3] = places
     camera = Intrinsics.from_focal(width, height, float(height))
     rows, columns = torch.ones(height, width).nonzero().T.view(2, height, width)
+    T_world_camera = torch.from_numpy(poses).float()[:, None, None]
     directions = pixel_directions(camera, columns, rows)
-    poses = np.tile(np.eye(4), (len(offsets), 1, 1))
-    poses[:, :3, 3] = offsets
-    offset = torch.tensor(offsets, dtype=torch.float32)[:, None, None]
-    depth = ((room.half * directions.sign() - offset) / directions).amin(dim=-1)
-    color = room.color(offset + depth[..., None] * directions)
-    colors, depths = (255 * color).round().byte().numpy(), (1000 * depth).round().numpy()
-    frame_ids = np.arange(len(offsets))
-    return RgbdSequence("box", camera, colors, depths.astype(np.uint16), poses, frame_ids)
+    rays = (T_world_camera[..., :3, :3] @ directions[..., None])[..., 0]
+    origin = T_world_camera[..., :3, 3]
+    depth = ((room.half * rays.sign() - origin) / rays).amin(dim=-1)
+    colors = (255 * room.color(origin + depth[..., None] * rays)).round().byte().numpy()
+    return sequence_of(1000 * depth.numpy(), camera, colors, poses, "box")
 
 
 def walk(n_frames: int, *room_and_height: BoxRoom | int) -> RgbdSequence:

@@ -50,6 +50,15 @@ def write_image(path: Path, image: np.ndarray) -> None:
     assert cv2.imwrite(str(path), np.ascontiguousarray(bgr), options)
 
 
+def along_rays(data: Source, unit: float = 1.0) -> Source:
+    """Depth as distances along the rays; `unit` values a millimetre."""
+    rows, columns = np.indices(data.depths_mm.shape[1:])
+    x = (columns + 0.5 - data.camera.cx) / data.camera.fx
+    y = (rows + 0.5 - data.camera.cy) / data.camera.fy
+    raw = np.rint(unit * data.depths_mm * np.sqrt(1 + x**2 + y**2)).astype(np.uint16)
+    return data._replace(depths_mm=raw)
+
+
 def matrix_text(matrix: np.ndarray) -> str:
     return "\n".join(" ".join(map(repr, row)) for row in np.atleast_2d(matrix).tolist()) + "\n"
 
@@ -59,6 +68,12 @@ def camera_matrix(camera: Intrinsics, size: int = 3) -> np.ndarray:
     K = np.eye(size)
     K[0, 0], K[1, 1], K[0, 2], K[1, 2] = camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5
     return K
+
+
+def camera_words(camera: Intrinsics, width: str, height: str) -> dict[str, float]:
+    """The same by name."""
+    sizes, K = {width: camera.width, height: camera.height}, camera_matrix(camera)
+    return {**sizes, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
 
 
 def tum_lines(times: np.ndarray, poses: np.ndarray, order: str = "xyzw") -> str:
@@ -87,9 +102,8 @@ def write_tum(folder: Path, data: Source) -> None:
     times = START + np.arange(len(data.poses)) / 10
     lists = {"rgb": ["# timestamp filename"], "depth": ["# timestamp filename"]}
     for i, time in enumerate(times):
-        for name, image, late in (
-            ("rgb", data.colors[i], 0.0), ("depth", 5 * data.depths_mm[i], 0.011)
-        ):  # fmt: skip
+        both = ("rgb", data.colors[i], 0.0), ("depth", 5 * data.depths_mm[i], 0.011)
+        for name, image, late in both:
             file = f"{name}/{time + late:.6f}.png"
             write_image(folder / file, image)
             lists[name].append(f"{time + late:.6f} {file}")
@@ -115,11 +129,7 @@ def write_replica(folder: Path, data: Source) -> None:
     names = "results/frame{:06}.jpg", "results/depth{:06}.png"
     write_images(folder, data._replace(depths_mm=raw), *names)
     (folder / "traj.txt").write_text(matrix_text(data.poses.reshape(-1, 16)))
-    camera = data.camera
-    params = {
-        "w": camera.width, "h": camera.height, "fx": camera.fx, "fy": camera.fy,
-        "cx": camera.cx - 0.5, "cy": camera.cy - 0.5, "scale": 6553.5,
-    }  # fmt: skip
+    params = {**camera_words(data.camera, "w", "h"), "scale": 6553.5}
     (folder.parent / "cam_params.json").write_text(json.dumps({"camera": params}))
 
 
@@ -146,11 +156,7 @@ def write_scannet(folder: Path, data: Source) -> None:
 
 def write_plain(folder: Path, data: Source) -> None:
     write_images(folder, data)
-    K, camera = camera_matrix(data.camera), data.camera
-    content = {
-        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
-        "cx": K[0, 2], "cy": K[1, 2],
-    }  # fmt: skip
+    content = camera_words(data.camera, "width", "height")
     (folder / "intrinsics.json").write_text(json.dumps(content))
     (folder / "trajectory.txt").write_text(tum_lines(np.arange(len(data.poses)) / 30, data.poses))
 

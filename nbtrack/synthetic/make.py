@@ -22,7 +22,7 @@ from nbtrack.synthetic.room import Room, build_room
 from nbtrack.synthetic.sensor import add_kinect_noise, filter_depth
 
 ROOM_FILE = "room.json"
-ROOM_VERSION = 1  # raise it when a room, the motion or the sensor model changes
+ROOM_VERSION = 2  # raise it when a room, the motion or the sensor model changes
 _AGAIN = "remove the folder and make the room again"
 FIELD_OF_VIEW = np.radians(60.0)  # horizontal, as in the Neural RGB-D dataset
 

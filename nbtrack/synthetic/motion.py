@@ -1,4 +1,4 @@
-"""Smooth trajectories like those of a hand-held 30 Hz camera that looks around a room."""
+"""Smooth trajectories like those of a hand-held 30 Hz camera carried through a room."""
 
 import numpy as np
 from jaxtyping import Float
@@ -16,10 +16,11 @@ CLEARANCE = 0.35  # m, least distance of the camera to any surface (our choice)
 _KNOT_SPACING = 0.35  # rad of turning between knots of the path, about 35 frames
 _BURST_FRAMES = 14  # frames between knots of the speed
 _CALIBRATION_FRAMES = 120  # shorter trajectories are the beginning of one of this length
-# Frames in which a walk with two places goes from one to the other. A camera turns by about half
-# a circle in that time, so that a walk that looks ahead in a doorway once does so again.
-CROSSING_FRAMES = 300
-_ATTEMPTS = 40
+# How far a seed moves the center of a path (m, along x and z) and turns its start (rad): paths of
+# two seeds cross each other and see the same side of the room.
+_CENTER_REACH, _HEADING_REACH = 0.3, 0.25
+_FLATTENING = 0.25  # width of the path's ellipse over its length
+_ATTEMPTS = 400
 
 
 def motion_statistics(T_world_camera: Poses) -> tuple[float, float, float, float]:
@@ -32,14 +33,15 @@ def motion_statistics(T_world_camera: Poses) -> tuple[float, float, float, float
 
 
 def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
-    """Camera-to-world poses (OpenCV axes) of a walk that looks around a room.
+    """Camera-to-world poses (OpenCV axes) of a walk through a room that turns to look around.
 
-    The camera orbits the middle of the room's free space and looks across it, so that it sees
-    furniture at 1.5 to 3 m while turning. Where the walk has a second place, the middle of the
-    orbit goes there and back, `CROSSING_FRAMES` each way. Radius, height (1.1 to 1.7 m),
-    direction, tilt and roll wander as cubic splines (twice continuously differentiable), the
-    speed varies up to threefold, and a hand's tremor of 1.5 to 5 Hz lies on top. Mean speeds over
-    the trajectory, or 120 frames if it is shorter, are `MEAN_STEP_MM` and `MEAN_STEP_DEG`.
+    The camera goes along a flat ellipse, 1.6 m long, in the middle of the room's free space, and
+    always looks across its center: from one end ahead, then to the side, and from the other end
+    back to where it came from, half a circle in about 280 frames. A seed moves and turns the
+    ellipse a little, so that two seeds give two paths past the same things. Reach, height (1.1 to
+    1.7 m), direction, tilt and roll wander as cubic splines (twice continuously differentiable),
+    the speed varies up to threefold, and a hand's tremor of 1.5 to 5 Hz lies on top. Mean speeds
+    over the trajectory, or 120 frames if it is shorter, are `MEAN_STEP_MM` and `MEAN_STEP_DEG`.
 
     Raises `NumericalError` where no path keeps `CLEARANCE`: the room is too full.
     Source: our choice; the statistics are those of hand-held RGB-D recordings.
@@ -66,8 +68,9 @@ def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses
     """Draw a path and its speed; adjust turning rate and radius until mean speeds are as wanted."""
     knots = np.arange(-2.0, 1.6 * length * np.radians(MEAN_STEP_DEG) / _KNOT_SPACING + 4.0)
     # Radius (relative), side (rad), yaw (rad), pitch (rad), roll (rad), height (m).
-    spread = np.array([0.25, 0.18, 0.07, 0.09, 0.025, 0.10])
+    spread = np.array([0.04, 0.05, 0.07, 0.09, 0.025, 0.05])
     values = spread * np.clip(rng.normal(size=(len(knots), 6)), -2.0, 2.0)
+    values[:, 3] += walk.pitch
     values[:, 5] = np.clip(values[:, 5] + rng.uniform(1.3, 1.5), 1.15, 1.65)
     path = CubicSpline(knots * _KNOT_SPACING, values)  # over the angle turned
     bursts = np.arange(-1.0, length / _BURST_FRAMES + 3.0)
@@ -75,10 +78,12 @@ def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses
     speed = np.exp(CubicSpline(bursts, values)(np.arange(length) / _BURST_FRAMES))
     speed /= speed.mean()
     tremor = _tremor(length, rng)
-    rate, radius = np.radians(0.5), 0.45
+    center = np.asarray(walk.center) + rng.uniform(-_CENTER_REACH, _CENTER_REACH, 2)
+    heading = walk.start_yaw + rng.uniform(-_HEADING_REACH, _HEADING_REACH)
+    rate, radius = np.radians(0.5), 0.7
     for _ in range(12):
         turned = rate * np.concatenate([[0.0], np.cumsum(speed)[:-1]])
-        poses = _poses(walk, turned, path(turned), radius, tremor)
+        poses = _poses(center, heading, walk.turn * turned, path(turned), radius, tremor)
         mean_mm, _, mean_deg, _ = motion_statistics(poses)
         rate *= np.clip(MEAN_STEP_DEG / mean_deg, 0.7, 1.4)
         radius *= np.clip(MEAN_STEP_MM / mean_mm, 0.7, 1.4)
@@ -94,22 +99,22 @@ def _tremor(length: int, rng: np.random.Generator) -> Float[np.ndarray, "n 6"]:
     return amplitude * waves.sum(axis=1)
 
 
-def _poses(walk: Walk, turned: Values, wander, radius: float, tremor) -> Poses:
-    """Poses of an orbit by the angle turned (rad), with what wanders and trembles, per frame."""
-    relative_radius, side, yaw_offset, pitch_offset, roll, height = wander.T
-    yaw = walk.start_yaw + walk.turn * turned + yaw_offset + tremor[:, 4]
-    pitch = walk.pitch + pitch_offset + tremor[:, 3]
-    # Opposite to the direction of view, so that the whole room lies before the camera.
-    from_center = walk.start_yaw + walk.turn * turned + side + np.pi
-    reach = radius * (1.0 + relative_radius)
-    # The orbit's middle rests for a moment at both places and is fastest between them.
-    crossed = 0.5 - 0.5 * np.cos(np.pi / CROSSING_FRAMES * np.arange(len(turned)))
-    start, end = np.asarray(walk.center), np.asarray(walk.end or walk.center)
-    x, z = (start + crossed[:, None] * (end - start)).T
+def _poses(center, heading: float, turned: Values, wander, radius: float, tremor) -> Poses:
+    """Poses along an ellipse by the angle turned (rad), with what wanders and trembles, per frame.
+
+    `center` (m) is x and z of the ellipse, `heading` (rad) the yaw from its first end to the other,
+    `radius` (m) half its length.
+    """
+    relative_radius, side, yaw_offset, pitch, roll, height = wander.T
+    yaw = heading + turned + yaw_offset + tremor[:, 4]
+    # Opposite to the direction of view, so that the room lies before the camera.
+    along, across = -np.cos(turned + side), -_FLATTENING * np.sin(turned + side)
+    axes = -np.array([[np.sin(heading), np.cos(heading)], [np.cos(heading), -np.sin(heading)]])
+    reach = radius * (1.0 + relative_radius[:, None])
+    x, z = (center + reach * (np.stack([along, across], axis=1) @ axes)).T
     poses = np.tile(np.eye(4), (len(turned), 1, 1))
-    poses[:, :3, :3] = _camera_axes(yaw, pitch, roll + tremor[:, 5])
-    position = [x - reach * np.sin(from_center), height, z - reach * np.cos(from_center)]
-    poses[:, :3, 3] = np.stack(position, axis=1) + tremor[:, :3]
+    poses[:, :3, :3] = _camera_axes(yaw, pitch + tremor[:, 3], roll + tremor[:, 5])
+    poses[:, :3, 3] = np.stack([x, height, z], axis=1) + tremor[:, :3]
     return poses
 
 

@@ -27,17 +27,12 @@ REPORTED_ROOMS: tuple[str, ...] = tuple(n for n in ROOMS if not _TABLES[n].get("
 
 @dataclass(frozen=True)
 class Walk:
-    """Where a camera may wander: it orbits a point and looks across it (see `motion`).
+    """Where a camera is carried: across the room near a point, turning (see `motion`)."""
 
-    With an `end` the point itself wanders between `center` and `end`. Their distance should be
-    1.0 to 1.3 m, so that wandering alone stays below the speed of a hand-held camera.
-    """
-
-    center: Pair  # m; x and z of the orbit's middle
-    start_yaw: float = 0.0  # rad; 0 looks along -z, positive turns left
+    center: Pair  # m; x and z
+    start_yaw: float = 0.0  # rad; 0 walks and looks along -z, positive turns left
     turn: int = 1  # +1 turns left, -1 right
     pitch: float = -0.3  # rad; mean tilt, negative looks down
-    end: Pair | None = None  # m; x and z of the orbit's middle half a period later
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import map_coordinates
 
 Depth = Float[np.ndarray, "h w"]
 
@@ -38,13 +39,15 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     lost = ~seen | _is_grazing(exact, focal)
     lost |= _is_edge(exact) & (rng.uniform(size=depth.shape) < EDGE_DROPOUT)
     shift = rng.normal(scale=LATERAL_NOISE / per_pixel, size=(2, height, width))
-    rows, columns = np.indices(depth.shape)
-    rows = np.clip(np.rint(rows + shift[0]).astype(np.int64), 0, height - 1)
-    columns = np.clip(np.rint(columns + shift[1]).astype(np.int64), 0, width - 1)
-    noisy = exact[rows, columns] + rng.normal(scale=DISPARITY_NOISE, size=depth.shape)
+    places = np.indices(depth.shape) + shift
+    # Between pixels: at a width of 96 the jitter is below a tenth of one.
+    looked_up, was_seen = (
+        map_coordinates(values, places, order=1, mode="nearest") for values in (exact, 1.0 * seen)
+    )
+    noisy = looked_up + rng.normal(scale=DISPARITY_NOISE, size=depth.shape)
     disparity = np.rint(noisy / DISPARITY_STEP) * DISPARITY_STEP
     measured = scale / np.maximum(disparity, DISPARITY_STEP)
-    lost |= (measured < RANGE[0]) | (measured > RANGE[1]) | ~seen[rows, columns]
+    lost |= (measured < RANGE[0]) | (measured > RANGE[1]) | (was_seen < 0.999)
     return np.where(lost, 0.0, measured)
 
 
