@@ -1,19 +1,20 @@
 """Direct supervision of the signed distance: its targets, and the field that they teach."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
+from box_room import sequence_of
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.pixels import PixelSampler, Rays
-from nbtrack.data.sequence import RgbdSequence
+from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import NetworkSettings, NeusPlusMapping, supervised_field
+from nbtrack.fields.neus import guided_depths
 from nbtrack.fields.neus_plus import ObservedDistance, distance_targets
 from nbtrack.mapping.fit import map_sequence
+from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
 
 CONFIG = NeusPlusMapping()
 CAMERA = Intrinsics.from_focal(64, 48, 48.0)
@@ -21,14 +22,8 @@ CAMERA = Intrinsics.from_focal(64, 48, 48.0)
 
 def slanted_wall(n_frames: int = 1) -> RgbdSequence:
     """A wall through (0, 0, 2) whose normal is turned by 45 degrees about y: z = 2 + x."""
-    _, columns = np.indices((48, 64))
-    x_over_z = (columns + 0.5 - 32) / 48
-    depth = 2 / (1 - x_over_z)
-    return RgbdSequence(
-        "slanted", CAMERA, np.full((n_frames, 48, 64, 3), 100, np.uint8),
-        np.tile((1000 * depth).round().astype(np.uint16), (n_frames, 1, 1)),
-        np.tile(np.eye(4), (n_frames, 1, 1)), np.arange(n_frames),
-    )  # fmt: skip
+    depth = 2000 / (1 - (np.arange(64) + 0.5 - 32) / 48)
+    return sequence_of(np.tile(depth, (n_frames, 48, 1)), CAMERA)
 
 
 def test_plane_distance_of_a_slanted_wall() -> None:
@@ -57,11 +52,15 @@ def test_targets_by_hand() -> None:
     rays = Rays(zeros, zeros, zeros, torch.tensor([2.0, 0.0]), torch.tensor([1.0, 0.0]))
     depths = torch.tensor([1.0, 1.9, 2.05, 2.3]).expand(2, 4)
     nearest = torch.tensor([0.4, 0.11, 0.06, 0.28]).expand(2, 4)
-    target, known = distance_targets(rays, depths, nearest, 0.05, CONFIG)
+    nowhere = torch.zeros(2, 4, dtype=torch.bool)
+    target, known = distance_targets(rays, depths, nearest, nowhere, CONFIG)
     # At 1 m a chair is nearer (0.4 m) than the wall (1 m).
     torch.testing.assert_close(target[0, :3], torch.tensor([0.4, 0.1, -0.05]))
     assert known[0].tolist() == [1.0, 1.0, 1.0, 0.0]
     assert known[1].sum() == 0
+    # A thin plate: a camera has seen the third sample's place to be free.
+    target, known = distance_targets(rays, depths, nearest, depths == 2.05, CONFIG)
+    assert known[0].tolist() == [1.0, 1.0, 0.0, 0.0]
 
 
 def test_observed_distance_from_a_wall() -> None:
@@ -70,25 +69,47 @@ def test_observed_distance_from_a_wall() -> None:
     bounds = SceneBounds((-1.5, -1.5, -0.1), (3.0, 1.5, 5.0))
     frames = np.arange(4)
     observed = ObservedDistance(slanted_wall(4), frames, bounds, torch.device("cpu"))
-    points = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.1, 0.1, 0.1], [0.0, 0.0, -9.0]])
-    found = observed(points)
-    expected = torch.tensor([0.707, 0.0, 1.414])
-    torch.testing.assert_close(found[:3], expected, atol=observed.voxel, rtol=0)
-    assert torch.isfinite(found).all()
+    points = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 0.6], [0.0, 0.0, 3.0]])
+    found, is_free = observed(points[None])
+    expected = torch.tensor([[0.707, 0.0, 0.99, 0.707]])
+    torch.testing.assert_close(found, expected, atol=0.04, rtol=0)
+    assert is_free.tolist() == [[True, False, True, False]]
+    assert torch.isfinite(observed(torch.full((1, 1, 3), -9.0))[0]).all()
+
+
+def test_targets_in_a_furnished_room() -> None:
+    """Catches planes believed beyond their own patch, or behind thin things: what was observed is
+    part of what is there, so that no distance may be taught that is clearly less than the truth;
+    nor one that is more, near what was observed."""
+    room, camera = build_room("office"), room_intrinsics(64, 48)
+    poses = handheld_trajectory(room, 40, 0)[::2]
+    depths = np.stack([1000 * render_frame(room, camera, pose)[1] for pose in poses])
+    sequence = sequence_of(depths, camera, poses=poses)
+    bounds, frames, generator = observed_bounds(sequence), np.arange(20), torch.Generator()
+    observed = ObservedDistance(sequence, frames, bounds, torch.device("cpu"))
+    sampler = PixelSampler(sequence, torch.device("cpu"))
+    rays = sampler.draw(1000, generator, torch.from_numpy(frames), tangent_planes=True)
+    depths = guided_depths(rays, bounds, CONFIG, generator)
+    target, known = distance_targets(rays, depths, *observed(rays.points(depths)), CONFIG)
+    points = rays.points(depths).flatten(0, 1).double().numpy()
+    true_sdf = torch.from_numpy(room.sdf(points)).view_as(depths)
+    error = (target - true_sdf)[known > 0]
+    assert (error < -0.02).float().mean() < 0.02
+    assert error[true_sdf[known > 0].abs() < 0.1].abs().mean() < 0.007
 
 
 def test_distances_are_learned_sooner_than_by_rendering_alone() -> None:
     """Catches supervision that is not wired in: after a few steps it must be nearer the truth."""
-    sequence, network = slanted_wall(4), NetworkSettings(width=32)
-    base = NeusPlusMapping(40, n_rays=48, n_stratified=8, n_surface=8, learning_rate=3e-3)
-    errors = {}
+    settings = NeusPlusMapping(
+        25, n_rays=32, n_stratified=8, n_surface=8, learning_rate=3e-3, n_surface_points=64
+    )
+    depth, errors = torch.linspace(0.5, 2.1, 17), []
+    points = torch.stack([torch.zeros(17), torch.zeros(17), depth], dim=-1)
     for name in ("neus", "neus_plus"):
-        field = map_sequence(name, sequence, network, replace(base, n_surface_points=128)).field
-        depth = torch.linspace(0.5, 2.1, 17)
-        points = torch.stack([torch.zeros(17), torch.zeros(17), depth], dim=-1)
-        with torch.no_grad():
-            errors[name] = (field(points)[1] - (2 - depth) / 2**0.5).abs().mean().item()
-    assert errors["neus_plus"] < 0.5 * errors["neus"]
+        network = NetworkSettings(width=32, n_frequencies=32)
+        field = map_sequence(name, slanted_wall(4), network, settings).field
+        errors.append((field(points)[1] - (2 - depth) / 2**0.5).abs().mean().item())
+    assert errors[1] < 0.5 * errors[0]
 
 
 def test_supervision_chooses_the_variant_of_a_field() -> None:

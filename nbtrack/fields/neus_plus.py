@@ -4,21 +4,26 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
-from torch import Generator
+from torch import Generator, Tensor
 
-from nbtrack.core.arrays import Frames, Points, RaySamples, Values
+from nbtrack.core.arrays import Frames, RaySamples
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Draw, Losses, measured_mean, rendered_losses
 from nbtrack.fields.neus import NeuSField, NeusMapping, guided_depths
-from nbtrack.fields.points import cells_of, measured_points
+from nbtrack.fields.points import cells_of, fuse_points
 
-_LEAST_VOXEL = 0.05  # m; finer cells hold too few points to tell a surface from noise
-_MOST_CELLS_A_SIDE = 256  # so that a large scene takes no more than some 60 MB
-_LEAST_POINTS = 3  # measured points that make a cell part of a surface: single ones are noise
+# Distances are kept at corners so far apart (m), unless there would be more of them a side, and
+# measured from the mean points of cells half as wide, of three or more: single ones are noise.
+_LEAST_VOXEL, _MOST_CELLS_A_SIDE, _LEAST_POINTS = 0.05, 128, 3
 _POINTS_PER_FRAME = 10_000  # about, on a regular grid of its pixels
+# How much the distances to a tangent plane and to the nearest point may differ for the plane to be
+# believed (m): by half a point voxel, and the cells' rounding of distances near the surface.
+_PLANE_TOLERANCE = 0.015
+_FREE_IN_FRONT, _ASKED_EVERY = 0.05, 5  # m in front of a measured depth; frames, for free space
 
 
 @dataclass(frozen=True)
@@ -53,8 +58,8 @@ class NeuSPlusField(NeuSField):
         depths = guided_depths(rays, self.bounds, settings, generator)
         surface = draw(settings.n_surface_points)
         colors, sdf = self.along(rays, depths)
-        nearest = self.observed(rays.points(depths).flatten(0, 1)).view_as(depths)
-        target, known = distance_targets(rays, depths, nearest, self.observed.voxel, settings)
+        nearest, is_free = self.observed(rays.points(depths))
+        target, known = distance_targets(rays, depths, nearest, is_free, settings)
         lambdas = settings.lambda_color, settings.lambda_depth
         lambdas = (settings.lambda_rendering * weight for weight in lambdas)
         rendering = self.composite(colors, sdf, rays, depths)
@@ -72,15 +77,20 @@ class NeuSPlusField(NeuSField):
 
 
 def distance_targets(
-    rays: Rays, depths: RaySamples, nearest: RaySamples, voxel: float, settings: NeusPlusMapping
+    rays: Rays,
+    depths: RaySamples,
+    nearest: RaySamples,
+    is_free: Bool[Tensor, "rays samples"],
+    settings: NeusPlusMapping,
 ) -> tuple[RaySamples, RaySamples]:
     """Signed distances (m) to aim at, and a mask of 0 and 1: where one is known.
 
     A measured pixel gives the distance from its tangent plane, (D - d) times the ray's length
     times the cosine of incidence: exact where the surface is flat, with noise that averages out.
     In front of the surface it only holds where no other surface is nearer; there, and where the
-    plane is not known, the distance `nearest` from any observed surface (m, known to a `voxel`)
-    takes its place. Just behind the surface the plane is continued; farther nothing is known.
+    plane is not known, the distance `nearest` from any observed point (m) takes its place. Just
+    behind the surface the plane is continued, unless a camera saw through the place: thin things
+    end there. Farther behind nothing is known.
 
     Source: distances along the ray as iSDF (Ortiz et al. 2022), nearest points as its "pc" bounds,
     but over all frames rather than one batch; the choice between them is ours.
@@ -88,47 +98,55 @@ def distance_targets(
     behind = (rays.depth[:, None] - depths).neg()
     plane = -behind * rays.plane_distance_per_depth[:, None]
     has_depth, has_plane = rays.depth[:, None] > 0, rays.plane_distance_per_depth[:, None] > 0
-    is_plane_nearest = has_plane & ((plane.abs() - nearest).abs() < 1.5 * voxel)
+    is_plane_nearest = has_plane & ((plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
     in_front, just_behind = behind < 0, (behind >= 0) & (plane > -settings.behind_band)
     target = torch.where(is_plane_nearest, plane, nearest)
-    is_free = in_front & (is_plane_nearest | (-behind > settings.surface_band))
-    known = has_depth & (is_free | (just_behind & is_plane_nearest))
+    in_front &= is_plane_nearest | (-behind > settings.surface_band)
+    known = has_depth & (in_front | (just_behind & is_plane_nearest & ~is_free))
     return target, known.float()
 
 
 class ObservedDistance:
-    """Unsigned distance from the observed surface, on a grid over the scene's bounds.
+    """Unsigned distance from the observed surface, and where cameras saw through, on a grid.
 
-    Cells that hold measured points are the surface, from which a Euclidean distance transform
-    measures. It is true to about a cell: for free space, not for the surface itself.
+    The grid covers the scene's bounds; at its corners distances are those from a mean of measured
+    points, the nearest by an exact Euclidean distance transform. Between corners they are right to
+    millimetres but for the last `voxel` before a surface, where tangent planes serve.
     """
 
     def __init__(
         self, sequence: RgbdSequence, frames: Frames, bounds: SceneBounds, device: torch.device
     ) -> None:
-        self.voxel = max(_LEAST_VOXEL, 2 * bounds.metres_per_unit / _MOST_CELLS_A_SIDE)
-        low = np.array(bounds.minimum)
-        shape = np.ceil((np.array(bounds.maximum) - low) / self.voxel).astype(int) + 1
-        counts = np.zeros(shape.prod(), dtype=np.int64)
+        low, high = np.array(bounds.minimum), np.array(bounds.maximum)
+        self.voxel = max(_LEAST_VOXEL, (high - low).max() / _MOST_CELLS_A_SIDE)
+        fine = self.voxel / 2
+        shape = np.ceil((high - low) / fine).astype(int) + 1
         n_pixels = sequence.intrinsics.width * sequence.intrinsics.height
         stride = max(1, round((n_pixels / _POINTS_PER_FRAME) ** 0.5))
-        for index in frames.tolist():
-            cells, _ = cells_of(measured_points(sequence[index], stride)[0], low, shape, self.voxel)
-            counts += np.bincount(cells, minlength=len(counts))
-        # A short recording must not lose its surfaces to the demand for several points.
-        is_surface = counts >= min(_LEAST_POINTS, counts.max())
-        distance = distance_transform_edt(~is_surface.reshape(shape), sampling=self.voxel)
-        self.distance = torch.from_numpy(distance.astype(np.float32)).to(device)
-        self.low = torch.tensor(low, dtype=torch.float32, device=device)
+        cloud = fuse_points(sequence, frames, bounds, fine, stride, _LEAST_POINTS)
+        points = cloud.points.double().numpy()
+        number = np.full(shape, -1)  # of each cell's point
+        cells, inside = cells_of(points, low, shape, fine)
+        number.flat[cells] = np.flatnonzero(inside)
+        place = distance_transform_edt(number < 0, return_distances=False, return_indices=True)
+        nearest = points[number[tuple(place[:, ::2, ::2, ::2])]]
+        corners = np.stack(np.indices(shape)[:, ::2, ::2, ::2], -1) * fine + low + fine / 2
+        distance = np.linalg.norm(corners - nearest, axis=-1)
+        corners = torch.from_numpy(corners.reshape(-1, 3)).float()
+        is_free = torch.zeros(len(corners), dtype=torch.bool)
+        for index in frames[::_ASKED_EVERY].tolist():
+            is_free |= sequence[index].depth_behind(corners) < -_FREE_IN_FRONT
+        values = torch.from_numpy(distance).float(), is_free.view(distance.shape).float()
+        self.values, self.low = torch.stack(values)[None].to(device), corners[0].to(device)
 
-    def __call__(self, points_world: Points) -> Values:
-        """Distance (m) at points (m, world frame); outside the grid that of its border."""
-        shape = torch.tensor(self.distance.shape, device=points_world.device)
-        position = (points_world - self.low) / self.voxel - 0.5
-        position = position.clamp_min(0).minimum((shape - 1).float() - 1e-3)
+    def __call__(
+        self, points_world: Float[Tensor, "rays samples 3"]
+    ) -> tuple[RaySamples, Bool[Tensor, "rays samples"]]:
+        """Distance (m) and whether it is free at points (m); outside those of the border."""
+        most = torch.tensor(self.values.shape[2:], device=points_world.device) - 1
         # grid_sample takes x, y, z of a volume indexed z, y, x, from -1 to 1.
-        normalized = (2 * position / (shape - 1) - 1).flip(-1)
-        sampled = torch.nn.functional.grid_sample(
-            self.distance[None, None], normalized[None, None, None], align_corners=True
-        )
-        return sampled.flatten()
+        normalized = (2 * (points_world - self.low) / (self.voxel * most) - 1).flip(-1)
+        distance, free = torch.nn.functional.grid_sample(
+            self.values, normalized[None, None], padding_mode="border", align_corners=True
+        )[0, :, 0]
+        return distance, free > 0.5

@@ -65,25 +65,32 @@ class PointCloud:
 
 
 def fuse_points(
-    sequence: RgbdSequence, frames: Frames, bounds: SceneBounds, voxel: float
+    sequence: RgbdSequence,
+    frames: Frames,
+    bounds: SceneBounds,
+    voxel: float,
+    stride: int = 1,
+    least: int = 1,
 ) -> PointCloud:
     """One point a voxel (m): mean position (m, world frame) and mean colour (in [0, 1]).
 
-    All of the frames' measured pixels inside the bounds count. The mean takes noise off, and leaves
-    planes where they are. Memory grows with the surface that was seen, not with the frames.
+    The frames' measured pixels inside the bounds count, `stride` apart, in voxels that have at
+    `least` so many of them (or as many as any has). The mean takes noise off, and leaves planes
+    where they are. Memory grows with the surface that was seen, not with the frames.
     """
     low = np.array(bounds.minimum)
     shape = np.floor((np.array(bounds.maximum) - low) / voxel).astype(np.int64) + 1
     # For each voxel's number the sums of x, y, z (m), red, green, blue, and one a pixel.
     parts = []
     for count, index in enumerate(frames.tolist(), start=1):
-        points, colors = measured_points(sequence[index])
+        points, colors = measured_points(sequence[index], stride)
         voxels, inside = cells_of(points, low, shape, voxel)
         values = np.concatenate([points, colors, np.ones((len(points), 1))], axis=1)[inside]
         parts.append(pd.DataFrame(values, voxels))
         if count % _FRAMES_AT_ONCE == 0 or count == len(frames):
             parts = [pd.concat(parts).groupby(level=0).sum()]
     sums = parts[0].to_numpy()
+    sums = sums[sums[:, 6] >= min(least, sums[:, 6].max(initial=0))]
     means = torch.from_numpy((sums[:, :6] / sums[:, 6:]).astype(np.float32))
     return PointCloud(means[:, :3].contiguous(), means[:, 3:].contiguous(), voxel, bounds)
 

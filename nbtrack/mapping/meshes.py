@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float
 from skimage.measure import marching_cubes
 
 from nbtrack.core.arrays import Frames
-from nbtrack.core.camera import project
 from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, PointCloud
@@ -75,16 +74,7 @@ def seen_by(
     """
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32))
     seen = torch.zeros(len(points), dtype=torch.bool)
-    camera = sequence.intrinsics
     frames = np.arange(len(sequence)) if frames is None else frames
     for index in frames[::_ASKED_EVERY].tolist():
-        T_world_camera = torch.from_numpy(sequence.T_world_camera[index]).float()
-        points_camera = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-        columns, rows, depth = project(camera, points_camera)
-        columns, rows = columns.round(), rows.round()
-        inside = (depth > 0) & (columns >= 0) & (rows >= 0)
-        inside &= (columns < camera.width) & (rows < camera.height)
-        measured = torch.from_numpy(sequence.depth(index))
-        at_pixel = measured[rows[inside].long(), columns[inside].long()]
-        seen[inside] |= (at_pixel > 0) & (depth[inside] < at_pixel + _SEEN_BEHIND)
+        seen |= sequence[index].depth_behind(points) < _SEEN_BEHIND
     return seen.numpy()
