@@ -44,7 +44,8 @@ def test_frames_of_equal_steps(fault: str) -> None:
 
 
 def test_mean_is_over_the_whole_frame() -> None:
-    """Catches stopping by the last step's time. Steps of 1/2, 1/8, 1/8, ... s.
+    """Catches stopping by the last step's time, and a resumed frame that starts although the mean
+    does not fit. Steps of 1/2, 1/8, 1/8, ... s.
 
     After 1: mean 1/2, left 1/2, go on. After 2: mean 5/16, left 3/8, go on. After 3: mean 1/4,
     left 1/4, go on. After 4: mean 7/32, left 1/8: stop, although a step of 1/8 would fit.
@@ -52,10 +53,6 @@ def test_mean_is_over_the_whole_frame() -> None:
     assert FakeClock().steps(1 / 2, 1 / 8) == 4
     assert FakeClock(2).steps(1 / 16) == 8  # 2 Hz is half a second, not two
     assert str(FakeClock(2).budget) == "wall clock, 500 ms per frame"
-
-
-def test_mean_is_carried_to_a_resumed_run() -> None:
-    """Catches a resumed frame that starts with a step although the mean does not fit."""
     clock, resumed = FakeClock(), FakeClock()
     assert clock.steps(2.0) == 1
     resumed.budget.memory = clock.budget.memory
@@ -88,17 +85,12 @@ COUNTS = {
 
 @pytest.mark.parametrize("steps", COUNTS)
 def test_fractions_accumulate(steps: float | int) -> None:
-    """Catches rounding of every frame, and step numbers that depend on earlier frames."""
+    """Catches rounding of every frame, drift of the sum, and numbers that go by other frames."""
     budget = StepBudget(steps)
     assert [list(budget.frame()) for _ in COUNTS[steps]] == [[*range(n)] for n in COUNTS[steps]]
     assert str(budget) == f"{steps:g} steps per frame"
-
-
-def test_a_thousand_frames_sum_exactly() -> None:
-    """Catches drift of the accumulated fraction."""
-    for steps in (0.1, 6.8, 14.125, 15.3, 31.3, 36.1, 79.3):
-        budget = StepBudget(steps)
-        assert sum(1 for _ in range(1000) for _ in budget.frame()) == round(steps * 1000)
+    budget = StepBudget(steps)
+    assert sum(1 for _ in range(1000) for _ in budget.frame()) == round(steps * 1000)
 
 
 def test_paper_steps() -> None:

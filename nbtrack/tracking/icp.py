@@ -27,8 +27,9 @@ _OPTIONS |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}
 
 @dataclass(frozen=True)
 class IcpSettings(TrackerSettings):
-    """`n_pixels` are points a frame."""
+    """Of ICP."""
 
+    n_pixels: int = 512  # points a frame; as many as LM's, so that their rows compare
     motion_model: str = "constant_velocity"
 
 

@@ -152,15 +152,22 @@ class LmTracker(Tracker):
 
 
 def _cheapest(searches: list[_Search], scales: Scales) -> _Search:
-    """That with the lowest robust cost, all at equal scales."""
-    return min(searches, key=lambda search: robust_cost(search.residuals, scales, 1.0))
+    """That with the lowest robust cost, all at equal scales, of those on the most points."""
+    level = max(search.level for search in searches)
+    finest = [search for search in searches if search.level == level]
+    return min(finest, key=lambda search: robust_cost(search.residuals, scales, 1.0))
 
 
 def _damped_step(search: _Search, weight: float) -> Float[Tensor, "6"]:
-    """The twist that solves (H + pull + damping diag H) twist = -(J'Wr + pull)."""
+    """The twist that solves (H + pull + damping diag H) twist = -(J'Wr + pull's gradient).
+
+    The pull is START_PULL times (1 - cos(angle) + offset^2 / 2) from the start of the search.
+    """
     matrix, vector = registration.normal_equations(search.residuals, search.scales, weight)
+    turned = search.T_world_camera[:3, :3] @ search.T_start[:3, :3].T
+    sines = (turned - turned.T)[[2, 0, 1], [1, 2, 0]] / 2  # the axis times sin(angle)
     offset = search.T_world_camera[:3, 3] - search.T_start[:3, 3]
-    vector[3:] += registration.START_PULL * offset.to(vector)
+    vector += registration.START_PULL * torch.cat([sines, offset]).to(vector)
     diagonal = matrix.diagonal()
     diagonal += registration.START_PULL + search.damping * diagonal
     return -torch.linalg.solve(matrix, vector).to(search.T_world_camera)

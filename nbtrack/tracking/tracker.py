@@ -174,10 +174,10 @@ class Tracker(abc.ABC):
             self.step()
             self.restore(state)
             synchronize(self.device)
-        began = time.perf_counter()
+        began, allowed = time.perf_counter(), self.budget.frame()
         self.begin(frame, starts)
         steps, loss = 0, torch.tensor(float("nan"))
-        for step in self.budget.frame():
+        for step in allowed:
             loss, steps = self.step(), step + 1
             if self.is_converged:
                 break
