@@ -98,7 +98,7 @@ OPTIONS = {
     "--out": _option("where to write (default: in the cache or paper_tables)", type=a_path),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
     "--threads": _option("CPU threads (default: all cores)", type=a_count, metavar="N"),
-    "--preset": _option("smoke (default), synthetic or paper"),
+    "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
     "--config": _option("TOML file of settings", type=a_path),
     "--set": _option(
         "one setting, for example mapping.neus.iterations=500; may be repeated",

@@ -1,10 +1,15 @@
 """Fixtures that several test modules ask for by name."""
 
+import errno
 import os
+import shutil
 from collections.abc import Iterator
+from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
+from finished import GIVEN, MAP, OWN, isolate
 
 
 @pytest.fixture(scope="module")
@@ -14,6 +19,15 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def few_scores() -> Iterator[None]:
+    """For tests that make many maps and do not look at what those are worth."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nbtrack.mapping.quality.POINTS_SCORED", 200)
+        patch.setattr("nbtrack.mapping.quality._MISFIT_FRAMES", 1)
+        yield
 
 
 @pytest.fixture(autouse=True)
@@ -26,3 +40,28 @@ def settings_stay_inside() -> Iterator[None]:
             del os.environ[name]
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results: a small map (`map`), the same as one file (`room`), one that was `killed`, a run in
+    the map (`run`), and a cache (`runs`)."""
+    from nbtrack.cli import main
+
+    folder = tmp_path_factory.mktemp("finished")
+    no_space = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with pytest.MonkeyPatch.context() as patch:
+        isolate(folder, patch)
+        with mock.patch("safetensors.torch.save", side_effect=no_space):
+            assert main([*MAP, "--out", "killed"]) == 2
+        for command in (MAP, ["export", "map", "--to", "map", "room"], OWN, [*GIVEN, "map"]):
+            assert main(command) == 0
+    return folder
+
+
+@pytest.fixture
+def work(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the finished results as the working folder."""
+    shutil.copytree(finished, tmp_path / "work")
+    isolate(tmp_path / "work", monkeypatch)
+    return tmp_path / "work"

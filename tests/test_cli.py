@@ -15,7 +15,7 @@ TINY = tiny_words("scenes.n_frames=6", "tracking.sdf.n_pixels=32")
 
 
 @pytest.fixture(autouse=True)
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def runs(few_scores: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache, and none of the caller's settings."""
     for name in ("NBTRACK_PRESET", "NBTRACK_CONFIG", "NBTRACK_SET", "NBTRACK_DATA"):
         monkeypatch.delenv(name, raising=False)
@@ -65,7 +65,8 @@ WRONG = {
     "preset": ("tables --preset smok", "did you mean 'smoke'"),
     "supervision": ("map living_room --field imap --supervision rendering+sdf",
                     "'imap' knows no supervision 'rendering+sdf'"),
-    "baked and rendered": (f"{ROOM} --tracker vr --steps 2 --bake 0.04", "a baked field cannot"),
+    "baked and rendered": (f"{ROOM} --tracker vr --steps 2 --bake 0.04",
+                           "did you mean 'tracking.lm.bake_voxel'"),
     "bake": (f"{ROOM} --tracker lm --steps 2 --bake -1",
              "tracking.lm.bake_voxel = -1.0: it must be 0 or more"),
     "field": ("map living_room --field imapp", "did you mean 'imap'"),

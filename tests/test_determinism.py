@@ -15,12 +15,12 @@ from nbtrack.mapping.fit import map_sequence
 from nbtrack.tracking import StepBudget, make_tracker, track_sequence, tracker_class
 
 PAIRS = {"vr": "imap", "sdf": "neus", "lm": "neus_plus"}
-SMALL = {"iterations": 12, "n_rays": 64, "n_stratified": 8, "n_surface": 8, "n_surface_points": 64}
+SMALL = {"iterations": 6, "n_rays": 32, "n_stratified": 8, "n_surface": 8, "n_surface_points": 64}
 
 
 def digest_of(tracker: str, seed: int) -> str:
     """Hash of a small map's weights and of the trajectory that is tracked in it."""
-    sequence = box_sequence([[0.004 * i, 0.002 * i, 0.0] for i in range(5)])
+    sequence = box_sequence([[0.004 * i, 0.002 * i, 0.0] for i in range(4)])
     mapping = field_class(PAIRS[tracker]).Settings()
     mapping = replace(mapping, **{k: v for k, v in SMALL.items() if hasattr(mapping, k)})
     network = NetworkSettings(width=24, n_frequencies=16)
@@ -42,7 +42,6 @@ def test_again_and_with_other_threads(tracker: str) -> None:
     """
     torch.set_num_threads(1)
     once = digest_of(tracker, 1)
-    assert digest_of(tracker, 1) == once
     assert digest_of(tracker, 2) != once
     torch.set_num_threads(2)
     assert digest_of(tracker, 1) == once

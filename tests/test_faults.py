@@ -6,7 +6,6 @@ import os
 import resource
 import shutil
 import signal
-import subprocess
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,53 +13,11 @@ from typing import Any
 
 import pytest
 import torch
+from finished import GIVEN, MAP, OWN, TRACK
 
 from nbtrack.cli import main
 
-SETTINGS = (
-    "scenes.n_frames=6", "scenes.width=32", "network.neus.width=16", "mapping.neus.iterations=8",
-    "mapping.neus.n_rays=16", "mapping.neus.holdout_every=0", "tracking.sdf.n_pixels=16",
-)  # fmt: skip
-SET = [word for setting in SETTINGS for word in ("--set", setting)]
-MAP = ["map", "living_room", "--field", "neus", "--out", "map", *SET]
-TRACK = ["track", "living_room", "--tracker", "sdf", "--steps", "2", "--out", "run", *SET]
-GIVEN = [*TRACK, "--map-from"]
-OWN = [*TRACK, "--field", "neus"]
 CHECKPOINT = "map/mapping.pt"
-
-
-def _no_space(*arguments: Any) -> None:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results to be spoilt or left alone: `map`, `room`, `killed`, `run`, and a cache."""
-    folder = tmp_path_factory.mktemp("finished")
-    with pytest.MonkeyPatch.context() as patch:
-        _isolate(folder, patch)
-        with pytest.MonkeyPatch.context() as full:
-            full.setattr("safetensors.torch.save", _no_space)
-            assert main([*MAP, "--out", "killed"]) == 2
-        for command in (MAP, ["export", "map", "--to", "map", "room"], OWN, [*GIVEN, "map"]):
-            assert main(command) == 0
-    return folder
-
-
-@pytest.fixture
-def work(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the finished results as the working folder."""
-    folder = tmp_path / "work"
-    shutil.copytree(finished, folder)
-    _isolate(folder, monkeypatch)
-    return folder
-
-
-def _isolate(folder: Path, patch: pytest.MonkeyPatch) -> None:
-    for name in ("PRESET", "CONFIG", "SET", "DATA", "DEVICE"):
-        patch.delenv(f"NBTRACK_{name}", raising=False)
-    patch.setenv("NBTRACK_RUNS", str(folder / "runs"))
-    patch.chdir(folder)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -220,6 +177,7 @@ FILES = {
     "a word": (_write(TRAJECTORY, ROW.replace("3", "x")), KITTI, "line 1 is"),
     "a NaN": (_write(TRAJECTORY, ROW.replace("3", "nan")), KITTI, "not a finite pose"),
     "no rotation": (_write(TRAJECTORY, ROW[:-1] + "0"), KITTI, "norm 0"),
+    "another order": (_write(TRAJECTORY, "0.5 0 0 1 1 2 3 4"), KITTI, "of norm 5.48"),
     "second line": (_write(TRAJECTORY, f"{ROW}\n{ROW[:-2]}"), KITTI, "line 2 is"),
     "a map for a run": (_nothing, ["export", "map", "--to", "tum", "p"], "map holds no finished"),
     "a run for a mesh": (_nothing, ["export", "run", "--to", "glb", "m.glb"], "run holds no map"),
@@ -339,20 +297,3 @@ def test_a_disk_that_fills_up_while_results_are_written(
                 command = ["export", source, "--to", kind, "new"]
                 assert_refused(work, capsys, command, "File too large")
     assert json.loads((work / "run/metrics.json").read_text())["frames"] == 5
-
-
-def test_a_full_disk(work: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """Catches the same on a real disk without room, where a small one can be mounted."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(disk)]
-    if os.geteuid() or subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("only root may mount a disk, and not everywhere")
-    try:
-        (disk / "filler").write_bytes(bytes(12_000))
-        before = contents(disk)
-        assert_refused(work, capsys, ["export", "map", "--to", "map", str(disk / "m.pt")], "No spa")
-        assert_refused(work, capsys, [*OWN, "--out", str(disk / "run")], "No space left")
-        assert contents(disk) == before
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)

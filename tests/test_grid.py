@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import dask
 import psutil
 import pytest
 from tiny import tiny_words
@@ -20,18 +21,18 @@ from nbtrack.experiments.cells import Cell, Report
 from nbtrack.experiments.grid import Execution, run_cells
 
 # Dask's own threads and sockets warn as they are torn down.
-pytestmark = pytest.mark.filterwarnings("default")
+pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.usefixtures("few_scores")]
 
 
 @dataclass(frozen=True)
 class Square(Cell):
-    """A cell of two units that squares a number; or fails, or takes its process with it."""
+    """A cell that squares a number; or fails, or takes its process with it."""
 
     number: int
     how: str = "well"
     needs: "Square | None" = None
     is_done: bool = False
-    kind, key, units, cost = "squares", "0", 2, 2.0
+    kind, key, cost = "squares", "0", 2.0
 
     @property
     def name(self) -> str:
@@ -45,9 +46,9 @@ class Square(Cell):
             raise DataError(f"depth{self.number}.png is empty")
         if self.how == "deadly":
             os._exit(1)
-        for unit in range(self.units):
+        for share in (0.0, 0.5):
             time.sleep(0.4 if self.how == "slowly" else 0)
-            report(unit, "half")
+            report(share, "half")
         return self.result()
 
 
@@ -59,13 +60,17 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    """Of a scheduler with two workers in processes of their own."""
+    """Of a scheduler with two workers in processes of their own, forked with all imports done."""
     from distributed import LocalCluster
+    from distributed.utils import get_mp_context
 
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
-    ) as cluster:
-        yield cluster.scheduler_address
+    settings = {"worker.multiprocessing-method": "forkserver", "scheduler.allowed-failures": 0}
+    with dask.config.set({f"distributed.{key}": value for key, value in settings.items()}):
+        get_mp_context().set_forkserver_preload([__name__, "torch._dynamo", "trimesh"])
+        with LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+        ) as cluster:
+            yield cluster.scheduler_address
 
 
 @pytest.fixture(params=["here", "on a cluster"])
@@ -98,10 +103,10 @@ def test_others_go_on_after_a_failure(execution: dict) -> None:
     assert results[2] == 9
 
 
-def test_a_worker_that_dies_is_explained() -> None:
+def test_a_worker_that_dies_is_explained(address: str) -> None:
     """Catches a traceback, or waiting for ever, where the system took a worker away."""
     with pytest.raises(NbtrackError, match="a worker process died at square 7") as caught:
-        run_cells([Square(7, "deadly"), Square(2)], "dying", Execution(workers=2))
+        run_cells([Square(7, "deadly"), Square(2)], "dying", Execution(dask=address))
     assert "\n" not in str(caught.value)
 
 

@@ -10,7 +10,7 @@ import random
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pandas as pd
@@ -53,51 +53,46 @@ for line in sys.stdin:
     print(json.dumps([status, time.monotonic() - start]), flush=True)
 """
 SET = tiny_words(
-    "mapping.neus.iterations=25", "mapping.imap.iterations=25", "mapping.neus.holdout_every=0",
-    "mapping.imap.holdout_every=0", "scenes.n_frames=10", "tables.rates_hz=[10]",
+    "mapping.neus.iterations=15", "mapping.imap.iterations=15", "mapping.neus.holdout_every=0",
+    "mapping.imap.holdout_every=0", "scenes.n_frames=8", "tables.rates_hz=[10]",
 )  # fmt: skip
 COMMANDS = {
     "map": ["map", "living_room", "--field", "neus", "--out", "out", *SET],
-    "track": ["track", "living_room", "--field", "neus", "--tracker", "lm", "--steps", "6",
+    "track": ["track", "living_room", "--field", "neus", "--tracker", "lm", "--steps", "4",
               "--out", "out", *SET],
     "tables": ["tables", "--workers", "1", "--out", "out", "--scenes", "living_room", "--set",
                "scenes.track_frames=:4", *SET],
 }  # fmt: skip
 
 
-class Forker:
+Run = Callable[..., tuple[int, float]]
+"""Exit status and time (s) of a command in a folder, killed after some seconds if given."""
+
+
+@pytest.fixture(scope="module")
+def run() -> Iterator[Run]:
     """Runs commands in children of one process that has imported the package."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("NBTRACK_")}
+    kept["PYTHONPATH"] = str(Path(__file__).parents[1])
+    forker = subprocess.Popen(
+        [sys.executable, "-c", _FORKER], text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        env=kept,
+    )  # fmt: skip
 
-    def __init__(self) -> None:
-        kept = {k: v for k, v in os.environ.items() if not k.startswith("NBTRACK_")}
-        kept["PYTHONPATH"] = str(Path(__file__).parents[1])
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", _FORKER], text=True, stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, env=kept,
-        )  # fmt: skip
+    def run(folder: Path, arguments: list[str], seconds: float | None = None) -> tuple[int, float]:
+        forker.stdin.write(json.dumps([str(folder), arguments, seconds]) + "\n")
+        forker.stdin.flush()
+        return tuple(json.loads(forker.stdout.readline()))
 
-    def run(
-        self, folder: Path, arguments: list[str], seconds: float | None = None
-    ) -> tuple[int, float]:
-        """Exit status and time (s) of a command in a folder, killed after some seconds if given."""
-        self.process.stdin.write(json.dumps([str(folder), arguments, seconds]) + "\n")
-        self.process.stdin.flush()
-        status, ran = json.loads(self.process.stdout.readline())
-        return status, ran
+    yield run
+    forker.communicate()  # ends with its input
 
 
 @pytest.fixture(scope="module")
-def forker() -> Iterator[Forker]:
-    started = Forker()
-    yield started
-    started.process.communicate()  # ends with its input
-
-
-@pytest.fixture(scope="module")
-def room(forker: Forker, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def room(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The room that all commands work on: what is killed is the command's own work."""
     folder = tmp_path_factory.mktemp("room")
-    assert forker.run(folder, [*COMMANDS["map"], "--frames", ":2"])[0] == 0
+    assert run(folder, [*COMMANDS["map"], "--frames", ":2"])[0] == 0
     return folder / "runs" / "rooms"
 
 
@@ -115,26 +110,26 @@ def result(folder: Path) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_killed_and_told_again(name: str, forker: Forker, room: Path, tmp_path: Path) -> None:
+def test_killed_and_told_again(name: str, run: Run, room: Path, tmp_path: Path) -> None:
     """Catches half-written results that count, and runs that go on otherwise than they began."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
         shutil.copytree(room, folder / "runs" / "rooms")
-    status, seconds = forker.run(whole, COMMANDS[name])
+    status, seconds = run(whole, COMMANDS[name])
     assert status == 0
     expected = result(whole / "out")
     assert len(expected) >= 3
     rng, kills = random.Random(name), 0
     while kills < max(1, KILLS // len(COMMANDS)):
-        status, _ = forker.run(killed, COMMANDS[name], rng.uniform(0.02, 0.7) * seconds)
+        status, _ = run(killed, COMMANDS[name], rng.uniform(0.02, 0.7) * seconds)
         assert status in (0, -9)
         kills += status == -9
         if status == 0:  # it ended before the kill: the next one begins from nothing
             assert result(killed / "out") == expected
             shutil.rmtree(killed)
             shutil.copytree(room, killed / "runs" / "rooms")
-    assert forker.run(killed, COMMANDS[name])[0] == 0
+    assert run(killed, COMMANDS[name])[0] == 0
     assert result(killed / "out") == expected
     assert len(list((killed / "out").rglob(".*.tmp"))) <= kills
     if name == "track":
-        assert len(read_tum(killed / "out/trajectory.txt")[0]) == 9
+        assert len(read_tum(killed / "out/trajectory.txt")[0]) == 7

@@ -62,7 +62,7 @@ def own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def test_a_row_in_both_tables(
-    own_file: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    few_scores: None, own_file: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches an extension that needs more than its own file: presets, layouts, registries."""
     assert OWN.count("\n") <= 40

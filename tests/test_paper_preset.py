@@ -19,7 +19,7 @@ WIDTH, HEIGHT = 32, 24
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(few_scores: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine folders in the dataset's layout, under its names; what they show is one room of ours."""
     folder = tmp_path_factory.mktemp("neural_rgbd")
     frames = list(room_frames(build_room("living_room"), N_FRAMES, WIDTH, HEIGHT, seed=0))
@@ -37,7 +37,8 @@ def run(monkeypatch: pytest.MonkeyPatch, dataset: Path, folder: Path) -> int:
     monkeypatch.setenv("NBTRACK_DATA", str(dataset))
     kept = [s for s in TINY if not s.startswith(("scenes.", "tables.rates"))]
     kept += ["scenes.track_frames=9:12", "tables.rates_hz=10"]
-    kept += [f"mapping.{field}.holdout_every=0" for field in ("imap", "neus")]
+    for field in ("imap", "neus"):
+        kept += [f"mapping.{field}.holdout_every=0", f"mapping.{field}.iterations=2"]
     words = [word for setting in kept for word in ("--set", setting)]
     return main(
         ["tables", "--preset", "paper", "--workers", "1", "--out", str(folder / "out"), *words]

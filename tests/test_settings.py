@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from nbtrack.core.errors import ConfigError, MissingError
+from nbtrack.core.errors import ConfigError
 from nbtrack.core.files import fingerprint
 from nbtrack.core.settings import as_dict, changed_settings, with_settings
 from nbtrack.experiments.methods import METHODS, TABLE_1
@@ -34,14 +34,11 @@ def test_presets_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NBTRACK_PRESET", "synthetic")
     assert load_preset() == PRESETS["synthetic"]
     assert load_preset("paper") == PRESETS["paper"]
-    with pytest.raises(ConfigError, match="'papper': did you mean 'paper'"):
-        load_preset("papper")
-    with pytest.raises(MissingError, match=r"nowhere\.toml"):
-        load_preset(config_file=Path("nowhere.toml"))
 
 
-def test_papers_figures() -> None:
-    """Catches a drifted default: what the paper states, the paper's preset must say."""
+def test_figures_of_the_presets() -> None:
+    """Catches a drifted default: what the paper states, the paper's preset must say; and a preset
+    that reports a room on which settings were chosen, or leaves one out."""
     paper = PRESETS["paper"]
     assert (paper.tracking["vr"].n_pixels, paper.tracking["sdf"].n_pixels) == (512, 4096)
     for name in TABLE_1:
@@ -51,15 +48,11 @@ def test_papers_figures() -> None:
     assert paper.tables.rates_hz == (10.0, 5.0, 2.0)
     assert paper.tables.budgets_ms == (50.0, 100.0, 500.0)
     assert paper.scenes.names[:2] == ("breakfast_room", "complete_kitchen")
-    assert [METHODS[name].paper_steps(2) for name in TABLE_1] == [36.1, 79.3]
-    assert METHODS["vr_neus"].paper_steps(10) == 6.8
-    assert METHODS["lm"].paper_steps(10) == 15.3
-
-
-def test_nothing_is_tuned_on_what_is_reported() -> None:
-    """Catches a preset that reports a room on which settings were chosen, or leaves one out."""
+    steps = {name: METHODS[name].paper_steps(10) for name in ("vr_neus", "sdf", "lm")}
+    assert steps == {"vr_neus": 6.8, "sdf": 15.3, "lm": 15.3}
     assert PRESETS["synthetic"].scenes.names == REPORTED_ROOMS
-    assert set(PRESETS["smoke"].scenes.names) <= set(REPORTED_ROOMS)
+    assert not {"bedroom", "kitchen_nook"} & {*REPORTED_ROOMS}
+    assert {*PRESETS["smoke"].scenes.names} <= {*REPORTED_ROOMS}
 
 
 def test_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,27 +76,23 @@ def test_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert before == PRESETS
 
 
-def test_several_settings_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a split at commas or within quotes."""
-    monkeypatch.setenv("NBTRACK_SET", """scenes.n_frames=7 "scenes.names=['office', 'bedroom']" """)
-    scenes = load_preset().scenes
-    assert (scenes.n_frames, scenes.names) == (7, ("office", "bedroom"))
-
-
-def test_values_take_the_type_of_the_preset() -> None:
-    """Catches integers left in real settings, and single values where several are allowed."""
+def test_values_take_the_type_of_the_preset(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches integers left in real settings, single values where several are allowed, and, in the
+    environment, a split at commas or within quotes."""
     settings = (
-        "mapping.neus.learning_rate=1", "scenes.names=office", "tables.rates_hz=[4, 2.5]",
-        "scenes.synthetic=false", "scenes.track_frames=0:10:2", "scenes.width = 64",
-        "mapping.neus.holdout_every=0",
+        "mapping.neus.learning_rate=1", "tables.rates_hz=[4, 2.5]", "scenes.synthetic=false",
+        "scenes.track_frames=0:10:2", "scenes.width = 64", "mapping.neus.holdout_every=0",
     )  # fmt: skip
-    resolved = load_preset(settings=settings)
+    resolved = load_preset(settings=(*settings, "scenes.names=office"))
     assert type(resolved.mapping["neus"].learning_rate) is float
     assert resolved.mapping["neus"].holdout_every == 0
     assert resolved.scenes.names == ("office",)
     assert [type(rate) for rate in resolved.tables.rates_hz] == [float, float]
     assert resolved.scenes.synthetic is False
     assert (resolved.scenes.track_frames, resolved.scenes.width) == ("0:10:2", 64)
+    monkeypatch.setenv("NBTRACK_SET", """scenes.n_frames=7 "scenes.names=['office', 'bedroom']" """)
+    scenes = load_preset().scenes
+    assert (scenes.n_frames, scenes.names) == (7, ("office", "bedroom"))
 
 
 REFUSED = {  # beside those of test_faults.py

@@ -8,28 +8,13 @@ import numpy as np
 import pandas as pd
 import torch
 
-from nbtrack.core.device import (
-    advise_on_memory,
-    choose_device,
-    device_name,
-    suitable_threads,
-    synchronize,
-)
-from nbtrack.core.files import (
-    fingerprint,
-    foreign_source,
-    runs_folder,
-    sources_fingerprint,
-    versions,
-    write_atomic,
-)
+from nbtrack.core.device import advise_on_memory, choose_device, suitable_threads, synchronize
 from nbtrack.core.progress import ProgressBar
-from nbtrack.core.settings import as_dict
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.experiments.methods import TABLE_1, Method, find_methods
 from nbtrack.experiments.presets import Preset
 from nbtrack.fields import make_field
-from nbtrack.tracking import ClockBudget, StepBudget, Tracker, make_tracker, tracker_class
+from nbtrack.tracking import ClockBudget, StepBudget, Tracker, make_tracker
 
 _FRAMES_A_CELL = 3  # that a mean of steps is taken over
 _LEAST_STEPS, _MOST_STEPS, _SECONDS_A_ROW = 5, 200, 4.0  # that are timed
@@ -38,7 +23,7 @@ _LEAST_STEPS, _MOST_STEPS, _SECONDS_A_ROW = 5, 200, 4.0  # that are timed
 def measure_steps(
     preset: Preset, sequence: RgbdSequence, methods: Sequence[str | Method] = TABLE_1
 ) -> pd.DataFrame:
-    """Steps within each budget for every method's tracker and its pixel counts n.
+    """Steps within each budget for every tracker, in its first method's field, and its n (pixels).
 
     A tracker first spends one frame that is not counted, so that allocations and compilations are
     done. The sequence's first frame feeds it.
@@ -62,42 +47,21 @@ def measure_steps(
     return pd.DataFrame(rows, columns=columns)
 
 
-def measured_steps(
-    preset: Preset, sequence: RgbdSequence, methods: Sequence[str | Method] = TABLE_1
-) -> pd.DataFrame:
-    """Table II of this device as it was measured last, or measured now; see `measure_steps`."""
-    camera = sequence.intrinsics
-    trackers = [tracker_class(method.tracker) for method in find_methods(methods)]
-    key = fingerprint(
-        sources_fingerprint("fields", "tracking"), [foreign_source(t) for t in trackers],
-        [t.name for t in trackers], device_name(choose_device()), torch.get_num_threads(),
-        versions(), [as_dict(preset)[part] for part in ("network", "tracking", "tables")],
-        [camera.width, camera.height],
-    )  # fmt: skip
-    path = runs_folder() / "bench" / f"{preset.name}-{key}.csv"
-    if not path.is_file():
-        cells = measure_steps(preset, sequence, methods)
-        write_atomic(path, cells.to_csv(index=False))
-    return pd.read_csv(path)
-
-
 def default_pixels(preset: Preset, methods: Sequence[str | Method] = TABLE_1) -> dict[str, int]:
     """The n that each tracker uses for Table I, by its label in Table II."""
     trackers = [method.tracker for method in find_methods(methods)]
     return {_label(name): preset.tracking_of(name).n_pixels for name in trackers}
 
 
-def measure_step_times(
-    preset: Preset, sequence: RgbdSequence, methods: Sequence[str | Method] = TABLE_1
-) -> pd.DataFrame:
-    """Time of a step for every method's tracker and its pixel counts n.
+def measure_step_times(preset: Preset, sequence: RgbdSequence) -> pd.DataFrame:
+    """Time of a step of the paper's trackers with their pixel counts n.
 
     Returns:
         A row each: tracker, n_pixels, ms_per_step (median), ms_low and ms_high (quartiles).
     """
     rows, device = [], choose_device()
     T_start = torch.from_numpy(sequence.T_world_camera[:1]).float().to(device)
-    for name, n_pixels, tracker in _trackers(preset, sequence, methods, "step times"):
+    for name, n_pixels, tracker in _trackers(preset, sequence, TABLE_1, "step times"):
         tracker.begin(sequence[0].to(device), T_start)
         tracker.step()
         synchronize(device)
@@ -121,7 +85,11 @@ def _trackers(
 
     The fields are untrained: a step costs the same whatever the weights are.
     """
-    plan = [(m, n) for m in find_methods(methods) for n in preset.tables.pixels_of(m.tracker)]
+    firsts: dict[str, Method] = {}
+    for method in find_methods(methods):
+        firsts.setdefault(method.tracker, method)
+    pixels = preset.tables.pixels
+    plan = [(m, n) for m in firsts.values() for n in pixels.get(m.tracker, pixels["sdf"])]
     bounds, T_first = observed_bounds(sequence), sequence.T_world_camera[0]
     with ProgressBar(title, len(plan)) as bar:
         for done, (method, n_pixels) in enumerate(plan):

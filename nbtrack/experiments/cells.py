@@ -3,11 +3,11 @@
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import FileLock
 
 from nbtrack.core.device import advise_on_memory, choose_device
 from nbtrack.core.errors import NbtrackError
@@ -15,18 +15,15 @@ from nbtrack.core.files import fingerprint, foreign_source, runs_folder, sources
 from nbtrack.core.settings import as_dict
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import field_class
+from nbtrack.fields import PointMapping, field_class
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.mapping.quality import score_map
 
 SHARED_SOURCES = ("core.geometry", "core.camera", "core.bounds", "data", "fields")
 """What maps and runs both go through, beside their own rooms."""
-Report = Callable[[int, str], None]
-"""Called by a cell with the units done so far and a word on how it goes."""
-
-_RECENT: dict[tuple[Path, str], Map] = {}  # maps that this process has made or read lately
-_MOST_RECENT = 4
+Report = Callable[[float, str], None]
+"""Called by a cell with the share of it that is done and a word on how it goes."""
 
 
 class Cell(abc.ABC):
@@ -36,7 +33,6 @@ class Cell(abc.ABC):
     name: str  # for readers
     key: str  # changes with everything that the result depends on
     out: Path | None = None  # where to keep it instead of in the cache
-    units: int  # that it reports: iterations or frames
     cost: float  # work in all, relative to other cells: its share of the bar
     needs: "Cell | None"
     is_done: bool
@@ -59,28 +55,20 @@ class Cell(abc.ABC):
     def compute(self, report: Report) -> Any:
         """Make it, or take a killed attempt up where it stands; returns `result`."""
 
-    def make(self, report: Report) -> Any:
-        """Compute it, or wait for the process that does, and find it done; returns `result`.
-
-        The lock is the system's, which frees it when that process ends, however it ends.
-        """
-        path = runs_folder() / "locks" / f"{self.cache.name}.lock"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(path)
-        try:
-            held = lock.acquire(timeout=0)
-        except Timeout:
-            report(0, "waits for another process that makes the same")
-            held = lock.acquire()
-        with held:
-            return self.result() if self.is_done else self.compute(report)
-
     def outcome(self, needed: Any, report: Report) -> Any:
-        """What `make` returns, or the user's mistake that it met, or was kept from it by."""
+        """Its `result`, made where it is missing, or the user's mistake that kept it from that.
+
+        What another process is computing is waited for. The lock is the system's, which frees it
+        when that process ends, however it ends.
+        """
         if isinstance(needed, NbtrackError):
             return NbtrackError(f"not run, because {self.needs.name} failed: {needed}")
+        path = runs_folder() / "locks" / f"{self.cache.name}.lock"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        report(0.0, "begins, or waits for another process that makes the same")
         try:
-            return self.make(report)
+            with FileLock(path):
+                return self.result() if self.is_done else self.compute(report)
         except NbtrackError as error:
             return error
 
@@ -95,16 +83,15 @@ class MapCell(Cell):
     frames: str = ":"
     seed: int = 0
     out: Path | None = None
-    given: Map | None = None  # the scene is tracked in this one, read from:
-    given_path: Path | None = None
+    is_given: bool = False  # made elsewhere, and only read: `out` is its folder, or its file
 
     kind, needs = "maps", None
 
     @cached_property
     def key(self) -> str:
         """Of code, device, data, settings and seed."""
-        if self.given:
-            return fingerprint(self.given.key, choose_device().type, self.scene.fingerprint)
+        if self.is_given:
+            return fingerprint(read_map(self.folder).key, choose_device().type)
         code = sources_fingerprint(*SHARED_SOURCES, "mapping")
         return fingerprint(
             code, foreign_source(field_class(self.field)), choose_device().type,
@@ -123,23 +110,18 @@ class MapCell(Cell):
         return f"{self.scene.name}-{self.field}{seed_suffix(self.seed)}"
 
     @property
-    def units(self) -> int:
-        """Iterations."""
-        return getattr(self.settings, "iterations", 1)
-
-    @property
     def cost(self) -> float:
         """Points that the network is asked for, all told; of what learns nothing, next to none."""
-        if not hasattr(self.settings, "n_rays"):
+        if isinstance(self.settings, PointMapping):
             return 1e6
         samples = self.settings.n_stratified + self.settings.n_surface
-        return float(self.units * self.settings.n_rays * samples)
+        return float(self.settings.iterations * self.settings.n_rays * samples)
 
     @property
     def is_done(self) -> bool:
         """Whether the map is finished and scored; in a folder of the user's, whether it is this."""
-        if self.given or not (self.folder / MAP_FILE).is_file():
-            return self.given is not None
+        if self.is_given or not (self.folder / MAP_FILE).is_file():
+            return self.is_given
         return self.out is None or read_map(self.folder).made.get("key") == self.key
 
     def result(self) -> dict[str, Any]:
@@ -147,36 +129,36 @@ class MapCell(Cell):
         return self.map().made
 
     def map(self) -> Map:
-        """The finished map, ready for tracking; from disk only where another process made it."""
-        found = self.given or _RECENT.get((self.folder, self.key)) or read_map(self.folder)
-        return self._keep(replace(found, field=found.field.to(choose_device())))
+        """The finished map, ready for tracking."""
+        found = _read(self.folder, self.key)
+        return replace(found, field=found.field.to(choose_device()))
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Map and score, or resume; write the map's files."""
-        checkpoint = self.folder / CHECKPOINT_FILE
+        checkpoint, most = self.folder / CHECKPOINT_FILE, getattr(self.settings, "iterations", 1)
+
+        def tell(done: int, losses: dict[str, float | int]) -> None:
+            told = " ".join(f"{name} {value:.3f}" for name, value in losses.items())
+            report(done / most, told)
+
         with advise_on_memory(f"frames {self.frames} of {self.scene.name}"):
             sequence = self.scene.read(self.frames)
             made = map_sequence(
                 self.field, sequence, self.preset.network_of(self.field), self.settings,
-                self.seed, choose_device(), checkpoint,
-                lambda done, losses: report(done, _told(losses)),
+                self.seed, choose_device(), checkpoint, tell,
             )  # fmt: skip
             quality = score_map(made, sequence, self.scene.room)
         told = {"quality": quality, "frames": self.frames, "key": self.key}
         finished = replace(made, made={**made.made, **told, "config": as_dict(self.preset)})
         write_map(self.folder / MAP_FILE, finished)
         checkpoint.unlink(missing_ok=True)
-        return self._keep(finished).made
-
-    def _keep(self, found: Map) -> Map:
-        place = (self.folder, self.key)
-        while len(_RECENT) >= _MOST_RECENT and place not in _RECENT:
-            _RECENT.pop(next(iter(_RECENT)))
-        return _RECENT.setdefault(place, found)
+        return finished.made
 
 
-def _told(losses: dict[str, float | int]) -> str:
-    return " ".join(f"{name} {value:.3f}" for name, value in losses.items())
+@lru_cache(maxsize=4)
+def _read(folder: Path, key: str) -> Map:
+    """Read once for all runs in a map."""
+    return read_map(folder)
 
 
 def seed_suffix(seed: int) -> str:

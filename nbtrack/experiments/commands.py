@@ -20,7 +20,7 @@ from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.fields import NetworkSettings, field_class, supervised_field
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.mapping.meshes import extract_mesh
-from nbtrack.tracking import check_pair, make_budget, tracker_class
+from nbtrack.tracking import check_pair, make_budget
 
 _PRINTED = (
     "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
@@ -31,7 +31,8 @@ _UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": 
 
 def map_command(options: Namespace) -> None:
     """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
-    field, preset = _asked_field(options), preset_of(options)
+    field = supervised_field(options.field, options.supervision or "rendering")
+    preset = preset_of(options)
     scene = _checked_scene(options, preset, options.frames)
     cell = MapCell(scene, field, preset, options.frames, options.seed, options.out)
     _map(cell)
@@ -60,14 +61,11 @@ def track_command(options: Namespace) -> None:
     check_pair(options.tracker, field)
     budget = make_budget(options.steps, options.rate)  # told before a room is made
     scene = _checked_scene(options, preset, options.frames, map_frames)
-    cell = MapCell(
-        scene, field, preset, map_frames, options.seed, given=given, given_path=options.map_from
-    )
-    run = TrackCell(
-        cell, options.tracker, options.steps, options.rate, options.frames, options.seed,
-        options.out,
-    )  # fmt: skip
-    if given is None:
+    is_given, seed = given is not None, options.seed
+    cell = MapCell(scene, field, preset, map_frames, seed, options.map_from, is_given)
+    budgeted = (options.steps, options.rate)
+    run = TrackCell(cell, scene, options.tracker, *budgeted, options.frames, seed, options.out)
+    if not is_given:
         _map(cell)
     run = replace(run, out=run.folder)  # made anew, whatever the cache holds
     (metrics,) = run_cells([run], f"tracking {scene.name}")
@@ -147,22 +145,13 @@ def _checked_scene(options: Namespace, preset: Preset, *slices: str) -> Scene:
     return scene
 
 
-def _asked_field(options: Namespace) -> str:
-    return supervised_field(options.field, options.supervision or "rendering")
-
-
 def _field_and_map(options: Namespace) -> tuple[str, Map | None]:
     """What to track in: a field under its supervision, or a given map, which knows its field."""
-    if tracker_class(options.tracker).renders and options.bake is not None:
-        raise ConfigError(
-            f"tracker {options.tracker!r} renders, which a baked field cannot: leave --bake out, "
-            "or take --tracker sdf or lm"
-        )
     if options.field is None and options.map_from is None:
         raise ConfigError("track needs --field, or --map-from with a map that knows its own")
     if options.field is None and options.supervision is not None:
         raise ConfigError("--supervision belongs to --field: name that too, or leave both out")
-    asked = _asked_field(options) if options.field else None
+    asked = options.field and supervised_field(options.field, options.supervision or "rendering")
     if options.map_from is None:
         return asked, None
     if options.map_frames is not None:

@@ -10,12 +10,7 @@ from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.errors import ConfigError, NbtrackError
 from nbtrack.core.files import runs_folder, tables_folder, write_atomic
 from nbtrack.core.settings import changed_settings
-from nbtrack.experiments.bench import (
-    default_pixels,
-    measure_step_times,
-    measure_steps,
-    measured_steps,
-)
+from nbtrack.experiments.bench import default_pixels, measure_step_times, measure_steps
 from nbtrack.experiments.commands import preset_of
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, find_methods
@@ -24,6 +19,7 @@ from nbtrack.experiments.results import track_scenes
 from nbtrack.experiments.scenes import open_scene, open_scenes
 from nbtrack.tables import (
     beside_published,
+    naming_points,
     style_table_1,
     style_table_2,
     write_table_3,
@@ -32,8 +28,9 @@ from nbtrack.tables import (
 
 # What a run's row tells beside its place; none of it depends on how fast the machine was.
 _CELL_COLUMNS = (
-    "rate_hz", "method", "scene", "seed", "ate_m", "ate_rmse_aligned_m", "rotation_rmse_deg",
-    "max_error_m", "frames", "lost_frames", "steps_per_frame", "run", "failure",
+    "rate_hz", "method", "n_pixels", "scene", "seed", "ate_m", "ate_rmse_aligned_m",
+    "rotation_rmse_deg", "max_error_m", "frames", "lost_frames", "steps_per_frame", "run",
+    "failure",
 )  # fmt: skip
 
 
@@ -58,11 +55,11 @@ def tables_command(options: Namespace) -> None:
     folder = options.out or tables_folder() / (preset.name + "_clock" * clock)
     number, note = "III" if options.beyond else "I", _note(preset, clock)
     print(f"Table {number}: ATE (m), {note}")
-    print(style_table_1(results))
+    print(style_table_1(naming_points(results) if options.beyond else results))
     if options.beyond:
         paths = write_table_3(folder, results, note)
     else:
-        steps = measured_steps(preset, scenes[0].read(":1"), methods)
+        steps = measure_steps(preset, scenes[0].read(":1"), methods)
         pixels = default_pixels(preset, methods)
         print("Table I beside the paper's")
         print(beside_published(results).to_string(float_format="%.3f", na_rep="–"))

@@ -48,38 +48,26 @@ def run_cells(cells: Sequence[Cell], title: str, execution: Execution | None = N
         Whatever the first failing cell raised, unless it is to keep going; the others are then
         abandoned.
     """
-    execution = execution or Execution()
-    missing: dict[Path, Cell] = {}
-    for cell in cells:
-        if not cell.is_done:
-            if cell.needs and not cell.needs.is_done:
-                missing.setdefault(cell.needs.folder, cell.needs)
-            missing.setdefault(cell.folder, cell)
-    results: dict[Path, Any] = {}
-    if missing:
-        with ProgressBar(title, sum(cell.cost for cell in missing.values())) as bar:
-            _run(missing, results, bar, execution)
-    return [results[c.folder] if c.folder in results else c.result() for c in cells]
+    execution, results = execution or Execution(), {}
+    wanted = [part for cell in cells if not cell.is_done for part in (cell.needs, cell) if part]
+    missing = {cell.folder: cell for cell in wanted if not cell.is_done}
+    done = dict.fromkeys(missing, 0.0)
 
+    def show(folder: Path, share: float, status: str) -> None:
+        done[folder] = missing[folder].cost * share
+        ended = f"{len(results)} of {len(missing)} done"
+        bar.move_to(sum(done.values()), f"{ended}, {missing[folder].name}: {status}")
 
-def _run(
-    cells: dict[Path, Cell], results: dict[Path, Any], bar: ProgressBar, execution: Execution
-) -> None:
-    """Fill in the results, and move the bar to where each cell says it is."""
-    done = dict.fromkeys(cells, 0.0)
-
-    def show(folder: Path, units: int, status: str) -> None:
-        cell = cells[folder]
-        done[folder] = cell.cost * min(1.0, units / max(cell.units, 1))
-        ended = f"{len(results)} of {len(cells)} done"
-        bar.move_to(sum(done.values()), f"{ended}, {cell.name}: {status}")
-
-    with closing(_outcomes(cells, results, show, execution)) as outcomes:
+    with (
+        ProgressBar(title, sum(cell.cost for cell in missing.values())) as bar,
+        closing(_outcomes(missing, results, show, execution)) as outcomes,
+    ):
         for folder, outcome in outcomes:
             if isinstance(outcome, NbtrackError) and not execution.keep_going:
                 raise outcome
             results[folder] = outcome
-            show(folder, cells[folder].units, "done")
+            show(folder, 1.0, "done")
+    return [results[c.folder] if c.folder in results else c.result() for c in cells]
 
 
 def _outcomes(
@@ -88,7 +76,7 @@ def _outcomes(
     """What becomes of each cell, as they end; what a cell needs comes before it."""
     usual = os.cpu_count() or 1 if _has_dask() and choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, len(cells))
-    if execution.dask is not None or workers > 1:
+    if cells and (execution.dask is not None or workers > 1):
         from nbtrack.experiments.workers import run_on_workers
 
         share = 1 if execution.dask else max(1, torch.get_num_threads() // workers)

@@ -24,17 +24,32 @@ class Method:
 METHODS = {
     "vr": Method("iMAP with VR", "imap", "vr"),
     "sdf": Method("NeuS with SDF", "neus", "sdf"),
+    "vr_velocity": Method(
+        "iMAP with VR, constant velocity", "imap", "vr",
+        ("tracking.vr.motion_model=constant_velocity",),
+    ),
+    "sdf_velocity": Method(
+        "NeuS with SDF, constant velocity", "neus", "sdf",
+        ("tracking.sdf.motion_model=constant_velocity",),
+    ),
     "vr_neus": Method("NeuS with VR", "neus", "vr"),
     "sdf_plus": Method("NeuS+ with SDF (Adam)", "neus_plus", "sdf"),
     "lm": Method("NeuS+ with SDF (LM)", "neus_plus", "lm"),
     "baked": Method("NeuS+ baked (LM)", "neus_plus", "lm", ("tracking.lm.bake_voxel=0.04",)),
+    "lm_dense": Method(
+        "NeuS+ with SDF (LM), dense", "neus_plus", "lm", ("tracking.lm.n_pixels=4096",)
+    ),
     "icp": Method("ICP", "points", "icp"),
-}
+    "icp_dense": Method("ICP, dense", "points", "icp", ("tracking.icp.n_pixels=4096",)),
+}  # fmt: skip
 """By name. A method of your own joins by `METHODS["mine"] = Method(...)`."""
 
 TABLE_1 = ("vr", "sdf")
 """The rows of the paper's Table I."""
-TABLE_3 = ("vr", "vr_neus", "sdf", "sdf_plus", "lm", "baked", "icp")
+TABLE_3 = (
+    "vr", "vr_velocity", "vr_neus", "sdf", "sdf_velocity", "sdf_plus",
+    "lm", "baked", "lm_dense", "icp", "icp_dense",
+)  # fmt: skip
 """The paper's methods beside those that go beyond it."""
 RATES_3_HZ = (30.0, 10.0, 5.0, 2.0)
 """The rates of Table III: the paper's, and that of the camera itself."""

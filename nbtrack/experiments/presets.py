@@ -42,10 +42,6 @@ class TablesConfig:
         default_factory=lambda: {"vr": (128, 512, 1024), "sdf": (2048, 4096, 16384)}
     )
 
-    def pixels_of(self, tracker_name: str) -> tuple[int, ...]:
-        """Pixel counts of a tracker's rows in Table II."""
-        return self.pixels.get(tracker_name, self.pixels["sdf"])
-
 
 @dataclass(frozen=True)
 class Preset:
@@ -99,7 +95,7 @@ width = 96
 track_frames = ":120"
 [mapping]
 imap = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
-neus = {iterations = 2000, n_rays = 128, n_stratified = 16, n_surface = 8, learning_rate = 3e-3}
+neus = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
 [mapping.neus_plus]
 iterations = 1400
 n_rays = 96
@@ -114,11 +110,15 @@ sdf.n_pixels = 512
 vr = [16, 64, 128]
 sdf = [256, 512, 2048]
 """
-PRESETS = {
-    "smoke": with_values(Preset("smoke"), tomllib.loads(_SMOKE)),
-    "synthetic": Preset("synthetic", scenes=ScenesConfig(REPORTED_ROOMS)),
-    "paper": Preset("paper", scenes=ScenesConfig(tuple(PAPER_SCENE_LABELS), synthetic=False)),
-}
+_SMALL = with_values(Preset("smoke"), tomllib.loads(_SMOKE))
+_NINE = replace(_SMALL.scenes, names=REPORTED_ROOMS)
+_ALL = (
+    _SMALL,
+    replace(_SMALL, name="nine_rooms", scenes=_NINE),
+    Preset("synthetic", scenes=ScenesConfig(REPORTED_ROOMS)),
+    Preset("paper", scenes=ScenesConfig(tuple(PAPER_SCENE_LABELS), synthetic=False)),
+)
+PRESETS = {preset.name: preset for preset in _ALL}
 
 
 def load_preset(

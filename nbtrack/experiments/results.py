@@ -61,8 +61,9 @@ def track_scenes(
     steps: float | int | None = None,
     clock: bool = False,
     frames: str | None = None,
-    seeds: int = 1,
+    seeds: int | Sequence[int] = 1,
     execution: Execution | None = None,
+    tracked: Sequence[Scene] | None = None,
 ) -> pd.DataFrame:
     """Track some scenes with some methods; maps and runs that are not cached are made first.
 
@@ -70,23 +71,26 @@ def track_scenes(
         rates_hz: by default the preset's; each frame has the steps of the paper's hardware.
         steps, clock: so many steps a frame instead, or 1/rate seconds by this machine's clock.
         frames: the slice to track; by default the preset's.
-        seeds: of map and run together: their spread is that of the whole method.
+        seeds: of map and run together, so many or these: their spread is that of the method.
+        tracked: other recordings of the same rooms, in the same order, which no map has seen.
 
     Returns:
-        A row a run: rate_hz, steps, method, scene, seed, run (its name), ate_m (NaN where it
-        failed), failure (why) and the other metrics.
+        A row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), ate_m (NaN
+        where it failed), failure (why) and the other metrics.
     """
     rates, frames = rates_hz or preset.tables.rates_hz, frames or preset.scenes.track_frames
-    cells, rows = [], []
-    for method, seed, rate_hz, scene in product(
-        find_methods(methods), range(seeds), [None] if steps else rates, scenes
+    seeds, cells, rows = range(seeds) if isinstance(seeds, int) else seeds, [], []
+    pairs = zip(scenes, tracked or scenes, strict=True)
+    for method, seed, rate_hz, (scene, seen) in product(
+        find_methods(methods), seeds, [None] if steps else rates, pairs
     ):
         map_cell = MapCell(scene, method.field, with_settings(preset, *method.settings), seed=seed)
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
-        hz = rate_hz if clock else None
-        cells.append(TrackCell(map_cell, method.tracker, n_steps, hz, frames, seed))
+        budget = n_steps, rate_hz if clock else None
+        cells.append(TrackCell(map_cell, seen, method.tracker, *budget, frames, seed))
         place = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label}
-        rows.append(place | {"scene": scene.name, "seed": seed, "run": cells[-1].folder.name})
+        place |= {"n_pixels": cells[-1].settings.n_pixels, "scene": scene.name, "seed": seed}
+        rows.append(place | {"run": cells[-1].folder.name})
     found = _run(cells, clock, execution or Execution())
     return pd.DataFrame(row | _told(result) for row, result in zip(rows, found, strict=True))
 

@@ -31,8 +31,6 @@ from nbtrack.tracking.metrics import score_detection, trajectory_metrics
 from nbtrack.tracking.trajectories import tum_text
 
 RUN_FILE, METRICS_FILE = "run.pt", "metrics.json"
-# Where a single run gets these from its own options.
-_NOT_PASSED_ON = ("scenes.names", "scenes.track_frames", "tables.")
 
 
 @dataclass(frozen=True)
@@ -40,6 +38,7 @@ class TrackCell(Cell):
     """One tracked run in a map, under one budget: so many steps a frame, or a rate by the clock."""
 
     needs: MapCell
+    scene: Scene  # the mapped one, or another recording of the same room
     tracker: str
     steps: float | int | None = None
     rate_hz: float | int | None = None
@@ -62,40 +61,36 @@ class TrackCell(Cell):
         code = sources_fingerprint(*SHARED_SOURCES, "tracking")
         return fingerprint(
             code, foreign_source(tracker_class(self.tracker)), self.needs.key, self.tracker,
-            self.settings, self.steps, clock, self.frames, self.seed,
+            self.settings, self.steps, clock, self.frames, self.seed, self.scene.fingerprint,
         )  # fmt: skip
-
-    @property
-    def scene(self) -> Scene:
-        """The tracked scene."""
-        return self.needs.scene
 
     @property
     def name(self) -> str:
         """Scene, method and budget, and the seed if it is not the first."""
         budget = f"{self.rate_hz:g}hz" if self.rate_hz else f"{self.steps:g}steps"
-        method = f"{self.needs.field}-{self.tracker}"
+        method = f"{self.needs.field}-{self.tracker}{'-unmapped' * self.is_elsewhere}"
         return f"{self.scene.name}-{method}-{budget}{seed_suffix(self.seed)}"
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether the map was made from another recording."""
+        return self.needs.is_given or self.scene.folder != self.needs.scene.folder
 
     @property
     def is_done(self) -> bool:
         """Whether the run is finished; in a folder of the user's it is always made anew."""
         return self.out is None and (self.folder / METRICS_FILE).is_file()
 
-    @cached_property
-    def units(self) -> int:
-        """Frames to track, after the first one, whose pose is given."""
-        return self.scene.count(self.frames) - 1
-
     @property
     def cost(self) -> float:
         """Points that the network is asked for with a step budget; seconds with the clock."""
+        n_frames = self.scene.count(self.frames)
         if self.rate_hz is not None:
-            return self.units / self.rate_hz
+            return n_frames / self.rate_hz
         samples = 1
         if tracker_class(self.tracker).renders:
             samples = 2 * self.settings.n_stratified + self.settings.n_importance
-        return float(self.units * self.steps * self.settings.n_pixels * samples)
+        return float(n_frames * self.steps * self.settings.n_pixels * samples)
 
     def result(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""
@@ -113,7 +108,7 @@ class TrackCell(Cell):
         made, notes = self.needs.map(), {}
         with advise_on_memory(f"frames {self.frames} of {self.scene.name}"):
             sequence = self.scene.read(self.frames)
-        if self.needs.given:
+        if self.is_elsewhere:
             notes = {"map_from": made.made, "map_warning": check_belongs(made, sequence[0])}
         budget, start = make_budget(self.steps, self.rate_hz), time.perf_counter()
         tracker = make_tracker(
@@ -123,14 +118,13 @@ class TrackCell(Cell):
             notes["bake_seconds"] = time.perf_counter() - start
             notes["grid_bytes"] = tracker.field.n_bytes
         checkpoint = self.cache / RUN_FILE  # a folder of the user's holds results alone
-        tracked = track_sequence(
-            tracker, sequence, checkpoint, lambda done, m: report(done, f"off by {100 * m:.1f} cm")
-        )
-        metrics = self._metrics(tracked) | {
-            "map_seconds": made.made["seconds"],
-            "budget": str(budget),
-        }
-        metrics |= notes
+
+        def tell(done: int, error_m: float) -> None:
+            report(done / len(sequence), f"off by {100 * error_m:.1f} cm")
+
+        tracked = track_sequence(tracker, sequence, checkpoint, tell)
+        notes |= {"map_seconds": made.made["seconds"], "budget": str(budget)}
+        metrics = self._metrics(tracked) | notes
         ids = tracked.frames["frame_id"].to_numpy()[1:]
         # The metrics come last: where they stand, the run is complete.
         write_together(self.folder, {
@@ -177,19 +171,17 @@ class TrackCell(Cell):
     def _command(self) -> str:
         """What makes this run anew, and its map where that is not cached."""
         cell, preset = self.needs, self.needs.preset
-        is_known = self.scene.name in (*ROOMS, *DATASET_SCENES)
+        is_known = self.scene.name in (*ROOMS, *DATASET_SCENES) and not self.is_elsewhere
         made = {"field": cell.field, "map-frames": cell.frames}
         options = {
             "format": self.scene.format,
-            **({"map-from": cell.given_path} if cell.given else made),
+            **({"map-from": cell.folder} if self.is_elsewhere else made),
             "tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps,
             "frames": self.frames, "seed": self.seed, "device": choose_device().type,
             "threads": torch.get_num_threads(), "preset": preset.name,
         }  # fmt: skip
-        words = ["python", "-m", "nbtrack", "track"]
-        words += [self.scene.name if is_known else str(self.scene.folder)]
-        for name, value in options.items():
-            words += [f"--{name}", str(value)] if value is not None else []
-        for setting in changed_settings(preset, PRESETS[preset.name]):
-            words += ["--set", setting] if not setting.startswith(_NOT_PASSED_ON) else []
+        given = [f"--{name}={value}" for name, value in options.items() if value is not None]
+        settings = [f"--set={text}" for text in changed_settings(preset, PRESETS[preset.name])]
+        sequence = self.scene.name if is_known else str(self.scene.folder)
+        words = ["python", "-m", "nbtrack", "track", sequence, *settings, *given]
         return shlex.join([*words, "--out", f"again_{self.name}"])

@@ -31,7 +31,7 @@ _LOCAL = {
 
 def run_on_workers(
     cells: Mapping[Path, Cell],
-    show: Callable[[Path, int, str], None],
+    show: Callable[[Path, float, str], None],
     address: str | None,
     workers: int,
     n_threads: int,
@@ -58,9 +58,9 @@ def run_on_workers(
             with contextlib.suppress(TimeoutError):
                 wait([*waiting.values()], timeout=_REPORT_SECONDS, return_when="FIRST_COMPLETED")
             while news:
-                name, units, status = news.pop(0)
+                name, share, status = news.pop(0)
                 if Path(name) in waiting:
-                    show(Path(name), units, status)
+                    show(Path(name), share, status)
             for folder in [folder for folder, future in waiting.items() if future.done()]:
                 yield folder, _result(waiting.pop(folder), folder.name)
 
@@ -88,11 +88,11 @@ def _outcome_there(
     TRACKERS.update(known[1])
     worker, last = get_worker(), time.monotonic()
 
-    def report(units: int, status: str) -> None:
+    def report(share: float, status: str) -> None:
         nonlocal last
         if time.monotonic() - last > _REPORT_SECONDS:
             last = time.monotonic()
-            worker.log_event(topic, [str(cell.folder), units, status])
+            worker.log_event(topic, [str(cell.folder), share, status])
 
     with threads(n_threads):
         return cell.outcome(needed, report)

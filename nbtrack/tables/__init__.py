@@ -3,6 +3,7 @@
 from nbtrack.tables.layout import (
     PAPER_SCENE_LABELS,
     beside_published,
+    naming_points,
     published_table_1,
     published_table_2,
     table_1,
@@ -12,6 +13,7 @@ from nbtrack.tables.styles import (
     style_table_1,
     style_table_2,
     write_published,
+    write_table_1,
     write_table_3,
     write_tables,
 )

@@ -33,6 +33,12 @@ def published_table_2() -> pd.DataFrame:
     return pd.read_csv(files(__package__) / "published_table_2.csv")
 
 
+def naming_points(results: pd.DataFrame) -> pd.DataFrame:
+    """The results of methods that use different numbers of points or pixels, n, named with it."""
+    labels = [f"{m}, n = {n}" for m, n in zip(results["method"], results["n_pixels"], strict=True)]
+    return results.assign(method=labels)
+
+
 def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
     """Table I in long form from a row for every seed; rates fall, dataset's scenes are labelled.
 
