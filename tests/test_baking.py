@@ -2,33 +2,26 @@
 
 import pytest
 import torch
+from box_room import Formula
 from test_fields import points_inside
 from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError
-from nbtrack.fields import FIELDS, Field, grid
+from nbtrack.fields import FIELDS, grid
 from nbtrack.fields.base import LUMA
 from nbtrack.fields.grid import BakedField
 
 BOX = SceneBounds((-0.5, -0.25, 0.25), (0.55, 0.5, 1.0))  # x is no multiple of VOXEL
 VOXEL = 0.125  # exact in binary, as all corners' coordinates are
 SLOPE = torch.tensor([0.3, -0.7, 0.2])
+MIX = torch.tensor([[0.2, 0.0, 0.1], [0.0, 0.3, 0.1], [-0.1, 0.1, 0.2]])
 PARTS = ("value", "value_gradient", "intensity", "intensity_gradient")
 
 
-class Formula(Field):
-    """A value by formula, and a colour that differs per channel and axis, in [0, 1] in BOX."""
-
-    name, label, surface_level = "formula", "Formula", 0.25
-
-    def __init__(self, value, bounds: SceneBounds = BOX) -> None:
-        super().__init__(bounds)
-        self.value = value
-
-    def forward(self, points_world: Tensor) -> tuple[Tensor, Tensor]:
-        mix = torch.tensor([[0.2, 0.0, 0.1], [0.0, 0.3, 0.1], [-0.1, 0.1, 0.2]])
-        return 0.4 + points_world @ mix, self.value(points_world)
+def formula(value) -> Formula:
+    """With a colour that differs per channel and axis, in [0, 1] in BOX."""
+    return Formula(value, BOX, lambda points: 0.4 + points @ MIX)
 
 
 def linear(points: Tensor) -> Tensor:
@@ -42,7 +35,7 @@ def wavy(points: Tensor) -> Tensor:
 def test_linear_field_is_reproduced() -> None:
     """Catches swapped axes or channels, a shifted origin and gradients per cell, not per metre:
     interpolation of a linear function is exact everywhere, and its gradient constant."""
-    source, points = Formula(linear), points_inside(BOX, 500)
+    source, points = formula(linear), points_inside(BOX, 500)
     baked, exact = BakedField(source, VOXEL), source.linearize(points)
     torch.testing.assert_close(baked(points)[0], source(points)[0])
     for name, found in vars(baked.linearize(points)).items():
@@ -57,7 +50,7 @@ def test_product_in_the_middle_of_a_cell() -> None:
     cell, with value 81/4096 and derivatives 27/256, 27/256 and 9/256.
     """
     points = torch.tensor([[0.25, 0.125, 0.5], [3 / 16, 3 / 16, 9 / 16]])
-    found = BakedField(Formula(lambda points: points.prod(dim=-1)), VOXEL).linearize(points)
+    found = BakedField(formula(lambda points: points.prod(dim=-1)), VOXEL).linearize(points)
     torch.testing.assert_close(found.value, torch.tensor([1 / 64, 81 / 4096]))
     expected = torch.tensor([27 / 256, 27 / 256, 9 / 256])
     torch.testing.assert_close(found.value_gradient[1], expected)
@@ -67,7 +60,7 @@ def test_product_in_the_middle_of_a_cell() -> None:
 def test_forward_and_linearize_agree(beyond: float) -> None:
     """Catches the gradient of something else than the interpolant, two interpolants (inside and,
     where each axis is clamped, outside), and a graph that is dragged along."""
-    baked = BakedField(Formula(wavy), VOXEL)
+    baked = BakedField(formula(wavy), VOXEL)
     points = points_inside(BOX, 500, -beyond).requires_grad_()
     found, (color, value) = baked.linearize(points), baked(points)
     intensity = color @ LUMA
@@ -81,44 +74,31 @@ def test_forward_and_linearize_agree(beyond: float) -> None:
 
 
 def test_outside_is_clamped_to_the_border() -> None:
-    """Catches extrapolation, wrapped indices, and a slope along an axis that is clamped.
+    """Catches extrapolation, wrapped indices, a slope along an axis that is clamped, and an index
+    error where a pose diverged (it shows in its loss, as with networks) or no pixel has a depth.
 
     The grid reaches one cell beyond BOX: x from -0.625 to 0.625 + 0.125 (its vertices overshoot
     0.55), z from 0.125 to 1.125.
     """
-    baked = BakedField(Formula(linear), VOXEL)
+    baked = BakedField(formula(linear), VOXEL)
     far = torch.tensor([[-50.0, 0.1, 0.5], [50.0, 0.1, 0.5], [0.1, 0.1, 50.0], [9.0, 9.0, 9.0]])
     low, high = torch.tensor([-0.625, -0.375, 0.125]), torch.tensor([0.75, 0.625, 1.125])
     border, found = far.clamp(low, high), baked.linearize(far)
     torch.testing.assert_close(found.value, linear(border))
-    torch.testing.assert_close(baked(far)[0], Formula(linear)(border)[0])
+    torch.testing.assert_close(baked(far)[0], formula(linear)(border)[0])
     torch.testing.assert_close(found.value_gradient, SLOPE * (far == border), atol=5e-6, rtol=0)
-
-
-def test_points_that_are_no_numbers_and_no_points() -> None:
-    """Catches an index error: a pose that diverged shows in its loss, as with networks; and a view
-    that cannot infer its shape when every pixel lacks a depth."""
-    baked = BakedField(Formula(linear), VOXEL)
-    points = torch.tensor([[float("nan"), 0.1, 0.5], [0.1, 0.1, 0.5]])
-    assert baked.linearize(points).value.isnan().tolist() == [True, False]
-    assert baked(points)[1].isnan().tolist() == [True, False]
-    assert baked.linearize(torch.zeros(0, 3)).value_gradient.shape == (0, 3)
-    assert baked(torch.zeros(0, 3))[0].shape == (0, 3)
-
-
-def test_baked_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a part lost or repeated where the vertices are sampled some at a time."""
-    whole = BakedField(Formula(wavy), VOXEL)
-    monkeypatch.setattr(grid, "_POINTS_AT_ONCE", 37)
-    parts = BakedField(Formula(wavy), VOXEL)
-    assert torch.equal(whole.cells, parts.cells)
-    assert torch.equal(whole.color, parts.color)
+    for points in (torch.full((1, 3), float("nan")), torch.zeros(0, 3)):
+        assert baked.linearize(points).value.isnan().all()
+        assert baked(points)[1].isnan().all()
+        assert baked(points)[0].shape == baked.linearize(points).value_gradient.shape
 
 
 def test_what_is_taken_from_the_source() -> None:
     """Catches a bake that forgets its field's bounds, label or level, that trains, that the command
     line offers as a map, or that takes more than 76 bytes a vertex (and 1 % for the rest)."""
-    baked = BakedField(Formula(linear), 1)  # a whole number is a length as well
+    source = formula(linear)
+    source.surface_level = 0.25
+    baked = BakedField(source, 1)  # a whole number is a length as well
     assert (baked.name, baked.label, baked.surface_level) == ("baked", "Formula baked", 0.25)
     assert (baked.bounds, baked.n_vertices) == (BOX, (5, 4, 4))
     assert list(baked.parameters()) == []
@@ -127,18 +107,14 @@ def test_what_is_taken_from_the_source() -> None:
     assert 83 * 53 * 33 * 76 <= room.n_bytes < 1.01 * 84 * 54 * 34 * 76
 
 
-@pytest.mark.parametrize("voxel", [0, 0.0, -0.04, float("nan"), float("inf")])
-def test_voxel_that_is_no_length(voxel: float) -> None:
-    """Catches a division by zero, or an endless grid, where a line should say what to do."""
-    with pytest.raises(ConfigError, match=r"^voxel is .* m: .* positive length; set.*$"):
-        BakedField(Formula(linear), voxel)
-
-
-@pytest.mark.parametrize("voxel", [0.002, 1e-300])
-def test_grid_that_is_too_large(voxel: float) -> None:
-    """Catches memory taken before it is counted, and advice that does not help."""
-    never = Formula(lambda points: pytest.fail("sampled before the size was checked"))
-    with pytest.raises(ConfigError, match=r"^voxel .* allowed is 1 GB; set .* m or more") as error:
+@pytest.mark.parametrize("voxel", [0, 0.0, -0.04, float("nan"), float("inf"), 0.002, 1e-300])
+def test_voxels_that_are_refused(voxel: float) -> None:
+    """Catches a division by zero, memory taken before it is counted, and advice that is no help."""
+    never = formula(lambda points: pytest.fail("sampled before the size was checked"))
+    is_small = 0 < voxel < 1
+    says = "allowed is 1 GB; set .* m or more" if is_small else "is .* m: .* positive length; set"
+    with pytest.raises(ConfigError, match=f"^voxel .*{says}.*$") as error:
         BakedField(never, voxel)
-    advice = float(str(error.value).split("; set ")[1].split(" m")[0])
-    grid._checked_size(never, advice)  # must not raise
+    if is_small:
+        advice = float(str(error.value).split("; set ")[1].split(" m")[0])
+        grid._checked_size(never, advice)  # must not raise

@@ -1,13 +1,23 @@
-"""The pinhole camera: pixels and points are each other's inverse."""
+"""The pinhole camera; the box of what it saw of a known room, and where rays leave it."""
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from box_room import sequence_of
 
+from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, backproject, pixel_directions, project
+from nbtrack.core.errors import DataError
+from nbtrack.data.sequence import observed_bounds
 
 CAMERA = Intrinsics(640, 480, 500.0, 510.0, 300.0, 250.0)
+UNIT = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+# 90 degrees wide and high: the corner pixels' centers are seen at 19/20 of the half width.
+SQUARE = Intrinsics.from_focal(20, 20, 10.0)
+AHEAD = np.eye(4)[None]
+TURNED = np.array([[[0.0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]])  # along +x, x = 5
 
 
 def test_pixels_by_hand() -> None:
@@ -30,28 +40,14 @@ def test_pixels_by_hand() -> None:
 
 @pytest.mark.parametrize("shape", [(), (1,), (50,), (3, 4), (0,)], ids=str)
 def test_project_undoes_backproject(shape: tuple[int, ...]) -> None:
-    """Catches a half pixel lost on the way, and batch shapes that are flattened."""
+    """Catches a half pixel lost on the way, batch shapes that are flattened, pixels that are
+    rounded, and an absolute depth: callers mask points behind the camera by its sign."""
     generator = torch.Generator().manual_seed(0)
-    columns = torch.randint(640, shape, generator=generator)
-    rows = torch.randint(480, shape, generator=generator)
-    depth = 0.1 + 5 * torch.rand(shape, generator=generator)
-    points = backproject(CAMERA, columns, rows, depth)
+    columns, rows, depth = torch.rand(3, *shape, generator=generator)
+    pixel = 640 * columns, 480 * rows, 5 * depth - 2.5
+    points = backproject(CAMERA, *pixel)
     assert points.shape == (*shape, 3)
-    found_columns, found_rows, found_depth = project(CAMERA, points)
-    torch.testing.assert_close(found_columns, columns.float(), rtol=0, atol=1e-3)
-    torch.testing.assert_close(found_rows, rows.float(), rtol=0, atol=1e-3)
-    torch.testing.assert_close(found_depth, depth)
-
-
-def test_backproject_undoes_project() -> None:
-    """Catches real-valued pixels that are rounded between the two, and an absolute depth: callers
-    mask points behind the camera by the sign."""
-    generator = torch.Generator().manual_seed(0)
-    points = torch.randn(100, 3, generator=generator) + torch.tensor([0.0, 0.0, 6.0])
-    points[0, 2] = -1.0
-    columns, rows, depth = project(CAMERA, points)
-    assert depth[0].item() == -1.0
-    torch.testing.assert_close(backproject(CAMERA, columns, rows, depth), points)
+    torch.testing.assert_close(project(CAMERA, points), pixel, rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0, 0.25])
@@ -67,3 +63,64 @@ def test_scaled_camera_sees_the_same(factor: float) -> None:
         pixel_directions(small, factor * (columns + 0.5) - 0.5, factor * (rows + 0.5) - 0.5),
         pixel_directions(CAMERA, columns, rows),
     )
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "expected"),
+    [
+        ((0, 0, 0), (0, 0, 1), 1.0),  # along an axis
+        ((0, 0, 0), (0, 0, -2), 0.5),  # in units of the direction
+        ((0, 0, 0), (0.5, 0, 1), 1.0),  # z is reached first
+        ((0, 0, 0), (2, 0, 1), 0.5),  # x is reached first
+        ((0.5, 0, 0), (1, 0.1, 0.2), 0.5),  # 0.5 m to go in x
+        ((0.5, 0, 0), (-1, 0.1, 0.2), 1.5),  # and 1.5 m backward
+        ((0.2, 0.3, 0.4), (0, -0.0, 1), 0.6),  # minus zero is no direction either
+        ((0.2, 0.3, 0.4), (1e-12, 0, -1), 1.4),
+        ((0, 0, 3), (0, 0, 1), -2.0),  # outside and away: it left 2 m ago
+    ],
+)
+def test_exit_depth(origin: tuple, direction: tuple, expected: float) -> None:
+    """Catches NaN for rays along an axis, the near wall taken for the far, and a wrong unit."""
+    found = UNIT.exit_depth(torch.tensor([origin]).float(), torch.tensor([direction]).float())
+    assert found.item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_box_by_hand() -> None:
+    """Catches half and full sides mixed up, a scale of another axis than the longest, and an axis
+    left out: from inside, every exit is on a wall and none is outside."""
+    box = SceneBounds((0.0, -1.0, 2.0), (4.0, 1.0, 5.0))
+    np.testing.assert_allclose(box.center, [2.0, 0.0, 3.5])
+    assert box.metres_per_unit == 2.0
+    generator = torch.Generator().manual_seed(0)
+    low, high = torch.tensor(box.minimum), torch.tensor(box.maximum)
+    origins = low + (high - low) * torch.rand(500, 3, generator=generator)
+    directions = torch.randn(500, 3, generator=generator)
+    exits = origins + box.exit_depth(origins, directions)[:, None] * directions
+    beyond = torch.maximum(low - exits, exits - high).amax(dim=-1)
+    torch.testing.assert_close(beyond, torch.zeros(500), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("pose", "margin", "low", "high"),
+    [
+        (AHEAD, 0.1, [-2.0, -2.0, -0.1], [2.0, 2.0, 2.1]),  # seen at +-0.95 * 2 m; camera at z = 0
+        (TURNED, 0.0, [5.0, -1.9, -1.9], [7.0, 1.9, 1.9]),
+    ],
+)
+def test_observed_wall(pose, margin, low, high) -> None:
+    """Catches pixels that are half off, a missing margin, a camera left outside, the inverse pose:
+    a wall is 2 m ahead."""
+    box = observed_bounds(sequence_of(np.full((1, 20, 20), 2000), SQUARE, poses=pose), margin)
+    np.testing.assert_allclose([box.minimum, box.maximum], [low, high], atol=1e-5)
+
+
+def test_missing_and_wild_depths_do_not_stretch_the_box() -> None:
+    """Catches pixels without a measurement taken for points at the camera, a few wild ones, and a
+    NumPy error about quantiles where the depth folder is at fault."""
+    depths_mm = np.full((5, 20, 20), 2000)
+    depths_mm[0, 3, 4:6] = 60_000
+    depths_mm[1:, :10] = 0
+    box = observed_bounds(sequence_of(depths_mm, SQUARE), margin=0.1)
+    assert box.maximum[2] == pytest.approx(2.1, abs=1e-5)
+    with pytest.raises(DataError, match=r"^no pixel of room has a depth.*$"):
+        observed_bounds(sequence_of(np.zeros((2, 20, 20)), SQUARE))

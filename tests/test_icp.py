@@ -5,17 +5,18 @@ import sys
 import numpy as np
 import pytest
 import torch
+from box_room import sequence_of
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import MissingError
-from nbtrack.data.sequence import RgbdSequence, read_sequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, PointMapping
 from nbtrack.fields.points import fuse_points
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.mapping.quality import score_map
-from nbtrack.synthetic import build_room, make_room
+from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
 from nbtrack.tracking import IcpSettings, StepBudget, Tracker, make_tracker
 from nbtrack.tracking.metrics import pose_errors
 from nbtrack.tracking.registration import moved
@@ -24,23 +25,19 @@ BOX = SceneBounds((-1.0, -1.0, 0.0), (1.0, 1.0, 3.0))
 Room = tuple[RgbdSequence, Map]
 
 
-def two_pixel_sequence(depths_mm: list[list[int]], shades: list[list[int]]) -> RgbdSequence:
-    """Frames of two pixels side by side, from one camera at the origin; grey by pixel.
-
-    The pixels' directions are (-0.25, 0, 1) and (0.25, 0, 1).
-    """
-    n, camera = len(depths_mm), Intrinsics(2, 1, 2.0, 2.0, 1.0, 0.5)
-    colors = np.repeat(np.array(shades, np.uint8).reshape(n, 1, 2, 1), 3, axis=3)
-    depths, poses = np.array(depths_mm, np.uint16)[:, None], np.tile(np.eye(4), (n, 1, 1))
-    return RgbdSequence("two pixels", camera, colors, depths, poses, np.arange(n))
+def two_pixels(depths_mm: list[list[int]], shades: list[list[int]]) -> RgbdSequence:
+    """Frames of two pixels side by side, which look along (-0.25, 0, 1) and (0.25, 0, 1)."""
+    colors = np.repeat(np.array(shades, np.uint8).reshape(-1, 1, 2, 1), 3, axis=3)
+    return sequence_of(np.array(depths_mm)[:, None], Intrinsics(2, 1, 2.0, 2.0, 1.0, 0.5), colors)
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
+def room() -> Room:
     """A few clean frames of a furnished room, and their points."""
-    folder = tmp_path_factory.mktemp("data") / "bedroom"
-    make_room("bedroom", folder, 8, 80, 60)
-    sequence = read_sequence(folder, depth_folder="depth")
+    of, camera = build_room("bedroom"), room_intrinsics(80, 60)
+    poses = handheld_trajectory(of, 8, 0)
+    colors, depths, _ = zip(*(render_frame(of, camera, pose) for pose in poses), strict=True)
+    sequence = sequence_of(1000 * np.stack(depths), camera, np.stack(colors), poses)
     return sequence, map_sequence("points", sequence, NetworkSettings(), PointMapping())
 
 
@@ -53,7 +50,7 @@ def test_points_of_a_voxel_are_averaged() -> None:
     """Catches sums that are not divided, or voxels mixed up: the mean is worked out by hand."""
     # Left pixel: x = -z/4. 2.02 and 2.04 m fall into one voxel of 10 cm, 2.50 m into another.
     depths_mm, shades = [[2020, 0], [2040, 0], [2500, 0]], [[50, 0], [150, 0], [255, 0]]
-    cloud = fuse_points(two_pixel_sequence(depths_mm, shades), np.arange(3), BOX, voxel=0.1)
+    cloud = fuse_points(two_pixels(depths_mm, shades), np.arange(3), BOX, voxel=0.1)
     points, colors = cloud.points.numpy(), cloud.colors.numpy()
     order = points[:, 2].argsort()
     expected = [[-0.5075, 0, 2.03], [-0.625, 0, 2.5]]
@@ -64,23 +61,19 @@ def test_points_of_a_voxel_are_averaged() -> None:
 def test_mean_is_over_all_pixels_however_they_are_merged() -> None:
     """Catches a mean of means: 20 frames, merged in blocks, weigh the same each."""
     depths = [2010 + 4 * (i % 5) ** 2 for i in range(20)]
-    sequence = two_pixel_sequence([[0, d] for d in depths], [[0, 90]] * 20)
+    sequence = two_pixels([[0, d] for d in depths], [[0, 90]] * 20)
     points = fuse_points(sequence, np.arange(20), BOX, voxel=0.25).points
     assert points.shape == (1, 3)
     assert points[0, 2] == pytest.approx(np.mean(depths) / 1000, abs=1e-6)
 
 
 def test_only_the_frames_asked_for_and_what_lies_inside_are_fused() -> None:
-    """Catches a map of held-out frames, and wild depths that stretch the grid."""
-    sequence = two_pixel_sequence([[2000, 9000], [1000, 1000]], [[10, 10]] * 2)
-    points = fuse_points(sequence, np.array([0]), BOX, voxel=0.02).points
-    np.testing.assert_allclose(points, [[-0.5, 0.0, 2.0]], atol=1e-6)
-
-
-def test_distance_from_the_nearest_point() -> None:
-    """Catches a distance that is squared, or from another point."""
-    cloud = fuse_points(two_pixel_sequence([[2000, 2000]], [[0, 255]]), np.array([0]), BOX, 0.02)
-    found = cloud.distance(torch.tensor([[0.5, 0.3, 2.0], [-0.5, 0.0, 1.6]]))
+    """Catches a map of held-out frames, wild depths that stretch the grid, and a distance that is
+    squared, or from another point."""
+    sequence = two_pixels([[2000, 9000], [1000, 1000]], [[10, 10]] * 2)
+    cloud = fuse_points(sequence, np.array([0]), BOX, voxel=0.02)
+    np.testing.assert_allclose(cloud.points, [[-0.5, 0.0, 2.0]], atol=1e-6)
+    found = cloud.distance(torch.tensor([[-0.5, 0.3, 2.0], [-0.5, 0.0, 1.6]]))
     torch.testing.assert_close(found, torch.tensor([0.3, 0.4]))
 
 
@@ -99,11 +92,9 @@ def test_scores_of_points(room: Room) -> None:
 def test_icp_lands_on_the_true_pose(room: Room) -> None:
     """Catches a pose taken for its inverse, or wrong axes: from 5 cm and 3 degrees off."""
     pytest.importorskip("small_gicp")
-    tracker, frame = tracker_in(room), room[0][5]
-    twist = torch.cat(
-        [np.radians(3) * torch.tensor([2.0, -1, 2]), 0.05 * torch.tensor([2.0, 2, 1])]
-    )
-    T_start = moved(torch.from_numpy(frame.T_world_camera).float(), twist / 3)
+    tracker, frame, turn = tracker_in(room), room[0][5], float(np.radians(1))
+    twist = torch.tensor([2 * turn, -turn, 2 * turn, 0.033, 0.033, 0.017])
+    T_start = moved(torch.from_numpy(frame.T_world_camera).float(), twist)
     tracker.begin(frame, T_start[None])
     assert not tracker.is_converged
     assert torch.equal(tracker.T_world_camera, T_start)

@@ -2,10 +2,12 @@
 
 from functools import cache
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 import torch
+from box_room import sequence_of
 
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError, NumericalError
@@ -19,24 +21,17 @@ NETWORK = NetworkSettings(width=48, n_frequencies=32)
 
 
 def settings_of(field_name: str, **changes: float) -> MappingSettings:
-    """Few rays and samples; 20 iterations if nothing else is asked for."""
-    small = {"iterations": 20, "n_rays": 32, "n_stratified": 8, "n_surface": 4}
+    """Few rays and samples; 14 iterations if nothing else is asked for."""
+    small = {"iterations": 14, "n_rays": 32, "n_stratified": 8, "n_surface": 4}
     return field_class(field_name).Settings(**{**small, "learning_rate": 3e-3, **changes})
 
 
 def wall_sequence(n_frames: int = 6, distance: float = 2.0) -> RgbdSequence:
     """Cameras side by side that look straight at a grey wall, `distance` metres ahead."""
-    height, width = 12, 16
     poses = np.tile(np.eye(4), (n_frames, 1, 1))
     poses[:, 0, 3] = np.linspace(-0.5, 0.5, n_frames)
-    return RgbdSequence(
-        "wall",
-        Intrinsics.from_focal(width, height, 14.0),
-        np.full((n_frames, height, width, 3), 128, np.uint8),
-        np.full((n_frames, height, width), int(1000 * distance), np.uint16),
-        poses,
-        np.arange(n_frames),
-    )
+    depths_mm = np.full((n_frames, 12, 16), 1000 * distance)
+    return sequence_of(depths_mm, Intrinsics.from_focal(16, 12, 14.0), poses=poses, name="wall")
 
 
 @cache
@@ -69,13 +64,9 @@ def test_imap_renders_a_wall() -> None:
 
 def test_points_are_fused_at_once() -> None:
     """Catches held-out frames among the points, and a bar that never ends."""
-    seen = []
+    seen, settings = [], PointMapping(voxel=0.05, holdout_every=3)
     mapped = map_sequence(
-        "points",
-        wall_sequence(),
-        NETWORK,
-        PointMapping(voxel=0.05, holdout_every=3),
-        on_iteration=lambda *news: seen.append(news),
+        "points", wall_sequence(), NETWORK, settings, on_iteration=lambda *news: seen.append(news)
     )
     n_points = len(mapped.field.points)
     assert seen == [(1, {"points": n_points, "bytes": 24 * n_points})]
@@ -85,21 +76,16 @@ def test_points_are_fused_at_once() -> None:
     assert mapped.made["misfit_m"] < 0.05
 
 
-class Killed(Exception):
-    """Stands for the end of a process."""
-
-
 def map_killed(field_name: str, checkpoint: Path, at: int, seed: int = 3) -> None:
     """Leaves the checkpoint of a map that is killed after some iterations."""
 
     def kill(iteration: int, losses: dict[str, float]) -> None:
         if iteration >= at:
-            raise Killed
+            raise InterruptedError
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbtrack.mapping.fit.CHECKPOINT_SECONDS", 0.0)
-        with pytest.raises(Killed):
-            map_wall(field_name, checkpoint, kill, seed)
+    now = mock.patch("nbtrack.mapping.fit.CHECKPOINT_SECONDS", 0.0)
+    with now, pytest.raises(InterruptedError):
+        map_wall(field_name, checkpoint, kill, seed)
 
 
 def map_wall(field_name: str, checkpoint: Path | None, on_iteration=None, seed: int = 3) -> Map:
@@ -116,7 +102,7 @@ def test_resume_equals_uninterrupted(field_name: str, tmp_path: Path) -> None:
     whole = map_wall(field_name, None)
     map_killed(field_name, checkpoint, at=10)
     resumed = map_wall(field_name, checkpoint, lambda done, losses: seen.append(done))
-    assert seen == [11, 20]
+    assert seen == [11, 14]
     assert np.array_equal(resumed.history.to_numpy(), whole.history.to_numpy())
     assert resumed.key == whole.key
 
@@ -152,15 +138,12 @@ def test_no_depth_at_all(field_name: str) -> None:
         map_sequence(field_name, sequence, NETWORK, settings)
 
 
-def test_learning_rate_schedule() -> None:
-    """Catches a rate that ends high or too low; half-way it is 0.525 of the start."""
+def test_schedule_and_split() -> None:
+    """Catches a rate that ends high or too low (half-way it is 0.525 of the start), and frames that
+    are both mapped and scored, or neither."""
     settings = settings_of("imap", iterations=100, learning_rate=1.0)
     found = [learning_rate(settings, iteration) for iteration in (0, 50, 100)]
     assert found == pytest.approx([1.0, 0.525, 0.05])
-
-
-def test_split_holdout_parts() -> None:
-    """Catches frames that are both mapped and scored, or neither."""
     mapped, held_out = split_holdout(25, 10)
     assert held_out.tolist() == [5, 15]
     assert sorted([*mapped, *held_out]) == list(range(25))

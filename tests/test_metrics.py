@@ -1,16 +1,21 @@
-"""Trajectory errors: values worked by hand, and laws that any rigid motion must keep."""
+"""Trajectory errors, by hand and by laws of rigid motion; and TUM files, which others read."""
+
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.errors import DataError, NumericalError
+from nbtrack.core.files import json_text, write_atomic
 from nbtrack.tracking.metrics import (
     align_rigidly,
     pose_errors,
     score_detection,
     trajectory_metrics,
 )
+from nbtrack.tracking.trajectories import read_tum, tum_text
 
 
 def poses(positions: list[list[float]]) -> np.ndarray:
@@ -29,30 +34,25 @@ def wandering(frames: int, seed: int = 0) -> np.ndarray:
 
 
 def test_values_by_hand() -> None:
-    """Catches a wrong mean, a counted first frame, a shifted threshold."""
+    """Catches a wrong mean, a counted first frame, a shifted threshold; radians for degrees, half
+    angles, and transposed rotations that add instead."""
     true = poses([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
+    true[:, :3, :3] = Rotation.from_euler("x", 50, degrees=True).as_matrix()
     # The first row is wrong on purpose: it was given, so it must not count.
     estimated = poses([[9, 9, 9], [1, 0.1, 0], [2, 0, 0.2], [3, 0.4, 0]])
+    turned = Rotation.from_euler("x", [[90], [53], [46], [50]], degrees=True)
+    estimated[:, :3, :3] = turned.as_matrix()
+    np.testing.assert_allclose(pose_errors(estimated, true)[1], [40, 3, 4, 0], atol=1e-9)
     metrics = trajectory_metrics(estimated, true)
     assert metrics.pop("ate_rmse_aligned_m") < metrics["ate_rmse_m"]
     assert metrics == {
         "ate_rmse_m": pytest.approx(np.sqrt(0.07)),  # sqrt((0.01 + 0.04 + 0.16) / 3)
-        "rotation_rmse_deg": 0,
+        "rotation_rmse_deg": pytest.approx(np.sqrt(25 / 3)),
         "median_error_m": pytest.approx(0.2),
         "max_error_m": pytest.approx(0.4),
         "frames": 3,
         "lost_frames": 1,  # 0.2 is not above 0.2
     }
-
-
-def test_rotation_by_hand() -> None:
-    """Catches radians for degrees, half angles, and transposed rotations that add instead."""
-    true = poses([[0, 0, 0]] * 3)
-    true[:, :3, :3] = Rotation.from_euler("x", 50, degrees=True).as_matrix()
-    estimated = true.copy()
-    estimated[1:, :3, :3] = Rotation.from_euler("x", [[53], [46]], degrees=True).as_matrix()
-    np.testing.assert_allclose(pose_errors(estimated, true)[1], [0, 3, 4], atol=1e-9)
-    assert trajectory_metrics(estimated, true)["rotation_rmse_deg"] == pytest.approx(12.5**0.5)
 
 
 @pytest.mark.parametrize("true", [wandering(20), poses([[1, 2, 3]] * 5), poses([[1, 2, 3]] * 2)])
@@ -81,19 +81,16 @@ def test_aligned_error_ignores_rigid_motion_alone() -> None:
 
 
 @pytest.mark.parametrize("position", [0, 1])
-def test_nan_names_the_frame(position: int) -> None:
-    """Catches a NaN error that is reported as a number, or without saying where it is."""
+def test_poses_that_cannot_be_compared(position: int) -> None:
+    """Catches a NaN error that is reported as a number, or without saying where it is, and silent
+    broadcasting of one pose over a whole trajectory."""
     pair = [wandering(6), wandering(6)]
     pair[position][4, 0, 3] = np.nan
     with pytest.raises(NumericalError, match="pose of frame 4 is not finite"):
         trajectory_metrics(*pair)
-
-
-@pytest.mark.parametrize(("estimated", "true"), [(1, 6), (0, 0)])
-def test_numbers_of_poses(estimated: int, true: int) -> None:
-    """Catches silent broadcasting of one pose over a whole trajectory."""
-    with pytest.raises(DataError, match=f"{estimated} estimated and {true} true"):
-        trajectory_metrics(wandering(6)[:estimated], wandering(6)[:true])
+    for n_estimated, n_true in ((1, 6), (0, 0)):
+        with pytest.raises(DataError, match=f"{n_estimated} estimated and {n_true} true"):
+            trajectory_metrics(pair[0][:n_estimated], pair[1][:n_true])
 
 
 def test_detection_of_lost_frames() -> None:
@@ -103,3 +100,46 @@ def test_detection_of_lost_frames() -> None:
     assert found == {"lost_precision": 1.0, "lost_recall": pytest.approx(1 / 3)}
     none = score_detection(np.array([False]), np.array([0.01]))
     assert none == {"lost_precision": None, "lost_recall": None}
+
+
+def test_tum_round_trip(tmp_path: Path) -> None:
+    """Catches digits cut off, an inverted pose, a wrong quaternion order; and blanks too many and
+    negative zeros, which strict readers refuse or show."""
+    true, frame_ids = wandering(50, seed=7), np.arange(3, 153, 3)
+    true[0] = np.diag([1.0, -1, -1, 1])
+    text = tum_text(frame_ids, true)
+    for line in text.splitlines()[1:]:
+        assert line == " ".join(line.split())
+        assert "-0.0 " not in line
+        assert float(line.split()[7]) >= 0
+    write_atomic(tmp_path / "new" / "t.txt", text)
+    timestamps, read = read_tum(tmp_path / "new" / "t.txt")
+    np.testing.assert_allclose(read, true, atol=1e-12, rtol=0)
+    np.testing.assert_array_equal(timestamps, frame_ids / 30)
+
+
+def test_a_rotation_by_hand() -> None:
+    """Catches w x y z order: a quarter turn about z has z = w = sqrt(1/2)."""
+    pose = np.array([[0.0, -1, 0, 1.5], [1, 0, 0, -2], [0, 0, 1, 0.25], [0, 0, 0, 1]])
+    header, line, end = tum_text(np.array([15]), pose[None]).split("\n")
+    assert (header, end) == ("# timestamp tx ty tz qx qy qz qw", "")
+    assert line.startswith("0.5 1.5 -2.0 0.25 0.0 0.0 0.7071067811865")
+    expected = [0.5, 1.5, -2, 0.25, 0, 0, np.sqrt(0.5), np.sqrt(0.5)]
+    np.testing.assert_allclose([float(word) for word in line.split(" ")], expected, atol=1e-15)
+
+
+def test_rounded_and_commented_files_of_others(tmp_path: Path) -> None:
+    """Catches a reader that takes only our own files: comments, tabs, four-digit quaternions."""
+    path = tmp_path / "other.txt"
+    path.write_text(" # made elsewhere\n1305031102.1758\t1 2 3 0.6574 0.6126 -0.2949 -0.3248\n\n")
+    timestamps, T_world_camera = read_tum(path)
+    assert timestamps[0] == 1305031102.1758
+    rotation = T_world_camera[0, :3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_json_has_no_nan() -> None:
+    """Catches results that other readers of JSON refuse, and keys in another order."""
+    assert list(json.loads(json_text({"b": 1.5, "a": [None, "ü"]}))) == ["b", "a"]
+    with pytest.raises(ValueError, match="JSON"):
+        json_text({"ate": float("nan")})

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 import torch
 import trimesh
+from box_room import Formula
 from ipywidgets import fixed, interactive
 from matplotlib.axis import Axis
 from matplotlib.container import BarContainer
@@ -20,31 +21,19 @@ from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields import Field
 from nbtrack.fields.base import View
 from nbtrack.plots.rooms import screen_axes
 from nbtrack.plots.style import PALETTE, method_colors
 from nbtrack.synthetic import build_room
 from nbtrack.tables import published_table_1, published_table_2
 
-
-class AnalyticField(Field):
-    """A field without a network, of a function of points (m)."""
-
-    name, label = "analytic", "Analytic"
-
-    def __init__(self, value, level=0.0) -> None:
-        super().__init__(SceneBounds((-2.0,) * 3, (2.0,) * 3))
-        self.unused = torch.nn.Parameter(torch.zeros(1))  # says on which device the field lives
-        self.value, self.surface_level = value, level
-
-    def forward(self, points_world: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return torch.full_like(points_world, 0.5), self.value(points_world)
+CUBE = SceneBounds((-2.0,) * 3, (2.0,) * 3)
 
 
 # A hollow sphere around the origin: the distance, positive inside, and a density (1/m).
-SPHERE = AnalyticField(lambda points: 1.5 - points.norm(dim=-1))
-FOG = AnalyticField(lambda p: 20 * torch.exp(5 * (p.norm(dim=-1) - 1.5)), level=20.0)
+SPHERE = Formula(lambda points: 1.5 - points.norm(dim=-1), CUBE)
+FOG = Formula(lambda p: 20 * torch.exp(5 * (p.norm(dim=-1) - 1.5)), CUBE)
+FOG.surface_level = 20.0
 SWEEP = pd.DataFrame({"time (ms)": [1.0, 9.0], "ATE (cm)": [2.0, 0.5], "method": ["VR", "SDF"]})
 CELLS = pd.DataFrame({
     "rate_hz": [2.0, 10.0, 2.0, 2.0], "method": ["A", "A", "B", "B"], "scene": "whiteroom",
@@ -191,7 +180,7 @@ def test_the_zero_level_lies_on_the_sphere(sequence, field, height, up) -> None:
     level, and pixels off by half."""
     (circle,) = contours(plots.plot_slice(field, held(sequence, up), height))
     assert np.linalg.norm(circle, axis=1) == pytest.approx(np.sqrt(1.5**2 - height**2), abs=2e-3)
-    along = AnalyticField(lambda points: points @ torch.tensor(up, dtype=torch.float32))
+    along = Formula(lambda points: points @ torch.tensor(up, dtype=torch.float32), CUBE)
     values = plots.plot_slice(along, held(sequence, up), height).axes[0].collections[0].get_array()
     assert values.mean() == pytest.approx(height, abs=1e-4)
 

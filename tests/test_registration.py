@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from box_room import Formula
 from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
@@ -25,18 +26,10 @@ BOX = SceneBounds((-1.0, -1.2, -0.8), (1.0, 1.2, 0.8))
 WIDEST, ORIGIN = torch.full((2,), math.inf), torch.eye(4)
 
 
-class Wall(Field):
+def wall(slope: float = 1.0) -> Formula:
     """The plane z = 0.5 seen from below, as a distance that grows `slope` times too fast."""
-
-    name, label, surface_level = "wall", "wall", 0.0
-
-    def __init__(self, slope: float) -> None:
-        super().__init__(BOX)
-        self.slope = slope
-
-    def forward(self, points_world: Tensor) -> tuple[Tensor, Tensor]:
-        gray = 0.5 + 0.2 * points_world[:, :1]
-        return gray.expand(-1, 3), self.slope * (0.5 - points_world[:, 2])
+    gray = torch.tensor([[0.2] * 3, [0.0] * 3, [0.0] * 3])
+    return Formula(lambda p: slope * (0.5 - p[:, 2]), BOX, lambda p: 0.5 + p @ gray)
 
 
 def pose() -> Tensor:
@@ -79,22 +72,22 @@ def test_jacobians_of_both_residuals_against_finite_differences(kind: str) -> No
 def test_a_field_that_grows_too_fast_is_corrected() -> None:
     """Catches distances taken as they are: at slope 1.3 a step would be 30 % too long."""
     seen = torch.tensor([[0.0, 0.0, 0.2]]), torch.tensor([0.5])
-    residuals = residuals_at(Wall(1.3), seen, ORIGIN)
+    residuals = residuals_at(wall(1.3), seen, ORIGIN)
     assert residuals.value[0].item() == pytest.approx(0.3)
     assert residuals.jacobian[0, 0].tolist() == pytest.approx([0, 0, 0, 0, 0, -1])
     assert residuals.reliability.item() == pytest.approx((1 + 0.6**2) ** -2)
-    as_it_is = residuals_at(Wall(1.3), seen, ORIGIN, divide_by_slope=False)
+    as_it_is = residuals_at(wall(1.3), seen, ORIGIN, divide_by_slope=False)
     assert as_it_is.value[0].item() == pytest.approx(0.39)
 
 
 def test_points_out_of_bounds_count_the_most_and_pull_nowhere() -> None:
     """Catches a pose that gets cheaper by carrying points out of the map."""
     seen = torch.tensor([[0.0, 0.0, 0.4], [0.0, 0.0, 5.0]]), torch.full((2,), 0.5)
-    residuals, scales = residuals_at(Wall(1.0), seen, ORIGIN), torch.tensor([0.1, 1.0])
+    residuals, scales = residuals_at(wall(), seen, ORIGIN), torch.tensor([0.1, 1.0])
     assert residuals.reliability.tolist() == [1.0, 0.0]
     # First point: one scale off, cost 1/2; second: the worst, 1; intensities: 0 and the worst, 1.
     assert robust_cost(residuals, scales, 1.0).item() == pytest.approx((0.5 + 2) / 2)
-    alone = residuals_at(Wall(1.0), (seen[0][:1], seen[1][:1]), ORIGIN)
+    alone = residuals_at(wall(), (seen[0][:1], seen[1][:1]), ORIGIN)
     both, one = (normal_equations(r, scales, 1.0)[0] for r in (residuals, alone))
     torch.testing.assert_close(both, one)
 
@@ -116,8 +109,7 @@ def test_scales_follow_the_residuals_down_only() -> None:
     values = torch.tensor([[0.01, -0.04, 0.5], [0.0, 0.0, 0.0]])
     residuals = Residuals(values, torch.zeros(2, 3, 6), torch.ones(3))
     assert scales_of(residuals, WIDEST).tolist() == pytest.approx([0.12, float(LEAST_SCALES[1])])
-    narrower = torch.tensor([0.05, 1.0])
-    assert scales_of(residuals, narrower)[0].item() == pytest.approx(0.05)
+    assert scales_of(residuals, torch.full((2,), 0.05))[0].item() == pytest.approx(0.05)
 
 
 def test_moved_turns_about_the_camera_and_is_finite_at_zero() -> None:
@@ -133,7 +125,7 @@ def test_moved_turns_about_the_camera_and_is_finite_at_zero() -> None:
 def test_a_single_plane_leaves_three_directions_open() -> None:
     """Catches a covariance or condition that hides a slide along the only wall in view."""
     points, intensity = observation(300)
-    residuals = residuals_at(Wall(1.0), (points.float(), intensity.float()), ORIGIN)
+    residuals = residuals_at(wall(), (points.float(), intensity.float()), ORIGIN)
     found = certainty(residuals, scales_of(residuals, WIDEST), 0.0)
     assert found["condition_number"] > 1e6
     # Along the wall the position is as uncertain as the pull to the start allows.

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from box_room import Formula, sequence_of
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -13,10 +14,9 @@ from nbtrack.core.camera import Intrinsics, backproject
 from nbtrack.core.geometry import transform_points
 from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields import LearnedField, NeusMapping
+from nbtrack.fields import NeusMapping
 from nbtrack.fields.base import NEAR, rays_end
 from nbtrack.fields.neus import guided_depths
-from nbtrack.fields.rendering import Rendering, composite, weights_from_density, weights_from_sdf
 
 CAMERA = Intrinsics.from_focal(16, 12, 14.0)
 CPU = torch.device("cpu")
@@ -24,30 +24,10 @@ BOX = SceneBounds((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))
 CONFIG = NeusMapping(n_stratified=16, n_surface=8, surface_band=0.15)
 
 
-class Wall(LearnedField):
+def wall(signed: bool) -> Formula:
     """A gray wall at z = 2, either dense behind it or as a signed distance."""
-
-    name = label = "wall"
-    surface_level = 0.0
-
-    def __init__(self, signed: bool) -> None:
-        super().__init__(BOX)
-        self.signed = signed
-
-    def forward(self, points_world: Tensor) -> tuple[Tensor, Tensor]:
-        distance = 2.0 - points_world[:, 2]
-        value = distance if self.signed else 50.0 * (distance < 0)
-        return torch.full_like(points_world, 0.5), value
-
-    def composite(self, colors: Tensor, value: Tensor, rays: Rays, depths: Tensor) -> Rendering:
-        if not self.signed:
-            lengths = rays.directions_world.norm(dim=-1)
-            return composite(weights_from_density(value, depths, lengths), colors, depths)
-        weights = weights_from_sdf(value, torch.tensor(50.0))
-        return composite(weights, colors[:, 1:], (depths[:, 1:] + depths[:, :-1]) / 2)
-
-    def mapping_losses(self, *arguments: object) -> dict[str, Tensor]:
-        raise NotImplementedError
+    signed_distance, density = lambda p: 2.0 - p[:, 2], lambda p: 50.0 * (p[:, 2] > 2)
+    return Formula(signed_distance if signed else density, BOX, as_density=not signed)
 
 
 def random_sequence(n_frames: int) -> RgbdSequence:
@@ -56,10 +36,8 @@ def random_sequence(n_frames: int) -> RgbdSequence:
     poses = np.tile(np.eye(4), (n_frames, 1, 1))
     poses[:, :3, :3] = Rotation.random(n_frames, random_state=rng).as_matrix()
     poses[:, :3, 3] = rng.normal(size=(n_frames, 3))
-    return RgbdSequence(
-        "noise", CAMERA, rng.integers(0, 256, (*shape, 3), dtype=np.uint8),
-        rng.integers(0, 1 << 16, shape, dtype=np.uint16), poses, np.arange(n_frames),
-    )  # fmt: skip
+    colors = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+    return sequence_of(rng.integers(0, 1 << 16, shape), CAMERA, colors, poses)
 
 
 def rays_ahead(n_rays: int, depth: Tensor) -> Rays:
@@ -138,8 +116,9 @@ def test_images_stay_on_the_host_where_the_device_is_full(name: str, monkeypatch
 
 
 def test_guided_depths(generator: torch.Generator) -> None:
-    """Catches samples behind the surface's band, too few around it, an unsorted ray, and a missing
-    depth taken for a surface at the camera: such rays go to the box, 3 m."""
+    """Catches samples behind the surface's band, too few around it, an unsorted ray, a missing
+    depth taken for a surface at the camera (such rays go to the box, 3 m), and negative ranges when
+    a pose has left the box."""
     rays = rays_ahead(40, torch.linspace(0.5, 2.5, 40))
     depths = guided_depths(rays, BOX, CONFIG, generator)
     assert depths.shape == (40, 24)
@@ -150,44 +129,33 @@ def test_guided_depths(generator: torch.Generator) -> None:
     # One stratified sample falls into each of 16 parts, so none is left unseen.
     gaps = depths.diff(dim=-1).amax(dim=-1)
     assert (gaps <= 2 * (rays.depth + 0.15) / 16).all()
-    last = guided_depths(rays_ahead(40, torch.zeros(40)), BOX, CONFIG, generator).amax(dim=-1)
+    blind = rays_ahead(40, torch.zeros(40))
+    last = guided_depths(blind, BOX, CONFIG, generator).amax(dim=-1)
     assert 2.7 < last.min() <= last.max() <= 3.15 + 1e-5
+    outside = replace(blind, origins_world=blind.origins_world + torch.tensor([0.0, 0.0, 9.0]))
+    torch.testing.assert_close(rays_end(outside, BOX), torch.full((40,), 2 * NEAR))
 
 
-def test_rays_of_a_lost_camera_have_some_length() -> None:
-    """Catches negative ranges when a pose has left the box."""
-    rays = rays_ahead(3, torch.zeros(3))
-    outside = replace(rays, origins_world=rays.origins_world + torch.tensor([0.0, 0.0, 9.0]))
-    torch.testing.assert_close(rays_end(outside, BOX), torch.full((3,), 2 * NEAR))
-
-
-@pytest.mark.parametrize(("signed", "seeded"), [(False, True), (True, False)])
-def test_two_passes_find_the_wall(signed: bool, seeded: bool, generator: torch.Generator) -> None:
-    """Catches a second pass beside the surface: the sections' weights lie between the samples.
+@pytest.mark.parametrize("seeded", [False, True])
+@pytest.mark.parametrize("signed", [False, True])
+def test_two_passes_find_the_wall(signed: bool, seeded: bool) -> None:
+    """Catches a second pass beside the surface: the sections' weights lie between the samples; and
+    where every sample is asked for once, answers sorted unlike their depths, and other draws.
 
     The first pass leaves 9 cm between its samples; 12 of the second must be around the wall.
     """
-    wall, rays = Wall(signed), rays_ahead(20, torch.zeros(20))
-    depths = wall.two_pass_depths(rays, 32, 12, generator if seeded else None)
+    field, rays = wall(signed), rays_ahead(20, torch.zeros(20))
+    rays = replace(rays, origins_world=rays.origins_world.clone().requires_grad_())
+    again = [torch.Generator().manual_seed(1) if seeded else None for _ in range(2)]
+    depths = field.two_pass_depths(rays, 32, 12, again[0])
     assert depths.shape == (20, 44)
+    assert not depths.requires_grad
     assert (depths.diff(dim=-1) >= 0).all()
     assert ((depths - 2.0).abs() < 0.25).sum(dim=-1).min() >= 12
-    assert (wall.render(rays, depths).depth - 2.0).abs().mean() < 0.05
-
-
-@pytest.mark.parametrize("signed", [False, True])
-def test_asking_for_every_sample_once_renders_the_same(signed: bool) -> None:
-    """Catches answers sorted unlike their depths, other random numbers, and samples that move."""
-    wall, rays = Wall(signed), rays_ahead(20, torch.zeros(20))
-    rays = replace(rays, origins_world=rays.origins_world.clone().requires_grad_())
-    depths = wall.two_pass_depths(rays, 32, 12, torch.Generator().manual_seed(1))
-    assert not depths.requires_grad
-    expected = wall.render(rays, depths)
-    found = wall.render_in_two_passes(rays, 32, 12, torch.Generator().manual_seed(1))
-    if signed:  # the other wall is a step, without a derivative
-        both = (
-            torch.autograd.grad(r.depth.sum(), rays.origins_world)[0] for r in (found, expected)
-        )
-        torch.testing.assert_close(*both, atol=1e-5, rtol=1e-4)
+    both = field.render(rays, depths), field.render_in_two_passes(rays, 32, 12, again[1])
+    assert (both[0].depth - 2.0).abs().mean() < 0.05
     for name in ("color", "depth", "depth_variance", "opacity", "weights"):
-        assert torch.allclose(getattr(found, name), getattr(expected, name), atol=1e-6), name
+        torch.testing.assert_close(*(getattr(r, name) for r in both), atol=1e-6, rtol=1e-5)
+    if signed:  # the other wall is a step, without a derivative
+        slopes = [torch.autograd.grad(r.depth.sum(), rays.origins_world)[0] for r in both]
+        torch.testing.assert_close(*slopes, atol=1e-5, rtol=1e-4)
