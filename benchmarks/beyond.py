@@ -12,7 +12,7 @@ from dataclasses import replace
 import pandas as pd
 from basin import find_from_afar
 
-from nbtrack import METHODS, Method, load_preset, map_scenes, open_scenes, track_scenes
+from nbtrack import METHODS, Method, load_preset, map_scene, map_scenes, open_scenes, track_scenes
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
@@ -22,7 +22,8 @@ from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.tables import write_table_3
 
-_COLUMNS = ["rate_hz", "method", "scene", "frames", "steps_per_frame", "seconds_per_frame", "ate_m"]
+_COLUMNS = ["rate_hz", "method", "n_pixels", "scene", "frames"]
+_COLUMNS += ["steps_per_frame", "seconds_per_frame", "ate_m"]
 _FIRST_60 = ":60"
 
 _CHANGES = {
@@ -59,6 +60,7 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     # Times count: one run after the other. Other frames than above, so that none is cached.
     speed = track_scenes(scenes, TABLE_3, preset, [10], frames=":40", execution=Execution(1, 1))
     write("beyond", "speed", speed[_COLUMNS])
+    write("beyond", "points", points_and_bytes(scenes, preset))
     searches = find_from_afar(scenes[0], {"sdf_plus": 79, "lm": 30, "baked": 30}, preset)
     write("beyond", "basin", searches)
     parts = [
@@ -69,15 +71,32 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     write("beyond", "ingredients", ingredients)
 
 
+def points_and_bytes(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
+    """LM and ICP with fewer and more points a frame; ICP in coarser clouds too. Error and size.
+
+    `map_mb` is what the map's numbers take, a million bytes.
+    """
+    maps = {"NeuS+ with SDF (LM)": ("neus_plus", "lm", ())}
+    for voxel in (0.02, 0.05, 0.1):
+        setting = f"mapping.points.voxel={voxel}"
+        maps[f"ICP, cells of {100 * voxel:g} cm"] = ("points", "icp", (setting,))
+    parts = []
+    for label, (field, tracker, settings) in maps.items():
+        fields = [map_scene(s, field, with_settings(preset, *settings)).field for s in scenes]
+        sizes = [sum(t.nbytes for t in field.state_dict().values()) / 1e6 for field in fields]
+        for n in (128, 512, 2048, 4096):
+            points = f"tracking.{tracker}.n_pixels={n}"
+            method = Method(label, field, tracker, (*settings, points))
+            found = track_scenes(scenes, [method], preset, [10], frames=_FIRST_60)
+            parts.append(found.assign(map_mb=sizes))
+    return pd.concat(parts)[["method", "n_pixels", "scene", "map_mb", "ate_m"]]
+
+
 def open_questions(scenes: Sequence[Scene], preset: Preset) -> None:
     """Steps against learning rates, the start of the search, VR in both maps, cost of mapping."""
-    from_velocity = []
-    for method in (METHODS["vr"], METHODS["sdf"]):
-        setting = f"tracking.{method.tracker}.motion_model=constant_velocity"
-        label = f"{method.label}, constant velocity"
-        from_velocity.append(replace(method, label=label, settings=(setting,)))
     write("open_questions", "steps_and_rates", steps_and_rates(scenes[:1], preset))
-    starts = track_scenes(scenes, ["vr", "sdf", *from_velocity], preset, rates_hz=[10])
+    methods = ["vr", "sdf", "vr_velocity", "sdf_velocity"]
+    starts = track_scenes(scenes, methods, preset, rates_hz=[10])
     write("open_questions", "starts", starts[_COLUMNS])
     both = track_scenes(scenes, ["vr", "sdf", "vr_neus"], preset, rates_hz=[2], frames=_FIRST_60)
     write("open_questions", "vr_in_both_maps", both[_COLUMNS])
