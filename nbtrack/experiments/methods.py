@@ -21,6 +21,7 @@ class Method:
         return paper_steps("vr" if tracker_class(self.tracker).renders else "sdf", rate_hz)
 
 
+_COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
 METHODS = {
     "vr": Method("iMAP with VR", "imap", "vr"),
     "sdf": Method("NeuS with SDF", "neus", "sdf"),
@@ -33,6 +34,15 @@ METHODS = {
         ("tracking.sdf.motion_model=constant_velocity",),
     ),
     "vr_neus": Method("NeuS with VR", "neus", "vr"),
+    "vr_plus": Method("NeuS+ with VR", "neus_plus", "vr"),
+    "vr_volsdf": Method("VolSDF with VR", "volsdf", "vr"),
+    "sdf_volsdf": Method("VolSDF with SDF", "volsdf", "sdf"),
+    "vr_occupancy": Method("Occupancy with VR", "occupancy", "vr"),
+    "color": Method("iMAP with VR, colour only", "imap", "vr", _COLOR_ONLY),
+    "color_neus": Method("NeuS with VR, colour only", "neus", "vr", _COLOR_ONLY),
+    "color_plus": Method("NeuS+ with VR, colour only", "neus_plus", "vr", _COLOR_ONLY),
+    "color_volsdf": Method("VolSDF with VR, colour only", "volsdf", "vr", _COLOR_ONLY),
+    "color_occupancy": Method("Occupancy with VR, colour only", "occupancy", "vr", _COLOR_ONLY),
     "sdf_plus": Method("NeuS+ with SDF (Adam)", "neus_plus", "sdf"),
     "lm": Method("NeuS+ with SDF (LM)", "neus_plus", "lm"),
     "baked": Method("NeuS+ baked (LM)", "neus_plus", "lm", ("tracking.lm.bake_voxel=0.04",)),

@@ -54,6 +54,7 @@ class Preset:
         default_factory=lambda: {
             "imap": NetworkSettings(embedding_sigma=4.0),
             "neus": NetworkSettings(),
+            "occupancy": NetworkSettings(embedding_sigma=4.0),
         }
     )
     mapping: dict[str, MappingSettings | PointMapping] = field(
@@ -88,6 +89,7 @@ def _shared(kind: type, other: Any) -> Any:
 _SMOKE = """
 network.imap.width = 96
 network.neus.width = 96
+network.occupancy.width = 96
 [scenes]
 names = ["living_room", "office"]
 n_frames = 240
@@ -96,6 +98,8 @@ track_frames = ":120"
 [mapping]
 imap = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
 neus = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
+volsdf = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
+occupancy = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
 [mapping.neus_plus]
 iterations = 1400
 n_rays = 96

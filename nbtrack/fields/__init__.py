@@ -9,10 +9,13 @@ from nbtrack.fields.imap import IMapField
 from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.neus import NeuSField, NeusMapping
 from nbtrack.fields.neus_plus import NeuSPlusField, NeusPlusMapping
+from nbtrack.fields.occupancy import OccupancyField
 from nbtrack.fields.points import PointCloud, PointMapping
+from nbtrack.fields.volsdf import VolSdfField
 
 FIELDS: dict[str, type[Field | PointCloud]] = {
-    kind.name: kind for kind in (IMapField, NeuSField, NeuSPlusField, PointCloud)
+    kind.name: kind
+    for kind in (IMapField, NeuSField, NeuSPlusField, VolSdfField, OccupancyField, PointCloud)
 }
 """What can be mapped, by name. A field of your own joins by `FIELDS["mine"] = MyField`."""
 

@@ -76,6 +76,7 @@ class VrSettings(AdamSettings):
 
     n_pixels: int = 512  # (paper)
     lambda_color: float = 5.0  # (iMAP)
+    lambda_depth: float = 1.0  # 0: by colour alone, of the same pixels (iNeRF)
     n_stratified: int = 32  # samples of the first pass (iMAP)
     n_importance: int = may_be_zero(12)  # of the second pass (iMAP)
 
@@ -97,7 +98,7 @@ class VrTracker(AdamTracker):
         n_samples = self.settings.n_stratified, self.settings.n_importance
         rendering = self.field.render_in_two_passes(rays, *n_samples, self.generator)
         terms = rendering_losses(rendering, rays, self.settings.lambda_color)
-        return terms["depth"] + terms["color"]
+        return self.settings.lambda_depth * terms["depth"] + terms["color"]
 
 
 @dataclass(frozen=True)

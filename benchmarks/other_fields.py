@@ -1,0 +1,49 @@
+"""VR, VR by colour alone, and SDF in five fields: rows of paper_tables/other_fields/table_1.csv.
+
+    python benchmarks/other_fields.py [SEEDS]
+
+Rows are added as they are finished; those that are there are not made again, whatever has changed
+since: remove the file to begin anew. A seed takes 15 minutes on one core.
+"""
+
+import sys
+from datetime import UTC, datetime
+from itertools import product
+
+import pandas as pd
+
+from nbtrack import load_preset, open_scenes, track_scenes
+from nbtrack.core.files import tables_folder, write_atomic
+from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.methods import METHODS
+
+ROWS = (
+    "vr", "color", "vr_neus", "color_neus", "sdf", "vr_volsdf", "color_volsdf", "sdf_volsdf",
+    "vr_plus", "color_plus", "sdf_plus", "vr_occupancy", "color_occupancy",
+)  # fmt: skip
+RATES_HZ = (10.0, 2.0)
+FRAMES = ":60"  # half of those of Table I, for time
+COLUMNS = [
+    "scene", "seed", "rate_hz", "method", "frames", "steps_per_frame", "ate_m",
+    "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "lost_frames", "device", "date",
+]  # fmt: skip
+
+
+def main(seeds: int) -> None:
+    """Make the rows that are missing, method by method."""
+    preset, path = load_preset("smoke"), tables_folder() / "other_fields" / "table_1_cells.csv"
+    rows = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=COLUMNS)
+    for seed, scene, name in product(range(seeds), open_scenes(preset), ROWS):
+        place = {"scene": scene.name, "seed": seed, "method": METHODS[name].label}
+        if (rows[[*place]] == pd.Series(place)).all(axis=1).any():
+            continue
+        how = {"frames": FRAMES, "seeds": [seed], "execution": Execution(workers=1)}
+        made = track_scenes([scene], [name], preset, RATES_HZ, **how)
+        made = made.assign(date=f"{datetime.now(UTC):%Y-%m-%d}")[COLUMNS]
+        rows = pd.concat([rows, made]) if len(rows) else made
+        write_atomic(path, rows.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+        print(made.to_string(index=False, header=False), flush=True)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 3)
