@@ -36,6 +36,17 @@ def renamed(name: str, to: str) -> Damage:
     return lambda folder: (folder / name).rename(folder / to)
 
 
+def suffix(pattern: str, to: str) -> Damage:
+    return lambda folder: [path.rename(path.with_suffix(to)) for path in folder.glob(pattern)]
+
+
+def in_a_folder(folder: Path) -> None:
+    """Everything lies one level deeper."""
+    folder.rename(folder.parent / "inner")
+    folder.mkdir()
+    (folder.parent / "inner").rename(folder / "inner")
+
+
 def cut(name: str) -> Damage:
     """Only the first half is left."""
     return changed(name, lambda content: content[: len(content) // 2])
@@ -89,7 +100,8 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "empty list": (text("depth.txt", "# nothing\n"), "depth.txt is empty: every line holds"),
         "no timestamp": (line("rgb.txt", 1, "rgb/a.png"), "rgb.txt line 2 is 'rgb/a.png': every"),
         "timestamp NaN": (line("rgb.txt", 1, "nan rgb/a.png"), "line 2 is 'nan rgb/a.png'"),
-        "file not there": (line("depth.txt", 2, "1.0 depth/no.png"), "no file .*no.png.* named in"),
+        "file not there": (line("depth.txt", 2, "1.0 depth/no.png"), "1 of 7 .* in .*no.png.: add"),
+        "part of the files": (without("depth/*86*"), "6 of 7 files named in .*depth.txt are not"),
         "other clock": (text("depth.txt", "1.0 depth/odd.png\n"), "no times within 0.02 s"),
         "poses of another clock": (text("groundtruth.txt", "5 0 0 0 0 0 0 1"), "no pose within"),
         "7 columns": (line("groundtruth.txt", 3, ROW), "line 4 is '1305031102.675 0"),
@@ -111,10 +123,11 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "camera is no JSON": (text("../cam_params.json", "{w: 1200}"), "is no JSON"),
         "deep JSON": (text("../cam_params.json", "[" * 100_000), "is no JSON"),
         "depth is a JPEG": (image("results/depth000002.png", THREE_CHANNELS), "is uint16 of"),
-        "an image less": (without("results/frame000003.jpg"), r"has 5 images but .* 6 .png.* \[3"),
+        "an image less": (without("results/frame000003.jpg"), "5 im.* 6 .*: depth000003.png"),
     },
     "7scenes": {
-        "pose missing": (without("frame-000002.pose.txt"), r"6 images but .* 5 .txt .*\[2\]"),
+        "pose missing": (without("frame-000002.pose.txt"), "6 .* 5 .txt .*: frame-000002.color"),
+        "no rotation": (text("frame-000003.pose.txt", SKEWED), "frame-000003.pose.txt is no rigid"),
         "no poses": (without("*.pose.txt"), r"no file .*pose.txt \(.txt\): "),
         "3 rows": (line("frame-000001.pose.txt", 3), None),  # 3x4: as good as 4x4
         "2 rows": (text("frame-000001.pose.txt", "1 0 0 0\n0 1 0 0\n"), "has 2 rows: it needs"),
@@ -127,7 +140,7 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "NaN focal": (text(K, "nan 0 1\n0 5 1\n0 0 1\n"), r"camera matrix \[\[nan"),
         "skew": (text(K, "5 1 1\n0 5 1\n0 0 1\n"), r"camera matrix \[\[5.0, 1.0, 1.0\]"),
         "infinite centre": (text(K, "5 0 inf\n0 5 1\n0 0 1\n"), r"camera matrix .*, inf\]"),
-        "odd numbers": (renamed("depth/5.png", "depth/9.png"), r"frame numbers .*\[5, 9\]"),
+        "odd numbers": (renamed("depth/5.png", "depth/9.png"), r"\(2 without .*: 5.jpg, 9.png\)"),
         "all poses lost": (changed("pose/*", lambda _: 4 * b"-inf -inf -inf -inf\n"), "no pose in"),
         "empty pose": (text("pose/3.txt", ""), "3.txt is empty: every line holds"),
         "pose of UTF-16": (text("pose/3.txt", "1 0 0 0\n".encode("utf-16")), "3.txt line 1 is"),
@@ -173,9 +186,11 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "binary poses": (text("poses.txt", BINARY), "poses.txt line 1 is"),
         "folder missing": (shutil.rmtree, "no folder .*recording"),
         "no images": (without("images/*"), "no file .*recording/images"),
-        "no depth folder": (renamed("depth_filtered", "depths"), "no depth in .*recording"),
+        "no depth folder": (renamed("depth_filtered", "depths"), "no file .*filtered/. or .*/dep"),
         "3 images, 2 depths": (without("depth_filtered/depth2.png"), "6 images but .* has 5 .png"),
-        "other frame numbers": (renamed(DEPTH_1, "depth_filtered/depth7.png"), r"\[1, 7\]"),
+        "other frame numbers": (renamed(DEPTH_1, "depth_filtered/depth7.png"), "img1.png, depth7"),
+        "PGM": (suffix("depth_filtered/*", ".pgm"), r"convert \.pgm, which is not read"),
+        "format: one level too high": (in_a_folder, "level too high, above inner: give .*inner"),
         "depth of another size": (image(DEPTH_1, SMALL), r"depth1.png is .* of shape \(18, 24\)"),
         "8-bit depth": (image(DEPTH_1, EIGHT_BIT), "depth1.png is uint8"),
         "colour of another size": (image("images/img2.png", SMALL), r"img2.png is .*\(18, 24, 3\)"),

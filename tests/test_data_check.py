@@ -18,8 +18,10 @@ from recordings import (
     along_rays,
     camera_matrix,
     matrix_text,
+    source,
     write_images,
     write_neural_rgbd,
+    write_recording,
 )
 from scipy.spatial.transform import Rotation
 
@@ -132,9 +134,14 @@ def test_misread_is_named(tmp_path: Path, name: str, keys: dict[str, str], scale
         (walk(8, 0.0, 0.0), 1.0, "poses.txt is not proved: the camera moves too little to tell"),
         (walk(1), 1.0, "poses.txt is not proved: that takes two frames"),
         (walk(N_FRAMES), 2.0, "no other reading fits: check focal.txt, the depth unit"),
-        (JUMPING, 1.0, "1 of 15 steps are longer than 0.3 m, first to frame 8"),
+        (
+            JUMPING,
+            1.0,
+            "1 of 15 steps are longer than 0.3 m, first to img8.png: check .* --frames of map",
+        ),
+        (walk(6, 0.03, 120.0), 1.0, "poses.txt is not proved: two frames see too little of the sa"),
     ],
-    ids=["still", "one frame", "no reading fits", "jump"],
+    ids=["still", "one frame", "no reading fits", "jump", "turned away"],
 )
 def test_one_warning(tmp_path: Path, poses: np.ndarray, scale: float, says: str) -> None:
     """Catches what is called right because nothing contradicts it, and statistics of nothing."""
@@ -222,6 +229,11 @@ def five_times(data: Source) -> Source:
     return data._replace(depths_mm=5 * data.depths_mm)
 
 
+def rotated(data: Source) -> Source:
+    """By three bits to the left, as SUN3D stores them: up to 8.19 m times 8."""
+    return data._replace(depths_mm=(data.depths_mm << 3) | (data.depths_mm >> 13))
+
+
 def camera(f: float, c: float) -> Change:
     """Focal lengths and principal point times a factor each."""
 
@@ -245,6 +257,7 @@ MISTAKES = [
     Case("quaternions in .* xyzw; set quat.* = .xyzw. in", 'quaternion = "wxyz"', rolled(-1)),
     Case("5000 depth values a metre; set depth_scale = 5000 in", change=five_times),
     Case("1000 depth values a metre; set depth_scale = 1000 in", "depth_scale = 5000"),
+    Case("8000 depth values a metre; set depth_scale = 8000 in", change=rotated),
     Case("1000 depth values", "depth_scale = 1"),
     Case("1000 depth values", "depth_scale = 1000000"),
     Case("1000 depth", "depth_scale = 5000000"),
@@ -295,6 +308,31 @@ def test_long_way_between_frames(tmp_path: Path) -> None:
     """Catches alarms about fast cameras: frames of a pair then share little."""
     thin = Case("", change=lambda d: Source(*(a[::3] for a in d[:3]), d.camera))
     assert not any("look" in text for text in check(write(tmp_path / "r", "office", thin)).warnings)
+
+
+@pytest.mark.parametrize("stride", [40, 80])
+def test_key_frames_far_apart(tmp_path: Path, stride: int) -> None:
+    """Catches alarms about frames 0.2 m and 27 degrees apart and more: about surfaces of which too
+    little is seen twice, about steps that are all long, about light that differs with the view."""
+    room = synthetic.build_room("living_room")
+    poses = synthetic.handheld_trajectory(room, 12 * stride, 0)[::stride]
+    rendered = [synthetic.render_frame(room, CAMERA, pose) for pose in poses]
+    depths = [np.rint(1000 * depth).astype(np.uint16) for _, depth, _ in rendered]
+    data = Source(np.stack([color for color, _, _ in rendered]), np.stack(depths), poses, CAMERA)
+    assert check(write(tmp_path / "r", "office", Case("", change=lambda _: data))).warnings == []
+
+
+def test_sentences_name_files_that_are_there(tmp_path: Path) -> None:
+    """Catches advice to look at folders, an assumed camera that is not named as such, and bits that
+    are rotated unnoticed."""
+    folder, data = tmp_path / "seq-01", source("office", 12, 10)
+    wrong = (1.5 * data.depths_mm).astype(np.uint16)
+    write_recording("7scenes", folder, data._replace(depths_mm=wrong))
+    printed = str(check(folder))
+    assert "check the camera assumed for 7-Scenes, the depth unit and *.pose.txt, and" in printed
+    assert "  note: the camera assumed for 7-Scenes, 585 px at 640x480: no intrinsics" in printed
+    warnings = check(write(tmp_path / "r", "office", Case("", change=rotated))).warnings
+    assert any("of the depth values are multiples of 8, as where they are" in w for w in warnings)
 
 
 def test_command_prints_the_sentence_and_draws(tmp_path: Path, capsys) -> None:

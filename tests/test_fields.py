@@ -1,4 +1,4 @@
-"""iMAP and NeuS: the network, NeuS's start, exact gradients, and losses that stay finite."""
+"""The learned fields: the network, NeuS's start, exact gradients, and losses that stay finite."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from nbtrack.fields.rendering import Rendering
 ROOM = SceneBounds((-1.0, -1.2, 0.5), (3.0, 1.3, 3.7))  # 4 x 2.5 x 3.2 m
 SMALL = NetworkSettings(width=64)
 SETTINGS = NeusMapping(n_stratified=8, n_surface=4)
-BOTH = pytest.mark.parametrize("name", ["imap", "neus"])
+ALL = pytest.mark.parametrize("name", ["imap", "neus", "volsdf", "occupancy"])
 
 
 def seeded(seed: int) -> torch.Generator:
@@ -37,10 +37,10 @@ def random_rays(n_rays: int, depth: float) -> Rays:
     return Rays(origins, directions, colors, torch.full((n_rays,), depth))
 
 
-@BOTH
+@ALL
 def test_the_start(name: str) -> None:
     """Catches weights drawn from the global generator, a layer too many or a lost bias: the paper's
-    network, and NeuS's one more."""
+    network, and one more for a distance."""
     first = make_field(name, SMALL, ROOM, seed=4).state_dict()
     torch.manual_seed(99)
     again = make_field(name, SMALL, ROOM, seed=4).state_dict()
@@ -50,10 +50,10 @@ def test_the_start(name: str) -> None:
     n_layers = (93 + 1) * 256, (256 + 1) * 256, (256 + 93 + 1) * 256, (256 + 1) * 256
     field = make_field(name, NetworkSettings(), ROOM, seed=0)
     n_parameters = sum(p.numel() for p in field.parameters() if p.requires_grad)
-    assert n_parameters == 3 * 93 + sum(n_layers) + (256 + 1) * 4 + (name == "neus")
+    assert n_parameters == 3 * 93 + sum(n_layers) + (256 + 1) * 4 + field.is_distance
 
 
-@BOTH
+@ALL
 def test_scene_of_twice_the_size(name: str) -> None:
     """Catches coordinates in metres inside the network, and answers out of range: the same weights,
     in a scene twice as large and elsewhere, give the same colours and densities, and twice the
@@ -66,11 +66,12 @@ def test_scene_of_twice_the_size(name: str) -> None:
     points = points_inside(ROOM, 100)
     color, value = small(points)
     large_color, large_value = large(2 * points + shift)
-    factor = 2 if name == "neus" else 1
+    factor = 2 if small.is_distance else 1
     torch.testing.assert_close(large_color, color, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(large_value, factor * value, rtol=1e-3, atol=5e-3)
     assert 0 <= color.min() <= color.max() <= 1
-    assert name == "neus" or value.min() >= 0
+    assert small.is_distance or value.min() >= 0
+    assert name != "occupancy" or value.max() <= 1
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -115,7 +116,7 @@ def test_gradients_of_a_field() -> None:
     assert field.mlp.layer_1.weight.grad.abs().max() > 0
 
 
-@BOTH
+@ALL
 def test_losses_are_finite_and_fall(name: str) -> None:
     """Catches 0/0 in a batch without a single measurement, a term that trains nothing, a sign or a
     detached head: forty steps on the same rays must fit them better."""

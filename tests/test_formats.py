@@ -48,6 +48,12 @@ def check_equal(sequence: RgbdSequence, data: Source, lossy: bool = False) -> No
         assert getattr(found, name) == pytest.approx(getattr(wanted, name), abs=1e-9), name
 
 
+def convert(folder: Path) -> str:
+    """What is said of a conversion."""
+    out = folder.parent / f"converted{len(list(folder.parent.iterdir()))}"
+    return convert_sequence(open_recording(folder), out)
+
+
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
     return write_recording("neural_rgbd", tmp_path / "scene")
@@ -154,7 +160,7 @@ def test_depth_folder_and_pose_file_are_chosen(scene: Path) -> None:
     check_equal(read_sequence(scene), source())
     # A folder may lie anywhere.
     check_equal(read_sequence(scene, slice(None), str(scene / "depth"), "other.txt"), other)
-    with pytest.raises(MissingError, match=r"it needs a folder depth_with_noise$"):
+    with pytest.raises(MissingError, match=r"no file .*/depth_with_noise/\*"):
         read_sequence(scene, depth_folder="depth_with_noise")
     with pytest.raises(MissingError, match=r"needs pose\.txt;"):
         read_sequence(scene, pose_file="pose.txt")
@@ -167,6 +173,7 @@ def with_mark_and_crlf(text: str) -> str:
 PLAIN_TEXTS: dict[str, Callable[[np.ndarray], str]] = {
     "4x4 in a line": lambda T: matrix_text(T.reshape(-1, 16)),
     "3x4 in a line": lambda T: matrix_text(T[:, :3].reshape(-1, 12)).replace(" ", ", "),
+    "rows of 4x4": lambda T: matrix_text(T.reshape(-1, 4)),
     "BOM and CRLF": lambda T: with_mark_and_crlf(tum_lines(np.zeros(N_FRAMES), T)),
     "a file a frame": lambda T: "",
 }
@@ -196,6 +203,42 @@ def test_own_trajectory_names_frames_by_time(plain: Path) -> None:
         read_sequence(plain)
 
 
+def test_more_poses_than_images(tmp_path: Path) -> None:
+    """Catches images that get the poses of others, where only some of a recording are there."""
+    folder = write_recording("replica", tmp_path / "r")
+    for number in (0, 2, 3):
+        (folder / f"results/frame00000{number}.jpg").unlink()
+        (folder / f"results/depth00000{number}.png").unlink()
+    check_equal(read_sequence(folder), Source(*(a[[1, 4, 5]] for a in source()[:3])), lossy=True)
+    assert "of 6 poses in traj.txt those of the 3 images' numbers" in convert(folder)
+
+
+@pytest.mark.parametrize("colors", ["color", "image"])
+def test_open3d(tmp_path: Path, colors: str) -> None:
+    """Catches heads of matrices taken for their rows, and files that are not known by name."""
+    write_images(tmp_path, source(), colors + "/{:06}.png")
+    blocks = (f"{i} {i} {i + 1}\n{matrix_text(T)}" for i, T in enumerate(source().poses))
+    (tmp_path / "trajectory.log").write_text("".join(blocks))
+    matrix = camera_matrix(CAMERA).T.ravel().tolist()
+    words = {"width": 48, "height": 36, "intrinsic_matrix": matrix}
+    (tmp_path / "camera_primesense.json").write_text(json.dumps(words))
+    check_equal(read_sequence(tmp_path), source())
+
+
+def test_cameras_of_other_names(scene: Path, tmp_path: Path) -> None:
+    """Catches a calibration that is passed over: 7-Scenes' own, one folder up too, and K.txt."""
+    (scene / "focal.txt").rename(scene / "K.txt")
+    (scene / "K.txt").write_text(matrix_text(camera_matrix(CAMERA)))
+    check_equal(read_sequence(scene), source())
+    folder = write_recording("7scenes", tmp_path / "chess/seq-01")
+    assert "the camera assumed for 7-Scenes, 585 px at 640x480: no intrinsics" in convert(folder)
+    for number, place in enumerate((folder.parent, folder)):
+        camera = replace(CAMERA, fx=40.0 + number)
+        (place / "camera-intrinsics.txt").write_text(matrix_text(camera_matrix(camera)))
+        check_equal(read_sequence(folder), source()._replace(camera=camera))
+    assert "assumed" not in convert(folder)
+
+
 def test_times_of_tum(tmp_path: Path) -> None:
     """Catches streams paired by position: odd images, and poses of other moments, are left out."""
     folder = write_recording("tum", tmp_path / "r")
@@ -204,20 +247,22 @@ def test_times_of_tum(tmp_path: Path) -> None:
     assert recording.rate_hz == pytest.approx(10, abs=1e-3)
     lines = (folder / "groundtruth.txt").read_text().splitlines()
     (folder / "groundtruth.txt").write_text("\n".join(lines[:2] + lines[4:]) + "\n")
+    assert "1 of the 7 images in rgb.txt are left out: no depth map of depth.txt" in convert(folder)
     # The first pose is gone, and with it the first frame.
     check_equal(read_sequence(folder), Source(*(a[1:] for a in source()[:3])))
 
 
 @pytest.mark.parametrize(("camera", "fx", "cy"), [("1", 517.3, 255.3), ("3", 535.4, 247.6)])
 def test_calibration_by_the_folders_name(tmp_path: Path, camera: str, fx: float, cy: float) -> None:
-    """Catches another camera's numbers, the half pixel, and a lens that is not corrected."""
+    """Catches another camera's numbers, the half pixel, a lens taken out of depth, where the
+    benchmark has a pinhole camera, and an assumption in silence."""
     folder = write_recording("tum", tmp_path / f"rgbd_dataset_freiburg{camera}_desk")
     (folder / "calibration.txt").unlink()
     sequence = read_sequence(folder)
     assert sequence.intrinsics.fx == pytest.approx(fx * 48 / 640)
     assert sequence.intrinsics.cy == pytest.approx((cy + 0.5) * 48 / 640)
-    is_straight = np.array_equal(sequence.depths_mm, source().depths_mm)
-    assert is_straight == (camera == "3")
+    assert np.array_equal(sequence.depths_mm, source().depths_mm)
+    assert f"assumed for TUM RGB-D, {fx} px at 640x480" in convert(folder)
 
 
 def test_everything_declared_otherwise(tmp_path: Path) -> None:
@@ -290,7 +335,7 @@ def test_formats_are_told_apart(plain: Path, tmp_path: Path) -> None:
 
 def test_a_new_format_is_one_entry(plain: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches formats listed anywhere but in the table."""
-    monkeypatch.setitem(FORMATS, "own", replace(FORMATS["plain"], color="rgb/*"))
+    monkeypatch.setitem(FORMATS, "own", replace(FORMATS["plain"], color=("rgb/*",)))
     (plain / "color").rename(plain / "rgb")
     check_equal(read_sequence(plain), source())
     assert open_recording(plain).declared.format == "own"

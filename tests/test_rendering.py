@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from nbtrack.fields.occupancy import weights_from_occupancy
 from nbtrack.fields.rendering import (
     composite,
     importance_depths,
@@ -13,6 +14,7 @@ from nbtrack.fields.rendering import (
     weights_from_density,
     weights_from_sdf,
 )
+from nbtrack.fields.volsdf import density_from_sdf
 
 LN2, LN3 = math.log(2.0), math.log(3.0)
 
@@ -64,6 +66,37 @@ def test_sdf_weights_by_hand(sdf, steepness, expected) -> None:
     that sees out of a solid, and a missing transmittance."""
     found = weights_from_sdf(torch.tensor([sdf]), torch.tensor(steepness))
     torch.testing.assert_close(found, torch.tensor([expected]))
+
+
+def test_density_of_a_distance_by_hand() -> None:
+    """Catches a sign, a factor and a scale: with 1/beta = 2 the tail e^(-2 |d|) / 2 is 1/2, 1/4 and
+    1/4 at d = 0, ln 2 / 2 and -ln 2 / 2, and times 2, from inside 1 less it; and gradients that are
+    lost, or no numbers, far from the surface."""
+    sdf = torch.tensor([[0.0, LN2 / 2, -LN2 / 2, 1e4, -1e4]], requires_grad=True)
+    found = density_from_sdf(sdf, torch.tensor(2.0))
+    torch.testing.assert_close(found, torch.tensor([[1.0, 0.5, 1.5, 0.0, 2.0]]))
+    found.sum().backward()
+    torch.testing.assert_close(sdf.grad[0, 1:], torch.tensor([-1.0, -1.0, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("occupancy", "expected"),
+    [
+        ([1 / 2, 1 / 2, 1.0, 1 / 2], [1 / 2, 1 / 4, 1 / 4, 0.0]),  # behind a taken place nothing
+        ([0.0, 1 / 4, 0.0, 1 / 3], [0.0, 1 / 4, 0.0, 1 / 4]),  # half of the light passes
+    ],
+)
+def test_occupancy_weights_by_hand(occupancy, expected) -> None:
+    """Catches light that a sample takes from itself, and gradients lost behind what is taken."""
+    occupancy = torch.tensor([occupancy], requires_grad=True)
+    found = weights_from_occupancy(occupancy)
+    torch.testing.assert_close(found, torch.tensor([expected]))
+    found[0, -1].backward()
+    assert torch.isfinite(occupancy.grad).all()
+    # The last weight falls as its passed light does: by product over all others.
+    others = [o for i, o in enumerate(1 - occupancy[0, :-1].detach()) if i != 2]
+    slope = -occupancy[0, -1].detach() * torch.stack(others).prod()
+    torch.testing.assert_close(occupancy.grad[0, 2], slope)
 
 
 def test_composite_by_hand() -> None:

@@ -1,6 +1,7 @@
 """Adam's trackers, and what all trackers share, in fields whose answers are known exactly."""
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,19 @@ def test_one_step_of_adam_moves_by_the_learning_rates() -> None:
     assert tracker.position.detach().abs().tolist() == pytest.approx([5e-4] * 3, rel=1e-3)
     assert tracker.q_wxyz.detach()[1:].abs().tolist() == pytest.approx([1e-3] * 3, rel=1e-2)
     assert tracker.q_wxyz.norm().item() == pytest.approx(1.0, abs=1e-6)
+
+
+def test_colour_alone() -> None:
+    """Catches a depth term that is still on, or was never: of a frame whose depths are all 5 cm too
+    long, the same pixels' colours are the same."""
+    frame, losses = box_sequence([[0.05, 0.04, 0.03]])[0], {}
+    longer = replace(frame, depth_mm=frame.depth_mm + 50)
+    for seen, weight in product((frame, longer), (0.0, 1.0)):
+        tracker = tracker_of("vr", 1, VrSettings(n_pixels=128, lambda_depth=weight))
+        tracker.begin(seen, torch.eye(4)[None])
+        losses[seen is frame, weight] = float(tracker.step())
+    assert losses[True, 0.0] == losses[False, 0.0] > 0
+    assert losses[True, 1.0] != losses[False, 1.0]
 
 
 def test_where_a_frame_starts() -> None:

@@ -8,18 +8,21 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.errors import DataError
-from nbtrack.data.readings import Reading, best_reading, diagnosis, fitted, readings
+from nbtrack.data.readings import ROTATED, Reading, best_reading, diagnosis, fitted, readings
 from nbtrack.data.recording import Recording
 from nbtrack.data.sequence import RgbdSequence, read_frames
 
 _CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
-_N_PAIRS, _GAPS = 20, (5, 10, 15)  # frames between the two: they moved, and still see the same
+_N_PAIRS, _GAPS = 20, (5, 10, 15)  # frames between the two: they moved, and still see the same,
+_TURNED_DEG = 60  # which they do where the camera has not turned by more in between
 _CELL = 0.1  # m: edge of the cells of surface that coverage counts
 _CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
-_JUMP = 0.3  # m between consecutive frames; a hand moves 0.02
+_JUMP = 0.3  # m between consecutive frames, and five times what is usual; a hand moves 0.02
 _DEPTH = (0.2, 20.0)  # m, plausible median of a depth camera's measurements
 _FLICKER = 0.35  # share by which brightness may change between frames (our choice)
+_SAME_VIEW_DEG = 10  # where they are turned by no more
+_ROTATED_SHARE = 0.9  # of the values there are: multiples of 8 (our choice; by chance an eighth)
 _LEAST_MEASURED = 0.3  # share of pixels with a depth, below which maps have holes (our choice)
 # What the second-order tracker still followed, of a real recording thinned to every third frame.
 _FOLLOWED_MM, _FOLLOWED_DEG = 70, 3.6
@@ -42,16 +45,26 @@ class DataReport:
     def warnings(self) -> list[str]:
         """What is wrong, each in a sentence."""
         depth, moved = self.cloud.depth.median(), self.frames.moved_mm / 1e3
-        jumps, measured = moved[moved > _JUMP], self.frames.measured.mean()
-        flicker = self.frames.flicker.max()
+        jumps = moved[moved > max(_JUMP, 5 * moved.median())]
+        first = "".join(self.recording.color_files[i].name for i in jumps.index[:1])
+        measured = self.frames.measured.mean()
+        flicker = self.frames.flicker[self.frames.turned_deg < _SAME_VIEW_DEG].max()
+        scale = self.recording.declared.depth_scale
+        values = (self.cloud.depth * scale).round().unique()
+        eights = np.mean(values % 8 == 0) * (len(values) > 8)  # few may be so by chance
         # Motion and depth tell nothing where they are read wrongly.
         is_right = self.best is self.readings[0]
         rules = [
             (True, diagnosis(self.readings, self.best, self.recording)),
             (
+                scale not in ROTATED and eights > _ROTATED_SHARE,
+                f"{eights:.0%} of the depth values are multiples of 8, as where they are rotated "
+                "by three bits (SUN3D): set depth_scale = 8000 in sequence.toml, or 80000",
+            ),
+            (
                 is_right and len(jumps),
-                f"{len(jumps)} of {moved.count()} steps are longer than {_JUMP} m, first to frame "
-                f"{jumps.index.min()}: check the poses there, or leave frames out with --frames",
+                f"{len(jumps)} of {moved.count()} steps are longer than {_JUMP} m, first to {first}"
+                ": check the poses there, or leave frames out with --frames of map and track",
             ),
             (
                 is_right and not _DEPTH[0] <= depth <= _DEPTH[1],
@@ -100,6 +113,7 @@ class DataReport:
             f"frames have a pose, {c.width} x {c.height} px",
             f"  camera: focal lengths {c.fx:.2f} and {c.fy:.2f} px ({wide:.1f} deg wide), "
             f"principal point ({c.cx:g}, {c.cy:g})",
+            *(f"  note: {text}" for text in recording.notes),
             f"  depth: {near:.2f} to {far:.2f} m (1% and 99%)",
             f"  scene: {x:.2f} x {y:.2f} x {z:.2f} m, {covered:.0%} of the surface seen by 3 of "
             f"{n_seen} frames looked at",
@@ -123,8 +137,11 @@ def check_recording(recording: Recording, progress: bool = False) -> DataReport:
     frames, ids = _by_frame(sequence), sequence.frame_ids
     if not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
-    # Pairs of frames that see much the same, spread over the sequence, with all gaps alike.
-    gaps = np.minimum(np.resize(_GAPS, _N_PAIRS), len(ids) - 1)
+    # Pairs of frames that see much the same, spread over the sequence, with all gaps alike. How far
+    # the camera turns is the same in all conventions.
+    turn = max(1.0, np.nan_to_num(frames.turned_deg.median()))
+    most = max(1, min(len(ids) - 1, int(_TURNED_DEG / turn)))
+    gaps = np.minimum(np.resize(_GAPS, _N_PAIRS), most)
     first = np.rint(np.linspace(0, 1, _N_PAIRS) * (len(ids) - 1 - gaps)).astype(int)
     pairs = np.unique([first, first + gaps], axis=1)[:, : _N_PAIRS * (len(ids) > 1)]
     in_files = sequence.depths_mm[pairs], recording.file_poses[ids[pairs.ravel()]]

@@ -80,8 +80,9 @@ class Format:
     """One layout of recordings on disk. Paths are patterns within the recording's folder."""
 
     label: str  # for people
-    color: str  # image files, or a .txt with `timestamp file` a line
-    depth: tuple[str, ...]  # the same; the first whose folder is there
+    # Image files, the first whose folder is there; or a .txt with `timestamp file` a line.
+    color: tuple[str, ...]
+    depth: tuple[str, ...]  # the same
     poses: tuple[str, ...]  # a file of all poses, or with `*` one a frame
     cameras: tuple[str, ...]  # calibration files; the first that is there
     known_cameras: tuple[Calibration, ...] = ()  # without a file; `source` is in the folder's name
@@ -92,36 +93,37 @@ class Format:
     def needs(self) -> tuple[tuple[str, ...], ...]:
         """Of each of these patterns one must be there."""
         cameras = () if self.known_cameras else (self.cameras,)
-        return (self.color,), self.depth, self.poses, *cameras
+        return self.color, self.depth, self.poses, *cameras
 
 
 _VGA = (640, 480)
-# The benchmark's own calibrations of its three cameras. The third needs no correction.
+# The benchmark's own calibrations of its three cameras; their lenses are not corrected. It says
+# (page "Intrinsic Camera Calibration of the Kinect") that the driver has undistorted the images and
+# laid depth on colour pixel by pixel, so that points follow from depth as of a pinhole camera.
 _TUM_CAMERAS = (
-    Calibration(Path("freiburg1"), 517.3, 516.5, (319.1, 255.8), _VGA,
-                (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    Calibration(Path("freiburg2"), 520.9, 521.0, (325.6, 250.2), _VGA,
-                (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    Calibration(Path("freiburg1"), 517.3, 516.5, (319.1, 255.8), _VGA),
+    Calibration(Path("freiburg2"), 520.9, 521.0, (325.6, 250.2), _VGA),
     Calibration(Path("freiburg3"), 535.4, 539.2, (320.6, 248.1), _VGA),
 )  # fmt: skip
 FORMATS: dict[str, Format] = {
     # Azinovic et al. 2022. Filtered depth is what the dataset's own loader takes; intrinsics.txt
     # is an addition of this package.
     "neural_rgbd": Format(
-        "Neural RGB-D", color="images/*",
+        "Neural RGB-D", color=("images/*",),
         depth=("depth_filtered/*", "depth/*", "depth_with_noise/*"), poses=("poses.txt",),
-        cameras=("intrinsics.txt", "focal.txt"), declared=Declaration(camera_axes="opengl"),
+        cameras=("intrinsics.txt", "focal.txt", "K.txt"),
+        declared=Declaration(camera_axes="opengl"),
     ),
     # Sturm et al. 2012. The depth maps carry their scale correction already.
     "tum": Format(
-        "TUM RGB-D", color="rgb.txt", depth=("depth.txt",), poses=("groundtruth.txt",),
+        "TUM RGB-D", color=("rgb.txt",), depth=("depth.txt",), poses=("groundtruth.txt",),
         cameras=("intrinsics.json", "intrinsics.txt", "calibration.txt"),
         known_cameras=_TUM_CAMERAS, declared=Declaration(depth_scale=5000.0),
     ),
     # As rendered for iMAP and shared with NICE-SLAM, whose loader turns the y and z axes of these
     # poses to reach OpenGL's.
     "replica": Format(
-        "Replica (NICE-SLAM)", color="results/frame*", depth=("results/depth*",),
+        "Replica (NICE-SLAM)", color=("results/frame*",), depth=("results/depth*",),
         poses=("traj.txt",), cameras=("cam_params.json", "../cam_params.json"),
         declared=Declaration(depth_scale=6553.5),
     ),
@@ -129,20 +131,22 @@ FORMATS: dict[str, Format] = {
     # not register. Its page states the focal length and the principal point (320, 240), taken here
     # as the middle of the image.
     "7scenes": Format(
-        "7-Scenes", color="*.color.*", depth=("*.depth.*",), poses=("*.pose.txt",),
-        cameras=("intrinsics.txt",), declared=Declaration(no_depth=65535),
+        "7-Scenes", color=("*.color.*",), depth=("*.depth.*",), poses=("*.pose.txt",),
+        cameras=("intrinsics.txt", "camera-intrinsics.txt", "../camera-intrinsics.txt"),
+        declared=Declaration(no_depth=65535),
         known_cameras=(Calibration(Path(), 585.0, 585.0, None, _VGA),),
     ),
     # Dai et al. 2017, as SensReader exports a scan: one view, colour larger than depth.
     "scannet": Format(
-        "ScanNet export", color="color/*", depth=("depth/*",), poses=("pose/*.txt",),
+        "ScanNet export", color=("color/*",), depth=("depth/*",), poses=("pose/*.txt",),
         cameras=("intrinsic/intrinsic_depth.txt",), resize_color=True,
     ),
-    # A folder of an own recording. The last two cameras are Open3D's.
+    # A folder of an own recording, or of Open3D's: image/, .log and the last three cameras.
     "plain": Format(
-        "plain folder", color="color/*", depth=("depth/*",),
-        poses=("trajectory.txt", "poses.txt", "poses/*.txt"),
-        cameras=("intrinsics.json", "intrinsics.txt", "intrinsic.json", "camera_intrinsic.json"),
+        "plain folder", color=("color/*", "image/*"), depth=("depth/*",),
+        poses=("trajectory.txt", "poses.txt", "poses/*.txt", "trajectory.log"),
+        cameras=("intrinsics.json", "intrinsics.txt", "K.txt",
+                 "intrinsic.json", "camera_intrinsic.json", "camera_primesense.json"),
     ),
 }  # fmt: skip
 
@@ -166,12 +170,13 @@ def declaration(folder: Path, format: str | None = None) -> Declaration:
 
 def _told_by_files(folder: Path) -> str:
     """The format with the largest share of what it needs."""
-    shares = {
-        name: np.mean([any(any(folder.glob(p)) for p in patterns) for patterns in layout.needs])
-        for name, layout in FORMATS.items()
-    }
+    shares = _shares(folder)
     most = max(shares.values())
     best = [name for name, share in shares.items() if share == most]
+    folders = sorted(path for path in folder.iterdir() if path.is_dir()) if most < 1 else []
+    if inner := [path for path in folders if 1 in _shares(path).values()]:
+        names = ", ".join(path.name for path in inner[:4]) + " ..." * (len(inner) > 4)
+        raise MissingError(f"{folder} is one level too high, above {names}: give {inner[0]}")
     if most == 0:
         files = (f"{name} ({', '.join(map(' or '.join, FORMATS[name].needs))})" for name in best)
         raise MissingError(
@@ -184,6 +189,14 @@ def _told_by_files(folder: Path) -> str:
             f'"{best[0]}" in {DECLARATION_FILE}'
         )
     return best[0]
+
+
+def _shares(folder: Path) -> dict[str, float]:
+    """How much of what each format needs is in a folder."""
+    return {
+        name: np.mean([any(any(folder.glob(p)) for p in patterns) for patterns in layout.needs])
+        for name, layout in FORMATS.items()
+    }
 
 
 def _declared(path: Path, defaults: Declaration) -> Declaration:

@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +16,22 @@ _IMAGES = (".png", ".jpg", ".jpeg")
 _TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
 
 
-def numbered_files(pattern: Path, suffixes: tuple[str, ...] = _IMAGES) -> list[Path]:
-    """Files in natural order, `img2` before `img10`. Raises MissingError if there is none."""
-    files = pattern.parent.glob(pattern.name)
-    files = [path for path in files if path.suffix.lower() in suffixes and path.is_file()]
+def numbered_files(patterns: list[Path], suffixes: tuple[str, ...] = _IMAGES) -> list[Path]:
+    """Files of the first pattern whose folder is there, in natural order, `img2` before `img10`.
+
+    Raises MissingError if there is none.
+    """
+    pattern = next((p for p in patterns if p.parent.is_dir()), patterns[0])
+    found = [path for path in pattern.parent.glob(pattern.name) if path.is_file()]
+    files = [path for path in found if path.suffix.lower() in suffixes]
     if not files:
-        needed = f"{pattern} ({', '.join(suffixes)})"
-        raise MissingError(f"no file {needed}: add some, with the frame's number in the name")
+        others, places = {path.suffix for path in found}, " or ".join(map(str, patterns))
+        unread = ", ".join(sorted(others))
+        advice = f"convert {unread}, which is not read" if others else "add some"
+        raise MissingError(
+            f"no file {places} ({', '.join(suffixes)}): {advice}, with the frame's number in the "
+            "name, depth as PNG of 16 bits"
+        )
     # The name decides between img1 and img01.
     return sorted(files, key=lambda path: (_numbers(path), path.name))
 
@@ -40,16 +50,19 @@ def check_paired(colors: list[Path], others: list[Path]) -> None:
     """Raises DataError unless every image has its depth map or pose, with the same frame number."""
     numbers, other_numbers = numbers_of(colors), numbers_of(others)
     if not np.array_equal(numbers, other_numbers):
-        odd = np.setxor1d(numbers, other_numbers)[:5].tolist()
+        count = Counter([*numbers, *other_numbers])
+        odd = [path.name for path in (*colors, *others) if count[numbers_of([path])[0]] != 2]
         raise DataError(
             f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
-            f"{len(others)} {others[0].suffix} files, with other frame numbers in the names (only "
-            f"one has {odd}): every image needs one; rename or remove the odd files"
+            f"{len(others)} {others[0].suffix} files, with other frame numbers in the names "
+            f"({len(odd)} without a partner: {', '.join(odd[:4])}{' ...' * (len(odd) > 4)}): every "
+            "image needs one; rename or remove the odd files"
         )
 
 
-def listed_pairs(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Path], Times]:
-    """Images and depth maps of two lists that are each other's nearest in time, and the times."""
+def listed_pairs(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Path], Times, str]:
+    """Images and depth maps of two lists that are each other's nearest in time, the times, and a
+    word on images that are left out."""
     (color_times, colors), (depth_times, depths) = map(_read_list, (color_list, depth_list))
     closest = _nearest(color_times, depth_times)
     kept = _nearest(depth_times, color_times)[closest] == np.arange(len(colors))
@@ -59,8 +72,11 @@ def listed_pairs(color_list: Path, depth_list: Path) -> tuple[list[Path], list[P
             f"{color_list} ({_span(color_times)}) and {depth_list} ({_span(depth_times)}) have no "
             f"times within {_TOLERANCE} s of each other: both need timestamps of one clock"
         )
+    left_out = f"{(~kept).sum()} of the {len(kept)} images in {color_list.name} are left out: no "
+    left_out += f"depth map of {depth_list.name} is within {_TOLERANCE} s"
     colors = [colors[i] for i in np.flatnonzero(kept)]
-    return colors, [depths[i] for i in closest[kept]], color_times[kept]
+    depths = [depths[i] for i in closest[kept]]
+    return colors, depths, color_times[kept], "" if kept.all() else left_out
 
 
 def _read_list(path: Path) -> tuple[Times, list[Path]]:
@@ -68,10 +84,12 @@ def _read_list(path: Path) -> tuple[Times, list[Path]]:
     meaning = "'timestamp file', as in '1305031102.175 rgb/1305031102.175.png'"
     rows = sorted(read_rows(path, _entry, (2,), meaning), key=lambda row: row[0])
     files = [path.parent / name for _, name in rows]
-    for file in files:
-        # Unlike pathlib's, it takes names that no file can have.
-        if not os.path.isfile(file):
-            raise MissingError(f"no file {str(file)[:200]!r}, named in {path}: add it there")
+    # Unlike pathlib's, it takes names that no file can have.
+    if absent := [file for file in files if not os.path.isfile(file)]:
+        raise MissingError(
+            f"{len(absent)} of {len(files)} files named in {path} are not there, the first of them "
+            f"{str(absent[0])[:200]!r}: add them, or take their lines out"
+        )
     return np.array([time for time, _ in rows]), files
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -22,10 +23,13 @@ _POINTS_PER_FRAME = 1000  # 20 pairs of frames have enough for a median
 _CLEARLY_BETTER = 0.5  # of the distance as declared (our choice)
 _LEAST_GAIN = 5e-4  # of the depth: 1 mm at 2 m, depth's resolution on disk
 _FAR_APART = 0.05  # m, median distance above which a map of the scene would be blurred (our choice)
-_LEAST_OVERLAP = 0.15  # share of points below which a median tells nothing (our choice)
-# Depth values a metre that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1
-# mm; and metres and micrometres, which 16 bits hold badly.
-_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 256.0, 100.0, 1.0, 1e6)
+# Shares of points below which a median tells nothing, and below which not even a large one does: of
+# a right recording hardly a point lies in front of what another frame sees there (our choice).
+_LEAST_OVERLAP, _LEAST_CONTRADICTION = 0.15, 0.02
+ROTATED = (8000.0, 80_000.0)  # depth values a metre: millimetres, and tenths, times 8 (SUN3D)
+# Those that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1 mm; and metres
+# and micrometres, which 16 bits hold badly.
+_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, *ROTATED, 256.0, 100.0, 1.0, 1e6)
 _ALONG = {"axis": "depth along the optical axis", "ray": "distances along the ray, not z-depth"}
 # The common camera axes first: where several fit alike, the first is named.
 _USUAL = {
@@ -152,10 +156,11 @@ def best_reading(found: list[Reading]) -> Reading:
     Clearly: surfaces meet at half the distance or less, with no less than half the overlap, since
     cameras turned away from each other may agree on the few points that are left.
     """
-    own, enough = found[0], max(_LEAST_OVERLAP, *(reading.overlap / 2 for reading in found))
+    own, half = found[0], max(reading.overlap / 2 for reading in found)
+    enough = max(_LEAST_OVERLAP, half)
     meeting = [r for r in found if r.overlap >= enough and r.median_m < _FAR_APART]
     least = min((reading.relative for reading in meeting), default=math.inf)
-    if own.overlap >= enough and not _is_clearly_less(least, own.relative):
+    if own.overlap >= half and not _is_clearly_less(least, own.relative):
         return own
     near = max(1.1 * least, least + _LEAST_GAIN)  # the common ones come first
     return next((reading for reading in meeting if reading.relative <= near), own)
@@ -167,7 +172,7 @@ def _is_clearly_less(relative: float, other: float) -> bool:
 
 def diagnosis(found: list[Reading], best: Reading, recording: Recording) -> str:
     """What is wrong with how the numbers are read, in a sentence; empty where nothing is."""
-    own, file = found[0], recording.pose_file.name
+    own, file = found[0], os.path.relpath(recording.pose_file, recording.folder)
     apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
     if best is not own:
         look = "look" if best.subject == "poses" else "looks"
@@ -177,7 +182,12 @@ def diagnosis(found: list[Reading], best: Reading, recording: Recording) -> str:
         )
     if recording.has_pose.sum() < 2:
         return f"{file} is not proved: that takes two frames with a pose"
-    if own.overlap < _LEAST_OVERLAP or own.median_m > _FAR_APART:
+    is_far = own.median_m > _FAR_APART
+    if own.overlap < (_LEAST_CONTRADICTION if is_far else _LEAST_OVERLAP):
+        little = f"{file} is not proved: two frames see too little of the same"
+        where = f"{own.overlap:.0%} of the points, whose surfaces {apart}"
+        return f"{little} ({where}): check it, and a piece with smaller steps"
+    if is_far:
         return (
             f"surfaces that two frames see {apart} (median, {own.overlap:.0%} of the points "
             f"overlap) and no other reading fits: check {recording.calibration.source.name}, "

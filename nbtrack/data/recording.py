@@ -13,7 +13,7 @@ from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import DataError, MissingError
 from nbtrack.data.formats import DECLARATION_FILE, FORMATS, Declaration, Format, declaration
 from nbtrack.data.pairs import check_paired, listed_pairs, numbered_files, numbers_of, posed_by_time
-from nbtrack.data.text_files import Calibration, Times, checked_poses, read_calibration, read_poses
+from nbtrack.data.text_files import Calibration, Times, read_calibration, read_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +28,10 @@ class Recording:
     depth_files: list[Path]
     times: Times  # of the frames, as recorded, or by their numbers and the rate declared
     file_poses: Poses  # as `declared` says; NaN without a pose
-    pose_file: Path  # named in messages; a folder where every frame has a file
+    pose_file: Path  # named in messages; with `*` where every frame has a file
     calibration: Calibration  # of the depth images, and of the colour that lies on them
     text_files: list[Path]  # everything read beside the images
+    notes: list[str]  # what was assumed, and left out
 
     def __len__(self) -> int:
         return len(self.color_files)
@@ -75,27 +76,24 @@ def open_recording(
     """
     folder = Path(folder)
     declared = declaration(folder, format)
-    layout, lists = FORMATS[declared.format], []
-    if layout.color.endswith(".txt"):
-        names = (layout.color, *layout.depth)
-        lists = [_first_there(folder, (name,), "images", layout) for name in names]
-        colors, depths, times = listed_pairs(*lists)
+    layout, lists, left_out = FORMATS[declared.format], [], ""
+    if layout.color[0].endswith(".txt"):
+        names = (layout.color, layout.depth)
+        lists = [_first_there(folder, name, "images", layout) for name in names]
+        colors, depths, times, left_out = listed_pairs(*lists)
     else:
-        patterns = [folder / (depth_folder or Path(p).parent) / Path(p).name for p in layout.depth]
-        there = [pattern for pattern in patterns if pattern.parent.is_dir()]
-        if not there:
-            names = " or ".join(dict.fromkeys(pattern.parent.name for pattern in patterns))
-            raise MissingError(f"no depth in {folder}: it needs a folder {names}")
-        colors, depths = numbered_files(folder / layout.color), numbered_files(there[0])
+        places = [(depth_folder or Path(p).parent, Path(p).name) for p in layout.depth]
+        colors = numbered_files([folder / pattern for pattern in layout.color])
+        depths = numbered_files([folder / place / name for place, name in places])
         check_paired(colors, depths)
         times = (numbers_of(colors) - numbers_of(colors[:1])) / declared.frame_rate
-    poses, pose_files = _poses(folder, declared, pose_file, colors, times)
-    pose_path = pose_files[0] if len(pose_files) == 1 else pose_files[0].parent
-    camera = _calibration(folder, layout)
+    poses, pose_path, pose_files, chosen = _poses(folder, declared, pose_file, colors, times)
+    camera, assumed = _calibration(folder, layout)
     texts = [*lists, *pose_files, camera.source, folder / DECLARATION_FILE]
     texts = [path for path in texts if path.is_file()]
-    poses, what = checked_poses(poses, pose_path), (folder.resolve().name, layout, declared)
-    return Recording(folder, *what, colors, depths, times, poses, pose_path, camera, texts)
+    notes, what = [left_out, chosen, assumed], (folder.resolve().name, layout, declared)
+    found = colors, depths, times, poses, pose_path, camera, texts, [*filter(None, notes)]
+    return Recording(folder, *what, *found)
 
 
 def _first_there(folder: Path, names: tuple[str, ...], what: str, layout: Format) -> Path:
@@ -108,19 +106,21 @@ def _first_there(folder: Path, names: tuple[str, ...], what: str, layout: Format
     )
 
 
-def _calibration(folder: Path, layout: Format) -> Calibration:
-    """From the folder's own file, else that of a camera which is in the folder's name."""
+def _calibration(folder: Path, layout: Format) -> tuple[Calibration, str]:
+    """From the folder's own file, else assumed, by the folder's name; and a word on that."""
     known = [c for c in layout.known_cameras if c.source.name in folder.resolve().name]
     if known and not any((folder / name).is_file() for name in layout.cameras):
-        return replace(known[0], source=folder / known[0].source)
+        camera = replace(known[0], source=folder / f"the camera assumed for {layout.label}")
+        return camera, f"{camera.source.name}, {camera.fx:g} px at 640x480: no {layout.cameras[0]}"
     named = tuple(f"{c.source} in the folder's name" for c in layout.known_cameras)
-    return read_calibration(_first_there(folder, layout.cameras + named, "calibration", layout))
+    path = _first_there(folder, layout.cameras + named, "calibration", layout)
+    return read_calibration(path), ""
 
 
 def _poses(
     folder: Path, declared: Declaration, pose_file: str | None, colors: list[Path], times: Times
-) -> tuple[Poses, list[Path]]:
-    """A pose a frame, and the files that they were read from."""
+) -> tuple[Poses, Path, list[Path], str]:
+    """A pose a frame, the files that they were read from, by one name and all, and how chosen."""
     layout = FORMATS[declared.format]
     names = (pose_file,) if pose_file else layout.poses
     files = [folder / name for name in names if (folder / name).is_file()]
@@ -130,13 +130,14 @@ def _poses(
     patterns = [folder / (f"{n}/*.txt" if (folder / n).is_dir() else n) for n in names]
     patterns = [p for p in patterns if "*" in p.name and p.parent.is_dir()]
     if patterns and not files:
-        files = numbered_files(patterns[0], (".txt",))
+        path, files = patterns[0], numbered_files(patterns, (".txt",))
         check_paired(colors, files)
     else:
-        files = [_first_there(folder, names, "poses", layout)]
+        path = _first_there(folder, names, "poses", layout)
+        files = [path]
     found = [read_poses(file, declared.quaternion) for file in files]
-    poses, pose_times, path = np.concatenate([T for T, _ in found]), found[0][1], files[0]
-    if pose_times is not None and layout.color.endswith(".txt"):
+    poses, pose_times, chosen = np.concatenate([T for T, _ in found]), found[0][1], ""
+    if pose_times is not None and layout.color[0].endswith(".txt"):
         poses = posed_by_time(times, poses, pose_times, path)
     elif pose_times is not None and len(poses) != len(colors):
         # nbtrack's own trajectories leave frames out.
@@ -144,9 +145,13 @@ def _poses(
         # Unless all poses find a frame the times are something else.
         if np.isfinite(placed).sum() == np.isfinite(poses).sum():
             poses = placed
+    numbers = numbers_of(colors)
+    if len(poses) > len(colors) and 0 <= numbers.min() <= numbers.max() < len(poses):
+        chosen = f"of {len(poses)} poses in {path.name} those of the {len(colors)} images' numbers"
+        poses = poses[numbers]
     if len(poses) != len(colors):
         raise DataError(
             f"{path} has {len(poses)} poses but there are {len(colors)} images: every frame needs "
             "one; write 'nan' for each number of a frame without a pose"
         )
-    return poses, files
+    return poses, path, files, chosen

@@ -5,6 +5,7 @@ datasets have it: the middle of 640 pixels is 319.5. Inside the package they lie
 """
 
 import json
+import re
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,10 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 
 Times = Float[np.ndarray, "_"]  # s
+Parse = Callable[[str], Sequence]
 _TOLERANT = {"encoding": "utf-8-sig", "errors": "replace"}  # of a byte-order mark, and of any bytes
+_NO_ROW = r"\s*(#|$)"
+_HEAD = r"|\s*-?\d+\s+-?\d+\s+-?\d+\s*$"  # of each matrix in Open3D's .log: three whole numbers
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
 _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
 _CAMERA = '{"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5}'
@@ -45,15 +49,15 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def read_rows(
-    path: Path, parse: Callable[[str], Sequence], columns: tuple[int, ...], meaning: str
+    path: Path, parse: Parse, columns: tuple[int, ...], meaning: str, skipped: str = _NO_ROW
 ) -> list[Sequence]:
-    """What `parse` makes of every line that is not blank and does not start with `#`.
+    """What `parse` makes of every line that does not begin as `skipped`: blank, or with `#`.
 
     Raises DataError for a line of other columns, or for which `parse` raises ValueError.
     """
     rows: list[Sequence] = []
     for number, line in enumerate(path.read_text(**_TOLERANT).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
+        if re.match(skipped, line):
             continue
         try:
             row = parse(line)
@@ -74,12 +78,13 @@ def _numbers(line: str) -> list[float]:
 
 
 def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | None]:
-    """Poses as they stand in a file, and their timestamps (s) where it has quaternions.
+    """Poses as they stand in a file, checked, and their timestamps (s) where it has quaternions.
 
     Lines hold `timestamp tx ty tz` and a quaternion in the order that is given, a 4x4 or 3x4
     matrix, or one of the rows of a matrix; else DataError is raised. NaN gives NaN poses.
     """
-    numbers = np.array(read_rows(path, _numbers, (4, 8, 12, 16), _POSE_LINE))
+    skipped = _NO_ROW + _HEAD * (path.suffix == ".log")
+    numbers = np.array(read_rows(path, _numbers, (4, 8, 12, 16), _POSE_LINE, skipped))
     if numbers.shape[1] == 8:
         return _from_quaternions(numbers[:, 1:], quaternion, path), numbers[:, 0]
     if numbers.shape == (3, 4):
@@ -88,7 +93,7 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
         numbers = np.hstack([numbers, np.tile([0.0, 0, 0, 1], (len(numbers), 1))])
     if numbers.size % 16:
         raise DataError(f"{path} has {len(numbers)} rows: it needs the four of each 4x4 matrix")
-    return numbers.reshape(-1, 4, 4), None
+    return checked_poses(numbers.reshape(-1, 4, 4), path), None
 
 
 def _from_quaternions(numbers: np.ndarray, order: str, path: Path) -> Poses:
@@ -105,7 +110,7 @@ def _from_quaternions(numbers: np.ndarray, order: str, path: Path) -> Poses:
     q_xyzw = quaternions[:, [order.index(axis) for axis in "xyzw"]]
     poses = np.tile(np.eye(4), (len(numbers), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_quat(q_xyzw).as_matrix(), positions
-    return poses
+    return checked_poses(poses, path)
 
 
 def checked_poses(poses: Poses, path: Path) -> Poses:
@@ -122,8 +127,9 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
     is_wrong |= (np.abs(bottom) > _RIGID).any(axis=1) | far.any(axis=1)
     for i in np.flatnonzero(is_wrong):
         found = " ".join(f"{number:.4g}" for number in poses[i].flat)
+        place = f"{path} frame {i}" if len(poses) > 1 else path
         raise DataError(
-            f"{path} frame {i} is no rigid transform in metres ({found}): rows must be [R | t] "
+            f"{place} is no rigid transform in metres ({found}): rows must be [R | t] "
             f"with a right-handed rotation R and t up to {_FARTHEST:g}, and 0 0 0 1"
         )
     return np.where(is_known, poses, np.nan)
@@ -133,7 +139,7 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
 class Calibration:
     """A camera, before the size of its images is known; pixel centres at integer + 0.5."""
 
-    source: Path  # where it was found, for messages
+    source: Path  # where it was found, for messages; of an assumed one, words for it
     fx: float
     fy: float
     principal_point: tuple[float, float] | None = None  # None: the middle of the image

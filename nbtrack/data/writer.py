@@ -122,7 +122,7 @@ def convert_sequence(
     n_lost = int((~recording.has_pose[numbers]).sum())
     lost = f" ({n_lost} without a pose)" if n_lost else ""
     said = f"{out}: {len(numbers)} frames{lost} of {camera.width}x{camera.height}"
-    said += f", read as {recording.format.label}"
+    said = "\n  ".join([f"{said}, read as {recording.format.label}", *recording.notes])
     if _is_told_by_focal(camera):
         return said
     return (

@@ -158,7 +158,10 @@ def _field_and_map(options: Namespace) -> tuple[str, Map | None]:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
     given = read_map(options.map_from)
     name = given.field.name
-    if asked and not issubclass(field_class(name), field_class(asked)):
+    # A field's variants, as NeuS+ is one of NeuS, differ in what teaches them.
+    kinds = [field_class(name), field_class(asked or name)]
+    is_variant = issubclass(*kinds) and kinds[0].supervision != kinds[1].supervision
+    if name != (asked or name) and not is_variant:
         raise ConfigError(
             f"{options.map_from} is a map of field {name!r}, not {asked!r}: leave it out"
         )
