@@ -97,9 +97,8 @@ class Format:
 
 
 _VGA = (640, 480)
-# The benchmark's own calibrations of its three cameras; their lenses are not corrected. It says
-# (page "Intrinsic Camera Calibration of the Kinect") that the driver has undistorted the images and
-# laid depth on colour pixel by pixel, so that points follow from depth as of a pinhole camera.
+# The benchmark's own calibrations of its three cameras. Their lenses are not corrected: its page on
+# the Kinect's calibration says that the driver has done so, and laid depth on colour by the pixel.
 _TUM_CAMERAS = (
     Calibration(Path("freiburg1"), 517.3, 516.5, (319.1, 255.8), _VGA),
     Calibration(Path("freiburg2"), 520.9, 521.0, (325.6, 250.2), _VGA),

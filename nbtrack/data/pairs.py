@@ -17,17 +17,14 @@ _TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark'
 
 
 def numbered_files(patterns: list[Path], suffixes: tuple[str, ...] = _IMAGES) -> list[Path]:
-    """Files of the first pattern whose folder is there, in natural order, `img2` before `img10`.
-
-    Raises MissingError if there is none.
-    """
+    """Files of the first pattern with a folder, `img2` before `img10`; or raises MissingError."""
     pattern = next((p for p in patterns if p.parent.is_dir()), patterns[0])
     found = [path for path in pattern.parent.glob(pattern.name) if path.is_file()]
     files = [path for path in found if path.suffix.lower() in suffixes]
     if not files:
-        others, places = {path.suffix for path in found}, " or ".join(map(str, patterns))
-        unread = ", ".join(sorted(others))
-        advice = f"convert {unread}, which is not read" if others else "add some"
+        unread = ", ".join(sorted({path.suffix for path in found}))
+        advice = f"convert {unread}, which is not read" if found else "add some"
+        places = " or ".join(map(str, patterns))
         raise MissingError(
             f"no file {places} ({', '.join(suffixes)}): {advice}, with the frame's number in the "
             "name, depth as PNG of 16 bits"

@@ -87,13 +87,13 @@ def open_recording(
         depths = numbered_files([folder / place / name for place, name in places])
         check_paired(colors, depths)
         times = (numbers_of(colors) - numbers_of(colors[:1])) / declared.frame_rate
-    poses, pose_path, pose_files, chosen = _poses(folder, declared, pose_file, colors, times)
-    camera, assumed = _calibration(folder, layout)
+    poses, path, pose_files, chosen = _poses(folder, declared, pose_file, colors, times)
+    camera, what = _calibration(folder, layout), (folder.resolve().name, layout, declared)
     texts = [*lists, *pose_files, camera.source, folder / DECLARATION_FILE]
-    texts = [path for path in texts if path.is_file()]
-    notes, what = [left_out, chosen, assumed], (folder.resolve().name, layout, declared)
-    found = colors, depths, times, poses, pose_path, camera, texts, [*filter(None, notes)]
-    return Recording(folder, *what, *found)
+    texts = [text for text in texts if text.is_file()]
+    assumed = f"{camera.source.name}, {camera.fx:g} px at 640x480: no {layout.cameras[0]}"
+    notes = [*filter(None, [left_out, chosen]), *[assumed] * (not camera.source.is_file())]
+    return Recording(folder, *what, colors, depths, times, poses, path, camera, texts, notes)
 
 
 def _first_there(folder: Path, names: tuple[str, ...], what: str, layout: Format) -> Path:
@@ -106,15 +106,13 @@ def _first_there(folder: Path, names: tuple[str, ...], what: str, layout: Format
     )
 
 
-def _calibration(folder: Path, layout: Format) -> tuple[Calibration, str]:
-    """From the folder's own file, else assumed, by the folder's name; and a word on that."""
+def _calibration(folder: Path, layout: Format) -> Calibration:
+    """From the folder's own file, else assumed, by the folder's name."""
     known = [c for c in layout.known_cameras if c.source.name in folder.resolve().name]
     if known and not any((folder / name).is_file() for name in layout.cameras):
-        camera = replace(known[0], source=folder / f"the camera assumed for {layout.label}")
-        return camera, f"{camera.source.name}, {camera.fx:g} px at 640x480: no {layout.cameras[0]}"
+        return replace(known[0], source=folder / f"the camera assumed for {layout.label}")
     named = tuple(f"{c.source} in the folder's name" for c in layout.known_cameras)
-    path = _first_there(folder, layout.cameras + named, "calibration", layout)
-    return read_calibration(path), ""
+    return read_calibration(_first_there(folder, layout.cameras + named, "calibration", layout))
 
 
 def _poses(

@@ -127,10 +127,9 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
     is_wrong |= (np.abs(bottom) > _RIGID).any(axis=1) | far.any(axis=1)
     for i in np.flatnonzero(is_wrong):
         found = " ".join(f"{number:.4g}" for number in poses[i].flat)
-        place = f"{path} frame {i}" if len(poses) > 1 else path
         raise DataError(
-            f"{place} is no rigid transform in metres ({found}): rows must be [R | t] "
-            f"with a right-handed rotation R and t up to {_FARTHEST:g}, and 0 0 0 1"
+            f"{path}{f' frame {i}' * (len(poses) > 1)} is no rigid transform in metres ({found}): "
+            f"rows must be [R | t], right-handed rotation R and t up to {_FARTHEST:g}, and 0 0 0 1"
         )
     return np.where(is_known, poses, np.nan)
 

@@ -159,9 +159,9 @@ def _field_and_map(options: Namespace) -> tuple[str, Map | None]:
     given = read_map(options.map_from)
     name = given.field.name
     # A field's variants, as NeuS+ is one of NeuS, differ in what teaches them.
-    kinds = [field_class(name), field_class(asked or name)]
-    is_variant = issubclass(*kinds) and kinds[0].supervision != kinds[1].supervision
-    if name != (asked or name) and not is_variant:
+    kind, wanted = field_class(name), field_class(asked or name)
+    is_variant = issubclass(kind, wanted) and kind.supervision != wanted.supervision
+    if kind is not wanted and not is_variant:
         raise ConfigError(
             f"{options.map_from} is a map of field {name!r}, not {asked!r}: leave it out"
         )

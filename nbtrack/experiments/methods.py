@@ -25,14 +25,10 @@ _COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
 METHODS = {
     "vr": Method("iMAP with VR", "imap", "vr"),
     "sdf": Method("NeuS with SDF", "neus", "sdf"),
-    "vr_velocity": Method(
-        "iMAP with VR, constant velocity", "imap", "vr",
-        ("tracking.vr.motion_model=constant_velocity",),
-    ),
-    "sdf_velocity": Method(
-        "NeuS with SDF, constant velocity", "neus", "sdf",
-        ("tracking.sdf.motion_model=constant_velocity",),
-    ),
+    "vr_velocity": Method("iMAP with VR, constant velocity", "imap", "vr",
+                          ("tracking.vr.motion_model=constant_velocity",)),
+    "sdf_velocity": Method("NeuS with SDF, constant velocity", "neus", "sdf",
+                           ("tracking.sdf.motion_model=constant_velocity",)),
     "vr_neus": Method("NeuS with VR", "neus", "vr"),
     "vr_plus": Method("NeuS+ with VR", "neus_plus", "vr"),
     "vr_volsdf": Method("VolSDF with VR", "volsdf", "vr"),

@@ -105,11 +105,10 @@ class TrackCell(Cell):
         Raises:
             DataError: a given map does not fit the first frame at its given pose.
         """
-        made, notes = self.needs.map(), {}
+        made = self.needs.map()
         with advise_on_memory(f"frames {self.frames} of {self.scene.name}"):
             sequence = self.scene.read(self.frames)
-        if self.is_elsewhere:
-            notes["map_from"] = made.made
+        notes = {"map_from": made.made} if self.is_elsewhere else {}
         if self.needs.is_given:  # another path of a room we know may begin where no map reaches
             notes["map_warning"] = check_belongs(made, sequence[0])
         budget, start = make_budget(self.steps, self.rate_hz), time.perf_counter()
