@@ -8,9 +8,8 @@ from torch import Tensor
 
 from nbtrack.data.frame import Frame
 from nbtrack.tracking import LmSettings, LmTracker, StepBudget
-from nbtrack.tracking.lm import _damped_step, _Search
 from nbtrack.tracking.metrics import pose_errors
-from nbtrack.tracking.registration import LEAST_SCALES, Residuals, moved
+from nbtrack.tracking.registration import Residuals, damped_step, moved
 
 FRAME, T_TRUE = walk(1, narrow_room(), 48)[0], torch.eye(4)
 
@@ -55,10 +54,10 @@ def test_a_rejected_step_leaves_the_pose_unchanged(monkeypatch: pytest.MonkeyPat
     tracker = begun()
     tracker.begin(FRAME, T_TRUE[None])
     bad = torch.tensor([0.3, 0.0, 0.0, 0.5, 0.0, 0.0], dtype=torch.float64)
-    monkeypatch.setattr("nbtrack.tracking.lm._damped_step", lambda *arguments: bad)
+    monkeypatch.setattr("nbtrack.tracking.registration.damped_step", lambda *arguments: bad)
     damping = tracker.searches[-1].damping
     tracker.step()
-    torch.testing.assert_close(tracker.T_world_camera, T_TRUE, atol=1e-6, rtol=0)
+    torch.testing.assert_close(tracker.T_world_camera.float(), T_TRUE, atol=1e-6, rtol=0)
     assert tracker.searches[-1].damping > damping
 
 
@@ -95,6 +94,5 @@ def test_the_pull_goes_back_to_the_start() -> None:
     T_start = torch.eye(4, dtype=torch.float64)
     T_there = moved(T_start, torch.cat([turn, offset]).double())
     nothing = Residuals(torch.zeros(2, 1), torch.zeros(2, 1, 6), torch.zeros(1))
-    search = _Search(T_start, T_there, 1, nothing, LEAST_SCALES, damping=0.0)
-    expected = -torch.cat([turn.sin(), offset])
-    torch.testing.assert_close(_damped_step(search, 1.0).float(), expected)
+    found = damped_step(nothing, torch.ones(2), 1.0, T_start, T_there, 0.0)
+    torch.testing.assert_close(found.float(), -torch.cat([turn.sin(), offset]))

@@ -12,7 +12,6 @@ from nbtrack.core.geometry import make_transform, rotation_vector_to_matrix
 from nbtrack.fields import Field, NetworkSettings, make_field
 from nbtrack.fields.grid import BakedField
 from nbtrack.tracking.registration import (
-    LEAST_SCALES,
     Residuals,
     certainty,
     moved,
@@ -24,6 +23,7 @@ from nbtrack.tracking.registration import (
 
 BOX = SceneBounds((-1.0, -1.2, -0.8), (1.0, 1.2, 0.8))
 WIDEST, ORIGIN = torch.full((2,), math.inf), torch.eye(4)
+LEAST = torch.tensor([0.02, 0.05])
 
 
 def wall(slope: float = 1.0) -> Formula:
@@ -108,8 +108,8 @@ def test_scales_follow_the_residuals_down_only() -> None:
     """Catches scales that widen again, which would let outliers back in, or shrink to nothing."""
     values = torch.tensor([[0.01, -0.04, 0.5], [0.0, 0.0, 0.0]])
     residuals = Residuals(values, torch.zeros(2, 3, 6), torch.ones(3))
-    assert scales_of(residuals, WIDEST).tolist() == pytest.approx([0.12, float(LEAST_SCALES[1])])
-    assert scales_of(residuals, torch.full((2,), 0.05))[0].item() == pytest.approx(0.05)
+    assert scales_of(residuals, WIDEST, LEAST).tolist() == pytest.approx([0.12, 0.05])
+    assert scales_of(residuals, torch.full((2,), 0.05), LEAST)[0].item() == pytest.approx(0.05)
 
 
 def test_moved_turns_about_the_camera_and_is_finite_at_zero() -> None:
@@ -126,7 +126,9 @@ def test_a_single_plane_leaves_three_directions_open() -> None:
     """Catches a covariance or condition that hides a slide along the only wall in view."""
     points, intensity = observation(300)
     residuals = residuals_at(wall(), (points.float(), intensity.float()), ORIGIN)
-    found = certainty(residuals, scales_of(residuals, WIDEST), 0.0)
+    matrix, _ = normal_equations(residuals, scales_of(residuals, WIDEST, LEAST), 0.0)
+    parts = residuals.value[0], residuals.reliability, matrix
+    found = certainty(*(part.numpy() for part in parts))
     assert found["condition_number"] > 1e6
     # Along the wall the position is as uncertain as the pull to the start allows.
     assert found["position_deviation_m"] == pytest.approx(0.5 / (3 * 0.6745), rel=0.01)

@@ -14,7 +14,7 @@ from nbtrack.core.errors import DataError
 MILLIMETRE = 1e-3
 _MOST_MILLIMETRES = np.iinfo(np.uint16).max
 # Points to track: a neighbouring depth that differs by more, as a share, marks an edge.
-_EDGE_JUMP, _DRAWN_PER_POINT = 0.05, 4
+EDGE_JUMP, DRAWN_PER_POINT = 0.05, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +56,8 @@ class Frame:
 
     @property
     def has_depth(self) -> bool:
-        """Whether any pixel is measured."""
-        return bool(self.depth_mm.any())
+        """Whether any pixel is measured; few are looked at where many are."""
+        return bool(self.depth_mm[::8, ::8].any()) or bool(self.depth_mm.any())
 
     def to(self, device: torch.device) -> "Frame":
         """The same on a device."""
@@ -99,7 +99,7 @@ class Frame:
         Not those at depth edges, which may belong to either side, nor at the border. Only a few
         times as many pixels as wanted are drawn: where little is measured, fewer points come back.
         """
-        n_drawn = (_DRAWN_PER_POINT * n_points,)
+        n_drawn = (DRAWN_PER_POINT * n_points,)
         rows, columns = (
             torch.randint(1, size - 1, n_drawn, generator=generator, device=generator.device)
             for size in self.depth_mm.shape
@@ -108,7 +108,7 @@ class Frame:
         is_smooth = depth > 0
         for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
             beside = self.at(rows + down, columns + right)[1]
-            is_smooth &= (beside - depth).abs() < _EDGE_JUMP * depth
+            is_smooth &= (beside - depth).abs() < EDGE_JUMP * depth
         kept = torch.nonzero(is_smooth).squeeze(-1)[:n_points]
         return self.points(rows[kept], columns[kept])
 

@@ -70,6 +70,9 @@ class Field(nn.Module, abc.ABC):
     supervision: str = "rendering"  # what teaches it: tells variants of one field apart
     is_distance: bool = True  # whether its value is a signed distance (m), else a density
     surface_level: float  # the value whose isosurface is drawn as the scene's surface
+    # By how much its distance (m) and intensity are off at surfaces, together with depth cameras:
+    # larger residuals lose their say in second-order tracking. Our choice, for small networks.
+    accuracy: tuple[float, float] = (0.02, 0.05)
     Settings: type[MappingSettings] = MappingSettings  # of mapping
 
     def __init__(self, bounds: SceneBounds) -> None:

@@ -1,26 +1,23 @@
-"""A field baked into a dense grid: sampled once, then answered by trilinear interpolation.
+"""A field on a regular grid: sampled once, then answered by trilinear interpolation.
 
-A network costs 250,000 products a point, the grid one row of memory. The interpolant is continuous;
-its gradient is exact, and jumps from cell to cell. Computations keep the points on the last axis:
-torch is slow where the last axis is short.
+A network costs 250,000 products a point, the grid eight vertices. The interpolant is continuous;
+its gradient is exact, and jumps from cell to cell.
 """
 
 import math
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import nn
 
-from nbtrack.core.arrays import Colors, Indices, Points, Values
+from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.core.errors import ConfigError
-from nbtrack.fields.base import LUMA, Field, Linearization
+from nbtrack.fields.base import LUMA, Field
 
 _POINTS_AT_ONCE = 65_536
 _MAX_BYTES = 1_000_000_000
-# A vertex holds its colour (3 floats) and, for the cell that starts there, value and intensity
-# of all 8 corners: 8 times the memory of the samples, but one cache line a query, not 4 to 8.
-_BYTES_PER_VERTEX = 4 * (3 + 2 * 8)
+# A vertex holds colour and value, and for the compiled search value and intensity side by side.
+_BYTES_PER_VERTEX = 4 * (3 + 1 + 2)
 
 
 class BakedField(Field):
@@ -35,7 +32,7 @@ class BakedField(Field):
     def __init__(self, source: Field, voxel: float | int) -> None:
         """Sample a field, on its device, in cells of `voxel` (m), one to spare on each side.
 
-        The interpolation's error falls with the voxel's square; the memory (76 bytes a vertex) and
+        The interpolation's error falls with the voxel's square; the memory (24 bytes a vertex) and
         the time grow with its inverse's cube. Raises ConfigError where it is no positive number,
         or the grid would exceed 1 GB.
         """
@@ -44,76 +41,35 @@ class BakedField(Field):
         self.surface_level = float(source.surface_level)
         self.voxel, self.n_vertices = float(voxel), _checked_size(source, voxel)
         # The first vertex lies one cell below the bounds; they are listed with z fastest.
-        origin = torch.tensor([x - voxel for x in self.bounds.minimum], device=source.device)
+        low = torch.tensor([x - voxel for x in self.bounds.minimum], device=source.device)
         numbers = torch.arange(math.prod(self.n_vertices), device=source.device)
         answers = [
-            source(origin + voxel * torch.stack(torch.unravel_index(part, self.n_vertices), -1))
+            source(low + voxel * torch.stack(torch.unravel_index(part, self.n_vertices), -1))
             for part in numbers.split(_POINTS_AT_ONCE)
         ]
         color, value = map(torch.cat, zip(*answers, strict=True))
-        # Steps to a vertex's neighbours, and from a cell's first vertex to its corners, of which
-        # x changes fastest.
-        strides = torch.tensor([self.n_vertices[1] * self.n_vertices[2], self.n_vertices[2], 1])
-        offsets = torch.cartesian_prod(*3 * [torch.arange(2)]).flip(-1) @ strides
-        last_vertex = value.new_tensor(self.n_vertices)[:, None] - 1
-        samples = torch.stack([value, color @ LUMA.to(color)], dim=-1)
-        # Rows of last vertices, where no cell starts, hold rubbish and are never read.
-        cells = samples.new_zeros(len(samples), 2, 8)
-        for corner, offset in enumerate(offsets.tolist()):
-            cells[: len(samples) - offset, :, corner] = samples[offset:]
-        self.register_buffer("color", color.T.contiguous())
-        self.register_buffer("cells", cells)
-        self.register_buffer("corner_offsets", offsets[:, None].to(source.device))
-        self.register_buffer("strides", strides[:, None].to(value))
-        self.register_buffer("origin_world", origin[:, None])
-        self.register_buffer("first_vertex", torch.zeros_like(last_vertex))
-        self.register_buffer("last_vertex", last_vertex)
+        vertices = torch.stack([value, color @ LUMA.to(color)], dim=-1)
+        self.register_buffer("low", low, persistent=False)
+        self.register_buffer("volume", torch.cat([color.T, value[None]]), persistent=False)
+        self.register_buffer("vertices", vertices, persistent=False)
 
     @property
     def n_bytes(self) -> int:
-        """Memory of all buffers (bytes): 76 a vertex in single precision."""
+        """Memory of all buffers (bytes): 24 a vertex in single precision."""
         return sum(buffer.nbytes for buffer in self.buffers())
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
-        """Colour in [0, 1] and value (m for a signed distance) at points (m).
-
-        Differentiable with respect to the points, with the gradients of `linearize`.
-        """
-        _, index, fraction = self._locate(points_world)
-        value = self.cells[:, 0].index_select(0, index).T
-        color = self.color.index_select(1, (self.corner_offsets + index).flatten())
-        corners = torch.cat([color.view(3, 8, -1), value[None]]).view(4, 2, 2, 2, -1)
-        for along in fraction:
-            low, high = corners.unbind(dim=-2)
-            corners = torch.addcmul(low, along, high - low)
-        return corners[:3].T, corners[3]
-
-    @torch.no_grad()
-    def linearize(self, points_world: Points) -> Linearization:
-        """Value and intensity with the exact gradients of their interpolants."""
-        is_inside, index, fraction = self._locate(points_world)
-        rows = self.cells.index_select(0, index).flatten(1).T.contiguous()
-        # Channel, derivative (first none; x, y and z join one by one), corners z, y, x, point.
-        terms = rows.view(2, 1, 2, 2, 2, -1)
-        for along in fraction:
-            low, high = terms.unbind(dim=-2)
-            slope = high - low
-            terms = torch.cat([torch.addcmul(low, along, slope), slope[:, :1]], dim=1)
-        value, intensity = terms[:, 0]
-        of_value, of_intensity = terms[:, 1:] * (is_inside / self.voxel)
-        return Linearization(value, of_value.T, intensity, of_intensity.T)
-
-    def _locate(
-        self, points_world: Points
-    ) -> tuple[Bool[Tensor, "3 n"], Indices, Float[Tensor, "3 n"]]:
-        """Whether inside, per axis; row of the cell; position between its borders in [0, 1]."""
-        scaled = (points_world.T.contiguous() - self.origin_world) * (1 / self.voxel)
-        inside = scaled.clamp(self.first_vertex, self.last_vertex)
-        # The upper border belongs to the last cell. A point that is not a number finds some
-        # cell, but its answers are not numbers either, as a network's would be.
-        cell = torch.minimum(inside.detach().floor().nan_to_num(0.0), self.last_vertex - 1)
-        index = (cell * self.strides).sum(dim=0, dtype=torch.int64)
-        return inside == scaled, index, inside - cell
+        """Colour in [0, 1] and value (m for a signed distance) at points (m); differentiable."""
+        last = self.voxel * (torch.tensor(self.n_vertices).to(self.low) - 1)
+        # grid_sample wants x, y, z of a volume indexed z, y, x, from -1 to 1.
+        normalized = (2 * (points_world - self.low) / last - 1).flip(-1)
+        volume = self.volume.view(1, 4, *self.n_vertices)
+        found = nn.functional.grid_sample(
+            volume, normalized[None, None, None], padding_mode="border", align_corners=True
+        )[0, :, 0, 0]
+        # A point that is not a number is taken for one at the border.
+        found = torch.where(points_world.isnan().any(dim=-1), torch.nan, found)
+        return found[:3].T, found[3]
 
 
 def _checked_size(field: Field, voxel: float | int) -> tuple[int, int, int]:

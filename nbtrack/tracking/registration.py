@@ -9,6 +9,7 @@ x -> t + v + exp(omega) (x - t), so that rotation and translation stay apart whe
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -18,12 +19,11 @@ from nbtrack.core.geometry import make_transform, rotation_vector_to_matrix, tra
 from nbtrack.fields import Field
 
 # Gradient lengths between which a signed distance is taken at its word (PIN-SLAM: 0.5 to 2).
-_LEAST_SLOPE, _MOST_SLOPE = 0.3, 2.0
-_SLOPE_SCALE = 0.5  # a gradient so much longer or shorter than 1 counts for a quarter
-_MARGIN = 0.3  # m beyond a field's bounds, where walls lie of which the pose is off
-LEAST_SCALES = torch.tensor([0.02, 0.05])  # maps and depth cameras are off by that (our choice)
-_MEDIANS = 3.0  # of its residuals in a scale: two standard deviations, were they normal
-_DEVIATIONS = 0.6745 * _MEDIANS
+LEAST_SLOPE, MOST_SLOPE = 0.3, 2.0
+SLOPE_SCALE = 0.5  # a gradient so much longer or shorter than 1 counts for a quarter
+MARGIN = 0.3  # m beyond a field's bounds, where walls lie of which the pose is off
+MEDIANS = 3.0  # of its residuals in a scale: two standard deviations, were they normal
+_DEVIATIONS = 0.6745 * MEDIANS
 INLIER_DISTANCE = 0.05  # m: a point that near the surface fits
 # A pull towards the start of the frame's search, so weak that it decides only where the frame says
 # nothing, as along a corridor: one point's worth, at a twist of 0.5 rad or 0.5 m (our choice).
@@ -56,11 +56,11 @@ def residuals_at(
     points_world = transform_points(T_world_camera, points_camera)
     field_at = field.linearize(points_world)
     slope = field_at.value_gradient.norm(dim=-1)
-    is_usable = (slope > _LEAST_SLOPE) & (slope < _MOST_SLOPE)
-    is_usable &= field.bounds.contain(points_world, _MARGIN)
+    is_usable = (slope > LEAST_SLOPE) & (slope < MOST_SLOPE)
+    is_usable &= field.bounds.contain(points_world, MARGIN)
     # A distance field's gradient has length 1; the farther from it, the less it is trusted.
-    reliability = is_usable / (1 + ((slope - 1) / _SLOPE_SCALE).square()).square()
-    slope = slope.clamp_min(_LEAST_SLOPE) if divide_by_slope else torch.ones_like(slope)
+    reliability = is_usable / (1 + ((slope - 1) / SLOPE_SCALE).square()).square()
+    slope = slope.clamp_min(LEAST_SLOPE) if divide_by_slope else torch.ones_like(slope)
     value = torch.stack([field_at.value / slope, field_at.intensity - intensity])
     gradient = field_at.value_gradient / slope[:, None], field_at.intensity_gradient
     # d g(x) / d(omega, v) = [(arm x gradient)', gradient'], from dx = v + omega x arm.
@@ -69,10 +69,10 @@ def residuals_at(
     return Residuals(value, torch.stack(jacobian), reliability)
 
 
-def scales_of(residuals: Residuals, before: Scales) -> Scales:
+def scales_of(residuals: Residuals, before: Scales, least: Scales) -> Scales:
     """Scales for residuals: some medians wide, never below the least, nor above those before."""
-    scales = _MEDIANS * residuals.value.abs().median(dim=1).values
-    return scales.maximum(LEAST_SCALES.to(scales)).minimum(before.to(scales))
+    scales = MEDIANS * residuals.value.abs().median(dim=1).values
+    return scales.maximum(least.to(scales)).minimum(before.to(scales))
 
 
 def robust_cost(residuals: Residuals, scales: Scales, intensity_weight: float) -> Scalar:
@@ -102,24 +102,52 @@ def normal_equations(
     return jacobian.T @ jacobian, jacobian.T @ (u * root).flatten().double()
 
 
-def certainty(residuals: Residuals, scales: Scales, intensity_weight: float) -> dict[str, float]:
+def damped_step(
+    residuals: Residuals,
+    scales: Scales,
+    intensity_weight: float,
+    T_start: Transform,
+    T_world_camera: Transform,
+    damping: float,
+) -> Float[Tensor, "6"]:
+    """The twist that solves (H + pull + damping diag H) twist = -(J'Wr + pull's gradient).
+
+    The pull is START_PULL times (1 - cos(angle) + offset^2 / 2) from the start of the search.
+    """
+    matrix, vector = normal_equations(residuals, scales, intensity_weight)
+    matrix, vector = matrix.to(T_world_camera), vector.to(T_world_camera)
+    turned = T_world_camera[:3, :3] @ T_start[:3, :3].T
+    sines = (turned - turned.T)[[2, 0, 1], [1, 2, 0]] / 2  # the axis times sin(angle)
+    offset = T_world_camera[:3, 3] - T_start[:3, 3]
+    vector += START_PULL * torch.cat([sines, offset])
+    diagonal = matrix.diagonal()
+    diagonal += START_PULL + damping * diagonal
+    return -torch.linalg.solve(matrix, vector)
+
+
+def certainty(
+    distance: Float[np.ndarray, "_"],
+    reliability: Float[np.ndarray, "_"],
+    matrix: Float[np.ndarray, "6 6"],
+) -> dict[str, float]:
     """The share of points near the surface, and how well the curvature of their cost holds a pose.
 
-    Deviations are along the least certain direction, the condition number without the pull to the
-    start, rotations at an arm of 1 m. Errors of the map are not independent, as residuals are here
-    taken to be: these are lower bounds, good for telling poses apart, not for error bars.
+    Of residuals (m) and the matrix of the normal equations. Deviations are along the least certain
+    direction, the condition number without the pull to the start, rotations at an arm of 1 m.
+    Errors of the map are not independent, as residuals are here taken to be: these are lower
+    bounds, good for telling poses apart, not for error bars.
     """
-    is_inlier = (residuals.value[0].abs() < INLIER_DISTANCE) & (residuals.reliability > 0)
-    matrix, _ = normal_equations(residuals, scales, intensity_weight)
-    values = torch.linalg.eigvalsh(matrix)
-    pulled = matrix + START_PULL * torch.eye(6).to(matrix)
-    covariance = torch.linalg.inv(pulled) / _DEVIATIONS**2  # rad, m
-    rotation, position = covariance[:3, :3], covariance[3:, 3:]
+    is_inlier = (np.abs(distance) < INLIER_DISTANCE) & (reliability > 0)
+    values = np.linalg.eigvalsh(matrix)
+    covariance = np.linalg.inv(matrix + START_PULL * np.eye(6)) / _DEVIATIONS**2  # rad, m
+    rotation, position = (
+        np.linalg.eigvalsh(np.stack([covariance[:3, :3], covariance[3:, 3:]]))[:, -1] ** 0.5
+    )
     return {
-        "inlier_ratio": float(is_inlier.float().mean()),
-        "position_deviation_m": float(torch.linalg.eigvalsh(position)[-1].sqrt()),
-        "rotation_deviation_deg": float(torch.linalg.eigvalsh(rotation)[-1].sqrt().rad2deg()),
-        "condition_number": float(values[-1] / values[0].clamp_min(1e-9)),
+        "inlier_ratio": float(is_inlier.mean()),
+        "position_deviation_m": float(position),
+        "rotation_deviation_deg": float(np.rad2deg(rotation)),
+        "condition_number": float(values[-1] / max(values[0], 1e-9)),
     }
 
 

@@ -1,0 +1,212 @@
+"""Compiled sums over points in a grid: what `registration` computes, one point after the other.
+
+Of every point a column of twelve numbers is kept: the residuals of distance (m) and intensity, how
+reliable they are, the arm from the camera's centre (m, world axes), and both spatial gradients.
+Loops are plain so that numba compiles them; no result depends on the number of threads.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+from nbtrack.data.frame import DRAWN_PER_POINT, EDGE_JUMP, MILLIMETRE
+from nbtrack.fields.base import LUMA
+from nbtrack.tracking.registration import LEAST_SLOPE, MEDIANS, MOST_SLOPE, SLOPE_SCALE, START_PULL
+
+_RED, _GREEN, _BLUE = LUMA.tolist()
+
+
+# Sums may be reordered, so that they fill vector registers; what is no number stays none.
+_HOW = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
+_ONE, _NONE = np.float32(1), np.float32(0)
+
+
+@no_type_check
+@njit(**_HOW)
+def _weigh(rows, by_slope):
+    """Reliability by the slope, and division by it."""
+    for i in range(rows.shape[1]):
+        slope = np.sqrt(rows[6, i] ** 2 + rows[7, i] ** 2 + rows[8, i] ** 2)
+        trust = _ONE / (_ONE + ((slope - _ONE) / np.float32(SLOPE_SCALE)) ** 2)
+        rows[2, i] *= trust * trust if LEAST_SLOPE < slope < MOST_SLOPE else _NONE
+        length = max(slope, np.float32(LEAST_SLOPE)) if by_slope else _ONE
+        rows[0, i] /= length
+        for k in range(6, 9):
+            rows[k, i] /= length
+
+
+@no_type_check
+@njit(**_HOW)
+def residual_rows(observed, T, grid, by_slope):
+    """A column of every point at a pose; `registration.residuals_at` in a grid.
+
+    A grid is its vertices (value and intensity), their numbers along x, y and z, and its place: the
+    first vertex, the voxel, and both corners of the box whose points are usable.
+    """
+    (points, intensity), (vertices, shape, place) = observed, grid
+    rows = np.empty((12, len(points)), np.float32)
+    step_x, step_y, one = np.uintp(shape[1] * shape[2]), np.uintp(shape[2]), np.uintp(1)
+    inverse, at, inside = 1 / place[3], np.empty(3, np.float32), np.empty(3, np.float32)
+    for i in range(len(points)):
+        number, is_usable = 0, True
+        for k in range(3):
+            arm = T[k, 0] * points[i, 0] + T[k, 1] * points[i, 1] + T[k, 2] * points[i, 2]
+            world, last = arm + T[k, 3], shape[k] - 1.0
+            is_usable &= place[4 + k] <= world <= place[7 + k]
+            scaled = (world - place[k]) * inverse
+            # Points outside are moved to the border, where they have no slope; so are NaNs.
+            inside[k] = inverse if 0 <= scaled <= last else 0.0
+            scaled = min(scaled, last) if scaled > 0 else 0.0
+            cell = min(int(scaled), shape[k] - 2)
+            at[k], number, rows[3 + k, i] = scaled - cell, number * shape[k] + cell, arm
+        v, (x, y, z) = np.uintp(number), (at[0], at[1], at[2])
+        for k in range(2):
+            a, b = vertices[v, k], vertices[v + one, k]
+            c, d = vertices[v + step_y, k], vertices[v + step_y + one, k]
+            e, f = vertices[v + step_x, k], vertices[v + step_x + one, k]
+            g, h = vertices[v + step_x + step_y, k], vertices[v + step_x + step_y + one, k]
+            ab, cd, ef, gh = a + z * (b - a), c + z * (d - c), e + z * (f - e), g + z * (h - g)
+            low, high = ab + y * (cd - ab), ef + y * (gh - ef)
+            low_z, high_z = b - a + y * (d - c - b + a), f - e + y * (h - g - f + e)
+            rows[k, i] = low + x * (high - low)
+            rows[6 + 3 * k, i] = (high - low) * inside[0]
+            rows[7 + 3 * k, i] = (cd - ab + x * (gh - ef - cd + ab)) * inside[1]
+            rows[8 + 3 * k, i] = (low_z + x * (high_z - low_z)) * inside[2]
+        rows[1, i] -= intensity[i]
+        rows[2, i] = _ONE if is_usable else _NONE
+    _weigh(rows, by_slope)
+    return rows
+
+
+@no_type_check
+@njit(**_HOW)
+def scales_of(rows, before, least):
+    """`registration.scales_of`."""
+    scales, middle = np.empty(2), (rows.shape[1] - 1) // 2
+    for k in range(2):
+        median = np.partition(np.abs(rows[k]), middle)[middle]
+        scales[k] = min(max(MEDIANS * median, least[k]), before[k])
+    return scales
+
+
+@no_type_check
+@njit(**_HOW)
+def robust_cost(rows, scales, weight):
+    """`registration.robust_cost`."""
+    total, weight = 0.0, np.float32(weight)
+    first, second = np.float32(1 / scales[0]), np.float32(1 / scales[1])
+    for i in range(rows.shape[1]):
+        u, v = (rows[0, i] * first) ** 2, (rows[1, i] * second) ** 2
+        cost = u / (_ONE + u) + weight * v / (_ONE + v)
+        total += rows[2, i] * cost + (_ONE - rows[2, i]) * (_ONE + weight)
+    return total / rows.shape[1]
+
+
+@no_type_check
+@njit(**_HOW)
+def normal_equations(rows, scales, weight):
+    """`registration.normal_equations`."""
+    n_points = rows.shape[1]
+    jacobian, trust = np.empty((6, n_points), np.float32), np.empty(n_points, np.float32)
+    matrix, vector = np.zeros((6, 6)), np.zeros(6)
+    for k in range(2):
+        scale, share = np.float32(scales[k]), np.float32(weight if k else 1.0)
+        for i in range(n_points):
+            gx, gy, gz = rows[6 + 3 * k, i], rows[7 + 3 * k, i], rows[8 + 3 * k, i]
+            ax, ay, az = rows[3, i], rows[4, i], rows[5, i]
+            jacobian[0, i], jacobian[1, i] = ay * gz - az * gy, az * gx - ax * gz
+            jacobian[2, i], jacobian[3, i] = ax * gy - ay * gx, gx
+            jacobian[4, i], jacobian[5, i] = gy, gz
+            flat = (_ONE + (rows[k, i] / scale) ** 2) * scale
+            trust[i] = share * rows[2, i] / (flat * flat)
+        for a in range(6):
+            for i in range(n_points):
+                vector[a] += trust[i] * jacobian[a, i] * rows[k, i]
+            for b in range(a + 1):
+                total = 0.0
+                for i in range(n_points):
+                    total += trust[i] * jacobian[a, i] * jacobian[b, i]
+                matrix[a, b] += total
+                matrix[b, a] = matrix[a, b]
+    return matrix, vector
+
+
+@no_type_check
+@njit(**_HOW)
+def moved(T, twist):
+    """`registration.moved`, by Rodrigues' formula."""
+    x, y, z = twist[0], twist[1], twist[2]
+    angle = np.sqrt(x * x + y * y + z * z)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sine = np.sin(angle) / angle if angle > 1e-9 else 1.0
+    versine = 2 * (np.sin(angle / 2) / angle) ** 2 if angle > 1e-9 else 0.5
+    turn = np.eye(3) + sine * cross + versine * (cross @ cross)
+    after = T.copy()
+    after[:3, :3] = turn @ np.ascontiguousarray(T[:3, :3])
+    after[:3, 3] += twist[3:]
+    return after
+
+
+@no_type_check
+@njit(**_HOW)
+def damped_step(rows, scales, weight, T_start, T, damping):
+    """`registration.damped_step`."""
+    matrix, vector = normal_equations(rows, scales, weight)
+    for k in range(3):
+        i, j = (k + 2) % 3, (k + 1) % 3
+        turned = 0.0
+        for m in range(3):
+            turned += T[i, m] * T_start[j, m] - T[j, m] * T_start[i, m]
+        vector[k] += START_PULL * turned / 2
+        vector[3 + k] += START_PULL * (T[k, 3] - T_start[k, 3])
+    for k in range(6):
+        matrix[k, k] += START_PULL + damping * matrix[k, k]
+    return -np.linalg.solve(matrix, vector)
+
+
+@no_type_check
+@njit(**_HOW)
+def try_step(observed, grid, by_slope, weight, least, T_start, T, rows, scales, damping):
+    """A step: whether it is better, pose, rows and scales after it, cost before, and its length."""
+    twist = damped_step(rows, scales, weight, T_start, T, damping)
+    T_after = moved(T, twist)
+    rows_after = residual_rows(observed, T_after, grid, by_slope)
+    before, after = robust_cost(rows, scales, weight), robust_cost(rows_after, scales, weight)
+    longest = np.abs(twist).max()
+    if after < before:
+        return True, T_after, rows_after, scales_of(rows_after, scales, least), before, longest
+    return False, T, rows, scales, before, longest
+
+
+@no_type_check
+@njit(**_HOW)
+def draw_points(depth_mm, color, camera, n_points, seed):
+    """`Frame.smooth_points`, but one pixel after the other, until there are enough.
+
+    Random numbers are those of SplitMix64 (Steele, Lea, Flood 2014): a few operations each.
+    """
+    (height, width), (fx, fy, cx, cy), found = depth_mm.shape, camera, 0
+    points, luma = np.empty((n_points, 3)), np.empty(n_points)
+    state = np.uint64(seed)
+    for _ in range(DRAWN_PER_POINT * n_points):
+        if found == n_points:
+            break
+        state += np.uint64(0x9E3779B97F4A7C15)
+        mixed = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        mixed ^= mixed >> np.uint64(31)
+        v = 1 + np.int64((mixed >> np.uint64(32)) % np.uint64(height - 2))
+        u = 1 + np.int64((mixed & np.uint64(0xFFFFFFFF)) % np.uint64(width - 2))
+        z = depth_mm[v, u]
+        jump = EDGE_JUMP * z
+        is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
+        is_smooth &= abs(depth_mm[v, u + 1] - z) < jump and abs(depth_mm[v, u - 1] - z) < jump
+        if is_smooth:  # never without a depth: nothing is below a jump of zero
+            point, metres = points[found], z * MILLIMETRE
+            point[0], point[1] = (u + 0.5 - cx) / fx * metres, (v + 0.5 - cy) / fy * metres
+            point[2] = metres
+            red, green, blue = color[v, u, 0], color[v, u, 1], color[v, u, 2]
+            luma[found] = (_RED * red + _GREEN * green + _BLUE * blue) / 255
+            found += 1
+    return points[:found], luma[:found]

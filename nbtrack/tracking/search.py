@@ -1,0 +1,107 @@
+"""One descent of Levenberg-Marquardt from one start, in any field with a signed distance."""
+
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import torch
+
+from nbtrack.core.arrays import Points, Pose, Transform, Values
+from nbtrack.core.settings import may_be_zero
+from nbtrack.data.frame import Frame
+from nbtrack.fields import Field
+from nbtrack.fields.base import LUMA
+from nbtrack.tracking import registration
+from nbtrack.tracking.registration import Scales
+from nbtrack.tracking.tracker import TrackerSettings
+
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e3
+_DAMPING_UP, _DAMPING_DOWN = 10.0, 0.2
+# A step below these (rad and m) ends the search on some points, and on all of them.
+_LEAST_STEPS = (5e-3, 1e-3)
+
+
+@dataclass(frozen=True)
+class LmSettings(TrackerSettings):
+    """Levenberg-Marquardt; all our choice."""
+
+    n_pixels: int = 512  # points a frame
+    motion_model: str = "better_of_both"
+    lambda_intensity: float = 1.0  # weight of the intensity residual, both over their scale
+    n_restarts: int = may_be_zero(8)  # where the first search ends lost
+    anneal: bool = True  # robust scales fall with the residuals; else the narrowest throughout
+    divide_by_slope: bool = True  # residuals are f / |grad f|, else f
+    bake_voxel: float = 0.0  # m; the field is asked on a grid of such cells, 0: itself
+
+
+class Search:
+    """A descent on some of a frame's points, then on all; the pose is kept in double precision.
+
+    A step is taken only if it lowers the robust cost; else the damping grows. Robust scales follow
+    the residuals down, so that far-off starts converge and outliers lose their say in the end.
+    """
+
+    residuals: Any  # at the pose, as this kind of search keeps them
+
+    def __init__(
+        self, field: Field, levels: tuple, settings: LmSettings, start: Transform | Pose
+    ) -> None:
+        """From a start (camera to world, double precision), on the first of two sets of points."""
+        self.field, self.levels, self.settings = field, levels, settings
+        self.start = self.T_world_camera = start
+        self.begin(0)
+
+    @staticmethod
+    def draw(frame: Frame, n_points: int, generator: torch.Generator) -> tuple[Points, Values]:
+        """Random observed points (m, camera frame) away from edges, and their intensities."""
+        points_camera, color = frame.smooth_points(n_points, generator)
+        return points_camera, color @ LUMA.to(color)
+
+    def begin(self, level: int) -> None:
+        """Go on from the present pose with some of the points (level 0) or all (1)."""
+        self.level, self.damping, self.is_ended = level, _FIRST_DAMPING, False
+        self._look(inf if self.settings.anneal else 0.0)
+
+    def step(self) -> float:
+        """One step, taken or refused; returns the robust cost before it."""
+        weight = self.settings.lambda_intensity
+        now = self.residuals, self.scales, weight
+        twist = registration.damped_step(*now, self.start, self.T_world_camera, self.damping)
+        T_world_camera = registration.moved(self.T_world_camera, twist)
+        residuals = self._residuals_at(T_world_camera)
+        before = registration.robust_cost(*now)
+        is_better = bool(registration.robust_cost(residuals, *now[1:]) < before)
+        if is_better:
+            self.T_world_camera, self.residuals = T_world_camera, residuals
+            self.scales = registration.scales_of(
+                residuals, self.scales, torch.tensor(self.field.accuracy)
+            )
+        self._judge(is_better, float(twist.abs().max()))
+        return float(before)
+
+    def cost(self, scales: Scales) -> float:
+        """The robust cost at given scales, by which searches are compared."""
+        return float(registration.robust_cost(self.residuals, scales, 1.0))
+
+    def certainty(self) -> dict[str, float]:
+        """What the points say of the pose; see `registration.certainty`."""
+        now, weight = (self.residuals, self.scales), self.settings.lambda_intensity
+        matrix, _ = registration.normal_equations(*now, weight)
+        parts = self.residuals.value[0], self.residuals.reliability, matrix
+        return registration.certainty(*(part.cpu().double().numpy() for part in parts))
+
+    def _look(self, widest: float) -> None:
+        """Residuals at the pose, and robust scales for them, up to the widest."""
+        self.residuals = self._residuals_at(self.T_world_camera)
+        least = torch.tensor(self.field.accuracy)
+        self.scales = registration.scales_of(self.residuals, least.clamp_min(widest), least)
+
+    def _residuals_at(self, T_world_camera: Transform) -> registration.Residuals:
+        observed, by_slope = self.levels[self.level], self.settings.divide_by_slope
+        return registration.residuals_at(self.field, observed, T_world_camera, by_slope)
+
+    def _judge(self, is_better: bool, length: float) -> None:
+        """Set the damping after a step, and whether the level is at its end."""
+        down = max(self.damping * _DAMPING_DOWN, _LEAST_DAMPING)
+        self.damping = down if is_better else self.damping * _DAMPING_UP
+        self.is_ended = length < _LEAST_STEPS[self.level] or self.damping > _MOST_DAMPING
