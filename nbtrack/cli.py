@@ -61,6 +61,11 @@ OPTIONS = {
         type=float,
         metavar="METRES",
     ),
+    "--correct": _option(
+        "correct the map at its surfaces in such cells, for example 0.04",
+        type=float,
+        metavar="METRES",
+    ),
     "--frames": _option("Python slice of frames, A:B:S", default=":"),
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from": _option(
@@ -117,12 +122,12 @@ _PARTS = " --format --depth-folder --poses"
 COMMANDS = {
     "map": (
         "fit a field to a sequence with known poses",
-        "sequence --field! --supervision --format " + _MADE,
+        "sequence --field! --supervision --correct --format " + _MADE,
     ),
     "track": (
         "track a camera; maps first where no map fits",
-        "sequence --field --supervision --format --tracker! --rate --steps --pixels --bake "
-        "--map-frames --map-from " + _MADE,
+        "sequence --field --supervision --correct --format --tracker! --rate --steps --pixels "
+        "--bake --map-frames --map-from " + _MADE,
     ),
     "export": ("a run's trajectory or a map elsewhere", "source out --to!"),
     "tables": (

@@ -6,7 +6,7 @@ import torch
 from box_room import sequence_of
 
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.camera import Intrinsics
+from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
@@ -37,7 +37,9 @@ def test_plane_distance_of_a_slanted_wall() -> None:
     sequence.depths_mm[0, 20, 10] = 0
     sampler = PixelSampler(sequence, torch.device("cpu"))
     rows, columns = torch.tensor([10, 24, 20, 10, 20, 0]), torch.tensor([20, 32, 30, 39, 11, 30])
-    found = sampler.plane_distance_per_depth(torch.zeros_like(rows), rows, columns)
+    normals = sampler.normals_camera(torch.zeros_like(rows), rows, columns)
+    # Towards the camera, against the ray.
+    found = -(normals * pixel_directions(sequence.intrinsics, columns, rows)).sum(dim=-1)
     expected = (1 - (columns + 0.5 - 32) / 48) / 2**0.5 * (torch.arange(6) < 3)
     torch.testing.assert_close(found, expected, atol=5e-3, rtol=0)
 
@@ -48,8 +50,8 @@ def test_targets_by_hand() -> None:
 
     The ray measured 2 m at a plane met head-on; samples at 1, 1.9, 2.05 and 2.3 m.
     """
-    zeros = torch.zeros(2, 3)
-    rays = Rays(zeros, zeros, zeros, torch.tensor([2.0, 0.0]), torch.tensor([1.0, 0.0]))
+    zeros, ahead = torch.zeros(2, 3), torch.tensor([[0.0, 0.0, 1.0]] * 2)
+    rays = Rays(zeros, ahead, zeros, torch.tensor([2.0, 0.0]), -ahead * torch.tensor([[1], [0]]))
     depths = torch.tensor([1.0, 1.9, 2.05, 2.3]).expand(2, 4)
     nearest = torch.tensor([0.4, 0.11, 0.06, 0.28]).expand(2, 4)
     nowhere = torch.zeros(2, 4, dtype=torch.bool)

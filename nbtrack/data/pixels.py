@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.core.arrays import Colors, Indices, RaySamples, Values
+from nbtrack.core.arrays import Colors, Indices, Points, RaySamples, Values
 from nbtrack.core.camera import backproject, pixel_directions
 from nbtrack.core.device import has_room_for
 from nbtrack.data.frame import MILLIMETRE
@@ -25,9 +25,9 @@ class Rays:
     directions_world: Float[Tensor, "rays 3"]  # z = 1 in the camera frame: steps are z-depths
     color: Float[Tensor, "rays 3"]  # measured, in [0, 1]
     depth: Float[Tensor, "rays"]  # measured z-depth (m), 0 = no measurement
-    # Distance (m) from the measured surface's tangent plane that one metre of z-depth makes: below
-    # the ray's length by the cosine of incidence. 0 where not known; None where not asked for.
-    plane_distance_per_depth: Float[Tensor, "rays"] | None = None
+    # Unit normal of the measured surface, towards the camera; 0 where not known, None where not
+    # asked for. One metre of z-depth leads |normal . direction| metres away from the plane.
+    normals_world: Float[Tensor, "rays 3"] | None = None
 
     def points(self, depths: RaySamples) -> Float[Tensor, "rays samples 3"]:
         """World points (m) at z-depths along the rays."""
@@ -58,11 +58,11 @@ class PixelSampler:
         directions = (T_world_camera[:, :3, :3] @ directions_camera[..., None]).squeeze(-1)
         return Rays(T_world_camera[:, :3, 3], directions, color, depth)
 
-    def plane_distance_per_depth(self, frames: Indices, rows: Indices, columns: Indices) -> Values:
-        """Distance from the tangent plane at a pixel for one metre of z-depth; see `Rays`.
+    def normals_camera(self, frames: Indices, rows: Indices, columns: Indices) -> Points:
+        """Unit normals (camera frame, towards it) of the surface at pixels.
 
-        The plane goes through neighbours to all sides, some pixels away, so that noise tilts it
-        little. 0 where one of them is not measured, or lies on another surface.
+        The tangent plane goes through neighbours to all sides, some pixels away, so that noise
+        tilts it little. 0 where one of them is not measured, or lies on another surface.
         """
         _, height, width = self.depths_mm.shape
         reach = max(1, round(width * _PLANE_REACH))
@@ -75,10 +75,9 @@ class PixelSampler:
             near = self.measurements(frames, row, column)[1]
             is_whole &= (near > 0) & ((near - depth).abs() < _PLANE_JUMP * depth)
             points.append(backproject(self.intrinsics, column, row, near))
-        normal = torch.linalg.cross(points[1] - points[0], points[3] - points[2])
-        normal = torch.nn.functional.normalize(normal, dim=-1)
-        directions = pixel_directions(self.intrinsics, columns, rows)
-        return (normal * directions).sum(dim=-1).abs() * is_whole
+        # To the right, then upwards: x times -y is -z, towards the camera.
+        normal = torch.linalg.cross(points[1] - points[0], points[2] - points[3])
+        return torch.nn.functional.normalize(normal, dim=-1) * is_whole[:, None]
 
     def measurements(self, *pixels: Indices) -> tuple[Colors, Values]:
         """Colour in [0, 1] and z-depth (m, 0 = none) of pixels: frames, rows and columns."""
@@ -97,5 +96,8 @@ class PixelSampler:
             for limit in (len(frames), height, width)
         )
         pixels = frames[chosen], rows, columns
-        planes = self.plane_distance_per_depth(*pixels) if tangent_planes else None
-        return replace(self.rays(*pixels), plane_distance_per_depth=planes)
+        rays = self.rays(*pixels)
+        if not tangent_planes:
+            return rays
+        normals = self.T_world_camera[pixels[0], :3, :3] @ self.normals_camera(*pixels)[..., None]
+        return replace(rays, normals_world=normals.squeeze(-1))

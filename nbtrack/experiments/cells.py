@@ -12,12 +12,12 @@ from filelock import FileLock
 from nbtrack.core.device import advise_on_memory, choose_device
 from nbtrack.core.errors import NbtrackError
 from nbtrack.core.files import fingerprint, foreign_source, runs_folder, sources_fingerprint
-from nbtrack.core.settings import as_dict
+from nbtrack.core.settings import as_dict, with_settings
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import PointMapping, field_class
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
-from nbtrack.mapping.fit import map_sequence
+from nbtrack.mapping.fit import correct_map, map_sequence
 from nbtrack.mapping.quality import score_map
 
 SHARED_SOURCES = ("core.geometry", "core.camera", "core.bounds", "data", "fields")
@@ -107,7 +107,16 @@ class MapCell(Cell):
     @property
     def name(self) -> str:
         """Scene and field, and the seed if it is not the first."""
-        return f"{self.scene.name}-{self.field}{seed_suffix(self.seed)}"
+        corrected = "-corrected" * (self.base is not None)
+        return f"{self.scene.name}-{self.field}{corrected}{seed_suffix(self.seed)}"
+
+    @property
+    def base(self) -> "MapCell | None":
+        """The map that this one corrects, if it is a corrected one."""
+        if not getattr(self.settings, "correct_voxel", 0.0):
+            return None
+        preset = with_settings(self.preset, f"mapping.{self.field}.correct_voxel=0.0")
+        return replace(self, preset=preset, out=None)
 
     @property
     def cost(self) -> float:
@@ -141,12 +150,18 @@ class MapCell(Cell):
             told = " ".join(f"{name} {value:.3f}" for name, value in losses.items())
             report(done / most, told)
 
+        base = self.base
+        if base and isinstance(failure := base.outcome(None, report), NbtrackError):
+            raise failure
         with advise_on_memory(f"frames {self.frames} of {self.scene.name}"):
             sequence = self.scene.read(self.frames)
-            made = map_sequence(
-                self.field, sequence, self.preset.network_of(self.field), self.settings,
-                self.seed, choose_device(), checkpoint, tell,
-            )  # fmt: skip
+            if base:
+                made = correct_map(base.map(), sequence, self.settings)
+            else:
+                made = map_sequence(
+                    self.field, sequence, self.preset.network_of(self.field), self.settings,
+                    self.seed, choose_device(), checkpoint, tell,
+                )  # fmt: skip
             quality = score_map(made, sequence, self.scene.room)
         told = {"quality": quality, "frames": self.frames, "key": self.key}
         finished = replace(made, made={**made.made, **told, "config": as_dict(self.preset)})

@@ -26,13 +26,16 @@ _PRINTED = (
     "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
     "lost_frames", "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
 )  # fmt: skip
+_SETTINGS = (
+    ("pixels", "tracking", "n_pixels"), ("bake", "tracking", "bake_voxel"),
+    ("correct", "mapping", "correct_voxel"),
+)  # fmt: skip
 _UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": ("s", 0)}
 
 
 def map_command(options: Namespace) -> None:
     """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
-    field = supervised_field(options.field, options.supervision or "rendering")
-    preset = preset_of(options)
+    field, preset = _field_of(options), preset_of(options)
     scene = _checked_scene(options, preset, options.frames)
     cell = MapCell(scene, field, preset, options.frames, options.seed, options.out)
     _map(cell)
@@ -125,10 +128,21 @@ def convert_command(options: Namespace) -> None:
 def preset_of(options: Namespace, *settings: str) -> Preset:
     """The preset with all that changes it."""
     settings = (*options.settings, *settings)
-    for option, key in (("pixels", "n_pixels"), ("bake", "bake_voxel")):
+    for option, room, key in _SETTINGS:
         value = getattr(options, option, None)
-        settings += (f"tracking.{options.tracker}.{key}={value}",) if value is not None else ()
+        if value is not None:
+            name = options.tracker if room == "tracking" else _field_of(options)
+            settings += (f"{room}.{name}.{key}={value}",)
     return load_preset(options.preset, options.config, settings)
+
+
+def _field_of(options: Namespace) -> str:
+    """The field under its supervision. Raises ConfigError where none is named."""
+    if options.field is None:
+        raise ConfigError(
+            "--correct belongs to --field, which is mapped: name one, or leave it out"
+        )
+    return supervised_field(options.field, options.supervision or "rendering")
 
 
 def _recording(options: Namespace) -> Recording:
@@ -151,7 +165,7 @@ def _field_and_map(options: Namespace) -> tuple[str, Map | None]:
         raise ConfigError("track needs --field, or --map-from with a map that knows its own")
     if options.field is None and options.supervision is not None:
         raise ConfigError("--supervision belongs to --field: name that too, or leave both out")
-    asked = options.field and supervised_field(options.field, options.supervision or "rendering")
+    asked = options.field and _field_of(options)
     if options.map_from is None:
         return asked, None
     if options.map_frames is not None:

@@ -42,6 +42,19 @@ METHODS = {
     "sdf_plus": Method("NeuS+ with SDF (Adam)", "neus_plus", "sdf"),
     "lm": Method("NeuS+ with SDF (LM)", "neus_plus", "lm"),
     "baked": Method("NeuS+ baked (LM)", "neus_plus", "lm", ("tracking.lm.bake_voxel=0.04",)),
+    "corrected": Method(
+        "NeuS+ corrected (LM)", "neus_plus", "lm", ("mapping.neus_plus.correct_voxel=0.04",)
+    ),
+    "corrected_dense": Method(
+        "NeuS+ corrected (LM), dense", "neus_plus", "lm",
+        ("mapping.neus_plus.correct_voxel=0.04", "tracking.lm.n_pixels=4096"),
+    ),
+    "neus_corrected": Method(
+        "NeuS corrected (LM)", "neus", "lm", ("mapping.neus.correct_voxel=0.04",)
+    ),
+    "sdf_corrected": Method(
+        "NeuS corrected with SDF (Adam)", "neus", "sdf", ("mapping.neus.correct_voxel=0.04",)
+    ),
     "lm_dense": Method(
         "NeuS+ with SDF (LM), dense", "neus_plus", "lm", ("tracking.lm.n_pixels=4096",)
     ),
@@ -54,7 +67,8 @@ TABLE_1 = ("vr", "sdf")
 """The rows of the paper's Table I."""
 TABLE_3 = (
     "vr", "vr_velocity", "vr_neus", "sdf", "sdf_velocity", "sdf_plus",
-    "lm", "baked", "lm_dense", "icp", "icp_dense",
+    "sdf_corrected", "lm", "baked", "lm_dense", "neus_corrected", "corrected", "corrected_dense",
+    "icp", "icp_dense",
 )  # fmt: skip
 """The paper's methods beside those that go beyond it."""
 RATES_3_HZ = (30.0, 10.0, 5.0, 2.0)

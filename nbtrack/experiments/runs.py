@@ -100,10 +100,8 @@ class TrackCell(Cell):
         """Track, or take a killed run up where its last checkpoint stands; write the files.
 
         `trajectory.txt` and `groundtruth.txt` (TUM) hold the tracked frames, without the first
-        one, whose pose was given: so public tools report the error of the paper's formula.
-
-        Raises:
-            DataError: a given map does not fit the first frame at its given pose.
+        one, whose pose was given: so public tools report the error of the paper's formula. Raises
+        DataError where a given map does not fit the first frame at its given pose.
         """
         made = self.needs.map()
         with advise_on_memory(f"frames {self.frames} of {self.scene.name}"):

@@ -96,8 +96,8 @@ def distance_targets(
     but over all frames rather than one batch; the choice between them is ours.
     """
     behind = (rays.depth[:, None] - depths).neg()
-    plane = -behind * rays.plane_distance_per_depth[:, None]
-    has_depth, has_plane = rays.depth[:, None] > 0, rays.plane_distance_per_depth[:, None] > 0
+    cosine = (rays.normals_world * rays.directions_world).sum(dim=-1).abs()[:, None]
+    plane, has_depth, has_plane = -behind * cosine, rays.depth[:, None] > 0, cosine > 0
     is_plane_nearest = has_plane & ((plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
     in_front, just_behind = behind < 0, (behind >= 0) & (plane > -settings.behind_band)
     target = torch.where(is_plane_nearest, plane, nearest)

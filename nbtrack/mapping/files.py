@@ -17,6 +17,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import MissingError
 from nbtrack.core.files import naming_damaged, write_together
 from nbtrack.fields import FIELDS, Field, NetworkSettings, PointCloud, make_field
+from nbtrack.fields.correction import CORRECTIONS, CorrectedField
 
 MAP_FILE, HISTORY_FILE = "map.safetensors", "history.csv"
 MESH_FILE = "mesh.ply"  # what a map's frames have seen
@@ -89,7 +90,7 @@ def _read_file(file: Path) -> Map:
     with safetensors.safe_open(file, "pt") as opened:
         header = dict(json.loads((opened.metadata() or {})[_FORMAT]))
         names = list(opened.keys())
-        tensors = {name: opened.get_tensor(name).clone().float() for name in names}
+        tensors = {name: opened.get_tensor(name).clone() for name in names}
     if header.get("format_version") != _VERSION:
         raise ValueError(f"format {header.get('format_version')!r}; this nbtrack reads {_VERSION}")
     # A bit that flipped on a disk, or a number edited by hand, shows nowhere else.
@@ -105,8 +106,12 @@ def _read_file(file: Path) -> Map:
         mapped = PointCloud(**tensors, voxel=float(made["settings"]["voxel"]), bounds=bounds)
     else:
         mapped = make_field(name, NetworkSettings(**made["network"]), bounds, seed=0)
-        mapped.load_state_dict(tensors)
+        own = {key.removeprefix("source."): tensors[key] for key in names if key not in CORRECTIONS}
+        mapped.load_state_dict(own)
         mapped.eval().requires_grad_(False)
+        if correction := [tensors[key] for key in CORRECTIONS if key in tensors]:
+            voxel = float(made["settings"]["correct_voxel"])
+            mapped = CorrectedField(mapped, voxel, *correction)
     return Map(mapped, Intrinsics(**header["camera"]), made)
 
 

@@ -4,7 +4,7 @@ import io
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from nbtrack.core.files import naming_damaged, versions, write_atomic
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import LearnedField, MappingSettings, NetworkSettings, PointMapping, make_field
+from nbtrack.fields.correction import corrected
 from nbtrack.fields.points import fuse_points
 from nbtrack.mapping.files import MAP_FILE, Map, read_map
 from nbtrack.mapping.quality import split_holdout, usual_misfit
@@ -77,6 +78,22 @@ def map_sequence(
     made = {**recipe, "seconds": seconds, "misfit_m": usual_misfit(field, sequence, mapped)}
     made |= {"mapped_frames": len(mapped), "device": device_name(device), "versions": versions()}
     return Map(field, sequence.intrinsics, made, pd.DataFrame(history).rename_axis("iteration"))
+
+
+def correct_map(finished: Map, sequence: RgbdSequence, settings: MappingSettings) -> Map:
+    """A map corrected at its surfaces by the frames it was made from; see `fields.correction`.
+
+    It says how long that took, and how much memory network and corrections take.
+    """
+    start = time.perf_counter()
+    mapped, _ = split_holdout(len(sequence), settings.holdout_every)
+    field = corrected(finished.field, sequence, mapped, settings.correct_voxel)
+    seconds = time.perf_counter() - start
+    made = {**finished.made, "settings": asdict(settings), "correction_seconds": seconds}
+    made["map_bytes"] = sum(tensor.nbytes for tensor in field.state_dict().values())
+    made["seconds"] += seconds
+    made["misfit_m"] = usual_misfit(field, sequence, mapped)
+    return replace(finished, field=field, made=made)
 
 
 def _check_recipe(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:

@@ -136,8 +136,8 @@ def _score_surface(field: AnyField, sequence, mapped: Frames, room: Room) -> Sco
 def map_misfit(field: AnyField, frame: Frame) -> float:
     """How far (m) a map is from what a frame measured, at the frame's given pose.
 
-    The median over random pixels of |rendered depth - measured depth|; of points, which cannot be
-    rendered, the distance from what was measured. NaN where nothing was.
+    The median over random pixels of |rendered depth - measured depth|; of points and grids, which
+    cannot be rendered, the distance at what was measured. NaN where nothing was.
     """
     if not frame.has_depth:
         return float("nan")
@@ -146,9 +146,11 @@ def map_misfit(field: AnyField, frame: Frame) -> float:
     order = torch.randperm(pixels.shape[1], generator=torch.Generator().manual_seed(0))
     rows, columns = pixels[:, order[:_MISFIT_PIXELS].to(pixels.device)]
     T_world_camera = torch.from_numpy(frame.T_world_camera).float().to(rows.device)
-    if isinstance(field, PointCloud):
+    if not isinstance(field, LearnedField):
         points_world = transform_points(T_world_camera, frame.points(rows, columns)[0])
-        return float(field.distance(points_world).median())
+        cloud = isinstance(field, PointCloud)
+        distance = field.distance(points_world) if cloud else field(points_world)[1].abs()
+        return float(distance.median())
     directions = pixel_directions(frame.camera, columns, rows) @ T_world_camera[:3, :3].T
     origins, measured = T_world_camera[:3, 3].expand_as(directions), frame.at(rows, columns)[1]
     return float((field.render_rays(origins, directions)[1] - measured).abs().median())

@@ -1,0 +1,114 @@
+"""The corrected field: better at surfaces that were measured, as before elsewhere; in a file."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from box_room import BoxRoom, Formula, box_sequence
+
+from nbtrack.core.errors import DataError
+from nbtrack.data.sequence import RgbdSequence
+from nbtrack.fields import NetworkSettings, NeusMapping, make_field
+from nbtrack.fields.correction import CorrectedField, corrected, interpolation
+from nbtrack.fields.grid import BakedField
+from nbtrack.mapping.files import Map, read_map, write_map
+from nbtrack.mapping.fit import correct_map
+from nbtrack.tracking import LmSettings, LmTracker, StepBudget
+
+ROOM, VOXEL = BoxRoom(half=(1.0, 0.5, 1.2)), 0.05
+
+
+def wavy(points: torch.Tensor) -> torch.Tensor:
+    """The room's distance (m), 8 mm off in waves, as a network's is."""
+    return ROOM.value(points) + 0.008 * torch.sin(9 * points).prod(dim=-1).sign()
+
+
+@pytest.fixture(scope="module")
+def sequence() -> RgbdSequence:
+    """Views all around from the middle: turns about the vertical axis."""
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, 0, 0] = poses[:, 2, 2] = np.cos(angles)
+    poses[:, 0, 2], poses[:, 2, 0] = np.sin(angles), -np.sin(angles)
+    poses[:, 0, 3] = 0.01 * np.arange(12)
+    return box_sequence(poses, ROOM, 96)
+
+
+@pytest.fixture(scope="module")
+def found(sequence: RgbdSequence) -> CorrectedField:
+    dark = Formula(wavy, ROOM.bounds, lambda points: 0.8 * ROOM.color(points))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nbtrack.fields.correction._N_POINTS", 40_000)
+        return corrected(dark, sequence, np.arange(12), VOXEL)
+
+
+def errors(field: Formula | CorrectedField) -> tuple[float, float]:
+    """Mean errors of distance (m) and colour on two walls that the cameras face."""
+    drawn = 2 * torch.rand(2, 4000, 3, generator=torch.Generator().manual_seed(3)) - 1
+    points = drawn * torch.tensor([0.6, 0.4, 0.6])
+    points[0, :, 0], points[1, :, 2] = 1.0, 1.2
+    answers = zip(field(points.flatten(0, 1)), ROOM(points.flatten(0, 1)), strict=True)
+    color, distance = ((found - exact).abs().mean().item() for found, exact in answers)
+    return distance, color
+
+
+def test_surfaces_are_mended_and_the_rest_is_left(found: CorrectedField) -> None:
+    """Catches corrections of the wrong sign, at the wrong vertices, or without effect; and ones
+    that reach into free space, where nothing was measured."""
+    before, after = errors(found.source), errors(found)
+    assert after[0] < before[0] / 4
+    assert after[1] < before[1] / 4
+    inside = 0.2 * (2 * torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 1)
+    assert torch.equal(found(inside)[1], BakedField(found.source, VOXEL)(inside)[1])
+
+
+def test_the_same_data_give_the_same_corrections(
+    found: CorrectedField, sequence: RgbdSequence
+) -> None:
+    """Catches draws that follow no seed. Frames without any surface are told."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nbtrack.fields.correction._N_POINTS", 40_000)
+        again = corrected(found.source, sequence, np.arange(12), VOXEL)
+    assert torch.equal(found.corrections, again.corrections)
+    sequence = box_sequence([[0.0, 0.0, 0.0]], ROOM)
+    sequence.depths_mm[:] = 0
+    with pytest.raises(DataError, match="shows no surface to correct a map by: check its depth"):
+        corrected(found.source, sequence, np.arange(1), VOXEL)
+
+
+def test_weights_of_interpolation(found: CorrectedField) -> None:
+    """Catches corners in another order than the grid's: the mean of vertices must be its answer."""
+    points = (2 * np.random.default_rng(0).random((50, 3)) - 1) * [0.9, 0.5, 0.9]
+    vertices, weights = interpolation(points, found)
+    np.testing.assert_allclose(weights.sum(axis=1), 1)
+    expected = found(torch.from_numpy(points).float())[1]
+    values = (found.vertices[:, 0].numpy()[vertices] * weights).sum(axis=1)
+    np.testing.assert_allclose(values, expected, atol=1e-5)
+
+
+def test_a_file_keeps_it_whole(tmp_path: Path, sequence: RgbdSequence) -> None:
+    """Catches corrections lost or rounded on the way to disk and back, and a size that is not
+    what the file has."""
+    network, settings = NetworkSettings(width=32), NeusMapping(correct_voxel=0.1)
+    field = make_field("neus", network, ROOM.bounds, seed=0).eval().requires_grad_(False)
+    made = {"field": "neus", "network": vars(network), "seconds": 0.0}
+    finished = correct_map(Map(field, sequence.intrinsics, made), sequence, settings)
+    write_map(tmp_path / "map.safetensors", finished)
+    stored, points = read_map(tmp_path), torch.rand(100, 3)
+    assert torch.equal(stored.field(points)[1], finished.field(points)[1])
+    assert stored.field.label == "NeuS corrected"
+    assert stored.key == finished.key
+    size = (tmp_path / "map.safetensors").stat().st_size
+    assert finished.made["map_bytes"] < size < finished.made["map_bytes"] + 20_000
+
+
+def test_a_kidnapped_camera_is_found(found: CorrectedField, sequence: RgbdSequence) -> None:
+    """Catches a tracker that looks only around where it last was: here it is told half a turn
+    off, and the map's own cameras stand 30 degrees apart."""
+    told = sequence.T_world_camera[7]
+    tracker = LmTracker(found, told, StepBudget(200), LmSettings(n_pixels=1024))
+    estimate = tracker.track(sequence[1])
+    assert not estimate.lost
+    off = estimate.T_world_camera[:3, 3] - sequence.T_world_camera[1, :3, 3]
+    assert np.linalg.norm(off) < 0.05
