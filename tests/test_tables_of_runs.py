@@ -218,7 +218,7 @@ def test_a_damaged_scene_leaves_the_others(
     assert [s.name for s in open_scenes(preset)] == ["office"]
     told = capsys.readouterr().err
     assert "left out: living_room" in told
-    assert "only one has [2]" in told
+    assert "1 without a partner: depth2.png" in told
 
 
 def test_a_failed_map_tells_why_in_every_cell(preset: Preset, own_scenes: list[Scene]) -> None:
