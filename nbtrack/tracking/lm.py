@@ -113,16 +113,14 @@ class LmTracker(Tracker):
 
     def _follow_up(self) -> None:
         """Restart if even the best search is lost and another start is left; else it is done."""
-        n_restarted = len(self.searches) - 1
-        self.is_converged = n_restarted >= self.settings.n_restarts or not self.report()["lost"]
-        if self.is_converged:
-            return
-        if n_restarted == 0:
-            self.starts = self._other_starts()
-        self.searches.append(self._search_from(self.starts[n_restarted]))
+        if len(self.searches) == 1 and self.report()["lost"]:
+            self.starts = self._other_starts()[: self.settings.n_restarts]
+        self.is_converged = not self.report()["lost"] or not self.starts
+        if not self.is_converged:
+            self.searches.append(self._search_from(self.starts.pop(0)))
 
     def _other_starts(self) -> list[Transform]:
-        """Where else the camera may be, `n_restarts` poses, the likeliest first."""
+        """Where else the camera may be, the likeliest first."""
         around = [_around(self.anchor, number) for number in range(self.settings.n_restarts)]
         cameras = getattr(self.field, "T_world_cameras", None)
         if cameras is None:

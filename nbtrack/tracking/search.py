@@ -73,9 +73,8 @@ class Search:
         is_better = bool(registration.robust_cost(residuals, *now[1:]) < before)
         if is_better:
             self.T_world_camera, self.residuals = T_world_camera, residuals
-            self.scales = registration.scales_of(
-                residuals, self.scales, torch.tensor(self.field.accuracy)
-            )
+            least = torch.tensor(self.field.accuracy)
+            self.scales = registration.scales_of(residuals, self.scales, least)
         self._judge(is_better, float(twist.abs().max()))
         return float(before)
 

@@ -172,6 +172,7 @@ class Tracker(abc.ABC):
             state, self._is_warm = self.state(), True
             self.begin(frame, starts[:1])
             self.step()
+            self.report()
             self.restore(state)
             synchronize(self.device)
         began, allowed = time.perf_counter(), self.budget.frame()

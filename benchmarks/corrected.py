@@ -1,0 +1,140 @@
+"""Tracking in corrected maps: accuracy, time, basin, and cameras without a start.
+
+    python benchmarks/corrected.py [RECORDING]
+
+Writes paper_tables/corrected/tracking.csv and searches.csv. RECORDING is a folder in the dataset's
+layout. Times count: run nothing else.
+"""
+
+import sys
+import time
+from datetime import UTC, datetime
+
+import numpy as np
+import pandas as pd
+import torch
+from basin import find_from_afar
+
+from nbtrack import (
+    METHODS,
+    Method,
+    load_preset,
+    make_tracker,
+    map_scene,
+    open_scene,
+    open_scenes,
+    track_scenes,
+)
+from nbtrack.core.device import choose_device, device_name
+from nbtrack.core.files import tables_folder, write_atomic
+from nbtrack.core.geometry import rotation_angle
+from nbtrack.core.settings import with_settings
+from nbtrack.experiments.cells import MapCell
+from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.runs import TrackCell
+from nbtrack.tracking import StepBudget
+from nbtrack.tracking.metrics import score_detection
+
+ALONE, FOUND_M, FOUND_DEG = Execution(workers=1), 0.05, 3.0
+_MIDDLE = "tracking.lm.n_pixels=2048"
+COMPARED = [
+    METHODS["baked"],
+    METHODS["corrected"],
+    Method(
+        "NeuS+ corrected (LM), 2048", "neus_plus", "lm", (*METHODS["corrected"].settings, _MIDDLE)
+    ),
+    METHODS["corrected_dense"],
+    METHODS["neus_corrected"],
+    METHODS["icp"],
+    METHODS["icp_dense"],
+]
+ON_RECORDINGS = [method for method in COMPARED if method != METHODS["neus_corrected"]]
+COLUMNS = [
+    "frames", "path", "scene", "method", "n_pixels", "ate_m", "max_error_m", "lost_frames",
+    "seconds_per_frame", "steps_per_frame", "map_seconds",
+]  # fmt: skip
+
+
+def main() -> None:
+    """Measure and write everything."""
+    torch.set_num_threads(1)
+    preset, second = load_preset("smoke"), load_preset("smoke", settings=["scenes.seed=1"])
+    rooms, elsewhere = open_scenes(preset), open_scenes(second)
+    recordings = [open_scene(folder, preset) for folder in sys.argv[1:]]
+    runs = []
+    for tracked, path in ((rooms, "mapped"), (elsewhere, "second")):
+        for frames in (":120", "::4"):
+            runs.append(_track(rooms, COMPARED, preset, frames, path, tracked))
+    _write("tracking.csv", pd.concat(runs))
+    searches = []
+    for room, other in zip(rooms, elsewhere, strict=True):
+        afar = find_from_afar(room, {"corrected_dense": 30}, preset, [(20, 15)], 100)
+        searches += [afar.assign(scene=room.name), _without_a_start(room, other, preset)]
+    found = pd.concat(searches)
+    _write("searches.csv", found)
+    for recording in recordings:
+        for frames in (":", "::2", "::4"):
+            runs.append(_track([recording], ON_RECORDINGS, preset, frames, "mapped"))
+        runs.append(_held_out(recording, preset))
+        _write("tracking.csv", pd.concat(runs))
+    print(pd.concat(runs).to_string(index=False))
+    print(found.groupby(["scene", "offset"])[["recovered", "seconds"]].mean().to_string())
+    print(score_detection(found["lost"].to_numpy(bool), found["error_m"].to_numpy()))
+
+
+def _track(scenes, methods, preset, frames: str, path: str, tracked=None) -> pd.DataFrame:
+    """At most 30 steps a frame, one run after the other."""
+    found = track_scenes(
+        scenes, methods, preset, steps=30, frames=frames, tracked=tracked, execution=ALONE
+    )
+    return found.assign(path=path, frames=frames)[COLUMNS]
+
+
+def _held_out(scene, preset) -> pd.DataFrame:
+    """Mapped on even frames, tracked on odd ones."""
+    rows = []
+    for method in (METHODS["corrected_dense"], METHODS["icp_dense"]):
+        changed = with_settings(preset, *method.settings)
+        made = MapCell(scene, method.field, changed, "::2")
+        cell = TrackCell(made, scene, method.tracker, 30, frames="1::2")
+        made.outcome(None, print)
+        found = cell.outcome(None, lambda share, told: None)
+        row = {name: found[name] for name in COLUMNS if name in found}
+        n_pixels = changed.tracking_of(method.tracker).n_pixels
+        row |= {"ate_m": found["ate_rmse_m"], "method": method.label, "n_pixels": n_pixels}
+        rows.append({**row, "scene": scene.name, "frames": "1::2", "path": "odd, mapped even"})
+    return pd.DataFrame(rows)[COLUMNS]
+
+
+def _without_a_start(room, elsewhere, preset, n_views: int = 50) -> pd.DataFrame:
+    """Views of an unmapped path; the tracker is told a pose at the other end of the mapped one."""
+    method = METHODS["corrected_dense"]
+    changed = with_settings(preset, *method.settings)
+    field, sequence = map_scene(room, method.field, changed).field, elsewhere.read()
+    told = room.read().T_world_camera[-1]
+    views, rows = np.linspace(0, len(sequence) - 1, n_views).round().astype(int), []
+    settings = changed.tracking_of(method.tracker)
+    for view in views.tolist():
+        frame = sequence[view]
+        tracker = make_tracker(method.tracker, field, told, StepBudget(1000), settings)
+        start = time.perf_counter()
+        found = tracker.track(frame)
+        seconds = time.perf_counter() - start
+        off = np.linalg.inv(frame.T_world_camera) @ found.T_world_camera
+        error_m = float(np.linalg.norm(off[:3, 3]))
+        error_deg = float(rotation_angle(torch.from_numpy(off[:3, :3])).rad2deg())
+        is_found = error_m < FOUND_M and error_deg < FOUND_DEG
+        rows.append((method.label, "no start", error_m, error_deg, is_found, found.lost, seconds))
+    columns = ["method", "offset", "error_m", "error_deg", "recovered", "lost", "seconds"]
+    return pd.DataFrame(rows, columns=columns).assign(scene=room.name)
+
+
+def _write(name: str, rows: pd.DataFrame) -> None:
+    """With machine and date."""
+    made = {"device": device_name(choose_device()), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
+    text = rows.assign(**made).to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    write_atomic(tables_folder() / "corrected" / name, text)
+
+
+if __name__ == "__main__":
+    main()
