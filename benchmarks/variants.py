@@ -1,0 +1,248 @@
+"""What the experiments of `evidence.py` change where no setting does: trackers, fields, depth.
+
+Importing this module makes them known by name; `with_variants` gives them the settings of what they
+were made from.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from math import inf
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, silu
+from torch.optim.lr_scheduler import CosineAnnealingLR
+
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.data.recording import Recording, open_recording
+from nbtrack.data.sequence import RgbdSequence
+from nbtrack.experiments.presets import Preset
+from nbtrack.experiments.scenes import Scene
+from nbtrack.fields import FIELDS, Field, IMapField, Linearization, NeuSField
+from nbtrack.fields.base import rendered_losses
+from nbtrack.synthetic import Room
+from nbtrack.tracking import TRACKERS, AdamTracker, SdfTracker, VrTracker
+
+FALLING_STEPS = 200
+
+
+class _Kept(AdamTracker):
+    """Adam's moments go on from frame to frame."""
+
+    remembers = ("moments",)
+    moments = None
+
+    def begin(self, frame, T_starts) -> None:
+        super().begin(frame, T_starts)
+        if self.moments is not None:
+            self.optimizer.load_state_dict(self.moments)
+
+    def step(self) -> Tensor:
+        loss = super().step()
+        self.moments = self.optimizer.state_dict()
+        return loss
+
+
+class _Best(AdamTracker):
+    """The iterate with the lowest loss counts, each on the pixels of its own step (NICE-SLAM)."""
+
+    def begin(self, frame, T_starts) -> None:
+        super().begin(frame, T_starts)
+        self.least = inf
+
+    def step(self) -> Tensor:
+        before = self.T_world_camera.detach()
+        loss = super().step()
+        if loss < self.least:
+            self.least, self.best = float(loss), before.double().numpy()
+        return loss
+
+    def _search(self, frame, T_starts):
+        return replace(super()._search(frame, T_starts), T_world_camera=self.best)
+
+
+class _Falling(AdamTracker):
+    """Learning rates fall to zero along a cosine: large ones reach far, and still converge."""
+
+    def begin(self, frame, T_starts) -> None:
+        super().begin(frame, T_starts)
+        self.schedule = CosineAnnealingLR(self.optimizer, FALLING_STEPS)
+
+    def step(self) -> Tensor:
+        loss = super().step()
+        self.schedule.step()
+        return loss
+
+
+class VrKept(_Kept, VrTracker):
+    """VR with Adam's memory."""
+
+    name = "vr_kept"
+
+
+class SdfKept(_Kept, SdfTracker):
+    """SDF with Adam's memory."""
+
+    name = "sdf_kept"
+
+
+class VrBest(_Best, VrTracker):
+    """VR, its best iterate."""
+
+    name = "vr_best"
+
+
+class SdfBest(_Best, SdfTracker):
+    """SDF, its best iterate."""
+
+    name = "sdf_best"
+
+
+class VrFalling(_Falling, VrTracker):
+    """VR with falling rates."""
+
+    name = "vr_falling"
+
+
+class SdfFalling(_Falling, SdfTracker):
+    """SDF with falling rates."""
+
+    name = "sdf_falling"
+
+
+class UnguidedNeus(NeuSField):
+    """NeuS mapped with iMAP's samples, which know nothing of the measured depth."""
+
+    name = "neus_unguided"
+
+    def mapping_losses(self, draw, settings, generator) -> dict[str, Tensor]:
+        """The terms of NeuS."""
+        rays = draw(settings.n_rays)
+        n_samples = settings.n_stratified, settings.n_surface
+        depths = self.two_pass_depths(rays, *n_samples, generator)
+        lambdas = settings.lambda_color, settings.lambda_depth
+        return {
+            **rendered_losses(self.render(rays, depths), rays, *lambdas),
+            "eikonal": self._eikonal(rays.points(depths), settings, generator),
+        }
+
+
+class SmoothImap(IMapField):
+    """iMAP with the activation of NeuS."""
+
+    name = "imap_silu"
+
+    def __init__(self, *args) -> None:
+        super().__init__(*args)
+        self.mlp.activation = silu
+
+
+_TRACKERS = (VrKept, SdfKept, VrBest, SdfBest, VrFalling, SdfFalling)
+TRACKERS.update({kind.name: kind for kind in _TRACKERS})
+FIELDS.update({kind.name: kind for kind in (UnguidedNeus, SmoothImap)})
+
+
+def with_variants(preset: Preset) -> Preset:
+    """The preset, with settings for the variants: those of what each was made from."""
+    trackers = {kind.name: preset.tracking[kind.name.split("_")[0]] for kind in _TRACKERS}
+    fields = {"neus_unguided": "neus", "imap_silu": "imap"}
+    return replace(
+        preset,
+        tracking=preset.tracking | trackers,
+        mapping=preset.mapping | {new: preset.mapping[old] for new, old in fields.items()},
+        network=preset.network | {new: preset.network[old] for new, old in fields.items()},
+    )
+
+
+@dataclass(frozen=True)
+class OtherDepth(Scene):
+    """A synthetic room read with another of its depths: exact, or as the sensor gave it."""
+
+    depth_folder: str = "depth"
+
+    @cached_property
+    def recording(self) -> Recording:
+        """With the depth of that folder."""
+        return open_recording(self.folder, self.format, self.depth_folder)
+
+
+class _Uncoloured(Field):
+    """A signed distance (m) alone: grey everywhere."""
+
+    surface_level = 0.0
+
+    def __init__(self, bounds: SceneBounds) -> None:
+        super().__init__(bounds)
+
+    def forward(self, points_world: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.full_like(points_world, 0.5), self.value(points_world)
+
+
+class ExactDistance(_Uncoloured):
+    """The room's own distance; its gradient from differences over 1 µm in double precision."""
+
+    name, label = "exact", "exact distance"
+
+    def __init__(self, bounds: SceneBounds, room: Room) -> None:
+        super().__init__(bounds)
+        self.room = room
+
+    def value(self, points_world: Tensor) -> Tensor:
+        """Signed distance (m)."""
+        return torch.from_numpy(self.room.sdf(points_world.double().numpy())).to(points_world)
+
+    def linearize(self, points_world: Tensor) -> Linearization:
+        """Distance and gradient; the colour says nothing."""
+        points, steps = points_world.double().numpy(), 1e-6 * np.eye(3)
+        value = self.room.sdf(points)
+        slopes = [(self.room.sdf(points + step) - value) / 1e-6 for step in steps]
+        gradient = torch.from_numpy(np.stack(slopes, axis=-1)).to(points_world)
+        grey, value = torch.full_like(gradient[:, 0], 0.5), torch.from_numpy(value).to(gradient)
+        return Linearization(value, gradient, grey, torch.zeros_like(gradient))
+
+
+class FusedDistance(_Uncoloured):
+    """A truncated distance on voxels, fused from depth images as KinectFusion does.
+
+    At a voxel the mean over the frames of how far it lies in front of the depth measured in its
+    direction, at most `truncation`; frames that see it farther behind do not count.
+    """
+
+    name, label = "fused", "fused voxels"
+
+    def __init__(
+        self, sequence: RgbdSequence, frames, bounds: SceneBounds, voxel=0.05, truncation=0.15
+    ) -> None:
+        super().__init__(bounds)
+        axes = [
+            torch.arange(low, high + voxel, voxel)
+            for low, high in zip(bounds.minimum, bounds.maximum, strict=True)
+        ]
+        corners = torch.cartesian_prod(*axes)
+        total, count = torch.zeros(2, len(corners))
+        for index in frames.tolist():
+            in_front = -sequence[index].depth_behind(corners)
+            seen = in_front > -truncation
+            total[seen] += in_front[seen].clamp(max=truncation)
+            count += seen
+        value = torch.where(count > 0, total / count.clamp_min(1), truncation)
+        self.values = value.view(*map(len, axes))[None, None]
+        self.low = corners[0]
+        self.extent = corners[-1] - corners[0]
+
+    def value(self, points_world: Tensor) -> Tensor:
+        """Signed distance (m)."""
+        # grid_sample takes x, y, z of a volume indexed z, y, x, from -1 to 1.
+        places = (2 * (points_world - self.low) / self.extent - 1).flip(-1)
+        sample = partial(grid_sample, padding_mode="border", align_corners=True)
+        return sample(self.values, places[None, None, None])[0, 0, 0, 0]
+
+    def linearize(self, points_world: Tensor) -> Linearization:
+        """Distance and gradient; the colour says nothing."""
+        points = points_world.detach().requires_grad_()
+        with torch.enable_grad():
+            value = self.value(points)
+            (gradient,) = torch.autograd.grad(value.sum(), points)
+        grey = torch.full_like(value.detach(), 0.5)
+        return Linearization(value.detach(), gradient, grey, torch.zeros_like(gradient))
