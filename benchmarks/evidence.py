@@ -5,7 +5,7 @@
 EXPERIMENT is one of nine_rooms, steps, oracle, choices, maps, basin (see `EXPERIMENTS`). Rows are
 added to a CSV under paper_tables/ as they are finished, the first seed first; those that are there
 are not made again, whatever has changed since: remove the file to begin anew. Maps and runs are
-kept with all others (`NBTRACK_RUNS`).
+kept with all others (`NBTRACK_RUNS`). Only nine_rooms uses all cores: run others side by side.
 """
 
 import sys
@@ -24,6 +24,7 @@ from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
 from nbtrack.data.sequence import observed_bounds
+from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.scenes import Scene
 from nbtrack.mapping.quality import split_holdout
@@ -55,7 +56,10 @@ def main(experiment: str, seeds: int) -> None:
     for seed in range(seeds):
         for place, make in chunks_of(seed):
             place = {**place, "seed": seed}
-            if len(rows) and (rows[[*place]].astype(str) == pd.Series(place).map(str)).all(1).any():
+            if (
+                len(rows)
+                and (rows[[*place]].astype(str) == pd.Series(place).map(str)).all(axis=1).any()
+            ):
                 continue
             print(experiment, place, flush=True)
             made = make().assign(**place, device=machine, date=f"{datetime.now(UTC):%Y-%m-%d}")
@@ -67,9 +71,9 @@ def main(experiment: str, seeds: int) -> None:
         write_table_1(path.parent, rows.query("path == 'mapped'"), note)
 
 
-def track(scenes: list[Scene], methods, preset, **how) -> pd.DataFrame:
+def track(scenes: list[Scene], methods, preset, workers: int | None = 1, **how) -> pd.DataFrame:
     """Rows of `track_scenes`, with the columns that are kept."""
-    return track_scenes(scenes, methods, preset, **how)[KEPT]
+    return track_scenes(scenes, methods, preset, execution=Execution(workers), **how)[KEPT]
 
 
 def nine_rooms(seed: int) -> Iterator[Chunk]:
@@ -77,7 +81,7 @@ def nine_rooms(seed: int) -> Iterator[Chunk]:
     scenes = open_scenes(NINE)
     second = open_scenes(load_preset("nine_rooms", settings=["scenes.seed=1"]))
     for (path, paths), number in product({"mapped": scenes, "second": second}.items(), range(9)):
-        there = {"seeds": [seed], "tracked": paths[number : number + 1]}
+        there = {"seeds": [seed], "tracked": paths[number : number + 1], "workers": None}
         place = {"path": path, "scene": scenes[number].name}
         yield place, partial(track, scenes[number : number + 1], TABLE_1, NINE, **there)
 

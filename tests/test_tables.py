@@ -12,6 +12,7 @@ from nbtrack.core.errors import DataError
 from nbtrack.tables import (
     PAPER_SCENE_LABELS,
     beside_published,
+    over_rooms,
     published_table_1,
     published_table_2,
     style_table_1,
@@ -248,6 +249,20 @@ def test_written_files(tmp_path: Path) -> None:
     _, third = write_table_3(tmp_path / "smoke", ours.assign(n_pixels=512), NOTE)
     assert r"\label{tab:beyond-smoke}" in third.read_text()
     assert "C, n = 512 &" in third.read_text()
+
+
+def test_means_over_rooms() -> None:
+    """Catches a room that counts twice because it has two seeds, and a wrong interval.
+
+    By hand: 4 cm in one room (2 and 8 with two seeds), 1 cm in the other: the mean is 2 cm, and the
+    interval 12.7 standard errors of ln 2 either way, for one degree of freedom.
+    """
+    results = pd.DataFrame(
+        {"scene": ["a", "a", "b"], "seed": [0, 1, 0], "ate_m": [0.02, 0.08, 0.01]}
+    )
+    (found,) = over_rooms(results.assign(method="A"), ["method"]).itertuples(index=False)
+    assert found[:2] == ("A", pytest.approx(0.02))
+    assert found[2:] == pytest.approx((0.02 / 2**12.7062, 0.02 * 2**12.7062), rel=1e-3)
 
 
 @pytest.mark.parametrize(

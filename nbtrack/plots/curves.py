@@ -81,6 +81,8 @@ def plot_curves(
 ) -> Figure:
     """One column over another, a line a group; a group of one row is a point.
 
+    Where the table has columns `from` and `to`, thin lines span that interval of y.
+
     Args:
         x, y: columns, named as the axes are to be labelled: "time a frame (ms)". Text on x is
             drawn in the order of its first appearance.
@@ -92,6 +94,8 @@ def plot_curves(
     for index, (label, color) in enumerate(method_colors(labels).items()):
         rows = table[labels == label]
         axes.plot(rows[x], rows[y], marker="os^Dv"[index % 5], color=color, label=label)
+        if "from" in rows:
+            axes.vlines(rows[x], rows["from"], rows["to"], color=color, linewidth=0.8)
     axes.set(xlabel=x, ylabel=y)
     log_axes(axes, log)
     axes.figure.legend(loc="outside right center")

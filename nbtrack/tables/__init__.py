@@ -4,6 +4,7 @@ from nbtrack.tables.layout import (
     PAPER_SCENE_LABELS,
     beside_published,
     naming_points,
+    over_rooms,
     published_table_1,
     published_table_2,
     table_1,

@@ -6,7 +6,9 @@ table. Rows follow the data: a new tracker is a new row and nothing here names a
 
 from importlib.resources import files
 
+import numpy as np
 import pandas as pd
+from scipy.stats import t as student
 
 from nbtrack.core.errors import DataError
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
@@ -82,6 +84,18 @@ def table_2(steps: pd.DataFrame, value: str = "steps") -> pd.DataFrame:
     """
     _check(steps, "steps", _CELL_2)
     return _wide(steps, _CELL_2, value).reindex(steps["tracker"].unique(), level="tracker")
+
+
+def over_rooms(results: pd.DataFrame, by: list[str], value: str = "ate_m") -> pd.DataFrame:
+    """Geometric mean of a positive column by groups, and its 95 % interval: columns `from`, `to`.
+
+    A room counts once, with the mean of its seeds' logarithms: rooms differ more than seeds do.
+    The interval is Student's of the rooms' logarithms, NaN for a single room (our choice).
+    """
+    of_rooms = np.log(results.set_index([*by, "scene"])[value])
+    rooms = of_rooms.groupby([*by, "scene"], sort=False).mean().groupby(by, sort=False)
+    mean, half = rooms.mean(), rooms.sem() * student.ppf(0.975, rooms.size() - 1)
+    return np.exp(pd.DataFrame({value: mean, "from": mean - half, "to": mean + half})).reset_index()
 
 
 def beside_published(results: pd.DataFrame) -> pd.DataFrame:
