@@ -24,7 +24,7 @@ from nbtrack.fields.base import rendered_losses
 from nbtrack.synthetic import Room
 from nbtrack.tracking import TRACKERS, AdamTracker, SdfTracker, VrTracker
 
-FALLING_STEPS = 200
+FALLING_STEPS = 100
 
 
 class _Kept(AdamTracker):
