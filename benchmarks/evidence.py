@@ -190,6 +190,7 @@ MAPS = {  # in the order in which they are made
     "iMAP, 1200 iterations": ("imap", 1200, "filtered"),
     "NeuS, 1200 iterations": ("neus", 1200, "filtered"),
     "NeuS, 300 iterations": ("neus", 300, "filtered"),
+    "NeuS+, 1400 iterations": ("neus_plus", 1400, "filtered"),
     "NeuS, 600 iterations": ("neus", 600, "filtered"),
     "NeuS, 150 iterations": ("neus", 150, "filtered"),
     "NeuS, not guided, noisy depth": ("neus_unguided", 1200, "noisy"),
