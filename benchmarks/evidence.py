@@ -191,13 +191,13 @@ MAPS = {  # in the order in which they are made
     "NeuS, 1200 iterations": ("neus", 1200, "filtered"),
     "NeuS, 300 iterations": ("neus", 300, "filtered"),
     "NeuS+, 1400 iterations": ("neus_plus", 1400, "filtered"),
+    "iMAP, 300 iterations": ("imap", 300, "filtered"),
+    "iMAP, 150 iterations": ("imap", 150, "filtered"),
     "NeuS, 600 iterations": ("neus", 600, "filtered"),
     "NeuS, 150 iterations": ("neus", 150, "filtered"),
     "NeuS, not guided, noisy depth": ("neus_unguided", 1200, "noisy"),
     "NeuS, samples not guided": ("neus_unguided", 1200, "filtered"),
-    "iMAP, 300 iterations": ("imap", 300, "filtered"),
     "iMAP, 600 iterations": ("imap", 600, "filtered"),
-    "iMAP, 150 iterations": ("imap", 150, "filtered"),
 }
 """Maps of all qualities: the field, its iterations, and the depth it is made from."""
 
