@@ -189,9 +189,9 @@ def choices(seed: int) -> Iterator[Chunk]:
 MAPS = {  # in the order in which they are made
     "iMAP, 1200 iterations": ("imap", 1200, "filtered"),
     "NeuS, 1200 iterations": ("neus", 1200, "filtered"),
-    "NeuS, 300 iterations": ("neus", 300, "filtered"),
     "NeuS+, 1400 iterations": ("neus_plus", 1400, "filtered"),
     "iMAP, 300 iterations": ("imap", 300, "filtered"),
+    "NeuS, 300 iterations": ("neus", 300, "filtered"),
     "iMAP, 150 iterations": ("imap", 150, "filtered"),
     "NeuS, 600 iterations": ("neus", 600, "filtered"),
     "NeuS, 150 iterations": ("neus", 150, "filtered"),
@@ -205,7 +205,7 @@ MAPS = {  # in the order in which they are made
 def maps(seed: int) -> Iterator[Chunk]:
     """Both trackers with the steps of 2 Hz in maps of every quality, in the first and last room."""
     for label, (field, *_) in MAPS.items():
-        for tracker in (SDF, VR) if field != "imap" else (VR,):
+        for tracker in {"imap": (VR,), "neus_plus": (SDF,)}.get(field, (SDF, VR)):
             place = {"map": label, "tracker": tracker.tracker}
             yield place, partial(_in_map, label, tracker, seed)
 
