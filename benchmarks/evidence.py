@@ -2,7 +2,7 @@
 
     python benchmarks/evidence.py EXPERIMENT [SEEDS]
 
-EXPERIMENT is one of nine_rooms, steps, oracle, choices, maps, basin (see `EXPERIMENTS`). Rows are
+EXPERIMENT is one of nine_rooms, scores, steps, oracle, choices, maps, basin. Rows are
 added to a CSV under paper_tables/ as they are finished, the first seed first; those that are there
 are not made again, whatever has changed since: remove the file to begin anew. Maps and runs are
 kept with all others (`NBTRACK_RUNS`). Only nine_rooms uses all cores: run others side by side.
@@ -84,6 +84,17 @@ def nine_rooms(seed: int) -> Iterator[Chunk]:
         there = {"seeds": [seed], "tracked": paths[number : number + 1], "workers": None}
         place = {"path": path, "scene": scenes[number].name}
         yield place, partial(track, scenes[number : number + 1], TABLE_1, NINE, **there)
+
+
+def scores(seed: int) -> Iterator[Chunk]:
+    """How good the maps of nine rooms are."""
+    for scene in open_scenes(NINE):
+        yield {"scene": scene.name}, partial(_scores, scene, seed)
+
+
+def _scores(scene: Scene, seed: int) -> pd.DataFrame:
+    made = [map_scene(scene, field, NINE, seed).made for field in ("imap", "neus")]
+    return pd.DataFrame([{"field": m["field"], **m["quality"]} for m in made])
 
 
 def steps(seed: int) -> Iterator[Chunk]:
@@ -252,7 +263,8 @@ def basin(seed: int) -> Iterator[Chunk]:
 EXPERIMENTS = {
     "nine_rooms": (nine_rooms, "nine_rooms/table_1_cells.csv"),
     **{
-        f.__name__: (f, f"evidence/{f.__name__}.csv") for f in (steps, oracle, choices, maps, basin)
+        f.__name__: (f, f"evidence/{f.__name__}.csv")
+        for f in (scores, steps, oracle, choices, maps, basin)
     },
 }
 
