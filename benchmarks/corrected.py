@@ -2,8 +2,8 @@
 
     python benchmarks/corrected.py [RECORDING]
 
-Writes tracking.csv, times.csv and searches.csv to paper_tables/corrected. RECORDING is a folder in the dataset's
-layout. Times count: run nothing else.
+Writes tracking.csv, times.csv and searches.csv to paper_tables/corrected. RECORDING is a folder in
+the dataset's layout. Times count: run nothing else.
 """
 
 import sys
