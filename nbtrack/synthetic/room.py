@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from nbtrack.core.errors import MissingError, NumericalError, nearest_name
 from nbtrack.synthetic import furniture, materials
-from nbtrack.synthetic.materials import Light, Pair, Part
+from nbtrack.synthetic.materials import Light, Material, Pair, Part
 from nbtrack.synthetic.primitives import Array3, Indices, Points, RoomShell, Values, row_dot
 
 _TABLES = tomllib.loads(Path(__file__).with_name("rooms.toml").read_text(encoding="utf-8"))
@@ -118,24 +118,21 @@ def build_room(name: str) -> Room:
     if name not in ROOMS:
         raise MissingError(f"no synthetic room '{name}'; {nearest_name(name, list(ROOMS))}")
     table = _TABLES[name]
-    named: dict[str, Any] = {}  # a material, or one for each of `seeds`
+    named: dict[str, Material] = {}
     for label, fields in (_PALETTE | table["materials"]).items():
-        options = fields.copy()
-        kind, seeds = options.pop("kind"), options.pop("seeds", None)
-        made = partial(getattr(materials, kind), **_resolved(options, named))
-        named[label] = tuple(partial(made, seed=seed) for seed in seeds) if seeds else made
+        options = {key: _resolved(value, named) for key, value in fields.items() if key != "kind"}
+        named[label] = partial(getattr(materials, fields["kind"]), **options)
     width, height, depth = table["size"]
     shell = RoomShell((0.0, height / 2, 0.0), (width, height, depth))
     lining = partial(materials.lining, shell=shell, **_resolved(table["surfaces"], named))
     parts = [Part(shell, lining)]
     for piece, *arguments in table["parts"]:
-        made = getattr(furniture, piece)(*_resolved(arguments, named))
-        parts += [made] if isinstance(made, Part) else made
+        parts.append(getattr(furniture, piece)(*_resolved(arguments, named)))
     light, walk = (_resolved(table[key], named) for key in ("light", "walk"))
     return Room(name, tuple(parts), Light(**light), Walk(**walk))
 
 
-def _resolved(value: Any, named: dict[str, Any]) -> Any:
+def _resolved(value: Any, named: dict[str, Material]) -> Any:
     """A value of the file with its material names looked up and its lists as tuples."""
     if isinstance(value, dict):
         return {key: _resolved(item, named) for key, item in value.items()}
