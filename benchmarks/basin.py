@@ -4,12 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import radians
 
+import numpy as np
 import pandas as pd
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from nbtrack import Method, make_tracker, map_scene
-from nbtrack.core.geometry import rotation_angle
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.methods import find_methods
@@ -59,9 +60,9 @@ def find_from_afar(
                 T_true = torch.from_numpy(frame.T_world_camera)
                 tracker.restart(moved(T_true, twist(start, cm, degrees).double()).numpy())
                 found = tracker.track(frame)
-                T_found = torch.from_numpy(found.T_world_camera)
-                error_m = float((T_found - T_true)[:3, 3].norm())
-                error_deg = float(rotation_angle(T_true[:3, :3].T @ T_found[:3, :3]).rad2deg())
+                off = np.linalg.inv(frame.T_world_camera) @ found.T_world_camera
+                error_m = float(np.linalg.norm(off[:3, 3]))
+                error_deg = float(np.degrees(Rotation.from_matrix(off[:3, :3]).magnitude()))
                 is_near = error_m < RECOVERED_M and error_deg < RECOVERED_DEG
                 offset = f"{cm} cm, {degrees}°"
                 rows.append((method.label, offset, error_m, error_deg, is_near, found.lost))

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import torch
 from basin import find_from_afar
+from scipy.spatial.transform import Rotation
 
 from nbtrack import (
     METHODS,
@@ -28,7 +29,6 @@ from nbtrack import (
 )
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder, write_atomic
-from nbtrack.core.geometry import rotation_angle
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import Execution
@@ -150,7 +150,7 @@ def _without_a_start(room, elsewhere, preset, n_views: int = 50) -> pd.DataFrame
         seconds = time.perf_counter() - start
         off = np.linalg.inv(frame.T_world_camera) @ found.T_world_camera
         error_m = float(np.linalg.norm(off[:3, 3]))
-        error_deg = float(rotation_angle(torch.from_numpy(off[:3, :3])).rad2deg())
+        error_deg = float(np.degrees(Rotation.from_matrix(off[:3, :3]).magnitude()))
         is_found = error_m < FOUND_M and error_deg < FOUND_DEG
         rows.append((method.label, "no start", error_m, error_deg, is_found, found.lost, seconds))
     columns = ["method", "offset", "error_m", "error_deg", "recovered", "lost", "seconds"]

@@ -26,7 +26,7 @@ def make_long_sequence(folder: Path) -> Path:
     """A scene folder of `N_FRAMES` frames in the Neural RGB-D layout."""
     short, long = folder / "short", folder / "long_scene"
     if not short.is_dir():
-        make_room("living_room", short, N_RENDERED, 640, 480, workers=os.cpu_count() or 1)
+        make_room("living_room", short, N_RENDERED, 640, 480)
     shutil.rmtree(long, ignore_errors=True)
     for name, prefix in (("images", "img"), ("depth_filtered", "depth")):
         (long / name).mkdir(parents=True)

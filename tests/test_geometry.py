@@ -11,7 +11,6 @@ from nbtrack.core.geometry import (
     matrix_to_quaternion,
     normalize_quaternion,
     quaternion_to_matrix,
-    rotation_angle,
     transform_points,
 )
 
@@ -72,17 +71,6 @@ def test_round_trip_at_special_angles(axis: list[float], angle: float) -> None:
     torch.testing.assert_close(again, rotation, rtol=0, atol=1e-14)
     single = quaternion_to_matrix(matrix_to_quaternion(rotation.float()))
     torch.testing.assert_close(single.double(), rotation, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-4, 0.02, 1.0, math.pi - 1e-4, math.pi])
-def test_rotation_angle(angle: float) -> None:
-    """Catches the arc cosine of the trace, which rounds angles below 1e-8 to zero, and an angle
-    that depends on the axis: conjugation leaves it as it is."""
-    rotation = quaternion_to_matrix(axis_angle([1, -2, 3], angle))
-    assert rotation_angle(rotation).item() == pytest.approx(angle, rel=1e-6, abs=1e-15)
-    frames = quaternion_to_matrix(random_quaternions((2, 3)))
-    turned = rotation_angle(frames @ rotation @ frames.mT)
-    torch.testing.assert_close(turned, torch.full((2, 3), angle).double())
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 1e-3, 1.0, math.pi - 1e-7, math.pi])

@@ -1,12 +1,7 @@
 """The synthetic rooms: exact geometry, exact depth, human motion, a believable sensor."""
 
 import filecmp
-import os
-import pickle
-import time
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from multiprocessing import get_context
 
 import numpy as np
 import pandas as pd
@@ -16,7 +11,6 @@ from scipy.spatial import cKDTree
 from nbtrack.core.errors import ConfigError, DataError, MissingError
 from nbtrack.data.sequence import read_sequence
 from nbtrack.synthetic import make_room, room_frames, room_intrinsics, room_of
-from nbtrack.synthetic.make import _end_with_parent
 from nbtrack.synthetic.motion import handheld_trajectory, motion_statistics
 from nbtrack.synthetic.primitives import Box, Cylinder, RoomShell, Sphere
 from nbtrack.synthetic.render import render_frame
@@ -280,23 +274,13 @@ def test_filter_reduces_noise_and_leaves_holes():
     assert np.abs(smooth - exact)[valid].max() < 0.06
 
 
-class Pool(ThreadPoolExecutor):
-    """Threads that are handed what processes would be handed: copies."""
-
-    def __init__(self, n_workers, *process_options):
-        super().__init__(n_workers)
-
-    def map(self, make, *columns):
-        return super().map(pickle.loads(pickle.dumps(make)), *columns)
-
-
 def test_rooms_are_bit_identical_for_a_seed(tmp_path, monkeypatch):
-    """Catches hidden randomness, a result that depends on the number of workers, a layout that the
+    """Catches hidden randomness, a result that depends on the number of threads, a layout that the
     reader does not take, and lost exactness of poses."""
     seen = []
-    monkeypatch.setattr("nbtrack.synthetic.make.ProcessPoolExecutor", Pool)
     first = make_room("office", tmp_path / "a", 3, 16, 12, 7, progress=seen.append)
-    again = make_room("office", tmp_path / "b", 3, 16, 12, 7, workers=2)
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    again = make_room("office", tmp_path / "b", 3, 16, 12, 7)
     other = make_room("office", tmp_path / "c", 3, 16, 12, 8)
     assert seen == [1, 2, 3]
     files = [path.relative_to(first) for path in first.rglob("*.*")]
@@ -312,26 +296,6 @@ def test_rooms_are_bit_identical_for_a_seed(tmp_path, monkeypatch):
         np.testing.assert_array_equal(sequence.T_world_camera, T_world_camera)
     assert room_of(first).name == "office"
     assert room_of(tmp_path) is None
-
-
-@pytest.mark.filterwarnings("ignore:.*fork")  # these processes only sleep
-def test_workers_end_with_a_killed_parent():
-    """Catches workers that wait for ever for the next frame of a process that is no more."""
-    fork, (reader, writer) = get_context("fork"), os.pipe()
-
-    def work():
-        _end_with_parent()
-        os.write(writer, b"ready")
-        time.sleep(60)
-
-    parent = fork.Process(target=lambda: fork.Process(target=work).start())
-    parent.start()
-    os.close(writer)
-    assert os.read(reader, 5) == b"ready"
-    parent.kill()
-    start = time.monotonic()
-    assert os.read(reader, 1) == b""  # ends with the last process that could write
-    assert time.monotonic() - start < 20
 
 
 def test_user_errors(tmp_path):

@@ -46,26 +46,11 @@ def rotation_vector_to_matrix(rotation_vector: Float[Tensor, "3"]) -> Float[Tens
 def matrix_to_quaternion(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternion (w, x, y, z) of a rotation matrix; w >= 0.
 
-    Each of the four components is the largest for some rotation; the best-conditioned of the four
-    classical formulas is selected, so that no rotation angle divides by a small number.
+    Every row of 4 q qᵀ is a multiple of q. The one whose own component is the largest is taken, so
+    that no rotation angle divides by a small number.
     """
-    m = rotation
-    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
-    # Four times the squares of w, x, y, z.
-    squares = torch.stack(
-        [1 + trace] + [1 - trace + 2 * m[..., i, i] for i in range(3)], dim=-1
-    ).clamp_min(0)
-    products = _quaternion_products(m)
-    best = squares.argmax(dim=-1, keepdim=True)
-    row = products.gather(-2, best.unsqueeze(-1).expand(*best.shape, 4)).squeeze(-2)
-    q_wxyz = normalize_quaternion(row)
-    return torch.where(q_wxyz[..., :1] < 0, -q_wxyz, q_wxyz)
-
-
-def _quaternion_products(m: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4 4"]:
-    """4 q qᵀ of the quaternion (w, x, y, z) of a rotation matrix: every row is a multiple of q."""
+    m, difference, total = rotation, rotation - rotation.mT, rotation + rotation.mT
     xx, yy, zz = (m[..., i, i] for i in range(3))
-    difference, total = m - m.mT, m + m.mT
     wx, wy, wz = difference[..., 2, 1], difference[..., 0, 2], difference[..., 1, 0]
     xy, xz, yz = total[..., 0, 1], total[..., 0, 2], total[..., 1, 2]
     entries = [
@@ -74,7 +59,10 @@ def _quaternion_products(m: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batc
         wy, xy, 1 - xx + yy - zz, yz,
         wz, xz, yz, 1 - xx - yy + zz,
     ]  # fmt: skip
-    return torch.stack(entries, dim=-1).unflatten(-1, (4, 4))
+    products = torch.stack(entries, dim=-1).unflatten(-1, (4, 4))
+    best = products.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+    q_wxyz = normalize_quaternion(products.take_along_dim(best[..., None, None], dim=-2)[..., 0, :])
+    return torch.where(q_wxyz[..., :1] < 0, -q_wxyz, q_wxyz)
 
 
 def make_transform(
@@ -92,9 +80,3 @@ def transform_points(
 ) -> Float[Tensor, "*batch 3"]:
     """Points (m) of frame b expressed in frame a."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
-
-
-def rotation_angle(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-    """Angle (rad, 0 to pi) of a rotation, accurate near zero, where the arc cosine is not."""
-    q_wxyz = matrix_to_quaternion(rotation)
-    return 2 * torch.atan2(q_wxyz[..., 1:].norm(dim=-1), q_wxyz[..., 0])

@@ -1,6 +1,5 @@
 """From what a user calls a sequence to a folder on disk: a path, a room, a scene of the dataset."""
 
-import os
 import shutil
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,8 +18,6 @@ from nbtrack.tables import PAPER_SCENE_LABELS
 
 DATASET_SCENES = tuple(PAPER_SCENE_LABELS)
 """Folders of the Neural RGB-D dataset, in the order of the paper's Table I."""
-
-_SMALL_WIDTH = 320  # pixels; smaller rooms are made sooner than processes start
 
 
 @dataclass(frozen=True)
@@ -123,11 +120,10 @@ def open_scenes(preset: Preset) -> list[Scene]:
 
 def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
     """A room as a sequence folder, under a bar."""
-    workers = 1 if config.width < _SMALL_WIDTH else os.cpu_count() or 1
     with ProgressBar(f"room {name}", config.n_frames) as bar:
         make_room(
             name, folder, config.n_frames, config.width, config.width * 3 // 4, config.seed,
-            workers, bar.move_to,
+            bar.move_to,
         )  # fmt: skip
 
 

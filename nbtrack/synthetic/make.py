@@ -3,11 +3,9 @@
 import json
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from multiprocessing import get_context, parent_process
 from pathlib import Path
-from threading import Thread
 
 import numpy as np
 
@@ -24,6 +22,7 @@ from nbtrack.synthetic.sensor import add_kinect_noise, filter_depth
 ROOM_FILE = "room.json"
 ROOM_VERSION = 2  # raise it when a room, the motion or the sensor model changes
 _AGAIN = "remove the folder and make the room again"
+_FRAMES_AT_ONCE = 32  # in flight, so that memory is bounded where writing is slower
 FIELD_OF_VIEW = np.radians(60.0)  # horizontal, as in the Neural RGB-D dataset
 
 
@@ -33,33 +32,25 @@ def room_intrinsics(width: int, height: int) -> Intrinsics:
 
 
 def room_frames(
-    room: Room, n_frames: int, width: int, height: int, seed: int, workers: int = 1
+    room: Room, n_frames: int, width: int, height: int, seed: int
 ) -> Iterator[WrittenFrame]:
-    """Render a room's frames one after the other; memory does not grow with their number.
+    """Render a room's frames in order; memory does not grow with their number.
 
     `seed` is that of the camera's path and of the depth noise. Every frame has its own random
-    numbers, so that the result does not depend on `workers`, the number of processes.
+    numbers, so that the result does not depend on the number of threads.
     Raises `ConfigError` for a number that is too small.
     """
-    asked = [("frames", n_frames, 2), ("width", width, 8), ("height", height, 8)]
-    for label, value, least in [*asked, ("workers", workers, 1), ("seed", seed, 0)]:
+    asked = [("frames", n_frames, 2), ("width", width, 8), ("height", height, 8), ("seed", seed, 0)]
+    for label, value, least in asked:
         if value < least:
             raise ConfigError(f"{label} = {value}; {least} or more are allowed; raise it")
     poses = handheld_trajectory(room, n_frames, seed)
     make = partial(_make_frame, room, room_intrinsics(width, height), seed)
-    if workers == 1:
-        yield from map(make, range(n_frames), poses)
-        return
-    # Spawned, not forked: the caller may have threads (torch) that do not survive a fork.
-    with ProcessPoolExecutor(workers, get_context("spawn"), _end_with_parent) as pool:
-        block = 4 * workers  # frames in flight: bounds memory when writing is slower
-        for start in range(0, n_frames, block):
-            yield from pool.map(make, range(start, n_frames), poses[start : start + block])
-
-
-def _end_with_parent() -> None:
-    """A worker of a killed process would wait for its next frame for ever."""
-    Thread(target=lambda: (parent_process().join(), os._exit(1)), daemon=True).start()
+    # NumPy releases the interpreter lock, so threads suffice.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for start in range(0, n_frames, _FRAMES_AT_ONCE):
+            block = poses[start : start + _FRAMES_AT_ONCE]
+            yield from pool.map(make, range(start, n_frames), block)
 
 
 def _make_frame(room: Room, camera: Intrinsics, seed: int, number: int, pose: Pose) -> WrittenFrame:
@@ -78,7 +69,6 @@ def make_room(
     width: int,
     height: int,
     seed: int = 0,
-    workers: int = 1,
     progress: Callable[[int], object] = lambda done: None,
 ) -> Path:
     """Write a synthetic scene as the Neural RGB-D dataset does; returns `folder`.
@@ -94,7 +84,7 @@ def make_room(
     room = build_room(name)
     record = {"room": name, "version": ROOM_VERSION, "seed": seed, "frames": n_frames}
     record |= {"width": width, "height": height}
-    frames = room_frames(room, n_frames, width, height, seed, workers)
+    frames = room_frames(room, n_frames, width, height, seed)
     notes = {ROOM_FILE: json_text(record)}
     write_sequence(folder, room_intrinsics(width, height), frames, notes, progress)
     return folder
