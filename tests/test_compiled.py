@@ -33,7 +33,7 @@ def test_the_sums_are_those_of_registration(by_slope: bool) -> None:
     assert 0.1 < (plain.reliability > 0).float().mean() < 0.9  # some outside, some in between
     np.testing.assert_allclose(rows[:2], plain.value, atol=1e-6)
     np.testing.assert_allclose(rows[2], plain.reliability, atol=1e-5)
-    scales = kernels.scales_of(rows, np.full(2, np.inf), least)
+    scales = kernels.scales_of(rows, np.full(2, np.inf), least, 3.0)
     expected = registration.scales_of(plain, torch.full((2,), np.inf), torch.tensor(GRID.accuracy))
     np.testing.assert_allclose(scales, expected, rtol=1e-5)
     state = expected, 0.7

@@ -43,8 +43,8 @@ class CompiledSearch(Search):
         """One step, taken or refused; returns the robust cost before it."""
         settings, now = self.settings, (self.residuals, self.scales, self.damping)
         is_better, *after, before, length = kernels.try_step(
-            self.levels[self.level], self.grid, settings.divide_by_slope, settings.lambda_intensity,
-            self.least, self.start, self.T_world_camera, *now,
+            self.levels[self.level], self.grid, settings.divide_by_slope, self.weight,
+            self.medians, self.least, self.start, self.T_world_camera, *now,
         )  # fmt: skip
         self.T_world_camera, self.residuals, self.scales = after
         self._judge(is_better, length)
@@ -56,11 +56,12 @@ class CompiledSearch(Search):
 
     def certainty(self) -> dict[str, float]:
         """What the points say of the pose; see `registration.certainty`."""
-        rows, weight = self.residuals, self.settings.lambda_intensity
-        matrix, _ = kernels.normal_equations(rows, self.scales, weight)
-        return registration.certainty(rows[0], rows[2], matrix)
+        rows = self.residuals
+        matrix, _ = kernels.normal_equations(rows, self.scales, self.weight)
+        return registration.certainty(rows[:2], rows[2], matrix, self._accuracy())
 
     def _look(self, widest: float) -> None:
         observed, by_slope = self.levels[self.level], self.settings.divide_by_slope
         self.residuals = kernels.residual_rows(observed, self.T_world_camera, self.grid, by_slope)
-        self.scales = kernels.scales_of(self.residuals, self.least.clip(widest), self.least)
+        widest = self.least.clip(widest)
+        self.scales = kernels.scales_of(self.residuals, widest, self.least, self.medians)

@@ -12,7 +12,7 @@ from numba import njit
 
 from nbtrack.data.frame import DRAWN_PER_POINT, EDGE_JUMP, MILLIMETRE
 from nbtrack.fields.base import LUMA
-from nbtrack.tracking.registration import LEAST_SLOPE, MEDIANS, MOST_SLOPE, SLOPE_SCALE, START_PULL
+from nbtrack.tracking.registration import LEAST_SLOPE, MOST_SLOPE, SLOPE_SCALE, START_PULL
 
 _RED, _GREEN, _BLUE = LUMA.tolist()
 
@@ -81,12 +81,12 @@ def residual_rows(observed, T, grid, by_slope):
 
 @no_type_check
 @njit(**_HOW)
-def scales_of(rows, before, least):
+def scales_of(rows, before, least, medians):
     """`registration.scales_of`."""
     scales, middle = np.empty(2), (rows.shape[1] - 1) // 2
     for k in range(2):
         median = np.partition(np.abs(rows[k]), middle)[middle]
-        scales[k] = min(max(MEDIANS * median, least[k]), before[k])
+        scales[k] = min(max(medians * median, least[k]), before[k])
     return scales
 
 
@@ -167,7 +167,7 @@ def damped_step(rows, scales, weight, T_start, T, damping):
 
 @no_type_check
 @njit(**_HOW)
-def try_step(observed, grid, by_slope, weight, least, T_start, T, rows, scales, damping):
+def try_step(observed, grid, by_slope, weight, medians, least, T_start, T, rows, scales, damping):
     """A step: whether it is better, pose, rows and scales after it, cost before, and its length."""
     twist = damped_step(rows, scales, weight, T_start, T, damping)
     T_after = moved(T, twist)
@@ -175,7 +175,8 @@ def try_step(observed, grid, by_slope, weight, least, T_start, T, rows, scales, 
     before, after = robust_cost(rows, scales, weight), robust_cost(rows_after, scales, weight)
     longest = np.abs(twist).max()
     if after < before:
-        return True, T_after, rows_after, scales_of(rows_after, scales, least), before, longest
+        scales = scales_of(rows_after, scales, least, medians)
+        return True, T_after, rows_after, scales, before, longest
     return False, T, rows, scales, before, longest
 
 

@@ -24,7 +24,8 @@ SLOPE_SCALE = 0.5  # a gradient so much longer or shorter than 1 counts for a qu
 MARGIN = 0.3  # m beyond a field's bounds, where walls lie of which the pose is off
 MEDIANS = 3.0  # of its residuals in a scale: two standard deviations, were they normal
 _DEVIATIONS = 0.6745 * MEDIANS
-INLIER_DISTANCE = 0.05  # m: a point that near the surface fits
+# A point fits if both of its residuals are below so many times the field's accuracy.
+INLIER_ACCURACIES = 2.5
 # A pull towards the start of the frame's search, so weak that it decides only where the frame says
 # nothing, as along a corridor: one point's worth, at a twist of 0.5 rad or 0.5 m (our choice).
 START_PULL = 1 / 0.5**2
@@ -69,9 +70,11 @@ def residuals_at(
     return Residuals(value, torch.stack(jacobian), reliability)
 
 
-def scales_of(residuals: Residuals, before: Scales, least: Scales) -> Scales:
+def scales_of(
+    residuals: Residuals, before: Scales, least: Scales, medians: float = MEDIANS
+) -> Scales:
     """Scales for residuals: some medians wide, never below the least, nor above those before."""
-    scales = MEDIANS * residuals.value.abs().median(dim=1).values
+    scales = medians * residuals.value.abs().median(dim=1).values
     return scales.maximum(least.to(scales)).minimum(before.to(scales))
 
 
@@ -126,18 +129,20 @@ def damped_step(
 
 
 def certainty(
-    distance: Float[np.ndarray, "_"],
+    value: Float[np.ndarray, "2 _"],
     reliability: Float[np.ndarray, "_"],
     matrix: Float[np.ndarray, "6 6"],
+    accuracy: Float[np.ndarray, "2"],
 ) -> dict[str, float]:
-    """The share of points near the surface, and how well the curvature of their cost holds a pose.
+    """The share of points that fit the map, and how well the curvature of their cost holds a pose.
 
-    Of residuals (m) and the matrix of the normal equations. Deviations are along the least certain
+    Of both residuals, the matrix of the normal equations and the field's accuracy. Deviations are along the least certain
     direction, the condition number without the pull to the start, rotations at an arm of 1 m.
     Errors of the map are not independent, as residuals are here taken to be: these are lower
     bounds, good for telling poses apart, not for error bars.
     """
-    is_inlier = (np.abs(distance) < INLIER_DISTANCE) & (reliability > 0)
+    fits = (np.abs(value) < INLIER_ACCURACIES * accuracy[:, None]).all(axis=0)
+    is_inlier = fits & (reliability > 0)
     values = np.linalg.eigvalsh(matrix)
     covariance = np.linalg.inv(matrix + START_PULL * np.eye(6)) / _DEVIATIONS**2  # rad, m
     rotation, position = (

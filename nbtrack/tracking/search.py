@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
+import numpy as np
 import torch
 
 from nbtrack.core.arrays import Points, Pose, Transform, Values
@@ -12,13 +13,16 @@ from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
 from nbtrack.fields.base import LUMA
 from nbtrack.tracking import registration
-from nbtrack.tracking.registration import Scales
+from nbtrack.tracking.registration import MEDIANS, Scales
 from nbtrack.tracking.tracker import TrackerSettings
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e3
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.2
 # A step below these (rad and m) ends the search on some points, and on all of them.
 _LEAST_STEPS = (5e-3, 1e-3)
+# From afar distances say where the camera is, and intensities mislead: their basin is as wide as
+# the texture. So the first level asks for distances alone, at scales of so many medians.
+_FIRST_MEDIANS = 8.0
 
 
 @dataclass(frozen=True)
@@ -60,12 +64,13 @@ class Search:
     def begin(self, level: int) -> None:
         """Go on from the present pose with some of the points (level 0) or all (1)."""
         self.level, self.damping, self.is_ended = level, _FIRST_DAMPING, False
+        weight = self.settings.lambda_intensity
+        self.weight, self.medians = (weight, MEDIANS) if level else (0.0, _FIRST_MEDIANS)
         self._look(inf if self.settings.anneal else 0.0)
 
     def step(self) -> float:
         """One step, taken or refused; returns the robust cost before it."""
-        weight = self.settings.lambda_intensity
-        now = self.residuals, self.scales, weight
+        now = self.residuals, self.scales, self.weight
         twist = registration.damped_step(*now, self.start, self.T_world_camera, self.damping)
         T_world_camera = registration.moved(self.T_world_camera, twist)
         residuals = self._residuals_at(T_world_camera)
@@ -74,7 +79,7 @@ class Search:
         if is_better:
             self.T_world_camera, self.residuals = T_world_camera, residuals
             least = torch.tensor(self.field.accuracy)
-            self.scales = registration.scales_of(residuals, self.scales, least)
+            self.scales = registration.scales_of(residuals, self.scales, least, self.medians)
         self._judge(is_better, float(twist.abs().max()))
         return float(before)
 
@@ -84,16 +89,22 @@ class Search:
 
     def certainty(self) -> dict[str, float]:
         """What the points say of the pose; see `registration.certainty`."""
-        now, weight = (self.residuals, self.scales), self.settings.lambda_intensity
-        matrix, _ = registration.normal_equations(*now, weight)
-        parts = self.residuals.value[0], self.residuals.reliability, matrix
-        return registration.certainty(*(part.cpu().double().numpy() for part in parts))
+        matrix, _ = registration.normal_equations(self.residuals, self.scales, self.weight)
+        parts = self.residuals.value, self.residuals.reliability, matrix
+        return registration.certainty(
+            *(part.cpu().double().numpy() for part in parts), self._accuracy()
+        )
+
+    def _accuracy(self) -> np.ndarray:
+        """Of the field; any intensity fits where it has no say."""
+        return np.array([self.field.accuracy[0], self.field.accuracy[1] if self.weight else inf])
 
     def _look(self, widest: float) -> None:
         """Residuals at the pose, and robust scales for them, up to the widest."""
         self.residuals = self._residuals_at(self.T_world_camera)
         least = torch.tensor(self.field.accuracy)
-        self.scales = registration.scales_of(self.residuals, least.clamp_min(widest), least)
+        widest = least.clamp_min(widest)
+        self.scales = registration.scales_of(self.residuals, widest, least, self.medians)
 
     def _residuals_at(self, T_world_camera: Transform) -> registration.Residuals:
         observed, by_slope = self.levels[self.level], self.settings.divide_by_slope
