@@ -172,7 +172,11 @@ def try_step(observed, grid, by_slope, weight, medians, least, T_start, T, rows,
     twist = damped_step(rows, scales, weight, T_start, T, damping)
     T_after = moved(T, twist)
     rows_after = residual_rows(observed, T_after, grid, by_slope)
-    before, after = robust_cost(rows, scales, weight), robust_cost(rows_after, scales, weight)
+    fixed = rows_after[:3].copy()
+    for i in range(rows.shape[1]):
+        if fixed[2, i] > 0:
+            fixed[2, i] = rows[2, i]
+    before, after = robust_cost(rows, scales, weight), robust_cost(fixed, scales, weight)
     longest = np.abs(twist).max()
     if after < before:
         scales = scales_of(rows_after, scales, least, medians)
