@@ -50,15 +50,15 @@ class CompiledSearch(Search):
         self._judge(is_better, length)
         return before
 
-    def cost(self, scales: registration.Scales) -> float:
+    def cost(self, scales: tuple[float, float]) -> float:
         """The robust cost at given scales, by which searches are compared."""
-        return kernels.robust_cost(self.residuals, scales.numpy(), 1.0)
+        return kernels.robust_cost(self.residuals, np.array(scales), 1.0)
 
     def certainty(self) -> dict[str, float]:
         """What the points say of the pose; see `registration.certainty`."""
         rows = self.residuals
         matrix, _ = kernels.normal_equations(rows, self.scales, self.weight)
-        return registration.certainty(rows[:2], rows[2], matrix, self._accuracy())
+        return registration.certainty(rows[:2], rows[2], matrix, self.tolerance)
 
     def _look(self, widest: float) -> None:
         observed, by_slope = self.levels[self.level], self.settings.divide_by_slope

@@ -81,10 +81,22 @@ def residual_rows(observed, T, grid, by_slope):
 
 @no_type_check
 @njit(**_HOW)
+def judged_as(rows, before):
+    """`registration.judged_as`, of the residuals alone."""
+    judged = rows[:3].copy()
+    for i in range(rows.shape[1]):
+        judged[2, i] = before[2, i] if rows[2, i] > 0 else _NONE
+    return judged
+
+
+@no_type_check
+@njit(**_HOW)
 def scales_of(rows, before, least, medians):
     """`registration.scales_of`."""
-    scales, middle = np.empty(2), (rows.shape[1] - 1) // 2
+    scales, middle = before.copy(), (rows.shape[1] - 1) // 2
     for k in range(2):
+        if before[k] <= least[k]:  # as in most steps: a median takes as long as many sums
+            continue
         median = np.partition(np.abs(rows[k]), middle)[middle]
         scales[k] = min(max(medians * median, least[k]), before[k])
     return scales
@@ -172,11 +184,8 @@ def try_step(observed, grid, by_slope, weight, medians, least, T_start, T, rows,
     twist = damped_step(rows, scales, weight, T_start, T, damping)
     T_after = moved(T, twist)
     rows_after = residual_rows(observed, T_after, grid, by_slope)
-    fixed = rows_after[:3].copy()
-    for i in range(rows.shape[1]):
-        if fixed[2, i] > 0:
-            fixed[2, i] = rows[2, i]
-    before, after = robust_cost(rows, scales, weight), robust_cost(fixed, scales, weight)
+    judged = judged_as(rows_after, rows) if weight > 0 else rows_after
+    before, after = robust_cost(rows, scales, weight), robust_cost(judged, scales, weight)
     longest = np.abs(twist).max()
     if after < before:
         scales = scales_of(rows_after, scales, least, medians)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,7 +13,7 @@ from nbtrack.core.progress import tell
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
 from nbtrack.fields.grid import BakedField
-from nbtrack.tracking.registration import Scales, moved
+from nbtrack.tracking.registration import moved
 from nbtrack.tracking.search import LmSettings, Search
 from nbtrack.tracking.tracker import Tracker
 
@@ -21,9 +22,9 @@ _LEAST_POINTS = 20  # below, a frame says too little for six unknowns
 # pose the coarse answer is as good and costs less.
 _COARSE_SHARE, _LEAST_COARSE = 8, 128
 # Starts are compared by widely robust costs: narrow ones say the same of all that are off.
-_WIDE_SCALES = torch.tensor([0.1, 0.2])
+_WIDE_SCALES = 0.1, 0.2
 # A pose is taken for lost with fewer inliers than this, or a position less certain than that (m).
-_LEAST_INLIERS, _MOST_DEVIATION = 0.6, 0.04
+_LEAST_INLIERS, _MOST_DEVIATION = 0.7, 0.04
 _RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
 _GLANCES = 6  # steps from each mapped pose, before the cheapest are followed to their ends
 
@@ -54,8 +55,8 @@ class LmTracker(Tracker):
         """Draw the frame's points; take up the search from the start that fits them best."""
         T_starts = T_starts.to("cpu", torch.float64, copy=True)
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
-        R = T_starts[:, :3, :3]
-        T_starts[:, :3, :3] = R @ (3 * torch.eye(3) - R.mT @ R) / 2
+        R = T_starts.numpy()[:, :3, :3]
+        R[:] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
         self.T_kept, self.searches, self.verdict = T_starts[0], [], None
         self.anchor = T_starts[-1] if self.last_good is None else self.last_good
         observed = self.search_kind.draw(frame, self.settings.n_pixels, self.generator)
@@ -106,7 +107,7 @@ class LmTracker(Tracker):
         """The cheapest of the searches on the most points."""
         level = max(search.level for search in self.searches)
         finest = [search for search in self.searches if search.level == level]
-        return _by_cost(finest, torch.tensor(self.field.accuracy))[0]
+        return _by_cost(finest, self.field.accuracy)[0]
 
     def _search_from(self, T_start: Transform) -> Search:
         return self.search_kind(self.field, self.levels, self.settings, T_start)
@@ -145,7 +146,7 @@ def search_kind(field: Field) -> type[Search]:
     return CompiledSearch
 
 
-def _by_cost(searches: Sequence[Search], scales: Scales) -> list[Search]:
+def _by_cost(searches: Sequence[Search], scales: tuple[float, float]) -> list[Search]:
     """Searches in the order of their robust costs, all at equal scales."""
     return sorted(searches, key=lambda search: search.cost(scales)) if searches[1:] else [*searches]
 

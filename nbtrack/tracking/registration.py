@@ -24,8 +24,8 @@ SLOPE_SCALE = 0.5  # a gradient so much longer or shorter than 1 counts for a qu
 MARGIN = 0.3  # m beyond a field's bounds, where walls lie of which the pose is off
 MEDIANS = 3.0  # of its residuals in a scale: two standard deviations, were they normal
 _DEVIATIONS = 0.6745 * MEDIANS
-# A point fits if both of its residuals are below so many times the field's accuracy.
-INLIER_ACCURACIES = 2.5
+# A point fits if it is so many accuracies of the field near to its surface, and so like in luma.
+INLIER_ACCURACIES, INLIER_INTENSITY = 2.5, 0.25
 # A pull towards the start of the frame's search, so weak that it decides only where the frame says
 # nothing, as along a corridor: one point's worth, at a twist of 0.5 rad or 0.5 m (our choice).
 START_PULL = 1 / 0.5**2
@@ -68,6 +68,15 @@ def residuals_at(
     arm = points_world - T_world_camera[:3, 3]
     jacobian = [torch.cat([torch.linalg.cross(arm, g), g], dim=-1) for g in gradient]
     return Residuals(value, torch.stack(jacobian), reliability)
+
+
+def judged_as(residuals: Residuals, before: Residuals) -> Residuals:
+    """Residuals after a step with the reliabilities before it, but for points it made unusable.
+
+    From cell to cell of a grid slopes jump, and reliabilities: a pose is no worse for that.
+    """
+    reliability = torch.where(residuals.reliability > 0, before.reliability, 0.0)
+    return Residuals(residuals.value, residuals.jacobian, reliability)
 
 
 def scales_of(
@@ -132,16 +141,16 @@ def certainty(
     value: Float[np.ndarray, "2 _"],
     reliability: Float[np.ndarray, "_"],
     matrix: Float[np.ndarray, "6 6"],
-    accuracy: Float[np.ndarray, "2"],
+    tolerance: tuple[float, float],
 ) -> dict[str, float]:
     """The share of points that fit the map, and how well the curvature of their cost holds a pose.
 
-    Of both residuals, the matrix of the normal equations and the field's accuracy. Deviations are along the least certain
+    Of both residuals, which fit within a tolerance, and the matrix of the normal equations. Deviations are along the least certain
     direction, the condition number without the pull to the start, rotations at an arm of 1 m.
     Errors of the map are not independent, as residuals are here taken to be: these are lower
     bounds, good for telling poses apart, not for error bars.
     """
-    fits = (np.abs(value) < INLIER_ACCURACIES * accuracy[:, None]).all(axis=0)
+    fits = (np.abs(value) < np.array(tolerance)[:, None]).all(axis=0)
     is_inlier = fits & (reliability > 0)
     values = np.linalg.eigvalsh(matrix)
     covariance = np.linalg.inv(matrix + START_PULL * np.eye(6)) / _DEVIATIONS**2  # rad, m

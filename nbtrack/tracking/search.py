@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
-import numpy as np
 import torch
 
 from nbtrack.core.arrays import Points, Pose, Transform, Values
@@ -13,13 +12,13 @@ from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
 from nbtrack.fields.base import LUMA
 from nbtrack.tracking import registration
-from nbtrack.tracking.registration import MEDIANS, Scales
+from nbtrack.tracking.registration import MEDIANS
 from nbtrack.tracking.tracker import TrackerSettings
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e3
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.2
 # A step below these (rad and m) ends the search on some points, and on all of them.
-_LEAST_STEPS = (5e-3, 1e-3)
+_LEAST_STEPS = (1e-2, 3e-4)
 # From afar distances say where the camera is, and intensities mislead: their basin is as wide as
 # the texture. So the first level asks for distances alone, at scales of so many medians.
 _FIRST_MEDIANS = 8.0
@@ -53,6 +52,9 @@ class Search:
         """From a start (camera to world, double precision), on the first of two sets of points."""
         self.field, self.levels, self.settings = field, levels, settings
         self.start = self.T_world_camera = start
+        # Any intensity fits where it has no say.
+        likeness = registration.INLIER_INTENSITY if settings.lambda_intensity else inf
+        self.tolerance = registration.INLIER_ACCURACIES * field.accuracy[0], likeness
         self.begin(0)
 
     @staticmethod
@@ -75,7 +77,8 @@ class Search:
         T_world_camera = registration.moved(self.T_world_camera, twist)
         residuals = self._residuals_at(T_world_camera)
         before = registration.robust_cost(*now)
-        is_better = bool(registration.robust_cost(residuals, *now[1:]) < before)
+        judged = registration.judged_as(residuals, self.residuals)
+        is_better = bool(registration.robust_cost(judged, *now[1:]) < before)
         if is_better:
             self.T_world_camera, self.residuals = T_world_camera, residuals
             least = torch.tensor(self.field.accuracy)
@@ -83,21 +86,17 @@ class Search:
         self._judge(is_better, float(twist.abs().max()))
         return float(before)
 
-    def cost(self, scales: Scales) -> float:
+    def cost(self, scales: tuple[float, float]) -> float:
         """The robust cost at given scales, by which searches are compared."""
-        return float(registration.robust_cost(self.residuals, scales, 1.0))
+        return float(registration.robust_cost(self.residuals, torch.tensor(scales), 1.0))
 
     def certainty(self) -> dict[str, float]:
         """What the points say of the pose; see `registration.certainty`."""
         matrix, _ = registration.normal_equations(self.residuals, self.scales, self.weight)
         parts = self.residuals.value, self.residuals.reliability, matrix
         return registration.certainty(
-            *(part.cpu().double().numpy() for part in parts), self._accuracy()
+            *(part.cpu().double().numpy() for part in parts), self.tolerance
         )
-
-    def _accuracy(self) -> np.ndarray:
-        """Of the field; any intensity fits where it has no say."""
-        return np.array([self.field.accuracy[0], self.field.accuracy[1] if self.weight else inf])
 
     def _look(self, widest: float) -> None:
         """Residuals at the pose, and robust scales for them, up to the widest."""
