@@ -39,6 +39,11 @@ def test_the_sums_are_those_of_registration(by_slope: bool) -> None:
     state = expected, 0.7
     cost = registration.robust_cost(plain, *state)
     assert kernels.robust_cost(rows, scales, 0.7) == pytest.approx(cost.item(), rel=1e-6)
+    before = kernels.residual_rows(NUMPY, start.numpy(), grid, by_slope)
+    judged = registration.judged_as(
+        plain, registration.residuals_at(EXACT, observed, start, by_slope)
+    )
+    np.testing.assert_allclose(kernels.judged_as(rows, before)[2], judged.reliability, atol=1e-5)
     sums = kernels.normal_equations(rows, scales, 0.7)
     for found, wanted in zip(sums, registration.normal_equations(plain, *state), strict=True):
         np.testing.assert_allclose(found, wanted, atol=1e-6 * abs(sums[0]).max())

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from nbtrack.core.arrays import Scalar, Transform
+from nbtrack.core.arrays import Poses, Scalar, Transform
 from nbtrack.core.progress import tell
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
@@ -26,15 +27,17 @@ _WIDE_SCALES = 0.1, 0.2
 # A pose is taken for lost with fewer inliers than this, or a position less certain than that (m).
 _LEAST_INLIERS, _MOST_DEVIATION = 0.7, 0.04
 _RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
-_GLANCES = 6  # steps from each mapped pose, before the cheapest are followed to their ends
+# Where a map knows its cameras, a lost one is looked for at so many random poses, so far (m) from
+# theirs; from the cheapest some steps are taken, before the cheapest of those are followed.
+_GUESSES, _GUESS_SPREAD, _GLANCES, _GLANCE_STEPS = 1000, 0.3, 40, 6
 
 
 class LmTracker(Tracker):
     """Levenberg-Marquardt on SE(3), on points drawn once a frame; knows when it is lost.
 
     A search that ends lost is followed by others, while the budget lasts: from the last good pose,
-    then around it, or, where the map knows its own cameras, from those of them that fit the frame
-    best after a few steps, which count as one. The cheapest estimate counts. A frame with too few
+    then around it, or, where the map knows its own cameras, from random poses near theirs that fit
+    the frame best after a few steps, which count as one. The cheapest estimate counts. A frame with too few
     points keeps the start that the motion model gave.
 
     Source: Levenberg 1944, Marquardt 1963; residuals of the paper's Eq. 2; an answer of our own to
@@ -126,12 +129,24 @@ class LmTracker(Tracker):
         cameras = getattr(self.field, "T_world_cameras", None)
         if cameras is None:
             return around
-        glances = [self._search_from(T_world_camera) for T_world_camera in cameras.double()]
+        guesses = [self._search_from(T) for T in self._guesses(cameras.cpu().double().numpy())]
+        glances = _by_cost(guesses, _WIDE_SCALES)[:_GLANCES]
         for search in glances:
-            for _ in range(_GLANCES):
+            for _ in range(_GLANCE_STEPS):
                 search.step()
         glances = _by_cost(glances, _WIDE_SCALES)
         return around[:1] + [torch.as_tensor(search.T_world_camera) for search in glances]
+
+    def _guesses(self, T_world_cameras: Poses) -> Float[Tensor, "_ 4 4"]:
+        """Where else a camera may be: near the known ones, turned about the vertical they share."""
+        seed = torch.randint(2**62, (), generator=self.generator, device=self.device)
+        random = np.random.default_rng(int(seed))
+        guesses = T_world_cameras[random.integers(len(T_world_cameras), size=_GUESSES)]
+        down = T_world_cameras[:, :3, 1].mean(axis=0)
+        turns = random.uniform(0, 2 * np.pi, (_GUESSES, 1)) * down / np.linalg.norm(down)
+        guesses[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix() @ guesses[:, :3, :3]
+        guesses[:, :3, 3] += random.normal(scale=_GUESS_SPREAD, size=(_GUESSES, 3))
+        return torch.from_numpy(guesses)
 
 
 def search_kind(field: Field) -> type[Search]:

@@ -77,7 +77,8 @@ class Search:
         T_world_camera = registration.moved(self.T_world_camera, twist)
         residuals = self._residuals_at(T_world_camera)
         before = registration.robust_cost(*now)
-        judged = registration.judged_as(residuals, self.residuals)
+        # Not at first: from afar the slope tells that a surface is near.
+        judged = registration.judged_as(residuals, self.residuals) if self.weight else residuals
         is_better = bool(registration.robust_cost(judged, *now[1:]) < before)
         if is_better:
             self.T_world_camera, self.residuals = T_world_camera, residuals
