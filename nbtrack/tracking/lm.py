@@ -37,8 +37,8 @@ class LmTracker(Tracker):
 
     A search that ends lost is followed by others, while the budget lasts: from the last good pose,
     then around it, or, where the map knows its own cameras, from random poses near theirs that fit
-    the frame best after a few steps, which count as one. The cheapest estimate counts. A frame with too few
-    points keeps the start that the motion model gave.
+    the frame best after a few steps, which count as one. The cheapest estimate counts. A frame with
+    too few points keeps the start that the motion model gave.
 
     Source: Levenberg 1944, Marquardt 1963; residuals of the paper's Eq. 2; an answer of our own to
     its remark that SDF tracking with Adam needs more steps than 10 Hz allows.

@@ -146,8 +146,8 @@ def certainty(
     """The share of points that fit the map, and how well the curvature of their cost holds a pose.
 
     Of both residuals, which fit within a tolerance, and the matrix of the normal equations.
-    Deviations are along the least certain direction, the condition number without the pull to the start, rotations at an arm of 1 m.
-    Errors of the map are not independent, as residuals are here taken to be: these are lower
+    Deviations are along the least certain direction, the condition number without the pull to the
+    start, rotations at an arm of 1 m. Errors of the map are not independent, as residuals are here taken to be: these are lower
     bounds, good for telling poses apart, not for error bars.
     """
     fits = (np.abs(value) < np.array(tolerance)[:, None]).all(axis=0)
