@@ -147,8 +147,8 @@ def certainty(
 
     Of both residuals, which fit within a tolerance, and the matrix of the normal equations.
     Deviations are along the least certain direction, the condition number without the pull to the
-    start, rotations at an arm of 1 m. Errors of the map are not independent, as residuals are here taken to be: these are lower
-    bounds, good for telling poses apart, not for error bars.
+    start, rotations at an arm of 1 m. Errors of the map are not independent, as residuals are here
+    taken to be: these are lower bounds, good for telling poses apart, not for error bars.
     """
     fits = (np.abs(value) < np.array(tolerance)[:, None]).all(axis=0)
     is_inlier = fits & (reliability > 0)
