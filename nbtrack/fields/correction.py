@@ -42,7 +42,7 @@ class CorrectedField(BakedField):
     """
 
     # Distances are better than the field's, intensities of small things are not: a voxel is wide.
-    accuracy = (0.01, 0.1)
+    accuracy, least_inliers = (0.01, 0.1), 0.8
 
     def __init__(
         self,

@@ -24,8 +24,7 @@ _LEAST_POINTS = 20  # below, a frame says too little for six unknowns
 _COARSE_SHARE, _LEAST_COARSE = 8, 128
 # Starts are compared by widely robust costs: narrow ones say the same of all that are off.
 _WIDE_SCALES = 0.1, 0.2
-# A pose is taken for lost with fewer inliers than this, or a position less certain than that (m).
-_LEAST_INLIERS, _MOST_DEVIATION = 0.7, 0.04
+_MOST_DEVIATION = 0.04  # m; a pose whose position is less certain is taken for lost
 _RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
 # Where a map knows its cameras, a lost one is looked for at so many random poses, so far (m) from
 # theirs; from the cheapest some steps are taken, before the cheapest of those are followed.
@@ -100,7 +99,7 @@ class LmTracker(Tracker):
         best = self._best()
         found = best.certainty()
         is_uncertain = found["position_deviation_m"] > _MOST_DEVIATION
-        is_lost = found["inlier_ratio"] < _LEAST_INLIERS or is_uncertain
+        is_lost = found["inlier_ratio"] < self.field.least_inliers or is_uncertain
         if not is_lost:
             self.last_good = torch.as_tensor(best.T_world_camera)
         self.verdict = {**found, "lost": is_lost}
