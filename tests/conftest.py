@@ -11,6 +11,8 @@ import pytest
 import torch
 from finished import GIVEN, MAP, OWN, isolate
 
+os.environ["NBTRACK_DEVICE"] = "cpu"  # where there is a GPU too: what is tested there says so
+
 
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:

@@ -9,7 +9,7 @@ from torch import Tensor
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError
 from nbtrack.fields import FIELDS, grid
-from nbtrack.fields.base import LUMA
+from nbtrack.fields.base import intensity_of
 from nbtrack.fields.grid import BakedField
 
 BOX = SceneBounds((-0.5, -0.25, 0.25), (0.55, 0.5, 1.0))  # x is no multiple of VOXEL
@@ -63,7 +63,7 @@ def test_forward_and_linearize_agree(beyond: float) -> None:
     baked = BakedField(formula(wavy), VOXEL)
     points = points_inside(BOX, 500, -beyond).requires_grad_()
     found, (color, value) = baked.linearize(points), baked(points)
-    intensity = color @ LUMA
+    intensity = intensity_of(color)
     of_value, of_intensity = (
         torch.autograd.grad(answer.sum(), points, retain_graph=True)[0]
         for answer in (value, intensity)

@@ -7,7 +7,6 @@ import pytest
 import torch
 from box_room import walk
 from test_fields import points_inside
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.device import advise_on_memory
@@ -39,36 +38,12 @@ def test_parts_answer_as_the_whole(name: str, monkeypatch: pytest.MonkeyPatch) -
         torch.testing.assert_close(parts, whole, rtol=1e-4, atol=1e-5)
 
 
-class HostTraffic(TorchDispatchMode):
-    """Notes the operations that copy between host and device or wait for the device."""
-
-    COPIES = ("lift_fresh", "_local_scalar_dense", "nonzero", "masked_select", "unique")
-    found = ()
-
-    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
-        name = operation._overloadpacket.__name__
-        self.found += (name,) if name in self.COPIES else ()
-        return operation(*args, **(kwargs or {}))
-
-
 def tracker_of(name: str, field_name: str):
     """At the first frame."""
     settings = TRACKERS[name].Settings(n_pixels=16)
     tracker = make_tracker(name, frozen_field(field_name), np.eye(4), StepBudget(1), settings)
     tracker.begin(SEQUENCE[1], torch.eye(4)[None])
     return tracker
-
-
-@pytest.mark.parametrize(("name", "field_name"), [("sdf", "neus"), ("vr", "imap")])
-def test_a_step_copies_nothing_between_host_and_device(name: str, field_name: str) -> None:
-    """On CUDA each such copy would wait for the device."""
-    tracker = tracker_of(name, field_name)
-    tracker.step()
-    pixels = tracker.drawn_of(tracker.measured)
-    with HostTraffic() as traffic:
-        tracker.loss(tracker.T_world_camera, pixels).backward()
-        torch.tensor(1.0).item()  # what the mode must see
-    assert traffic.found == ("lift_fresh", "_local_scalar_dense")
 
 
 def test_many_frames_leave_no_memory_behind() -> None:

@@ -104,7 +104,9 @@ def test_gradients_of_a_field() -> None:
         found = field.linearize(points)
         around = [(field(points + s), field(points - s)) for s in step]
     slopes = [(after[1] - before[1]) / 2e-5 for after, before in around]
-    of_luma = [(after[0] - before[0]) @ LUMA.double() / 2e-5 for after, before in around]
+    of_luma = [
+        (after[0] - before[0]) @ torch.tensor(LUMA).double() / 2e-5 for after, before in around
+    ]
     for gradient, expected in ((found.value_gradient, slopes), (found.intensity_gradient, of_luma)):
         torch.testing.assert_close(gradient, torch.stack(expected, -1), rtol=1e-5, atol=1e-6)
     assert not any(part.requires_grad for part in vars(found).values())

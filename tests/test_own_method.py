@@ -40,8 +40,8 @@ class FadingField(NeuSField):
 class DistanceTracker(AdamTracker):
     name = "distance"
 
-    def loss(self, T_world_camera, pixels):
-        points_camera, _ = self.frame.points(*pixels)
+    def loss(self, T_world_camera, directions_camera, color, depth):
+        points_camera = directions_camera * depth[:, None]
         return self.field(transform_points(T_world_camera, points_camera))[1].square().mean()
 
 

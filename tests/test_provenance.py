@@ -26,7 +26,7 @@ def key() -> str:
     ("file", "old", "new", "counts"),
     [
         ("fields/rendering.py", "weights", "wights", True),
-        ("core/geometry.py", "clamp_min(0)", "clamp_min(1)", True),
+        ("core/geometry.py", "argmax", "argmin", True),
         ("fields/rendering.py", '"""Volume', '"""Another docstring. ', False),
         ("fields/rendering.py", "import torch\n", "import torch  # a comment\n\n", False),
         ("core/errors.py", "did you mean", "perhaps", False),

@@ -91,7 +91,7 @@ def test_draw_covers_only_the_given_frames() -> None:
     assert len(torch.unique(both, dim=0)) == 2 * 16 * 12
 
 
-@pytest.mark.parametrize("name", ["meta", "cuda"])
+@pytest.mark.parametrize("name", ["meta", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_images_stay_on_the_host_where_the_device_is_full(name: str, monkeypatch) -> None:
     """Catches a long sequence that is copied to a small device: images stay, as 5 bytes a pixel;
     on a GPU also other draws, or rays left behind."""

@@ -1,12 +1,13 @@
 """The axis-aligned box of a scene: where fields live and where rays end."""
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from nbtrack.core.device import constant
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class SceneBounds:
 
     def contain(self, points_world: Float[Tensor, "n 3"], margin: float = 0.0) -> Bool[Tensor, "n"]:
         """Whether points (m) lie inside the box, or no farther than `margin` metres from it."""
-        low, high = _corners(self, points_world.device, points_world.dtype)
+        low, high = self._corners(points_world)
         return ((points_world >= low - margin) & (points_world <= high + margin)).all(dim=-1)
 
     def exit_depth(
@@ -40,17 +41,10 @@ class SceneBounds:
         """
         # An axis that a ray runs along is left at infinity, never at 0/0.
         safe = torch.where(directions_world.abs() < 1e-9, 1e-9, directions_world)
-        low, high = _corners(self, origins_world.device, origins_world.dtype)
+        low, high = self._corners(origins_world)
         to_minimum, to_maximum = (low - origins_world) / safe, (high - origins_world) / safe
         return torch.maximum(to_minimum, to_maximum).amin(dim=-1)
 
-
-@cache
-def _corners(
-    bounds: SceneBounds, device: torch.device, dtype: torch.dtype
-) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Both corners on a device, copied there once."""
-    return (
-        torch.tensor(bounds.minimum, device=device, dtype=dtype),
-        torch.tensor(bounds.maximum, device=device, dtype=dtype),
-    )
+    def _corners(self, like: Tensor) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        corners = self.minimum, self.maximum
+        return tuple(constant(corner, like.device, like.dtype) for corner in corners)

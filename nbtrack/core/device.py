@@ -4,8 +4,10 @@ import contextlib
 import os
 import platform
 from collections.abc import Iterator
+from functools import cache
 
 import torch
+from torch import Tensor
 
 from nbtrack.core.errors import ConfigError, OutOfMemory
 
@@ -31,6 +33,8 @@ def named_device(name: str) -> torch.device:
     try:
         device = torch.device(name)
         torch.empty(0, device=device)
+        if device.index is not None:  # streams, and what is recorded on them, go to the current one
+            torch.accelerator.set_device_index(device.index)
     except (RuntimeError, AssertionError, NotImplementedError):
         kind = torch.accelerator.current_accelerator(check_available=True)
         there = ["cpu", *(f"{kind}:{i}" for i in range(torch.accelerator.device_count()))]
@@ -38,6 +42,12 @@ def named_device(name: str) -> torch.device:
             f"device {name!r} is not there: this machine has {', '.join(there)}"
         ) from None
     return device
+
+
+@cache
+def constant(numbers: tuple, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Numbers on a device, copied there once: in every step a copy would wait for the device."""
+    return torch.tensor(numbers, dtype=dtype).to(device)
 
 
 def device_name(device: torch.device) -> str:

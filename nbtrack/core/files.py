@@ -166,8 +166,8 @@ def naming_damaged(
     """
     try:
         yield
-    except (NbtrackError, MemoryError):
-        raise
+    except (NbtrackError, MemoryError, torch.OutOfMemoryError, torch.AcceleratorError):
+        raise  # a device that fails says nothing about the file
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:120]
         raise DataError(f"{path} is not a readable {kind} ({reason}): {advice}") from None

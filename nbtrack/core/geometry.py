@@ -4,6 +4,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nbtrack.core.device import constant
+
+# The entries of a rotation matrix: twice these products of a unit quaternion's components, and on
+# the diagonal one minus that. From the last to the first: their gradients then add up in the order
+# of entries written one by one, and results stay the same to the last bit.
+_ENTRIES = ["xx+yy", "yz+wx", "xz-wy", "yz-wx", "xx+zz", "xy+wz", "xz+wy", "xy-wz", "yy+zz"]
+_FACTORS = tuple("wxyz".index(letter) for entry in _ENTRIES for letter in entry[3:] + entry[:2])
+_SIGNS = tuple(-1 if "-" in entry else 1 for entry in _ENTRIES)
+_ONES = tuple(int(entry[0] == entry[1]) for entry in _ENTRIES)
+_TWICE = tuple(2 - 4 * one for one in _ONES)
+
 
 def normalize_quaternion(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternion of the same rotation axis and angle.
@@ -22,13 +33,15 @@ def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
     >>> quaternion_to_matrix(torch.tensor([0.0, 0.0, 0.0, 2.0])).diagonal().tolist()
     [-1.0, -1.0, 1.0]
     """
-    w, x, y, z = normalize_quaternion(q_wxyz).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    # All at once, for a GPU: one by one, entries and gradients are 150 kernels.
+    like = q_wxyz.device, q_wxyz.dtype
+    factors = constant(_FACTORS, q_wxyz.device, torch.int64)
+    drawn = normalize_quaternion(q_wxyz).index_select(-1, factors)
+    left, right = drawn.unflatten(-1, (-1, 2)).unbind(-1)
+    second, first = (left * right).unflatten(-1, (9, 2)).unbind(-1)
+    sums = torch.addcmul(first, constant(_SIGNS, *like), second)
+    entries = torch.addcmul(constant(_ONES, *like), constant(_TWICE, *like), sums)
+    return entries.flip(-1).unflatten(-1, (3, 3))
 
 
 def rotation_vector_to_matrix(rotation_vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
@@ -69,9 +82,8 @@ def make_transform(
     rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
     """Homogeneous transform from a rotation matrix and a translation (m)."""
-    # Made on the device: a row of numbers from the host would be copied there in every step.
-    identity = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
-    bottom = identity[3:].expand(*rotation.shape[:-2], 1, 4)
+    bottom = constant(((0, 0, 0, 1),), rotation.device, rotation.dtype)
+    bottom = bottom.expand(*rotation.shape[:-2], 1, 4)
     return torch.cat([torch.cat([rotation, translation.unsqueeze(-1)], dim=-1), bottom], dim=-2)
 
 
@@ -79,4 +91,5 @@ def transform_points(
     T_a_b: Float[Tensor, "4 4"], points_b: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
     """Points (m) of frame b expressed in frame a."""
-    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    rotation, translation = T_a_b[:3].split([3, 1], dim=-1)
+    return points_b @ rotation.T + translation.squeeze(-1)

@@ -13,12 +13,13 @@ from torch import Generator, Tensor, nn
 from nbtrack.core.arrays import Colors, Frames, Points, Pose, RayColors, RaySamples, Scalar, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
+from nbtrack.core.device import constant
 from nbtrack.core.settings import may_be_zero
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.rendering import Rendering, importance_depths, stratified_depths
 
-LUMA = torch.tensor([0.299, 0.587, 0.114])
+LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in the intensity that trackers compare (ITU-R BT.601)."""
 NEAR = 0.05  # m, z-depth before which nothing is looked for: closer than any depth camera measures
 
@@ -89,7 +90,7 @@ class Field(nn.Module, abc.ABC):
         points = points_world.detach().requires_grad_()
         with torch.enable_grad():
             color, value = self(points)
-            intensity = color @ LUMA.to(color)
+            intensity = intensity_of(color)
             (value_gradient,) = torch.autograd.grad(value.sum(), points, retain_graph=True)
             (intensity_gradient,) = torch.autograd.grad(intensity.sum(), points)
         return Linearization(value.detach(), value_gradient, intensity.detach(), intensity_gradient)
@@ -184,6 +185,11 @@ class LearnedField(Field):
                 weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
             extra = importance_depths(spread, weights, n_importance, generator)
         return spread, answers, extra
+
+
+def intensity_of(color: Colors) -> Values:
+    """Luma of colours, in [0, 1]."""
+    return color @ constant(LUMA, color.device, color.dtype)
 
 
 def rays_end(rays: Rays, bounds: SceneBounds) -> Values:

@@ -19,7 +19,7 @@ from nbtrack.core.arrays import Frames, WorldPoints
 from nbtrack.core.errors import DataError
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.base import LUMA, Field
+from nbtrack.fields.base import Field, intensity_of
 from nbtrack.fields.grid import BakedField
 
 # All our choice, tried in the two rooms for tuning. Measured points, and where along their normals
@@ -61,7 +61,7 @@ class CorrectedField(BakedField):
         added = self.corrections.float()
         self.volume[:, numbers.long()] += added.T
         self.vertices[numbers.long(), 0] += added[:, 3]
-        self.vertices[numbers.long(), 1] += added[:, :3] @ LUMA.to(added)
+        self.vertices[numbers.long(), 1] += intensity_of(added[:, :3])
 
 
 def corrected(

@@ -11,8 +11,9 @@ import torch
 from torch import nn
 
 from nbtrack.core.arrays import Colors, Points, Values
+from nbtrack.core.device import constant
 from nbtrack.core.errors import ConfigError
-from nbtrack.fields.base import LUMA, Field
+from nbtrack.fields.base import Field, intensity_of
 
 _POINTS_AT_ONCE = 65_536
 _MAX_BYTES = 1_000_000_000
@@ -48,7 +49,7 @@ class BakedField(Field):
             for part in numbers.split(_POINTS_AT_ONCE)
         ]
         color, value = map(torch.cat, zip(*answers, strict=True))
-        vertices = torch.stack([value, color @ LUMA.to(color)], dim=-1)
+        vertices = torch.stack([value, intensity_of(color)], dim=-1)
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("volume", torch.cat([color.T, value[None]]), persistent=False)
         self.register_buffer("vertices", vertices, persistent=False)
@@ -60,7 +61,8 @@ class BakedField(Field):
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour in [0, 1] and value (m for a signed distance) at points (m); differentiable."""
-        last = self.voxel * (torch.tensor(self.n_vertices).to(self.low) - 1)
+        n_vertices = constant(self.n_vertices, self.low.device, self.low.dtype)
+        last = self.voxel * (n_vertices - 1)
         # grid_sample wants x, y, z of a volume indexed z, y, x, from -1 to 1.
         normalized = (2 * (points_world - self.low) / last - 1).flip(-1)
         volume = self.volume.view(1, 4, *self.n_vertices)

@@ -69,9 +69,10 @@ class FourierMlp(nn.Module):
         n_at_once = max(1, len(points_world))
         if not (self.head.weight.requires_grad or points_world.is_cuda):
             n_at_once = max(1, _LAYER_SIZE // self.head.in_features)
-        parts = points_world.split(n_at_once)
-        raw = torch.cat([self.head(self.features(part)) for part in parts])
-        return raw[:, :3], raw[:, 3]
+        parts = [self.head(self.features(part)) for part in points_world.split(n_at_once)]
+        raw = torch.cat(parts) if parts[1:] else parts[0]
+        color, value = raw.split([3, 1], dim=1)
+        return color, value.squeeze(1)
 
 
 def _linear(n_in: int, n_out: int, generator: Generator) -> nn.Linear:

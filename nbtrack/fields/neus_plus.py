@@ -138,14 +138,14 @@ class ObservedDistance:
             is_free |= sequence[index].depth_behind(corners) < -_FREE_IN_FRONT
         values = torch.from_numpy(distance).float(), is_free.view(distance.shape).float()
         self.values, self.low = torch.stack(values)[None].to(device), corners[0].to(device)
+        self.extent = (self.voxel * (torch.tensor(distance.shape) - 1)).to(device)
 
     def __call__(
         self, points_world: Float[Tensor, "rays samples 3"]
     ) -> tuple[RaySamples, Bool[Tensor, "rays samples"]]:
         """Distance (m) and whether it is free at points (m); outside those of the border."""
-        most = torch.tensor(self.values.shape[2:], device=points_world.device) - 1
         # grid_sample takes x, y, z of a volume indexed z, y, x, from -1 to 1.
-        normalized = (2 * (points_world - self.low) / (self.voxel * most) - 1).flip(-1)
+        normalized = (2 * (points_world - self.low) / self.extent - 1).flip(-1)
         distance, free = torch.nn.functional.grid_sample(
             self.values, normalized[None, None], padding_mode="border", align_corners=True
         )[0, :, 0]

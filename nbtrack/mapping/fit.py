@@ -109,7 +109,9 @@ class _Fit:
     """All that changes while a field is fitted, and what its batches are drawn from."""
 
     def __init__(self, recipe: dict, settings, field: LearnedField, sequence, mapped) -> None:
-        self.recipe, self.settings, self.field = recipe, settings, field
+        # Random numbers go on only on the kind of device that they began on.
+        self.recipe = {**recipe, "device": field.device.type}
+        self.settings, self.field = settings, field
         self.optimizer = torch.optim.Adam(field.parameters(), lr=settings.learning_rate)
         self.generator = torch.Generator(field.device).manual_seed(recipe["seed"])
         self.sampler = PixelSampler(sequence, field.device)

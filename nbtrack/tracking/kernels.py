@@ -14,7 +14,7 @@ from nbtrack.data.frame import DRAWN_PER_POINT, EDGE_JUMP, MILLIMETRE
 from nbtrack.fields.base import LUMA
 from nbtrack.tracking.registration import LEAST_SLOPE, MOST_SLOPE, SLOPE_SCALE, START_PULL
 
-_RED, _GREEN, _BLUE = LUMA.tolist()
+_RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
 
 
 # Sums may be reordered, so that they fill vector registers; what is no number stays none.

@@ -55,7 +55,7 @@ class LmTracker(Tracker):
 
     def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
         """Draw the frame's points; take up the search from the start that fits them best."""
-        T_starts = T_starts.to("cpu", torch.float64, copy=True)
+        T_starts = T_starts.cpu().double().clone()
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
         R = T_starts.numpy()[:, :3, :3]
         R[:] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2

@@ -4,11 +4,11 @@ import abc
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.core import geometry
-from nbtrack.core.arrays import Colors, Scalar, Transform, Values
+from nbtrack.core import capture, geometry
+from nbtrack.core.arrays import Colors, Points, Scalar, Transform, Values
 from nbtrack.core.camera import pixel_directions
 from nbtrack.core.settings import may_be_zero
 from nbtrack.data.frame import Frame
@@ -33,34 +33,73 @@ class AdamTracker(Tracker):
     """
 
     Settings = AdamSettings
+    pixels: Float[Tensor, "most 7"] | None = None  # rays, colours and depths that may be drawn
+    recorded: capture.Recorded | None = None  # the step, where its device can
 
     @abc.abstractmethod
-    def loss(self, T_world_camera: Transform, pixels: Int[Tensor, "2 n"]) -> Scalar:
-        """The loss of some pixels (rows, columns) of `self.frame` at a pose."""
+    def loss(
+        self, T_world_camera: Transform, directions_camera: Points, color: Colors, depth: Values
+    ) -> Scalar:
+        """The loss of some pixels at a pose: rays (z = 1), colours in [0, 1] and z-depths (m)."""
 
     def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
         """Take up a frame; of several starts, that with the lowest loss on the same pixels."""
-        self.frame, self.measured = frame, frame.measured_pixels()
+        self._list_pixels(frame)
         T_start = T_starts[0]
         if len(T_starts) > 1:
-            pixels = self.drawn_of(self.measured)
+            self._draw()
             with torch.no_grad():
-                losses = torch.stack([self.loss(T, pixels) for T in T_starts])
+                losses = torch.stack([self.loss(T, *self._drawn()) for T in T_starts])
             T_start = T_starts[losses.argmin()]
-        self.position = T_start[:3, 3].clone().requires_grad_()
-        self.q_wxyz = geometry.matrix_to_quaternion(T_start[:3, :3]).requires_grad_()
+        start = T_start[:3, 3].clone(), geometry.matrix_to_quaternion(T_start[:3, :3])
+        if self.recorded:  # it knows its tensors by their place
+            with torch.no_grad():
+                self.position.copy_(start[0])
+                self.q_wxyz.copy_(start[1])
+            for moments in self.optimizer.state.values():
+                torch._foreach_zero_([*moments.values()])
+            return
+        self.position, self.q_wxyz = (part.requires_grad_() for part in start)
         position = {"params": [self.position], "lr": self.settings.position_rate}
         orientation = {"params": [self.q_wxyz], "lr": self.settings.orientation_rate}
-        self.optimizer = torch.optim.Adam([position, orientation])
+        can, groups = capture.can_record(self.device), [position, orientation]
+        self.optimizer = torch.optim.Adam(groups, fused=can or None, capturable=can)
+        # What another class does in its steps may not bear to be replayed.
+        is_known = type(self).begin is AdamTracker.begin and type(self).step is AdamTracker.step
+        self.recorded = capture.Recorded(self._descend, self) if can and is_known else None
 
     def step(self) -> Scalar:
         """Draw pixels, lower their loss by one step of Adam, renormalise the quaternion."""
+        self._draw()
+        return (self.recorded or self._descend)()
+
+    def _list_pixels(self, frame: Frame) -> None:
+        """Rays, colours and depths of all measured pixels, where those of the last frame were."""
+        rows, columns = frame.measured_pixels()
+        if self.pixels is None or len(self.pixels) != frame.depth_mm.numel():
+            self.pixels = torch.empty(frame.depth_mm.numel(), 7, device=self.device)
+            self.drawn = rows.new_empty(self.settings.n_pixels)
+            self.recorded = None
+        self.n_measured = len(rows)
+        listed = self.pixels[: self.n_measured]
+        listed[:, :3] = pixel_directions(frame.camera, columns, rows)
+        listed[:, 3:6], listed[:, 6] = frame.at(rows, columns)
+
+    def _draw(self) -> None:
+        drawn, generator = self.drawn, self.generator
+        torch.randint(self.n_measured, drawn.shape, generator=generator, out=drawn)
+
+    def _drawn(self) -> tuple[Points, Colors, Values]:
+        directions, color, depth = self.pixels[self.drawn].split([3, 3, 1], dim=1)
+        return directions, color, depth.squeeze(1)
+
+    def _descend(self) -> Scalar:
         self.optimizer.zero_grad()
-        loss = self.loss(self.T_world_camera, self.drawn_of(self.measured))
+        loss = self.loss(self.T_world_camera, *self._drawn())
         loss.backward()
         self.optimizer.step()
         with torch.no_grad():
-            self.q_wxyz.copy_(geometry.normalize_quaternion(self.q_wxyz))
+            self.q_wxyz.div_(self.q_wxyz.norm(dim=-1, keepdim=True))
         return loss.detach()
 
     @property
@@ -88,13 +127,13 @@ class VrTracker(AdamTracker):
     Settings = VrSettings
     renders = True
 
-    def loss(self, T_world_camera: Transform, pixels: Int[Tensor, "2 n"]) -> Scalar:
+    def loss(
+        self, T_world_camera: Transform, directions_camera: Points, color: Colors, depth: Values
+    ) -> Scalar:
         """iMAP's loss of rendered pixels; gradients reach the pose through every sample."""
-        rows, columns = pixels
-        directions_camera = pixel_directions(self.frame.camera, columns, rows)
-        directions_world = directions_camera @ T_world_camera[:3, :3].T
-        origins_world = T_world_camera[:3, 3].expand_as(directions_world)
-        rays = Rays(origins_world, directions_world, *self.frame.at(rows, columns))
+        rotation, position = T_world_camera[:3].split([3, 1], dim=-1)
+        directions_world = directions_camera @ rotation.T
+        rays = Rays(position.T.expand_as(directions_world), directions_world, color, depth)
         n_samples = self.settings.n_stratified, self.settings.n_importance
         rendering = self.field.render_in_two_passes(rays, *n_samples, self.generator)
         terms = rendering_losses(rendering, rays, self.settings.lambda_color)
@@ -116,9 +155,11 @@ class SdfTracker(AdamTracker):
     name = "sdf"
     Settings = SdfSettings
 
-    def loss(self, T_world_camera: Transform, pixels: Int[Tensor, "2 n"]) -> Scalar:
+    def loss(
+        self, T_world_camera: Transform, directions_camera: Points, color: Colors, depth: Values
+    ) -> Scalar:
         """Paper, Eq. 2, for the pixels' back-projected points."""
-        points_camera, color = self.frame.points(*pixels)
+        points_camera = directions_camera * depth[:, None]
         points_world = geometry.transform_points(T_world_camera, points_camera)
         field_color, field_sdf = self.field(points_world)
         weights = self.settings.lambda_sdf, self.settings.lambda_color

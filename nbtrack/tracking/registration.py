@@ -102,7 +102,8 @@ def robust_cost(residuals: Residuals, scales: Scales, intensity_weight: float) -
 def normal_equations(
     residuals: Residuals, scales: Scales, intensity_weight: float
 ) -> tuple[Float[Tensor, "6 6"], Float[Tensor, "6"]]:
-    """J'WJ and J'Wr of both residuals in double precision, divided by their scales' squares.
+    """J'WJ and J'Wr of both residuals, divided by their scales' squares; in double precision, on
+    the host, since not every device has it.
 
     W holds Geman-McClure's weights 1 / (1 + u^2)^2 times the points' reliability.
     """
@@ -110,8 +111,8 @@ def normal_equations(
     u = residuals.value / scales
     weights = torch.stack([residuals.reliability, intensity_weight * residuals.reliability])
     root = weights.sqrt() / (1 + u.square())
-    jacobian = (residuals.jacobian * (root / scales)[..., None]).flatten(0, 1).double()
-    return jacobian.T @ jacobian, jacobian.T @ (u * root).flatten().double()
+    jacobian = (residuals.jacobian * (root / scales)[..., None]).flatten(0, 1).cpu().double()
+    return jacobian.T @ jacobian, jacobian.T @ (u * root).flatten().cpu().double()
 
 
 def damped_step(

@@ -7,10 +7,11 @@ from typing import Any
 import torch
 
 from nbtrack.core.arrays import Points, Pose, Transform, Values
+from nbtrack.core.device import constant
 from nbtrack.core.settings import may_be_zero
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
-from nbtrack.fields.base import LUMA
+from nbtrack.fields.base import intensity_of
 from nbtrack.tracking import registration
 from nbtrack.tracking.registration import MEDIANS
 from nbtrack.tracking.tracker import TrackerSettings
@@ -61,7 +62,7 @@ class Search:
     def draw(frame: Frame, n_points: int, generator: torch.Generator) -> tuple[Points, Values]:
         """Random observed points (m, camera frame) away from edges, and their intensities."""
         points_camera, color = frame.smooth_points(n_points, generator)
-        return points_camera, color @ LUMA.to(color)
+        return points_camera, intensity_of(color)
 
     def begin(self, level: int) -> None:
         """Go on from the present pose with some of the points (level 0) or all (1)."""
@@ -82,7 +83,7 @@ class Search:
         is_better = bool(registration.robust_cost(judged, *now[1:]) < before)
         if is_better:
             self.T_world_camera, self.residuals = T_world_camera, residuals
-            least = torch.tensor(self.field.accuracy)
+            least = self._least_scales()
             self.scales = registration.scales_of(residuals, self.scales, least, self.medians)
         self._judge(is_better, float(twist.abs().max()))
         return float(before)
@@ -102,9 +103,12 @@ class Search:
     def _look(self, widest: float) -> None:
         """Residuals at the pose, and robust scales for them, up to the widest."""
         self.residuals = self._residuals_at(self.T_world_camera)
-        least = torch.tensor(self.field.accuracy)
+        least = self._least_scales()
         widest = least.clamp_min(widest)
         self.scales = registration.scales_of(self.residuals, widest, least, self.medians)
+
+    def _least_scales(self) -> Values:
+        return constant(self.field.accuracy, self.residuals.value.device, torch.float32)
 
     def _residuals_at(self, T_world_camera: Transform) -> registration.Residuals:
         observed, by_slope = self.levels[self.level], self.settings.divide_by_slope

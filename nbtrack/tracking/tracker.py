@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nbtrack.core import capture
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform
 from nbtrack.core.device import suitable_threads, synchronize
 from nbtrack.core.errors import ConfigError, NumericalError, nearest_name
@@ -168,10 +169,11 @@ class Tracker(abc.ABC):
     def _search(self, frame: Frame, T_starts: Poses) -> Estimate:
         starts = torch.from_numpy(T_starts).float().to(self.device)
         if frame.has_depth and not self._is_warm:
-            # One step that counts nowhere: first calls load and allocate for a second or more.
+            # Steps that count nowhere: first calls load, allocate and record for a second or more.
             state, self._is_warm = self.state(), True
             self.begin(frame, starts[:1])
-            self.step()
+            for _ in range(capture.WARM_STEPS + 1 if capture.can_record(self.device) else 1):
+                self.step()
             self.report()
             self.restore(state)
             synchronize(self.device)

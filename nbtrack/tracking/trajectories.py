@@ -58,13 +58,13 @@ def track_sequence(
     tracker.restart(sequence.T_world_camera[0])
     given = Estimate(sequence.T_world_camera[0], without_depth=not sequence[0].has_depth)
     rows = [_row(sequence, 0, given)]
-    if checkpoint and checkpoint.exists():
-        with files.naming_damaged(checkpoint):
-            state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-            tracker.restore(state["tracker"])
-            rows = state["rows"]
     last_saved = time.perf_counter()
     with advise_on_memory(f"tracking.{tracker.name}.n_pixels={tracker.settings.n_pixels}"):
+        if checkpoint and checkpoint.exists():
+            with files.naming_damaged(checkpoint):
+                state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+                tracker.restore(state["tracker"])
+                rows = state["rows"]
         for index in range(len(rows), len(sequence)):
             rows.append(_row(sequence, index, tracker.track(sequence[index])))
             if on_frame:
