@@ -1,0 +1,131 @@
+"""Times of a GPU's steps: recorded and plain, in single precision and in TF32; and of mapping.
+
+`python benchmarks/gpu_steps.py steps` or `mapping`, CSV files into the folder $OUT. Of untrained
+networks of full size and an image of noise before a wall: a step costs the same whatever they show.
+On a CPU everything is small, and nothing is recorded: that only says that the script runs.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import Intrinsics
+from nbtrack.core.capture import WARM_STEPS
+from nbtrack.core.device import choose_device, device_name, synchronize
+from nbtrack.data.sequence import RgbdSequence
+from nbtrack.fields import NetworkSettings, field_class, make_field
+from nbtrack.tracking import TRACKERS, StepBudget, Tracker, make_tracker
+
+DEVICE = choose_device()
+IS_GPU = DEVICE.type == "cuda"
+WIDTH, HEIGHT, N_TIMED, N_WARM = (640, 480, 200, 30) if IS_GPU else (64, 48, 5, 2)
+NETWORK = NetworkSettings() if IS_GPU else NetworkSettings(width=32)
+BOUNDS = SceneBounds((-3.0, -3.0, -1.0), (3.0, 3.0, 3.0))
+PRECISIONS = {"float32": "highest", "TF32": "high"}
+
+
+def noise(n_frames: int) -> RgbdSequence:
+    """A wall about 2 m ahead of cameras that stand still."""
+    rng, size = np.random.default_rng(0), (n_frames, HEIGHT, WIDTH)
+    colors = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
+    depths_mm = rng.integers(1950, 2050, size).astype(np.uint16)
+    poses = np.tile(np.eye(4), (n_frames, 1, 1))
+    camera = Intrinsics.from_focal(WIDTH, HEIGHT, float(HEIGHT))
+    return RgbdSequence("wall", camera, colors, depths_mm, poses, np.arange(n_frames))
+
+
+SEQUENCE = noise(20)
+
+
+def warm_tracker(name: str, field_name: str, is_recorded: bool) -> Tracker:
+    """At the start of a frame, after all that counts nowhere."""
+    field = make_field(field_name, NETWORK, BOUNDS, seed=0).to(DEVICE)
+    settings = TRACKERS[name].Settings() if IS_GPU else TRACKERS[name].Settings(n_pixels=32)
+    tracker = make_tracker(name, field, np.eye(4), StepBudget(1), settings)
+    tracker.track(SEQUENCE[0])
+    recorded = tracker.recorded if is_recorded else None
+    tracker.recorded = recorded
+    tracker.begin(SEQUENCE[1].to(DEVICE), torch.eye(4, device=DEVICE)[None])
+    tracker.recorded = recorded  # without it, kernels are launched one by one
+    return tracker
+
+
+def milliseconds(call: Callable[[], object], waits: bool) -> tuple[float, float, float]:
+    """Median and quartiles of a call, each waited for; or the mean where calls are queued."""
+    for _ in range(N_WARM):
+        call()
+    synchronize(DEVICE)
+    times = [time.perf_counter()]
+    for _ in range(N_TIMED):
+        call()
+        if waits:
+            synchronize(DEVICE)
+            times.append(time.perf_counter())
+    synchronize(DEVICE)
+    if not waits:
+        return (1e3 * (time.perf_counter() - times[0]) / N_TIMED,) * 3
+    median, low, high = 1e3 * np.quantile(np.diff(times), [0.5, 0.25, 0.75])
+    return median, low, high
+
+
+def step_rows() -> Iterator[dict]:
+    """Step times of the paper's trackers in its fields, and how far recorded steps lead off."""
+    for name, field_name in (("sdf", "neus"), ("vr", "imap")):
+        kinds = {kind: warm_tracker(name, field_name, kind == "recorded") for kind in
+                 ("recorded", "plain")}  # fmt: skip
+        recording = kinds["recorded"].recorded
+        is_recorded = recording is not None and recording._run != kinds["recorded"]._descend
+        losses = [[float(kinds[kind].step()) for _ in range(20)] for kind in kinds]
+        one, other = (kinds[kind].T_world_camera.detach() for kind in kinds)
+        told = {"is_recorded": is_recorded, "pose_gap_after_20": float((one - other).abs().max()),
+                "loss_gap_after_20": float(np.abs(np.diff(losses, axis=0)).max())}  # fmt: skip
+        for kind, tracker in kinds.items():
+            for waits in (True, False):
+                median, low, high = milliseconds(tracker.step, waits)
+                yield {"tracker": name, "steps": kind, "waits": waits, "ms": median,
+                       "ms_low": low, "ms_high": high, **told}  # fmt: skip
+
+
+def mapping_rows() -> Iterator[dict]:
+    """Time of a mapping iteration, after a warm-up."""
+    from nbtrack.mapping.fit import _Fit
+
+    for name in ("imap", "neus", "neus_plus"):
+        field = make_field(name, NETWORK, BOUNDS, seed=0).to(DEVICE)
+        settings = field_class(name).Settings()
+        settings = settings if IS_GPU else replace(settings, n_rays=16)
+        fit = _Fit({"seed": 0}, settings, field, SEQUENCE, np.arange(len(SEQUENCE)))
+        fit._advance(range(N_WARM))
+        synchronize(DEVICE)
+        start = time.perf_counter()
+        for first in range(0, N_TIMED, 10):
+            fit._advance(range(first, min(N_TIMED, first + 10)))
+        synchronize(DEVICE)
+        seconds = time.perf_counter() - start
+        yield {"field": name, "n_rays": settings.n_rays, "ms": 1e3 * seconds / N_TIMED}
+
+
+def main(part: str) -> None:
+    """Measure one part, at both precisions, and write what is there after each row."""
+    torch.set_num_threads(1)
+    found, out = [], Path(os.environ.get("OUT", "runs/first_gpu_run"))
+    out.mkdir(parents=True, exist_ok=True)
+    about = {"device": device_name(DEVICE), "torch": torch.__version__, "warm_steps": WARM_STEPS}
+    for precision, word in PRECISIONS.items():
+        torch.set_float32_matmul_precision(word)
+        for row in {"steps": step_rows, "mapping": mapping_rows}[part]():
+            found.append({**row, "precision": precision, **about})
+            print(found[-1], flush=True)
+            pd.DataFrame(found).to_csv(out / f"gpu_{part}.csv", index=False, float_format="%.6g")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
