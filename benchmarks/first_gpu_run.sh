@@ -43,15 +43,15 @@ part 110 python3 benchmarks/gpu_steps.py steps
 part 110 python3 benchmarks/gpu_steps.py mapping
 part 60 python3 -m pytest -q -p no:cacheprovider --noconftest -W default -m gpu \
   tests/test_gpu.py tests/test_sampling.py
-track() { # its name, the options
-  local name=$1; shift
-  part 40 python3 -m nbtrack track living_room "$@" --preset smoke --frames :60 \
+track() { # seconds, its name, the options
+  local seconds=$1 name=$2; shift 2
+  part "$seconds" python3 -m nbtrack track living_room "$@" --preset smoke --frames :60 \
     ${small[@]+"${small[@]}"} --out "$OUT/track_$name"
 }
-track sdf --field neus --tracker sdf --rate 30
-track vr --field imap --tracker vr --rate 10
-track lm --field neus --tracker lm --steps 20
-track icp --field points --tracker icp --steps 30
+track 70 sdf --field neus --tracker sdf --rate 30
+track 40 vr --field imap --tracker vr --rate 10
+track 40 lm --field neus --tracker lm --steps 20
+track 40 icp --field points --tracker icp --steps 30
 sizes=(--preset synthetic)
 [ "$NBTRACK_DEVICE" = cpu ] && sizes=(--preset smoke "${small[@]}")
 part 120 python3 -m nbtrack bench "${sizes[@]}" --out "$OUT/bench"

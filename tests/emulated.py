@@ -62,9 +62,9 @@ class Emulator(TorchDispatchMode):
             is_there = torch.device(kwargs["device"]).type == DEVICE.type
             kwargs["device"] = "cpu"
         self._note(operation, name, tensors, there, is_there)
+        args, kwargs = tree_map_only(There, lambda t: t.here, (args, kwargs))
         known = {id(t.here): t for t in there}
-        found = operation(*tree_map_only(There, lambda t: t.here, args),
-                          **tree_map_only(There, lambda t: t.here, kwargs))  # fmt: skip
+        found = operation(*args, **kwargs)
         made = [t for t in tree_leaves(found) if isinstance(t, torch.Tensor)]
         # As Apple's GPUs, whose copies to the host change the type before they leave.
         if (there or is_there) and any(t.dtype == torch.float64 for t in made):
@@ -109,14 +109,9 @@ def refuse(step: Callable, generator: torch.Generator) -> None:
 @contextmanager
 def emulated() -> Iterator[Emulator]:
     """Within it `DEVICE` is there, and taken for CUDA, on which no step can be recorded."""
-    make, capture, optim = torch.tensor, "nbtrack.core.capture", "torch.optim"
-
-    def tensor(*content, device=None, **more):
-        return make(*content, **more).to(device or "cpu")
-
+    capture, optim = "nbtrack.core.capture", "torch.optim"
     patches = {
         "torch.Generator": Draws,
-        "torch.tensor": tensor,
         "torch.accelerator.synchronize": lambda device: None,
         f"{optim}.adam._default_to_fused_or_foreach": lambda *_, **__: (False, True),
         f"{optim}.optimizer._get_fused_kernels_supported_devices": lambda: ["meta", "cpu"],

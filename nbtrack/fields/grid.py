@@ -42,7 +42,7 @@ class BakedField(Field):
         self.surface_level = float(source.surface_level)
         self.voxel, self.n_vertices = float(voxel), _checked_size(source, voxel)
         # The first vertex lies one cell below the bounds; they are listed with z fastest.
-        low = torch.tensor([x - voxel for x in self.bounds.minimum], device=source.device)
+        low = torch.tensor([x - voxel for x in self.bounds.minimum]).to(source.device)
         numbers = torch.arange(math.prod(self.n_vertices), device=source.device)
         answers = [
             source(low + voxel * torch.stack(torch.unravel_index(part, self.n_vertices), -1))

@@ -109,8 +109,7 @@ class _Fit:
     """All that changes while a field is fitted, and what its batches are drawn from."""
 
     def __init__(self, recipe: dict, settings, field: LearnedField, sequence, mapped) -> None:
-        # Random numbers go on only on the kind of device that they began on.
-        self.recipe = {**recipe, "device": field.device.type}
+        self.recipe = {**recipe, "device": field.device.type}  # each draws other numbers
         self.settings, self.field = settings, field
         self.optimizer = torch.optim.Adam(field.parameters(), lr=settings.learning_rate)
         self.generator = torch.Generator(field.device).manual_seed(recipe["seed"])
