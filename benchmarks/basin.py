@@ -32,8 +32,9 @@ def find_from_afar(
     offsets: Sequence[tuple[int, int]] = OFFSETS,
     n_starts: int = 24,
     frames: str = "::10",
+    n_restarts: int = 0,
 ) -> pd.DataFrame:
-    """Where each tracker ends, from starts that are off in random directions; without restarts.
+    """Where each tracker ends, from starts that are off in random directions.
 
     Each start is turned by the offset's degrees about one random axis and moved by its centimetres
     along another, the same for every method.
@@ -51,7 +52,7 @@ def find_from_afar(
         changed = with_settings(preset, *method.settings)
         settings = changed.tracking_of(method.tracker)
         if hasattr(settings, "n_restarts"):
-            settings = replace(settings, n_restarts=0)
+            settings = replace(settings, n_restarts=n_restarts)
         field, T_first = map_scene(scene, method.field, changed).field, sequence.T_world_camera[0]
         tracker = make_tracker(method.tracker, field, T_first, StepBudget(steps), settings)
         with ProgressBar(f"searches, {method.label}", len(searches)) as bar:

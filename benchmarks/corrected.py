@@ -34,7 +34,6 @@ from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.runs import TrackCell
 from nbtrack.tracking import StepBudget
-from nbtrack.tracking.metrics import score_detection
 
 ALONE, FOUND_M, FOUND_DEG = Execution(workers=1), 0.05, 3.0
 _MIDDLE = "tracking.lm.n_pixels=2048"
@@ -70,8 +69,12 @@ def main() -> None:
     _write("times.csv", frame_times(rooms, preset))
     searches = []
     for room, other in zip(rooms, elsewhere, strict=True):
-        afar = find_from_afar(room, {"corrected_dense": 30}, preset, [(20, 15)], 100)
-        searches += [afar.assign(scene=room.name), _without_a_start(room, other, preset)]
+        for n_restarts, steps in ((0, 60), (8, 1000)):
+            how = {"corrected_dense": steps}, preset, [(20, 15)], 100
+            afar = find_from_afar(room, *how, n_restarts=n_restarts)
+            told = afar["offset"] + (", with restarts" if n_restarts else "")
+            searches.append(afar.assign(offset=told, scene=room.name))
+        searches.append(_without_a_start(room, other, preset))
     found = pd.concat(searches)
     _write("searches.csv", found)
     for recording in recordings:
@@ -81,7 +84,9 @@ def main() -> None:
         _write("tracking.csv", pd.concat(runs))
     print(pd.concat(runs).to_string(index=False))
     print(found.groupby(["scene", "offset"])[["recovered", "seconds"]].mean().to_string())
-    print(score_detection(found["lost"].to_numpy(bool), found["error_m"].to_numpy()))
+    is_wrong = (found["error_m"] > FOUND_M) | (found["error_deg"] > FOUND_DEG)
+    verdicts = pd.crosstab(found["lost"], is_wrong.rename("wrong"))
+    print("verdicts, wrong by 5 cm or 3 degrees", verdicts, sep="\n")
 
 
 def _track(scenes, methods, preset, frames: str, path: str, tracked=None) -> pd.DataFrame:
