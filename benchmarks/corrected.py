@@ -1,9 +1,10 @@
 """Tracking in corrected maps: accuracy, time, basin, and cameras without a start.
 
     python benchmarks/corrected.py [RECORDING]
+    python benchmarks/corrected.py ablation
 
-Writes tracking.csv, times.csv and searches.csv to paper_tables/corrected. RECORDING is a folder in
-the dataset's layout. Times count: run nothing else.
+Writes tracking.csv, times.csv and searches.csv, or ablation.csv, to paper_tables/corrected.
+RECORDING is a folder in the dataset's layout. Times count: run nothing else.
 """
 
 import sys
@@ -33,7 +34,10 @@ from nbtrack.core.settings import with_settings
 from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.runs import TrackCell
-from nbtrack.tracking import StepBudget
+from nbtrack.fields import correction
+from nbtrack.mapping.fit import correct_map
+from nbtrack.tracking import StepBudget, track_sequence
+from nbtrack.tracking.metrics import trajectory_metrics
 
 ALONE, FOUND_M, FOUND_DEG = Execution(workers=1), 0.05, 3.0
 _MIDDLE = "tracking.lm.n_pixels=2048"
@@ -55,9 +59,28 @@ COLUMNS = [
 ]  # fmt: skip
 
 
+# What a correction is made with, changed one at a time: settings, and constants of its module.
+SHORT = "mapping.neus_plus.iterations=300"
+ABLATION = [
+    ("as it is", (), {}),
+    ("from NeuS", (), {}),
+    ("from NeuS+ of 300 iterations", (SHORT,), {}),
+    ("at the surface alone", (), {"_OFFSETS": (0.0,)}),
+    ("offsets up to 1.5 cm", (), {"_OFFSETS": (-0.015, 0.0, 0.015)}),
+    ("30,000 points", (), {"_N_POINTS": 30_000}),
+    ("smoothness 0.1", (), {"_SMOOTHNESS": 0.1}),
+    ("smoothness 10", (), {"_SMOOTHNESS": 10.0}),
+    ("ends abruptly", (), {"_FADE": 0}),
+    ("cells of 8 cm", ("mapping.neus_plus.correct_voxel=0.08",), {}),
+]
+
+
 def main() -> None:
     """Measure and write everything."""
     torch.set_num_threads(1)
+    if sys.argv[1:] == ["ablation"]:
+        _write("ablation.csv", ablation())
+        return
     preset, second = load_preset("smoke"), load_preset("smoke", settings=["scenes.seed=1"])
     rooms, elsewhere = open_scenes(preset), open_scenes(second)
     recordings = [open_scene(folder, preset) for folder in sys.argv[1:]]
@@ -121,6 +144,42 @@ def frame_times(rooms, preset) -> pd.DataFrame:
             rows.append((room.name, label, n_pixels, milliseconds, float(np.linalg.norm(off))))
     table = pd.DataFrame(rows, columns=["scene", "method", "n_pixels", "milliseconds", "error_m"])
     return table.groupby(["scene", "method", "n_pixels"]).median().reset_index()
+
+
+def ablation() -> pd.DataFrame:
+    """Errors with 4,096 points in the two rooms for tuning, on the mapped and on another path."""
+    names, rows = "scenes.names=['bedroom', 'kitchen_nook']", []
+    preset, second = (load_preset("smoke", settings=[names, f"scenes.seed={n}"]) for n in (0, 1))
+    rooms, elsewhere = open_scenes(preset), open_scenes(second)
+    for what, settings, constants in ABLATION:
+        method = METHODS["neus_corrected" if what == "from NeuS" else "corrected"]
+        changed = with_settings(preset, "tracking.lm.n_pixels=4096", *method.settings, *settings)
+        usual = {name: getattr(correction, name) for name in constants}
+        for name, value in constants.items():
+            setattr(correction, name, value)
+        for room, other in zip(rooms, elsewhere, strict=True):
+            made = MapCell(room, method.field, changed)
+            made.base.outcome(None, lambda share, told: None)
+            began, sequence = time.perf_counter(), room.read()
+            field = correct_map(made.base.map(), sequence, made.settings).field
+            seconds = time.perf_counter() - began
+            for path, frames in product((room, other), (":120", "::4")):
+                followed = path.read(frames)
+                tracker = make_tracker(
+                    "lm",
+                    field,
+                    followed.T_world_camera[0],
+                    StepBudget(30),
+                    changed.tracking_of("lm"),
+                )
+                tracked = track_sequence(tracker, followed)
+                ate_m = trajectory_metrics(tracked.T_estimated, tracked.T_true)["ate_rmse_m"]
+                where = "mapped" if path is room else "second"
+                rows.append((what, room.name, where, frames, ate_m, seconds, len(field.numbers)))
+        for name, value in usual.items():
+            setattr(correction, name, value)
+    columns = ["changed", "scene", "path", "frames", "ate_m", "seconds", "vertices"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def _held_out(scene, preset) -> pd.DataFrame:
