@@ -151,8 +151,9 @@ def certainty(
     start, rotations at an arm of 1 m. Errors of the map are not independent, as residuals are here
     taken to be: these are lower bounds, good for telling poses apart, not for error bars.
     """
-    fits = (np.abs(value) < np.array(tolerance)[:, None]).all(axis=0)
-    is_inlier = fits & (reliability > 0)
+    is_inlier = reliability > 0
+    for residual, most in zip(value, tolerance, strict=True):
+        is_inlier &= np.abs(residual) < most
     values = np.linalg.eigvalsh(matrix)
     covariance = np.linalg.inv(matrix + START_PULL * np.eye(6)) / _DEVIATIONS**2  # rad, m
     rotation, position = (
