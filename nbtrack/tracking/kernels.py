@@ -45,22 +45,26 @@ def residual_rows(observed, T, grid, by_slope):
     first vertex, the voxel, and both corners of the box whose points are usable.
     """
     (points, intensity), (vertices, shape, place) = observed, grid
-    rows = np.empty((12, len(points)), np.float32)
-    step_x, step_y, one = np.uintp(shape[1] * shape[2]), np.uintp(shape[2]), np.uintp(1)
-    inverse, at, inside = 1 / place[3], np.empty(3, np.float32), np.empty(3, np.float32)
-    for i in range(len(points)):
-        number, is_usable = 0, True
-        for k in range(3):
+    n_points, inverse = len(points), 1 / place[3]
+    rows, numbers = np.empty((12, n_points), np.float32), np.zeros(n_points, np.int64)
+    at, inside = np.empty((2, 3, n_points), np.float32)
+    rows[2] = _ONE
+    for k in range(3):
+        last = shape[k] - 1.0
+        for i in range(n_points):
             arm = T[k, 0] * points[i, 0] + T[k, 1] * points[i, 1] + T[k, 2] * points[i, 2]
-            world, last = arm + T[k, 3], shape[k] - 1.0
-            is_usable &= place[4 + k] <= world <= place[7 + k]
+            world = arm + T[k, 3]
+            rows[3 + k, i] = arm
+            rows[2, i] *= (place[4 + k] <= world) & (world <= place[7 + k])
             scaled = (world - place[k]) * inverse
             # Points outside are moved to the border, where they have no slope; so are NaNs.
-            inside[k] = inverse if 0 <= scaled <= last else 0.0
+            inside[k, i] = inverse if (scaled >= 0) & (scaled <= last) else 0.0
             scaled = min(scaled, last) if scaled > 0 else 0.0
             cell = min(int(scaled), shape[k] - 2)
-            at[k], number, rows[3 + k, i] = scaled - cell, number * shape[k] + cell, arm
-        v, (x, y, z) = np.uintp(number), (at[0], at[1], at[2])
+            at[k, i], numbers[i] = scaled - cell, numbers[i] * shape[k] + cell
+    step_x, step_y, one = np.uintp(shape[1] * shape[2]), np.uintp(shape[2]), np.uintp(1)
+    for i in range(n_points):
+        v, x, y, z = np.uintp(numbers[i]), at[0, i], at[1, i], at[2, i]
         for k in range(2):
             a, b = vertices[v, k], vertices[v + one, k]
             c, d = vertices[v + step_y, k], vertices[v + step_y + one, k]
@@ -70,11 +74,10 @@ def residual_rows(observed, T, grid, by_slope):
             low, high = ab + y * (cd - ab), ef + y * (gh - ef)
             low_z, high_z = b - a + y * (d - c - b + a), f - e + y * (h - g - f + e)
             rows[k, i] = low + x * (high - low)
-            rows[6 + 3 * k, i] = (high - low) * inside[0]
-            rows[7 + 3 * k, i] = (cd - ab + x * (gh - ef - cd + ab)) * inside[1]
-            rows[8 + 3 * k, i] = (low_z + x * (high_z - low_z)) * inside[2]
+            rows[6 + 3 * k, i] = (high - low) * inside[0, i]
+            rows[7 + 3 * k, i] = (cd - ab + x * (gh - ef - cd + ab)) * inside[1, i]
+            rows[8 + 3 * k, i] = (low_z + x * (high_z - low_z)) * inside[2, i]
         rows[1, i] -= intensity[i]
-        rows[2, i] = _ONE if is_usable else _NONE
     _weigh(rows, by_slope)
     return rows
 
