@@ -63,7 +63,9 @@ class IcpTracker(Tracker):
         self.is_converged, self.inlier_ratio = False, 0.0
         measured = frame.measured_pixels()
         if measured.numel():
-            points = frame.points(*self.drawn_of(measured))[0].cpu().double().numpy()
+            size, seeded = (self.settings.n_pixels,), self.generator
+            drawn = torch.randint(measured.shape[1], size, generator=seeded, device=self.device)
+            points = frame.points(*measured[:, drawn])[0].cpu().double().numpy()
             thinned = self.small_gicp.voxelgrid_sampling(points, _SOURCE_VOXEL)
             self.source, _ = self._with_planes(thinned)
 

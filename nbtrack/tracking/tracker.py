@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from nbtrack.core import capture
@@ -159,12 +159,6 @@ class Tracker(abc.ABC):
         self.generator.set_state(state["generator"])
         for name in self.remembers:
             setattr(self, name, state[name])
-
-    def drawn_of(self, pixels: Int[Tensor, "2 n"]) -> Int[Tensor, "2 drawn"]:
-        """`n_pixels` random ones of some pixels (rows, columns); one may come twice."""
-        size = (self.settings.n_pixels,)
-        drawn = torch.randint(pixels.shape[1], size, generator=self.generator, device=self.device)
-        return pixels[:, drawn]
 
     def _search(self, frame: Frame, T_starts: Poses) -> Estimate:
         starts = torch.from_numpy(T_starts).float().to(self.device)
