@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nbtrack.core.arrays import Points, Values
 from nbtrack.core.device import constant
 
 
@@ -27,14 +28,12 @@ class SceneBounds:
         """Half of the longest side: it maps the box into [-1, 1]^3 without changing its shape."""
         return float((np.array(self.maximum) - np.array(self.minimum)).max() / 2)
 
-    def contain(self, points_world: Float[Tensor, "n 3"], margin: float = 0.0) -> Bool[Tensor, "n"]:
+    def contain(self, points_world: Points, margin: float = 0.0) -> Bool[Tensor, "n"]:
         """Whether points (m) lie inside the box, or no farther than `margin` metres from it."""
         low, high = self._corners(points_world)
         return ((points_world >= low - margin) & (points_world <= high + margin)).all(dim=-1)
 
-    def exit_depth(
-        self, origins_world: Float[Tensor, "rays 3"], directions_world: Float[Tensor, "rays 3"]
-    ) -> Float[Tensor, "rays"]:
+    def exit_depth(self, origins_world: Points, directions_world: Points) -> Values:
         """Where rays from inside leave the box, in units of the direction (z-depth, m, for z = 1).
 
         Rays that start outside, as a lost camera's do, may give small or negative values.

@@ -34,22 +34,29 @@ def as_dict(config: Any) -> dict[str, Any]:
 def with_settings(config: Config, *settings: str) -> Config:
     """The config with some `key=value` texts applied, the last one last.
 
-    Raises:
-        ConfigError: an unknown key, or a value of the wrong type.
+    Raises ConfigError as `with_values` does, and for a text that is none.
     """
     for setting in settings:
-        key, equals, text = setting.partition("=")
+        key, equals, text = (part.strip() for part in setting.partition("="))
         if not equals:
             raise ConfigError(f"setting {setting!r} has no value: write key=value")
-        config = with_values(config, {key.strip(): _parse_value(text.strip())})
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            if text.startswith(("[", "{", '"', "'")):
+                raise ConfigError(
+                    f"value {text!r} is no TOML: write ['a', 'b'] or [1, 2], and quote the whole "
+                    "setting, so that the shell leaves the inner quotes"
+                ) from None
+            value = text  # a bare word is a string
+        config = with_values(config, {key: value})
     return config
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     """The config with some values of dotted keys, or of trees of keys as TOML gives them.
 
-    Raises:
-        ConfigError: an unknown key, or a value of the wrong type.
+    Raises ConfigError for an unknown key, or a value of the wrong type or range.
     """
     valid = [key for key, _ in _leaves(config)]
     for key, value in _leaves(dict(values)):
@@ -79,19 +86,6 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         return
     for name, value in node.items():
         yield from _leaves(value, f"{prefix}.{name}" if prefix else name)
-
-
-def _parse_value(text: str) -> Any:
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        pass
-    if text.startswith(("[", "{", '"', "'")):
-        raise ConfigError(
-            f"value {text!r} is no TOML: write ['a', 'b'] or [1, 2], and quote the whole "
-            "setting, so that the shell leaves the inner quotes"
-        )
-    return text  # a bare word is a string
 
 
 def _replaced(node: Any, path: list[str], key: str, value: Any, least: int = 1) -> Any:

@@ -49,7 +49,8 @@ class DataReport:
         first = "".join(self.recording.color_files[i].name for i in jumps.index[:1])
         flicker = self.frames.flicker[self.frames.turned_deg < _SAME_VIEW_DEG].max()
         measured, scale = self.frames.measured.mean(), self.recording.declared.depth_scale
-        eights = _share_of_eights(self.cloud.depth * scale)
+        values = (self.cloud.depth * scale).round().unique()
+        eights = np.mean(values % 8 == 0) * (len(values) > 8)  # of a few it may be so by chance
         # Motion and depth tell nothing where they are read wrongly.
         is_right = self.best is self.readings[0]
         rules = [
@@ -160,12 +161,6 @@ def _by_frame(sequence: RgbdSequence) -> pd.DataFrame:
     steps = np.stack([moved_mm, np.degrees(turns.magnitude()), flicker], axis=1)
     steps = pd.DataFrame(steps, frames.index[1:], ["moved_mm", "turned_deg", "flicker"])
     return frames.join(steps[np.diff(frames.index) == 1])
-
-
-def _share_of_eights(values: pd.Series) -> float:
-    """Share of multiples of 8 among the values that occur; of a few it may be so by chance: 0."""
-    values = values.round().unique()
-    return np.mean(values % 8 == 0) * (len(values) > 8)
 
 
 def _cloud(reading: Reading, sequence: RgbdSequence) -> pd.DataFrame:

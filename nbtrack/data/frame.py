@@ -63,9 +63,9 @@ class Frame:
         """The same on a device."""
         return replace(self, color=self.color.to(device), depth_mm=self.depth_mm.to(device))
 
-    def measured_pixels(self) -> Int[Tensor, "2 n"]:
-        """Rows and columns of all pixels that have a depth."""
-        return torch.nonzero(self.depth_mm).T
+    def measured_pixels(self, stride: int = 1, first: int = 0) -> Int[Tensor, "2 n"]:
+        """Rows and columns of pixels that have a depth; all, or those on a regular grid."""
+        return first + stride * torch.nonzero(self.depth_mm[first::stride, first::stride]).T
 
     def at(self, rows: Indices, columns: Indices) -> tuple[Colors, Values]:
         """Colour in [0, 1] and z-depth (m, 0 = none) of pixels."""

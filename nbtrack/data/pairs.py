@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int
+from scipy.spatial import cKDTree
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import DataError, MissingError
@@ -99,17 +100,14 @@ def _entry(line: str) -> tuple[float, str]:
 
 def _nearest(times: Times, others: Times) -> Int[np.ndarray, "_"]:
     """For every time the index of the nearest other one (m > 0)."""
-    order = np.argsort(others, kind="stable")
-    ranks = np.searchsorted(others[order], times)
-    before, after = order[(ranks - 1).clip(0)], order[ranks.clip(max=len(others) - 1)]
-    return np.where(np.abs(others[before] - times) <= np.abs(others[after] - times), before, after)
+    return cKDTree(others[:, None]).query(times[:, None], p=1)[1]
 
 
 def posed_by_time(
     times: Times, poses: Poses, pose_times: Times, path: Path, tolerance: float = _TOLERANCE
 ) -> Poses:
     """The pose nearest to every frame in time; NaN where none is within the tolerance (s)."""
-    closest = _nearest(times, pose_times)
+    closest = _nearest(times, np.nan_to_num(pose_times))
     has_pose = np.abs(pose_times[closest] - times) <= tolerance
     if not (has_pose.any() and np.isfinite(pose_times).all()):
         raise DataError(

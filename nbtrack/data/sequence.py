@@ -36,15 +36,13 @@ class RgbdSequence:
     depths_mm: UInt16[np.ndarray, "frames height width"]  # z-depth, 0 = no measurement
     T_world_camera: Poses  # OpenCV camera axes
     frame_ids: Int[np.ndarray, "frames"]  # position in the folder's natural order
-    excluded_frames: int = 0  # frames left out because their pose is NaN
 
     def __len__(self) -> int:
         return len(self.frame_ids)
 
     def __repr__(self) -> str:
         size = f"{self.intrinsics.width}x{self.intrinsics.height}"
-        left_out = f", {self.excluded_frames} without pose" if self.excluded_frames else ""
-        return f"RgbdSequence({self.name!r}, {len(self)} frames of {size}{left_out})"
+        return f"RgbdSequence({self.name!r}, {len(self)} frames of {size})"
 
     def __getitem__(self, index: int) -> Frame:
         """One frame, with the pose that it was recorded with."""
@@ -106,10 +104,8 @@ def read_frames(
     """
     frame_ids = select_frames(recording, frames)
     known = frame_ids[recording.has_pose[frame_ids]]
-    poses, n_excluded = recording.T_world_camera[known], len(frame_ids) - len(known)
-    return RgbdSequence(
-        recording.name, *decode(recording, known, progress), poses, known, n_excluded
-    )
+    images = decode(recording, known, progress)
+    return RgbdSequence(recording.name, *images, recording.T_world_camera[known], known)
 
 
 def select_frames(recording: Recording, frames: slice) -> Int[np.ndarray, "n"]:
@@ -133,13 +129,10 @@ def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
     """
     height, width = sequence.depths_mm.shape[1:]
     stride = max(1, round((width * height / _POINTS_PER_FRAME) ** 0.5))
-    sides = (torch.arange(stride // 2, length, stride) for length in (height, width))
-    grid = torch.meshgrid(*sides, indexing="ij")
     clouds = []
     for index, T in enumerate(sequence.T_world_camera):
         frame = sequence[index]
-        seen = frame.depth_mm[grid] > 0
-        points_camera, _ = frame.points(*(pixels[seen] for pixels in grid))
+        points_camera, _ = frame.points(*frame.measured_pixels(stride, stride // 2))
         clouds.append(points_camera.numpy() @ T[:3, :3].T + T[:3, 3])
     points_world = np.concatenate(clouds)
     if len(points_world) == 0:

@@ -106,8 +106,7 @@ def cells_of(
 
 def measured_points(frame: Frame, stride: int = 1) -> tuple[WorldPoints, WorldPoints]:
     """World points (m) and colours (in [0, 1]) of measured pixels, `stride` apart."""
-    pixels = frame.measured_pixels()
-    rows, columns = pixels[:, (pixels % stride == 0).all(dim=0)]
+    rows, columns = frame.measured_pixels(stride)
     points_camera = frame.points(rows, columns)[0].double().numpy()
     T_world_camera = frame.T_world_camera
     points = points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]

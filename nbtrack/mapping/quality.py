@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from nbtrack.core.arrays import Frames, Points, Values
+from nbtrack.core.arrays import Frames
 from nbtrack.core.camera import pixel_directions
 from nbtrack.core.errors import DataError
 from nbtrack.core.geometry import transform_points
@@ -79,18 +79,11 @@ def _score_images(
     origins, directions = rays.origins_world[hit], rays.directions_world[hit]
     color, depth = field.render_rays(origins, directions)
     psnr_db = -10 * float(np.log10((color - rays.color[hit]).square().mean().item()))
-    reference = rays.depth[hit].cpu() if room is None else _true_depth(room, origins, directions)
+    reference = rays.depth[hit].cpu()
+    if room is not None:
+        exact = (rays.cpu().double().numpy() for rays in (origins, directions))
+        reference = torch.from_numpy(room.first_hit(*exact)[0]).float()
     return {"psnr_db": psnr_db, "depth_l1_m": (depth.cpu() - reference).abs().mean().item()}
-
-
-def _true_depth(room: Room, origins_world: Points, directions_world: Points) -> Values:
-    """Exact z-depth (m) of rays."""
-    origins, camera = origins_world.cpu().double().unique(dim=0, return_inverse=True)
-    directions, depth = directions_world.cpu().double().numpy(), torch.empty(len(camera))
-    for number, origin in enumerate(origins.numpy()):
-        rays = (camera == number).numpy()
-        depth[rays] = torch.from_numpy(room.first_hit(origin, directions[rays])[0]).float()
-    return depth
 
 
 def _score_sdf(field: Field, sequence: RgbdSequence, mapped: Frames, room: Room) -> Scores:

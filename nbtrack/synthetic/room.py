@@ -11,12 +11,24 @@ import numpy as np
 from jaxtyping import Float
 
 from nbtrack.core.errors import MissingError, NumericalError, nearest_name
-from nbtrack.synthetic import furniture, materials
+from nbtrack.synthetic import materials
 from nbtrack.synthetic.materials import Light, Material, Pair, Part
-from nbtrack.synthetic.primitives import Array3, Indices, Points, RoomShell, Values, row_dot
+from nbtrack.synthetic.primitives import (
+    Array3,
+    Box,
+    Cylinder,
+    Indices,
+    Origins,
+    Points,
+    RoomShell,
+    Sphere,
+    Values,
+    row_dot,
+)
 
 _TABLES = tomllib.loads(Path(__file__).with_name("rooms.toml").read_text(encoding="utf-8"))
 _PALETTE = _TABLES.pop("palette")
+_SOLIDS = {"box": Box, "cylinder": Cylinder, "sphere": Sphere}
 _OPENNESS_RADIUS = 0.2  # m; how far contact shadows reach (our choice)
 
 ROOMS: tuple[str, ...] = tuple(_TABLES)
@@ -77,19 +89,21 @@ class Room:
             distance[rows] = np.minimum(distance[rows], part.solid.sdf(points[rows]))
         return distance
 
-    def first_hit(self, origin: Array3, directions: Points) -> tuple[Values, Indices]:
-        """Ray parameter and index in `parts` of the first surface from a point in free space."""
+    def first_hit(self, origins: Origins, directions: Points) -> tuple[Values, Indices]:
+        """Ray parameter and index in `parts` of the first surface from points in free space."""
         t = np.full(len(directions), np.inf)
         index = np.zeros(len(directions), dtype=np.int64)
         lengths = np.sqrt(row_dot(directions, directions))
         for number, part in enumerate(self.parts):
-            towards = part.solid.center - origin
+            towards = part.solid.center - origins
             # Only rays in the cone around the solid may meet it; from within the sphere, all. The
             # tangent is taken slightly short, so that rounding never drops a ray that grazes.
-            squared = float(towards @ towards) - (part.solid.reach * 1.001) ** 2
-            least = lengths * np.sqrt(squared) if squared > 0.0 else -np.inf
-            rays = np.flatnonzero(directions @ towards >= least)
-            candidate = part.solid.hit(origin, directions[rays])
+            squared = row_dot(towards, towards) - (part.solid.reach * 1.001) ** 2
+            least = np.where(squared > 0.0, lengths * np.sqrt(np.maximum(squared, 0.0)), -np.inf)
+            rays = np.flatnonzero(row_dot(directions, towards) >= least)
+            candidate = part.solid.hit(
+                origins if origins.ndim == 1 else origins[rays], directions[rays]
+            )
             closer = candidate < t[rays]
             t[rays[closer]] = candidate[closer]
             index[rays[closer]] = number
@@ -119,23 +133,24 @@ def build_room(name: str) -> Room:
         raise MissingError(f"no synthetic room '{name}'; {nearest_name(name, list(ROOMS))}")
     table = _TABLES[name]
     named: dict[str, Material] = {}
-    for label, fields in (_PALETTE | table["materials"]).items():
-        options = {key: _resolved(value, named) for key, value in fields.items() if key != "kind"}
-        named[label] = partial(getattr(materials, fields["kind"]), **options)
+    for label, material in (_PALETTE | table["materials"]).items():
+        named[label] = _resolved(material, named)
     width, height, depth = table["size"]
     shell = RoomShell((0.0, height / 2, 0.0), (width, height, depth))
     lining = partial(materials.lining, shell=shell, **_resolved(table["surfaces"], named))
     parts = [Part(shell, lining)]
-    for piece, *arguments in table["parts"]:
-        parts.append(getattr(furniture, piece)(*_resolved(arguments, named)))
+    for kind, *arguments in table["parts"]:
+        material, *shape = _resolved(arguments, named)
+        parts.append(Part(_SOLIDS[kind](*shape), material))
     light, walk = (_resolved(table[key], named) for key in ("light", "walk"))
     return Room(name, tuple(parts), Light(**light), Walk(**walk))
 
 
 def _resolved(value: Any, named: dict[str, Material]) -> Any:
-    """A value of the file with its material names looked up and its lists as tuples."""
+    """A value of the file with its materials made or looked up and its lists as tuples."""
     if isinstance(value, dict):
-        return {key: _resolved(item, named) for key, item in value.items()}
+        options = {key: _resolved(item, named) for key, item in value.items() if key != "kind"}
+        return partial(getattr(materials, value["kind"]), **options) if "kind" in value else options
     if isinstance(value, list):
         return tuple(_resolved(item, named) for item in value)
     return named[value] if isinstance(value, str) else value
