@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from box_room import BoxRoom, box_sequence
 from recordings import (
+    CAMERA,
     Source,
     along_rays,
     camera_matrix,
@@ -40,7 +41,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 REAL_ROOM = Path(__file__).resolve().parents[2] / "shared/data/real_room"
 NEEDS_REAL = pytest.mark.skipif(not REAL_ROOM.is_dir(), reason="no real recording here")
 SEEN = ["living_room", "office", "long_hall", pytest.param("real_room", marks=NEEDS_REAL)]
-CAMERA = synthetic.room_intrinsics(48, 36)
 Change = Callable[[Source], Source]
 N_FRAMES = 16
 MOVED_MM = 30 * np.linalg.norm([0.55, -0.4, 0.73])
@@ -191,14 +191,11 @@ def seen(name: str) -> Source:
         quarter = (slice(None), slice(2, None, 4), slice(2, None, 4))
         colors, depths = sequence.colors[quarter], sequence.depths_mm[quarter]
         return Source(colors, depths, sequence.T_world_camera, camera)
-    room = synthetic.build_room(name)
-    poses = synthetic.handheld_trajectory(room, 90, 0)[::5]
-    rendered = [synthetic.render_frame(room, CAMERA, pose) for pose in poses]
-    depths = []
-    for number, (_, depth, _) in enumerate(rendered):
-        noisy = synthetic.add_kinect_noise(depth, CAMERA.fx, np.random.default_rng(number))
+    depths, rng = [], np.random.default_rng(0)
+    for clean in source(name, 18, 5).depths_mm / 1000:
+        noisy = synthetic.add_kinect_noise(clean, CAMERA.fx, rng)
         depths.append(np.rint(1000 * synthetic.filter_depth(noisy)).astype(np.uint16))
-    return Source(np.stack([color for color, _, _ in rendered]), np.stack(depths), poses, CAMERA)
+    return source(name, 18, 5)._replace(depths_mm=np.stack(depths))
 
 
 class Case(NamedTuple):
@@ -314,12 +311,8 @@ def test_long_way_between_frames(tmp_path: Path) -> None:
 def test_key_frames_far_apart(tmp_path: Path, stride: int) -> None:
     """Catches alarms about frames 0.2 m and 27 degrees apart and more: about surfaces of which too
     little is seen twice, about steps that are all long, about light that differs with the view."""
-    room = synthetic.build_room("living_room")
-    poses = synthetic.handheld_trajectory(room, 12 * stride, 0)[::stride]
-    rendered = [synthetic.render_frame(room, CAMERA, pose) for pose in poses]
-    depths = [np.rint(1000 * depth).astype(np.uint16) for _, depth, _ in rendered]
-    data = Source(np.stack([color for color, _, _ in rendered]), np.stack(depths), poses, CAMERA)
-    assert check(write(tmp_path / "r", "office", Case("", change=lambda _: data))).warnings == []
+    apart = Case("", change=lambda _: source("living_room", 12, stride))
+    assert check(write(tmp_path / "r", "office", apart)).warnings == []
 
 
 def test_sentences_name_files_that_are_there(tmp_path: Path) -> None:

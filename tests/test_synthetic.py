@@ -13,9 +13,8 @@ from nbtrack.data.sequence import read_sequence
 from nbtrack.synthetic import make_room, room_frames, room_intrinsics, room_of
 from nbtrack.synthetic.motion import handheld_trajectory, motion_statistics
 from nbtrack.synthetic.primitives import Box, Cylinder, RoomShell, Sphere
-from nbtrack.synthetic.render import render_frame
+from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame
 from nbtrack.synthetic.room import REPORTED_ROOMS, ROOMS, Room, build_room, true_surface_points
-from nbtrack.synthetic.sensor import add_kinect_noise, filter_depth
 
 SOLIDS = {
     "box": Box((0.1, -0.2, 0.3), (0.8, 0.5, 1.1)),

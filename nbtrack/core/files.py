@@ -100,12 +100,9 @@ def versions() -> dict[str, str]:
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Replaces the file at `path` by `content` in one move; missing parent folders are made.
+    """Replaces the file at `path` by `content` in one move, as `write_together` does.
 
     Text is UTF-8 with the given line ends on every system.
-
-    Raises:
-        OSError: the folder cannot be made or written; an existing file is then left as it was.
     """
     write_together(path.parent, {path.name: content})
 
@@ -115,9 +112,7 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
 
     All are written aside before the first is moved, so that a disk that fills up leaves the
     earlier ones as they were. Whoever is killed between two moves leaves a folder without the last.
-
-    Raises:
-        OSError: the folder cannot be made or written; it names the last file.
+    Missing folders are made. Raises OSError, which names the last file, where that is not possible.
     """
     # The process id keeps two writers of one path from moving each other's half-written file.
     asides = {folder / name: folder / f".{name}.{os.getpid()}.tmp" for name in contents}
@@ -139,11 +134,7 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
 
 
 def json_text(content: Any) -> str:
-    """JSON, indented, keys in the given order, newline at the end.
-
-    Raises:
-        ValueError: a number is NaN or infinite, for which JSON has no word; pass None instead.
-    """
+    """JSON, indented. Raises ValueError for NaN and infinity, which it cannot say: pass None."""
     return json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
@@ -157,12 +148,9 @@ def read_json(path: Path) -> dict[str, Any]:
 def naming_damaged(
     path: Path, kind: str = "checkpoint", advice: str = "remove it and run the same command again"
 ) -> Iterator[None]:
-    """Turn what goes wrong in reading a file and taking up its content into one line that names it.
+    """Turn what goes wrong in reading a file and taking up its content into a DataError in a line.
 
     Bytes of any other kind make readers stumble in many ways; an interruption is none of them.
-
-    Raises:
-        DataError: the block met bytes it cannot read, or a part that is missing or of another kind.
     """
     try:
         yield

@@ -51,8 +51,7 @@ class DataReport:
         measured, scale = self.frames.measured.mean(), self.recording.declared.depth_scale
         values = (self.cloud.depth * scale).round().unique()
         eights = np.mean(values % 8 == 0) * (len(values) > 8)  # of a few it may be so by chance
-        # Motion and depth tell nothing where they are read wrongly.
-        is_right = self.best is self.readings[0]
+        is_right = self.best is self.readings[0]  # else motion and depth tell nothing
         rules = [
             (True, diagnosis(self.readings, self.best, self.recording)),
             (

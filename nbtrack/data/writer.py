@@ -32,16 +32,11 @@ def write_sequence(
     notes: Mapping[str, str] | None = None,
     progress: Callable[[int], object] = lambda done: None,
 ) -> None:
-    """Write frames in a hidden folder and put it in place at the end.
+    """Write frames, and notes (texts of further files, by name), as a scene in the layout.
 
-    A run that is killed, or ends with an exception, leaves no half-written scene behind.
-
-    Args:
-        notes: texts of small files beside the layout's own, by name.
-        progress: called after each frame with how many are written.
-
-    Raises:
-        DataError: the folder exists, a frame has another size than the camera, or there is none.
+    It is put in place when it is complete: a run that is killed leaves no half-written scene.
+    `progress` is called after each frame with how many are written. Raises DataError if the folder
+    exists, a frame has another size than the camera, or there is none.
     """
     if folder.exists():
         raise DataError(f"{folder} exists: choose another folder or remove it first")
@@ -59,12 +54,7 @@ def write_sequence(
             raise DataError(f"no frame was added to {folder}: a scene needs at least one")
         for name, text in (_texts(camera, np.stack(poses)) | dict(notes or {})).items():
             (unfinished / name).write_text(text, encoding="utf-8")
-        try:
-            unfinished.rename(folder)
-        except OSError:
-            # Another command may have finished the same scene meanwhile: then that one stands.
-            if not folder.is_dir():
-                raise
+        unfinished.rename(folder)  # fails if another command has finished it meanwhile
 
 
 def _write_images(

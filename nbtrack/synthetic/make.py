@@ -15,9 +15,8 @@ from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.core.files import json_text, naming_damaged
 from nbtrack.data.writer import WrittenFrame, write_sequence
 from nbtrack.synthetic.motion import handheld_trajectory
-from nbtrack.synthetic.render import render_frame
+from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame
 from nbtrack.synthetic.room import Room, build_room
-from nbtrack.synthetic.sensor import add_kinect_noise, filter_depth
 
 ROOM_FILE = "room.json"
 ROOM_VERSION = 2  # raise it when a room, the motion or the sensor model changes
@@ -75,11 +74,7 @@ def make_room(
 
     Clean depth goes to `depth/`, the sensor's to `depth_with_noise/` and `depth_filtered/`; the
     poses are exact in both pose files. `room.json` records how the scene was made. The same
-    arguments give the same bytes. The folder, which must not exist yet, appears when it is
-    complete. `progress` is called with the number of frames done after each.
-
-    Raises `MissingError` (no such room), `ConfigError` (a number is too small), `DataError`
-    (the folder exists).
+    arguments give the same bytes. Raises as `build_room`, `room_frames` and `write_sequence` do.
     """
     room = build_room(name)
     record = {"room": name, "version": ROOM_VERSION, "seed": seed, "frames": n_frames}

@@ -77,7 +77,11 @@ def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses
     values = 0.4 * np.clip(rng.normal(size=len(bursts)), -1.6, 1.6)
     speed = np.exp(CubicSpline(bursts, values)(np.arange(length) / _BURST_FRAMES))
     speed /= speed.mean()
-    tremor = _tremor(length, rng)
+    # A hand's tremor, (n, 6): translation (m) and rotation (rad), four sines of 1.5 to 5 Hz each.
+    cycles_per_frame, phases = rng.uniform(1.5, 5.0, (4, 6)) / 30, rng.uniform(0, 2 * np.pi, (4, 6))
+    amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / 2.0
+    waves = np.sin(2 * np.pi * cycles_per_frame * np.arange(length)[:, None, None] + phases)
+    tremor = amplitude * waves.sum(axis=1)
     center = np.asarray(walk.center) + rng.uniform(-_CENTER_REACH, _CENTER_REACH, 2)
     heading = walk.start_yaw + rng.uniform(-_HEADING_REACH, _HEADING_REACH)
     rate, radius = np.radians(0.5), 0.7
@@ -88,15 +92,6 @@ def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses
         rate *= np.clip(MEAN_STEP_DEG / mean_deg, 0.7, 1.4)
         radius *= np.clip(MEAN_STEP_MM / mean_mm, 0.7, 1.4)
     return poses
-
-
-def _tremor(length: int, rng: np.random.Generator) -> Float[np.ndarray, "n 6"]:
-    """Translation (m) and rotation (rad): four sines an axis, 1.5 to 5 Hz at 30 frames a second."""
-    cycles_per_frame = rng.uniform(1.5, 5.0, (4, 6)) / 30.0
-    phases = rng.uniform(0, 2 * np.pi, (4, 6))
-    amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / 2.0
-    waves = np.sin(2 * np.pi * cycles_per_frame * np.arange(length)[:, None, None] + phases)
-    return amplitude * waves.sum(axis=1)
 
 
 def _poses(center, heading: float, turned: Values, wander, radius: float, tremor) -> Poses:

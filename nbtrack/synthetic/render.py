@@ -1,18 +1,28 @@
-"""One picture of a room: exact z-depth at pixel centers, anti-aliased color."""
+"""What a camera sees of a room: exact pictures, and those of a structured-light depth camera."""
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.ndimage import map_coordinates
 
 from nbtrack.core.arrays import Pose
 from nbtrack.core.camera import Intrinsics
 from nbtrack.synthetic.room import Room
 
-# Samples of a refined pixel, as offsets from its center in pixels: a 2x2 grid.
-_SUBPIXELS = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)]
-_CONTRAST = 0.06  # difference of color to a neighbor above which a pixel is refined (our choice)
 Color = UInt8[np.ndarray, "h w 3"]
 Depth = Float[np.ndarray, "h w"]
 Surfaces = Int[np.ndarray, "h w"]
+# Samples of a refined pixel, as offsets from its center in pixels: a 2x2 grid.
+_SUBPIXELS = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)]
+_CONTRAST = 0.06  # difference of color to a neighbor above which a pixel is refined (our choice)
+BASELINE = 0.075  # m between projector and camera (Khoshelham & Elberink 2012, Kinect v1)
+DISPARITY_STEP = 1 / 8  # px at 640 width: the sensor's sub-pixel resolution (the same source)
+DISPARITY_NOISE = 1 / 16  # px at 640 width: half a step of random error (the same source)
+LATERAL_NOISE = 0.5  # px at 640 width; Handa et al. 2014 (ICL-NUIM) shift lookups likewise
+RANGE = (0.4, 8.0)  # m; nearer and farther is invalid (our choice, near the sensor's limits)
+MAX_INCIDENCE = np.radians(82.0)  # dropped beyond; Nguyen et al. 2012: noise explodes there
+EDGE_JUMP = 1.0  # px of disparity at 640 width that make a depth edge (our choice)
+EDGE_DROPOUT = 0.6  # probability that a pixel at an edge is lost (our choice)
 
 
 def render_frame(
@@ -51,3 +61,84 @@ def _rough(image: Float[np.ndarray, "h w 3"], surfaces: Surfaces) -> Bool[np.nda
     steep = [np.abs(np.diff(looks, axis=axis)).max(axis=2) > _CONTRAST for axis in (0, 1)]
     below, right = np.pad(steep[0], ((1, 1), (0, 0))), np.pad(steep[1], ((0, 0), (1, 1)))
     return below[1:] | below[:-1] | right[:, 1:] | right[:, :-1]
+
+
+def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> Depth:
+    """Depth (m, 0 = invalid) as a Kinect-like sensor would report it.
+
+    Lookups jitter sideways; disparity gets Gaussian noise and is rounded to an eighth of a pixel,
+    which makes depth steps and errors grow with the square of depth (2.7 cm steps at 3 m); pixels
+    at depth edges, at grazing incidence and out of range are lost. All pixel constants hold at a
+    width of 640; other widths are treated as the same camera's image made smaller. Where the exact
+    depth is 0 or not finite nothing is seen. `focal` (pixels) is that of this image; `rng` advances
+    by a fixed number of draws.
+
+    Source: Khoshelham & Elberink, Sensors 2012 (disparity model); Nguyen et al., 3DIMPVT 2012
+    (growth with incidence); Handa et al., ICRA 2014 (jitter, rounding). Dropout probability and
+    thresholds are our choice.
+    """
+    height, width = depth.shape
+    per_pixel = 640.0 / width
+    scale = focal * per_pixel * BASELINE  # disparity (px at width 640) times depth (m)
+    seen = np.isfinite(depth) & (depth > 0)
+    exact = np.where(seen, scale / np.where(seen, depth, 1.0), 0.0)
+    lost = ~seen | _is_grazing(exact, focal)
+    lost |= _is_edge(exact) & (rng.uniform(size=depth.shape) < EDGE_DROPOUT)
+    shift = rng.normal(scale=LATERAL_NOISE / per_pixel, size=(2, height, width))
+    places = np.indices(depth.shape) + shift
+    # Between pixels: at a width of 96 the jitter is below a tenth of one.
+    looked_up, was_seen = (
+        map_coordinates(values, places, order=1, mode="nearest") for values in (exact, 1.0 * seen)
+    )
+    noisy = looked_up + rng.normal(scale=DISPARITY_NOISE, size=depth.shape)
+    disparity = np.rint(noisy / DISPARITY_STEP) * DISPARITY_STEP
+    measured = scale / np.maximum(disparity, DISPARITY_STEP)
+    lost |= (measured < RANGE[0]) | (measured > RANGE[1]) | (was_seen < 0.999)
+    return np.where(lost, 0.0, measured)
+
+
+def _is_edge(disparity: Depth) -> Bool[np.ndarray, "h w"]:
+    """Pixels where disparity bends sharply: it is affine on planes, however slanted they are."""
+    across, along = (np.abs(np.diff(disparity, 2, axis=axis)) > EDGE_JUMP for axis in (0, 1))
+    return np.pad(across, ((1, 1), (0, 0))) | np.pad(along, ((0, 0), (1, 1)))  # no border
+
+
+def _is_grazing(disparity: Depth, focal: float) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose surface is seen at more than `MAX_INCIDENCE` from its normal.
+
+    On a plane, inverse depth is a x + b y + c over normalised coordinates (x, y), and (a, b, c)
+    is parallel to the normal: the slopes of disparity give the normal without back-projection.
+    """
+    height, width = disparity.shape
+    slope_y, slope_x = focal * _gentler_slope(disparity), focal * _gentler_slope(disparity.T).T
+    y = ((np.arange(height) + 0.5 - height / 2) / focal)[:, None]
+    x = ((np.arange(width) + 0.5 - width / 2) / focal)[None, :]
+    constant = disparity - slope_x * x - slope_y * y
+    normal = np.sqrt(slope_x**2 + slope_y**2 + constant**2)
+    cosine = disparity / np.maximum(normal * np.sqrt(1 + x * x + y * y), 1e-12)
+    return cosine < np.cos(MAX_INCIDENCE)
+
+
+def _gentler_slope(values: Depth) -> Depth:
+    """Difference per row to the next or the last row, whichever is less: no slope over an edge."""
+    steps = np.diff(values, axis=0)
+    forward = np.concatenate([steps, steps[-1:]])
+    backward = np.concatenate([steps[:1], steps])
+    return np.where(np.abs(forward) < np.abs(backward), forward, backward)
+
+
+def filter_depth(depth: Depth, sigma_px: float = 2.0, sigma_range: float = 0.1) -> Depth:
+    """Bilateral filter of depth (m); invalid pixels (0) stay invalid and influence none.
+
+    Standard deviations are in space (pixels at a width of 640) and of depth differences (m). The
+    first shrinks with the image, but not below 0.7 pixels of it: small images are smoothed too.
+
+    Source: Neural RGB-D filters its noisy depth with these values; the lower limit is our choice.
+    """
+    sigma = max(sigma_px * depth.shape[1] / 640.0, 0.7)
+    valid = depth > 0
+    # Far from every real depth an invalid pixel has no weight; zero would pull at 0.4 m.
+    marked = np.where(valid, depth, -10.0 * sigma_range - 1.0).astype(np.float32)
+    diameter = 2 * int(np.ceil(2 * sigma)) + 1
+    smooth = cv2.bilateralFilter(marked, diameter, sigma_range, sigma)
+    return np.where(valid, smooth.astype(np.float64), 0.0)
