@@ -50,21 +50,6 @@ def test_project_undoes_backproject(shape: tuple[int, ...]) -> None:
     torch.testing.assert_close(project(CAMERA, points), pixel, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0, 0.25])
-def test_scaled_camera_sees_the_same(factor: float) -> None:
-    """Catches a principal point or focal length that is left behind: angles must not change.
-
-    The real-valued pixel index i addresses i + 0.5; scaled, that is factor (i + 0.5).
-    """
-    small = CAMERA.scaled(factor)
-    assert (small.width, small.height) == (640 * factor, 480 * factor)
-    columns, rows = torch.tensor([0.0, 100.0, 639.0]), torch.tensor([3.0, 200.0, 479.0])
-    torch.testing.assert_close(
-        pixel_directions(small, factor * (columns + 0.5) - 0.5, factor * (rows + 0.5) - 0.5),
-        pixel_directions(CAMERA, columns, rows),
-    )
-
-
 @pytest.mark.parametrize(
     ("origin", "direction", "expected"),
     [

@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack import synthetic
 from nbtrack.cli import main
+from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.settings import with_settings
 from nbtrack.data.check import DataReport, check_recording
@@ -186,8 +187,9 @@ def seen(name: str) -> Source:
     """A room with a Kinect's noise, or the real recording at a quarter of its size."""
     if name == "real_room":
         sequence = read_sequence(REAL_ROOM, slice(0, 36, 2))
+        K = sequence.intrinsics
         # The middle of four pixels is the corner of one: the principal point moves with it.
-        camera = replace(sequence.intrinsics.scaled(0.25), cx=39.875, cy=29.875)
+        camera = Intrinsics(80, 60, 0.25 * K.fx, 0.25 * K.fy, 39.875, 29.875)
         quarter = (slice(None), slice(2, None, 4), slice(2, None, 4))
         colors, depths = sequence.colors[quarter], sequence.depths_mm[quarter]
         return Source(colors, depths, sequence.T_world_camera, camera)

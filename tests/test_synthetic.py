@@ -43,7 +43,8 @@ def test_sdf_is_the_distance_to_the_surface(body):
     surface that nobody can see."""
     rng = np.random.default_rng(0)
     if isinstance(body, Room):
-        surface, points = true_surface_points(body, 10_000, 0), rng.uniform(*body.bounds, (200, 3))
+        surface, size = true_surface_points(body, 10_000, 0), np.array(body.parts[0].solid.size)
+        points = rng.uniform(-0.5, 0.5, (200, 3)) * size + body.parts[0].solid.center
         points = points[body.sdf(points) > 1e-3]  # where bodies overlap it is a bound
         nearby = np.minimum(body.sdf(points), 0.3)
         np.testing.assert_allclose(body.sdf_up_to(points, 0.3), nearby, atol=1e-12)

@@ -27,13 +27,6 @@ class Intrinsics:
         """Square pixels and a centred principal point: what the Neural RGB-D layout stores."""
         return cls(width, height, focal, focal, width / 2, height / 2)
 
-    def scaled(self, factor: float) -> "Intrinsics":
-        """The same camera with images resized by `factor` (0.5 halves width and height)."""
-        return Intrinsics(
-            round(self.width * factor), round(self.height * factor),
-            self.fx * factor, self.fy * factor, self.cx * factor, self.cy * factor,
-        )  # fmt: skip
-
 
 def pixel_directions(
     intrinsics: Intrinsics, columns: Real[Tensor, "*n"], rows: Real[Tensor, "*n"]

@@ -108,11 +108,12 @@ def readings(declared: Declaration, camera: Intrinsics) -> list[Reading]:
     table += [("depth", f"{n:g} depth values a metre", {"depth_scale": n}) for n in _SCALES]
     table += [("depth", name, {"depth_along": along}) for along, name in _ALONG.items()]
     found = [Reading(what, name, replace(declared, **keys), camera) for what, name, keys in table]
-    cameras = {"with its principal point in the middle of the image": camera}
-    for much, factor in (("twice", 0.5), ("half", 2.0)):
-        cameras[f"for images {much} as large"] = camera.scaled(factor)
-    for name, scaled in cameras.items():
+    factors = {"with its principal point in the middle of the image": 1.0}
+    factors |= {"for images twice as large": 0.5, "for images half as large": 2.0}
+    lengths = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    for name, factor in factors.items():
         # The principal point scales with the rest, or is in the middle of any image.
+        scaled = Intrinsics(camera.width, camera.height, *(factor * lengths).tolist())
         middle = replace(scaled, cx=camera.width / 2, cy=camera.height / 2)
         found += [Reading("calibration", f"one {name}", declared, c) for c in (scaled, middle)]
     return found[:1] + [r for r in found if (r.declared, r.camera) != (declared, camera)]

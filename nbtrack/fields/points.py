@@ -14,7 +14,6 @@ from torch import Tensor
 from nbtrack.core.arrays import Colors, Frames, Points, Values, WorldPoints
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.settings import may_be_zero
-from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 
 _FRAMES_AT_ONCE = 8  # frames whose voxels wait to be merged: what the memory is bounded by
@@ -83,7 +82,11 @@ def fuse_points(
     # For each voxel's number the sums of x, y, z (m), red, green, blue, and one a pixel.
     parts = []
     for count, index in enumerate(frames.tolist(), start=1):
-        points, colors = measured_points(sequence[index], stride)
+        frame, T_world_camera = sequence[index], sequence.T_world_camera[index]
+        rows, columns = frame.measured_pixels(stride)
+        points_camera = frame.points(rows, columns)[0].double().numpy()
+        points = points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+        colors = frame.color[rows, columns].numpy() / 255.0
         voxels, inside = cells_of(points, low, shape, voxel)
         values = np.concatenate([points, colors, np.ones((len(points), 1))], axis=1)[inside]
         parts.append(pd.DataFrame(values, voxels))
@@ -102,12 +105,3 @@ def cells_of(
     cells = np.floor((points - low) / voxel).astype(np.int64)
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
     return np.ravel_multi_index(tuple(cells[inside].T), tuple(shape)), inside
-
-
-def measured_points(frame: Frame, stride: int = 1) -> tuple[WorldPoints, WorldPoints]:
-    """World points (m) and colours (in [0, 1]) of measured pixels, `stride` apart."""
-    rows, columns = frame.measured_pixels(stride)
-    points_camera = frame.points(rows, columns)[0].double().numpy()
-    T_world_camera = frame.T_world_camera
-    points = points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    return points, frame.color[rows, columns].numpy() / 255.0

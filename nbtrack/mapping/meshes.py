@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from skimage.measure import marching_cubes
 
-from nbtrack.core.arrays import Frames
+from nbtrack.core.arrays import Frames, WorldPoints
 from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, PointCloud
@@ -55,9 +55,7 @@ def extract_mesh(
 
 
 @torch.no_grad()
-def query_field(
-    field: Field, points_world: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+def query_field(field: Field, points_world: WorldPoints) -> tuple[WorldPoints, np.ndarray]:
     """Colours and values at any number of points (m), some at a time to bound the memory."""
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32))
     answers = [field(part.to(field.device)) for part in points.split(_POINTS_AT_ONCE)]
@@ -66,7 +64,7 @@ def query_field(
 
 
 def seen_by(
-    points_world: Float[np.ndarray, "n 3"], sequence: RgbdSequence, frames: Frames | None = None
+    points_world: WorldPoints, sequence: RgbdSequence, frames: Frames | None = None
 ) -> Bool[np.ndarray, "n"]:
     """Whether a point (m) lies in some frame's view and not behind what that frame measured.
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from nbtrack.core.errors import MissingError, NumericalError, nearest_name
 from nbtrack.synthetic import materials
@@ -60,13 +59,6 @@ class Room:
     def number(self) -> int:
         """A number made of the name, so that one seed means another path in every room."""
         return zlib.crc32(self.name.encode())
-
-    @property
-    def bounds(self) -> Float[np.ndarray, "2 3"]:
-        """Lower and upper corner (m) of the room's inside."""
-        shell = self.parts[0].solid
-        half = np.asarray(shell.size) / 2
-        return np.asarray(shell.center) + np.array([-half, half])
 
     def sdf(self, points: Points) -> Values:
         """Signed distance (m) to the nearest surface, positive in free space and exact there.
