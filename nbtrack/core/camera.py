@@ -34,10 +34,8 @@ def pixel_directions(
     """Ray directions (camera frame) through pixel centres, with z = 1.
 
     A z-depth times this direction is the observed point. The length is not one: at the corner of
-    a 640x480 image with a 60 degree field of view it is about 1.23.
-
-    Args:
-        columns, rows: integer pixel indices, or real ones (0 addresses the centre at 0.5).
+    a 640x480 image with a 60 degree field of view it is about 1.23. Pixel indices are integers, or
+    real ones (0 addresses the centre at 0.5).
     """
     x = (columns.float() + 0.5 - intrinsics.cx) / intrinsics.fx
     y = (rows.float() + 0.5 - intrinsics.cy) / intrinsics.fy

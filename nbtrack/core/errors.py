@@ -30,11 +30,7 @@ class OutOfMemory(NbtrackError, MemoryError):
 
 
 def nearest_name(found: str, allowed: list[str]) -> str:
-    """Hint for a misspelt name: `did you mean 'x'? Allowed: a, b, x`.
-
-    Args:
-        found: the name as the user gave it.
-        allowed: every valid name, in the order in which to list them; of many, the nearest few.
+    """Hint for a misspelt name, with every valid one in the order given; of many, the nearest few.
 
     >>> nearest_name("imapp", ["imap", "neus"])
     "did you mean 'imap'? Allowed: imap, neus"

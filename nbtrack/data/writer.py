@@ -79,7 +79,8 @@ def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
     T_file = FORMATS["neural_rgbd"].declared.poses_to_opencv(T_world_camera)
     poses = _text(T_file.reshape(-1, 4))
     texts = {"poses.txt": poses, "trainval_poses.txt": poses}
-    if _is_told_by_focal(camera):
+    told = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
+    if np.allclose(astuple(camera), astuple(told), rtol=0, atol=_SAME_CAMERA):
         return texts | {"focal.txt": f"{float(camera.fx)!r}\n"}
     # Programs that know only `focal.txt` then stop, instead of reading another camera.
     K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
@@ -88,12 +89,6 @@ def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
 
 def _text(rows: Float[np.ndarray, "n m"]) -> str:
     return "".join(" ".join(map(repr, row)) + "\n" for row in rows.astype(np.float64).tolist())
-
-
-def _is_told_by_focal(camera: Intrinsics) -> bool:
-    """Square pixels, and a centred principal point."""
-    told = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
-    return np.allclose(astuple(camera), astuple(told), rtol=0, atol=_SAME_CAMERA)
 
 
 def convert_sequence(
@@ -113,7 +108,7 @@ def convert_sequence(
     lost = f" ({n_lost} without a pose)" if n_lost else ""
     said = f"{out}: {len(numbers)} frames{lost} of {camera.width}x{camera.height}"
     said = "\n  ".join([f"{said}, read as {recording.format.label}", *recording.notes])
-    if _is_told_by_focal(camera):
+    if (out / "focal.txt").is_file():
         return said
     return (
         f"{said}\n  the camera (fx {camera.fx:.2f}, fy {camera.fy:.2f}, principal point "

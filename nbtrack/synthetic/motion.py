@@ -1,7 +1,6 @@
 """Smooth trajectories like those of a hand-held 30 Hz camera carried through a room."""
 
 import numpy as np
-from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from nbtrack.core.arrays import Poses
@@ -95,7 +94,7 @@ def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses
 
 
 def _poses(center, heading: float, turned: Values, wander, radius: float, tremor) -> Poses:
-    """Poses along an ellipse by the angle turned (rad), with what wanders and trembles, per frame.
+    """Poses (OpenCV axes) along an ellipse by the angle turned (rad), wandering and trembling.
 
     `center` (m) is x and z of the ellipse, `heading` (rad) the yaw from its first end to the other,
     `radius` (m) half its length.
@@ -108,17 +107,13 @@ def _poses(center, heading: float, turned: Values, wander, radius: float, tremor
     reach = radius * (1.0 + relative_radius[:, None])
     x, z = (center + reach * (np.stack([along, across], axis=1) @ axes)).T
     poses = np.tile(np.eye(4), (len(turned), 1, 1))
-    poses[:, :3, :3] = _camera_axes(yaw, pitch + tremor[:, 3], roll + tremor[:, 5])
     poses[:, :3, 3] = np.stack([x, height, z], axis=1) + tremor[:, :3]
-    return poses
-
-
-def _camera_axes(yaw: Values, pitch: Values, roll: Values) -> Float[np.ndarray, "n 3 3"]:
-    """Camera-to-world rotations, OpenCV axes; yaw 0 looks along -z, positive turns left."""
-    zeros = np.zeros_like(yaw)
+    # Yaw 0 looks along -z, positive turns left.
+    pitch, roll = pitch + tremor[:, 3], (roll + tremor[:, 5])[:, None]
     forward = [-np.sin(yaw) * np.cos(pitch), np.sin(pitch), -np.cos(yaw) * np.cos(pitch)]
     forward = np.stack(forward, axis=-1)
-    right = np.stack([np.cos(yaw), zeros, -np.sin(yaw)], axis=-1)
-    down = np.cross(forward, right)
-    cosine, sine = np.cos(roll)[:, None], np.sin(roll)[:, None]
-    return np.stack([cosine * right + sine * down, cosine * down - sine * right, forward], axis=-1)
+    right = np.stack([np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)], axis=-1)
+    down, cosine, sine = np.cross(forward, right), np.cos(roll), np.sin(roll)
+    axes = [cosine * right + sine * down, cosine * down - sine * right, forward]
+    poses[:, :3, :3] = np.stack(axes, axis=-1)
+    return poses

@@ -83,7 +83,10 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     seen = np.isfinite(depth) & (depth > 0)
     exact = np.where(seen, scale / np.where(seen, depth, 1.0), 0.0)
     lost = ~seen | _is_grazing(exact, focal)
-    lost |= _is_edge(exact) & (rng.uniform(size=depth.shape) < EDGE_DROPOUT)
+    # On planes, however slanted, disparity is affine: where it bends sharply is an edge.
+    bends = [np.abs(np.diff(exact, 2, axis=axis)) > EDGE_JUMP for axis in (0, 1)]
+    is_edge = np.pad(bends[0], ((1, 1), (0, 0))) | np.pad(bends[1], ((0, 0), (1, 1)))
+    lost |= is_edge & (rng.uniform(size=depth.shape) < EDGE_DROPOUT)
     shift = rng.normal(scale=LATERAL_NOISE / per_pixel, size=(2, height, width))
     places = np.indices(depth.shape) + shift
     # Between pixels: at a width of 96 the jitter is below a tenth of one.
@@ -95,12 +98,6 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     measured = scale / np.maximum(disparity, DISPARITY_STEP)
     lost |= (measured < RANGE[0]) | (measured > RANGE[1]) | (was_seen < 0.999)
     return np.where(lost, 0.0, measured)
-
-
-def _is_edge(disparity: Depth) -> Bool[np.ndarray, "h w"]:
-    """Pixels where disparity bends sharply: it is affine on planes, however slanted they are."""
-    across, along = (np.abs(np.diff(disparity, 2, axis=axis)) > EDGE_JUMP for axis in (0, 1))
-    return np.pad(across, ((1, 1), (0, 0))) | np.pad(along, ((0, 0), (1, 1)))  # no border
 
 
 def _is_grazing(disparity: Depth, focal: float) -> Bool[np.ndarray, "h w"]:
