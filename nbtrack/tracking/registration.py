@@ -151,9 +151,10 @@ def certainty(
     start, rotations at an arm of 1 m. Errors of the map are not independent, as residuals are here
     taken to be: these are lower bounds, good for telling poses apart, not for error bars.
     """
-    is_inlier = reliability > 0
-    for residual, most in zip(value, tolerance, strict=True):
-        is_inlier &= np.abs(residual) < most
+    distance, intensity = value
+    # A picture that is darker as a whole says nothing against a pose.
+    is_inlier = np.abs(intensity - np.median(intensity)) < tolerance[1]
+    is_inlier &= (np.abs(distance) < tolerance[0]) & (reliability > 0)
     values = np.linalg.eigvalsh(matrix)
     covariance = np.linalg.inv(matrix + START_PULL * np.eye(6)) / _DEVIATIONS**2  # rad, m
     rotation, position = (
