@@ -303,12 +303,6 @@ def test_no_false_alarm(tmp_path: Path, name: str) -> None:
         assert check(write(tmp_path / str(number), name, case)).warnings == [], case
 
 
-def test_long_way_between_frames(tmp_path: Path) -> None:
-    """Catches alarms about fast cameras: frames of a pair then share little."""
-    thin = Case("", change=lambda d: Source(*(a[::3] for a in d[:3]), d.camera))
-    assert not any("look" in text for text in check(write(tmp_path / "r", "office", thin)).warnings)
-
-
 @pytest.mark.parametrize("stride", [40, 80])
 def test_key_frames_far_apart(tmp_path: Path, stride: int) -> None:
     """Catches alarms about frames 0.2 m and 27 degrees apart and more: about surfaces of which too

@@ -21,11 +21,6 @@ def may_be_zero(default: int) -> Any:
     return dataclasses.field(default=default, metadata={"least": 0})
 
 
-def not_a_setting() -> Any:
-    """A dataclass field that no `key=value` reaches, as a preset's own name."""
-    return dataclasses.field(metadata={"is_setting": False})
-
-
 def as_dict(config: Any) -> dict[str, Any]:
     """A config as nested dictionaries of plain values, ready for JSON."""
     return json.loads(json.dumps(dataclasses.asdict(config)))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from nbtrack.core.errors import ConfigError, MissingError, nearest_name
-from nbtrack.core.settings import may_be_zero, not_a_setting, with_settings, with_values
+from nbtrack.core.settings import may_be_zero, with_settings, with_values
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, PointMapping, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.tables import PAPER_SCENE_LABELS
@@ -47,7 +47,7 @@ class TablesConfig:
 class Preset:
     """Everything that a run depends on, apart from the data and the seed."""
 
-    name: str = not_a_setting()
+    name: str = field(metadata={"is_setting": False})  # no `key=value` reaches it
     # A density gains from finer detail; a distance must start smooth, or ripples satisfy the
     # eikonal term: at 4 rad/m in place of 2.5 it was off by 19 cm in free space, not by 5.
     network: dict[str, NetworkSettings] = field(

@@ -17,7 +17,6 @@ from nbtrack.synthetic.primitives import Box, Points, Solid, Values, Vector3, ro
 
 Pair = tuple[float, float]  # (x, z) of a place, or width and height
 Color = tuple[float, float, float]
-Colors3 = tuple[Color, Color, Color]
 Material = Callable[[Points], Points]
 
 
@@ -113,7 +112,7 @@ def split(points: Points, below: Material, above: Material, axis: int) -> Points
 
 
 def framed(
-    points: Points, center: Vector3, size: Pair, axis: int, colors: Colors3, seed: int
+    points: Points, center: Vector3, size: Pair, axis: int, colors: tuple[Color, ...], seed: int
 ) -> Points:
     """A picture across `axis`: a frame of the first color, 5 cm wide, around soft shapes in two."""
     offset = np.abs(points - np.asarray(center))

@@ -14,7 +14,6 @@ Array3 = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "n 3"]
 Values = Float[np.ndarray, "n"]
 Indices = Int[np.ndarray, "n"]
-Rows = Float[np.ndarray, "n k"]
 Vectors = Float[np.ndarray, "... k"]
 Origins = Float[np.ndarray, "... 3"]  # one origin for all rays, (3,), or one each, (n, 3)
 Interval = tuple[Values, Values]  # ray parameters between which a ray is inside; none: near > far
@@ -25,12 +24,12 @@ def row_dot(first: Vectors, second: Vectors) -> Float[np.ndarray, "..."]:
     return np.asarray(np.einsum("...i,...i->...", first, second))
 
 
-def _row_max(rows: Rows) -> Values:
+def _row_max(rows: Vectors) -> Values:
     """Largest entry of each row; for short rows several times as fast as `rows.max(axis=1)`."""
     return reduce(np.maximum, rows.T)
 
 
-def _slab_interval(origins: Vectors, directions: Rows, half: Vectors) -> Interval:
+def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Interval:
     """Where a ray is inside the box |local| <= half."""
     # A direction parallel to a slab: a tiny slope sends both crossings far away, without 0/0.
     slope = np.where(directions == 0.0, 1e-30, directions)
