@@ -6,6 +6,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -19,33 +20,25 @@ def a_path(text: str) -> Path:
     return Path(text)
 
 
-def a_seed(text: str) -> int:
-    """A seed: what every generator in use takes."""
-    if not (text.isdecimal() and int(text) < 2**63):
-        raise argparse.ArgumentTypeError(f"{text!r} is no seed: give a whole number from 0 on")
+def a_count(text: str, least: int = 1) -> int:
+    """A number of things, of which there is at least one, that every random generator takes."""
+    if not (text.lstrip("-").isdecimal() and least <= int(text) < 2**63):
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number that is {least} or more")
     return int(text)
 
 
-def a_count(text: str) -> int:
-    """A number of things, of which there is at least one."""
-    if not text.lstrip("-").isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not allowed: it must be 1 or more")
-    return int(text)
-
-
-def _option(help: str, **more: Any) -> dict[str, Any]:
-    return {"help": help, **more}
+def _option(help: str, type: Any = str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
+    return {"help": help, "type": type, "metavar": metavar, **more}
 
 
 OPTIONS = {
     "sequence": _option("a folder, or the name of a room or dataset scene"),
-    "folder": _option("a recording", type=a_path),
+    "folder": _option("a recording", a_path),
     "room": _option("its name"),
-    "source": _option("folder of a run or a map, or a map file", type=a_path),
-    "out": _option("file or folder to write", type=a_path),
+    "source": _option("folder of a run or a map, or a map file", a_path),
+    "out": _option("file or folder to write", a_path),
     "--format": _option(
-        "how the folder is laid out, as neural_rgbd, tum, replica, 7scenes, scannet or plain "
-        "(default: told by its files)",
+        "neural_rgbd, tum, replica, 7scenes, scannet or plain (default: told by its files)",
         metavar="NAME",
     ),
     "--field": _option("imap, neus or another"),
@@ -53,25 +46,15 @@ OPTIONS = {
         "rendering, as in the paper (default); rendering+sdf teaches NeuS the distances too"
     ),
     "--tracker": _option("vr, sdf, lm or another"),
-    "--rate": _option("frames a second, by the clock", type=float, metavar="HZ"),
-    "--steps": _option("optimisation steps a frame", type=float, metavar="N"),
-    "--pixels": _option("pixels a step", type=int, metavar="N"),
-    "--bake": _option(
-        "ask the field on a grid of such cells, for example 0.04, not the network",
-        type=float,
-        metavar="METRES",
-    ),
-    "--correct": _option(
-        "correct the map at its surfaces in such cells, for example 0.04",
-        type=float,
-        metavar="METRES",
-    ),
+    "--rate": _option("frames a second, by the clock", float, "HZ"),
+    "--steps": _option("optimisation steps a frame", float, "N"),
+    "--pixels": _option("pixels a step", int, "N"),
+    "--bake": _option("ask a grid of such cells, as 0.04, not the network", float, "METRES"),
+    "--correct": _option("correct the map at surfaces in such cells, as 0.04", float, "METRES"),
     "--frames": _option("Python slice of frames, A:B:S", default=":"),
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from": _option(
-        "track in this map, of another recording of the room: a folder or a map file",
-        type=a_path,
-        metavar="MAP",
+        "track in this map, of another recording of the room: a folder or a map file", a_path, "MAP"
     ),
     "--to": _option(
         "tum, kitti: trajectory; ply, glb: coloured mesh; map: one file that opens anywhere",
@@ -84,32 +67,28 @@ OPTIONS = {
     ),
     "--scenes": _option("only these scenes of the preset's kind", metavar="A,B"),
     "--trackers": _option("rows (default: the paper's, vr,sdf)", metavar="A,B"),
-    "--beyond": _option(
-        "Table III instead: the paper's methods and ours, 30 Hz too", action="store_true"
-    ),
-    "--seeds": _option(
-        "K maps and runs a cell: mean ± deviation", type=a_count, default=1, metavar="K"
-    ),
-    "--workers": _option(
-        "cells side by side (default: one a core, or one on a GPU)", type=a_count, metavar="N"
-    ),
+    "--beyond": {
+        "help": "Table III instead: the paper's methods and ours, 30 Hz too",
+        "action": "store_true",
+    },
+    "--seeds": _option("K maps and runs a cell: mean ± deviation", a_count, "K", default=1),
+    "--workers": _option("cells side by side (default: one a core, or one on a GPU)", a_count, "N"),
     "--dask": _option("run on a Dask cluster, as tcp://HOST:8786", metavar="ADDRESS"),
-    "--in-place": _option("store the outputs in the committed notebooks too", action="store_true"),
-    "--n-frames": _option("how many (default: 300)", type=int, default=300),
-    "--width": _option("pixels; the height is 3/4 of it", type=int, default=640),
+    "--n-frames": _option("how many (default: 300)", int, default=300),
+    "--width": _option("pixels; the height is 3/4 of it", int, default=640),
     "--depth-folder": _option("default: the format's; filtered before raw depth"),
     "--poses": _option("pose file (default: the format's)", metavar="FILE"),
-    "--seed": _option("of all random numbers (default: 0)", type=a_seed, default=0),
-    "--out": _option("where to write (default: in the cache or paper_tables)", type=a_path),
+    "--seed": _option("of all random numbers (default: 0)", partial(a_count, least=0), default=0),
+    "--out": _option("where to write (default: in the cache or paper_tables)", a_path),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
-    "--threads": _option("CPU threads (default: all cores)", type=a_count, metavar="N"),
+    "--threads": _option("CPU threads (default: all cores)", a_count, "N"),
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
-    "--config": _option("TOML file of settings", type=a_path),
+    "--config": _option("TOML file of settings", a_path),
     "--set": _option(
         "one setting, for example mapping.neus.iterations=500; may be repeated",
+        metavar="KEY=VALUE",
         action="append",
         default=[],
-        metavar="KEY=VALUE",
         dest="settings",
     ),
 }
@@ -134,7 +113,7 @@ COMMANDS = {
         "the paper's tables, and one beyond, CSV and LaTeX",
         "--budget --scenes --trackers --beyond --seeds --workers --dask --out" + _RUN,
     ),
-    "notebooks": ("run all notebooks headless, with HTML copies", "--in-place" + _PRESET),
+    "notebooks": ("run all notebooks headless, with HTML copies", _PRESET),
     "data make": (
         "write a synthetic room in the dataset's layout",
         "room --out! --n-frames --width --seed",
@@ -144,7 +123,7 @@ COMMANDS = {
         "write a recording in the Neural RGB-D layout",
         "folder out --frames" + _PARTS,
     ),
-    "bench": ("Table II and step times on this machine, full-size networks", "--out" + _RUN),
+    "bench": ("Table II on this machine, full-size networks", "--out" + _RUN),
 }
 
 
@@ -165,24 +144,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = _parsed(arguments)
         _set_device(options)
-        module = "commands_tables" if options.command in ("tables", "bench") else "commands"
+        module = "bench" if options.command in ("tables", "bench") else "commands"
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)
+        return 0
     except NbtrackError as error:
-        print(f"nbtrack: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        told, status = " ".join(str(error).split()), 2
     except OSError as error:  # a disk that is full or read-only, a file where a folder should be
         where = error.filename2 or error.filename or "the output"
-        print(
-            f"nbtrack: {where}: {error.strerror or error}; what was finished is kept: make room or "
-            "choose another place, and run the same command again",
-            file=sys.stderr,
-        )
-        return 2
+        told, status = f"{where}: {error.strerror or error}; what was finished is kept: ", 2
+        told += "make room or choose another place, and run the same command again"
     except KeyboardInterrupt:
-        print("nbtrack: interrupted; run the same command again to go on", file=sys.stderr)
-        return 130
-    return 0
+        told, status = "interrupted; run the same command again to go on", 130
+    print(f"nbtrack: {told}", file=sys.stderr)
+    return status
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:

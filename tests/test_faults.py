@@ -208,9 +208,9 @@ ARGUMENTS = {
     "endless steps": ([*OWN, "--steps", "inf"], "steps_per_frame is inf"),
     "no grid": ([*OWN, "--bake", "nan"], "bake_voxel"),
     "negative pixels": ([*OWN, "--pixels", "-5"], "must be 1 or more"),
-    "negative seed": ([*OWN, "--seed", "-1"], "is no seed"),
-    "giant seed": ([*OWN, "--seed", "9" * 30], "is no seed"),
-    "no threads": ([*OWN, "--threads", "0"], "must be 1 or more"),
+    "negative seed": ([*OWN, "--seed", "-1"], "is 0 or more"),
+    "giant seed": ([*OWN, "--seed", "9" * 30], "is 0 or more"),
+    "no threads": ([*OWN, "--threads", "0"], "is 1 or more"),
     "unknown device": ([*OWN, "--device", "tpu"], "is not there"),
     "no slice": ([*OWN, "--frames", "3"], "is no slice"),
     "no step": ([*OWN, "--frames", "::0"], "with S above 0"),
@@ -219,7 +219,7 @@ ARGUMENTS = {
     "unknown motion": ([*OWN, "--set", "tracking.sdf.motion_model=leap"], "unknown motion model"),
     "empty folder name": ([*OWN, "--out", ""], "the path is empty"),
     "no seeds": (["tables", "--seeds", "0"], "seeds"),
-    "no workers": (["tables", "--workers", "0"], "must be 1 or more"),
+    "no workers": (["tables", "--workers", "0"], "is 1 or more"),
     "unknown row": (["tables", "--trackers", "vr,sfd"], "did you mean 'sdf'"),
 }
 

@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,6 +11,8 @@ from typing import Any
 import dask
 import psutil
 import pytest
+from distributed import LocalCluster
+from forked import forking
 from tiny import tiny_words
 
 from nbtrack.cli import main
@@ -60,17 +60,15 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    """Of a scheduler with two workers in processes of their own, forked with all imports done."""
-    from distributed import LocalCluster
-    from distributed.utils import get_mp_context
-
-    settings = {"worker.multiprocessing-method": "forkserver", "scheduler.allowed-failures": 0}
-    with dask.config.set({f"distributed.{key}": value for key, value in settings.items()}):
-        get_mp_context().set_forkserver_preload([__name__, "torch._dynamo", "trimesh"])
-        with LocalCluster(
+    """Of a scheduler with two workers in processes of their own."""
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        forking(),
+        LocalCluster(
             n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
-        ) as cluster:
-            yield cluster.scheduler_address
+        ) as cluster,
+    ):
+        yield cluster.scheduler_address
 
 
 @pytest.fixture(params=["here", "on a cluster"])
@@ -157,23 +155,29 @@ def test_a_cluster_makes_the_same_table(address: str, tmp_path: Path, undisturbe
     assert text.count("office,\n") == 2
 
 
+def undertake(folder: Path, words: list[str]) -> None:
+    """The command in a process of its own, which forks its workers too."""
+    os.environ["NBTRACK_RUNS"] = str(folder / "runs")
+    with forking():
+        main(words)
+
+
 def test_killed_with_two_workers_and_told_again(tmp_path: Path, undisturbed: bytes) -> None:
     """Catches workers that outlive their parent, finished cells that are made again, and
     half-written ones that count as done."""
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("NBTRACK_")}
-    # A short path for Dask's sockets, which may have 107 characters.
-    kept |= {"NBTRACK_RUNS": str(tmp_path / "runs"), "TMPDIR": "/tmp"}
-    command = [sys.executable, "-m", "nbtrack", *words(tmp_path, "--workers", "2")]
-    process = subprocess.Popen(
-        command, env=kept, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    with forking() as context:
+        process = context.Process(
+            target=undertake, args=(tmp_path, words(tmp_path, "--workers", "2"))
+        )
+        process.start()
     while not any(tmp_path.rglob("map.safetensors")):
-        assert process.poll() is None, "it ended before its first map"
+        assert process.is_alive(), "it ended before its first map"
         time.sleep(0.01)
     workers = psutil.Process(process.pid).children(recursive=True)
     assert len(workers) >= 2
     process.kill()
-    assert process.wait() == -signal.SIGKILL
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
     assert psutil.wait_procs(workers, timeout=30)[1] == []
     made = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("map.safetensors")}
     assert len(made) < 4, "nothing was left to do"

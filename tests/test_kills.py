@@ -1,57 +1,29 @@
 """Mapping, tracking and tables killed at any moment, then told the same again: the same result.
 
-`test_grid.py` does so for tables with workers. Here one process that has imported everything
-forks a child for each command, so that many kills are affordable: NBTRACK_TEST_KILLS=30.
+`test_grid.py` does so for tables with workers. More kills: NBTRACK_TEST_KILLS=30.
 """
 
-import json
+import contextlib
+import io
 import os
 import random
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from time import monotonic as time
 
 import pandas as pd
 import pytest
+from finished import isolate
+from forked import forking
 from tiny import tiny_words
 
+from nbtrack.cli import main
 from nbtrack.mapping.files import MAP_FILE, read_map
 from nbtrack.tracking.trajectories import read_tum
 
 KILLS = int(os.environ.get("NBTRACK_TEST_KILLS", "3"))
-# Forks a child for each line `[folder, arguments, seconds until SIGKILL or null]`; answers with
-# its exit status, negative where it was killed, and how long it ran. Checkpoints are written after
-# every step, or every other command would be over before its first one.
-_FORKER = """
-import json, os, signal, sys, time
-import torch._dynamo, trimesh  # else every child would import them by itself
-import nbtrack.experiments.commands_tables, nbtrack.experiments.runs
-import nbtrack.mapping.fit, nbtrack.tracking.trajectories
-from nbtrack.cli import main
-nbtrack.mapping.fit.CHECKPOINT_SECONDS = nbtrack.tracking.trajectories.CHECKPOINT_SECONDS = 0.0
-for line in sys.stdin:
-    folder, arguments, seconds = json.loads(line)
-    start = time.monotonic()
-    child = os.fork()
-    if not child:
-        os.makedirs(folder, exist_ok=True)
-        os.chdir(folder)
-        os.environ["NBTRACK_RUNS"] = folder + "/runs"
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        status = 1
-        try:
-            status = main(arguments)
-        finally:
-            sys.stderr.flush()
-            os._exit(status)
-    if seconds is not None:
-        time.sleep(seconds)
-        os.kill(child, signal.SIGKILL)
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    print(json.dumps([status, time.monotonic() - start]), flush=True)
-"""
 SET = tiny_words(
     "mapping.neus.iterations=15", "mapping.imap.iterations=15", "mapping.neus.holdout_every=0",
     "mapping.imap.holdout_every=0", "scenes.n_frames=8", "tables.rates_hz=[10]",
@@ -69,23 +41,31 @@ Run = Callable[..., tuple[int, float]]
 """Exit status and time (s) of a command in a folder, killed after some seconds if given."""
 
 
+def undertake(folder: Path, arguments: list[str]) -> None:
+    """The command in a process of its own. Checkpoints are written after every step, or every
+    other command would be over before its first one."""
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()):
+        isolate(folder, patch)
+        patch.setattr("nbtrack.mapping.fit.CHECKPOINT_SECONDS", 0.0)
+        patch.setattr("nbtrack.tracking.trajectories.CHECKPOINT_SECONDS", 0.0)
+        sys.exit(main(arguments))
+
+
 @pytest.fixture(scope="module")
 def run() -> Iterator[Run]:
-    """Runs commands in children of one process that has imported the package."""
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("NBTRACK_")}
-    kept["PYTHONPATH"] = str(Path(__file__).parents[1])
-    forker = subprocess.Popen(
-        [sys.executable, "-c", _FORKER], text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        env=kept,
-    )  # fmt: skip
+    """Runs commands in processes of their own; exit statuses are negative where killed."""
+    with forking() as context:
 
-    def run(folder: Path, arguments: list[str], seconds: float | None = None) -> tuple[int, float]:
-        forker.stdin.write(json.dumps([str(folder), arguments, seconds]) + "\n")
-        forker.stdin.flush()
-        return tuple(json.loads(forker.stdout.readline()))
+        def run(folder: Path, arguments: list[str], seconds: float | None = None) -> tuple:
+            folder.mkdir(exist_ok=True)
+            process, start = context.Process(target=undertake, args=(folder, arguments)), time()
+            process.start()
+            process.join(seconds)
+            process.kill()
+            process.join()
+            return process.exitcode, time() - start
 
-    yield run
-    forker.communicate()  # ends with its input
+        yield run
 
 
 @pytest.fixture(scope="module")
@@ -100,10 +80,11 @@ def result(folder: Path) -> dict[str, object]:
     """All of a result that the clock does not enter, by file and part."""
     found: dict[str, object] = {path.name: "there" for path in folder.iterdir()}
     for path in folder.iterdir():
-        if path.suffix in (".txt", ".ply") or path.name.startswith(("history", "table_1")):
+        if path.suffix in (".txt", ".ply") or path.name.startswith("table_1"):
             found[path.name] = path.read_bytes()
-        elif path.name == "frames.csv":
-            found[path.name] = pd.read_csv(path).drop(columns="seconds").to_csv()
+        elif path.name in ("frames.csv", "history.csv"):  # slow machines look at s more often
+            clocked = ["seconds", "deviation_m"]
+            found[path.name] = pd.read_csv(path).drop(columns=clocked, errors="ignore").to_csv()
         elif path.name == MAP_FILE:
             found[path.name] = read_map(path).key
     return found

@@ -6,6 +6,7 @@ import math
 import shlex
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,10 +18,10 @@ from tiny import TINY, tiny_words
 from nbtrack.cli import main
 from nbtrack.core.errors import ConfigError, MissingError, NbtrackError
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments.bench import default_pixels, measure_step_times, measure_steps
+from nbtrack.experiments.bench import default_pixels, measure_steps
 from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import Execution
-from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Method
+from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, Method
 from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.results import map_scene, map_scenes, read_run, track_scenes
 from nbtrack.experiments.scenes import Scene, open_scenes
@@ -131,7 +132,11 @@ def test_table_3(tmp_path: Path, scenes: list[Scene], monkeypatch: pytest.Monkey
     """Catches rows of Table III that are other runs than those of Table I, or go without a map."""
     assert set(TABLE_1) < set(TABLE_3)
     assert RATES_3_HZ[0] == 30
-    monkeypatch.setattr("nbtrack.experiments.commands_tables.RATES_3_HZ", RATES_3_HZ[:1])
+    monkeypatch.setattr("nbtrack.experiments.bench.RATES_3_HZ", RATES_3_HZ[:1])
+    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 2000)
+    for name in TABLE_3:  # a grid of a whole room in cells of 4 cm takes seconds to fill
+        settings = tuple(text.replace("voxel=0.04", "voxel=0.3") for text in METHODS[name].settings)
+        monkeypatch.setitem(METHODS, name, replace(METHODS[name], settings=settings))
     words = tiny_words("scenes.names=office", "scenes.track_frames=:2")
     assert main(["tables", "--beyond", "--workers", "1", "--out", str(tmp_path), *words]) == 0
     assert len(pd.read_csv(tmp_path / "table_3.csv")) == len(TABLE_3)
@@ -171,20 +176,13 @@ def test_a_second_path_is_tracked_in_the_map_of_the_first(
     assert metrics["ate_rmse_m"] == found["ate_m"][0]
 
 
-def test_table_2_of_this_machine(
-    preset: Preset, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_table_2_of_this_machine(preset: Preset, scenes: list[Scene]) -> None:
     """Catches empty cells: even a slow machine fits a step of 16 points into 20 ms sometimes; and
     rows that stand there twice, where two methods share a tracker."""
-    first = scenes[0].read(":1")
-    steps = measure_steps(preset, first, [*TABLE_1, "vr_neus"])
+    steps = measure_steps(preset, scenes[0].read(":1"), [*TABLE_1, "vr_neus"])
     assert steps[["tracker", "n_pixels"]].to_numpy().tolist() == [["VR", 4], ["SDF", 8]]
     assert (steps["steps"] >= 0).all()
     assert default_pixels(preset) == {"VR": 8, "SDF": 16}
-    monkeypatch.setattr("nbtrack.experiments.bench._MOST_STEPS", 10)
-    times = measure_step_times(preset, first)
-    assert (times["ms_low"] <= times["ms_high"]).all()
-    assert (times["ms_low"] > 0).all()
 
 
 def test_missing_dataset_scene_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -1,23 +1,101 @@
-"""Table II on the machine at hand: optimisation steps that fit in a time budget, and their time."""
+"""The commands `tables` and `bench`, and Table II on the machine at hand."""
 
-import time
-from collections.abc import Iterator, Sequence
+import os
+from argparse import Namespace
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import torch
 
-from nbtrack.core.device import advise_on_memory, choose_device, suitable_threads, synchronize
+from nbtrack import tables
+from nbtrack.core.device import advise_on_memory, choose_device, device_name
+from nbtrack.core.errors import ConfigError, NbtrackError
+from nbtrack.core.files import runs_folder, tables_folder
 from nbtrack.core.progress import ProgressBar
+from nbtrack.core.settings import changed_settings
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
-from nbtrack.experiments.methods import TABLE_1, Method, find_methods
-from nbtrack.experiments.presets import Preset
+from nbtrack.experiments.commands import preset_of
+from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Method, find_methods
+from nbtrack.experiments.presets import PRESETS, Preset
+from nbtrack.experiments.results import track_scenes
+from nbtrack.experiments.scenes import open_scene, open_scenes
 from nbtrack.fields import make_field
-from nbtrack.tracking import ClockBudget, StepBudget, Tracker, make_tracker
+from nbtrack.tracking import ClockBudget, StepBudget, make_tracker
 
-_FRAMES_A_CELL = 3  # that a mean of steps is taken over
-_LEAST_STEPS, _MOST_STEPS, _SECONDS_A_ROW = 5, 200, 4.0  # that are timed
+_FRAMES_A_CELL = 3  # that a mean of steps in Table II is taken over
+# What a run's row tells beside its place; none of it depends on how fast the machine was.
+_CELL_COLUMNS = (
+    "rate_hz", "method", "n_pixels", "scene", "seed", "ate_m", "ate_rmse_aligned_m",
+    "rotation_rmse_deg", "max_error_m", "frames", "lost_frames", "steps_per_frame", "run",
+    "failure",
+)  # fmt: skip
+
+
+def tables_command(options: Namespace) -> None:
+    """Fill the tables of a preset and write them as CSV and LaTeX.
+
+    Raises NbtrackError at the end where cells failed, and left gaps.
+    """
+    names = [f"scenes.names={_words(options.scenes)}"] if options.scenes else []
+    preset = preset_of(options, *names)
+    if options.beyond and options.trackers:
+        raise ConfigError("--beyond has rows of its own: leave --trackers out")
+    methods = _words(options.trackers) or (TABLE_3 if options.beyond else TABLE_1)
+    find_methods(methods)  # a bad name is told before a room is made
+    execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
+    scenes, clock = open_scenes(preset), options.budget == "clock"
+    results = track_scenes(
+        scenes, methods, preset, RATES_3_HZ if options.beyond else None, clock=clock,
+        seeds=options.seeds, execution=execution,
+    )  # fmt: skip
+    folder = options.out or tables_folder() / (preset.name + "_clock" * clock)
+    number, note = "III" if options.beyond else "I", _note(preset, clock)
+    print(f"Table {number}: ATE (m), {note}")
+    print(tables.style_table_1(tables.naming_points(results) if options.beyond else results))
+    if options.beyond:
+        paths = tables.write_table_3(folder, results, note)
+    else:
+        print("Table I beside the paper's")
+        print(tables.beside_published(results).to_string(float_format="%.3f", na_rep="–"))
+        steps, pixels = _table_2(preset, scenes[0].read(":1"), methods)
+        paths = tables.write_tables(folder, results, steps, note, pixels)
+    cells = results[[name for name in _CELL_COLUMNS if name in results]]
+    paths.append(
+        tables.write_csv(folder / f"table_{len(number)}_cells.csv", cells, float_format=None)
+    )
+    print("\n".join(str(path) for path in paths))
+    failed = results[results["failure"] != ""]
+    if len(failed):
+        raise NbtrackError(
+            f"{len(failed)} cells of the table failed and are empty, the first of them "
+            f"{failed['run'].iloc[0]}: {failed['failure'].iloc[0]}; mend the cause and run the "
+            "same command again, the rest is kept"
+        )
+
+
+def bench_command(options: Namespace) -> None:
+    """Measure and print Table II; write it as CSV."""
+    # The paper's sizes unless something else is asked for: small networks measure bookkeeping.
+    if "NBTRACK_PRESET" not in os.environ:
+        options.preset = options.preset or "synthetic"
+    preset = preset_of(options, "scenes.n_frames=2")  # one image is enough
+    steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset).read(":1"))
+    folder = options.out or runs_folder() / "bench" / preset.name
+    print(tables.write_csv(folder / "table_2.csv", steps))
+
+
+def _table_2(
+    preset: Preset, sequence: RgbdSequence, methods: Sequence[str | Method] = TABLE_1
+) -> tuple[pd.DataFrame, dict[str, int]]:
+    """Measure and print it; the n of Table I besides."""
+    steps, pixels = measure_steps(preset, sequence, methods), default_pixels(preset, methods)
+    machine = f"{device_name(choose_device())}, {torch.get_num_threads()} threads"
+    print(f"Table II: steps, {preset.name} networks, on {machine}")
+    print(tables.style_table_2(steps, default_pixels=pixels))
+    return steps, pixels
 
 
 def measure_steps(
@@ -26,23 +104,35 @@ def measure_steps(
     """Steps within each budget for every tracker, in its first method's field, and its n (pixels).
 
     A tracker first spends one frame that is not counted, so that allocations and compilations are
-    done. The sequence's first frame feeds it.
+    done. The sequence's first frame feeds it. Fields are untrained: a step costs the same whatever
+    the weights are.
 
-    Returns:
-        One row a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames),
-        steps_deviation (over frames).
-
-    Source: paper, Table II and evaluation protocol.
+    A row is a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames) and
+    steps_deviation (over frames). Source: paper, Table II and evaluation protocol.
     """
-    rows = []
-    for name, n_pixels, tracker in _trackers(preset, sequence, methods, "Table II"):
-        for budget_ms in preset.tables.budgets_ms:
-            tracker.budget, counts = ClockBudget(1000 / budget_ms), []
-            for _ in range(1 + _FRAMES_A_CELL):
-                tracker.restart(sequence.T_world_camera[0])
-                counts.append(tracker.track(sequence[0]).steps)
-            mean, deviation = float(np.mean(counts[1:])), float(np.std(counts[1:]))
-            rows.append((name, n_pixels, budget_ms, mean, deviation))
+    firsts: dict[str, Method] = {}
+    for method in find_methods(methods):
+        firsts.setdefault(method.tracker, method)
+    pixels, rows = preset.tables.pixels, []
+    plan = [(m, n) for m in firsts.values() for n in pixels.get(m.tracker, pixels["sdf"])]
+    bounds, T_first = observed_bounds(sequence), sequence.T_world_camera[0]
+    with ProgressBar("Table II", len(plan)) as bar:
+        for done, (method, n_pixels) in enumerate(plan):
+            name = method.tracker
+            bar.move_to(done, f"{name}={n_pixels}")
+            settings = replace(preset.tracking_of(name), n_pixels=n_pixels)
+            with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
+                field = make_field(method.field, preset.network_of(method.field), bounds, seed=0)
+                field = field.to(choose_device())
+                tracker = make_tracker(name, field, T_first, StepBudget(1), settings)
+                for budget_ms in preset.tables.budgets_ms:
+                    tracker.budget, counts = ClockBudget(1000 / budget_ms), []
+                    for _ in range(1 + _FRAMES_A_CELL):
+                        tracker.restart(T_first)
+                        counts.append(tracker.track(sequence[0]).steps)
+                    mean, deviation = float(np.mean(counts[1:])), float(np.std(counts[1:]))
+                    rows.append((_label(name), n_pixels, budget_ms, mean, deviation))
+        bar.move_to(len(plan))
     columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_deviation"]
     return pd.DataFrame(rows, columns=columns)
 
@@ -53,59 +143,20 @@ def default_pixels(preset: Preset, methods: Sequence[str | Method] = TABLE_1) ->
     return {_label(name): preset.tracking_of(name).n_pixels for name in trackers}
 
 
-def measure_step_times(preset: Preset, sequence: RgbdSequence) -> pd.DataFrame:
-    """Time of a step of the paper's trackers with their pixel counts n.
-
-    Returns:
-        A row each: tracker, n_pixels, ms_per_step (median), ms_low and ms_high (quartiles).
-    """
-    rows, device = [], choose_device()
-    T_start = torch.from_numpy(sequence.T_world_camera[:1]).float().to(device)
-    for name, n_pixels, tracker in _trackers(preset, sequence, TABLE_1, "step times"):
-        tracker.track(sequence[0])  # with what counts nowhere
-        tracker.begin(sequence[0].to(device), T_start)
-        synchronize(device)
-        times = [time.perf_counter()]
-        while len(times) <= _LEAST_STEPS or (
-            len(times) <= _MOST_STEPS and times[-1] - times[0] < _SECONDS_A_ROW
-        ):
-            tracker.step()
-            synchronize(device)
-            times.append(time.perf_counter())
-        low, median, high = 1e3 * np.quantile(np.diff(times), [0.25, 0.5, 0.75])
-        rows.append((name, n_pixels, median, low, high))
-    columns = ["tracker", "n_pixels", "ms_per_step", "ms_low", "ms_high"]
-    return pd.DataFrame(rows, columns=columns)
-
-
-def _trackers(
-    preset: Preset, sequence: RgbdSequence, methods: Sequence[str | Method], title: str
-) -> Iterator[tuple[str, int, Tracker]]:
-    """Label, n and a tracker of each row in turn, under a bar, with suitable threads and advice.
-
-    The fields are untrained: a step costs the same whatever the weights are.
-    """
-    firsts: dict[str, Method] = {}
-    for method in find_methods(methods):
-        firsts.setdefault(method.tracker, method)
-    pixels = preset.tables.pixels
-    plan = [(m, n) for m in firsts.values() for n in pixels.get(m.tracker, pixels["sdf"])]
-    bounds, T_first = observed_bounds(sequence), sequence.T_world_camera[0]
-    with ProgressBar(title, len(plan)) as bar:
-        for done, (method, n_pixels) in enumerate(plan):
-            tracker, network = method.tracker, preset.network_of(method.field)
-            bar.move_to(done, f"{tracker}={n_pixels}")
-            with (
-                advise_on_memory(f"tables.pixels.{tracker}={n_pixels}"),
-                suitable_threads(network.width),
-            ):
-                field = make_field(method.field, network, bounds, seed=0).to(choose_device())
-                settings = replace(preset.tracking_of(tracker), n_pixels=n_pixels)
-                made = make_tracker(tracker, field, T_first, StepBudget(1), settings)
-                yield _label(tracker), n_pixels, made
-        bar.move_to(len(plan))
-
-
 def _label(tracker: str) -> str:
     """A tracker's name in Table II: VR for vr."""
     return tracker.upper().replace("_", " ")
+
+
+def _note(preset: Preset, clock: bool) -> str:
+    """How the numbers came about, in a sentence. Which scenes there are the columns tell."""
+    changed = changed_settings(preset, PRESETS[preset.name])
+    changed = [setting for setting in changed if not setting.startswith("scenes.names")]
+    told = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name
+    budget = "wall clock" if clock else "the paper's step counts"
+    return f"Preset: {told}; budget: {budget}; device: {device_name(choose_device())}."
+
+
+def _words(text: str | None) -> list[str]:
+    """The parts of a list with commas."""
+    return [word.strip() for word in (text or "").split(",") if word.strip()]

@@ -67,7 +67,7 @@ class Cell(abc.ABC):
         path.parent.mkdir(parents=True, exist_ok=True)
         report(0.0, "begins, or waits for another process that makes the same")
         try:
-            with FileLock(path):
+            with FileLock(path), advise_on_memory(f"the frames and settings of {self.name}"):
                 return self.result() if self.is_done else self.compute(report)
         except NbtrackError as error:
             return error
@@ -153,16 +153,15 @@ class MapCell(Cell):
         base = self.base
         if base and isinstance(failure := base.outcome(None, report), NbtrackError):
             raise failure
-        with advise_on_memory(f"frames {self.frames} of {self.scene.name}"):
-            sequence = self.scene.read(self.frames)
-            if base:
-                made = correct_map(base.map(), sequence, self.settings)
-            else:
-                made = map_sequence(
-                    self.field, sequence, self.preset.network_of(self.field), self.settings,
-                    self.seed, choose_device(), checkpoint, tell,
-                )  # fmt: skip
-            quality = score_map(made, sequence, self.scene.room)
+        sequence = self.scene.read(self.frames)
+        if base:
+            made = correct_map(base.map(), sequence, self.settings)
+        else:
+            made = map_sequence(
+                self.field, sequence, self.preset.network_of(self.field), self.settings,
+                self.seed, choose_device(), checkpoint, tell,
+            )  # fmt: skip
+        quality = score_map(made, sequence, self.scene.room)
         told = {"quality": quality, "frames": self.frames, "key": self.key}
         finished = replace(made, made={**made.made, **told, "config": as_dict(self.preset)})
         write_map(self.folder / MAP_FILE, finished)

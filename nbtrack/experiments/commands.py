@@ -1,27 +1,31 @@
-"""What each command does and prints; `tables` and `bench` have a module of their own."""
+"""What each command does and prints; `tables` and `bench` stand in `bench.py`."""
 
 from argparse import Namespace
 from dataclasses import replace
+from pathlib import Path
 
-from nbtrack.core.errors import ConfigError, DataError
-from nbtrack.core.files import write_atomic
+import trimesh
+
+from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
+from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import tell
 from nbtrack.data.check import check_recording
 from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import parse_frames
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.cells import MapCell
-from nbtrack.experiments.export import export
 from nbtrack.experiments.grid import run_cells
 from nbtrack.experiments.notebooks import run_notebooks
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
-from nbtrack.experiments.runs import TrackCell
+from nbtrack.experiments.runs import METRICS_FILE, TrackCell
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
-from nbtrack.fields import NetworkSettings, field_class, supervised_field
-from nbtrack.mapping.files import MESH_FILE, Map, read_map
+from nbtrack.fields import NetworkSettings, PointCloud, field_class, supervised_field
+from nbtrack.mapping.files import MAP_FILE, MESH_FILE, Map, read_map
 from nbtrack.mapping.meshes import extract_mesh
 from nbtrack.tracking import check_pair, make_budget
+from nbtrack.tracking.trajectories import read_tum, write_kitti
 
+_FORMATS = ["tum", "kitti", "ply", "glb", "map"]
 _PRINTED = (
     "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
     "lost_frames", "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
@@ -82,14 +86,50 @@ def track_command(options: Namespace) -> None:
 
 
 def export_command(options: Namespace) -> None:
-    """Write a run's trajectory or a map in another format; print what was written."""
-    print(f"{options.out}: {export(options.source, options.to, options.out)}")
+    """Write a run's trajectory, or a map (of folders or files), in another format; print what.
+
+    Raises ConfigError for an unknown format, or a file that would replace its source; MissingError
+    and DataError where the result is not there, unfinished, damaged, or not what the format is for.
+    """
+    source, name, out = options.source, options.to, options.out
+    if name not in _FORMATS:
+        raise ConfigError(f"unknown format {name!r}: {nearest_name(name, _FORMATS)}")
+    if source.exists() and out.exists() and source.samefile(out):
+        raise ConfigError(f"{out} is the source itself: choose another file to write")
+    told = (_export_trajectory if name in ("tum", "kitti") else _export_map)(source, name, out)
+    print(f"{out}: {told}")
+
+
+def _export_map(source: Path, format_name: str, out: Path) -> str:
+    found, seen = read_map(source), source / MESH_FILE
+    if format_name == "map":
+        content = (source / MAP_FILE if source.is_dir() else source).read_bytes()
+        write_atomic(out, content)
+        return f"{found.field.label} map of {found.made['scene']}, {len(content) / 1e6:.2f} MB"
+    is_seen = seen.is_file() and not isinstance(found.field, PointCloud)
+    with naming_damaged(seen, "mesh", "remove it and map again"):
+        mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(found.field)
+        content = mesh.export(file_type=format_name)
+    write_atomic(out, content)
+    return f"{len(mesh.vertices)} coloured vertices of {'what was seen' if is_seen else 'all'}"
+
+
+def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
+    if source.is_dir() and not (source / METRICS_FILE).is_file():
+        raise MissingError(f"{source} holds no finished run: give a folder of `track --out`")
+    path = source / "trajectory.txt" if source.is_dir() else source
+    T_world_camera = read_tum(path)[1]
+    if format_name == "kitti":
+        write_kitti(out, T_world_camera)
+        return f"{len(T_world_camera)} poses, KITTI: three rows of the matrix (m), no time stamps"
+    write_atomic(out, path.read_bytes())
+    return f"{len(T_world_camera)} poses, TUM: timestamp (s), position (m), quaternion xyzw"
 
 
 def notebooks_command(options: Namespace) -> None:
     """Run all notebooks headless."""
     preset = preset_of(options)  # a wrong setting is refused before the first kernel starts
-    run_notebooks(preset.name, options.config, options.settings, options.in_place)
+    run_notebooks(preset.name, options.config, options.settings)
 
 
 def make_command(options: Namespace) -> None:

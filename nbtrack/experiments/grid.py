@@ -44,9 +44,7 @@ class Execution:
 def run_cells(cells: Sequence[Cell], title: str, execution: Execution | None = None) -> list[Any]:
     """The results of all cells, in order; those that are missing, and what they need, are made.
 
-    Raises:
-        Whatever the first failing cell raised, unless it is to keep going; the others are then
-        abandoned.
+    Unless it is to keep going, it raises what the first failing cell raised, and drops the others.
     """
     execution, results = execution or Execution(), {}
     wanted = [part for cell in cells if not cell.is_done for part in (cell.needs, cell) if part]

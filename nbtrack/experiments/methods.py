@@ -78,8 +78,7 @@ RATES_3_HZ = (30.0, 10.0, 5.0, 2.0)
 def find_methods(methods: Sequence[str | Method]) -> list[Method]:
     """Methods by their names; those that are one already stay.
 
-    Raises:
-        ConfigError: a name is unknown, or its field and tracker do not go together.
+    Raises ConfigError if a name is unknown, or its field and tracker do not go together.
     """
     found = []
     for method in dict.fromkeys(methods):

@@ -12,21 +12,12 @@ from nbtrack.core.files import project_folder, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
 
 
-def run_notebooks(
-    preset: str, config_file: Path | None, settings: Sequence[str], in_place: bool
-) -> None:
+def run_notebooks(preset: str, config_file: Path | None, settings: Sequence[str]) -> None:
     """Execute every notebook in order, as `jupyter nbconvert --execute`.
 
     Copies, executed and HTML, go to `runs/notebooks/<preset>/`. Settings reach the kernels through
-    the environment, where each notebook's settings cell finds them.
-
-    Args:
-        in_place: store the outputs in the committed notebooks as well, which otherwise stay as
-            they are: for a change of theirs, on the smoke preset.
-
-    Raises:
-        MissingError: there are no notebooks here, or Jupyter is not installed.
-        NbtrackError: a cell failed; the copy up to there is kept.
+    the environment, where each notebook's settings cell finds them. Raises MissingError without
+    notebooks or Jupyter, NbtrackError if a cell failed; the copy up to there is kept.
     """
     if any(importlib.util.find_spec(name) is None for name in ("nbconvert", "ipykernel")):
         raise MissingError("notebooks need Jupyter: pip install 'nbtrack[notebooks]'")
@@ -42,11 +33,11 @@ def run_notebooks(
     with ProgressBar("notebooks", len(paths)) as bar:
         for done, path in enumerate(paths):
             bar.move_to(done, path.stem)
-            _run_notebook(path, runs_folder() / "notebooks" / preset, in_place)
+            _run_notebook(path, runs_folder() / "notebooks" / preset)
         bar.move_to(len(paths))
 
 
-def _run_notebook(path: Path, folder: Path, in_place: bool) -> None:
+def _run_notebook(path: Path, folder: Path) -> None:
     """Run one notebook in a fresh kernel; its copies go to the folder."""
     import nbformat
     from nbconvert import HTMLExporter
@@ -63,7 +54,5 @@ def _run_notebook(path: Path, folder: Path, in_place: bool) -> None:
         ) from None
     finally:
         write_atomic(folder / path.name, nbformat.writes(notebook) + "\n")
-    if in_place:
-        write_atomic(path, nbformat.writes(notebook) + "\n")
     write_atomic(page, HTMLExporter().from_notebook_node(notebook)[0])
     print(f"{page}: {time.monotonic() - start:.0f} s")

@@ -128,16 +128,11 @@ PRESETS = {preset.name: preset for preset in _ALL}
 def load_preset(
     name: str | None = None, config_file: Path | None = None, settings: Sequence[str] = ()
 ) -> Preset:
-    """The preset with all overrides applied.
+    """A preset, by default that of `NBTRACK_PRESET`, else `smoke`, with all overrides applied.
 
-    Args:
-        name: a preset's name; by default `NBTRACK_PRESET`, else `smoke`.
-        config_file: TOML file of overrides; by default the one `NBTRACK_CONFIG` names, if any.
-        settings: `key=value` texts, applied last, after those in `NBTRACK_SET`.
-
-    Raises:
-        ConfigError: an unknown preset or key, or a value of the wrong type.
-        MissingError: the file does not exist.
+    They are a TOML file, by default the one that `NBTRACK_CONFIG` names, and `key=value` texts,
+    after those in `NBTRACK_SET`. Raises ConfigError for an unknown preset or key, or a value of the
+    wrong type; MissingError if the file does not exist.
     """
     name = name or os.environ.get("NBTRACK_PRESET", "smoke")
     if name not in PRESETS:

@@ -40,8 +40,7 @@ def map_scenes(
 ) -> pd.DataFrame:
     """Scores of the maps of some scenes; those that are not cached are made, side by side.
 
-    Returns:
-        A row a map: field, scene, seed, seconds, and the scores, `SCORES`.
+    A row is a map: field, scene, seed, seconds, and the scores, `SCORES`.
     """
     places = [*product(fields, range(seeds), scenes)]
     cells = [MapCell(scene, field, preset, seed=seed) for field, seed, scene in places]
@@ -125,11 +124,7 @@ class Run:
 
 
 def read_run(name: str | Path) -> Run:
-    """A run by its name in the column `run`, or by its folder.
-
-    Raises:
-        MissingError: there is no such finished run.
-    """
+    """A run by its name in the column `run`, or by its folder; MissingError if there is none."""
     folder = Path(name) if Path(name).is_dir() else runs_folder() / "tracks" / name
     if not (folder / METRICS_FILE).is_file():
         raise MissingError(f"no finished run {name}: give a name in column `run`, or a folder")

@@ -9,16 +9,8 @@ from typing import Any
 
 import torch
 
-from nbtrack.core.device import advise_on_memory, choose_device, device_name
-from nbtrack.core.files import (
-    fingerprint,
-    foreign_source,
-    json_text,
-    read_json,
-    sources_fingerprint,
-    versions,
-    write_together,
-)
+from nbtrack.core import files
+from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.settings import as_dict, changed_settings
 from nbtrack.experiments.cells import SHARED_SOURCES, Cell, MapCell, Report, seed_suffix
 from nbtrack.experiments.presets import PRESETS
@@ -58,9 +50,9 @@ class TrackCell(Cell):
         """Of code, map, tracker, budget, frames and seed; by the clock, of the machine too."""
         machine = (device_name(choose_device()), torch.get_num_threads())
         clock = None if self.rate_hz is None else (self.rate_hz, *machine)
-        code = sources_fingerprint(*SHARED_SOURCES, "tracking")
-        return fingerprint(
-            code, foreign_source(tracker_class(self.tracker)), self.needs.key, self.tracker,
+        code = files.sources_fingerprint(*SHARED_SOURCES, "tracking")
+        return files.fingerprint(
+            code, files.foreign_source(tracker_class(self.tracker)), self.needs.key, self.tracker,
             self.settings, self.steps, clock, self.frames, self.seed, self.scene.fingerprint,
         )  # fmt: skip
 
@@ -94,7 +86,7 @@ class TrackCell(Cell):
 
     def result(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""
-        return read_json(self.folder / METRICS_FILE)
+        return files.read_json(self.folder / METRICS_FILE)
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Track, or take a killed run up where its last checkpoint stands; write the files.
@@ -103,9 +95,7 @@ class TrackCell(Cell):
         one, whose pose was given: so public tools report the error of the paper's formula. Raises
         DataError where a given map does not fit the first frame at its given pose.
         """
-        made = self.needs.map()
-        with advise_on_memory(f"frames {self.frames} of {self.scene.name}"):
-            sequence = self.scene.read(self.frames)
+        made, sequence = self.needs.map(), self.scene.read(self.frames)
         notes = {"map_from": made.made} if self.is_elsewhere else {}
         if self.needs.is_given:  # another path of a room we know may begin where no map reaches
             notes["map_warning"] = check_belongs(made, sequence[0])
@@ -126,11 +116,11 @@ class TrackCell(Cell):
         metrics = self._metrics(tracked) | notes
         ids = tracked.frames["frame_id"].to_numpy()[1:]
         # The metrics come last: where they stand, the run is complete.
-        write_together(self.folder, {
+        files.write_together(self.folder, {
             "trajectory.txt": tum_text(ids, tracked.T_estimated[1:]),
             "groundtruth.txt": tum_text(ids, tracked.T_true[1:]),
             "frames.csv": tracked.frames.to_csv(index=False),
-            METRICS_FILE: json_text(metrics),
+            METRICS_FILE: files.json_text(metrics),
         })  # fmt: skip
         checkpoint.unlink(missing_ok=True)
         return metrics
@@ -155,7 +145,7 @@ class TrackCell(Cell):
             "tracker": self.tracker,
             "seed": self.seed,
             "key": self.key,
-            "versions": versions(),
+            "versions": files.versions(),
             "command": self._command(),
             "config": {
                 "preset": as_dict(map_cell.preset),

@@ -56,23 +56,17 @@ class Scene:
 
 
 def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) -> Scene:
-    """The scene that a user means.
+    """The scene that a user means. Raises MissingError if there is no such folder, room or scene.
 
-    Args:
-        sequence: a folder in a supported layout, the name of a synthetic room (made here at the
-            size that the preset gives, unless it is there already), or of a scene of the Neural
-            RGB-D dataset below the data folder.
-        format: of the folder; by default told by its files.
-
-    Raises:
-        MissingError: there is no such folder, room or scene.
+    It is a folder in a supported layout, the name of a synthetic room (made here at the size that
+    the preset gives, unless it is there already), or of a scene of the Neural RGB-D dataset below
+    the data folder. The format of a folder is by default told by its files.
     """
     text, folder = str(sequence), Path(sequence)
     if text in ROOMS and (preset.scenes.synthetic or text not in DATASET_SCENES):
         return Scene(text, _room_folder(text, preset.scenes))
     if text in DATASET_SCENES:
-        folder = data_folder() / text
-        if folder.is_dir():
+        if (folder := data_folder() / text).is_dir():
             return Scene(text, folder, format)
         raise MissingError(
             f"no folder {folder}: download the Neural RGB-D dataset there (see data/README.md), "
@@ -88,11 +82,8 @@ def open_scenes(preset: Preset) -> list[Scene]:
     """The preset's scenes; synthetic rooms that are not there are made.
 
     Scenes that lack a folder, or whose folder is damaged, are named at once, and the others
-    returned.
-
-    Raises:
-        ConfigError: no name is given, or one is given twice or unknown.
-        MissingError, DataError: no scene is there, or none is whole; that of the first.
+    returned. Raises ConfigError where no name is given, or one twice, or an unknown one; where no
+    scene is whole, what is wrong with the first.
     """
     names, known = preset.scenes.names, [*ROOMS, *DATASET_SCENES]
     for name in names:

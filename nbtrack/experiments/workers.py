@@ -38,9 +38,8 @@ def run_on_workers(
 ) -> Iterator[tuple[Path, Any]]:
     """What becomes of each cell, as they end; each begins as soon as what it needs is there.
 
-    Args:
-        show: told where a running cell is.
-        address: of a Dask scheduler; by default local processes are started, `workers` of them.
+    `show` is told where a running cell is. Without the address of a Dask scheduler, `workers` local
+    processes are started.
     """
     with _connected(address) if address is not None else _started(workers) as client:
         topic, news = f"nbtrack-{os.getpid()}-{time.time_ns()}", []
@@ -62,18 +61,14 @@ def run_on_workers(
                 if Path(name) in waiting:
                     show(Path(name), share, status)
             for folder in [folder for folder, future in waiting.items() if future.done()]:
-                yield folder, _result(waiting.pop(folder), folder.name)
-
-
-def _result(future: Any, name: str) -> Any:
-    """What a worker returned, or that it died."""
-    try:
-        return future.result()
-    except KilledWorker:
-        return NbtrackError(
-            f"a worker process died at {name}, perhaps for lack of memory: what was finished is "
-            "kept; run the same command again, with fewer --workers or smaller settings"
-        )
+                try:
+                    outcome = waiting.pop(folder).result()
+                except KilledWorker:
+                    outcome = NbtrackError(
+                        f"a worker process died at {folder.name}, perhaps for lack of memory: what "
+                        "is done is kept; run it again, with fewer --workers or smaller settings"
+                    )
+                yield folder, outcome
 
 
 def _outcome_there(

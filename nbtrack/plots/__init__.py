@@ -4,15 +4,16 @@ Every function returns a figure that a notebook shows once, with axes labelled i
 paper's method names, and a title that states the finding.
 """
 
-from nbtrack.plots.curves import (
+from nbtrack.plots.figures import (
     plot_along_ray,
     plot_ate_bars,
     plot_curves,
     plot_errors,
+    plot_frame,
     plot_losses,
     plot_steps,
+    plot_views,
 )
-from nbtrack.plots.images import plot_frame, plot_views
 from nbtrack.plots.rooms import (
     mesh_viewer,
     plot_mesh,

@@ -13,6 +13,7 @@ from nbtrack.tables.layout import (
 from nbtrack.tables.styles import (
     style_table_1,
     style_table_2,
+    write_csv,
     write_published,
     write_table_1,
     write_table_3,

@@ -4,6 +4,7 @@ import copy
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from pandas.io.formats.style import Styler
@@ -130,18 +131,18 @@ def write_tables(
     compared_2 = layout.beside(table_2(steps), table_2(layout.published_table_2()))
     return [
         *write_table_1(folder, results, note),
-        _write_csv(folder / "table_2.csv", steps),
+        write_csv(folder / "table_2.csv", steps),
         _write_latex(folder / "table_2.tex", styled_2, "runtime", note),
-        _write_csv(folder / "table_2_vs_paper.csv", compared_2, index=True),
+        write_csv(folder / "table_2_vs_paper.csv", compared_2, index=True),
     ]
 
 
 def write_table_1(folder: Path, results: pd.DataFrame, note: str) -> list[Path]:
     """Writes Table I alone as CSV, LaTeX, and beside the paper's; see `write_tables`."""
     return [
-        _write_csv(folder / "table_1.csv", layout.average_over_seeds(results)),
+        write_csv(folder / "table_1.csv", layout.average_over_seeds(results)),
         _write_latex(folder / "table_1.tex", style_table_1(results), "ate", note),
-        _write_csv(folder / "table_1_vs_paper.csv", layout.beside_published(results), index=True),
+        write_csv(folder / "table_1_vs_paper.csv", layout.beside_published(results), index=True),
     ]
 
 
@@ -152,7 +153,7 @@ def write_table_3(folder: Path, results: pd.DataFrame, note: str) -> list[Path]:
     """
     results = layout.naming_points(results)
     return [
-        _write_csv(folder / "table_3.csv", layout.average_over_seeds(results)),
+        write_csv(folder / "table_3.csv", layout.average_over_seeds(results)),
         _write_latex(folder / "table_3.tex", style_table_1(results), "beyond", note),
     ]
 
@@ -196,8 +197,10 @@ def _texts(wide: pd.DataFrame, form: str, missing: str = "") -> pd.DataFrame:
     return wide.map(lambda value: missing if pd.isna(value) else form.format(value))
 
 
-def _write_csv(path: Path, table: pd.DataFrame, index: bool = False) -> Path:
-    write_atomic(path, table.to_csv(index=index, float_format="%.6g", lineterminator="\n"))
+def write_csv(path: Path, table: pd.DataFrame, **how: Any) -> Path:
+    """Writes a table as CSV, by default without its index and with six digits; returns the path."""
+    how = {"index": False, "float_format": "%.6g", "lineterminator": "\n", **how}
+    write_atomic(path, table.to_csv(**how))
     return path
 
 

@@ -1,15 +1,95 @@
-"""Numbers as curves and bars: along a ray, over mapping, over time, over a setting, by table."""
+"""What a camera saw beside what a field renders; numbers as curves and bars."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+import matplotlib
+import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
 from nbtrack.core.arrays import Values
-from nbtrack.data.sequence import FRAMES_PER_SECOND
-from nbtrack.plots.style import DASHED, legend_below, log_axes, method_colors, new_axes, styled
+from nbtrack.data.frame import MILLIMETRE
+from nbtrack.data.sequence import FRAMES_PER_SECOND, RgbdSequence
+from nbtrack.fields.base import View
+from nbtrack.plots.style import (
+    DASHED,
+    WIDTH,
+    legend_below,
+    log_axes,
+    method_colors,
+    new_axes,
+    styled,
+)
 from nbtrack.tables import table_1
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
+
+
+@styled
+def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figure:
+    """Colour and depth (m) of the frame at a position of a sequence; unmeasured pixels are grey.
+
+    With a slider, where `fixed` is that of ipywidgets: `interact(plot_frame,
+    sequence=fixed(sequence), index=(0, len(sequence) - 1), title=fixed("A room"))`.
+    """
+    some = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
+    left, right = new_axes(title, 0.4 + 0.5 * _height(sequence), 1, 2)[0]
+    _show(left, sequence.color(index), f"frame {sequence.frame_ids[index]}: colour")
+    image = _show(right, _measured(sequence.depth(index)), "depth", MILLIMETRE * _most(some))
+    right.figure.colorbar(image, ax=right, label="depth (m)", extend="max", aspect=25, pad=0.02)
+    return right.figure
+
+
+@styled
+def plot_views(
+    sequence: RgbdSequence, indices: Sequence[int], views: Sequence[View], title: str = ""
+) -> Figure:
+    """Observed and rendered colour and depth of some frames, one a row; unmeasured pixels grey.
+
+    Depths (m) share one colour scale and errors (cm) another, cut at their 98 % quantiles, so
+    that a few wild pixels do not hide the rest. `indices` are positions in the sequence, `views`
+    what the field renders from the same poses.
+    """
+    depths = np.ma.stack([_measured(sequence.depth(index)) for index in indices])
+    errors = 100 * np.abs(np.stack([view.depth for view in views]) - depths)
+    far, worst = _most(depths), _most(errors)
+    height = 0.9 + len(views) * (0.2 + 0.2 * _height(sequence))
+    grid = new_axes(title, height, len(views), 5)
+    for row, index, view, depth, error in zip(grid, indices, views, depths, errors, strict=True):
+        _show(row[0], sequence.color(index), f"frame {sequence.frame_ids[index]}")
+        _show(row[1], view.color, "rendered colour")
+        _show(row[2], depth, "depth", far)
+        depth_image = _show(row[3], view.depth, "rendered depth", far)
+        error_image = _show(row[4], error, "|error|", worst, "magma")
+    bars = {"location": "bottom", "pad": 0.02, "aspect": 30, "extend": "max"}
+    depth_image.figure.colorbar(depth_image, ax=grid[:, 2:4], label="depth (m)", **bars)
+    error_image.figure.colorbar(error_image, ax=grid[:, 4:], label="depth error (cm)", **bars)
+    return error_image.figure
+
+
+def _show(
+    axes: Axes, image: np.ndarray, title: str, most: float | None = None, colors: str = "viridis"
+) -> AxesImage:
+    """An image without ticks, grid and frame; unknown pixels are grey."""
+    axes.set_title(title)
+    axes.set_axis_off()
+    cmap = matplotlib.colormaps[colors].with_extremes(bad="#bdbdbd")
+    return axes.imshow(image, cmap=cmap, vmin=0, vmax=most)
+
+
+def _height(sequence: RgbdSequence) -> float:
+    """Inches of an image as wide as a figure."""
+    return WIDTH * sequence.intrinsics.height / sequence.intrinsics.width
+
+
+def _measured(depth: np.ndarray) -> np.ma.MaskedArray:
+    return np.ma.masked_equal(depth, 0)
+
+
+def _most(images: np.ndarray) -> float:
+    values = _measured(images).compressed()
+    return float(np.quantile(values, 0.98)) if len(values) else 1.0
 
 
 @styled
@@ -81,13 +161,9 @@ def plot_curves(
 ) -> Figure:
     """One column over another, a line a group; a group of one row is a point.
 
-    Where the table has columns `from` and `to`, thin lines span that interval of y.
-
-    Args:
-        x, y: columns, named as the axes are to be labelled: "time a frame (ms)". Text on x is
-            drawn in the order of its first appearance.
-        group: column or columns of labels; methods get their colours.
-        log: which axes are logarithmic: "x", "y", "xy" or "".
+    Columns x and y are named as the axes are to be labelled, "time a frame (ms)"; text on x keeps
+    the order of its first appearance. Methods among the labels get their colours. Where there are
+    columns `from` and `to`, thin lines span that interval of y. Axes of `log` are logarithmic.
     """
     axes = new_axes(title, 3.6)[0, 0]
     labels = table[[group] if isinstance(group, str) else group].agg(", ".join, axis=1)
