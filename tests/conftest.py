@@ -12,6 +12,12 @@ import torch
 from finished import GIVEN, MAP, OWN, isolate
 
 os.environ["NBTRACK_DEVICE"] = "cpu"  # where there is a GPU too: what is tested there says so
+LONG = ("test_grid", "test_tables_of_runs", "test_kills", "test_data_check", "test_synthetic")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest modules first: at the end they would leave the other processes idle."""
+    items.sort(key=lambda item: item.path.stem not in LONG)
 
 
 @pytest.fixture(scope="module")
