@@ -38,20 +38,14 @@ def _weigh(rows, by_slope):
 
 @no_type_check
 @njit(**_HOW)
-def residual_rows(observed, T, grid, by_slope):
-    """A column of every point at a pose; `registration.residuals_at` in a grid.
-
-    A grid is its vertices (value and intensity), their numbers along x, y and z, and its place: the
-    first vertex, the voxel, and both corners of the box whose points are usable.
-    """
-    (points, intensity), (vertices, shape, place) = observed, grid
-    n_points, inverse = len(points), 1 / place[3]
-    rows, numbers = np.empty((12, n_points), np.float32), np.zeros(n_points, np.int64)
-    at, inside = np.empty((2, 3, n_points), np.float32)
+def _place(rows, points, T, shape, place):
+    """Arms, and whether points are usable; their cells, where in them, and the slopes' unit."""
+    inverse, numbers = 1 / place[3], np.zeros(len(points), np.int64)
+    at, inside = np.empty((2, 3, len(points)), np.float32)
     rows[2] = _ONE
     for k in range(3):
         last = shape[k] - 1.0
-        for i in range(n_points):
+        for i in range(len(points)):
             arm = T[k, 0] * points[i, 0] + T[k, 1] * points[i, 1] + T[k, 2] * points[i, 2]
             world = arm + T[k, 3]
             rows[3 + k, i] = arm
@@ -62,8 +56,22 @@ def residual_rows(observed, T, grid, by_slope):
             scaled = min(scaled, last) if scaled > 0 else 0.0
             cell = min(int(scaled), shape[k] - 2)
             at[k, i], numbers[i] = scaled - cell, numbers[i] * shape[k] + cell
+    return numbers, at, inside
+
+
+@no_type_check
+@njit(**_HOW)
+def residual_rows(observed, T, grid, by_slope):
+    """A column of every point at a pose; `registration.residuals_at` in a grid.
+
+    A grid is its vertices (value and intensity), their numbers along x, y and z, and its place: the
+    first vertex, the voxel, and both corners of the box whose points are usable.
+    """
+    (points, intensity), (vertices, shape, place) = observed, grid
+    rows = np.empty((12, len(points)), np.float32)
+    numbers, at, inside = _place(rows, points, T, shape, place)
     step_x, step_y, one = np.uintp(shape[1] * shape[2]), np.uintp(shape[2]), np.uintp(1)
-    for i in range(n_points):
+    for i in range(len(points)):
         v, x, y, z = np.uintp(numbers[i]), at[0, i], at[1, i], at[2, i]
         for k in range(2):
             a, b = vertices[v, k], vertices[v + one, k]
