@@ -82,9 +82,8 @@ def result(folder: Path) -> dict[str, object]:
     for path in folder.iterdir():
         if path.suffix in (".txt", ".ply") or path.name.startswith("table_1"):
             found[path.name] = path.read_bytes()
-        elif path.name in ("frames.csv", "history.csv"):  # slow machines look at s more often
-            clocked = ["seconds", "deviation_m"]
-            found[path.name] = pd.read_csv(path).drop(columns=clocked, errors="ignore").to_csv()
+        elif path.name in ("frames.csv", "history.csv"):
+            found[path.name] = pd.read_csv(path).drop(columns="seconds", errors="ignore").to_csv()
         elif path.name == MAP_FILE:
             found[path.name] = read_map(path).key
     return found

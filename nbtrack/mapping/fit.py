@@ -24,8 +24,7 @@ from nbtrack.mapping.files import MAP_FILE, Map, read_map
 from nbtrack.mapping.quality import split_holdout, usual_misfit
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
-# Iterations between two looks at the losses, which wait for the device; one, where it takes longer.
-_MOST_PENDING, _SLOW_SECONDS = 10, 0.2
+_PENDING = 10  # iterations between two looks at the losses, which wait for the device
 _FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
 
 OnIteration = Callable[[int, dict[str, float]], None]
@@ -124,8 +123,7 @@ class _Fit:
             self._load(checkpoint)
         last_saved, end = time.perf_counter(), self.settings.iterations
         while (done := len(self.history)) < end:
-            is_slow = done == 0 or self.seconds > _SLOW_SECONDS * done
-            self._advance(range(done, min(end, done + (1 if is_slow else _MOST_PENDING))))
+            self._advance(range(done, min(end, done + _PENDING)))
             if on_iteration:
                 on_iteration(len(self.history), self.history[-1])
             is_due = time.perf_counter() - last_saved > CHECKPOINT_SECONDS
