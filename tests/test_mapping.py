@@ -21,8 +21,8 @@ NETWORK = NetworkSettings(width=48, n_frequencies=32)
 
 
 def settings_of(field_name: str, **changes: float) -> MappingSettings:
-    """Few rays and samples; 14 iterations if nothing else is asked for."""
-    small = {"iterations": 14, "n_rays": 32, "n_stratified": 8, "n_surface": 4}
+    """Few rays and samples; 24 iterations if nothing else is asked for."""
+    small = {"iterations": 24, "n_rays": 32, "n_stratified": 8, "n_surface": 4}
     return field_class(field_name).Settings(**{**small, "learning_rate": 3e-3, **changes})
 
 
@@ -100,9 +100,9 @@ def test_resume_equals_uninterrupted(field_name: str, tmp_path: Path) -> None:
     """Catches a checkpoint that forgets anything: batches, Adam's moments, the learning rate."""
     checkpoint, seen = tmp_path / "mapping.pt", []
     whole = map_wall(field_name, None)
-    map_killed(field_name, checkpoint, at=10)
+    map_killed(field_name, checkpoint, at=20)
     resumed = map_wall(field_name, checkpoint, lambda done, losses: seen.append(done))
-    assert seen == [11, 14]
+    assert seen == [20, 24]
     assert np.array_equal(resumed.history.to_numpy(), whole.history.to_numpy())
     assert resumed.key == whole.key
 
@@ -110,7 +110,7 @@ def test_resume_equals_uninterrupted(field_name: str, tmp_path: Path) -> None:
 def test_a_checkpoint_that_is_not_this_maps(tmp_path: Path) -> None:
     """Catches a silent continuation of another map, and a traceback from a damaged file."""
     checkpoint = tmp_path / "mapping.pt"
-    map_killed("neus", checkpoint, at=10)
+    map_killed("neus", checkpoint, at=20)
     with pytest.raises(DataError, match="made with another seed: remove it"):
         map_wall("neus", checkpoint, seed=1)
     with pytest.raises(DataError, match="made with another field, settings: remove it"):
