@@ -55,10 +55,10 @@ def test_a_rejected_step_leaves_the_pose_unchanged(monkeypatch: pytest.MonkeyPat
     tracker.begin(FRAME, T_TRUE[None])
     bad = torch.tensor([0.3, 0.0, 0.0, 0.5, 0.0, 0.0], dtype=torch.float64)
     monkeypatch.setattr("nbtrack.tracking.registration.damped_step", lambda *arguments: bad)
-    damping = tracker.searches[-1].damping
+    damping = tracker.search.damping
     tracker.step()
     torch.testing.assert_close(tracker.T_world_camera.float(), T_TRUE, atol=1e-6, rtol=0)
-    assert tracker.searches[-1].damping > damping
+    assert tracker.search.damping > damping
 
 
 def test_in_a_corridor_the_axis_is_flagged_and_the_pose_stays() -> None:

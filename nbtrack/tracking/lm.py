@@ -25,6 +25,8 @@ _COARSE_SHARE, _LEAST_COARSE = 8, 128
 # Starts are compared by widely robust costs: narrow ones say the same of all that are off.
 _WIDE_SCALES = 0.1, 0.2
 _MOST_DEVIATION = 0.04  # m; a pose whose position is less certain is taken for lost
+# With fewer inliers even a pose is lost to which the frame before led, within so much (m, rad).
+_LEAST_INLIERS, _FOLLOWED = 0.6, 0.15
 _RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
 # Where a map knows its cameras, a lost one is looked for at so many random poses, so far (m) from
 # theirs; from the cheapest some steps are taken, before the cheapest of those are followed.
@@ -36,8 +38,8 @@ class LmTracker(Tracker):
 
     A search that ends lost is followed by others, while the budget lasts: from the last good pose,
     then around it, or, where the map knows its own cameras, from random poses near theirs that fit
-    the frame best after a few steps, which count as one. The cheapest estimate counts. A frame with
-    too few points keeps the start that the motion model gave.
+    the frame best after a few steps, which count as one. The first that is not lost counts; if all
+    are, that from the motion model. A frame with too few points keeps the start that this gave.
 
     Source: Levenberg 1944, Marquardt 1963; residuals of the paper's Eq. 2; an answer of our own to
     its remark that SDF tracking with Adam needs more steps than 10 Hz allows.
@@ -46,8 +48,9 @@ class LmTracker(Tracker):
     name = "lm"
     Settings = LmSettings
     copes_without_depth = True
-    remembers = ("last_good",)
+    remembers = ("last_good", "was_lost")
     last_good: Transform | None = None  # of the latest frame not taken for lost
+    was_lost: bool = False  # in the frame before
 
     def __init__(self, field: Field, *arguments: Any, **settings: Any) -> None:
         super().__init__(field, *arguments, **settings)
@@ -59,7 +62,7 @@ class LmTracker(Tracker):
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
         R = T_starts.numpy()[:, :3, :3]
         R[:] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
-        self.T_kept, self.searches, self.verdict = T_starts[0], [], None
+        self.T_kept, self.search, self.starts, self.verdict = T_starts[0], None, None, None
         self.anchor = T_starts[-1] if self.last_good is None else self.last_good
         observed = self.search_kind.draw(frame, self.settings.n_pixels, self.generator)
         n_points = len(observed[0])
@@ -69,58 +72,60 @@ class LmTracker(Tracker):
         n_coarse = max(_LEAST_COARSE, n_points // _COARSE_SHARE)
         self.levels = tuple(part[:n_coarse] for part in observed), observed
         searches = [self._search_from(T_start) for T_start in T_starts]
-        self.searches.append(_by_cost(searches, _WIDE_SCALES)[0])
+        self.search = self.best = _by_cost(searches, _WIDE_SCALES)[0]
+        self.was_followed = not self.was_lost
 
     def step(self) -> Scalar:
         """One step of Levenberg-Marquardt, taken or refused; returns the cost before it."""
-        if not self.searches:
+        if self.search is None:
             return torch.tensor(float("nan"))
-        search, self.verdict = self.searches[-1], None
-        before = search.step()
-        if search.is_ended and search.level == 0:
-            search.begin(1)
-        elif search.is_ended:
+        self.verdict = None if self.search is self.best else self.verdict
+        before = self.search.step()
+        if self.search.is_ended and self.search.level == 0:
+            self.search.begin(1)
+        elif self.search.is_ended:
             self._follow_up()
         return torch.tensor(before)
 
     @property
     def T_world_camera(self) -> Transform:
-        """The cheapest estimate so far; without points, the first start."""
-        if not self.searches:
-            return self.T_kept
-        return torch.as_tensor(self._best().T_world_camera)
+        """The estimate so far; without points, the first start."""
+        return self.T_kept if self.search is None else torch.as_tensor(self.best.T_world_camera)
 
     def report(self) -> dict[str, float | bool]:
         """Inliers, deviations, condition number and verdict; a good pose is kept for restarts."""
-        if not self.searches:
-            return {"inlier_ratio": 0.0, "lost": True}
-        if self.verdict:
-            return self.verdict
-        best = self._best()
-        found = best.certainty()
-        is_uncertain = found["position_deviation_m"] > _MOST_DEVIATION
-        is_lost = found["inlier_ratio"] < self.field.least_inliers or is_uncertain
-        if not is_lost:
-            self.last_good = torch.as_tensor(best.T_world_camera)
-        self.verdict = {**found, "lost": is_lost}
+        if self.search is None:
+            self.verdict = {"inlier_ratio": 0.0, "lost": True}
+        elif self.verdict is None:
+            self.verdict = self._judge(self.best)
+        self.was_lost = bool(self.verdict["lost"])
+        if not self.was_lost:
+            self.last_good = torch.as_tensor(self.best.T_world_camera)
         return self.verdict
 
-    def _best(self) -> Search:
-        """The cheapest of the searches on the most points."""
-        level = max(search.level for search in self.searches)
-        finest = [search for search in self.searches if search.level == level]
-        return _by_cost(finest, self.field.accuracy)[0]
+    def _judge(self, search: Search) -> dict[str, float | bool]:
+        """What a search says of its pose. One to which the frame before led needs fewer inliers."""
+        found = search.certainty()
+        moved_by = np.linalg.inv(np.asarray(search.start)) @ np.asarray(search.T_world_camera)
+        is_near = np.abs(moved_by - np.eye(4)).max() < _FOLLOWED
+        is_followed = self.was_followed and self.starts is None and is_near
+        least = _LEAST_INLIERS if is_followed else self.field.least_inliers
+        is_uncertain = found["position_deviation_m"] > _MOST_DEVIATION
+        return {**found, "lost": found["inlier_ratio"] < least or is_uncertain}
 
     def _search_from(self, T_start: Transform) -> Search:
         return self.search_kind(self.field, self.levels, self.settings, T_start)
 
     def _follow_up(self) -> None:
-        """Restart if even the best search is lost and another start is left; else it is done."""
-        if len(self.searches) == 1 and self.report()["lost"]:
+        """Restart if a search has ended lost and another start is left; else the frame is done."""
+        verdict = self._judge(self.search)
+        if self.search is self.best or not verdict["lost"]:
+            self.best, self.verdict = self.search, verdict
+        if self.starts is None and verdict["lost"]:
             self.starts = self._other_starts()[: self.settings.n_restarts]
-        self.is_converged = not self.report()["lost"] or not self.starts
+        self.is_converged = not verdict["lost"] or not self.starts
         if not self.is_converged:
-            self.searches.append(self._search_from(self.starts.pop(0)))
+            self.search = self._search_from(self.starts.pop(0))
 
     def _other_starts(self) -> list[Transform]:
         """Where else the camera may be, the likeliest first."""
