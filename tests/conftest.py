@@ -11,22 +11,16 @@ import pytest
 import torch
 from finished import GIVEN, MAP, OWN, isolate
 
+for name in ("PRESET", "CONFIG", "SET", "DATA", "RUNS"):  # of whoever runs the tests
+    os.environ.pop(f"NBTRACK_{name}", None)
 os.environ["NBTRACK_DEVICE"] = "cpu"  # where there is a GPU too: what is tested there says so
+torch.set_num_threads(1)  # images are so small that threads would only wait for each other
 LONG = ("test_grid", "test_tables_of_runs", "test_kills", "test_data_check", "test_synthetic")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest modules first: at the end they would leave the other processes idle."""
     items.sort(key=lambda item: item.path.stem not in LONG)
-
-
-@pytest.fixture(scope="module")
-def one_thread() -> Iterator[None]:
-    """For tests with images so small that threads would only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -39,15 +33,13 @@ def few_scores() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def settings_stay_inside() -> Iterator[None]:
-    """What a command sets for its own process must not reach the next test."""
-    environment, threads = dict(os.environ), torch.get_num_threads()
-    yield
-    for name in set(os.environ) - set(environment):
-        if name.startswith("NBTRACK_"):
-            del os.environ[name]
-    if torch.get_num_threads() != threads:
-        torch.set_num_threads(threads)
+def settings_stay_inside(tmp_path: Path) -> Iterator[None]:
+    """A cache for each test, unless its module has one; and what a command sets for its own process
+    must not reach the next test."""
+    with mock.patch.dict(os.environ):
+        os.environ.setdefault("NBTRACK_RUNS", str(tmp_path / "runs"))
+        yield
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

@@ -5,11 +5,12 @@ is slow there only, so shows everywhere: tensors of two devices in one operation
 that a device lacks, waits, copies, and how many kernels a step launches.
 """
 
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from unittest import mock
+from contextlib import contextmanager
 
+import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
@@ -106,23 +107,25 @@ def refuse(step: Callable, generator: torch.Generator) -> None:
     raise RuntimeError("cannot be recorded here")
 
 
+def pretend(patch: pytest.MonkeyPatch, graph_of: Callable) -> None:
+    """Steps are recorded on any device, in a way."""
+    patch.setattr("nbtrack.core.capture.can_record", lambda device: True)
+    patch.setattr("nbtrack.core.capture.run_aside", lambda step, device: step())
+    patch.setattr("nbtrack.core.capture.graph_of", graph_of)
+
+
 @contextmanager
 def emulated() -> Iterator[Emulator]:
     """Within it `DEVICE` is there, and taken for CUDA, on which no step can be recorded."""
-    capture, optim = "nbtrack.core.capture", "torch.optim"
-    patches = {
-        "torch.Generator": Draws,
-        "torch.accelerator.synchronize": lambda device: None,
-        f"{optim}.adam._default_to_fused_or_foreach": lambda *_, **__: (False, True),
-        f"{optim}.optimizer._get_fused_kernels_supported_devices": lambda: ["meta", "cpu"],
-        f"{capture}.can_record": lambda device: device == DEVICE,
-        f"{capture}.run_aside": lambda step, device: step(),
-        f"{capture}.graph_of": refuse,
-    }
-    with ExitStack() as stack:
-        for name, value in patches.items():
-            stack.enter_context(mock.patch(name, value))
-        yield stack.enter_context(Emulator())
+    adam, optimizer = (sys.modules[f"torch.optim.{name}"] for name in ("adam", "optimizer"))
+    with pytest.MonkeyPatch.context() as patch:
+        pretend(patch, refuse)
+        patch.setattr("torch.Generator", Draws)
+        patch.setattr("torch.accelerator.synchronize", lambda device: None)
+        patch.setattr(adam, "_default_to_fused_or_foreach", lambda *_, **__: (False, True))
+        patch.setattr(optimizer, "_get_fused_kernels_supported_devices", lambda: ["meta", "cpu"])
+        with Emulator() as emulator:
+            yield emulator
 
 
 class Tape(TorchDispatchMode):

@@ -17,9 +17,6 @@ OWN = [*TRACK, "--field", "neus"]
 
 
 def isolate(folder: Path, patch: pytest.MonkeyPatch) -> None:
-    """Work in a folder, with a cache there and none of the caller's settings."""
-    for name in ("PRESET", "CONFIG", "SET", "DATA"):
-        patch.delenv(f"NBTRACK_{name}", raising=False)
-    patch.setenv("NBTRACK_DEVICE", "cpu")
+    """Work in a folder, with a cache there."""
     patch.setenv("NBTRACK_RUNS", str(folder / "runs"))
     patch.chdir(folder)

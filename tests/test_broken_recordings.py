@@ -14,7 +14,6 @@ from nbtrack.cli import main
 from nbtrack.core.errors import NbtrackError
 from nbtrack.data.sequence import read_sequence
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 Damage = Callable[[Path], object]
 
 

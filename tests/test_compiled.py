@@ -60,20 +60,23 @@ def test_what_is_no_number_stays_none() -> None:
     assert np.isnan(kernels.normal_equations(rows, least, 1.0)[0]).any() or not rows[2].any()
 
 
-def test_points_are_drawn_away_from_borders_and_edges() -> None:
-    """Catches pixels that the plain draw would refuse, and draws that do not follow the seed."""
+@pytest.mark.parametrize("kind", [Search, CompiledSearch])
+def test_points_are_drawn_away_from_borders_and_edges(kind: type[Search]) -> None:
+    """Catches points whose depth may belong to either side of an edge, and draws that do not follow
+    the seed."""
     frame = walk(1)[0]
     frame.depth_mm[:, :16], frame.depth_mm[:, 16:], frame.depth_mm[3:6] = 1000, 2000, 0
     seeds = (torch.Generator().manual_seed(seed) for seed in (1, 1, 2))
-    (points, luma), again, other = (CompiledSearch.draw(frame, 400, seed) for seed in seeds)
-    assert np.array_equal(points, again[0])
-    assert not np.array_equal(points, other[0])
+    draws = [kind.draw(frame, 400, seed) for seed in seeds]
+    (points, luma), (again, _), (other, _) = (map(np.asarray, draw) for draw in draws)
+    assert np.array_equal(points, again)
+    assert not np.array_equal(points, other)
     columns, rows = (points[:, :2] / points[:, 2:] * 24 + [16, 12] - 0.5).T.round().astype(int)
     assert {*columns} == {*range(1, 15), *range(17, 31)}
     assert {*rows} == {1, *range(7, 23)}
     color = frame.color[rows, columns].numpy() / 255
     np.testing.assert_allclose(luma, color @ [0.299, 0.587, 0.114], atol=1e-6)
-    assert len(CompiledSearch.draw(walk(1)[0], 400, torch.Generator())[0]) == 400
+    assert len(kind.draw(walk(1)[0], 400, torch.Generator())[0]) == 400
 
 
 def test_without_numba_torch_does_it_and_says_so(

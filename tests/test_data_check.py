@@ -38,7 +38,6 @@ from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import read_sequence
 from nbtrack.experiments.presets import load_preset
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 REAL_ROOM = Path(__file__).resolve().parents[2] / "shared/data/real_room"
 NEEDS_REAL = pytest.mark.skipif(not REAL_ROOM.is_dir(), reason="no real recording here")
 SEEN = ["living_room", "office", "long_hall", pytest.param("real_room", marks=NEEDS_REAL)]

@@ -12,10 +12,9 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.device import advise_on_memory
 from nbtrack.core.errors import OutOfMemory
 from nbtrack.fields import Field, NetworkSettings, make_field, mlp
-from nbtrack.tracking import TRACKERS, StepBudget, make_tracker
+from nbtrack.tracking import SdfSettings, StepBudget, make_tracker
 
 BOUNDS = SceneBounds((-2.0, -1.0, -1.0), (2.0, 1.0, 2.0))
-SEQUENCE = walk(2)
 
 
 def frozen_field(name: str) -> Field:
@@ -38,21 +37,14 @@ def test_parts_answer_as_the_whole(name: str, monkeypatch: pytest.MonkeyPatch) -
         torch.testing.assert_close(parts, whole, rtol=1e-4, atol=1e-5)
 
 
-def tracker_of(name: str, field_name: str):
-    """At the first frame."""
-    settings = TRACKERS[name].Settings(n_pixels=16)
-    tracker = make_tracker(name, frozen_field(field_name), np.eye(4), StepBudget(1), settings)
-    tracker.begin(SEQUENCE[1], torch.eye(4)[None])
-    return tracker
-
-
 def test_many_frames_leave_no_memory_behind() -> None:
     """Catches tensors that a tracker keeps of every frame."""
-    tracker, counts = tracker_of("sdf", "neus"), []
+    settings, frame, counts = SdfSettings(n_pixels=16), walk(2)[1], []
+    tracker = make_tracker("sdf", frozen_field("neus"), np.eye(4), StepBudget(1), settings)
     for n_frames in (2, 5):
         for _ in range(n_frames):
             tracker.restart(np.eye(4))
-            tracker.track(SEQUENCE[1])
+            tracker.track(frame)
         gc.collect()
         counts.append(sum(issubclass(type(thing), torch.Tensor) for thing in gc.get_objects()))
     assert counts[1] <= counts[0]

@@ -144,6 +144,7 @@ def _forget_the_map() -> None:
 
 KITTI = ["export", "run", "--to", "kitti", "poses.txt"]
 MESH = ["export", "map", "--to", "glb", "m.glb"]
+IMAP, NO_STEPS = [*MAP, "--field", "imap"], [*OWN[:4], "--field", "neus"]
 NO_OPTIMIZER = {"optimizer": {"state": {}, "param_groups": []}, "iteration": 2}
 RUN_OF_WORDS = {"estimates": "here", "rows": [], "tracker": {}, "budget": {}}
 CUT = "not a readable checkpoint"
@@ -164,6 +165,7 @@ FILES = {
     "checkpoint is empty": (_unfinished(_resave(lambda c: {})), MAP, CUT),
     "checkpoint without state": (_unfinished(_resave(_no_generator)), MAP, "KeyError: 'gener"),
     "checkpoint of another optimiser": (_unfinished(_resave(lambda c: c | NO_OPTIMIZER)), MAP, CUT),
+    "checkpoint of another field": (_unfinished(), IMAP, "with another field, network, settings"),
     "checkpoint of another seed": (_unfinished(), [*MAP, "--seed", "5"], "made with another seed"),
     "finished map of another seed": (_nothing, [*MAP, "--seed", "5"], "made with another seed"),
     "run checkpoint is a list": (_run_checkpoint([1]), OWN, "run.pt is " + CUT),
@@ -221,6 +223,23 @@ ARGUMENTS = {
     "no seeds": (["tables", "--seeds", "0"], "seeds"),
     "no workers": (["tables", "--workers", "0"], "is 1 or more"),
     "unknown row": (["tables", "--trackers", "vr,sfd"], "did you mean 'sdf'"),
+    "unknown budget": (["tables", "--budget", "tick"], "unknown 'tick'"),
+    "unknown command": (["trak", "living_room"], "did you mean 'track'"),
+    "unknown action": (["data", "chekc", "room"], "did you mean 'check'"),
+    "unknown option": ([*OWN, "--stpes", "2"], "did you mean '--steps'"),
+    "unknown room": (["track", "living_rom", *OWN[2:]], "did you mean 'living_room'"),
+    "no folder": (["track", "does/not/exist", *OWN[2:]], "no sequence 'does/not/exist'"),
+    "unknown field": ([*MAP, "--field", "imapp"], "did you mean 'imap'"),
+    "unknown tracker": ([*OWN, "--tracker", "sfd"], "did you mean 'sdf'"),
+    "tracker not the field's": ([*OWN, "--field", "imap"], "take one of neus"),
+    "supervision not the field's": ([*IMAP, "--supervision", "rendering+sdf"], "'imap' knows no"),
+    "baked and rendered": ([*OWN, "--tracker", "vr", "--bake", "0.04"], "'tracking.lm.bake_voxel'"),
+    "no budget": (NO_STEPS, "give one of the two"),
+    "both budgets": ([*OWN, "--rate", "2"], "give one of the two"),
+    "rate of zero": ([*NO_STEPS, "--rate", "0"], "rate_hz is 0"),
+    "negative steps": ([*OWN, "--steps", "-1"], "steps_per_frame is -1"),
+    "no frames to map": ([*OWN, "--map-frames", "10:20"], "select 0 of"),
+    "room onto a folder": (["data", "make", "office", "--out", "run"], "exists"),
 }
 
 

@@ -32,7 +32,6 @@ from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import RgbdSequence, parse_frames, read_sequence
 from nbtrack.data.writer import convert_sequence
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 LOSSY = ("replica", "scannet")  # colour is JPEG
 
 

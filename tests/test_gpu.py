@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from box_room import BoxRoom, walk
-from emulated import DEVICE, emulated, pretended_graph, refuse
+from emulated import DEVICE, emulated, pretend, pretended_graph, refuse
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.capture import WARM_STEPS, Recorded
@@ -111,13 +111,6 @@ def test_the_device_is_the_named_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.accelerator.current_accelerator", lambda **_: DEVICE)
     assert [named_device("meta:1"), choose_device().type] == [torch.device("meta:1"), "cpu"]
     assert chosen == [1]
-
-
-def pretend(monkeypatch: pytest.MonkeyPatch, graph_of) -> None:
-    """Steps on the CPU are recorded, in a way."""
-    monkeypatch.setattr("nbtrack.core.capture.can_record", lambda device: True)
-    monkeypatch.setattr("nbtrack.core.capture.run_aside", lambda step, device: step())
-    monkeypatch.setattr("nbtrack.core.capture.graph_of", graph_of)
 
 
 @pytest.mark.parametrize(("name", "field_name"), [("sdf", "neus"), ("vr", "imap"), ("vr", "neus")])

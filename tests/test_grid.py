@@ -52,12 +52,6 @@ class Square(Cell):
         return self.result()
 
 
-@pytest.fixture(autouse=True)
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A cache of its own."""
-    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
-
-
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """Of a scheduler with two workers in processes of their own."""
@@ -85,16 +79,13 @@ def test_results_come_in_order(execution: dict, capsys: pytest.CaptureFixture) -
         assert capsys.readouterr().err == ""
 
 
-def test_a_users_mistake_comes_through(execution: dict) -> None:
-    """Catches errors of workers that lose their class or message on the way."""
-    with pytest.raises(DataError, match=r"depth7.png is empty"):
-        run_cells([Square(7, "badly"), Square(2)], "mixed", Execution(**execution))
-
-
-def test_others_go_on_after_a_failure(execution: dict) -> None:
-    """Catches one bad cell that ends the grid, and dependants that do not know why they failed."""
+def test_a_users_mistake_comes_through_and_others_go_on(execution: dict) -> None:
+    """Catches errors of workers that lose their class or message on the way, one bad cell that ends
+    the grid, and dependants that do not know why they failed."""
     bad = Square(7, "badly")
     cells = [bad, Square(2, needs=bad), Square(3)]
+    with pytest.raises(DataError, match=r"depth7.png is empty"):
+        run_cells(cells, "mixed", Execution(**execution))
     results = run_cells(cells, "mixed", Execution(**execution, keep_going=True))
     assert isinstance(results[0], DataError)
     assert str(results[1]) == "not run, because square 7 failed: depth7.png is empty"

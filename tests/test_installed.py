@@ -15,8 +15,7 @@ from nbtrack.core import files
 @pytest.fixture
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty current folder, and no checkout around the package."""
-    for name in ("RUNS", "DATA", "PRESET", "CONFIG", "SET"):
-        monkeypatch.delenv(f"NBTRACK_{name}", raising=False)
+    monkeypatch.delenv("NBTRACK_RUNS")
     monkeypatch.setattr(files, "PACKAGE", tmp_path / "site-packages" / "nbtrack")
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")

@@ -61,12 +61,9 @@ def own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     del FIELDS["fading"], TRACKERS["distance"], METHODS["mine"], sys.modules["own_method"]
 
 
-def test_a_row_in_both_tables(
-    few_scores: None, own_file: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_row_in_both_tables(few_scores: None, own_file: None, tmp_path: Path) -> None:
     """Catches an extension that needs more than its own file: presets, layouts, registries."""
     assert OWN.count("\n") <= 40
-    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
     words = tiny_words(
         "tables.rates_hz=[10]", "tracking.distance.n_pixels=8", "mapping.fading.decay=0.1",
         "mapping.fading.iterations=6", "mapping.fading.n_rays=8",

@@ -24,7 +24,6 @@ from nbtrack.data.check import check_recording
 from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import read_sequence
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 EXAMPLES = int(os.environ.get("NBTRACK_FUZZ_EXAMPLES", "100"))
 TEXTS = {
     "neural_rgbd": ("poses.txt", "focal.txt", "intrinsics.txt"),

@@ -17,13 +17,6 @@ from nbtrack.synthetic import REPORTED_ROOMS
 KEY = "mapping.neus.iterations"
 
 
-@pytest.fixture(autouse=True)
-def clean_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The settings of whoever runs the tests must not count."""
-    for name in ("NBTRACK_PRESET", "NBTRACK_CONFIG", "NBTRACK_SET"):
-        monkeypatch.delenv(name, raising=False)
-
-
 def iterations(preset: Preset) -> int:
     return preset.mapping["neus"].iterations
 

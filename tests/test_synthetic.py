@@ -305,8 +305,6 @@ def test_user_errors(tmp_path):
     with pytest.raises(ConfigError, match="frames = 1"):
         make_room("office", tmp_path / "a", 1, 32, 24)
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(DataError, match="exists"):
-        make_room("office", tmp_path, 4, 32, 24)
     for content, message in (("{", "again"), ('{"room": "office", "version": 0}', "version 0")):
         (tmp_path / "room.json").write_text(content)
         with pytest.raises(DataError, match=message):

@@ -31,8 +31,6 @@ from nbtrack.experiments.scenes import Scene, open_scenes
 def cache(few_scores: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """One cache for all tests here, so that rooms and maps are made once, and one process."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("NBTRACK_PRESET", "NBTRACK_CONFIG", "NBTRACK_SET"):
-            patch.delenv(name, raising=False)
         folder = tmp_path_factory.mktemp("runs")
         patch.setenv("NBTRACK_RUNS", str(folder))
         patch.setattr("nbtrack.experiments.grid.os.cpu_count", lambda: 1)
@@ -185,27 +183,21 @@ def test_table_2_of_this_machine(preset: Preset, scenes: list[Scene]) -> None:
     assert default_pixels(preset) == {"VR": 8, "SDF": 16}
 
 
-def test_missing_dataset_scene_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Catches an unhelpful error where the dataset was not downloaded."""
-    monkeypatch.setenv("NBTRACK_DATA", str(tmp_path / "nothing"))
-    with pytest.raises(MissingError, match=r"no folder .*breakfast_room.*data/README.md"):
-        open_scenes(load_preset("paper"))
-
-
-@pytest.mark.parametrize(
-    ("names", "told"),
-    [
+def test_wrong_scenes_are_told_before_anything_is_made(
+    preset: Preset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a misspelt column that is left out in silence, a column counted as two seeds, and an
+    unhelpful error where the dataset was not downloaded."""
+    for names, told in (
         ("['living_rom']", "unknown scene 'living_rom', and no such folder: did you mean"),
         ("['office', 'office']", "office, office: give at least one, and of one name only one"),
         ("[]", r"\(none\): give at least one"),
-    ],
-)
-def test_wrong_scenes_are_told_before_anything_is_made(
-    preset: Preset, names: str, told: str
-) -> None:
-    """Catches a misspelt column that is left out in silence, and a column counted as two seeds."""
-    with pytest.raises(ConfigError, match=told):
-        open_scenes(with_settings(preset, f"scenes.names={names}"))
+    ):
+        with pytest.raises(ConfigError, match=told):
+            open_scenes(with_settings(preset, f"scenes.names={names}"))
+    monkeypatch.setenv("NBTRACK_DATA", str(tmp_path / "nothing"))
+    with pytest.raises(MissingError, match=r"no folder .*breakfast_room.*data/README.md"):
+        open_scenes(load_preset("paper"))
 
 
 def test_a_damaged_scene_leaves_the_others(

@@ -22,7 +22,6 @@ from nbtrack.tracking import (
     TrackerSettings,
     Trajectory,
     VrSettings,
-    check_pair,
     make_tracker,
     track_sequence,
 )
@@ -129,16 +128,8 @@ def test_the_warm_up_step_counts_nowhere() -> None:
 
 
 def test_wrong_arguments() -> None:
-    """Catches a typing mistake that is met late, a pose that is none, a grid to render, tracking on
-    nothing, and poses that are not numbers."""
-    for tracker, field, advice in (("sdf", "imap", "neus"), ("icp", "neus", "points")):
-        match = f"tracker '{tracker}' does not work on field '{field}': take .*{advice}"
-        with pytest.raises(ConfigError, match=match):
-            check_pair(tracker, field)
-    with pytest.raises(ConfigError, match="unknown tracker 'sfd': did you mean 'sdf'"):
-        check_pair("sfd", "neus")
-    with pytest.raises(ConfigError, match="unknown motion model 'none'"):
-        tracker_of("sdf", 1, SdfSettings(motion_model="none"))
+    """Catches a pose that is none, a grid to render, tracking on nothing, and poses that are not
+    numbers. What commands refuse: `test_faults.py`."""
     for pose in (np.full((4, 4), np.nan), np.diag([1.0, 1.0, -1.0, 1.0])):
         with pytest.raises(DataError, match="no rigid transform"):
             make_tracker("sdf", BoxRoom(), pose, StepBudget(1))
