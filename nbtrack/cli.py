@@ -27,71 +27,52 @@ def a_count(text: str, least: int = 1) -> int:
     return int(text)
 
 
-def _option(help: str, type: Any = str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
-    return {"help": help, "type": type, "metavar": metavar, **more}
+def _option(help: str, type: Any = str, **more: Any) -> dict[str, Any]:
+    return {"help": help, "type": type, **more}
 
 
+# By name, and a word for its value where the name says too little.
 OPTIONS = {
     "sequence": _option("a folder, or the name of a room or dataset scene"),
     "folder": _option("a recording", a_path),
     "room": _option("its name"),
     "source": _option("folder of a run or a map, or a map file", a_path),
     "out": _option("file or folder to write", a_path),
-    "--format": _option(
-        "neural_rgbd, tum, replica, 7scenes, scannet or plain (default: told by its files)",
-        metavar="NAME",
-    ),
+    "--format NAME": _option("neural_rgbd, tum, replica, 7scenes, scannet, plain (default: told)"),
     "--field": _option("imap, neus or another"),
-    "--supervision": _option(
-        "rendering, as in the paper (default); rendering+sdf teaches NeuS the distances too"
-    ),
+    "--supervision": _option("rendering (default) or, for NeuS's distances too, rendering+sdf"),
     "--tracker": _option("vr, sdf, lm or another"),
-    "--rate": _option("frames a second, by the clock", float, "HZ"),
-    "--steps": _option("optimisation steps a frame", float, "N"),
-    "--pixels": _option("pixels a step", int, "N"),
-    "--bake": _option("ask a grid of such cells, as 0.04, not the network", float, "METRES"),
-    "--correct": _option("correct the map at surfaces in such cells, as 0.04", float, "METRES"),
+    "--rate HZ": _option("frames a second, by the clock", float),
+    "--steps N": _option("optimisation steps a frame", float),
+    "--pixels N": _option("pixels a step", int),
+    "--bake METRES": _option("ask a grid of such cells, as 0.04, not the network", float),
+    "--correct METRES": _option("correct the map at surfaces in such cells, as 0.04", float),
     "--frames": _option("Python slice of frames, A:B:S", default=":"),
     "--map-frames": _option("Python slice of frames to map (default: all)"),
-    "--map-from": _option(
-        "track in this map, of another recording of the room: a folder or a map file", a_path, "MAP"
-    ),
-    "--to": _option(
-        "tum, kitti: trajectory; ply, glb: coloured mesh; map: one file that opens anywhere",
-        metavar="FORMAT",
-    ),
-    "--budget": _option(
-        "the paper's step counts (default), or this machine's own speed",
-        choices=("steps", "clock"),
-        default="steps",
-    ),
-    "--scenes": _option("only these scenes of the preset's kind", metavar="A,B"),
-    "--trackers": _option("rows (default: the paper's, vr,sdf)", metavar="A,B"),
-    "--beyond": {
-        "help": "Table III instead: the paper's methods and ours, 30 Hz too",
-        "action": "store_true",
-    },
-    "--seeds": _option("K maps and runs a cell: mean ± deviation", a_count, "K", default=1),
-    "--workers": _option("cells side by side (default: one a core, or one on a GPU)", a_count, "N"),
-    "--dask": _option("run on a Dask cluster, as tcp://HOST:8786", metavar="ADDRESS"),
+    "--map-from MAP": _option("track in this map of the room: its folder or file", a_path),
+    "--to FORMAT": _option("tum, kitti: trajectory; ply, glb: coloured mesh; map: one file"),
+    "--budget BY": _option("steps, the paper's counts (default), or this machine's clock",
+                           choices=("steps", "clock"), default="steps"),
+    "--scenes A,B": _option("only these scenes of the preset's kind"),
+    "--trackers A,B": _option("rows (default: the paper's, vr,sdf)"),
+    "--seeds K": _option("K maps and runs a cell: mean ± deviation", a_count, default=1),
+    "--workers N": _option("cells side by side (default: one a core, or one on a GPU)", a_count),
+    "--dask ADDRESS": _option("run on a Dask cluster, as tcp://HOST:8786"),
+    "--beyond": {"help": "Table III instead: the paper's methods and ours, 30 Hz too",
+                 "action": "store_true"},
     "--n-frames": _option("how many (default: 300)", int, default=300),
     "--width": _option("pixels; the height is 3/4 of it", int, default=640),
     "--depth-folder": _option("default: the format's; filtered before raw depth"),
-    "--poses": _option("pose file (default: the format's)", metavar="FILE"),
+    "--poses FILE": _option("pose file (default: the format's)"),
     "--seed": _option("of all random numbers (default: 0)", partial(a_count, least=0), default=0),
     "--out": _option("where to write (default: in the cache or paper_tables)", a_path),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
-    "--threads": _option("CPU threads (default: all cores)", a_count, "N"),
+    "--threads N": _option("CPU threads (default: all cores)", a_count),
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
     "--config": _option("TOML file of settings", a_path),
-    "--set": _option(
-        "one setting, for example mapping.neus.iterations=500; may be repeated",
-        metavar="KEY=VALUE",
-        action="append",
-        default=[],
-        dest="settings",
-    ),
-}
+    "--set KEY=VALUE": _option("one setting, as mapping.neus.iterations=500; may be repeated",
+                               action="append", default=[], dest="settings"),
+}  # fmt: skip
 _PRESET = " --preset --config --set"
 _RUN = " --device --threads" + _PRESET
 _MADE = "--frames --seed --out" + _RUN
@@ -99,32 +80,22 @@ _PARTS = " --format --depth-folder --poses"
 # By name: what it does, and its options; ! marks those that must be. `map` is done by the function
 # `map_command`, `data make` by `make_command`.
 COMMANDS = {
-    "map": (
-        "fit a field to a sequence with known poses",
-        "sequence --field! --supervision --correct --format " + _MADE,
-    ),
-    "track": (
-        "track a camera; maps first where no map fits",
-        "sequence --field --supervision --correct --format --tracker! --rate --steps --pixels "
-        "--bake --map-frames --map-from " + _MADE,
-    ),
+    "map": ("fit a field to a sequence with known poses",
+            "sequence --field! --supervision --correct --format " + _MADE),
+    "track": ("track a camera; maps first where no map fits",
+              "sequence --field --supervision --correct --format --tracker! --rate --steps "
+              "--pixels --bake --map-frames --map-from " + _MADE),
     "export": ("a run's trajectory or a map elsewhere", "source out --to!"),
-    "tables": (
-        "the paper's tables, and one beyond, CSV and LaTeX",
-        "--budget --scenes --trackers --beyond --seeds --workers --dask --out" + _RUN,
-    ),
+    "tables": ("the paper's tables, and one beyond, CSV and LaTeX",
+               "--budget --scenes --trackers --beyond --seeds --workers --dask --out" + _RUN),
     "notebooks": ("run all notebooks headless, with HTML copies", _PRESET),
-    "data make": (
-        "write a synthetic room in the dataset's layout",
-        "room --out! --n-frames --width --seed",
-    ),
+    "data make": ("write a synthetic room in the dataset's layout",
+                  "room --out! --n-frames --width --seed"),
     "data check": ("what is wrong with a recording", "folder --out" + _PARTS),
-    "data convert": (
-        "write a recording in the Neural RGB-D layout",
-        "folder out --frames" + _PARTS,
-    ),
+    "data convert": ("write a recording in the Neural RGB-D layout",
+                     "folder out --frames" + _PARTS),
     "bench": ("Table II on this machine, full-size networks", "--out" + _RUN),
-}
+}  # fmt: skip
 
 
 class Parser(argparse.ArgumentParser):
@@ -144,7 +115,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = _parsed(arguments)
         _set_device(options)
-        module = "bench" if options.command in ("tables", "bench") else "commands"
+        module = {"tables": "bench", "bench": "bench", "notebooks": "notebooks"}
+        module = module.get(options.command, "commands")
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)
         return 0
@@ -162,19 +134,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
-    groups = {"": parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)}
+    groups = {"": parser.add_subparsers(required=True, metavar="COMMAND")}
+    known = {name.split()[0]: (name.split(), option) for name, option in OPTIONS.items()}
     for name, (about, options) in COMMANDS.items():
         *group, last = name.split()
         if group and group[0] not in groups:
             part = groups[""].add_parser(group[0], help="make rooms; check or convert a recording")
-            groups[group[0]] = part.add_subparsers(
-                required=True, metavar="ACTION", parser_class=Parser
-            )
+            groups[group[0]] = part.add_subparsers(required=True, metavar="ACTION")
         command = groups["".join(group)].add_parser(last, help=about, description=about)
         for word in options.split():
-            option = OPTIONS[word.rstrip("!")]
-            must = {"required": True} if word.endswith("!") else {}
-            command.add_argument(word.rstrip("!"), **option, **must)
+            (option, *metavar), how = known[word.rstrip("!")]
+            how = how | {"metavar": metavar[0]} if metavar else how
+            how = how | {"required": True} if word.endswith("!") else how
+            command.add_argument(option, **how)
         command.set_defaults(command=last, parser=command)
     found, unknown = parser.parse_known_args(arguments)
     if unknown:

@@ -19,11 +19,9 @@ _WIDTH_FOR_THREADS = 192
 def choose_device() -> torch.device:
     """The device that `NBTRACK_DEVICE` names, else the accelerator there is, else the CPU.
 
-    Raises:
-        ConfigError: the named device is unknown, or not there.
+    Raises ConfigError if the named device is unknown, or not there.
     """
-    name = os.environ.get("NBTRACK_DEVICE")
-    if name:
+    if name := os.environ.get("NBTRACK_DEVICE"):
         return named_device(name)
     return torch.accelerator.current_accelerator(check_available=True) or torch.device("cpu")
 
@@ -94,13 +92,9 @@ def has_room_for(device: torch.device, n_bytes: int) -> bool:
 
 @contextlib.contextmanager
 def advise_on_memory(setting: str) -> Iterator[None]:
-    """Turn running out of memory into one line that names the setting to lower.
+    """Turn running out of memory, the device's or the host's, into an OutOfMemory in one line.
 
-    Args:
-        setting: what decides on the memory, with its present value.
-
-    Raises:
-        OutOfMemory: the block ran out of the device's or the host's memory.
+    It names the setting to lower: what decides on the memory, with its present value.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""What each command does and prints; `tables` and `bench` stand in `bench.py`."""
+"""What each command does; `tables` and `bench` stand in `bench.py`, `notebooks` beside it."""
 
 from argparse import Namespace
 from dataclasses import replace
@@ -15,7 +15,6 @@ from nbtrack.data.sequence import parse_frames
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import run_cells
-from nbtrack.experiments.notebooks import run_notebooks
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
 from nbtrack.experiments.runs import METRICS_FILE, TrackCell
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
@@ -30,10 +29,7 @@ _PRINTED = (
     "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
     "lost_frames", "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
 )  # fmt: skip
-_SETTINGS = (
-    ("pixels", "tracking", "n_pixels"), ("bake", "tracking", "bake_voxel"),
-    ("correct", "mapping", "correct_voxel"),
-)  # fmt: skip
+_SETTINGS = {"pixels": "n_pixels", "bake": "bake_voxel", "correct": "correct_voxel"}
 _UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": ("s", 0)}
 
 
@@ -126,12 +122,6 @@ def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
     return f"{len(T_world_camera)} poses, TUM: timestamp (s), position (m), quaternion xyzw"
 
 
-def notebooks_command(options: Namespace) -> None:
-    """Run all notebooks headless."""
-    preset = preset_of(options)  # a wrong setting is refused before the first kernel starts
-    run_notebooks(preset.name, options.config, options.settings)
-
-
 def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
     made = ScenesConfig(n_frames=options.n_frames, width=options.width, seed=options.seed)
@@ -168,20 +158,18 @@ def convert_command(options: Namespace) -> None:
 def preset_of(options: Namespace, *settings: str) -> Preset:
     """The preset with all that changes it."""
     settings = (*options.settings, *settings)
-    for option, room, key in _SETTINGS:
-        value = getattr(options, option, None)
-        if value is not None:
-            name = options.tracker if room == "tracking" else _field_of(options)
-            settings += (f"{room}.{name}.{key}={value}",)
+    for option, key in _SETTINGS.items():
+        if (value := getattr(options, option, None)) is not None:
+            mapping = option == "correct"
+            part = f"mapping.{_field_of(options)}" if mapping else f"tracking.{options.tracker}"
+            settings += (f"{part}.{key}={value}",)
     return load_preset(options.preset, options.config, settings)
 
 
 def _field_of(options: Namespace) -> str:
     """The field under its supervision. Raises ConfigError where none is named."""
     if options.field is None:
-        raise ConfigError(
-            "--correct belongs to --field, which is mapped: name one, or leave it out"
-        )
+        raise ConfigError("--correct belongs to --field, which is mapped: name one or leave it out")
     return supervised_field(options.field, options.supervision or "rendering")
 
 

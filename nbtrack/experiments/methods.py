@@ -22,13 +22,16 @@ class Method:
 
 
 _COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
+_VR_VELOCITY = ("tracking.vr.motion_model=constant_velocity",)
+_SDF_VELOCITY = ("tracking.sdf.motion_model=constant_velocity",)
+_DENSE = ("tracking.lm.n_pixels=4096",)
+_CORRECTED = ("mapping.neus.correct_voxel=0.04",)
+_PLUS_CORRECTED = ("mapping.neus_plus.correct_voxel=0.04",)
 METHODS = {
     "vr": Method("iMAP with VR", "imap", "vr"),
     "sdf": Method("NeuS with SDF", "neus", "sdf"),
-    "vr_velocity": Method("iMAP with VR, constant velocity", "imap", "vr",
-                          ("tracking.vr.motion_model=constant_velocity",)),
-    "sdf_velocity": Method("NeuS with SDF, constant velocity", "neus", "sdf",
-                           ("tracking.sdf.motion_model=constant_velocity",)),
+    "vr_velocity": Method("iMAP with VR, constant velocity", "imap", "vr", _VR_VELOCITY),
+    "sdf_velocity": Method("NeuS with SDF, constant velocity", "neus", "sdf", _SDF_VELOCITY),
     "vr_neus": Method("NeuS with VR", "neus", "vr"),
     "vr_plus": Method("NeuS+ with VR", "neus_plus", "vr"),
     "vr_volsdf": Method("VolSDF with VR", "volsdf", "vr"),
@@ -42,33 +45,23 @@ METHODS = {
     "sdf_plus": Method("NeuS+ with SDF (Adam)", "neus_plus", "sdf"),
     "lm": Method("NeuS+ with SDF (LM)", "neus_plus", "lm"),
     "baked": Method("NeuS+ baked (LM)", "neus_plus", "lm", ("tracking.lm.bake_voxel=0.04",)),
-    "corrected": Method(
-        "NeuS+ corrected (LM)", "neus_plus", "lm", ("mapping.neus_plus.correct_voxel=0.04",)
-    ),
+    "corrected": Method("NeuS+ corrected (LM)", "neus_plus", "lm", _PLUS_CORRECTED),
     "corrected_dense": Method(
-        "NeuS+ corrected (LM), dense", "neus_plus", "lm",
-        ("mapping.neus_plus.correct_voxel=0.04", "tracking.lm.n_pixels=4096"),
+        "NeuS+ corrected (LM), dense", "neus_plus", "lm", _PLUS_CORRECTED + _DENSE
     ),
-    "neus_corrected": Method(
-        "NeuS corrected (LM)", "neus", "lm", ("mapping.neus.correct_voxel=0.04",)
-    ),
-    "sdf_corrected": Method(
-        "NeuS corrected with SDF (Adam)", "neus", "sdf", ("mapping.neus.correct_voxel=0.04",)
-    ),
-    "lm_dense": Method(
-        "NeuS+ with SDF (LM), dense", "neus_plus", "lm", ("tracking.lm.n_pixels=4096",)
-    ),
+    "neus_corrected": Method("NeuS corrected (LM)", "neus", "lm", _CORRECTED),
+    "sdf_corrected": Method("NeuS corrected with SDF (Adam)", "neus", "sdf", _CORRECTED),
+    "lm_dense": Method("NeuS+ with SDF (LM), dense", "neus_plus", "lm", _DENSE),
     "icp": Method("ICP", "points", "icp"),
     "icp_dense": Method("ICP, dense", "points", "icp", ("tracking.icp.n_pixels=4096",)),
-}  # fmt: skip
+}
 """By name. A method of your own joins by `METHODS["mine"] = Method(...)`."""
 
 TABLE_1 = ("vr", "sdf")
 """The rows of the paper's Table I."""
 TABLE_3 = (
-    "vr", "vr_velocity", "vr_neus", "sdf", "sdf_velocity", "sdf_plus",
-    "sdf_corrected", "lm", "baked", "lm_dense", "neus_corrected", "corrected", "corrected_dense",
-    "icp", "icp_dense",
+    "vr", "vr_velocity", "vr_neus", "sdf", "sdf_velocity", "sdf_plus", "sdf_corrected", "lm",
+    "baked", "lm_dense", "neus_corrected", "corrected", "corrected_dense", "icp", "icp_dense",
 )  # fmt: skip
 """The paper's methods beside those that go beyond it."""
 RATES_3_HZ = (30.0, 10.0, 5.0, 2.0)

@@ -4,21 +4,23 @@ import importlib.util
 import os
 import shlex
 import time
-from collections.abc import Sequence
+from argparse import Namespace
 from pathlib import Path
 
 from nbtrack.core.errors import MissingError, NbtrackError
 from nbtrack.core.files import project_folder, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
+from nbtrack.experiments.commands import preset_of
 
 
-def run_notebooks(preset: str, config_file: Path | None, settings: Sequence[str]) -> None:
+def notebooks_command(options: Namespace) -> None:
     """Execute every notebook in order, as `jupyter nbconvert --execute`.
 
     Copies, executed and HTML, go to `runs/notebooks/<preset>/`. Settings reach the kernels through
     the environment, where each notebook's settings cell finds them. Raises MissingError without
     notebooks or Jupyter, NbtrackError if a cell failed; the copy up to there is kept.
     """
+    preset = preset_of(options).name  # a wrong setting is refused before the first kernel starts
     if any(importlib.util.find_spec(name) is None for name in ("nbconvert", "ipykernel")):
         raise MissingError("notebooks need Jupyter: pip install 'nbtrack[notebooks]'")
     paths = sorted((project_folder() / "notebooks").glob("[0-9A]*_*.ipynb"))
@@ -27,8 +29,8 @@ def run_notebooks(preset: str, config_file: Path | None, settings: Sequence[str]
     before = os.environ.get("NBTRACK_SET", "")
     os.environ |= {
         "NBTRACK_PRESET": preset,
-        "NBTRACK_SET": f"{before} {shlex.join(settings)}".strip(),
-        **({"NBTRACK_CONFIG": str(config_file.resolve())} if config_file else {}),
+        "NBTRACK_SET": f"{before} {shlex.join(options.settings)}".strip(),
+        **({"NBTRACK_CONFIG": str(options.config.resolve())} if options.config else {}),
     }
     with ProgressBar("notebooks", len(paths)) as bar:
         for done, path in enumerate(paths):

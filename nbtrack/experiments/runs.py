@@ -151,9 +151,7 @@ class TrackCell(Cell):
                 "preset": as_dict(map_cell.preset),
                 "map_frames": map_cell.frames,
                 "map_seed": map_cell.seed,
-                "frames": self.frames,
-                "steps": self.steps,
-                "rate_hz": self.rate_hz,
+                **{name: getattr(self, name) for name in ("frames", "steps", "rate_hz")},
             },
         }
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import dask
-from distributed import Client, LocalCluster, get_worker, wait
+from distributed import Client, get_worker, wait
 from distributed.scheduler import KilledWorker
 
 from nbtrack.core.device import threads
@@ -41,7 +41,7 @@ def run_on_workers(
     `show` is told where a running cell is. Without the address of a Dask scheduler, `workers` local
     processes are started.
     """
-    with _connected(address) if address is not None else _started(workers) as client:
+    with dask.config.set(_LOCAL), _client(address, workers) as client:
         topic, news = f"nbtrack-{os.getpid()}-{time.time_ns()}", []
         client.subscribe_topic(topic, lambda event: news.append(event[1]))
         settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
@@ -93,22 +93,13 @@ def _outcome_there(
         return cell.outcome(needed, report)
 
 
-@contextlib.contextmanager
-def _started(workers: int) -> Iterator[Client]:
-    """Of a cluster of processes here, which end with this one."""
-    with (
-        dask.config.set(_LOCAL),
-        LocalCluster(
+def _client(address: str | None, workers: int) -> Client:
+    if address is None:  # a cluster of processes here, which end with this one
+        return Client(
             n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0,
             silence_logs=50, local_directory=str(runs_folder() / "dask"),
             dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},
-        ) as cluster,
-        Client(cluster) as client,
-    ):  # fmt: skip
-        yield client
-
-
-def _connected(address: str) -> Client:
+        )  # fmt: skip
     try:
         client = Client(address, timeout=_SECONDS_TO_CONNECT)
     except (OSError, ValueError) as error:

@@ -13,15 +13,7 @@ from nbtrack.core.arrays import Values
 from nbtrack.data.frame import MILLIMETRE
 from nbtrack.data.sequence import FRAMES_PER_SECOND, RgbdSequence
 from nbtrack.fields.base import View
-from nbtrack.plots.style import (
-    DASHED,
-    WIDTH,
-    legend_below,
-    log_axes,
-    method_colors,
-    new_axes,
-    styled,
-)
+from nbtrack.plots.style import DASHED, WIDTH, log_axes, method_colors, new_axes, styled
 from nbtrack.tables import table_1
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
@@ -151,7 +143,7 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     above.set_ylabel("translation error (cm)")
     below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
     log_axes(above, "y")
-    legend_below(above.figure)
+    above.figure.legend_below()
     return above.figure
 
 
@@ -199,7 +191,7 @@ def plot_ate_bars(results: pd.DataFrame, title: str = "") -> Figure:
     for axes in panels[len(means.columns) :]:
         axes.remove()
     panels[0].set_ylim(bottom=min(0.002, 0.7 * means.min(axis=None)))
-    legend_below(panels[0].figure)
+    panels[0].figure.legend_below()
     return panels[0].figure
 
 

@@ -18,7 +18,7 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.mapping.meshes import query_field, seen_by
-from nbtrack.plots.style import legend_below, method_colors, new_axes, styled
+from nbtrack.plots.style import method_colors, new_axes, styled
 from nbtrack.synthetic import Room
 
 _POINTS_ALONG = 240  # grid points along the longer side of a slice
@@ -64,7 +64,7 @@ def plot_slice(
     veil[..., 3] = _DIMMED * ~seen.reshape(shape)
     axes.pcolormesh(right, ahead, veil, gid="unseen", zorder=2.5, **grid)
     axes.set_title(f"{field.label} at height {height:.2f} m; pale: never seen")
-    legend_below(axes.figure)
+    axes.figure.legend_below()
     return axes.figure
 
 
@@ -96,7 +96,7 @@ def plot_trajectories(T_true: Poses, estimates: Mapping[str, Poses], title: str 
     """Paths (m) from above: camera-to-world poses by method, the true ones green."""
     axes = new_axes(title, 4.7)[0, 0]
     _draw_from_above(axes, {"true": T_true, **estimates})
-    legend_below(axes.figure)
+    axes.figure.legend_below()
     return axes.figure
 
 

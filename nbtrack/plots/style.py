@@ -42,6 +42,12 @@ class NotebookFigure(Figure):
         self.savefig(buffer, format="png", pil_kwargs={"optimize": True})  # notebooks stay small
         return buffer.getvalue()
 
+    def legend_below(self) -> None:
+        """The first panel's legend for the whole figure."""
+        handles, labels = self.axes[0].get_legend_handles_labels()
+        ncols = 3 if sum(map(len, labels)) > 100 else len(labels)
+        self.legend(handles, labels, loc="outside lower center", ncols=ncols)
+
 
 def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **share) -> np.ndarray:
     """A grid of axes in a new figure of a height (inches), with its finding as title."""
@@ -65,10 +71,3 @@ def log_axes(axes: Axes, names: str) -> None:
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter("")
-
-
-def legend_below(figure: Figure) -> None:
-    """The first panel's legend for the whole figure."""
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    ncols = 3 if sum(map(len, labels)) > 100 else len(labels)
-    figure.legend(handles, labels, loc="outside lower center", ncols=ncols)

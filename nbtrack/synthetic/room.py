@@ -10,24 +10,12 @@ from typing import Any
 import numpy as np
 
 from nbtrack.core.errors import MissingError, NumericalError, nearest_name
-from nbtrack.synthetic import materials
+from nbtrack.synthetic import materials, primitives
 from nbtrack.synthetic.materials import Light, Material, Pair, Part
-from nbtrack.synthetic.primitives import (
-    Array3,
-    Box,
-    Cylinder,
-    Indices,
-    Origins,
-    Points,
-    RoomShell,
-    Sphere,
-    Values,
-    row_dot,
-)
+from nbtrack.synthetic.primitives import Array3, Indices, Origins, Points, Values, row_dot
 
 _TABLES = tomllib.loads(Path(__file__).with_name("rooms.toml").read_text(encoding="utf-8"))
 _PALETTE = _TABLES.pop("palette")
-_SOLIDS = {"box": Box, "cylinder": Cylinder, "sphere": Sphere}
 _OPENNESS_RADIUS = 0.2  # m; how far contact shadows reach (our choice)
 
 ROOMS: tuple[str, ...] = tuple(_TABLES)
@@ -128,12 +116,12 @@ def build_room(name: str) -> Room:
     for label, material in (_PALETTE | table["materials"]).items():
         named[label] = _resolved(material, named)
     width, height, depth = table["size"]
-    shell = RoomShell((0.0, height / 2, 0.0), (width, height, depth))
+    shell = primitives.RoomShell((0.0, height / 2, 0.0), (width, height, depth))
     lining = partial(materials.lining, shell=shell, **_resolved(table["surfaces"], named))
     parts = [Part(shell, lining)]
     for kind, *arguments in table["parts"]:
         material, *shape = _resolved(arguments, named)
-        parts.append(Part(_SOLIDS[kind](*shape), material))
+        parts.append(Part(getattr(primitives, kind.capitalize())(*shape), material))
     light, walk = (_resolved(table[key], named) for key in ("light", "walk"))
     return Room(name, tuple(parts), Light(**light), Walk(**walk))
 
