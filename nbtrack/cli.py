@@ -38,7 +38,7 @@ OPTIONS = {
     "room": _option("its name"),
     "source": _option("folder of a run or a map, or a map file", a_path),
     "out": _option("file or folder to write", a_path),
-    "--format NAME": _option("neural_rgbd, tum, replica, 7scenes, scannet, plain (default: told)"),
+    "--format NAME": _option("neural_rgbd, tum, replica, 7scenes, scannet, plain (default: found)"),
     "--field": _option("imap, neus or another"),
     "--supervision": _option("rendering (default) or, for NeuS's distances too, rendering+sdf"),
     "--tracker": _option("vr, sdf, lm or another"),
@@ -115,8 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = _parsed(arguments)
         _set_device(options)
-        module = {"tables": "bench", "bench": "bench", "notebooks": "notebooks"}
-        module = module.get(options.command, "commands")
+        module = "bench" if options.command in ("tables", "bench", "notebooks") else "commands"
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)
         return 0

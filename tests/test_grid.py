@@ -181,6 +181,6 @@ def test_no_scheduler(
     capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Catches a traceback of sockets where the address is wrong."""
-    monkeypatch.setattr("nbtrack.experiments.workers._SECONDS_TO_CONNECT", 0.5)
+    monkeypatch.setattr("nbtrack.experiments.grid._SECONDS_TO_CONNECT", 0.5)
     assert tables(tmp_path, "--dask", "tcp://127.0.0.1:9") == 2
     assert "no Dask scheduler at 'tcp://127.0.0.1:9'" in capsys.readouterr().err.splitlines()[-1]

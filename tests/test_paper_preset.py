@@ -10,7 +10,6 @@ from tiny import TINY
 from nbtrack.cli import main
 from nbtrack.data.text_files import read_poses
 from nbtrack.data.writer import write_sequence
-from nbtrack.experiments.scenes import DATASET_SCENES
 from nbtrack.synthetic import build_room, room_frames, room_intrinsics
 from nbtrack.tables import PAPER_SCENE_LABELS
 
@@ -23,7 +22,7 @@ def dataset(few_scores: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine folders in the dataset's layout, under its names; what they show is one room of ours."""
     folder = tmp_path_factory.mktemp("neural_rgbd")
     frames = list(room_frames(build_room("living_room"), N_FRAMES, WIDTH, HEIGHT, seed=0))
-    for name in DATASET_SCENES:
+    for name in PAPER_SCENE_LABELS:
         write_sequence(folder / name, room_intrinsics(WIDTH, HEIGHT), frames)
         poses = read_poses(folder / name / "poses.txt")[0]
         poses[3:5] = np.nan  # as where BundleFusion lost the camera

@@ -81,22 +81,17 @@ def foreign_source(kind: type) -> str:
 
 def _code(text: str) -> str:
     """Python source without comments, docstrings and layout."""
-    tree = ast.parse(text)
+    tree, documented = ast.parse(text), ast.Module | ast.ClassDef | ast.FunctionDef
     for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(
-            node, clean=False
-        ):
+        if isinstance(node, documented) and ast.get_docstring(node, clean=False):
             node.body = node.body[1:] or [ast.Pass()]
     return ast.unparse(tree)
 
 
 def versions() -> dict[str, str]:
     """Versions that a result depends on, to be kept beside it."""
-    return {
-        "nbtrack": nbtrack.__version__,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
+    found = {module.__name__: module.__version__ for module in (nbtrack, torch)}
+    return found | {"python": platform.python_version()}
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:

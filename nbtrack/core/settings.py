@@ -63,11 +63,9 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
 
 def changed_settings(config: Config, original: Config) -> list[str]:
     """The `key=value` texts that turn the original into this config."""
-    before = dict(_leaves(original))
+    before = dict(_leaves(original)).items()
     return [
-        f"{key}={json.dumps(value)}"
-        for key, value in _leaves(config)
-        if key not in before or before[key] != value
+        f"{key}={json.dumps(value)}" for key, value in _leaves(config) if (key, value) not in before
     ]
 
 

@@ -1,9 +1,13 @@
-"""The commands `tables` and `bench`, and Table II on the machine at hand."""
+"""The commands that compute the paper anew: `tables`, `bench` (Table II alone), `notebooks`."""
 
+import importlib.util
 import os
+import shlex
+import time
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,8 +15,8 @@ import torch
 
 from nbtrack import tables
 from nbtrack.core.device import advise_on_memory, choose_device, device_name
-from nbtrack.core.errors import ConfigError, NbtrackError
-from nbtrack.core.files import runs_folder, tables_folder
+from nbtrack.core.errors import ConfigError, MissingError, NbtrackError
+from nbtrack.core.files import project_folder, runs_folder, tables_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
@@ -63,9 +67,8 @@ def tables_command(options: Namespace) -> None:
         steps, pixels = _table_2(preset, scenes[0].read(":1"), methods)
         paths = tables.write_tables(folder, results, steps, note, pixels)
     cells = results[[name for name in _CELL_COLUMNS if name in results]]
-    paths.append(
-        tables.write_csv(folder / f"table_{len(number)}_cells.csv", cells, float_format=None)
-    )
+    cells_file = folder / f"table_{len(number)}_cells.csv"
+    paths.append(tables.write_csv(cells_file, cells, float_format=None))
     print("\n".join(str(path) for path in paths))
     failed = results[results["failure"] != ""]
     if len(failed):
@@ -85,6 +88,32 @@ def bench_command(options: Namespace) -> None:
     steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset).read(":1"))
     folder = options.out or runs_folder() / "bench" / preset.name
     print(tables.write_csv(folder / "table_2.csv", steps))
+
+
+def notebooks_command(options: Namespace) -> None:
+    """Execute every notebook in order, as `jupyter nbconvert --execute`.
+
+    Copies, executed and HTML, go to `runs/notebooks/<preset>/`. Settings reach the kernels through
+    the environment, where each notebook's settings cell finds them. Raises MissingError without
+    notebooks or Jupyter, NbtrackError if a cell failed; the copy up to there is kept.
+    """
+    preset = preset_of(options).name  # a wrong setting is refused before the first kernel starts
+    if any(importlib.util.find_spec(name) is None for name in ("nbconvert", "ipykernel")):
+        raise MissingError("notebooks need Jupyter: pip install 'nbtrack[notebooks]'")
+    paths = sorted((project_folder() / "notebooks").glob("[0-9A]*_*.ipynb"))
+    if not paths:
+        raise MissingError(f"no notebooks in {project_folder()}: run the command in a checkout")
+    before = os.environ.get("NBTRACK_SET", "")
+    os.environ |= {
+        "NBTRACK_PRESET": preset,
+        "NBTRACK_SET": f"{before} {shlex.join(options.settings)}".strip(),
+        **({"NBTRACK_CONFIG": str(options.config.resolve())} if options.config else {}),
+    }
+    with ProgressBar("notebooks", len(paths)) as bar:
+        for done, path in enumerate(paths):
+            bar.move_to(done, path.stem)
+            _run_notebook(path, runs_folder() / "notebooks" / preset)
+        bar.move_to(len(paths))
 
 
 def _table_2(
@@ -160,3 +189,24 @@ def _note(preset: Preset, clock: bool) -> str:
 def _words(text: str | None) -> list[str]:
     """The parts of a list with commas."""
     return [word.strip() for word in (text or "").split(",") if word.strip()]
+
+
+def _run_notebook(path: Path, folder: Path) -> None:
+    """Run one notebook in a fresh kernel; its copies go to the folder."""
+    import nbformat
+    from nbconvert import HTMLExporter
+    from nbconvert.preprocessors import CellExecutionError, ExecutePreprocessor
+
+    notebook, page, start = nbformat.read(path, 4), folder / f"{path.stem}.html", time.monotonic()
+    run = ExecutePreprocessor(timeout=None, kernel_name="python3", record_timing=False)
+    try:
+        run.preprocess(notebook, {"metadata": {"path": str(path.parent)}})
+    except CellExecutionError as error:
+        raise NbtrackError(
+            f"{path.name} failed with {error.ename}: {error.evalue}; see the last cell of "
+            f"{folder / path.name}, mend what it names and run again"
+        ) from None
+    finally:
+        write_atomic(folder / path.name, nbformat.writes(notebook) + "\n")
+    write_atomic(page, HTMLExporter().from_notebook_node(notebook)[0])
+    print(f"{page}: {time.monotonic() - start:.0f} s")

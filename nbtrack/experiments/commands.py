@@ -1,4 +1,4 @@
-"""What each command does; `tables` and `bench` stand in `bench.py`, `notebooks` beside it."""
+"""What each command does; `tables`, `bench` and `notebooks` stand in `bench.py`."""
 
 from argparse import Namespace
 from dataclasses import replace

@@ -3,10 +3,11 @@
 Small networks gain nothing from a second thread, so scenes and methods share the cores instead.
 """
 
+import contextlib
 import importlib.util
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,8 +17,21 @@ import torch
 
 from nbtrack.core.device import choose_device, threads
 from nbtrack.core.errors import MissingError, NbtrackError
+from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.progress import ProgressBar
 from nbtrack.experiments.cells import Cell
+from nbtrack.fields import FIELDS
+from nbtrack.tracking import TRACKERS
+
+_REPORT_SECONDS = 0.3  # between two reports of a worker
+_SECONDS_TO_CONNECT = 10
+_LOCAL = {
+    # A cell that kills its worker is tried once more; memory is the user's to divide.
+    "distributed.scheduler.allowed-failures": 1,
+    # Without Dask's own malloc threshold, which gives every tensor's memory back to the system:
+    # mapping then spent almost half of its time on getting it again.
+    "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1},
+}
 
 
 @dataclass(frozen=True)
@@ -58,7 +72,7 @@ def run_cells(cells: Sequence[Cell], title: str, execution: Execution | None = N
 
     with (
         ProgressBar(title, sum(cell.cost for cell in missing.values())) as bar,
-        closing(_outcomes(missing, results, show, execution)) as outcomes,
+        contextlib.closing(_outcomes(missing, results, show, execution)) as outcomes,
     ):
         for folder, outcome in outcomes:
             if isinstance(outcome, NbtrackError) and not execution.keep_going:
@@ -75,11 +89,9 @@ def _outcomes(
     usual = os.cpu_count() or 1 if _has_dask() and choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, len(cells))
     if cells and (execution.dask is not None or workers > 1):
-        from nbtrack.experiments.workers import run_on_workers
-
         share = 1 if execution.dask else max(1, torch.get_num_threads() // workers)
         n_threads = execution.threads or share
-        yield from run_on_workers(cells, show, execution.dask, workers, n_threads)
+        yield from _on_workers(cells, show, execution.dask, workers, n_threads)
         return
     with threads(execution.threads or torch.get_num_threads()):
         for folder, cell in cells.items():
@@ -89,3 +101,94 @@ def _outcomes(
 
 def _has_dask() -> bool:
     return importlib.util.find_spec("distributed") is not None
+
+
+def _on_workers(
+    cells: Mapping[Path, Cell], show: Callable, address: str | None, workers: int, n_threads: int
+) -> Iterator[tuple[Path, Any]]:
+    """The same by Dask: each cell begins as soon as what it needs is there.
+
+    `show` is told where a running cell is. Without the address of a Dask scheduler, `workers` local
+    processes are started.
+    """
+    import dask
+    from distributed import wait
+    from distributed.scheduler import KilledWorker
+
+    with dask.config.set(_LOCAL), _client(address, workers) as client:
+        topic, news = f"nbtrack-{os.getpid()}-{time.time_ns()}", []
+        client.subscribe_topic(topic, lambda event: news.append(event[1]))
+        settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
+        settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
+        waiting: dict[Path, Any] = {}
+        for priority, (folder, cell) in enumerate(cells.items()):
+            needed = waiting.get(cell.needs.folder) if cell.needs else None
+            waiting[folder] = client.submit(
+                _outcome_there, cell, needed, topic, settings, n_threads, (FIELDS, TRACKERS),
+                key=f"{topic}-{folder.name}", pure=False, priority=-priority,
+            )  # fmt: skip
+        while waiting:
+            with contextlib.suppress(TimeoutError):
+                wait([*waiting.values()], timeout=_REPORT_SECONDS, return_when="FIRST_COMPLETED")
+            while news:
+                name, share, status = news.pop(0)
+                if Path(name) in waiting:
+                    show(Path(name), share, status)
+            for folder in [folder for folder, future in waiting.items() if future.done()]:
+                try:
+                    outcome = waiting.pop(folder).result()
+                except KilledWorker:
+                    outcome = NbtrackError(
+                        f"a worker process died at {folder.name}, perhaps for lack of memory: what "
+                        "is done is kept; run it again, with fewer --workers or smaller settings"
+                    )
+                yield folder, outcome
+
+
+def _outcome_there(
+    cell: Cell, needed: Any, topic: str, settings: dict[str, str], n_threads: int, known: Any
+) -> Any:
+    """Runs in a worker, which may have been started with other folders, or for another device.
+
+    It may also know fewer fields and trackers: somebody adds them in the process that asks.
+    """
+    from distributed import get_worker
+
+    os.environ |= settings
+    FIELDS.update(known[0])
+    TRACKERS.update(known[1])
+    worker, last = get_worker(), time.monotonic()
+
+    def report(share: float, status: str) -> None:
+        nonlocal last
+        if time.monotonic() - last > _REPORT_SECONDS:
+            last = time.monotonic()
+            worker.log_event(topic, [str(cell.folder), share, status])
+
+    with threads(n_threads):
+        return cell.outcome(needed, report)
+
+
+def _client(address: str | None, workers: int) -> Any:
+    from distributed import Client
+
+    if address is None:  # a cluster of processes here, which end with this one
+        return Client(
+            n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0,
+            silence_logs=50, local_directory=str(runs_folder() / "dask"),
+            dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},
+        )  # fmt: skip
+    try:
+        client = Client(address, timeout=_SECONDS_TO_CONNECT)
+    except (OSError, ValueError) as error:
+        raise MissingError(
+            f"no Dask scheduler at {address!r} ({type(error).__name__}): start one with 'dask "
+            "scheduler', and workers with 'dask worker ADDRESS --nthreads 1'"
+        ) from None
+    if not client.scheduler_info()["workers"]:
+        client.close()
+        raise MissingError(
+            f"the Dask scheduler at {address} has no worker: start some with 'dask worker "
+            f"{address} --nthreads 1'"
+        )
+    return client

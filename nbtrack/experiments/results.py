@@ -77,12 +77,12 @@ def track_scenes(
         A row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), ate_m (NaN
         where it failed), failure (why) and the other metrics.
     """
-    rates, frames = rates_hz or preset.tables.rates_hz, frames or preset.scenes.track_frames
+    rates = [None] if steps else rates_hz or preset.tables.rates_hz
+    frames = frames or preset.scenes.track_frames
     seeds, cells, rows = range(seeds) if isinstance(seeds, int) else seeds, [], []
     pairs = zip(scenes, tracked or scenes, strict=True)
-    for method, seed, rate_hz, (scene, seen) in product(
-        find_methods(methods), seeds, [None] if steps else rates, pairs
-    ):
+    for method, seed, rate_hz, pair in product(find_methods(methods), seeds, rates, pairs):
+        scene, seen = pair
         map_cell = MapCell(scene, method.field, with_settings(preset, *method.settings), seed=seed)
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
         budget = n_steps, rate_hz if clock else None

@@ -14,10 +14,11 @@ from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.settings import as_dict, changed_settings
 from nbtrack.experiments.cells import SHARED_SOURCES, Cell, MapCell, Report, seed_suffix
 from nbtrack.experiments.presets import PRESETS
-from nbtrack.experiments.scenes import DATASET_SCENES, Scene
+from nbtrack.experiments.scenes import Scene
 from nbtrack.fields.grid import BakedField
 from nbtrack.mapping.quality import check_belongs
 from nbtrack.synthetic import ROOMS
+from nbtrack.tables import PAPER_SCENE_LABELS
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, trajectory_metrics
 from nbtrack.tracking.trajectories import tum_text
@@ -158,7 +159,7 @@ class TrackCell(Cell):
     def _command(self) -> str:
         """What makes this run anew, and its map where that is not cached."""
         cell, preset = self.needs, self.needs.preset
-        is_known = self.scene.name in (*ROOMS, *DATASET_SCENES) and not self.is_elsewhere
+        is_known = self.scene.name in (*ROOMS, *PAPER_SCENE_LABELS) and not self.is_elsewhere
         made = {"field": cell.field, "map-frames": cell.frames}
         options = {
             "format": self.scene.format,

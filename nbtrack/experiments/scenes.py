@@ -16,9 +16,6 @@ from nbtrack.experiments.presets import Preset, ScenesConfig
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of
 from nbtrack.tables import PAPER_SCENE_LABELS
 
-DATASET_SCENES = tuple(PAPER_SCENE_LABELS)
-"""Folders of the Neural RGB-D dataset, in the order of the paper's Table I."""
-
 
 @dataclass(frozen=True)
 class Scene:
@@ -63,9 +60,9 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     the data folder. The format of a folder is by default told by its files.
     """
     text, folder = str(sequence), Path(sequence)
-    if text in ROOMS and (preset.scenes.synthetic or text not in DATASET_SCENES):
+    if text in ROOMS and (preset.scenes.synthetic or text not in PAPER_SCENE_LABELS):
         return Scene(text, _room_folder(text, preset.scenes))
-    if text in DATASET_SCENES:
+    if text in PAPER_SCENE_LABELS:
         if (folder := data_folder() / text).is_dir():
             return Scene(text, folder, format)
         raise MissingError(
@@ -74,7 +71,7 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
         )
     if folder.is_dir():
         return Scene(folder.resolve().name, folder.resolve(), format)
-    advice = nearest_name(text, [*ROOMS, *DATASET_SCENES])
+    advice = nearest_name(text, [*ROOMS, *PAPER_SCENE_LABELS])
     raise MissingError(f"no sequence {text!r}: it is neither a folder nor a known scene; {advice}")
 
 
@@ -85,7 +82,7 @@ def open_scenes(preset: Preset) -> list[Scene]:
     returned. Raises ConfigError where no name is given, or one twice, or an unknown one; where no
     scene is whole, what is wrong with the first.
     """
-    names, known = preset.scenes.names, [*ROOMS, *DATASET_SCENES]
+    names, known = preset.scenes.names, [*ROOMS, *PAPER_SCENE_LABELS]
     for name in names:
         if name not in known and not Path(name).is_dir():
             advice = nearest_name(name, known)
@@ -112,10 +109,8 @@ def open_scenes(preset: Preset) -> list[Scene]:
 def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
     """A room as a sequence folder, under a bar."""
     with ProgressBar(f"room {name}", config.n_frames) as bar:
-        make_room(
-            name, folder, config.n_frames, config.width, config.width * 3 // 4, config.seed,
-            bar.move_to,
-        )  # fmt: skip
+        size = config.width, config.width * 3 // 4
+        make_room(name, folder, config.n_frames, *size, config.seed, bar.move_to)
 
 
 def _room_folder(name: str, config: ScenesConfig) -> Path:

@@ -44,13 +44,10 @@ def naming_points(results: pd.DataFrame) -> pd.DataFrame:
 def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
     """Table I in long form from a row for every seed; rates fall, dataset's scenes are labelled.
 
-    With several seeds, a column ate_deviation_m tells their deviation (m) as a sample. A cell with
-    a seed that failed is NaN: a mean over the others would hide the failure.
-
-    Args:
-        results: with columns rate_hz, method, scene, ate_m, and seed where there are several.
-
-    Raises DataError: a column is missing, there is no row, or two rows have one place.
+    Columns are rate_hz, method, scene, ate_m, and seed where there are several: then the column
+    ate_deviation_m tells their deviation (m) as a sample. A cell with a seed that failed is NaN: a
+    mean over the others would hide the failure. Raises DataError where a column is missing, there
+    is no row, or two rows have one place.
     """
     _check(results, "ate_m", [*_CELL_1, "seed"] if "seed" in results else _CELL_1)
     results = results.replace({"scene": PAPER_SCENE_LABELS})

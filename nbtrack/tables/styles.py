@@ -2,7 +2,6 @@
 
 import copy
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -66,9 +65,7 @@ def style_table_1(results: pd.DataFrame, caption: str | None = None) -> TableSty
 
 
 def style_table_2(
-    steps: pd.DataFrame,
-    caption: str | None = None,
-    default_pixels: Mapping[str, int] = PAPER_PIXELS,
+    steps: pd.DataFrame, caption: str | None = None, default_pixels: dict[str, int] = PAPER_PIXELS
 ) -> TableStyler:
     """Table II, mean ± deviation over frames, without decimals in rows of whole numbers.
 
@@ -121,7 +118,7 @@ def write_tables(
     results: pd.DataFrame,
     steps: pd.DataFrame,
     note: str,
-    default_pixels: Mapping[str, int] = PAPER_PIXELS,
+    default_pixels: dict[str, int] = PAPER_PIXELS,
 ) -> list[Path]:
     """Writes Tables I and II as CSV (long form), LaTeX, and beside the paper's; returns the paths.
 
