@@ -32,7 +32,7 @@ class Square(Cell):
     how: str = "well"
     needs: "Square | None" = None
     is_done: bool = False
-    kind, key, cost = "squares", "0", 2.0
+    kind, key = "squares", "0"
 
     @property
     def name(self) -> str:
@@ -107,8 +107,8 @@ def test_the_bar_moves_within_a_cell(monkeypatch: pytest.MonkeyPatch, execution:
         lambda bar, done, status="": seen.append((done, status)),
     )
     run_cells([Square(1, "slowly"), Square(2, "slowly")], "slow", Execution(**execution))
-    assert any(0 < done < 4 and "half" in status for done, status in seen)
-    assert max(done for done, _ in seen) == 4
+    assert any(0 < done < 2 and "half" in status for done, status in seen)
+    assert max(done for done, _ in seen) == 2
 
 
 def words(folder: Path, *options: str) -> list[str]:

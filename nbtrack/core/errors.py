@@ -2,8 +2,6 @@
 
 import difflib
 
-_MOST_NAMES = 40  # a message lists no more
-
 
 class NbtrackError(Exception):
     """Root of every error that a user can cause; the command line turns it into exit status 2."""
@@ -37,7 +35,7 @@ def nearest_name(found: str, allowed: list[str]) -> str:
     """
     close = difflib.get_close_matches(found, allowed, n=5, cutoff=0.5)
     hint = f"did you mean '{close[0]}'? " if close else ""
-    if len(allowed) > _MOST_NAMES:
+    if len(allowed) > 40:  # a message lists no more
         some = close or allowed[:5]
         return f"{hint}Allowed are {len(allowed)} names, such as {', '.join(some)}"
     return f"{hint}Allowed: {', '.join(allowed)}"

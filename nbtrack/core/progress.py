@@ -7,7 +7,10 @@ from typing import Any
 from tqdm import tqdm
 
 _SECONDS_BEFORE_SHOWN = 1.0  # so that a mistake which ends the work at once is told alone
-_FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+_LOOK = {
+    "bar_format": "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}",
+    "delay": _SECONDS_BEFORE_SHOWN, "ascii": False,
+}  # fmt: skip
 
 
 def tell(news: str) -> None:
@@ -50,16 +53,10 @@ class ProgressBar:
         is_notebook = _is_notebook()
         self.title, self.is_shown, self._start = title, is_shown, time.monotonic()
         # A notebook's kernel drops messages once a thousand wait to be read.
-        self._bar = tqdm(
-            total=total,
-            desc=title,
-            bar_format=_FORMAT,
-            delay=_SECONDS_BEFORE_SHOWN,
-            file=_NotebookLine() if is_notebook else sys.stderr,
-            mininterval=1.0 if is_notebook else 0.1,
-            ascii=False,
-            disable=not (is_shown and (is_notebook or sys.stderr.isatty())),
-        )
+        file, pause = (_NotebookLine(), 1.0) if is_notebook else (sys.stderr, 0.1)
+        is_hidden = not (is_shown and (is_notebook or sys.stderr.isatty()))
+        where = {"file": file, "mininterval": pause, "disable": is_hidden}
+        self._bar = tqdm(total=total, desc=title, **where, **_LOOK)
 
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much is done, and a word on how it goes."""

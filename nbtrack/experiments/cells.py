@@ -1,6 +1,5 @@
 """Cells, each named by all that it depends on and made once; and maps as cells."""
 
-import abc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -15,7 +14,7 @@ from nbtrack.core.files import fingerprint, foreign_source, runs_folder, sources
 from nbtrack.core.settings import as_dict, with_settings
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import PointMapping, field_class
+from nbtrack.fields import field_class
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import correct_map, map_sequence
 from nbtrack.mapping.quality import score_map
@@ -26,16 +25,17 @@ Report = Callable[[float, str], None]
 """Called by a cell with the share of it that is done and a word on how it goes."""
 
 
-class Cell(abc.ABC):
+class Cell:
     """One piece of work: picklable, kept in a folder of its own, perhaps made of another's."""
 
     kind: str  # the part of the cache where it is kept
     name: str  # for readers
     key: str  # changes with everything that the result depends on
     out: Path | None = None  # where to keep it instead of in the cache
-    cost: float  # work in all, relative to other cells: its share of the bar
     needs: "Cell | None"
     is_done: bool
+    result: Callable[[], Any]  # what a finished cell has kept
+    compute: Callable[[Report], Any]  # makes it, or takes a killed attempt up; returns `result`
 
     @property
     def cache(self) -> Path:
@@ -46,14 +46,6 @@ class Cell(abc.ABC):
     def folder(self) -> Path:
         """Where its files are kept."""
         return self.out or self.cache
-
-    @abc.abstractmethod
-    def result(self) -> Any:
-        """What a finished cell has kept."""
-
-    @abc.abstractmethod
-    def compute(self, report: Report) -> Any:
-        """Make it, or take a killed attempt up where it stands; returns `result`."""
 
     def outcome(self, needed: Any, report: Report) -> Any:
         """Its `result`, made where it is missing, or the user's mistake that kept it from that.
@@ -108,7 +100,7 @@ class MapCell(Cell):
     def name(self) -> str:
         """Scene and field, and the seed if it is not the first."""
         corrected = "-corrected" * (self.base is not None)
-        return f"{self.scene.name}-{self.field}{corrected}{seed_suffix(self.seed)}"
+        return f"{self.scene.name}-{self.field}{corrected}" + f"-seed{self.seed}" * bool(self.seed)
 
     @property
     def base(self) -> "MapCell | None":
@@ -117,14 +109,6 @@ class MapCell(Cell):
             return None
         preset = with_settings(self.preset, f"mapping.{self.field}.correct_voxel=0.0")
         return replace(self, preset=preset, out=None)
-
-    @property
-    def cost(self) -> float:
-        """Points that the network is asked for, all told; of what learns nothing, next to none."""
-        if isinstance(self.settings, PointMapping):
-            return 1e6
-        samples = self.settings.n_stratified + self.settings.n_surface
-        return float(self.settings.iterations * self.settings.n_rays * samples)
 
     @property
     def is_done(self) -> bool:
@@ -147,8 +131,7 @@ class MapCell(Cell):
         checkpoint, most = self.folder / CHECKPOINT_FILE, getattr(self.settings, "iterations", 1)
 
         def tell(done: int, losses: dict[str, float | int]) -> None:
-            told = " ".join(f"{name} {value:.3f}" for name, value in losses.items())
-            report(done / most, told)
+            report(done / most, " ".join(f"{name} {loss:.3f}" for name, loss in losses.items()))
 
         base = self.base
         if base and isinstance(failure := base.outcome(None, report), NbtrackError):
@@ -173,8 +156,3 @@ class MapCell(Cell):
 def _read(folder: Path, key: str) -> Map:
     """Read once for all runs in a map."""
     return read_map(folder)
-
-
-def seed_suffix(seed: int) -> str:
-    """Part of a cell's name: nothing for the first seed."""
-    return f"-seed{seed}" if seed else ""

@@ -160,8 +160,8 @@ def preset_of(options: Namespace, *settings: str) -> Preset:
     settings = (*options.settings, *settings)
     for option, key in _SETTINGS.items():
         if (value := getattr(options, option, None)) is not None:
-            mapping = option == "correct"
-            part = f"mapping.{_field_of(options)}" if mapping else f"tracking.{options.tracker}"
+            is_map = key == "correct_voxel"
+            part = f"mapping.{_field_of(options)}" if is_map else f"tracking.{options.tracker}"
             settings += (f"{part}.{key}={value}",)
     return load_preset(options.preset, options.config, settings)
 

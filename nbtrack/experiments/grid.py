@@ -25,6 +25,7 @@ from nbtrack.tracking import TRACKERS
 
 _REPORT_SECONDS = 0.3  # between two reports of a worker
 _SECONDS_TO_CONNECT = 10
+_HAS_DASK = importlib.util.find_spec("distributed") is not None
 _LOCAL = {
     # A cell that kills its worker is tried once more; memory is the user's to divide.
     "distributed.scheduler.allowed-failures": 1,
@@ -49,7 +50,7 @@ class Execution:
 
     def __post_init__(self) -> None:
         """Raises MissingError, before any work, if Dask is needed and not there."""
-        if (self.dask is not None or (self.workers or 1) > 1) and not _has_dask():
+        if (self.dask is not None or (self.workers or 1) > 1) and not _HAS_DASK:
             raise MissingError(
                 "several workers need Dask: pip install 'nbtrack[cluster]', or give --workers 1"
             )
@@ -63,15 +64,15 @@ def run_cells(cells: Sequence[Cell], title: str, execution: Execution | None = N
     execution, results = execution or Execution(), {}
     wanted = [part for cell in cells if not cell.is_done for part in (cell.needs, cell) if part]
     missing = {cell.folder: cell for cell in wanted if not cell.is_done}
-    done = dict.fromkeys(missing, 0.0)
+    done = dict.fromkeys(missing, 0.0)  # shares: each cell counts as one, however long it takes
 
     def show(folder: Path, share: float, status: str) -> None:
-        done[folder] = missing[folder].cost * share
+        done[folder] = share
         ended = f"{len(results)} of {len(missing)} done"
         bar.move_to(sum(done.values()), f"{ended}, {missing[folder].name}: {status}")
 
     with (
-        ProgressBar(title, sum(cell.cost for cell in missing.values())) as bar,
+        ProgressBar(title, len(missing)) as bar,
         contextlib.closing(_outcomes(missing, results, show, execution)) as outcomes,
     ):
         for folder, outcome in outcomes:
@@ -86,21 +87,16 @@ def _outcomes(
     cells: dict[Path, Cell], results: dict[Path, Any], show: Callable, execution: Execution
 ) -> Iterator[tuple[Path, Any]]:
     """What becomes of each cell, as they end; what a cell needs comes before it."""
-    usual = os.cpu_count() or 1 if _has_dask() and choose_device().type == "cpu" else 1
+    usual = os.cpu_count() or 1 if _HAS_DASK and choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, len(cells))
     if cells and (execution.dask is not None or workers > 1):
         share = 1 if execution.dask else max(1, torch.get_num_threads() // workers)
-        n_threads = execution.threads or share
-        yield from _on_workers(cells, show, execution.dask, workers, n_threads)
+        yield from _on_workers(cells, show, execution.dask, workers, execution.threads or share)
         return
     with threads(execution.threads or torch.get_num_threads()):
         for folder, cell in cells.items():
             needed = results.get(cell.needs.folder) if cell.needs else None
             yield folder, cell.outcome(needed, partial(show, folder))
-
-
-def _has_dask() -> bool:
-    return importlib.util.find_spec("distributed") is not None
 
 
 def _on_workers(
@@ -180,15 +176,10 @@ def _client(address: str | None, workers: int) -> Any:
         )  # fmt: skip
     try:
         client = Client(address, timeout=_SECONDS_TO_CONNECT)
+        client.wait_for_workers(1, timeout=_SECONDS_TO_CONNECT)
+        return client
     except (OSError, ValueError) as error:
         raise MissingError(
-            f"no Dask scheduler at {address!r} ({type(error).__name__}): start one with 'dask "
-            "scheduler', and workers with 'dask worker ADDRESS --nthreads 1'"
+            f"no Dask scheduler at {address!r} with a worker ({type(error).__name__}): start one "
+            "with 'dask scheduler', and workers with 'dask worker ADDRESS --nthreads 1'"
         ) from None
-    if not client.scheduler_info()["workers"]:
-        client.close()
-        raise MissingError(
-            f"the Dask scheduler at {address} has no worker: start some with 'dask worker "
-            f"{address} --nthreads 1'"
-        )
-    return client

@@ -12,7 +12,7 @@ import torch
 from nbtrack.core import files
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.settings import as_dict, changed_settings
-from nbtrack.experiments.cells import SHARED_SOURCES, Cell, MapCell, Report, seed_suffix
+from nbtrack.experiments.cells import SHARED_SOURCES, Cell, MapCell, Report
 from nbtrack.experiments.presets import PRESETS
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields.grid import BakedField
@@ -62,7 +62,7 @@ class TrackCell(Cell):
         """Scene, method and budget, and the seed if it is not the first."""
         budget = f"{self.rate_hz:g}hz" if self.rate_hz else f"{self.steps:g}steps"
         method = f"{self.needs.field}-{self.tracker}{'-unmapped' * self.is_elsewhere}"
-        return f"{self.scene.name}-{method}-{budget}{seed_suffix(self.seed)}"
+        return f"{self.scene.name}-{method}-{budget}" + f"-seed{self.seed}" * bool(self.seed)
 
     @property
     def is_elsewhere(self) -> bool:
@@ -73,17 +73,6 @@ class TrackCell(Cell):
     def is_done(self) -> bool:
         """Whether the run is finished; in a folder of the user's it is always made anew."""
         return self.out is None and (self.folder / METRICS_FILE).is_file()
-
-    @property
-    def cost(self) -> float:
-        """Points that the network is asked for with a step budget; seconds with the clock."""
-        n_frames = self.scene.count(self.frames)
-        if self.rate_hz is not None:
-            return n_frames / self.rate_hz
-        samples = 1
-        if tracker_class(self.tracker).renders:
-            samples = 2 * self.settings.n_stratified + self.settings.n_importance
-        return float(n_frames * self.steps * self.settings.n_pixels * samples)
 
     def result(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""
