@@ -36,6 +36,5 @@ def nearest_name(found: str, allowed: list[str]) -> str:
     close = difflib.get_close_matches(found, allowed, n=5, cutoff=0.5)
     hint = f"did you mean '{close[0]}'? " if close else ""
     if len(allowed) > 40:  # a message lists no more
-        some = close or allowed[:5]
-        return f"{hint}Allowed are {len(allowed)} names, such as {', '.join(some)}"
+        return f"{hint}Allowed are {len(allowed)} names, such as {', '.join(close or allowed[:5])}"
     return f"{hint}Allowed: {', '.join(allowed)}"

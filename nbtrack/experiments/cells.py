@@ -56,7 +56,6 @@ class Cell:
         if isinstance(needed, NbtrackError):
             return NbtrackError(f"not run, because {self.needs.name} failed: {needed}")
         path = runs_folder() / "locks" / f"{self.cache.name}.lock"
-        path.parent.mkdir(parents=True, exist_ok=True)
         report(0.0, "begins, or waits for another process that makes the same")
         try:
             with FileLock(path), advise_on_memory(f"the frames and settings of {self.name}"):

@@ -126,9 +126,8 @@ def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
     made = ScenesConfig(n_frames=options.n_frames, width=options.width, seed=options.seed)
     write_room(options.room, options.out, made)
-    size = f"{options.width}x{options.width * 3 // 4}"
-    told = f"{options.n_frames} frames of {size}, seed {options.seed}"
-    print(f"{options.out}: {options.room}, {told}")
+    size = f"{options.n_frames} frames of {options.width}x{options.width * 3 // 4}"
+    print(f"{options.out}: {options.room}, {size}, seed {options.seed}")
 
 
 def check_command(options: Namespace) -> None:

@@ -115,10 +115,9 @@ vr = [16, 64, 128]
 sdf = [256, 512, 2048]
 """
 _SMALL = with_values(Preset("smoke"), tomllib.loads(_SMOKE))
-_NINE = replace(_SMALL.scenes, names=REPORTED_ROOMS)
 _ALL = (
     _SMALL,
-    replace(_SMALL, name="nine_rooms", scenes=_NINE),
+    replace(_SMALL, name="nine_rooms", scenes=replace(_SMALL.scenes, names=REPORTED_ROOMS)),
     Preset("synthetic", scenes=ScenesConfig(REPORTED_ROOMS)),
     Preset("paper", scenes=ScenesConfig(tuple(PAPER_SCENE_LABELS), synthetic=False)),
 )

@@ -81,8 +81,7 @@ def track_scenes(
     frames = frames or preset.scenes.track_frames
     seeds, cells, rows = range(seeds) if isinstance(seeds, int) else seeds, [], []
     pairs = zip(scenes, tracked or scenes, strict=True)
-    for method, seed, rate_hz, pair in product(find_methods(methods), seeds, rates, pairs):
-        scene, seen = pair
+    for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         map_cell = MapCell(scene, method.field, with_settings(preset, *method.settings), seed=seed)
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
         budget = n_steps, rate_hz if clock else None

@@ -118,7 +118,6 @@ def _room_folder(name: str, config: ScenesConfig) -> Path:
     size = f"{config.n_frames}x{config.width}"
     folder = runs_folder() / "rooms" / f"{name}-{size}-seed{config.seed}" / name
     if not folder.is_dir():
-        folder.parent.mkdir(parents=True, exist_ok=True)
         # Another command may want the same room: it waits, and finds it made.
         with FileLock(folder.with_suffix(".lock")):
             for unfinished in folder.parent.glob(f".{name}.*.unfinished"):  # of a killed attempt

@@ -76,10 +76,9 @@ def make_room(
     poses are exact in both pose files. `room.json` records how the scene was made. The same
     arguments give the same bytes. Raises as `build_room`, `room_frames` and `write_sequence` do.
     """
-    room = build_room(name)
     record = {"room": name, "version": ROOM_VERSION, "seed": seed, "frames": n_frames}
     record |= {"width": width, "height": height}
-    frames = room_frames(room, n_frames, width, height, seed)
+    frames = room_frames(build_room(name), n_frames, width, height, seed)
     notes = {ROOM_FILE: json_text(record)}
     write_sequence(folder, room_intrinsics(width, height), frames, notes, progress)
     return folder

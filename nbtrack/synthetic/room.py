@@ -81,9 +81,8 @@ class Room:
             squared = row_dot(towards, towards) - (part.solid.reach * 1.001) ** 2
             least = np.where(squared > 0.0, lengths * np.sqrt(np.maximum(squared, 0.0)), -np.inf)
             rays = np.flatnonzero(row_dot(directions, towards) >= least)
-            candidate = part.solid.hit(
-                origins if origins.ndim == 1 else origins[rays], directions[rays]
-            )
+            starts = origins if origins.ndim == 1 else origins[rays]
+            candidate = part.solid.hit(starts, directions[rays])
             closer = candidate < t[rays]
             t[rays[closer]] = candidate[closer]
             index[rays[closer]] = number
