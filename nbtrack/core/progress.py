@@ -6,11 +6,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-_SECONDS_BEFORE_SHOWN = 1.0  # so that a mistake which ends the work at once is told alone
-_LOOK = {
-    "bar_format": "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}",
-    "delay": _SECONDS_BEFORE_SHOWN, "ascii": False,
-}  # fmt: skip
+_DELAY_SECONDS = 1.0  # so that a mistake which ends the work at once is told alone
+_FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
 
 
 def tell(news: str) -> None:
@@ -55,8 +52,8 @@ class ProgressBar:
         # A notebook's kernel drops messages once a thousand wait to be read.
         file, pause = (_NotebookLine(), 1.0) if is_notebook else (sys.stderr, 0.1)
         is_hidden = not (is_shown and (is_notebook or sys.stderr.isatty()))
-        where = {"file": file, "mininterval": pause, "disable": is_hidden}
-        self._bar = tqdm(total=total, desc=title, **where, **_LOOK)
+        where = {"file": file, "mininterval": pause, "disable": is_hidden, "ascii": False}
+        self._bar = tqdm(total=total, desc=title, bar_format=_FORMAT, delay=_DELAY_SECONDS, **where)
 
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much is done, and a word on how it goes."""
@@ -72,5 +69,5 @@ class ProgressBar:
         seconds, is_hidden = time.monotonic() - self._start, self._bar.disable
         self._bar.close()
         is_told = self.is_shown and is_hidden and kind is None
-        if is_told and seconds > _SECONDS_BEFORE_SHOWN:
+        if is_told and seconds > _DELAY_SECONDS:
             print(f"{self.title}: done in {seconds:.0f} s", file=sys.stderr)

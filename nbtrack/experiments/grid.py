@@ -25,7 +25,6 @@ from nbtrack.tracking import TRACKERS
 
 _REPORT_SECONDS = 0.3  # between two reports of a worker
 _SECONDS_TO_CONNECT = 10
-_HAS_DASK = importlib.util.find_spec("distributed") is not None
 _LOCAL = {
     # A cell that kills its worker is tried once more; memory is the user's to divide.
     "distributed.scheduler.allowed-failures": 1,
@@ -50,7 +49,7 @@ class Execution:
 
     def __post_init__(self) -> None:
         """Raises MissingError, before any work, if Dask is needed and not there."""
-        if (self.dask is not None or (self.workers or 1) > 1) and not _HAS_DASK:
+        if (self.dask is not None or (self.workers or 1) > 1) and not _has_dask():
             raise MissingError(
                 "several workers need Dask: pip install 'nbtrack[cluster]', or give --workers 1"
             )
@@ -87,7 +86,7 @@ def _outcomes(
     cells: dict[Path, Cell], results: dict[Path, Any], show: Callable, execution: Execution
 ) -> Iterator[tuple[Path, Any]]:
     """What becomes of each cell, as they end; what a cell needs comes before it."""
-    usual = os.cpu_count() or 1 if _HAS_DASK and choose_device().type == "cpu" else 1
+    usual = os.cpu_count() or 1 if _has_dask() and choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, len(cells))
     if cells and (execution.dask is not None or workers > 1):
         share = 1 if execution.dask else max(1, torch.get_num_threads() // workers)
@@ -97,6 +96,10 @@ def _outcomes(
         for folder, cell in cells.items():
             needed = results.get(cell.needs.folder) if cell.needs else None
             yield folder, cell.outcome(needed, partial(show, folder))
+
+
+def _has_dask() -> bool:
+    return importlib.util.find_spec("distributed") is not None
 
 
 def _on_workers(
