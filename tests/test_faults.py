@@ -198,7 +198,8 @@ ARGUMENTS = {
     "onto itself": (["export", "room", "--to", "map", "room"], "is the source itself"),
     "no field": (TRACK, "track needs --field, or --map-from"),
     "supervision alone": ([*GIVEN, "map", "--supervision", "rendering"], "belongs to --field"),
-    "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames out"),
+    "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames, --correct out"),
+    "made map": ([*GIVEN, "map", "--correct", "0.1"], "leave --map-frames, --correct out"),
     "field not the map's": ([*GIVEN, "map", "--field", "imap"], "is a map of field 'neus'"),
     "supervision not the map's": (
         [*GIVEN, "map", "--field", "neus", "--supervision", "rendering+sdf"],

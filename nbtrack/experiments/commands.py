@@ -72,7 +72,7 @@ def track_command(options: Namespace) -> None:
         _map(cell)
     run = replace(run, out=run.folder)  # made anew, whatever the cache holds
     (metrics,) = run_cells([run], f"tracking {scene.name}")
-    print(f"{run.folder}: {options.tracker} in {field_class(field).label}, {budget}")
+    print(f"{run.folder}: {options.tracker} in {cell.map().field.label}, {budget}")
     _print_numbers({name: metrics[name] for name in _PRINTED})
     if metrics["frames_without_depth"]:
         print(f"  frames without any depth, not searched: {metrics['frames_without_depth']}")
@@ -195,8 +195,8 @@ def _field_and_map(options: Namespace) -> tuple[str, Map | None]:
     asked = options.field and _field_of(options)
     if options.map_from is None:
         return asked, None
-    if options.map_frames is not None:
-        raise ConfigError("--map-from names a map that is made: leave --map-frames out")
+    if options.map_frames is not None or options.correct is not None:
+        raise ConfigError("--map-from names a map that is made: leave --map-frames, --correct out")
     given = read_map(options.map_from)
     name = given.field.name
     # A field's variants, as NeuS+ is one of NeuS, differ in what teaches them.
