@@ -2,11 +2,17 @@
 
 import importlib
 
+import pytest
 from jaxtyping import install_import_hook
 
 # What modules of the package import, the hook seeks under another name among the compiled modules,
 # does not find and compiles anew, in every process. So libraries come before it.
-for library in ("beartype", "cv2", "distributed", "numba", "pandas", "scipy.stats", "trimesh"):
-    importlib.import_module(library)
+LIBRARIES = ("beartype", "cv2", "distributed", "numba", "pandas", "scipy.stats", "trimesh")
 
-install_import_hook("nbtrack", "beartype.beartype")
+
+def pytest_collectstart(collector: pytest.Collector) -> None:
+    """Only where tests run, not in a process that hands them out: this takes seconds."""
+    if isinstance(collector, pytest.Session):
+        for library in LIBRARIES:
+            importlib.import_module(library)
+        install_import_hook("nbtrack", "beartype.beartype")

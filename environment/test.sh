@@ -13,9 +13,9 @@ unset NBTRACK_PRESET NBTRACK_CONFIG NBTRACK_SET NBTRACK_DATA
 
 step "Style" "$venv_python" -m ruff check
 step "Formatting" "$venv_python" -m ruff format --check --quiet
-# One process a core with one thread each: tests are too small to share. The longest modules begin
-# (tests/conftest.py); without the notebooks' plugin, which takes seconds to load in each process.
-step "Unit tests" env OMP_NUM_THREADS=1 "$venv_python" -m pytest -q -p no:nbval -n auto \
-    --dist loadfile --no-loadscope-reorder
+# One process a core; the longest modules begin (tests/conftest.py). Without the notebooks' plugin,
+# which takes seconds to load in each process.
+step "Unit tests" "$venv_python" -m pytest -q -p no:nbval -n auto --dist loadfile \
+    --no-loadscope-reorder
 step "Notebooks against their stored outputs" "$venv_python" -m pytest --nbval notebooks -q
 printf 'All checks passed in %d min %d s.\n' "$((SECONDS / 60))" "$((SECONDS % 60))"

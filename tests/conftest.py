@@ -8,24 +8,25 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-import torch
 from finished import GIVEN, MAP, OWN, isolate
 
 for name in ("PRESET", "CONFIG", "SET", "DATA", "RUNS"):  # of whoever runs the tests
     os.environ.pop(f"NBTRACK_{name}", None)
 os.environ["NBTRACK_DEVICE"] = "cpu"  # where there is a GPU too: what is tested there says so
-torch.set_num_threads(1)  # images are so small that threads would only wait for each other
-LONG = ("test_grid", "test_tables_of_runs", "test_kills", "test_data_check", "test_synthetic")
+os.environ["OMP_NUM_THREADS"] = "1"  # images are so small that threads would only wait for others
+LONG = ["test_compiled", "test_grid", "test_tables_of_runs", "test_data_check", "test_kills"]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest modules first: at the end they would leave the other processes idle."""
-    items.sort(key=lambda item: item.path.stem not in LONG)
+    """What others find compiled comes first, then the longest modules: at the end they would leave
+    the other processes idle."""
+    order = {name: place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(LONG)))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session", autouse=True)
 def few_scores() -> Iterator[None]:
-    """For tests that make many maps and do not look at what those are worth."""
+    """Most tests do not look at what their maps are worth."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nbtrack.mapping.quality.POINTS_SCORED", 200)
         patch.setattr("nbtrack.mapping.quality._MISFIT_FRAMES", 1)
@@ -36,6 +37,8 @@ def few_scores() -> Iterator[None]:
 def settings_stay_inside(tmp_path: Path) -> Iterator[None]:
     """A cache for each test, unless its module has one; and what a command sets for its own process
     must not reach the next test."""
+    import torch
+
     with mock.patch.dict(os.environ):
         os.environ.setdefault("NBTRACK_RUNS", str(tmp_path / "runs"))
         yield

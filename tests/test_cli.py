@@ -11,7 +11,6 @@ from tiny import tiny_words
 from nbtrack.cli import main
 from nbtrack.tracking.trajectories import read_tum
 
-pytestmark = pytest.mark.usefixtures("few_scores")
 TINY = tiny_words("scenes.n_frames=6", "tracking.sdf.n_pixels=32")
 
 

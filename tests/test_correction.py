@@ -87,10 +87,13 @@ def test_weights_of_interpolation(found: CorrectedField) -> None:
     np.testing.assert_allclose(values, expected, atol=1e-5)
 
 
-def test_a_file_keeps_it_whole(tmp_path: Path, sequence: RgbdSequence) -> None:
+def test_a_file_keeps_it_whole(
+    tmp_path: Path, sequence: RgbdSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches corrections lost or rounded on the way to disk and back, and a size that is not
     what the file has."""
-    network, settings = NetworkSettings(width=32), NeusMapping(correct_voxel=0.1)
+    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 10_000)
+    network, settings = NetworkSettings(width=16), NeusMapping(correct_voxel=0.2)
     field = make_field("neus", network, ROOM.bounds, seed=0).eval().requires_grad_(False)
     made = {"field": "neus", "network": vars(network), "seconds": 0.0}
     finished = correct_map(Map(field, sequence.intrinsics, made), sequence, settings)

@@ -21,7 +21,7 @@ from nbtrack.experiments.cells import Cell, Report
 from nbtrack.experiments.grid import Execution, run_cells
 
 # Dask's own threads and sockets warn as they are torn down.
-pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.usefixtures("few_scores")]
+pytestmark = pytest.mark.filterwarnings("default")
 
 
 @dataclass(frozen=True)

@@ -77,8 +77,9 @@ def test_only_the_frames_asked_for_and_what_lies_inside_are_fused() -> None:
     torch.testing.assert_close(found, torch.tensor([0.3, 0.4]))
 
 
-def test_scores_of_points(room: Room) -> None:
+def test_scores_of_points(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches images asked of points, and points off the exact surface: depth here is clean."""
+    monkeypatch.setattr("nbtrack.mapping.quality.POINTS_SCORED", 4000)
     sequence, made = room
     scores = score_map(made, sequence, build_room("bedroom"))
     assert scores["psnr_db"] is None

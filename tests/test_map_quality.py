@@ -40,9 +40,10 @@ def quality_of(sequence: RgbdSequence, shift: float) -> dict:
     return score_map(Map(shifted(sequence, shift), sequence.intrinsics, made), sequence, ROOM)
 
 
-def test_scores(sequence: RgbdSequence) -> None:
+def test_scores(sequence: RgbdSequence, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches scores that punish an exact map, blind scores and wrong units: of the truth, within
     half a cell, and of a surface 8 cm inside the room, which is beyond 5 cm."""
+    monkeypatch.setattr("nbtrack.mapping.quality.POINTS_SCORED", 4000)
     exact, inside = quality_of(sequence, 0.0), quality_of(sequence, 0.08)
     assert (exact["psnr_db"], exact["depth_l1_m"]) == (None, None)
     assert max(exact["sdf_near_m"], exact["sdf_free_m"]) < 1e-5

@@ -61,7 +61,7 @@ def own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     del FIELDS["fading"], TRACKERS["distance"], METHODS["mine"], sys.modules["own_method"]
 
 
-def test_a_row_in_both_tables(few_scores: None, own_file: None, tmp_path: Path) -> None:
+def test_a_row_in_both_tables(own_file: None, tmp_path: Path) -> None:
     """Catches an extension that needs more than its own file: presets, layouts, registries."""
     assert OWN.count("\n") <= 40
     words = tiny_words(

@@ -18,7 +18,7 @@ WIDTH, HEIGHT = 32, 24
 
 
 @pytest.fixture(scope="module")
-def dataset(few_scores: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine folders in the dataset's layout, under its names; what they show is one room of ours."""
     folder = tmp_path_factory.mktemp("neural_rgbd")
     frames = list(room_frames(build_room("living_room"), N_FRAMES, WIDTH, HEIGHT, seed=0))

@@ -28,7 +28,7 @@ from nbtrack.experiments.scenes import Scene, open_scenes
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(few_scores: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """One cache for all tests here, so that rooms and maps are made once, and one process."""
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("runs")

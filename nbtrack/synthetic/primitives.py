@@ -4,7 +4,7 @@ World axes: y up, metres. Distances are positive outside a solid and negative in
 """
 
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -58,7 +58,7 @@ class Solid:
     at points on the surface; `area` of it (m²); and `sample_surface`, uniform points there.
     """
 
-    @property
+    @cached_property
     def reach(self) -> float:
         """Radius (m) of the sphere around the center that holds the solid."""
         return float(np.linalg.norm(self._half))
@@ -87,11 +87,11 @@ class Box(Solid):
     size: Vector3  # full edge lengths (m) along its own x, y, z
     yaw: float = 0.0  # rad, counter-clockwise seen from above
 
-    @property
+    @cached_property
     def _half(self) -> Array3:
         return np.asarray(self.size) / 2
 
-    @property
+    @cached_property
     def _axes(self) -> Float[np.ndarray, "3 3"]:
         """World from box: the rotation by its yaw."""
         cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
@@ -151,7 +151,7 @@ class Sphere(Solid):
     center: Vector3
     radius: float
 
-    @property
+    @cached_property
     def _half(self) -> Float[np.ndarray, "1"]:
         return np.array([self.radius])
 
@@ -185,17 +185,17 @@ class Cylinder(Solid):
     end: Vector3  # center of the other cap
     radius: float
 
-    @property
+    @cached_property
     def center(self) -> Array3:
         """Middle of the axis."""
         return (np.asarray(self.start) + self.end) / 2
 
-    @property
+    @cached_property
     def _axis(self) -> Array3:
         along = np.asarray(self.end) - self.start
         return along / float(np.linalg.norm(along))
 
-    @property
+    @cached_property
     def _half(self) -> Float[np.ndarray, "2"]:
         """Radius and half the length (m)."""
         length = float(np.linalg.norm(np.asarray(self.end) - self.start))

@@ -2,7 +2,8 @@
 
 Of every point a column of twelve numbers is kept: the residuals of distance (m) and intensity, how
 reliable they are, the arm from the camera's centre (m, world axes), and both spatial gradients.
-Loops are plain so that numba compiles them; no result depends on the number of threads.
+Loops are plain so that numba compiles them, linear algebra too, whose own compilation takes
+seconds; no result depends on the number of threads.
 """
 
 from typing import no_type_check
@@ -103,13 +104,12 @@ def judged_as(rows, before):
 @no_type_check
 @njit(**_HOW)
 def scales_of(rows, before, least, medians):
-    """`registration.scales_of`."""
-    scales, middle = before.copy(), (rows.shape[1] - 1) // 2
+    """`registration.scales_of`, but an even number of points has its median between two of them."""
+    scales = before.copy()
     for k in range(2):
         if before[k] <= least[k]:  # as in most steps: a median takes as long as many sums
             continue
-        median = np.partition(np.abs(rows[k]), middle)[middle]
-        scales[k] = min(max(medians * median, least[k]), before[k])
+        scales[k] = min(max(medians * np.median(np.abs(rows[k])), least[k]), before[k])
     return scales
 
 
@@ -161,13 +161,16 @@ def moved(T, twist):
     """`registration.moved`, by Rodrigues' formula."""
     x, y, z = twist[0], twist[1], twist[2]
     angle = np.sqrt(x * x + y * y + z * z)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     sine = np.sin(angle) / angle if angle > 1e-9 else 1.0
     versine = 2 * (np.sin(angle / 2) / angle) ** 2 if angle > 1e-9 else 0.5
-    turn = np.eye(3) + sine * cross + versine * (cross @ cross)
     after = T.copy()
-    after[:3, :3] = turn @ np.ascontiguousarray(T[:3, :3])
-    after[:3, 3] += twist[3:]
+    for k in range(3):  # an axis a of the camera turns into a + sine w x a + versine w x (w x a)
+        a, b, c = T[0, k], T[1, k], T[2, k]
+        p, q, r = y * c - z * b, z * a - x * c, x * b - y * a
+        after[0, k] += sine * p + versine * (y * r - z * q)
+        after[1, k] += sine * q + versine * (z * p - x * r)
+        after[2, k] += sine * r + versine * (x * q - y * p)
+        after[k, 3] += twist[3 + k]
     return after
 
 
@@ -185,7 +188,17 @@ def damped_step(rows, scales, weight, T_start, T, damping):
         vector[3 + k] += START_PULL * (T[k, 3] - T_start[k, 3])
     for k in range(6):
         matrix[k, k] += START_PULL + damping * matrix[k, k]
-    return -np.linalg.solve(matrix, vector)
+    for k in range(6):  # elimination without pivots, which positive definite matrices do not need
+        for i in range(k + 1, 6):
+            share = matrix[i, k] / matrix[k, k]
+            vector[i] -= share * vector[k]
+            for j in range(k, 6):
+                matrix[i, j] -= share * matrix[k, j]
+    for k in range(5, -1, -1):
+        for j in range(k + 1, 6):
+            vector[k] += matrix[k, j] * vector[j]
+        vector[k] /= -matrix[k, k]
+    return vector
 
 
 @no_type_check
