@@ -149,7 +149,7 @@ def test_a_cluster_makes_the_same_table(address: str, tmp_path: Path, undisturbe
 def undertake(folder: Path, words: list[str]) -> None:
     """The command in a process of its own, which forks its workers too."""
     os.environ["NBTRACK_RUNS"] = str(folder / "runs")
-    with forking():
+    with dask.config.set({"distributed.worker.multiprocessing-method": "fork"}):
         main(words)
 
 
