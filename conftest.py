@@ -7,7 +7,10 @@ from jaxtyping import install_import_hook
 
 # What modules of the package import, the hook seeks under another name among the compiled modules,
 # does not find and compiles anew, in every process. So libraries come before it.
-LIBRARIES = ("beartype", "cv2", "distributed", "numba", "pandas", "scipy.stats", "trimesh")
+LIBRARIES = (
+    "beartype", "cv2", "distributed", "numba", "pandas", "scipy.interpolate", "scipy.ndimage",
+    "scipy.sparse.linalg", "scipy.spatial", "trimesh",
+)  # fmt: skip
 
 
 def pytest_collectstart(collector: pytest.Collector) -> None:

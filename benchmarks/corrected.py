@@ -60,11 +60,11 @@ COLUMNS = [
 
 
 # What a correction is made with, changed one at a time: settings, and constants of its module.
-SHORT = "mapping.neus_plus.iterations=300"
+LONG = "mapping.neus_plus.iterations=1400"
 ABLATION = [
     ("as it is", (), {}),
     ("from NeuS", (), {}),
-    ("from NeuS+ of 300 iterations", (SHORT,), {}),
+    ("from NeuS+ of 1400 iterations", (LONG,), {}),
     ("at the surface alone", (), {"_OFFSETS": (0.0,)}),
     ("offsets up to 1.5 cm", (), {"_OFFSETS": (-0.015, 0.0, 0.015)}),
     ("30,000 points", (), {"_N_POINTS": 30_000}),

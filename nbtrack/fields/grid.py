@@ -44,9 +44,10 @@ class BakedField(Field):
         # The first vertex lies one cell below the bounds; they are listed with z fastest.
         low = torch.tensor([x - voxel for x in self.bounds.minimum]).to(source.device)
         numbers = torch.arange(math.prod(self.n_vertices), device=source.device)
+        _, ny, nz = self.n_vertices  # `unravel_index` would import sympy, which takes a second
         answers = [
-            source(low + voxel * torch.stack(torch.unravel_index(part, self.n_vertices), -1))
-            for part in numbers.split(_POINTS_AT_ONCE)
+            source(low + voxel * torch.stack([i // (ny * nz), i // nz % ny, i % nz], dim=-1))
+            for i in numbers.split(_POINTS_AT_ONCE)
         ]
         color, value = map(torch.cat, zip(*answers, strict=True))
         vertices = torch.stack([value, intensity_of(color)], dim=-1)

@@ -8,7 +8,7 @@ from importlib.resources import files
 
 import numpy as np
 import pandas as pd
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from nbtrack.core.errors import DataError
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
@@ -91,7 +91,7 @@ def over_rooms(results: pd.DataFrame, by: list[str], value: str = "ate_m") -> pd
     """
     of_rooms = np.log(results.set_index([*by, "scene"])[value])
     rooms = of_rooms.groupby([*by, "scene"], sort=False).mean().groupby(by, sort=False)
-    mean, half = rooms.mean(), rooms.sem() * student.ppf(0.975, rooms.size() - 1)
+    mean, half = rooms.mean(), rooms.sem() * stdtrit(rooms.size() - 1, 0.975)
     return np.exp(pd.DataFrame({value: mean, "from": mean - half, "to": mean + half})).reset_index()
 
 
