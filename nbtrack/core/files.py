@@ -66,7 +66,6 @@ def sources_fingerprint(*rooms: str) -> str:
         path = PACKAGE / room.replace(".", "/")
         files = sorted(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
         found |= {str(f.relative_to(PACKAGE)): _code(f.read_text("utf-8")) for f in files}
-        found |= {str(f.relative_to(PACKAGE)): f.read_text("utf-8") for f in path.rglob("*.toml")}
     return fingerprint(found)
 
 

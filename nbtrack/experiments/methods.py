@@ -26,8 +26,7 @@ _VR_VELOCITY = ("tracking.vr.motion_model=constant_velocity",)
 _SDF_VELOCITY = ("tracking.sdf.motion_model=constant_velocity",)
 _DENSE = ("tracking.lm.n_pixels=4096",)
 _CORRECTED = ("mapping.neus.correct_voxel=0.04",)
-# Corrected, a NeuS+ of 600 iterations serves as well as one of 1400, in half the time: rooms for
-# tuning, benchmarks/corrected.py.
+# As good as from 1400 iterations, in half the time (benchmarks/README.md; rooms for tuning).
 _PLUS_CORRECTED = ("mapping.neus_plus.correct_voxel=0.04", "mapping.neus_plus.iterations=600")
 METHODS = {
     "vr": Method("iMAP with VR", "imap", "vr"),

@@ -2,8 +2,7 @@
 
 Of every point a column of twelve numbers is kept: the residuals of distance (m) and intensity, how
 reliable they are, the arm from the camera's centre (m, world axes), and both spatial gradients.
-Loops are plain so that numba compiles them, linear algebra too, whose own compilation takes
-seconds; no result depends on the number of threads.
+Loops are plain, which numba compiles soonest; no result depends on the number of threads.
 """
 
 from typing import no_type_check
@@ -16,7 +15,6 @@ from nbtrack.fields.base import LUMA
 from nbtrack.tracking.registration import LEAST_SLOPE, MOST_SLOPE, SLOPE_SCALE, START_PULL
 
 _RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
-
 
 # Sums may be reordered, so that they fill vector registers; what is no number stays none.
 _HOW = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
@@ -107,9 +105,8 @@ def scales_of(rows, before, least, medians):
     """`registration.scales_of`, but an even number of points has its median between two of them."""
     scales = before.copy()
     for k in range(2):
-        if before[k] <= least[k]:  # as in most steps: a median takes as long as many sums
-            continue
-        scales[k] = min(max(medians * np.median(np.abs(rows[k])), least[k]), before[k])
+        if before[k] > least[k]:  # as in few steps: a median takes as long as many sums
+            scales[k] = min(max(medians * np.median(np.abs(rows[k])), least[k]), before[k])
     return scales
 
 

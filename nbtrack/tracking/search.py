@@ -83,8 +83,7 @@ class Search:
         is_better = bool(registration.robust_cost(judged, *now[1:]) < before)
         if is_better:
             self.T_world_camera, self.residuals = T_world_camera, residuals
-            least = constant(self.field.accuracy, residuals.value.device, torch.float32)
-            self.scales = registration.scales_of(residuals, self.scales, least, self.medians)
+            self.scales = registration.scales_of(residuals, self.scales, self.least, self.medians)
         self._judge(is_better, float(twist.abs().max()))
         return float(before)
 
@@ -103,9 +102,9 @@ class Search:
     def _look(self, widest: float) -> None:
         """Residuals at the pose, and robust scales for them, up to the widest."""
         self.residuals = self._residuals_at(self.T_world_camera)
-        least = constant(self.field.accuracy, self.residuals.value.device, torch.float32)
-        widest = least.clamp_min(widest)
-        self.scales = registration.scales_of(self.residuals, widest, least, self.medians)
+        self.least = constant(self.field.accuracy, self.residuals.value.device, torch.float32)
+        widest = self.least.clamp_min(widest)
+        self.scales = registration.scales_of(self.residuals, widest, self.least, self.medians)
 
     def _residuals_at(self, T_world_camera: Transform) -> registration.Residuals:
         observed, by_slope = self.levels[self.level], self.settings.divide_by_slope
