@@ -28,7 +28,7 @@ STEPS = {
     ("sdf", "neus"): (101, []),
     ("vr", "imap"): (305, []),
     ("vr", "neus"): (322, []),
-    ("lm", "neus"): (135, LM_WAITS),
+    ("lm", "neus"): (131, LM_WAITS),
 }
 ITERATIONS = {"imap": 248, "neus": 394, "neus_plus": 724}  # kernels of mapping
 

@@ -12,7 +12,7 @@ from numba import njit
 
 from nbtrack.data.frame import DRAWN_PER_POINT, EDGE_JUMP, MILLIMETRE
 from nbtrack.fields.base import LUMA
-from nbtrack.tracking.registration import FAR, LEAST_SLOPE, MOST_SLOPE, SLOPE_SCALE, START_PULL
+from nbtrack.tracking.registration import LEAST_SLOPE, MOST_SLOPE, SLOPE_SCALE, START_PULL
 
 _RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
 
@@ -41,7 +41,7 @@ def _place(rows, points, T, shape, place):
     """Arms, and whether points are usable; their cells, where in them, and the slopes' unit."""
     inverse, numbers = 1 / place[3], np.zeros(len(points), np.int64)
     at, inside = np.empty((2, 3, len(points)), np.float32)
-    rows[2] = 1 / (1 + (points[:, 2] / FAR) ** 4)
+    rows[2] = _ONE
     for k in range(3):
         last = shape[k] - 1.0
         for i in range(len(points)):
@@ -238,8 +238,9 @@ def draw_points(depth_mm, color, camera, n_points, seed):
         is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
         is_smooth &= abs(depth_mm[v, u + 1] - z) < jump and abs(depth_mm[v, u - 1] - z) < jump
         if is_smooth:  # never without a depth: nothing is below a jump of zero
-            at, metres = points[found], z * MILLIMETRE
-            at[0], at[1], at[2] = (u + 0.5 - cx) / fx * metres, (v + 0.5 - cy) / fy * metres, metres
+            point, metres = points[found], z * MILLIMETRE
+            point[0], point[1] = (u + 0.5 - cx) / fx * metres, (v + 0.5 - cy) / fy * metres
+            point[2] = metres
             red, green, blue = color[v, u, 0], color[v, u, 1], color[v, u, 2]
             luma[found] = (_RED * red + _GREEN * green + _BLUE * blue) / 255
             found += 1

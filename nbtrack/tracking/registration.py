@@ -21,7 +21,6 @@ from nbtrack.fields import Field
 # Gradient lengths between which a signed distance is taken at its word (PIN-SLAM: 0.5 to 2).
 LEAST_SLOPE, MOST_SLOPE = 0.3, 2.0
 SLOPE_SCALE = 0.5  # a gradient so much longer or shorter than 1 counts for a quarter
-FAR = 2.0  # m; there a Kinect's error, which grows with the square of depth, is a map's: 6 mm
 MARGIN = 0.3  # m beyond a field's bounds, where walls lie of which the pose is off
 MEDIANS = 3.0  # of its residuals in a scale: two standard deviations, were they normal
 _DEVIATIONS = 0.6745 * MEDIANS
@@ -62,7 +61,6 @@ def residuals_at(
     is_usable &= field.bounds.contain(points_world, MARGIN)
     # A distance field's gradient has length 1; the farther from it, the less it is trusted.
     reliability = is_usable / (1 + ((slope - 1) / SLOPE_SCALE).square()).square()
-    reliability = reliability / (1 + (points_camera[:, 2] / FAR) ** 4)  # inverse variances
     slope = slope.clamp_min(LEAST_SLOPE) if divide_by_slope else torch.ones_like(slope)
     value = torch.stack([field_at.value / slope, field_at.intensity - intensity])
     gradient = field_at.value_gradient / slope[:, None], field_at.intensity_gradient
