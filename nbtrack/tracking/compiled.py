@@ -33,11 +33,9 @@ class CompiledSearch(Search):
     @staticmethod
     def draw(frame: Frame, n_points: int, generator: torch.Generator) -> tuple:
         """Random observed points (m, camera frame) away from edges, and their intensities."""
-        camera, images = frame.camera, (frame.depth_mm.numpy(), frame.color.numpy())
+        c, images = frame.camera, (frame.depth_mm.numpy(), frame.color.numpy())
         seed = int(torch.randint(2**62, (), generator=generator))
-        return kernels.draw_points(
-            *images, (camera.fx, camera.fy, camera.cx, camera.cy), n_points, seed
-        )
+        return kernels.draw_points(*images, (c.fx, c.fy, c.cx, c.cy), n_points, seed)
 
     def step(self) -> float:
         """One step, taken or refused; returns the robust cost before it."""
