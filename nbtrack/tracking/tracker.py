@@ -130,7 +130,7 @@ class Tracker(abc.ABC):
         """
         T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
         estimate = Estimate(T_starts[0], without_depth=True)
-        if frame.has_depth or self.copes_without_depth:
+        if self.copes_without_depth or frame.has_depth:
             with suitable_threads(self._width):
                 estimate = self._search(frame.to(self.device), T_starts)
         self.estimates.append(estimate.T_world_camera)
@@ -162,7 +162,7 @@ class Tracker(abc.ABC):
 
     def _search(self, frame: Frame, T_starts: Poses) -> Estimate:
         starts = torch.from_numpy(T_starts).float().to(self.device)
-        if frame.has_depth and not self._is_warm:
+        if not self._is_warm and frame.has_depth:
             # Steps that count nowhere: first calls load, allocate and record for a second or more.
             state, self._is_warm = self.state(), True
             self.begin(frame, starts[:1])
