@@ -198,7 +198,8 @@ def _run_notebook(path: Path, folder: Path) -> None:
     from nbconvert.preprocessors import CellExecutionError, ExecutePreprocessor
 
     notebook, page, start = nbformat.read(path, 4), folder / f"{path.stem}.html", time.monotonic()
-    run = ExecutePreprocessor(timeout=None, kernel_name="python3", record_timing=False)
+    how = {"record_timing": False, "extra_arguments": ["--log-level=ERROR"]}  # no talk of ports
+    run = ExecutePreprocessor(timeout=None, kernel_name="python3", **how)
     try:
         run.preprocess(notebook, {"metadata": {"path": str(path.parent)}})
     except CellExecutionError as error:
