@@ -14,7 +14,7 @@ from nbtrack.tracking.lm import search_kind
 from nbtrack.tracking.search import Search
 
 GRID, EXACT = BakedField(BoxRoom(), 0.05), BakedField(BoxRoom(), 0.05).double()
-OBSERVED = torch.rand(301, 4, generator=torch.Generator().manual_seed(0)) * 2.4 - 1.2
+OBSERVED = torch.rand(300, 4, generator=torch.Generator().manual_seed(0)) * 2.4 - 1.2
 NUMPY = OBSERVED[:, :3].double().numpy(), OBSERVED[:, 3].double().numpy()
 TWIST = torch.tensor([0.3, -0.2, 0.4, 0.2, -0.1, 0.3], dtype=torch.float64)
 

@@ -40,11 +40,12 @@ class CompiledSearch(Search):
     def step(self) -> float:
         """One step, taken or refused; returns the robust cost before it."""
         settings, now = self.settings, (self.residuals, self.scales, self.damping)
-        is_better, *after, before, length = kernels.try_step(
+        is_better, self.T_world_camera, self.residuals, before, length = kernels.try_step(
             self.levels[self.level], self.grid, settings.divide_by_slope, self.weight,
-            self.medians, self.least, self.start, self.T_world_camera, *now,
+            self.start, self.T_world_camera, *now,
         )  # fmt: skip
-        self.T_world_camera, self.residuals, self.scales = after
+        if is_better:
+            self.scales = kernels.scales_of(self.residuals, self.scales, self.least, self.medians)
         self._judge(is_better, length)
         return before
 

@@ -100,14 +100,13 @@ def judged_as(rows, before):
 
 
 @no_type_check
-@njit(**_HOW)
 def scales_of(rows, before, least, medians):
-    """`registration.scales_of`, but an even number of points has its median between two of them."""
-    scales = before.copy()
-    for k in range(2):
-        if before[k] > least[k]:  # as in few steps: a median takes as long as many sums
-            scales[k] = min(max(medians * np.median(np.abs(rows[k])), least[k]), before[k])
-    return scales
+    """`registration.scales_of`; numpy's own, whose compilation would take seconds."""
+    if (before <= least).all():  # as in most steps: a median takes as long as many sums
+        return before
+    middle = (rows.shape[1] - 1) // 2
+    median = np.partition(np.abs(rows[:2]), middle, axis=1)[:, middle]
+    return np.minimum(np.maximum(medians * median, least), before)
 
 
 @no_type_check
@@ -200,8 +199,8 @@ def damped_step(rows, scales, weight, T_start, T, damping):
 
 @no_type_check
 @njit(**_HOW)
-def try_step(observed, grid, by_slope, weight, medians, least, T_start, T, rows, scales, damping):
-    """A step: whether it is better, pose, rows and scales after it, cost before, and its length."""
+def try_step(observed, grid, by_slope, weight, T_start, T, rows, scales, damping):
+    """A step: whether it is better, pose and rows after it, cost before, and its length."""
     twist = damped_step(rows, scales, weight, T_start, T, damping)
     T_after = moved(T, twist)
     rows_after = residual_rows(observed, T_after, grid, by_slope)
@@ -209,9 +208,8 @@ def try_step(observed, grid, by_slope, weight, medians, least, T_start, T, rows,
     before, after = robust_cost(rows, scales, weight), robust_cost(judged, scales, weight)
     longest = np.abs(twist).max()
     if after < before:
-        scales = scales_of(rows_after, scales, least, medians)
-        return True, T_after, rows_after, scales, before, longest
-    return False, T, rows, scales, before, longest
+        return True, T_after, rows_after, before, longest
+    return False, T, rows, before, longest
 
 
 @no_type_check
