@@ -31,21 +31,21 @@ def with_settings(config: Config, *settings: str) -> Config:
 
     Raises ConfigError as `with_values` does, and for a text that is none.
     """
-    values = {}
     for setting in settings:
         key, equals, text = (part.strip() for part in setting.partition("="))
         if not equals:
             raise ConfigError(f"setting {setting!r} has no value: write key=value")
         try:
-            values[key] = tomllib.loads(f"value = {text}")["value"]
+            value = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
             if text.startswith(("[", "{", '"', "'")):
                 raise ConfigError(
                     f"value {text!r} is no TOML: write ['a', 'b'] or [1, 2], and quote the whole "
                     "setting, so that the shell leaves the inner quotes"
                 ) from None
-            values[key] = text  # a bare word is a string
-    return with_values(config, values)
+            value = text  # a bare word is a string
+        config = with_values(config, {key: value})
+    return config
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
