@@ -68,8 +68,8 @@ ABLATION = [
     ("at the surface alone", (), {"_OFFSETS": (0.0,)}),
     ("offsets up to 1.5 cm", (), {"_OFFSETS": (-0.015, 0.0, 0.015)}),
     ("30,000 points", (), {"_N_POINTS": 30_000}),
-    ("smoothness 0.1", (), {"_SMOOTHNESS": 0.1}),
-    ("smoothness 10", (), {"_SMOOTHNESS": 10.0}),
+    ("smoothness 1", (), {"_SMOOTHNESS": 1.0}),
+    ("weights judged twice", (), {"_ROUNDS": 2}),
     ("ends abruptly", (), {"_FADE": 0}),
     ("cells of 8 cm", ("mapping.neus_plus.correct_voxel=0.08",), {}),
 ]

@@ -25,11 +25,11 @@ from nbtrack.fields.grid import BakedField
 # All our choice, tried in the two rooms for tuning. Measured points, and where along their normals
 # (m) the distance is that offset. Nearer than a voxel: farther out, planes end.
 _N_POINTS, _OFFSETS = 300_000, (-0.03, -0.015, 0.0, 0.015, 0.03)
-# Residuals (m) from which one counts less (Huber), and not at all: another surface is nearer.
-_HUBER, _MOST_RESIDUAL, _ROUNDS = 0.01, 0.04, 2
+# The residual (m) from which one counts less (Huber), and how often that is judged anew.
+_HUBER, _ROUNDS = 0.01, 4
 # What a difference between neighbouring corrections, and a correction itself, cost, in points seen
 # from the mean distance. Corrections fade out over so many vertices beyond those that points touch.
-_SMOOTHNESS, _PULL, _FADE = 1.0, 0.1, 1
+_SMOOTHNESS, _PULL, _FADE = 0.1, 0.1, 1
 _MOST_CAMERAS = 200  # poses kept, evenly spread: where a lost camera may be looked for
 CORRECTIONS = ("numbers", "corrections", "T_world_cameras")
 """What a file keeps of a correction: arguments of `CorrectedField`, in their order."""
@@ -148,13 +148,12 @@ def _unknowns(
 def _solve(design, stiffness, wanted, reliability) -> Float[np.ndarray, "_ 4"]:
     """Corrections of colour and distance by least squares; outliers lose their say."""
     found = np.zeros((design.shape[1], wanted.shape[1]))
-    for _ in range(_ROUNDS):
+    for round_ in range(_ROUNDS):
         residual = np.abs(wanted[:, 3] - design @ found[:, 3])
-        weight = reliability * (_HUBER / residual.clip(_HUBER)) * (residual < _MOST_RESIDUAL)
-        weighted = (design * weight[:, None]).tocsr()
+        weighted = (design * (reliability * _HUBER / residual.clip(_HUBER))[:, None]).tocsr()
         matrix, vectors = design.T @ weighted + stiffness, weighted.T @ wanted
         scaling = sparse.dia_array((1 / matrix.diagonal()[None], 0), shape=matrix.shape)
-        for column in range(wanted.shape[1]):
+        for column in range(4) if round_ == _ROUNDS - 1 else [3]:  # weights are those of distances
             start = found[:, column].copy()
             found[:, column], _ = cg(matrix, vectors[:, column], start, rtol=1e-3, M=scaling)
     return found
