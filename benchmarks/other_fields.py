@@ -1,10 +1,11 @@
-"""VR, VR by colour alone, and SDF in five fields; and from how far off colour alone finds a pose.
+"""VR, VR by colour alone, and SDF in five fields; how opaque their maps are to VR; and from how far
+off colour alone finds a pose.
 
     python benchmarks/other_fields.py [SEEDS]
 
 Rows are added to paper_tables/other_fields/table_1_cells.csv as they are finished; those that are
 there are not made again, whatever has changed since: remove the file to begin anew. A seed takes 40
-minutes on one core. Then, where it is missing, starts.csv is made.
+minutes on one core. Then opacity.csv is made and, where it is missing, starts.csv.
 """
 
 import sys
@@ -13,10 +14,12 @@ from itertools import product
 from pathlib import Path
 
 import pandas as pd
+import torch
 from basin import OFFSETS, find_from_afar
 
-from nbtrack import load_preset, open_scenes, track_scenes
+from nbtrack import load_preset, map_scene, open_scenes, track_scenes
 from nbtrack.core.files import tables_folder, write_atomic
+from nbtrack.data.pixels import PixelSampler
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import METHODS
 
@@ -39,6 +42,26 @@ def starts(path: Path) -> None:
     write_atomic(path, found.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
 
 
+@torch.no_grad()
+def opacity(seeds: int) -> pd.DataFrame:
+    """What VR's own samples see of a map at the true poses: opacity, and how deep (m) it looks.
+
+    A row a map, with the mean over pixels of all tracked frames, and the map's own scale (m).
+    """
+    preset, rows = load_preset("smoke"), []
+    vr = preset.tracking_of("vr")
+    for scene, name, seed in product(open_scenes(preset), ("neus", "volsdf"), range(seeds)):
+        field = map_scene(scene, name, preset, seed).field
+        sequence, generator = scene.read(preset.scenes.track_frames), torch.Generator()
+        draw = PixelSampler(sequence, torch.device("cpu")).draw
+        rays = draw(5000, generator.manual_seed(0), torch.arange(len(sequence)))
+        seen = field.render_in_two_passes(rays, vr.n_stratified, vr.n_importance, generator)
+        measured, row = rays.depth > 0, {"field": field.label, "scene": scene.name, "seed": seed}
+        row |= {**field.diagnostics(), "opacity": seen.opacity[measured].mean().item()}
+        rows.append({**row, "depth_bias_m": (seen.depth - rays.depth)[measured].mean().item()})
+    return pd.DataFrame(rows)
+
+
 def main(seeds: int) -> None:
     """Make the rows that are missing, method by method."""
     preset, folder = load_preset("smoke"), tables_folder() / "other_fields"
@@ -54,6 +77,8 @@ def main(seeds: int) -> None:
         rows = pd.concat([rows, made]) if len(rows) else made
         write_atomic(path, rows.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
         print(made.to_string(index=False, header=False), flush=True)
+    found = opacity(seeds).to_csv(index=False, float_format="%.4g", lineterminator="\n")
+    write_atomic(folder / "opacity.csv", found)
     if not seen.exists():
         starts(seen)
 
