@@ -159,7 +159,7 @@ def test_a_cluster_makes_the_same_table(address: str, tmp_path: Path, undisturbe
     assert text.count("office,\n") == 2
 
 
-def undertake(folder: Path, words: list[str]) -> None:
+def undertake_with_workers(folder: Path, words: list[str]) -> None:
     """The command in a process of its own, which forks its workers too."""
     os.environ["NBTRACK_RUNS"] = str(folder / "runs")
     with dask.config.set({"distributed.worker.multiprocessing-method": "fork"}):
@@ -171,7 +171,7 @@ def test_killed_with_two_workers_and_told_again(tmp_path: Path, undisturbed: byt
     half-written ones that count as done."""
     with forking() as context:
         process = context.Process(
-            target=undertake, args=(tmp_path, words(tmp_path, "--workers", "2"))
+            target=undertake_with_workers, args=(tmp_path, words(tmp_path, "--workers", "2"))
         )
         process.start()
     while not any(tmp_path.rglob("map.safetensors")):
@@ -217,7 +217,7 @@ Run = Callable[..., tuple[int, float]]
 """Exit status and time (s) of a command in a folder, killed after some seconds if given."""
 
 
-def undertake_one(folder: Path, arguments: list[str]) -> None:
+def undertake(folder: Path, arguments: list[str]) -> None:
     """The command in a process of its own. Checkpoints are written after every step, or every
     other command would be over before its first one."""
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()):
@@ -235,7 +235,7 @@ def run() -> Iterator[Run]:
         def run(folder: Path, arguments: list[str], seconds: float | None = None) -> tuple:
             folder.mkdir(exist_ok=True)
             process, start = (
-                context.Process(target=undertake_one, args=(folder, arguments)),
+                context.Process(target=undertake, args=(folder, arguments)),
                 time.monotonic(),
             )
             process.start()
