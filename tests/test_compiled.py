@@ -15,20 +15,22 @@ from nbtrack.tracking.search import Search
 
 GRID, EXACT = BakedField(BoxRoom(), 0.05), BakedField(BoxRoom(), 0.05).double()
 OBSERVED = torch.rand(300, 4, generator=torch.Generator().manual_seed(0)) * 2.4 - 1.2
-NUMPY = OBSERVED[:, :3].double().numpy(), OBSERVED[:, 3].double().numpy()
+NORMALS = torch.nn.functional.normalize(OBSERVED[:, 1:] - 0.3, dim=-1).double().numpy()
+NUMPY = OBSERVED[:, :3].double().numpy(), OBSERVED[:, 3].double().numpy(), NORMALS
 TWIST = torch.tensor([0.3, -0.2, 0.4, 0.2, -0.1, 0.3], dtype=torch.float64)
 
 
-@pytest.mark.parametrize("by_slope", [True, False])
-def test_the_sums_are_those_of_registration(by_slope: bool) -> None:
+@pytest.mark.parametrize(("by_slope", "n_normals"), [(True, 0), (True, 300), (False, 300)])
+def test_the_sums_are_those_of_registration(by_slope: bool, n_normals: int) -> None:
     """Catches a swapped axis or channel, points outside that pull, another weight, scale, cost,
     pull or rotation than the functions whose mathematics is read and tested."""
+    seen = *NUMPY[:2], NORMALS[:n_normals]
     start = torch.eye(4, dtype=torch.float64)
     pose = registration.moved(start, TWIST)
     np.testing.assert_allclose(kernels.moved(start.numpy(), TWIST.numpy()), pose, atol=1e-12)
     grid, least = compiled._arrays_of(GRID)
-    rows = kernels.residual_rows(NUMPY, pose.numpy(), grid, by_slope)
-    observed = tuple(torch.from_numpy(part) for part in NUMPY)
+    rows = kernels.residual_rows(seen, pose.numpy(), grid, by_slope)
+    observed = tuple(torch.from_numpy(part) for part in seen)
     plain = registration.residuals_at(EXACT, observed, pose, by_slope)
     assert 0.1 < (plain.reliability > 0).float().mean() < 0.9  # some outside, some in between
     np.testing.assert_allclose(rows[:2], plain.value, atol=1e-6)
@@ -39,17 +41,48 @@ def test_the_sums_are_those_of_registration(by_slope: bool) -> None:
     state = expected, 0.7
     cost = registration.robust_cost(plain, *state)
     assert kernels.robust_cost(rows, scales, 0.7) == pytest.approx(cost.item(), rel=1e-6)
-    before = kernels.residual_rows(NUMPY, start.numpy(), grid, by_slope)
-    judged = registration.judged_as(
-        plain, registration.residuals_at(EXACT, observed, start, by_slope)
-    )
-    np.testing.assert_allclose(kernels.judged_as(rows, before)[2], judged.reliability, atol=1e-5)
     sums = kernels.normal_equations(rows, scales, 0.7)
     for found, wanted in zip(sums, registration.normal_equations(plain, *state), strict=True):
         np.testing.assert_allclose(found, wanted, atol=1e-6 * abs(sums[0]).max())
     twist = kernels.damped_step(rows, scales, 0.7, start.numpy(), pose.numpy(), 0.1)
     step = registration.damped_step(plain, *state, start, pose, 0.1)
     np.testing.assert_allclose(twist, step, atol=1e-5)
+
+
+def test_normals_of_planes() -> None:
+    """Catches a wrong sign, axis or focal length: planes that lean to a side, or overhead."""
+    frame = walk(1)[0]
+    y, x = torch.meshgrid(torch.arange(24) - 11.5, torch.arange(32) - 15.5, indexing="ij")
+    for normal in torch.tensor([[0.6, 0.0, -0.8], [0.0, -0.6, -0.8]]):
+        depth = -48_000 / (normal[0] * x + normal[1] * y + normal[2] * 24)
+        frame.depth_mm[:] = depth.round().int()
+        points, _ = CompiledSearch.draw(frame, 300, torch.Generator())
+        normals = torch.from_numpy(CompiledSearch.normals(frame, points)).float()
+        assert (normals - normal).abs().max() < 0.02
+    frame.depth_mm[:, ::2] *= 2
+    assert not CompiledSearch.normals(frame, points).any()  # each has an edge beside it
+
+
+def test_steps_are_those_of_the_plain_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches another rule for steps that are taken, and points that count more than there."""
+    frame, T_start = (
+        walk(2, narrow_room())[1],
+        registration.moved(torch.eye(4).double(), 0.1 * TWIST),
+    )
+    points, luma = CompiledSearch.draw(frame, 300, torch.Generator().manual_seed(0))
+    normals = CompiledSearch.normals(frame, points)
+    levels = (points, luma, normals), (points, luma, normals[:0])
+    tensors = tuple(tuple(torch.from_numpy(part) for part in level) for level in levels)
+    monkeypatch.setattr(Search, "first_medians", CompiledSearch.first_medians)
+    fast = CompiledSearch(BakedField(narrow_room(), 0.05), levels, LmSettings(), T_start)
+    slow = Search(BakedField(narrow_room(), 0.05).double(), tensors, LmSettings(), T_start)
+    for number in range(5):
+        if number == 2:
+            fast.begin(1)
+            slow.begin(1)
+        assert fast.step() == pytest.approx(slow.step(), rel=1e-4)
+        np.testing.assert_allclose(fast.T_world_camera, slow.T_world_camera, atol=1e-5)
+        assert fast.damping == pytest.approx(slow.damping)
 
 
 def test_what_is_no_number_stays_none() -> None:

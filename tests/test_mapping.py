@@ -57,9 +57,9 @@ def test_imap_renders_a_wall() -> None:
     settings = settings_of("imap", iterations=120, n_stratified=20, n_surface=8)
     sequence = wall_sequence()
     mapped = map_sequence("imap", sequence, NETWORK, settings)
-    view = mapped.field.render_view(sequence.intrinsics, sequence.T_world_camera[2])
-    assert np.median(np.abs(view.depth - 2.0)) < 0.06
-    assert np.median(np.abs(view.color - 128 / 255)) < 0.06
+    color, depth = mapped.field.render_view(sequence.intrinsics, sequence.T_world_camera[2])
+    assert np.median(np.abs(depth - 2.0)) < 0.06
+    assert np.median(np.abs(color - 128 / 255)) < 0.06
 
 
 def test_points_are_fused_at_once() -> None:

@@ -21,11 +21,10 @@ from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.base import View
 from nbtrack.plots.rooms import screen_axes
 from nbtrack.plots.style import PALETTE, method_colors
 from nbtrack.synthetic import build_room
-from nbtrack.tables import published_table_1, published_table_2
+from nbtrack.tables import published_table_1
 
 CUBE = SceneBounds((-2.0,) * 3, (2.0,) * 3)
 
@@ -78,7 +77,7 @@ def cloud(offset: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 FIGURES = {
     "frame": lambda s: plots.plot_frame(s, 3, "one"),
-    "views": lambda s: plots.plot_views(s, [0, 3], [View(s.color(0), s.depth(0) + 0.02)] * 2, "x"),
+    "views": lambda s: plots.plot_views(s, [0, 3], [(s.color(0), s.depth(0) + 0.02)] * 2, "x"),
     "ray": lambda s: plots.plot_along_ray(AT, {"a (1/m)": RAY, "b (m)": RAY[:-1]}, 1.2, "end"),
     "losses": lambda s: plots.plot_losses(HISTORIES, "fall"),
     "slice": lambda s: plots.plot_slice(SPHERE, s, 0.0, title="round"),
@@ -93,7 +92,6 @@ FIGURES = {
     "errors": lambda s: plots.plot_errors({"VR": FRAMES, "SDF": FRAMES}, "lost"),
     "curves": lambda s: plots.plot_curves(SWEEP, *SWEEP, "fast"),
     "ate": lambda s: plots.plot_ate_bars(published_table_1(), "rates matter"),
-    "steps": lambda s: plots.plot_steps(published_table_2(), published_table_2(), "cheap"),
 }  # fmt: skip
 COLORS = ["red", "green", "blue"]
 
@@ -288,19 +286,9 @@ def test_bars_are_the_errors_of_their_cell() -> None:
     assert axes.get_title(loc="left") == "Whiteroom"
 
 
-def test_steps_stand_beside_the_published_ones() -> None:
-    """Catches a tracker in the wrong panel, and our points taken for the paper's."""
-    ours = published_table_2().assign(steps=lambda cells: 2 * cells["steps"])
-    vr, sdf = plots.plot_steps(ours, published_table_2()).axes
-    assert [axes.get_title(loc="left") for axes in (vr, sdf)] == ["VR", "SDF"]
-    assert len(vr.lines) == 6
-    assert vr.lines[0].get_ydata() == pytest.approx(2 * vr.lines[3].get_ydata())
-    assert vr.lines[3].get_markerfacecolor() == "white"
-
-
 def test_unmeasured_pixels_are_not_errors(sequence) -> None:
     """Catches missing depth taken for a depth of zero."""
-    view = View(sequence.color(0), np.full((12, 16), 1.02, np.float32))
+    view = sequence.color(0), np.full((12, 16), 1.02, np.float32)
     error_cm = plots.plot_views(sequence, [0], [view]).axes[4].images[0].get_array()
     assert error_cm.mask.sum() == 1
     assert error_cm.compressed() == pytest.approx(2.0, abs=1e-3)

@@ -23,6 +23,7 @@ from nbtrack.tracking.registration import (
 
 BOX = SceneBounds((-1.0, -1.2, -0.8), (1.0, 1.2, 0.8))
 WIDEST, ORIGIN = torch.full((2,), math.inf), torch.eye(4)
+NO_NORMALS = torch.zeros(0, 3)
 LEAST = torch.tensor([0.02, 0.05])
 
 
@@ -37,10 +38,10 @@ def pose() -> Tensor:
     return make_transform(rotation, torch.tensor([0.2, -0.1, 0.1], dtype=torch.float64))
 
 
-def observation(n: int) -> tuple[Tensor, Tensor]:
-    """Points (m) and their intensities."""
+def observation(n: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Points (m) and their intensities, without normals."""
     drawn = torch.rand(n, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return 0.6 * (2 * drawn[:, :3] - 1), drawn[:, 3]
+    return 0.6 * (2 * drawn[:, :3] - 1), drawn[:, 3], NO_NORMALS
 
 
 @pytest.mark.parametrize("kind", ["network", "grid"])
@@ -71,7 +72,7 @@ def test_jacobians_of_both_residuals_against_finite_differences(kind: str) -> No
 
 def test_a_field_that_grows_too_fast_is_corrected() -> None:
     """Catches distances taken as they are: at slope 1.3 a step would be 30 % too long."""
-    seen = torch.tensor([[0.0, 0.0, 0.2]]), torch.tensor([0.5])
+    seen = torch.tensor([[0.0, 0.0, 0.2]]), torch.tensor([0.5]), NO_NORMALS
     residuals = residuals_at(wall(1.3), seen, ORIGIN)
     assert residuals.value[0].item() == pytest.approx(0.3)
     assert residuals.jacobian[0, 0].tolist() == pytest.approx([0, 0, 0, 0, 0, -1])
@@ -80,14 +81,26 @@ def test_a_field_that_grows_too_fast_is_corrected() -> None:
     assert as_it_is.value[0].item() == pytest.approx(0.39)
 
 
+def test_points_count_by_how_far_their_normals_agree() -> None:
+    """Catches points that pull towards a surface that faces elsewhere, normals that do not turn
+    with the camera, and unknown ones that count: cosines of 1, 1/2, -1, and none."""
+    normals = torch.tensor([[0.0, 0.0, -1.0], [0.75**0.5, 0.0, -0.5], [0.0, 0.0, 1.0], [0, 0, 0]])
+    seen = torch.tensor([[0.0, 0.0, 0.2]]).expand(4, 3), torch.full((4,), 0.5)
+    residuals = residuals_at(wall(), (*seen, normals), ORIGIN)
+    assert residuals.reliability.tolist() == pytest.approx([1, 0.25, 0, 0])
+    upside_down = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    residuals = residuals_at(wall(), (*seen, normals), upside_down)
+    assert residuals.reliability.tolist() == pytest.approx([0, 0, 1, 0])
+
+
 def test_points_out_of_bounds_count_the_most_and_pull_nowhere() -> None:
     """Catches a pose that gets cheaper by carrying points out of the map."""
-    seen = torch.tensor([[0.0, 0.0, 0.4], [0.0, 0.0, 5.0]]), torch.full((2,), 0.5)
+    seen = torch.tensor([[0.0, 0.0, 0.4], [0.0, 0.0, 5.0]]), torch.full((2,), 0.5), NO_NORMALS
     residuals, scales = residuals_at(wall(), seen, ORIGIN), torch.tensor([0.1, 1.0])
     assert residuals.reliability.tolist() == [1.0, 0.0]
     # First point: one scale off, cost 1/2; second: the worst, 1; intensities: 0 and the worst, 1.
     assert robust_cost(residuals, scales, 1.0).item() == pytest.approx((0.5 + 2) / 2)
-    alone = residuals_at(wall(), (seen[0][:1], seen[1][:1]), ORIGIN)
+    alone = residuals_at(wall(), (seen[0][:1], seen[1][:1], NO_NORMALS), ORIGIN)
     both, one = (normal_equations(r, scales, 1.0)[0] for r in (residuals, alone))
     torch.testing.assert_close(both, one)
 
@@ -124,8 +137,7 @@ def test_moved_turns_about_the_camera_and_is_finite_at_zero() -> None:
 
 def test_a_single_plane_leaves_three_directions_open() -> None:
     """Catches a covariance or condition that hides a slide along the only wall in view."""
-    points, intensity = observation(300)
-    residuals = residuals_at(wall(), (points.float(), intensity.float()), ORIGIN)
+    residuals = residuals_at(wall(), tuple(part.float() for part in observation(300)), ORIGIN)
     matrix, _ = normal_equations(residuals, scales_of(residuals, WIDEST, LEAST), 0.0)
     parts = residuals.value, residuals.reliability, matrix
     found = certainty(*(part.numpy() for part in parts), (0.05, 0.25))

@@ -14,7 +14,7 @@ from nbtrack.data.sequence import RgbdSequence
 
 # Tangent planes: how far away neighbours are, as a share of the image's width, and by how much of
 # the depth they may differ, which cuts off edges and incidences above some 75 degrees (our choice).
-_PLANE_REACH, _PLANE_JUMP = 1 / 64, 0.1
+PLANE_REACH, PLANE_JUMP = 1 / 64, 0.1
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class PixelSampler:
         tilts it little. 0 where one of them is not measured, or lies on another surface.
         """
         _, height, width = self.depths_mm.shape
-        reach = max(1, round(width * _PLANE_REACH))
+        reach = max(1, round(width * PLANE_REACH))
         depth = self.measurements(frames, rows, columns)[1]
         points, is_whole = [], depth > 0
         for down, right in ((0, -reach), (0, reach), (-reach, 0), (reach, 0)):
@@ -73,7 +73,7 @@ class PixelSampler:
             is_whole &= (row >= 0) & (row < height) & (column >= 0) & (column < width)
             row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
             near = self.measurements(frames, row, column)[1]
-            is_whole &= (near > 0) & ((near - depth).abs() < _PLANE_JUMP * depth)
+            is_whole &= (near > 0) & ((near - depth).abs() < PLANE_JUMP * depth)
             points.append(backproject(self.intrinsics, column, row, near))
         # To the right, then upwards: x times -y is -z, towards the camera.
         normal = torch.linalg.cross(points[1] - points[0], points[2] - points[3])

@@ -160,7 +160,7 @@ def measure_steps(
                         tracker.restart(T_first)
                         counts.append(tracker.track(sequence[0]).steps)
                     mean, deviation = float(np.mean(counts[1:])), float(np.std(counts[1:]))
-                    rows.append((_label(name), n_pixels, budget_ms, mean, deviation))
+                    rows.append((name.upper(), n_pixels, budget_ms, mean, deviation))
         bar.move_to(len(plan))
     columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_deviation"]
     return pd.DataFrame(rows, columns=columns)
@@ -169,12 +169,7 @@ def measure_steps(
 def default_pixels(preset: Preset, methods: Sequence[str | Method] = TABLE_1) -> dict[str, int]:
     """The n that each tracker uses for Table I, by its label in Table II."""
     trackers = [method.tracker for method in find_methods(methods)]
-    return {_label(name): preset.tracking_of(name).n_pixels for name in trackers}
-
-
-def _label(tracker: str) -> str:
-    """A tracker's name in Table II: VR for vr."""
-    return tracker.upper().replace("_", " ")
+    return {name.upper(): preset.tracking_of(name).n_pixels for name in trackers}
 
 
 def _note(preset: Preset, clock: bool) -> str:

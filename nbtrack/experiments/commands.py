@@ -10,7 +10,7 @@ from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_na
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import tell
 from nbtrack.data.check import check_recording
-from nbtrack.data.recording import Recording, open_recording
+from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import parse_frames
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.cells import MapCell
@@ -132,7 +132,7 @@ def make_command(options: Namespace) -> None:
 
 def check_command(options: Namespace) -> None:
     """Validate a recording; print what it holds and what is wrong, and draw it if asked to."""
-    recording = _recording(options)
+    recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     report = check_recording(recording, progress=True)
     print(report)
     if options.out is None:
@@ -151,7 +151,8 @@ def check_command(options: Namespace) -> None:
 def convert_command(options: Namespace) -> None:
     """Write a recording in the Neural RGB-D layout; print what became of it."""
     frames = parse_frames(options.frames)
-    print(convert_sequence(_recording(options), options.out, frames, progress=True))
+    recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
+    print(convert_sequence(recording, options.out, frames, progress=True))
 
 
 def preset_of(options: Namespace, *settings: str) -> Preset:
@@ -170,10 +171,6 @@ def _field_of(options: Namespace) -> str:
     if options.field is None:
         raise ConfigError("--correct belongs to --field, which is mapped: name one or leave it out")
     return supervised_field(options.field, options.supervision or "rendering")
-
-
-def _recording(options: Namespace) -> Recording:
-    return open_recording(options.folder, options.format, options.depth_folder, options.poses)
 
 
 def _checked_scene(options: Namespace, preset: Preset, *slices: str) -> Scene:

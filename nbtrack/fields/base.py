@@ -28,6 +28,7 @@ NEAR = 0.05  # m, z-depth before which nothing is looked for: closer than any de
 _N_STRATIFIED, _N_IMPORTANCE, _RAYS_AT_ONCE = 48, 24, 4096
 
 Losses = dict[str, Scalar]
+View = tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]
 Draw = Callable[..., Rays]  # of n_rays, and whether with tangent_planes: random measured pixels
 
 
@@ -43,14 +44,6 @@ class MappingSettings:
     learning_rate: float = 1e-3  # Adam's, at the start; falls to a twentieth along a cosine (NeuS)
     lambda_color: float = 5.0  # iMAP's, whose depth errors are relative to their deviation
     holdout_every: int = may_be_zero(10)  # every n-th frame is only scored
-
-
-@dataclass(frozen=True)
-class View:
-    """What a camera sees of a field."""
-
-    color: Float[np.ndarray, "height width 3"]  # in [0, 1]
-    depth: Float[np.ndarray, "height width"]  # z-depth, m
 
 
 @dataclass(frozen=True)
@@ -154,13 +147,13 @@ class LearnedField(Field):
         return self.composite(colors, values.gather(1, order), rays, depths)
 
     def render_view(self, camera: Intrinsics, T_world_camera: Pose) -> View:
-        """Colour and z-depth image (m) from a camera pose. Nothing in it is random."""
+        """Colour in [0, 1] and z-depth (m) from a camera pose. Nothing in it is random."""
         pose = torch.from_numpy(T_world_camera).float().to(self.device)
         shape = (camera.height, camera.width)
         rows, columns = torch.ones(shape, device=self.device).nonzero(as_tuple=True)
         directions_world = pixel_directions(camera, columns, rows) @ pose[:3, :3].T
         color, depth = self.render_rays(pose[:3, 3].expand_as(directions_world), directions_world)
-        return View(color.cpu().view(*shape, 3).numpy(), depth.cpu().view(shape).numpy())
+        return color.cpu().view(*shape, 3).numpy(), depth.cpu().view(shape).numpy()
 
     @torch.no_grad()
     def render_rays(self, origins_world: Points, directions_world: Points) -> tuple[Colors, Values]:

@@ -11,7 +11,6 @@ from nbtrack.plots.figures import (
     plot_errors,
     plot_frame,
     plot_losses,
-    plot_steps,
     plot_views,
 )
 from nbtrack.plots.rooms import (

@@ -26,9 +26,11 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     sequence=fixed(sequence), index=(0, len(sequence) - 1), title=fixed("A room"))`.
     """
     some = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
-    left, right = new_axes(title, 0.4 + 0.5 * _height(sequence), 1, 2)[0]
+    height = WIDTH * sequence.intrinsics.height / sequence.intrinsics.width  # inches
+    left, right = new_axes(title, 0.4 + 0.5 * height, 1, 2)[0]
     _show(left, sequence.color(index), f"frame {sequence.frame_ids[index]}: colour")
-    image = _show(right, _measured(sequence.depth(index)), "depth", MILLIMETRE * _most(some))
+    depth = np.ma.masked_equal(sequence.depth(index), 0)
+    image = _show(right, depth, "depth", MILLIMETRE * _most(some))
     right.figure.colorbar(image, ax=right, label="depth (m)", extend="max", aspect=25, pad=0.02)
     return right.figure
 
@@ -43,16 +45,18 @@ def plot_views(
     that a few wild pixels do not hide the rest. `indices` are positions in the sequence, `views`
     what the field renders from the same poses.
     """
-    depths = np.ma.stack([_measured(sequence.depth(index)) for index in indices])
-    errors = 100 * np.abs(np.stack([view.depth for view in views]) - depths)
+    depths = np.ma.stack([np.ma.masked_equal(sequence.depth(index), 0) for index in indices])
+    errors = 100 * np.abs(np.stack([depth for _, depth in views]) - depths)
     far, worst = _most(depths), _most(errors)
-    height = 0.9 + len(views) * (0.2 + 0.2 * _height(sequence))
+    slope = sequence.intrinsics.height / sequence.intrinsics.width
+    height = 0.9 + len(views) * (0.2 + 0.2 * WIDTH * slope)
     grid = new_axes(title, height, len(views), 5)
-    for row, index, view, depth, error in zip(grid, indices, views, depths, errors, strict=True):
+    parts = zip(grid, indices, views, depths, errors, strict=True)
+    for row, index, (color, rendered), depth, error in parts:
         _show(row[0], sequence.color(index), f"frame {sequence.frame_ids[index]}")
-        _show(row[1], view.color, "rendered colour")
+        _show(row[1], color, "rendered colour")
         _show(row[2], depth, "depth", far)
-        depth_image = _show(row[3], view.depth, "rendered depth", far)
+        depth_image = _show(row[3], rendered, "rendered depth", far)
         error_image = _show(row[4], error, "|error|", worst, "magma")
     bars = {"location": "bottom", "pad": 0.02, "aspect": 30, "extend": "max"}
     depth_image.figure.colorbar(depth_image, ax=grid[:, 2:4], label="depth (m)", **bars)
@@ -70,17 +74,8 @@ def _show(
     return axes.imshow(image, cmap=cmap, vmin=0, vmax=most)
 
 
-def _height(sequence: RgbdSequence) -> float:
-    """Inches of an image as wide as a figure."""
-    return WIDTH * sequence.intrinsics.height / sequence.intrinsics.width
-
-
-def _measured(depth: np.ndarray) -> np.ma.MaskedArray:
-    return np.ma.masked_equal(depth, 0)
-
-
 def _most(images: np.ndarray) -> float:
-    values = _measured(images).compressed()
+    values = np.ma.masked_equal(images, 0).compressed()
     return float(np.quantile(values, 0.98)) if len(values) else 1.0
 
 
@@ -192,27 +187,4 @@ def plot_ate_bars(results: pd.DataFrame, title: str = "") -> Figure:
         axes.remove()
     panels[0].set_ylim(bottom=min(0.002, 0.7 * means.min(axis=None)))
     panels[0].figure.legend_below()
-    return panels[0].figure
-
-
-@styled
-def plot_steps(steps: pd.DataFrame, published: pd.DataFrame, title: str = "") -> Figure:
-    """Table II as curves: steps that fit into a budget, a panel a tracker, a line a number n.
-
-    Stronger is more pixels n. Filled points are this machine's, hollow ones the paper's. Columns
-    are tracker, n_pixels, budget_ms, steps.
-    """
-    colors = method_colors(steps["tracker"])
-    panels = new_axes(title, 4.3, 1, len(colors), sharey=True)[0]
-    sources = {"this machine": (steps, "o-", None), "paper": (published, "o:", "white")}
-    for axes, (tracker, color) in zip(panels, colors.items(), strict=True):
-        for source, (cells, line, fill) in sources.items():
-            groups = cells[cells["tracker"] == tracker].groupby("n_pixels")
-            for index, (n_pixels, rows) in enumerate(groups, start=1):
-                look = {"color": color, "alpha": index / len(groups), "markerfacecolor": fill}
-                look["label"] = f"n = {n_pixels}, {source}"
-                axes.plot(rows["budget_ms"], rows["steps"], line, **look)
-        axes.set(title=tracker, xlabel="budget a frame (ms)", ylabel="optimization steps (number)")
-        log_axes(axes, "xy")
-        axes.legend()
     return panels[0].figure

@@ -10,33 +10,36 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from nbtrack.data.frame import DRAWN_PER_POINT, EDGE_JUMP, MILLIMETRE
-from nbtrack.fields.base import LUMA
 from nbtrack.tracking.registration import LEAST_SLOPE, MOST_SLOPE, SLOPE_SCALE, START_PULL
 
-_RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
-
 # Sums may be reordered, so that they fill vector registers; what is no number stays none.
-_HOW = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
+HOW = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 _ONE, _NONE = np.float32(1), np.float32(0)
 
 
 @no_type_check
-@njit(**_HOW)
-def _weigh(rows, by_slope):
-    """Reliability by the slope, and division by it."""
+@njit(**HOW)
+def _weigh(rows, normals, T, by_slope):
+    """Reliability by the slope and its angle to normals, and division by its length."""
     for i in range(rows.shape[1]):
         slope = np.sqrt(rows[6, i] ** 2 + rows[7, i] ** 2 + rows[8, i] ** 2)
         trust = _ONE / (_ONE + ((slope - _ONE) / np.float32(SLOPE_SCALE)) ** 2)
         rows[2, i] *= trust * trust if LEAST_SLOPE < slope < MOST_SLOPE else _NONE
-        length = max(slope, np.float32(LEAST_SLOPE)) if by_slope else _ONE
+        least = max(slope, np.float32(LEAST_SLOPE))
+        if len(normals):
+            along = 0.0
+            for k in range(3):
+                turned = T[k, 0] * normals[i, 0] + T[k, 1] * normals[i, 1] + T[k, 2] * normals[i, 2]
+                along += rows[6 + k, i] * turned / least
+            rows[2, i] *= max(along, 0.0) ** 2
+        length = least if by_slope else _ONE
         rows[0, i] /= length
         for k in range(6, 9):
             rows[k, i] /= length
 
 
 @no_type_check
-@njit(**_HOW)
+@njit(**HOW)
 def _place(rows, points, T, shape, place):
     """Arms, and whether points are usable; their cells, where in them, and the slopes' unit."""
     inverse, numbers = 1 / place[3], np.zeros(len(points), np.int64)
@@ -59,14 +62,14 @@ def _place(rows, points, T, shape, place):
 
 
 @no_type_check
-@njit(**_HOW)
+@njit(**HOW)
 def residual_rows(observed, T, grid, by_slope):
     """A column of every point at a pose; `registration.residuals_at` in a grid.
 
     A grid is its vertices (value and intensity), their numbers along x, y and z, and its place: the
     first vertex, the voxel, and both corners of the box whose points are usable.
     """
-    (points, intensity), (vertices, shape, place) = observed, grid
+    (points, intensity, normals), (vertices, shape, place) = observed, grid
     rows = np.empty((12, len(points)), np.float32)
     numbers, at, inside = _place(rows, points, T, shape, place)
     step_x, step_y, one = np.uintp(shape[1] * shape[2]), np.uintp(shape[2]), np.uintp(1)
@@ -85,18 +88,8 @@ def residual_rows(observed, T, grid, by_slope):
             rows[7 + 3 * k, i] = (cd - ab + x * (gh - ef - cd + ab)) * inside[1, i]
             rows[8 + 3 * k, i] = (low_z + x * (high_z - low_z)) * inside[2, i]
         rows[1, i] -= intensity[i]
-    _weigh(rows, by_slope)
+    _weigh(rows, normals, T, by_slope)
     return rows
-
-
-@no_type_check
-@njit(**_HOW)
-def judged_as(rows, before):
-    """`registration.judged_as`, of the residuals alone."""
-    judged = rows[:3].copy()
-    for i in range(rows.shape[1]):
-        judged[2, i] = before[2, i] if rows[2, i] > 0 else _NONE
-    return judged
 
 
 @no_type_check
@@ -110,7 +103,7 @@ def scales_of(rows, before, least, medians):
 
 
 @no_type_check
-@njit(**_HOW)
+@njit(**HOW)
 def robust_cost(rows, scales, weight):
     """`registration.robust_cost`."""
     total, weight = 0.0, np.float32(weight)
@@ -123,7 +116,7 @@ def robust_cost(rows, scales, weight):
 
 
 @no_type_check
-@njit(**_HOW)
+@njit(**HOW)
 def normal_equations(rows, scales, weight):
     """`registration.normal_equations`."""
     n_points = rows.shape[1]
@@ -152,7 +145,7 @@ def normal_equations(rows, scales, weight):
 
 
 @no_type_check
-@njit(**_HOW)
+@njit(**HOW)
 def moved(T, twist):
     """`registration.moved`, by Rodrigues' formula."""
     x, y, z = twist[0], twist[1], twist[2]
@@ -171,7 +164,7 @@ def moved(T, twist):
 
 
 @no_type_check
-@njit(**_HOW)
+@njit(**HOW)
 def damped_step(rows, scales, weight, T_start, T, damping):
     """`registration.damped_step`."""
     matrix, vector = normal_equations(rows, scales, weight)
@@ -198,48 +191,17 @@ def damped_step(rows, scales, weight, T_start, T, damping):
 
 
 @no_type_check
-@njit(**_HOW)
+@njit(**HOW)
 def try_step(observed, grid, by_slope, weight, T_start, T, rows, scales, damping):
     """A step: whether it is better, pose and rows after it, cost before, and its length."""
     twist = damped_step(rows, scales, weight, T_start, T, damping)
     T_after = moved(T, twist)
     rows_after = residual_rows(observed, T_after, grid, by_slope)
-    judged = judged_as(rows_after, rows) if weight > 0 else rows_after
+    judged = rows_after[:3].copy()
+    if weight > 0:  # by the reliabilities before; see `Search.step`
+        judged[2] = np.where(judged[2] > 0, rows[2], _NONE)
     before, after = robust_cost(rows, scales, weight), robust_cost(judged, scales, weight)
     longest = np.abs(twist).max()
     if after < before:
         return True, T_after, rows_after, before, longest
     return False, T, rows, before, longest
-
-
-@no_type_check
-@njit(**_HOW)
-def draw_points(depth_mm, color, camera, n_points, seed):
-    """`Frame.smooth_points`, but one pixel after the other, until there are enough.
-
-    Random numbers are those of SplitMix64 (Steele, Lea, Flood 2014): a few operations each.
-    """
-    (height, width), (fx, fy, cx, cy), found = depth_mm.shape, camera, 0
-    points, luma = np.empty((n_points, 3)), np.empty(n_points)
-    state = np.uint64(seed)
-    for _ in range(DRAWN_PER_POINT * n_points):
-        if found == n_points:
-            break
-        state += np.uint64(0x9E3779B97F4A7C15)
-        mixed = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        mixed ^= mixed >> np.uint64(31)
-        v = 1 + np.int64((mixed >> np.uint64(32)) % np.uint64(height - 2))
-        u = 1 + np.int64((mixed & np.uint64(0xFFFFFFFF)) % np.uint64(width - 2))
-        z = depth_mm[v, u]
-        jump = EDGE_JUMP * z
-        is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
-        is_smooth &= abs(depth_mm[v, u + 1] - z) < jump and abs(depth_mm[v, u - 1] - z) < jump
-        if is_smooth:  # never without a depth: nothing is below a jump of zero
-            point, metres = points[found], z * MILLIMETRE
-            point[0], point[1] = (u + 0.5 - cx) / fx * metres, (v + 0.5 - cy) / fy * metres
-            point[2] = metres
-            red, green, blue = color[v, u, 0], color[v, u, 1], color[v, u, 2]
-            luma[found] = (_RED * red + _GREEN * green + _BLUE * blue) / 255
-            found += 1
-    return points[:found], luma[:found]

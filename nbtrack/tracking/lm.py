@@ -64,13 +64,13 @@ class LmTracker(Tracker):
         R[:] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
         self.T_kept, self.search, self.starts, self.verdict = T_starts[0], None, None, None
         self.anchor = T_starts[-1] if self.last_good is None else self.last_good
-        observed = self.search_kind.draw(frame, self.settings.n_pixels, self.generator)
-        n_points = len(observed[0])
-        self.is_converged = n_points < _LEAST_POINTS
+        points, luma = self.search_kind.draw(frame, self.settings.n_pixels, self.generator)
+        self.is_converged = len(points) < _LEAST_POINTS
         if self.is_converged:
             return
-        n_coarse = max(_LEAST_COARSE, n_points // _COARSE_SHARE)
-        self.levels = tuple(part[:n_coarse] for part in observed), observed
+        n = max(_LEAST_COARSE, len(points) // _COARSE_SHARE)
+        normals = self.search_kind.normals(frame, points[:n])
+        self.levels = (points[:n], luma[:n], normals), (points, luma, normals[:0])
         searches = [self._search_from(T_start) for T_start in T_starts]
         self.search = self.best = _by_cost(searches, _WIDE_SCALES)[0]
         self.was_followed = not self.was_lost

@@ -30,7 +30,8 @@ INLIER_ACCURACIES, INLIER_INTENSITY = 2.5, 0.25
 # nothing, as along a corridor: one point's worth, at a twist of 0.5 rad or 0.5 m (our choice).
 START_PULL = 1 / 0.5**2
 
-Observed = tuple[Points, Values]  # in the camera frame (m); their luma
+# In the camera frame (m); their luma; normals of the surface there, or none (n = 0) to ask for.
+Observed = tuple[Points, Values, Points]
 Scales = Float[Tensor, "2"]
 
 
@@ -40,7 +41,7 @@ class Residuals:
 
     value: Float[Tensor, "2 n"]  # f / |grad f|, and the field's intensity minus the observed one
     jacobian: Float[Tensor, "2 n 6"]
-    reliability: Values  # in [0, 1]: 0 out of bounds or where the gradient is absurd
+    reliability: Values  # in [0, 1]: 0 out of bounds, or where the gradient is absurd
 
 
 def residuals_at(
@@ -52,7 +53,7 @@ def residuals_at(
     corrects fields that grow too fast or too slowly to first order. Source: paper, Eq. 2;
     f / |grad f| is an option in PIN-SLAM (Pan et al. 2024).
     """
-    points_camera, intensity = observed
+    points_camera, intensity, normals_camera = observed
     T_world_camera = T_world_camera.to(points_camera)
     points_world = transform_points(T_world_camera, points_camera)
     field_at = field.linearize(points_world)
@@ -61,6 +62,9 @@ def residuals_at(
     is_usable &= field.bounds.contain(points_world, MARGIN)
     # A distance field's gradient has length 1; the farther from it, the less it is trusted.
     reliability = is_usable / (1 + ((slope - 1) / SLOPE_SCALE).square()).square()
+    if len(normals_camera):  # the nearest surface is not the observed one if it faces elsewhere
+        along = (normals_camera @ T_world_camera[:3, :3].T * field_at.value_gradient).sum(dim=-1)
+        reliability = reliability * (along.clamp_min(0) / slope.clamp_min(LEAST_SLOPE)).square()
     slope = slope.clamp_min(LEAST_SLOPE) if divide_by_slope else torch.ones_like(slope)
     value = torch.stack([field_at.value / slope, field_at.intensity - intensity])
     gradient = field_at.value_gradient / slope[:, None], field_at.intensity_gradient
@@ -68,15 +72,6 @@ def residuals_at(
     arm = points_world - T_world_camera[:3, 3]
     jacobian = [torch.cat([torch.linalg.cross(arm, g), g], dim=-1) for g in gradient]
     return Residuals(value, torch.stack(jacobian), reliability)
-
-
-def judged_as(residuals: Residuals, before: Residuals) -> Residuals:
-    """Residuals after a step with the reliabilities before it, but for points it made unusable.
-
-    From cell to cell of a grid slopes jump, and reliabilities: a pose is no worse for that.
-    """
-    reliability = torch.where(residuals.reliability > 0, before.reliability, 0.0)
-    return Residuals(residuals.value, residuals.jacobian, reliability)
 
 
 def scales_of(

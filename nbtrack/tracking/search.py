@@ -1,6 +1,6 @@
 """One descent of Levenberg-Marquardt from one start, in any field with a signed distance."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
 
@@ -20,9 +20,6 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e3
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.2
 # A step below these (rad and m) ends the search on some points, and on all of them.
 _LEAST_STEPS = (1e-2, 3e-4)
-# From afar distances say where the camera is, and intensities mislead: their basin is as wide as
-# the texture. So the first level asks for distances alone, at scales of so many medians.
-_FIRST_MEDIANS = 8.0
 
 
 @dataclass(frozen=True)
@@ -46,6 +43,9 @@ class Search:
     """
 
     residuals: Any  # at the pose, as this kind of search keeps them
+    # From afar distances say where the camera is, and intensities mislead: their basin is as wide
+    # as the texture. So the first level asks for distances alone, at scales of so many medians.
+    first_medians = 8.0
 
     def __init__(
         self, field: Field, levels: tuple, settings: LmSettings, start: Transform | Pose
@@ -64,11 +64,16 @@ class Search:
         points_camera, color = frame.smooth_points(n_points, generator)
         return points_camera, intensity_of(color)
 
+    @staticmethod
+    def normals(frame: Frame, points_camera: Points) -> Points:
+        """None: in single operations they would take longer than the search gains."""
+        return points_camera[:0]
+
     def begin(self, level: int) -> None:
         """Go on from the present pose with some of the points (level 0) or all (1)."""
         self.level, self.damping, self.is_ended = level, _FIRST_DAMPING, False
         weight = self.settings.lambda_intensity
-        self.weight, self.medians = (weight, MEDIANS) if level else (0.0, _FIRST_MEDIANS)
+        self.weight, self.medians = (weight, MEDIANS) if level else (0.0, self.first_medians)
         self._look(inf if self.settings.anneal else 0.0)
 
     def step(self) -> float:
@@ -78,8 +83,12 @@ class Search:
         T_world_camera = registration.moved(self.T_world_camera, twist)
         residuals = self._residuals_at(T_world_camera)
         before = registration.robust_cost(*now)
-        # Not at first: from afar the slope tells that a surface is near.
-        judged = registration.judged_as(residuals, self.residuals) if self.weight else residuals
+        # From cell to cell of a grid slopes jump, and reliabilities: a pose is no worse for that.
+        # But at first, from afar, the slope tells that a surface is near.
+        judged = residuals
+        if self.weight:
+            kept = torch.where(residuals.reliability > 0, self.residuals.reliability, 0.0)
+            judged = replace(residuals, reliability=kept)
         is_better = bool(registration.robust_cost(judged, *now[1:]) < before)
         if is_better:
             self.T_world_camera, self.residuals = T_world_camera, residuals
