@@ -159,19 +159,12 @@ def test_a_cluster_makes_the_same_table(address: str, tmp_path: Path, undisturbe
     assert text.count("office,\n") == 2
 
 
-def undertake_with_workers(folder: Path, words: list[str]) -> None:
-    """The command in a process of its own, which forks its workers too."""
-    os.environ["NBTRACK_RUNS"] = str(folder / "runs")
-    with dask.config.set({"distributed.worker.multiprocessing-method": "fork"}):
-        main(words)
-
-
 def test_killed_with_two_workers_and_told_again(tmp_path: Path, undisturbed: bytes) -> None:
     """Catches workers that outlive their parent, finished cells that are made again, and
     half-written ones that count as done."""
     with forking() as context:
         process = context.Process(
-            target=undertake_with_workers, args=(tmp_path, words(tmp_path, "--workers", "2"))
+            target=undertake, args=(tmp_path, words(tmp_path, "--workers", "2"))
         )
         process.start()
     while not any(tmp_path.rglob("map.safetensors")):
