@@ -65,10 +65,8 @@ def test_normals_of_planes() -> None:
 
 def test_steps_are_those_of_the_plain_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches another rule for steps that are taken, and points that count more than there."""
-    frame, T_start = (
-        walk(2, narrow_room())[1],
-        registration.moved(torch.eye(4).double(), 0.1 * TWIST),
-    )
+    frame = walk(2, narrow_room())[1]
+    T_start = registration.moved(torch.eye(4).double(), 0.1 * TWIST)
     points, luma = CompiledSearch.draw(frame, 300, torch.Generator().manual_seed(0))
     normals = CompiledSearch.normals(frame, points)
     levels = (points, luma, normals), (points, luma, normals[:0])
@@ -96,13 +94,13 @@ def test_what_is_no_number_stays_none() -> None:
 @pytest.mark.parametrize("kind", [Search, CompiledSearch])
 def test_points_are_drawn_away_from_borders_and_edges(kind: type[Search]) -> None:
     """Catches points whose depth may belong to either side of an edge, and draws that do not follow
-    the seed."""
+    the seed, or that differ between both kinds of search."""
     frame = walk(1)[0]
     frame.depth_mm[:, :16], frame.depth_mm[:, 16:], frame.depth_mm[3:6] = 1000, 2000, 0
-    seeds = (torch.Generator().manual_seed(seed) for seed in (1, 1, 2))
-    draws = [kind.draw(frame, 400, seed) for seed in seeds]
+    kinds = (kind, 1), (CompiledSearch, 1), (kind, 2)
+    draws = [k.draw(frame, 400, torch.Generator().manual_seed(seed)) for k, seed in kinds]
     (points, luma), (again, _), (other, _) = (map(np.asarray, draw) for draw in draws)
-    assert np.array_equal(points, again)
+    np.testing.assert_allclose(points, again, atol=1e-6)
     assert not np.array_equal(points, other)
     columns, rows = (points[:, :2] / points[:, 2:] * 24 + [16, 12] - 0.5).T.round().astype(int)
     assert {*columns} == {*range(1, 15), *range(17, 31)}
@@ -110,6 +108,16 @@ def test_points_are_drawn_away_from_borders_and_edges(kind: type[Search]) -> Non
     color = frame.color[rows, columns].numpy() / 255
     np.testing.assert_allclose(luma, color @ [0.299, 0.587, 0.114], atol=1e-6)
     assert len(kind.draw(walk(1)[0], 400, torch.Generator())[0]) == 400
+
+
+def test_points_are_spread_evenly() -> None:
+    """Catches a sequence that repeats itself or leaves gaps: any beginning covers the image."""
+    points, _ = walk(1)[0].smooth_points(400, torch.Generator().manual_seed(0))
+    columns, rows = (points[:, :2] / points[:, 2:] * 24 + torch.tensor([16, 12]) - 1).T
+    tiles = (rows / 22 * 6).long() * 6 + (columns / 30 * 6).long()
+    for n in (100, 400):
+        deviation = torch.bincount(tiles[:n], minlength=36).float().std()
+        assert deviation < 0.6 * (n / 36) ** 0.5  # random pixels: about once
 
 
 def test_without_numba_torch_does_it_and_says_so(

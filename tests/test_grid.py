@@ -227,10 +227,8 @@ def run() -> Iterator[Run]:
 
         def run(folder: Path, arguments: list[str], seconds: float | None = None) -> tuple:
             folder.mkdir(exist_ok=True)
-            process, start = (
-                context.Process(target=undertake, args=(folder, arguments)),
-                time.monotonic(),
-            )
+            process = context.Process(target=undertake, args=(folder, arguments))
+            start = time.monotonic()
             process.start()
             process.join(seconds)
             process.kill()

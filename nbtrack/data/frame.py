@@ -15,6 +15,9 @@ MILLIMETRE = 1e-3
 _MOST_MILLIMETRES = np.iinfo(np.uint16).max
 # Points to track: a neighbouring depth that differs by more, as a share, marks an edge.
 EDGE_JUMP, DRAWN_PER_POINT = 0.05, 4
+# They are spread evenly: of the sequence R2 (Roberts 2018), the fractions of n g and n g^2 with
+# g^3 + g^2 = 1, every beginning is. In units of 1 / MODULUS; down and across.
+EVEN_STEPS, MODULUS = (0xC13FA9A9, 0x91E10DA5), 2**32
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,15 +97,17 @@ class Frame:
         return behind
 
     def smooth_points(self, n_points: int, generator: torch.Generator) -> tuple[Points, Colors]:
-        """Random observed points (m, camera frame), and their colours in [0, 1].
+        """Observed points (m, camera frame), evenly spread pixels, and their colours in [0, 1].
 
         Not those at depth edges, which may belong to either side, nor at the border. Only a few
-        times as many pixels as wanted are drawn: where little is measured, fewer points come back.
+        times as many pixels as wanted are looked at, from a random one on: where little is
+        measured, fewer points come back.
         """
-        n_drawn = (DRAWN_PER_POINT * n_points,)
+        starts = torch.randint(MODULUS, (2,), generator=generator, device=generator.device)
+        order = torch.arange(DRAWN_PER_POINT * n_points, device=generator.device)
         rows, columns = (
-            torch.randint(1, size - 1, n_drawn, generator=generator, device=generator.device)
-            for size in self.depth_mm.shape
+            1 + ((start + step * order) % MODULUS * (size - 2) // MODULUS)
+            for start, step, size in zip(starts, EVEN_STEPS, self.depth_mm.shape, strict=True)
         )
         depth = self.at(rows, columns)[1]
         is_smooth = depth > 0

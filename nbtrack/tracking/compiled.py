@@ -8,7 +8,7 @@ import torch
 from numba import njit
 
 from nbtrack.core.arrays import Transform
-from nbtrack.data.frame import DRAWN_PER_POINT, EDGE_JUMP, MILLIMETRE, Frame
+from nbtrack.data.frame import DRAWN_PER_POINT, EDGE_JUMP, EVEN_STEPS, MILLIMETRE, MODULUS, Frame
 from nbtrack.data.pixels import PLANE_JUMP, PLANE_REACH
 from nbtrack.fields.base import LUMA
 from nbtrack.fields.grid import BakedField
@@ -33,23 +33,15 @@ def _arrays_of(field: BakedField) -> tuple[tuple, np.ndarray]:
 
 @no_type_check
 @njit(**HOW)
-def _drawn_points(depth_mm, color, camera, n_points, seed):
-    """`Frame.smooth_points`, but one pixel after the other, until there are enough.
-
-    Random numbers are those of SplitMix64 (Steele, Lea, Flood 2014): a few operations each.
-    """
+def _drawn_points(depth_mm, color, camera, n_points, starts):
+    """`Frame.smooth_points`, but one pixel after the other, until there are enough."""
     (height, width), (fx, fy, cx, cy), found = depth_mm.shape, camera, 0
     points, luma = np.empty((n_points, 3)), np.empty(n_points)
-    state = np.uint64(seed)
-    for _ in range(DRAWN_PER_POINT * n_points):
+    for order in range(DRAWN_PER_POINT * n_points):
         if found == n_points:
             break
-        state += np.uint64(0x9E3779B97F4A7C15)
-        mixed = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        mixed ^= mixed >> np.uint64(31)
-        v = 1 + np.int64((mixed >> np.uint64(32)) % np.uint64(height - 2))
-        u = 1 + np.int64((mixed & np.uint64(0xFFFFFFFF)) % np.uint64(width - 2))
+        v = 1 + (starts[0] + EVEN_STEPS[0] * order) % MODULUS * (height - 2) // MODULUS
+        u = 1 + (starts[1] + EVEN_STEPS[1] * order) % MODULUS * (width - 2) // MODULUS
         z = depth_mm[v, u]
         jump = EDGE_JUMP * z
         is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
@@ -98,10 +90,10 @@ class CompiledSearch(Search):
 
     @staticmethod
     def draw(frame: Frame, n_points: int, generator: torch.Generator) -> tuple:
-        """Random observed points (m, camera frame) away from edges, and their intensities."""
+        """Observed points (m, camera frame) away from edges, and their intensities."""
         c, images = frame.camera, (frame.depth_mm.numpy(), frame.color.numpy())
-        seed = int(torch.randint(2**62, (), generator=generator))
-        return _drawn_points(*images, (c.fx, c.fy, c.cx, c.cy), n_points, seed)
+        starts = torch.randint(MODULUS, (2,), generator=generator).numpy()
+        return _drawn_points(*images, (c.fx, c.fy, c.cx, c.cy), n_points, starts)
 
     @staticmethod
     def normals(frame: Frame, points_camera: np.ndarray) -> np.ndarray:

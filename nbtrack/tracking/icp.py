@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.core.arrays import Scalar
 from nbtrack.data.frame import Frame
 from nbtrack.fields import PointCloud
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
@@ -69,25 +68,25 @@ class IcpTracker(Tracker):
             thinned = self.small_gicp.voxelgrid_sampling(points, _SOURCE_VOXEL)
             self.source, _ = self._with_planes(thinned)
 
-    def step(self) -> Scalar:
+    def step(self) -> float:
         """Align the frame; returns half the mean squared Mahalanobis distance of the inliers.
 
         Where too little was measured, or no point has a partner, the start remains.
         """
         self.is_converged = True
         if self.source is None or self.source.size() < _LEAST_POINTS:
-            return torch.tensor(float("nan"))
+            return float("nan")
         T_world_camera = self.T_world_camera.cpu().double().numpy()
         map_and_frame = self.target, self.source, self.target_tree
         for reach in _REACHES:
             options = {**_OPTIONS, "max_correspondence_distance": reach}
             result = self.small_gicp.align(*map_and_frame, T_world_camera, **options)
             if not result.num_inliers or not np.isfinite(result.T_target_source).all():
-                return torch.tensor(float("nan"))
+                return float("nan")
             T_world_camera = result.T_target_source
         self.T_world_camera = torch.from_numpy(T_world_camera.copy()).to(self.T_world_camera)
         self.inlier_ratio = result.num_inliers / self.source.size()
-        return torch.tensor(result.error / result.num_inliers)
+        return result.error / result.num_inliers
 
     def report(self) -> dict[str, float | bool]:
         """The share of the points that lie near the map; lost where most do not."""

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from nbtrack.core.arrays import Poses, Scalar, Transform
+from nbtrack.core.arrays import Poses, Transform
 from nbtrack.core.progress import tell
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
@@ -58,7 +58,9 @@ class LmTracker(Tracker):
 
     def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
         """Draw the frame's points; take up the search from the start that fits them best."""
-        T_starts = T_starts.cpu().double().clone()
+        # A lost frame says little of where the next one starts.
+        before = [self.last_good] if self.was_lost and self.last_good is not None else []
+        T_starts = torch.stack([*T_starts.cpu().double(), *before])
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
         R = T_starts.numpy()[:, :3, :3]
         R[:] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
@@ -75,17 +77,17 @@ class LmTracker(Tracker):
         self.search = self.best = _by_cost(searches, _WIDE_SCALES)[0]
         self.was_followed = not self.was_lost
 
-    def step(self) -> Scalar:
+    def step(self) -> float:
         """One step of Levenberg-Marquardt, taken or refused; returns the cost before it."""
         if self.search is None:
-            return torch.tensor(float("nan"))
+            return float("nan")
         self.verdict = None if self.search is self.best else self.verdict
         before = self.search.step()
         if self.search.is_ended and self.search.level == 0:
             self.search.begin(1)
         elif self.search.is_ended:
             self._follow_up()
-        return torch.tensor(before)
+        return before
 
     @property
     def T_world_camera(self) -> Transform:

@@ -148,7 +148,8 @@ def certainty(
     """
     distance, intensity = value
     # A picture that is darker as a whole says nothing against a pose.
-    is_inlier = np.abs(intensity - np.median(intensity)) < tolerance[1]
+    middle = np.partition(intensity, len(intensity) // 2)[len(intensity) // 2]
+    is_inlier = np.abs(intensity - middle) < tolerance[1]
     is_inlier &= (np.abs(distance) < tolerance[0]) & (reliability > 0)
     values = np.linalg.eigvalsh(matrix)
     covariance = np.linalg.inv(matrix + START_PULL * np.eye(6)) / _DEVIATIONS**2  # rad, m

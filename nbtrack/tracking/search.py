@@ -60,7 +60,7 @@ class Search:
 
     @staticmethod
     def draw(frame: Frame, n_points: int, generator: torch.Generator) -> tuple[Points, Values]:
-        """Random observed points (m, camera frame) away from edges, and their intensities."""
+        """Observed points (m, camera frame) away from edges, and their intensities."""
         points_camera, color = frame.smooth_points(n_points, generator)
         return points_camera, intensity_of(color)
 

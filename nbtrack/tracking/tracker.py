@@ -115,8 +115,8 @@ class Tracker(abc.ABC):
         """Take up a frame; its search starts at the best of some poses."""
 
     @abc.abstractmethod
-    def step(self) -> Scalar:
-        """One optimisation step; returns the loss before it, still on the device."""
+    def step(self) -> Scalar | float:
+        """One optimisation step; returns the loss before it, still on the device if on one."""
 
     def report(self) -> dict[str, float | bool]:
         """What it says about its estimate, by column name; `lost`, where given, is its verdict."""
@@ -173,7 +173,7 @@ class Tracker(abc.ABC):
             synchronize(self.device)
         began, allowed = time.perf_counter(), self.budget.frame()
         self.begin(frame, starts)
-        steps, loss = 0, torch.tensor(float("nan"))
+        steps, loss = 0, float("nan")
         for step in allowed:
             loss, steps = self.step(), step + 1
             if self.is_converged:
