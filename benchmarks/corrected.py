@@ -3,14 +3,15 @@
     python benchmarks/corrected.py [RECORDING]
     python benchmarks/corrected.py ablation
 
-Writes tracking.csv, times.csv and searches.csv, or ablation.csv, to paper_tables/corrected.
+Writes tracking.csv, times.csv, searches.csv and agreement.csv, or ablation.csv, to
+paper_tables/corrected.
 RECORDING is a folder in the dataset's layout. Times count: run nothing else.
 """
 
 import sys
 import time
 from datetime import UTC, datetime
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 import pandas as pd
@@ -26,6 +27,7 @@ from nbtrack import (
     map_scene,
     open_scene,
     open_scenes,
+    read_run,
     track_scenes,
 )
 from nbtrack.core.device import choose_device, device_name
@@ -105,6 +107,8 @@ def main() -> None:
             runs.append(_track([recording], ON_RECORDINGS, preset, frames, "mapped"))
         runs.append(_held_out(recording, preset))
         _write("tracking.csv", pd.concat(runs))
+    if recordings:
+        _write("agreement.csv", agreement(recordings[0], preset))
     print(pd.concat(runs).to_string(index=False))
     print(found.groupby(["scene", "offset"])[["recovered", "seconds"]].mean().to_string())
     is_wrong = (found["error_m"] > FOUND_M) | (found["error_deg"] > FOUND_DEG)
@@ -180,6 +184,21 @@ def ablation() -> pd.DataFrame:
             setattr(correction, name, value)
     columns = ["changed", "scene", "path", "frames", "ate_m", "seconds", "vertices"]
     return pd.DataFrame(rows, columns=columns)
+
+
+def agreement(scene, preset) -> pd.DataFrame:
+    """How far (RMS, m) paths are from one another: both trackers, two seeds, and the reference."""
+    methods, seeds = [METHODS["corrected_dense"], METHODS["icp_dense"]], [0, 1]
+    how = {"steps": 30, "frames": ":", "seeds": seeds}
+    found = track_scenes([scene], methods, preset, **how, execution=ALONE)
+    runs = {f"{row.method}, seed {row.seed}": read_run(row.run) for row in found.itertuples()}
+    paths = {name: run.T_estimated[:, :3, 3] for name, run in runs.items()}
+    paths["reference"] = next(iter(runs.values())).T_true[:, :3, 3]
+    rows = [
+        (a, b, float(np.sqrt(np.mean(np.sum((paths[a] - paths[b]) ** 2, axis=-1)))))
+        for a, b in combinations(paths, 2)
+    ]
+    return pd.DataFrame(rows, columns=["path", "other", "apart_m"]).assign(scene=scene.name)
 
 
 def _held_out(scene, preset) -> pd.DataFrame:
