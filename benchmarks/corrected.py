@@ -3,8 +3,7 @@
     python benchmarks/corrected.py [RECORDING]
     python benchmarks/corrected.py ablation
 
-Writes tracking.csv, times.csv, searches.csv and agreement.csv, or ablation.csv, to
-paper_tables/corrected.
+Writes tracking, times, searches and agreement.csv, or ablation.csv, to paper_tables/corrected.
 RECORDING is a folder in the dataset's layout. Times count: run nothing else.
 """
 

@@ -17,11 +17,12 @@ from itertools import product
 
 import numpy as np
 import pandas as pd
-from basin import find_from_afar
+from basin import OFFSETS, SEARCHES, find_from_afar
+from choices import CHOICES, FASTER, LARGER_SIZE, SDF, VR
 from scipy.stats import binomtest, bootstrap
-from variants import FALLING_STEPS, ExactDistance, FusedDistance, OtherDepth, with_variants
+from variants import ExactDistance, FusedDistance, OtherDepth, with_variants
 
-from nbtrack import METHODS, Method, load_preset, make_tracker, map_scene, open_scenes, track_scenes
+from nbtrack import Method, load_preset, make_tracker, map_scene, open_scenes, track_scenes
 from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
@@ -41,9 +42,7 @@ NINE = load_preset("nine_rooms")
 # Those of `smoke`, and one in which VR was ahead at 2 Hz with the first seed of nine rooms.
 THREE_ROOMS = ["living_room", "office", "stairwell"]
 PRESET = with_variants(load_preset("smoke", settings=[f"scenes.names={THREE_ROOMS}"]))
-FIRST_ROOMS = [*THREE_ROOMS, *(name for name in NINE.scenes.names if name not in THREE_ROOMS)]
 SHORT, SHORTER = ":60", ":30"  # frames: nine rooms have 120; fewer here, for time
-VR, SDF = METHODS["vr"], METHODS["sdf"]
 KEPT = [
     "rate_hz", "method", "scene", "frames", "steps_per_frame", "ate_m", "ate_rmse_aligned_m",
     "rotation_rmse_deg", "max_error_m", "lost_frames",
@@ -59,10 +58,8 @@ def main(experiment: str, seeds: int) -> None:
     for seed in range(seeds):
         for place, make in chunks_of(seed):
             place = {**place, "seed": seed}
-            if (
-                len(rows)
-                and (rows[[*place]].astype(str) == pd.Series(place).map(str)).all(axis=1).any()
-            ):
+            wanted = pd.Series(place).map(str)
+            if len(rows) and (rows[[*place]].astype(str) == wanted).all(axis=1).any():
                 continue
             print(experiment, place, flush=True)
             made = make().assign(**place, device=machine, date=f"{datetime.now(UTC):%Y-%m-%d}")
@@ -115,18 +112,10 @@ def nine_rooms(seed: int) -> Iterator[Chunk]:
         yield place, partial(track, scenes[number : number + 1], TABLE_1, NINE, **there)
 
 
-# Images, networks, rays and pixels between those of `smoke` and the paper's.
-LARGER_SIZE = [
-    "scenes.width=160", "network.imap.width=128", "network.neus.width=128",
-    "mapping.imap.iterations=2000", "mapping.imap.n_rays=160",
-    "mapping.neus.iterations=2000", "mapping.neus.n_rays=160",
-    "tracking.vr.n_pixels=128", "tracking.sdf.n_pixels=1024",
-]  # fmt: skip
-
-
 def larger(seed: int) -> Iterator[Chunk]:
     """Table I's cells at a larger size: the rooms of the other experiments, then the rest."""
-    preset = load_preset("nine_rooms", settings=[f"scenes.names={FIRST_ROOMS}", *LARGER_SIZE])
+    names = [*THREE_ROOMS, *(name for name in NINE.scenes.names if name not in THREE_ROOMS)]
+    preset = load_preset("nine_rooms", settings=[f"scenes.names={names}", *LARGER_SIZE])
     for scene in open_scenes(preset):
         yield {"scene": scene.name}, partial(track, [scene], TABLE_1, preset, seeds=[seed])
 
@@ -138,7 +127,7 @@ def scores(seed: int) -> Iterator[Chunk]:
 
 
 def _scores(scene: Scene, seed: int) -> pd.DataFrame:
-    made = [map_scene(scene, field, NINE, seed).made for field in ("imap", "neus")]
+    made = (map_scene(scene, field, NINE, seed).made for field in ("imap", "neus"))
     return pd.DataFrame([{"field": m["field"], **m["quality"]} for m in made])
 
 
@@ -152,7 +141,6 @@ def steps(seed: int) -> Iterator[Chunk]:
 
 ORACLES = ("exact distance", "fused voxels", "NeuS+", "NeuS")
 DEPTHS = {"exact": "depth", "filtered": "depth_filtered", "noisy": "depth_with_noise"}
-N_POINTS = 2048
 
 
 def oracle(seed: int) -> Iterator[Chunk]:
@@ -167,65 +155,21 @@ def _on_each_depth(scene: Scene, name: str, seed: int) -> pd.DataFrame:
     else:
         whole = scene.read()
         bounds, mapped = observed_bounds(whole), split_holdout(len(whole), 10)[0]
-        is_exact = name == "exact distance"
-        field = (
-            ExactDistance(bounds, scene.room) if is_exact else FusedDistance(whole, mapped, bounds)
-        )
-    settings = replace(PRESET.tracking_of("lm"), n_pixels=N_POINTS, lambda_intensity=0.0)
+        if name == "exact distance":
+            field = ExactDistance(bounds, scene.room)
+        else:
+            field = FusedDistance(whole, mapped, bounds)
+    settings = replace(PRESET.tracking_of("lm"), n_pixels=2048, lambda_intensity=0.0)
     rows = []
     for depth, folder in DEPTHS.items():
         sequence = OtherDepth(scene.name, scene.folder, depth_folder=folder).read(SHORT)
         T_first = sequence.T_world_camera[0]
-        tracker = make_tracker("lm", field, T_first, StepBudget(30), settings, seed)
         with threads(1):
+            tracker = make_tracker("lm", field, T_first, StepBudget(30), settings, seed)
             tracked = track_sequence(tracker, sequence)
         metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
         rows.append({"depth": depth, **metrics, "ate_m": metrics["ate_rmse_m"]})
     return pd.DataFrame(rows)[["depth", *(c for c in KEPT[3:] if c in rows[0])]]
-
-
-def _both(vr: Method | None = None, sdf: Method | None = None, raw: str = "") -> tuple:
-    return vr or VR, sdf or SDF, raw
-
-
-def _set(*settings: str) -> dict[str, Method]:
-    """The two methods, each with those of the settings that concern it."""
-    chosen = {
-        method: tuple(s for s in settings if s.split(".")[1] in (method.field, method.tracker))
-        for method in (VR, SDF)
-    }
-    return {m.tracker: replace(m, settings=chosen[m]) for m in (VR, SDF)}
-
-
-FASTER = "learning rates times 4"
-CHOICES = {
-    "ours": _both(),
-    "Adam kept from frame to frame": _both(
-        replace(VR, tracker="vr_kept"), replace(SDF, tracker="sdf_kept")
-    ),
-    "the best iterate counts": _both(
-        replace(VR, tracker="vr_best"), replace(SDF, tracker="sdf_best")
-    ),
-    "no colour": _both(**_set("tracking.vr.lambda_color=0.0", "tracking.sdf.lambda_color=0.0")),
-    "raw depth in tracking": _both(raw="tracking"),
-    FASTER: _both(
-        **_set(
-            "tracking.vr.position_rate=2e-3",
-            "tracking.vr.orientation_rate=4e-3",
-            "tracking.sdf.position_rate=2e-3",
-            "tracking.sdf.orientation_rate=4e-3",
-        )
-    ),
-    "first frequencies of 4 rad/m": _both(**_set("network.neus.embedding_sigma=4.0")),
-    "eikonal term on all samples": _both(**_set("mapping.neus.eikonal_share=1.0")),
-    "SiLU in both": _both(vr=replace(VR, field="imap_silu")),
-    "raw depth throughout": _both(raw="both"),
-    "first frequencies of 2.5 rad/m": _both(**_set("network.imap.embedding_sigma=2.5")),
-    "three times the colour": _both(
-        **_set("tracking.vr.lambda_color=15.0", "tracking.sdf.lambda_color=0.9")
-    ),
-}
-"""One thing that the paper leaves open changed at a time: VR, SDF, and where raw depth is read."""
 
 
 def choices(seed: int) -> Iterator[Chunk]:
@@ -280,26 +224,10 @@ def _in_map(label: str, method: Method, seed: int) -> pd.DataFrame:
     return pd.concat([found, scores], axis=1).assign(field=field, iterations=iterations)
 
 
-_FAST = "tracking.{0}.position_rate=1e-2", "tracking.{0}.orientation_rate=2e-2"
-SEARCHES = {
-    METHODS["lm"]: (30, 100),
-    METHODS["icp"]: (1, 100),
-    replace(SDF, tracker="sdf_falling", settings=tuple(s.format("sdf_falling") for s in _FAST)): (
-        FALLING_STEPS, 20,
-    ),
-    replace(VR, tracker="vr_falling", settings=tuple(s.format("vr_falling") for s in _FAST)): (
-        FALLING_STEPS, 20,
-    ),
-}  # fmt: skip
-"""With the steps of a search and how many starts: Adam's rates begin twenty times as high as the
-paper's and fall to zero, so that its basin is not what 79 steps of half a millimetre can reach."""
-OFFSETS = ((4, 4), (8, 6), (12, 9), (20, 15))
-
-
 def basin(seed: int) -> Iterator[Chunk]:
     """Shares of far-off starts from which a frame's pose is found; one seed of maps."""
     for (method, (n_steps, n_starts)), scene in product(SEARCHES.items(), open_scenes(PRESET)):
-        search = {method: n_steps}, PRESET, OFFSETS, n_starts
+        search = {method: n_steps}, PRESET, OFFSETS[2:6], n_starts
         if seed == 0:
             place = {"method": method.label, "scene": scene.name}
             yield place, partial(find_from_afar, scene, *search)

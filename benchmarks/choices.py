@@ -1,0 +1,58 @@
+"""What the paper leaves open, one thing changed at a time (docs/choices.md), and a larger size."""
+
+from dataclasses import replace
+
+from nbtrack import METHODS, Method
+
+VR, SDF = METHODS["vr"], METHODS["sdf"]
+# Images, networks, rays and pixels between those of `smoke` and the paper's.
+LARGER_SIZE = [
+    "scenes.width=160", "network.imap.width=128", "network.neus.width=128",
+    "mapping.imap.iterations=2000", "mapping.imap.n_rays=160",
+    "mapping.neus.iterations=2000", "mapping.neus.n_rays=160",
+    "tracking.vr.n_pixels=128", "tracking.sdf.n_pixels=1024",
+]  # fmt: skip
+
+
+def _both(vr: Method | None = None, sdf: Method | None = None, raw: str = "") -> tuple:
+    return vr or VR, sdf or SDF, raw
+
+
+def _set(*settings: str) -> dict[str, Method]:
+    """The two methods, each with those of the settings that concern it."""
+    chosen = {
+        method: tuple(s for s in settings if s.split(".")[1] in (method.field, method.tracker))
+        for method in (VR, SDF)
+    }
+    return {m.tracker: replace(m, settings=chosen[m]) for m in (VR, SDF)}
+
+
+FASTER = "learning rates times 4"
+CHOICES = {
+    "ours": _both(),
+    "Adam kept from frame to frame": _both(
+        replace(VR, tracker="vr_kept"), replace(SDF, tracker="sdf_kept")
+    ),
+    "the best iterate counts": _both(
+        replace(VR, tracker="vr_best"), replace(SDF, tracker="sdf_best")
+    ),
+    "no colour": _both(**_set("tracking.vr.lambda_color=0.0", "tracking.sdf.lambda_color=0.0")),
+    "raw depth in tracking": _both(raw="tracking"),
+    FASTER: _both(
+        **_set(
+            "tracking.vr.position_rate=2e-3",
+            "tracking.vr.orientation_rate=4e-3",
+            "tracking.sdf.position_rate=2e-3",
+            "tracking.sdf.orientation_rate=4e-3",
+        )
+    ),
+    "first frequencies of 4 rad/m": _both(**_set("network.neus.embedding_sigma=4.0")),
+    "eikonal term on all samples": _both(**_set("mapping.neus.eikonal_share=1.0")),
+    "SiLU in both": _both(vr=replace(VR, field="imap_silu")),
+    "raw depth throughout": _both(raw="both"),
+    "first frequencies of 2.5 rad/m": _both(**_set("network.imap.embedding_sigma=2.5")),
+    "three times the colour": _both(
+        **_set("tracking.vr.lambda_color=15.0", "tracking.sdf.lambda_color=0.9")
+    ),
+}
+"""One thing that the paper leaves open changed at a time: VR, SDF, and where raw depth is read."""
