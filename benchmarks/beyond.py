@@ -26,8 +26,6 @@ _COLUMNS += ["steps_per_frame", "seconds_per_frame", "ate_m"]
 
 _CHANGES = {
     "without colour": "tracking.lm.lambda_intensity=0",
-    "with narrow scales throughout": "tracking.lm.anneal=false",
-    "with f in place of f/|∇f|": "tracking.lm.divide_by_slope=false",
     "from the previous pose": "tracking.lm.motion_model=previous_pose",
     "from constant velocity": "tracking.lm.motion_model=constant_velocity",
     "with four times the points": "tracking.lm.n_pixels=2048",

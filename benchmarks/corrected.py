@@ -59,7 +59,6 @@ COLUMNS = [
     "seconds_per_frame", "steps_per_frame", "map_seconds",
 ]  # fmt: skip
 
-
 # What a correction is made with, changed one at a time: settings, and constants of its module.
 LONG = "mapping.neus_plus.iterations=1400"
 ABLATION = [
@@ -71,6 +70,7 @@ ABLATION = [
     ("30,000 points", (), {"_N_POINTS": 30_000}),
     ("smoothness 1", (), {"_SMOOTHNESS": 1.0}),
     ("weights judged twice", (), {"_ROUNDS": 2}),
+    ("every point alike", (), {"_GUESS": 1.0}),  # confidence is 1 everywhere
     ("at every vertex", (), {"_FADE": 0}),  # which scipy takes for: as often as anything changes
     ("cells of 8 cm", ("mapping.neus_plus.correct_voxel=0.08",), {}),
 ]

@@ -95,7 +95,7 @@ def test_outside_is_clamped_to_the_border() -> None:
 
 def test_what_is_taken_from_the_source() -> None:
     """Catches a bake that forgets its field's bounds, label or level, that trains, that the command
-    line offers as a map, or that takes more than 24 bytes a vertex (and 1 % for the rest)."""
+    line offers as a map, or that takes more than 20 bytes a vertex (and 1 % for the rest)."""
     source = formula(linear)
     source.surface_level = 0.25
     baked = BakedField(source, 1)  # a whole number is a length as well
@@ -104,7 +104,7 @@ def test_what_is_taken_from_the_source() -> None:
     assert list(baked.parameters()) == []
     assert "baked" not in FIELDS
     room = BakedField(Formula(linear, SceneBounds((-4.0, -2.5, 0.0), (4.0, 2.5, 3.0))), 0.1)
-    assert 83 * 53 * 33 * 24 <= room.n_bytes < 1.01 * 84 * 54 * 34 * 24
+    assert 83 * 53 * 33 * 20 <= room.n_bytes < 1.01 * 84 * 54 * 34 * 20
 
 
 @pytest.mark.parametrize("voxel", [0, 0.0, -0.04, float("nan"), float("inf"), 0.002, 1e-300])

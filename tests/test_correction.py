@@ -45,8 +45,8 @@ def found(sequence: RgbdSequence) -> CorrectedField:
 
 def errors(field: Formula | CorrectedField) -> tuple[float, float]:
     """Mean errors of distance (m) and colour on two walls that the cameras face."""
-    drawn = 2 * torch.rand(2, 4000, 3, generator=torch.Generator().manual_seed(3)) - 1
-    points = drawn * torch.tensor([0.6, 0.4, 0.6])
+    points = 2 * torch.rand(2, 4000, 3, generator=torch.Generator().manual_seed(3)) - 1
+    points *= torch.tensor([0.6, 0.4, 0.6])
     points[0, :, 0], points[1, :, 2] = 1.0, 1.2
     answers = zip(field(points.flatten(0, 1)), ROOM(points.flatten(0, 1)), strict=True)
     color, distance = ((found - exact).abs().mean().item() for found, exact in answers)
@@ -61,6 +61,16 @@ def test_surfaces_are_mended_and_the_rest_is_left(found: CorrectedField) -> None
     assert after[1] < before[1] / 4
     inside = 0.2 * (2 * torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 1)
     assert torch.equal(found(inside)[1], BakedField(found.source, VOXEL)(inside)[1])
+
+
+def test_a_map_knows_where_it_was_measured(found: CorrectedField) -> None:
+    """Catches a tracker that follows what the network made up in free space and behind walls."""
+    faced = torch.tensor([[1.0, 0.1, 0.2], [0.3, -0.2, 1.2], [-1.0, 0.0, 0.0]])
+    assert (found.confidence(faced) > 0.8).all()
+    for elsewhere in (0.3 * faced, 1.2 * faced):
+        torch.testing.assert_close(found.confidence(elsewhere), torch.full((3,), 0.1))
+    for uncorrected in (found.source, BakedField(found.source, VOXEL)):
+        assert (uncorrected.confidence(faced) == 1).all()
 
 
 def test_the_same_data_give_the_same_corrections(
@@ -83,15 +93,14 @@ def test_weights_of_interpolation(found: CorrectedField) -> None:
     vertices, weights = interpolation(points, found)
     np.testing.assert_allclose(weights.sum(axis=1), 1)
     expected = found(torch.from_numpy(points).float())[1]
-    values = (found.vertices[:, 0].numpy()[vertices] * weights).sum(axis=1)
+    values = (found.volume[3].numpy()[vertices] * weights).sum(axis=1)
     np.testing.assert_allclose(values, expected, atol=1e-5)
 
 
 def test_a_file_keeps_it_whole(
     tmp_path: Path, sequence: RgbdSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches corrections lost or rounded on the way to disk and back, and a size that is not
-    what the file has."""
+    """Catches corrections lost or rounded on the way to disk and back, and a wrong size."""
     monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 10_000)
     network, settings = NetworkSettings(width=16), NeusMapping(correct_voxel=0.2)
     field = make_field("neus", network, ROOM.bounds, seed=0).eval().requires_grad_(False)

@@ -88,6 +88,10 @@ class Field(nn.Module, abc.ABC):
             (intensity_gradient,) = torch.autograd.grad(intensity.sum(), points)
         return Linearization(value.detach(), value_gradient, intensity.detach(), intensity_gradient)
 
+    def confidence(self, points_world: Points) -> Values:
+        """How well the surface is known at points (m), in [0, 1]; of a network 1, its own word."""
+        return points_world.new_ones(len(points_world))
+
     @property
     def device(self) -> torch.device:
         """Where its tensors lie."""

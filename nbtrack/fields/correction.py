@@ -19,7 +19,7 @@ from nbtrack.core.arrays import Frames, WorldPoints
 from nbtrack.core.errors import DataError
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.base import Field, intensity_of
+from nbtrack.fields.base import Field
 from nbtrack.fields.grid import BakedField
 
 # All our choice, tried in the two rooms for tuning. Measured points, and where along their normals
@@ -30,6 +30,7 @@ _HUBER, _ROUNDS = 0.01, 4
 # What a difference between neighbouring corrections, and a correction itself, cost, in points seen
 # from the mean distance. Corrections fade out over so many vertices beyond those that points touch.
 _SMOOTHNESS, _PULL, _FADE = 0.1, 0.1, 1
+_GUESS = 0.1  # confidence where nothing was measured: the word of the network is a guess
 _MOST_CAMERAS = 200  # poses kept, evenly spread: where a lost camera may be looked for
 CORRECTIONS = ("numbers", "corrections", "T_world_cameras")
 """What a file keeps of a correction: arguments of `CorrectedField`, in their order."""
@@ -49,19 +50,17 @@ class CorrectedField(BakedField):
         source: Field,
         voxel: float,
         numbers: Int[Tensor, "corrected"],
-        corrections: Float[Tensor, "corrected 4"],
+        corrections: Float[Tensor, "corrected 5"],
         T_world_cameras: Float[Tensor, "cameras 4 4"],
     ) -> None:
-        """Add corrections of colour and distance (m) to the numbered vertices of a baked field."""
+        """Add to colour, distance (m) and confidence at the numbered vertices of a baked field."""
         super().__init__(source, voxel)
         self.name, self.label, self.source = source.name, f"{source.label} corrected", source
         self.register_buffer("numbers", numbers)
         self.register_buffer("corrections", corrections.half())
         self.register_buffer("T_world_cameras", T_world_cameras)
-        added = self.corrections.float()
-        self.volume[:, numbers.long()] += added.T
-        self.vertices[numbers.long(), 0] += added[:, 3]
-        self.vertices[numbers.long(), 1] += intensity_of(added[:, :3])
+        self.volume[4] = _GUESS
+        self.volume[:, numbers.long()] += self.corrections.float().T
 
 
 def corrected(
@@ -95,7 +94,7 @@ def corrected(
     asked = np.concatenate([points + offset * normals for offset in _OFFSETS])
     vertices, weights = interpolation(asked, baked)
     numbers, design, stiffness = _unknowns(vertices, weights, baked.n_vertices)
-    values = baked.volume.T.double().numpy()[numbers]
+    values = baked.volume[:4].T.double().numpy()[numbers]
     wanted = np.column_stack([np.tile(color, (len(_OFFSETS), 1)), offsets]) - design @ values
     reliability = np.tile((depth.mean() / depth) ** 2, len(_OFFSETS))
     corrections = _solve(design, stiffness, wanted, reliability)
@@ -145,8 +144,11 @@ def _unknowns(
     return numbers, design, stiffness + 6 * _SMOOTHNESS * sparse.eye_array(len(numbers))
 
 
-def _solve(design, stiffness, wanted, reliability) -> Float[np.ndarray, "_ 4"]:
-    """Corrections of colour and distance by least squares; outliers lose their say."""
+def _solve(design, stiffness, wanted, reliability) -> Float[np.ndarray, "_ 5"]:
+    """Corrections of colour and distance by least squares, where outliers lose their say.
+
+    And of confidence, by the share of measurements, not stiffness, in a vertex's diagonal.
+    """
     found = np.zeros((design.shape[1], wanted.shape[1]))
     for round_ in range(_ROUNDS):
         residual = np.abs(wanted[:, 3] - design @ found[:, 3])
@@ -156,4 +158,5 @@ def _solve(design, stiffness, wanted, reliability) -> Float[np.ndarray, "_ 4"]:
         for column in range(4) if round_ == _ROUNDS - 1 else [3]:  # weights are those of distances
             start = found[:, column].copy()
             found[:, column], _ = cg(matrix, vectors[:, column], start, rtol=1e-3, M=scaling)
-    return found
+    share = 1 - stiffness.diagonal() / matrix.diagonal()
+    return np.column_stack([found, (1 - _GUESS) * share])

@@ -8,17 +8,17 @@ import math
 
 import numpy as np
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.core.device import constant
 from nbtrack.core.errors import ConfigError
-from nbtrack.fields.base import Field, intensity_of
+from nbtrack.fields.base import Field
 
 _POINTS_AT_ONCE = 65_536
 _MAX_BYTES = 1_000_000_000
-# A vertex holds colour and value, and for the compiled search value and intensity side by side.
-_BYTES_PER_VERTEX = 4 * (3 + 1 + 2)
+_BYTES_PER_VERTEX = 4 * (3 + 1 + 1)  # colour, value and confidence
 
 
 class BakedField(Field):
@@ -33,7 +33,7 @@ class BakedField(Field):
     def __init__(self, source: Field, voxel: float | int) -> None:
         """Sample a field, on its device, in cells of `voxel` (m), one to spare on each side.
 
-        The interpolation's error falls with the voxel's square; the memory (24 bytes a vertex) and
+        The interpolation's error falls with the voxel's square; the memory (20 bytes a vertex) and
         the time grow with its inverse's cube. Raises ConfigError where it is no positive number,
         or the grid would exceed 1 GB.
         """
@@ -50,29 +50,35 @@ class BakedField(Field):
             for i in numbers.split(_POINTS_AT_ONCE)
         ]
         color, value = map(torch.cat, zip(*answers, strict=True))
-        vertices = torch.stack([value, intensity_of(color)], dim=-1)
+        volume = torch.cat([color.T, value[None], torch.ones_like(value)[None]])
         self.register_buffer("low", low, persistent=False)
-        self.register_buffer("volume", torch.cat([color.T, value[None]]), persistent=False)
-        self.register_buffer("vertices", vertices, persistent=False)
+        self.register_buffer("volume", volume, persistent=False)
 
     @property
     def n_bytes(self) -> int:
-        """Memory of all buffers (bytes): 24 a vertex in single precision."""
+        """Memory of all buffers (bytes): 20 a vertex in single precision."""
         return sum(buffer.nbytes for buffer in self.buffers())
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour in [0, 1] and value (m for a signed distance) at points (m); differentiable."""
+        found = self._at(points_world)
+        return found[:3].T, found[3]
+
+    def confidence(self, points_world: Points) -> Values:
+        """How well the surface is known at points (m), in [0, 1]."""
+        return self._at(points_world)[4]
+
+    def _at(self, points_world: Points) -> Float[Tensor, "5 points"]:
+        """All channels at points (m)."""
         n_vertices = constant(self.n_vertices, self.low.device, self.low.dtype)
         last = self.voxel * (n_vertices - 1)
         # grid_sample wants x, y, z of a volume indexed z, y, x, from -1 to 1.
         normalized = (2 * (points_world - self.low) / last - 1).flip(-1)
-        volume = self.volume.view(1, 4, *self.n_vertices)
-        found = nn.functional.grid_sample(
-            volume, normalized[None, None, None], padding_mode="border", align_corners=True
-        )[0, :, 0, 0]
+        normalized, volume = normalized[None, None, None], self.volume.view(1, 5, *self.n_vertices)
+        how = {"padding_mode": "border", "align_corners": True}
+        found = nn.functional.grid_sample(volume, normalized, **how)[0, :, 0, 0]
         # A point that is not a number is taken for one at the border.
-        found = torch.where(points_world.isnan().any(dim=-1), torch.nan, found)
-        return found[:3].T, found[3]
+        return torch.where(points_world.isnan().any(dim=-1), torch.nan, found)
 
 
 def _checked_size(field: Field, voxel: float | int) -> tuple[int, int, int]:

@@ -10,7 +10,7 @@ from numba import njit
 from nbtrack.core.arrays import Transform
 from nbtrack.data.frame import DRAWN_PER_POINT, EDGE_JUMP, EVEN_STEPS, MILLIMETRE, MODULUS, Frame
 from nbtrack.data.pixels import PLANE_JUMP, PLANE_REACH
-from nbtrack.fields.base import LUMA
+from nbtrack.fields.base import LUMA, intensity_of
 from nbtrack.fields.grid import BakedField
 from nbtrack.tracking import kernels, registration
 from nbtrack.tracking.kernels import HOW
@@ -27,8 +27,9 @@ def _arrays_of(field: BakedField) -> tuple[tuple, np.ndarray]:
     low, high = np.array(field.bounds.minimum), np.array(field.bounds.maximum)
     usable = low - registration.MARGIN, high + registration.MARGIN
     place = np.concatenate([field.low.double().numpy(), [field.voxel], *usable])
-    grid = field.vertices.numpy(), np.array(field.n_vertices), place
-    return grid, np.array(field.accuracy)
+    intensity, (value, known) = intensity_of(field.volume[:3].T), field.volume[3:]
+    vertices = torch.stack([value, intensity, known], dim=-1).numpy()
+    return (vertices, np.array(field.n_vertices), place), np.array(field.accuracy)
 
 
 @no_type_check
@@ -110,10 +111,10 @@ class CompiledSearch(Search):
 
     def step(self) -> float:
         """One step, taken or refused; returns the robust cost before it."""
-        settings, now = self.settings, (self.residuals, self.scales, self.damping)
+        now = self.residuals, self.scales, self.damping
         is_better, self.T_world_camera, self.residuals, before, length = kernels.try_step(
-            self.levels[self.level], self.grid, settings.divide_by_slope, self.weight,
-            self.start, self.T_world_camera, *now,
+            self.levels[self.level], self.grid, self.level > 0, self.weight, self.start,
+            self.T_world_camera, *now,
         )  # fmt: skip
         if is_better:
             self.scales = kernels.scales_of(self.residuals, self.scales, self.least, self.medians)
@@ -130,8 +131,8 @@ class CompiledSearch(Search):
         matrix, _ = kernels.normal_equations(rows, self.scales, self.weight)
         return registration.certainty(rows[:2], rows[2], matrix, self.tolerance)
 
-    def _look(self, widest: float) -> None:
-        observed, by_slope = self.levels[self.level], self.settings.divide_by_slope
-        self.residuals = kernels.residual_rows(observed, self.T_world_camera, self.grid, by_slope)
-        widest = self.least.clip(widest)
+    def _look(self) -> None:
+        observed, near = self.levels[self.level], self.level > 0
+        self.residuals = kernels.residual_rows(observed, self.T_world_camera, self.grid, near)
+        widest = np.full(2, np.inf)
         self.scales = kernels.scales_of(self.residuals, widest, self.least, self.medians)

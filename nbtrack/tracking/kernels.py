@@ -19,7 +19,7 @@ _ONE, _NONE = np.float32(1), np.float32(0)
 
 @no_type_check
 @njit(**HOW)
-def _weigh(rows, normals, T, by_slope):
+def _weigh(rows, normals, T):
     """Reliability by the slope and its angle to normals, and division by its length."""
     for i in range(rows.shape[1]):
         slope = np.sqrt(rows[6, i] ** 2 + rows[7, i] ** 2 + rows[8, i] ** 2)
@@ -32,10 +32,9 @@ def _weigh(rows, normals, T, by_slope):
                 turned = T[k, 0] * normals[i, 0] + T[k, 1] * normals[i, 1] + T[k, 2] * normals[i, 2]
                 along += rows[6 + k, i] * turned / least
             rows[2, i] *= max(along, 0.0) ** 2
-        length = least if by_slope else _ONE
-        rows[0, i] /= length
+        rows[0, i] /= least
         for k in range(6, 9):
-            rows[k, i] /= length
+            rows[k, i] /= least
 
 
 @no_type_check
@@ -63,11 +62,11 @@ def _place(rows, points, T, shape, place):
 
 @no_type_check
 @njit(**HOW)
-def residual_rows(observed, T, grid, by_slope):
+def residual_rows(observed, T, grid, near):
     """A column of every point at a pose; `registration.residuals_at` in a grid.
 
-    A grid is its vertices (value and intensity), their numbers along x, y and z, and its place: the
-    first vertex, the voxel, and both corners of the box whose points are usable.
+    A grid is its vertices (value, intensity, confidence), their numbers along x, y and z, and its
+    place: the first vertex, the voxel, and both corners of the box whose points are usable.
     """
     (points, intensity, normals), (vertices, shape, place) = observed, grid
     rows = np.empty((12, len(points)), np.float32)
@@ -75,20 +74,23 @@ def residual_rows(observed, T, grid, by_slope):
     step_x, step_y, one = np.uintp(shape[1] * shape[2]), np.uintp(shape[2]), np.uintp(1)
     for i in range(len(points)):
         v, x, y, z = np.uintp(numbers[i]), at[0, i], at[1, i], at[2, i]
-        for k in range(2):
+        for k in range(3 if near else 2):
             a, b = vertices[v, k], vertices[v + one, k]
             c, d = vertices[v + step_y, k], vertices[v + step_y + one, k]
             e, f = vertices[v + step_x, k], vertices[v + step_x + one, k]
             g, h = vertices[v + step_x + step_y, k], vertices[v + step_x + step_y + one, k]
             ab, cd, ef, gh = a + z * (b - a), c + z * (d - c), e + z * (f - e), g + z * (h - g)
             low, high = ab + y * (cd - ab), ef + y * (gh - ef)
+            if k == 2:
+                rows[2, i] *= low + x * (high - low)
+                break
             low_z, high_z = b - a + y * (d - c - b + a), f - e + y * (h - g - f + e)
             rows[k, i] = low + x * (high - low)
             rows[6 + 3 * k, i] = (high - low) * inside[0, i]
             rows[7 + 3 * k, i] = (cd - ab + x * (gh - ef - cd + ab)) * inside[1, i]
             rows[8 + 3 * k, i] = (low_z + x * (high_z - low_z)) * inside[2, i]
         rows[1, i] -= intensity[i]
-    _weigh(rows, normals, T, by_slope)
+    _weigh(rows, normals, T)
     return rows
 
 
@@ -192,11 +194,11 @@ def damped_step(rows, scales, weight, T_start, T, damping):
 
 @no_type_check
 @njit(**HOW)
-def try_step(observed, grid, by_slope, weight, T_start, T, rows, scales, damping):
+def try_step(observed, grid, near, weight, T_start, T, rows, scales, damping):
     """A step: whether it is better, pose and rows after it, cost before, and its length."""
     twist = damped_step(rows, scales, weight, T_start, T, damping)
     T_after = moved(T, twist)
-    rows_after = residual_rows(observed, T_after, grid, by_slope)
+    rows_after = residual_rows(observed, T_after, grid, near)
     judged = rows_after[:3].copy()
     if weight > 0:  # by the reliabilities before; see `Search.step`
         judged[2] = np.where(judged[2] > 0, rows[2], _NONE)

@@ -45,13 +45,14 @@ class Residuals:
 
 
 def residuals_at(
-    field: Field, observed: Observed, T_world_camera: Transform, divide_by_slope: bool = True
+    field: Field, observed: Observed, T_world_camera: Transform, near: bool = False
 ) -> Residuals:
     """Both residuals of observed points at a pose.
 
     Dividing the distance by the gradient's length, which makes its Jacobian the unit gradient,
     corrects fields that grow too fast or too slowly to first order. Source: paper, Eq. 2;
-    f / |grad f| is an option in PIN-SLAM (Pan et al. 2024).
+    f / |grad f| is an option in PIN-SLAM (Pan et al. 2024). Near the pose points count by how well
+    the map knows the surface there; from afar, where no point lies at its surface, none would.
     """
     points_camera, intensity, normals_camera = observed
     T_world_camera = T_world_camera.to(points_camera)
@@ -65,7 +66,9 @@ def residuals_at(
     if len(normals_camera):  # the nearest surface is not the observed one if it faces elsewhere
         along = (normals_camera @ T_world_camera[:3, :3].T * field_at.value_gradient).sum(dim=-1)
         reliability = reliability * (along.clamp_min(0) / slope.clamp_min(LEAST_SLOPE)).square()
-    slope = slope.clamp_min(LEAST_SLOPE) if divide_by_slope else torch.ones_like(slope)
+    if near:
+        reliability = reliability * field.confidence(points_world)
+    slope = slope.clamp_min(LEAST_SLOPE)
     value = torch.stack([field_at.value / slope, field_at.intensity - intensity])
     gradient = field_at.value_gradient / slope[:, None], field_at.intensity_gradient
     # d g(x) / d(omega, v) = [(arm x gradient)', gradient'], from dx = v + omega x arm.

@@ -30,8 +30,6 @@ class LmSettings(TrackerSettings):
     motion_model: str = "better_of_both"
     lambda_intensity: float = 1.0  # weight of the intensity residual, both over their scale
     n_restarts: int = may_be_zero(8)  # where the first search ends lost
-    anneal: bool = True  # robust scales fall with the residuals; else the narrowest throughout
-    divide_by_slope: bool = True  # residuals are f / |grad f|, else f
     bake_voxel: float = 0.0  # m; the field is asked on a grid of such cells, 0: itself
 
 
@@ -74,7 +72,7 @@ class Search:
         self.level, self.damping, self.is_ended = level, _FIRST_DAMPING, False
         weight = self.settings.lambda_intensity
         self.weight, self.medians = (weight, MEDIANS) if level else (0.0, self.first_medians)
-        self._look(inf if self.settings.anneal else 0.0)
+        self._look()
 
     def step(self) -> float:
         """One step, taken or refused; returns the robust cost before it."""
@@ -108,16 +106,16 @@ class Search:
             *(part.cpu().double().numpy() for part in parts), self.tolerance
         )
 
-    def _look(self, widest: float) -> None:
-        """Residuals at the pose, and robust scales for them, up to the widest."""
+    def _look(self) -> None:
+        """Residuals at the pose, and robust scales for them."""
         self.residuals = self._residuals_at(self.T_world_camera)
         self.least = constant(self.field.accuracy, self.residuals.value.device, torch.float32)
-        widest = self.least.clamp_min(widest)
+        widest = torch.full_like(self.least, inf)
         self.scales = registration.scales_of(self.residuals, widest, self.least, self.medians)
 
     def _residuals_at(self, T_world_camera: Transform) -> registration.Residuals:
-        observed, by_slope = self.levels[self.level], self.settings.divide_by_slope
-        return registration.residuals_at(self.field, observed, T_world_camera, by_slope)
+        observed, near = self.levels[self.level], self.level > 0
+        return registration.residuals_at(self.field, observed, T_world_camera, near)
 
     def _judge(self, is_better: bool, length: float) -> None:
         """Set the damping after a step, and whether the level is at its end."""
