@@ -19,7 +19,6 @@ from nbtrack.tables import (
     style_table_2,
     table_1,
     table_2,
-    write_published,
     write_table_3,
     write_tables,
 )
@@ -104,13 +103,13 @@ def check_table_2(source: str) -> None:
 
 def test_published_tables_cell_by_cell(tmp_path: Path) -> None:
     """Catches a mistyped published value, and a rule for bold or red that is not the paper's."""
-    first, second = write_published(tmp_path / "published")
-    check_table_1(first.read_text())
-    check_table_2(second.read_text())
+    note = "Values as published by Bruns, Zangeneh and Jensfelt."
+    write_tables(tmp_path / "published", published_table_1(), published_table_2(), note)
     assert (len(published_table_1()), len(published_table_2())) == (54, 18)
-    for path in (first, second):
-        committed = PROJECT / "paper_tables" / "published" / path.name
-        assert path.read_bytes() == committed.read_bytes(), "edited by hand: run write_published()"
+    for name, check in (("table_1.tex", check_table_1), ("table_2.tex", check_table_2)):
+        check(written := (tmp_path / "published" / name).read_text(encoding="utf-8"))
+        committed = PROJECT / "paper_tables" / "published" / name
+        assert written == committed.read_text(encoding="utf-8"), "edited by hand"
 
 
 def test_transcription_matches_the_paper() -> None:
@@ -123,8 +122,7 @@ def test_transcription_matches_the_paper() -> None:
 
 
 def test_red_and_bold_together() -> None:
-    """Catches mark-up where one of the two hides the other, and emphasis lost among row labels that
-    notebooks print in bold anyway."""
+    """Catches mark-up where one hides the other, and emphasis lost among labels in bold anyway."""
     styler = style_table_1(published_table_1())
     assert r"& \color{red} \bfseries 0.215 &" in latex(styler)
     assert re.search(r"row1_col2 \{\s*color: red;\s*font-weight: bold;", styler.to_html())
@@ -291,8 +289,7 @@ def latex_is_installed() -> bool:
 def test_tables_compile(tmp_path: Path) -> None:
     """Catches a table that needs more than its comment says: the document there is compiled."""
     steps = OURS_2.assign(steps_deviation=0.5)
-    paths = [*write_published(tmp_path / "a"), *write_tables(tmp_path / "b", SEEDS, steps, NOTE)]
-    for path in (path for path in paths if path.suffix == ".tex"):
+    for path in (p for p in write_tables(tmp_path, SEEDS, steps, NOTE) if p.suffix == ".tex"):
         comments = re.findall(r"^%   (.*)$", path.read_text(), re.MULTILINE)
         assert comments[0].startswith(r"\documentclass")
         (path.parent / "document.tex").write_text("\n".join(comments) + "\n")

@@ -14,7 +14,6 @@ from nbtrack.tables.styles import (
     style_table_1,
     style_table_2,
     write_csv,
-    write_published,
     write_table_1,
     write_table_3,
     write_tables,

@@ -155,17 +155,6 @@ def write_table_3(folder: Path, results: pd.DataFrame, note: str) -> list[Path]:
     ]
 
 
-def write_published(folder: Path) -> list[Path]:
-    """Writes the paper's own tables as table_1.tex and table_2.tex; returns their paths."""
-    note = "Values as published by Bruns, Zangeneh and Jensfelt."
-    first = style_table_1(layout.published_table_1())
-    second = style_table_2(layout.published_table_2())
-    return [
-        _write_latex(folder / "table_1.tex", first, "ate", note),
-        _write_latex(folder / "table_2.tex", second, "runtime", note),
-    ]
-
-
 def escape_latex(text: object) -> str:
     """Plain text with LaTeX's special characters made printable."""
     return str(text).translate(str.maketrans(_SPECIAL))
