@@ -56,8 +56,7 @@ def test_the_start(name: str) -> None:
 @ALL
 def test_scene_of_twice_the_size(name: str) -> None:
     """Catches coordinates in metres inside the network, and answers out of range: the same weights,
-    in a scene twice as large and elsewhere, give the same colours and densities, and twice the
-    distances."""
+    in a scene twice as large and elsewhere, give the same colours, and twice the distances."""
     shift = torch.tensor([5.0, -3.0, 1.0])
     corners = (2 * torch.tensor([ROOM.minimum, ROOM.maximum]) + shift).tolist()
     small = make_field(name, SMALL, ROOM, seed=0)

@@ -176,8 +176,7 @@ def contours(figure: Figure) -> list[np.ndarray]:
 @pytest.mark.parametrize("field", [SPHERE, FOG])
 @pytest.mark.parametrize(("height", "up"), [(0.0, (0, 1, 0)), (0.9, (0, -1, 0)), (0.9, (0, 0, 1))])
 def test_the_zero_level_lies_on_the_sphere(sequence, field, height, up) -> None:
-    """Catches swapped grid axes, a height along the wrong axis or with the wrong sign, a wrong
-    level, and pixels off by half."""
+    """Catches swapped grid axes, a wrong height or level, and pixels off by half."""
     (circle,) = contours(plots.plot_slice(field, held(sequence, up), height))
     assert np.linalg.norm(circle, axis=1) == pytest.approx(np.sqrt(1.5**2 - height**2), abs=2e-3)
     along = Formula(lambda points: points @ torch.tensor(up, dtype=torch.float32), CUBE)

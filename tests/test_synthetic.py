@@ -39,8 +39,7 @@ def numerical_gradient(sdf, points, step=1e-6):
 
 @pytest.mark.parametrize("body", [*SOLIDS.values(), *EACH_ROOM.values()], ids=[*SOLIDS, *ROOMS])
 def test_sdf_is_the_distance_to_the_surface(body):
-    """Catches a distance that is only a bound, a part left out, samples off the surface or of a
-    surface that nobody can see."""
+    """Catches a distance that is only a bound, a part left out, samples off what can be seen."""
     rng = np.random.default_rng(0)
     if isinstance(body, Room):
         surface, size = true_surface_points(body, 10_000, 0), np.array(body.parts[0].solid.size)

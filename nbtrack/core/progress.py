@@ -39,9 +39,6 @@ class _NotebookLine:
         else:
             self.handle.update(shown, raw=True)
 
-    def flush(self) -> None:
-        """Nothing waits."""
-
 
 class ProgressBar:
     """Progress with an ETA over a known amount of work, to be used in a `with` block."""
