@@ -9,9 +9,8 @@ import pandas as pd
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
-from variants import FALLING_STEPS
 
-from nbtrack import METHODS, Method, make_tracker, map_scene
+from nbtrack import Method, make_tracker, map_scene
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.methods import find_methods
@@ -24,23 +23,6 @@ OFFSETS = ((1, 1), (2, 2), (4, 4), (8, 6), (12, 9), (20, 15), (30, 20), (50, 30)
 """How far off the starts are: cm and degrees, from a frame's motion to a lost camera's."""
 RECOVERED_M, RECOVERED_DEG = 0.02, 1.0
 """A start is recovered when its pose ends so near the truth."""
-_FAST = "tracking.{0}.position_rate=1e-2", "tracking.{0}.orientation_rate=2e-2"
-
-
-def _falling(name: str) -> Method:
-    falling = f"{name}_falling"
-    settings = tuple(setting.format(falling) for setting in _FAST)
-    return replace(METHODS[name], tracker=falling, settings=settings)
-
-
-SEARCHES = {
-    METHODS["lm"]: (30, 100),
-    METHODS["icp"]: (1, 100),
-    _falling("sdf"): (FALLING_STEPS, 20),
-    _falling("vr"): (FALLING_STEPS, 20),
-}
-"""With the steps of a search and how many starts: Adam's rates begin twenty times as high as the
-paper's and fall to zero, so that its basin is not what 79 steps of half a millimetre can reach."""
 
 
 def find_from_afar(

@@ -1,6 +1,8 @@
-"""What the paper leaves open, one thing changed at a time (docs/choices.md), and a larger size."""
+"""What the paper leaves open, one choice at a time (docs/choices.md); a larger size; searches."""
 
 from dataclasses import replace
+
+from variants import FALLING_STEPS
 
 from nbtrack import METHODS, Method
 
@@ -56,3 +58,22 @@ CHOICES = {
     ),
 }
 """One thing that the paper leaves open changed at a time: VR, SDF, and where raw depth is read."""
+
+
+_FAST = "tracking.{0}.position_rate=1e-2", "tracking.{0}.orientation_rate=2e-2"
+
+
+def _falling(name: str) -> Method:
+    falling = f"{name}_falling"
+    settings = tuple(setting.format(falling) for setting in _FAST)
+    return replace(METHODS[name], tracker=falling, settings=settings)
+
+
+SEARCHES = {
+    METHODS["lm"]: (30, 100),
+    METHODS["icp"]: (1, 100),
+    _falling("sdf"): (FALLING_STEPS, 20),
+    _falling("vr"): (FALLING_STEPS, 20),
+}
+"""With the steps of a search and how many starts: Adam's rates begin twenty times as high as the
+paper's and fall to zero, so that its basin is not what 79 steps of half a millimetre can reach."""

@@ -17,8 +17,8 @@ from itertools import product
 
 import numpy as np
 import pandas as pd
-from basin import OFFSETS, SEARCHES, find_from_afar
-from choices import CHOICES, FASTER, LARGER_SIZE, SDF, VR
+from basin import OFFSETS, find_from_afar
+from choices import CHOICES, FASTER, LARGER_SIZE, SDF, SEARCHES, VR
 from scipy.stats import binomtest, bootstrap
 from variants import ExactDistance, FusedDistance, OtherDepth, with_variants
 
