@@ -5,6 +5,8 @@
 Writes to paper_tables/corrected: reference.csv, of rooms whose mapped poses were moved, so that the
 truth is known; and, of a recording, consistency.csv: poses that its depth alone was made to agree
 on, beside the given and the tracked ones, and how well its colours then agree, which took no part.
+Both say how far positions of frames a little apart are from what generalised ICP makes of these two
+frames' points alone, which knows no map.
 """
 
 import sys
@@ -12,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+import small_gicp
 import torch
 from scipy import sparse
 from scipy.ndimage import gaussian_filter1d
@@ -36,6 +39,8 @@ TRACKED = METHODS["corrected_dense"], METHODS["icp_dense"]
 OFF_M, OFF_DEG, AHEAD, SMOOTH = 0.006, 0.25, 1.5, 4
 # Cells (m) and points a frame, for depth and for colours; and how often poses are solved for.
 VOXEL, POINTS, COLOR_VOXEL, COLOR_POINTS, ROUNDS = 0.04, 2500, 0.02, 10_000, 3
+# Frames between the two of a pair, points of each, and cells (m) and reach (m) of registering them.
+GAP, PAIR_POINTS, PAIR_VOXEL, PAIR_REACH = 5, 16_384, 0.02, 0.05
 
 
 def main() -> None:
@@ -46,13 +51,13 @@ def main() -> None:
         truth = scene.read(":120")
         for seed in (0, 1):
             given = replace(truth, T_world_camera=moved_poses(truth.T_world_camera, seed))
-            rows.append((scene.name, seed, "reference", 0.0, apart(given, truth)))
-            for method in TRACKED:
-                path = tracked_path(method, given, preset)
-                rows.append(
-                    (scene.name, seed, method.label, apart(path, given), apart(path, truth))
-                )
-    columns = ["scene", "seed", "path", "from_reference_m", "from_truth_m"]
+            paths = {"reference": given, "truth": truth}
+            paths |= {method.label: tracked_path(method, given, preset) for method in TRACKED}
+            pairs = registered_pairs(given)
+            for name, path in paths.items():
+                off = apart(path, given), apart(path, truth), from_pairs(path, pairs)
+                rows.append((scene.name, seed, name, *off))
+    columns = ["scene", "seed", "path", "from_reference_m", "from_truth_m", "from_pairs_m"]
     table = pd.DataFrame(rows, columns=columns)
     print(table.groupby("path")[columns[3:]].mean())
     folder, made = tables_folder() / "corrected", {"device": device_name(choose_device())}
@@ -97,6 +102,32 @@ def apart(path, other, aligned: bool = False) -> float:
     return float(np.sqrt(((a - b) ** 2).sum(axis=1).mean()))
 
 
+def registered_pairs(sequence) -> np.ndarray:
+    """Poses of frames in the frame `GAP` before, by their points alone; the sequence's own poses
+    are the starts."""
+    seeded, clouds = torch.Generator().manual_seed(0), []
+    for index in range(len(sequence)):
+        points = sequence[index].smooth_points(PAIR_POINTS, seeded)[0].double().numpy()
+        clouds.append(small_gicp.preprocess_points(points, downsampling_resolution=PAIR_VOXEL))
+    starts = np.linalg.inv(sequence.T_world_camera[:-GAP]) @ sequence.T_world_camera[GAP:]
+    pairs = [
+        small_gicp.align(
+            before, after, tree, start, max_correspondence_distance=PAIR_REACH, max_iterations=50
+        ).T_target_source
+        for (before, tree), (after, _), start in zip(
+            clouds[:-GAP], clouds[GAP:], starts, strict=True
+        )
+    ]
+    return np.stack(pairs)
+
+
+def from_pairs(path, pairs: np.ndarray) -> float:
+    """RMS distance (m) of positions in the frame `GAP` before from those of registered pairs."""
+    poses = path.T_world_camera
+    off = (np.linalg.inv(poses[:-GAP]) @ poses[GAP:] - pairs)[:, :3, 3]
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
 def consistency(given, preset) -> pd.DataFrame:
     """A recording's poses as they are given and as its depth would have them."""
     changed = with_settings(preset, *TRACKED[0].settings)
@@ -108,6 +139,7 @@ def consistency(given, preset) -> pd.DataFrame:
         refined = replace(refined, T_world_camera=twisted(refined.T_world_camera, twists))
     paths = {"reference": given, "made consistent": refined}
     paths |= {method.label: tracked_path(method, given, preset) for method in TRACKED}
+    pairs = registered_pairs(given)
     rows = [
         (
             name,
@@ -115,10 +147,12 @@ def consistency(given, preset) -> pd.DataFrame:
             apart(path, refined, aligned=True),
             solve(path, source, with_poses=False)[1],
             color_difference(path, source),
+            from_pairs(path, pairs),
         )
         for name, path in paths.items()
     ]
     columns = ["path", "from_reference_m", "from_consistent_m", "depth_m", "intensity"]
+    columns += ["from_pairs_m"]
     return pd.DataFrame(rows, columns=columns).assign(scene=given.name)
 
 
