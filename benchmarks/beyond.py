@@ -6,20 +6,27 @@ On the two rooms of the `smoke` preset, with the paper's step counts; minutes on
 Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed run goes on.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import pandas as pd
 from basin import find_from_afar
+from turns import in_turns
+from variants import FusedDistance
 
-from nbtrack import METHODS, Method, load_preset, map_scene, open_scenes, track_scenes
+from nbtrack import METHODS, Method, load_preset, make_tracker, map_scene, open_scenes, track_scenes
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
+from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_3
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
+from nbtrack.fields import Field
+from nbtrack.fields.grid import BakedField
+from nbtrack.mapping.quality import split_holdout
 from nbtrack.tables import write_table_3
+from nbtrack.tracking import StepBudget
 
 _COLUMNS = ["rate_hz", "method", "n_pixels", "scene", "frames"]
 _COLUMNS += ["steps_per_frame", "seconds_per_frame", "ate_m"]
@@ -56,7 +63,7 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     # Times count: one run after the other. Other frames than above, so that none is cached.
     speed = track_scenes(scenes, TABLE_3, preset, [10], frames=":40", execution=Execution(1, 1))
     write("speed", speed[_COLUMNS])
-    write("points", points_and_bytes(scenes, preset))
+    write("points", points_time_and_bytes(scenes, preset))
     searches = find_from_afar(scenes[0], {"sdf_plus": 79, "lm": 30, "baked": 30}, preset)
     write("basin", searches)
     parts = [
@@ -67,25 +74,46 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     write("ingredients", ingredients)
 
 
-def points_and_bytes(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
-    """LM and ICP with fewer and more points a frame; ICP in coarser clouds too. Error and size.
+def points_time_and_bytes(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
+    """LM and ICP with fewer and more points a frame, in maps of several kinds, all in turns.
 
-    `map_mb` is what the map's numbers take, a million bytes.
+    `milliseconds` is the median over the frames, `map_mb` what a map's numbers take, in millions of
+    bytes.
     """
-    maps = {"NeuS+ with SDF (LM)": ("neus_plus", "lm", ())}
-    for voxel in (0.02, 0.05, 0.1):
-        setting = f"mapping.points.voxel={voxel}"
-        maps[f"ICP, cells of {100 * voxel:g} cm"] = ("points", "icp", (setting,))
-    parts = []
-    for label, (field, tracker, settings) in maps.items():
-        fields = [map_scene(s, field, with_settings(preset, *settings)).field for s in scenes]
-        sizes = [sum(t.nbytes for t in field.state_dict().values()) / 1e6 for field in fields]
-        for n in (128, 512, 2048, 4096):
-            points = f"tracking.{tracker}.n_pixels={n}"
-            method = Method(label, field, tracker, (*settings, points))
-            found = track_scenes(scenes, [method], preset, [10])
-            parts.append(found.assign(map_mb=sizes))
-    return pd.concat(parts)[["method", "n_pixels", "scene", "map_mb", "ate_m"]]
+    rows = []
+    for scene in scenes:
+        sequence, maps = scene.read(":60"), dict(_maps(scene, preset))
+        for n_pixels in (128, 512, 2048, 4096):
+            runs = {}
+            for label, (_, field, tracker, settings) in maps.items():
+                drawn = *settings, f"tracking.{tracker}.n_pixels={n_pixels}"
+                settings = with_settings(preset, *drawn).tracking_of(tracker)
+                how = field, sequence.T_world_camera[0], StepBudget(30), settings
+                runs[label] = make_tracker(tracker, *how), sequence
+            for label, found in in_turns(runs).groupby("run", sort=False):
+                ate_m = float(found["error_m"].pow(2).mean() ** 0.5)
+                told = label, n_pixels, scene.name, maps[label][0] / 1e6
+                rows.append((*told, found["milliseconds"].median(), ate_m))
+    columns = ["method", "n_pixels", "scene", "map_mb", "milliseconds", "ate_m"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _maps(scene: Scene, preset: Preset) -> Iterator[tuple[str, tuple[int, Field, str, tuple]]]:
+    """Labels; with each the bytes of a map, the map, a tracker and settings."""
+    methods = [METHODS["lm"], METHODS["corrected"]]
+    for cm in (2, 5, 10):
+        settings = (f"mapping.points.voxel={cm / 100}",)
+        methods.append(Method(f"ICP, cells of {cm} cm", "points", "icp", settings))
+    for method in methods:
+        field = map_scene(scene, method.field, with_settings(preset, *method.settings)).field
+        n_bytes = sum(part.nbytes for part in field.state_dict().values())
+        yield method.label, (n_bytes, field, method.tracker, method.settings)
+    whole = scene.read()
+    mapped, bounds = split_holdout(len(whole), 10)[0], observed_bounds(whole)
+    fused = FusedDistance(whole, mapped, bounds, voxel=0.04)
+    # In a grid of the same vertices, so that its search is compiled too; colours it has none.
+    uncoloured = ("tracking.lm.lambda_intensity=0",)
+    yield "fused voxels (LM)", (fused.values.nbytes, BakedField(fused, 0.04), "lm", uncoloured)
 
 
 if __name__ == "__main__":

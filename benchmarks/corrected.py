@@ -17,6 +17,7 @@ import pandas as pd
 import torch
 from basin import find_from_afar
 from scipy.spatial.transform import Rotation
+from turns import in_turns
 
 from nbtrack import (
     METHODS,
@@ -131,22 +132,15 @@ def frame_times(rooms, preset) -> pd.DataFrame:
         for method in (METHODS["corrected"], METHODS["icp"]):
             drawn = f"tracking.{method.tracker}.n_pixels={n_pixels}"
             changed = with_settings(preset, *method.settings, drawn)
-            field, T_first = (
-                map_scene(room, method.field, changed).field,
-                sequence.T_world_camera[0],
-            )
+            field = map_scene(room, method.field, changed).field
+            T_first = sequence.T_world_camera[0]
             settings = changed.tracking_of(method.tracker)
-            trackers[method.label] = make_tracker(
-                method.tracker, field, T_first, StepBudget(30), settings
-            )
-        for index, (label, tracker) in product(range(1, len(sequence)), trackers.items()):
-            frame, start = sequence[index], time.perf_counter()
-            found = tracker.track(frame)
-            milliseconds = 1000 * (time.perf_counter() - start)
-            off = found.T_world_camera[:3, 3] - sequence.T_world_camera[index, :3, 3]
-            rows.append((room.name, label, n_pixels, milliseconds, float(np.linalg.norm(off))))
-    table = pd.DataFrame(rows, columns=["scene", "method", "n_pixels", "milliseconds", "error_m"])
-    return table.groupby(["scene", "method", "n_pixels"]).median().reset_index()
+            how = field, T_first, StepBudget(30), settings
+            trackers[method.label] = make_tracker(method.tracker, *how), sequence
+        found = in_turns(trackers).rename(columns={"run": "method"})
+        rows.append(found.assign(scene=room.name, n_pixels=n_pixels))
+    kept = ["scene", "method", "n_pixels"], ["milliseconds", "error_m"]
+    return pd.concat(rows).groupby(kept[0])[kept[1]].median().reset_index()
 
 
 def ablation() -> pd.DataFrame:

@@ -6,11 +6,8 @@ Writes image_size.csv to paper_tables/corrected: median milliseconds a frame, ev
 the reading of files, in the corrected map of one room. Times count: run nothing else.
 """
 
-import time
-
-import numpy as np
-import pandas as pd
 import torch
+from turns import in_turns
 
 from nbtrack import METHODS, load_preset, make_tracker, map_scene, open_scene
 from nbtrack.core.device import choose_device, device_name
@@ -32,22 +29,12 @@ def main() -> None:
     for width in WIDTHS:
         of_size = with_settings(preset, f"scenes.width={width}")
         walks[width] = open_scene(ROOM, of_size).read(f":{FRAMES}")
-    trackers = {
-        width: make_tracker(
-            "lm", field, walk.T_world_camera[0], StepBudget(30), preset.tracking_of("lm")
-        )
+    how = StepBudget(30), preset.tracking_of("lm")
+    runs = {
+        width: (make_tracker("lm", field, walk.T_world_camera[0], *how), walk)
         for width, walk in walks.items()
     }
-    rows = []
-    for index in range(1, FRAMES):
-        for width, walk in walks.items():
-            frame, start = walk[index], time.perf_counter()
-            found = trackers[width].track(frame)
-            seconds = time.perf_counter() - start
-            off = found.T_world_camera[:3, 3] - walk.T_world_camera[index, :3, 3]
-            rows.append((width, 1000 * seconds, found.steps, float(np.linalg.norm(off))))
-    table = pd.DataFrame(rows, columns=["width", "milliseconds", "steps", "error_m"])
-    table = table.groupby("width").median().reset_index()
+    table = in_turns(runs).rename(columns={"run": "width"}).groupby("width").median().reset_index()
     print(table.to_string(index=False))
     made = {"n_pixels": POINTS, "scene": ROOM, "device": device_name(choose_device())}
     write_csv(tables_folder() / "corrected" / "image_size.csv", table.assign(**made))
