@@ -7,6 +7,7 @@ Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed run go
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 
 import pandas as pd
 from basin import find_from_afar
@@ -63,6 +64,7 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     # Times count: one run after the other. Other frames than above, so that none is cached.
     speed = track_scenes(scenes, TABLE_3, preset, [10], frames=":40", execution=Execution(1, 1))
     write("speed", speed[_COLUMNS])
+    write("convergence", convergence(scenes[0], preset))
     write("points", points_time_and_bytes(scenes, preset))
     searches = find_from_afar(scenes[0], {"sdf_plus": 79, "lm": 30, "baked": 30}, preset)
     write("basin", searches)
@@ -72,6 +74,16 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     ]
     ingredients = pd.concat(parts)[["method", "scene", "kept", "steps_per_frame", "ate_m"]]
     write("ingredients", ingredients)
+
+
+def convergence(scene: Scene, preset: Preset) -> pd.DataFrame:
+    """Seconds of mapping, and the error (m) of the distance near surfaces, of longer maps."""
+    rows = []
+    for name, iterations in product(("neus", "neus_plus"), (30, 60, 125, 250, 500, 1000)):
+        longer = with_settings(preset, f"mapping.{name}.iterations={iterations}")
+        made = map_scene(scene, name, longer).made
+        rows.append((name, iterations, made["seconds"], made["quality"]["sdf_near_m"]))
+    return pd.DataFrame(rows, columns=["field", "iterations", "seconds", "near_m"])
 
 
 def points_time_and_bytes(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:

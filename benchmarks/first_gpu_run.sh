@@ -39,8 +39,8 @@ part() { # seconds that it may take, and a command
   echo "=== $(date +%T) $*"
   timeout "$seconds" "$@" || echo "!!! status $? of: $*"
 }
-part 110 python3 benchmarks/gpu_steps.py steps
-part 110 python3 benchmarks/gpu_steps.py mapping
+part 110 python3 benchmarks/step_times.py steps
+part 110 python3 benchmarks/step_times.py mapping
 part 60 python3 -m pytest -q -p no:cacheprovider --noconftest -W default -m gpu \
   tests/test_gpu.py tests/test_sampling.py
 track() { # seconds, its name, the options

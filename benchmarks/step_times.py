@@ -1,8 +1,9 @@
-"""Times of a GPU's steps: recorded and plain, in single precision and in TF32; and of mapping.
+"""Times of steps, on a GPU recorded and plain, in single precision and in TF32; and of mapping.
 
-`python benchmarks/gpu_steps.py steps` or `mapping`, CSV files into the folder $OUT. Of untrained
+`python benchmarks/step_times.py steps` or `mapping`, CSV files into the folder $OUT. Of untrained
 networks of full size and an image of noise before a wall: a step costs the same whatever they show.
-On a CPU everything is small, and nothing is recorded: that only says that the script runs.
+On a CPU, where nothing is recorded, everything is small, which only says that the script runs;
+unless `full` follows, which takes minutes.
 """
 
 import os
@@ -26,10 +27,12 @@ from nbtrack.tracking import TRACKERS, StepBudget, Tracker, make_tracker
 
 DEVICE = choose_device()
 IS_GPU = DEVICE.type == "cuda"
-WIDTH, HEIGHT, N_TIMED, N_WARM = (640, 480, 200, 30) if IS_GPU else (64, 48, 5, 2)
-NETWORK = NetworkSettings() if IS_GPU else NetworkSettings(width=32)
+IS_FULL = IS_GPU or "full" in sys.argv
+WIDTH, HEIGHT = (640, 480) if IS_FULL else (64, 48)
+N_TIMED, N_WARM = (200, 30) if IS_GPU else (10, 2)
+NETWORK = NetworkSettings() if IS_FULL else NetworkSettings(width=32)
 BOUNDS = SceneBounds((-3.0, -3.0, -1.0), (3.0, 3.0, 3.0))
-PRECISIONS = {"float32": "highest", "TF32": "high"}
+PRECISIONS = {"float32": "highest", "TF32": "high"} if IS_GPU else {"float32": "highest"}
 
 
 def noise(n_frames: int) -> RgbdSequence:
@@ -48,7 +51,7 @@ SEQUENCE = noise(20)
 def warm_tracker(name: str, field_name: str, is_recorded: bool) -> Tracker:
     """At the start of a frame, after all that counts nowhere."""
     field = make_field(field_name, NETWORK, BOUNDS, seed=0).to(DEVICE)
-    settings = TRACKERS[name].Settings() if IS_GPU else TRACKERS[name].Settings(n_pixels=32)
+    settings = TRACKERS[name].Settings() if IS_FULL else TRACKERS[name].Settings(n_pixels=32)
     tracker = make_tracker(name, field, np.eye(4), StepBudget(1), settings)
     tracker.track(SEQUENCE[0])
     recorded = tracker.recorded if is_recorded else None
@@ -101,7 +104,7 @@ def mapping_rows() -> Iterator[dict]:
     for name in ("imap", "neus", "neus_plus"):
         field = make_field(name, NETWORK, BOUNDS, seed=0).to(DEVICE)
         settings = field_class(name).Settings()
-        settings = settings if IS_GPU else replace(settings, n_rays=16)
+        settings = settings if IS_FULL else replace(settings, n_rays=16)
         fit = _Fit({"seed": 0}, settings, field, SEQUENCE, np.arange(len(SEQUENCE)))
         fit._advance(range(N_WARM))
         synchronize(DEVICE)
@@ -124,7 +127,7 @@ def main(part: str) -> None:
         for row in {"steps": step_rows, "mapping": mapping_rows}[part]():
             found.append({**row, "precision": precision, **about})
             print(found[-1], flush=True)
-            pd.DataFrame(found).to_csv(out / f"gpu_{part}.csv", index=False, float_format="%.6g")
+            pd.DataFrame(found).to_csv(out / f"{part}.csv", index=False, float_format="%.6g")
 
 
 if __name__ == "__main__":
