@@ -22,7 +22,7 @@ from choices import CHOICES, FASTER, LARGER_SIZE, SDF, SEARCHES, VR
 from scipy.stats import binomtest, bootstrap
 from variants import ExactDistance, FusedDistance, OtherDepth, with_variants
 
-from nbtrack import Method, load_preset, make_tracker, map_scene, open_scenes, track_scenes
+from nbtrack import METHODS, Method, load_preset, make_tracker, map_scene, open_scenes, track_scenes
 from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
@@ -139,7 +139,8 @@ def steps(seed: int) -> Iterator[Chunk]:
         yield place, partial(track, open_scenes(PRESET), TABLE_1, PRESET, **there)
 
 
-ORACLES = ("exact distance", "fused voxels", "NeuS+", "NeuS")
+LEARNED = {"NeuS+ corrected": "corrected", "NeuS+": "lm", "NeuS": "sdf"}  # the methods' names
+ORACLES = ("exact distance", "NeuS+ corrected", "fused voxels", "NeuS+", "NeuS")
 DEPTHS = {"exact": "depth", "filtered": "depth_filtered", "noisy": "depth_with_noise"}
 
 
@@ -150,8 +151,10 @@ def oracle(seed: int) -> Iterator[Chunk]:
 
 
 def _on_each_depth(scene: Scene, name: str, seed: int) -> pd.DataFrame:
-    if name in ("NeuS+", "NeuS"):
-        field = map_scene(scene, {"NeuS+": "neus_plus", "NeuS": "neus"}[name], PRESET, seed).field
+    if name in LEARNED:
+        method = METHODS[LEARNED[name]]
+        preset = with_settings(PRESET, *method.settings)
+        field = map_scene(scene, method.field, preset, seed).field
     else:
         whole = scene.read()
         bounds, mapped = observed_bounds(whole), split_holdout(len(whole), 10)[0]
