@@ -151,8 +151,14 @@ def consistency(given, preset) -> pd.DataFrame:
         )
         for name, path in paths.items()
     ]
-    columns = ["path", "from_reference_m", "from_consistent_m", "depth_m", "intensity"]
-    columns += ["from_pairs_m"]
+    columns = [
+        "path",
+        "from_reference_m",
+        "from_consistent_m",
+        "depth_m",
+        "intensity",
+        "from_pairs_m",
+    ]
     return pd.DataFrame(rows, columns=columns).assign(scene=given.name)
 
 
@@ -198,9 +204,8 @@ def solve(sequence, source, with_poses: bool) -> tuple[np.ndarray, float]:
         stiffness = sparse.block_diag([stiffness, hold]).tocsr()
     reliability = np.tile((depth.mean() / depth) ** 2, len(correction._OFFSETS))
     nothing = np.zeros((len(wanted), 3))  # of colours
-    found = correction._solve(design, stiffness, np.column_stack([nothing, wanted]), reliability)[
-        :, 3
-    ]
+    wishes = np.column_stack([nothing, wanted])
+    found = correction._solve(design, stiffness, wishes, reliability)[:, 3]
     at_surface = np.abs(wanted - design @ found)[offsets == 0]
     return found[len(numbers) :].reshape(-1, 6), float(np.median(at_surface))
 

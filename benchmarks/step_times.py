@@ -117,7 +117,7 @@ def mapping_rows() -> Iterator[dict]:
 
 
 def main(part: str) -> None:
-    """Measure one part, at both precisions, and write what is there after each row."""
+    """Measure one part, at each precision, and write what is there after each row."""
     torch.set_num_threads(1)
     found, out = [], Path(os.environ.get("OUT", "runs/first_gpu_run"))
     out.mkdir(parents=True, exist_ok=True)
