@@ -37,7 +37,7 @@ from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.runs import TrackCell
 from nbtrack.fields import correction
-from nbtrack.mapping.fit import correct_map
+from nbtrack.mapping.correct import correct_map
 from nbtrack.tracking import StepBudget, track_sequence
 from nbtrack.tracking.metrics import trajectory_metrics
 

@@ -29,7 +29,8 @@ from nbtrack.data.pixels import PixelSampler
 from nbtrack.fields import correction
 from nbtrack.fields.base import intensity_of
 from nbtrack.fields.grid import BakedField
-from nbtrack.mapping.fit import correct_map, map_sequence
+from nbtrack.mapping.correct import correct_map
+from nbtrack.mapping.fit import map_sequence
 from nbtrack.tables import write_csv
 from nbtrack.tracking import StepBudget, track_sequence
 

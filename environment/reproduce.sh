@@ -9,8 +9,9 @@ trap 'rm -f "$started"' EXIT
 
 "$venv_python" -m nbtrack notebooks --preset smoke "$@"
 
+runs=${NBTRACK_RUNS:-$project_root/runs}
 printf '\nTables:\n'
-find "$project_root/paper_tables" -type f -newer "$started" | sort
+find "$runs/tables" -type f -newer "$started" | sort
 printf 'Notebooks as they ran:\n'
-find "${NBTRACK_RUNS:-$project_root/runs}" -type f -name '*.html' -newer "$started" | sort
+find "$runs" -type f -name '*.html' -newer "$started" | sort
 printf 'Everything took %d min %d s.\n' "$((SECONDS / 60))" "$((SECONDS % 60))"

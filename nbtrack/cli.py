@@ -20,10 +20,11 @@ def a_path(text: str) -> Path:
     return Path(text)
 
 
-def a_count(text: str, least: int = 1) -> int:
+def a_count(text: str, least: int = 1, most: int = 2**63 - 1) -> int:
     """A number of things, of which there is at least one, that every random generator takes."""
-    if not (text.lstrip("-").isdecimal() and least <= int(text) < 2**63):
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number that is {least} or more")
+    if not (text.lstrip("-").isdecimal() and least <= int(text) <= most):
+        limits = f"from {least} to {most}" if most < 2**31 else f"that is {least} or more"
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number {limits}")
     return int(text)
 
 
@@ -31,6 +32,7 @@ def _option(help: str, type: Any = str, **more: Any) -> dict[str, Any]:
     return {"help": help, "type": type, **more}
 
 
+_MAX_THREADS = 1024  # OpenMP ends the process where it cannot start them
 # By name, and a word for its value where the name says too little.
 OPTIONS = {
     "sequence": _option("a folder, or the name of a room or dataset scene"),
@@ -39,8 +41,7 @@ OPTIONS = {
     "source": _option("folder of a run or a map, or a map file", a_path),
     "out": _option("file or folder to write", a_path),
     "--format NAME": _option("neural_rgbd, tum, replica, 7scenes, scannet, plain (default: found)"),
-    "--field": _option("imap, neus or another"),
-    "--supervision": _option("rendering (default) or, for NeuS's distances too, rendering+sdf"),
+    "--field": _option("imap, neus, neus_plus or another"),
     "--tracker": _option("vr, sdf, lm or another"),
     "--rate HZ": _option("frames a second, by the clock", float),
     "--steps N": _option("optimisation steps a frame", float),
@@ -65,9 +66,9 @@ OPTIONS = {
     "--depth-folder": _option("default: the format's; filtered before raw depth"),
     "--poses FILE": _option("pose file (default: the format's)"),
     "--seed": _option("of all random numbers (default: 0)", partial(a_count, least=0), default=0),
-    "--out": _option("where to write (default: in the cache or paper_tables)", a_path),
+    "--out": _option("where to write (default: in runs/)", a_path),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
-    "--threads N": _option("CPU threads (default: all cores)", a_count),
+    "--threads N": _option("CPU threads (default: all cores)", partial(a_count, most=_MAX_THREADS)),
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
     "--config": _option("TOML file of settings", a_path),
     "--set KEY=VALUE": _option("one setting, as mapping.neus.iterations=500; may be repeated",
@@ -81,9 +82,9 @@ _PARTS = " --format --depth-folder --poses"
 # `map_command`, `data make` by `make_command`.
 COMMANDS = {
     "map": ("fit a field to a sequence with known poses",
-            "sequence --field! --supervision --correct --format " + _MADE),
+            "sequence --field! --correct --format " + _MADE),
     "track": ("track a camera; maps first where no map fits",
-              "sequence --field --supervision --correct --format --tracker! --rate --steps "
+              "sequence --field --correct --format --tracker! --rate --steps "
               "--pixels --bake --map-frames --map-from " + _MADE),
     "export": ("a run's trajectory or a map elsewhere", "source out --to!"),
     "tables": ("the paper's tables, and one beyond, CSV and LaTeX",

@@ -12,8 +12,8 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, NeusMapping, make_field
 from nbtrack.fields.correction import CorrectedField, corrected, interpolation
 from nbtrack.fields.grid import BakedField
+from nbtrack.mapping.correct import correct_map
 from nbtrack.mapping.files import Map, read_map, write_map
-from nbtrack.mapping.fit import correct_map
 from nbtrack.tracking import LmSettings, LmTracker, StepBudget
 
 ROOM, VOXEL = BoxRoom(half=(1.0, 0.5, 1.2)), 0.05

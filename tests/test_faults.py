@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from finished import GIVEN, MAP, OWN, TRACK
 
 from nbtrack.cli import main
+from nbtrack.core.files import loaded_checkpoint, save_checkpoint
 
 CHECKPOINT = "map/mapping.pt"
 
@@ -101,7 +101,8 @@ ENVIRONMENT = {
 # Results that were spoilt. What a map file may hold instead of a map: test_map_files.py.
 def _resave(change: Callable[[dict], Any]) -> Callable[[], None]:
     def resave() -> None:
-        torch.save(change(torch.load(CHECKPOINT, weights_only=True)), CHECKPOINT)
+        with loaded_checkpoint(Path(CHECKPOINT)) as state:
+            save_checkpoint(Path(CHECKPOINT), change(state))
 
     return resave
 
@@ -124,7 +125,7 @@ def _run_checkpoint(content: Any) -> Callable[[], None]:
         for lock in Path("runs/locks").glob("living_room-neus-sdf-2steps-*.lock"):
             folder = Path("runs/tracks") / lock.stem
             folder.mkdir(parents=True, exist_ok=True)
-            torch.save(content, folder / "run.pt")
+            save_checkpoint(folder / "run.pt", content)
 
     return write
 
@@ -195,15 +196,15 @@ ARGUMENTS = {
     "no format": (["export", "map", "x"], "--to"),
     "no output": (["export", "map", "--to", "glb"], "out"),
     "empty output": (["export", "map", "--to", "glb", ""], "the path is empty"),
-    "onto itself": (["export", "room", "--to", "map", "room"], "is the source itself"),
+    "onto itself": (["export", "room", "--to", "map", "room"], "room exists: choose another"),
     "no field": (TRACK, "track needs --field, or --map-from"),
-    "supervision alone": ([*GIVEN, "map", "--supervision", "rendering"], "belongs to --field"),
     "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames, --correct out"),
     "made map": ([*GIVEN, "map", "--correct", "0.1"], "leave --map-frames, --correct out"),
     "field not the map's": ([*GIVEN, "map", "--field", "imap"], "is a map of field 'neus'"),
-    "supervision not the map's": (
-        [*GIVEN, "map", "--field", "neus", "--supervision", "rendering+sdf"],
-        "not 'neus_plus'",
+    "another kind of NeuS": ([*GIVEN, "map", "--field", "neus_plus"], "not 'neus_plus'"),
+    "another network": (
+        [*GIVEN, "map", "--set", "network.neus.width=17"],
+        "map was made with other settings than --set network",
     ),
     "tracker not the map's": ([*GIVEN, "map", "--tracker", "icp"], "does not work on field 'neus'"),
     "steps that are none": ([*OWN, "--steps", "nan"], "steps_per_frame is nan"),
@@ -213,7 +214,8 @@ ARGUMENTS = {
     "negative pixels": ([*OWN, "--pixels", "-5"], "must be 1 or more"),
     "negative seed": ([*OWN, "--seed", "-1"], "is 0 or more"),
     "giant seed": ([*OWN, "--seed", "9" * 30], "is 0 or more"),
-    "no threads": ([*OWN, "--threads", "0"], "is 1 or more"),
+    "no threads": ([*OWN, "--threads", "0"], "from 1 to 1024"),
+    "too many threads": ([*OWN, "--threads", "100000"], "from 1 to 1024"),
     "unknown device": ([*OWN, "--device", "tpu"], "is not there"),
     "no slice": ([*OWN, "--frames", "3"], "is no slice"),
     "no step": ([*OWN, "--frames", "::0"], "with S above 0"),
@@ -233,7 +235,6 @@ ARGUMENTS = {
     "unknown field": ([*MAP, "--field", "imapp"], "did you mean 'imap'"),
     "unknown tracker": ([*OWN, "--tracker", "sfd"], "did you mean 'sdf'"),
     "tracker not the field's": ([*OWN, "--field", "imap"], "take one of neus"),
-    "supervision not the field's": ([*IMAP, "--supervision", "rendering+sdf"], "'imap' knows no"),
     "baked and rendered": ([*OWN, "--tracker", "vr", "--bake", "0.04"], "'tracking.lm.bake_voxel'"),
     "no budget": (NO_STEPS, "give one of the two"),
     "both budgets": ([*OWN, "--rate", "2"], "give one of the two"),

@@ -24,6 +24,7 @@ from test_mapping import NETWORK, finished_wall, map_wall, wall_sequence
 from nbtrack.cli import main
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import DataError
+from nbtrack.experiments.output import LOCK_FILE
 from nbtrack.fields import NetworkSettings, PointMapping, make_field
 from nbtrack.mapping.files import MAP_FILE, Map, _digest, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
@@ -241,7 +242,7 @@ def test_a_file_gives_the_same_trajectory_elsewhere(
     assert (metrics["map_from"]["scene"], metrics["field"]) == ("living_room", "neus")
     assert metrics["config"]["preset"]["network"]["neus"]["width"] == 16
     names = {path.name for path in (work / "map").iterdir()}
-    assert names == {MAP_FILE, "history.csv", "mesh.ply"}
+    assert names == {MAP_FILE, "history.csv", "mesh.ply", LOCK_FILE}
     assert (work / "room").read_bytes() == (work / "map" / MAP_FILE).read_bytes()
     assert len(read_map("map").history) == 30
 

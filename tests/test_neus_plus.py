@@ -8,7 +8,7 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
-from nbtrack.fields import NetworkSettings, NeusPlusMapping, supervised_field
+from nbtrack.fields import NetworkSettings, NeusPlusMapping
 from nbtrack.fields.neus import guided_depths
 from nbtrack.fields.neus_plus import ObservedDistance, distance_targets
 from nbtrack.mapping.fit import map_sequence
@@ -110,10 +110,3 @@ def test_distances_are_learned_sooner_than_by_rendering_alone() -> None:
         field = map_sequence(name, slanted_wall(4), network, settings).field
         errors.append((field(points)[1] - (2 - depth) / 2**0.5).abs().mean().item())
     assert errors[1] < 0.5 * errors[0]
-
-
-def test_supervision_chooses_the_variant_of_a_field() -> None:
-    """Catches a supervision that is ignored where a field does not know it."""
-    assert supervised_field("neus", "rendering") == "neus"
-    assert supervised_field("neus", "rendering+sdf") == "neus_plus"
-    assert supervised_field("neus_plus", "rendering+sdf") == "neus_plus"

@@ -30,7 +30,7 @@ class FadingMapping(NeusMapping):
 
 
 class FadingField(NeuSField):
-    name, label, supervision, Settings = "fading", "Fading NeuS", "fading", FadingMapping
+    name, label, Settings = "fading", "Fading NeuS", FadingMapping
 
     def mapping_losses(self, batch, settings, generator):
         losses = super().mapping_losses(batch, settings, generator)

@@ -19,7 +19,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def key() -> str:
     files.sources_fingerprint.cache_clear()
-    return files.sources_fingerprint("core.geometry", "fields")
+    return files.sources_fingerprint("fields.neus", "mapping.fit")
 
 
 @pytest.mark.parametrize(
@@ -31,6 +31,11 @@ def key() -> str:
         ("fields/rendering.py", "import torch\n", "import torch  # a comment\n\n", False),
         ("core/errors.py", "did you mean", "perhaps", False),
         ("tracking/budget.py", "yield", "return", False),
+        ("data/images.py", "INTER_NEAREST", "INTER_LINEAR", True),
+        ("data/check.py", "a metre, in sequence.toml", "a metre", False),
+        ("fields/volsdf.py", "class", "clas", False),
+        ("fields/__init__.py", "NeuSField, ", "", False),
+        ("fields/correction.py", "300_000", "30", False),
     ],
 )
 def test_what_changes_a_key(package: Path, file: str, old: str, new: str, counts: bool) -> None:

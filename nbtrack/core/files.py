@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import hashlib
 import inspect
+import io
 import json
 import os
 import platform
@@ -25,6 +26,12 @@ from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.settings import as_dict
 
 PACKAGE = Path(nbtrack.__file__).resolve().parent
+_WITHOUT_EFFECT = {
+    "core.capture", "core.device", "core.errors", "core.files", "core.progress", "core.settings",
+    "mapping.files",
+}  # fmt: skip
+"""Modules that change no digit of a result."""
+_DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def project_folder() -> Path:
@@ -44,7 +51,7 @@ def data_folder() -> Path:
 
 
 def tables_folder() -> Path:
-    """Where tables are written, a folder a preset: `paper_tables/` of the project."""
+    """The committed evidence: `paper_tables/` of the project. No command writes there by itself."""
     return project_folder() / "paper_tables"
 
 
@@ -55,18 +62,33 @@ def fingerprint(*parts: Any) -> str:
 
 
 @cache
-def sources_fingerprint(*rooms: str) -> str:
-    """Twelve hexadecimal digits that change with the code of rooms, or of modules as core.camera.
+def sources_fingerprint(*modules: str) -> str:
+    """Twelve hexadecimal digits that change with the code of modules and of all they import.
 
-    A cached result must not outlive the code that made it. Comments, docstrings and layout do not
-    count.
+    Modules are named within the package, as "mapping.fit". A cached result must not outlive the
+    code that made it, and must not be lost to code that it does not go through. So the lists in an
+    `__init__` do not count, nor do modules that read settings, write files or word messages, nor
+    comments, docstrings and layout.
     """
-    found = {}
-    for room in rooms:
-        path = PACKAGE / room.replace(".", "/")
-        files = sorted(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
-        found |= {str(f.relative_to(PACKAGE)): _code(f.read_text("utf-8")) for f in files}
+    found, waiting = {}, [*modules]
+    while waiting:
+        name = waiting.pop()
+        path = PACKAGE / f"{name.replace('.', '/')}.py"
+        if name in found or name in _WITHOUT_EFFECT or not path.is_file():
+            continue
+        tree = ast.parse(path.read_text("utf-8"))
+        found[name] = _code(tree)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("nbtrack."):
+                module = node.module.removeprefix("nbtrack.")
+                waiting += [module, *(f"{module}.{alias.name}" for alias in node.names)]
     return fingerprint(found)
+
+
+def modules_of(kind: type) -> tuple[str, ...]:
+    """The modules of this package in which a class and its base classes stand."""
+    names = [base.__module__ for base in kind.__mro__]
+    return tuple(name.removeprefix("nbtrack.") for name in names if name.startswith("nbtrack."))
 
 
 def foreign_source(kind: type) -> str:
@@ -75,12 +97,12 @@ def foreign_source(kind: type) -> str:
         return ""
     file = getattr(sys.modules.get(kind.__module__), "__file__", None)
     text = Path(file).read_text("utf-8") if file else inspect.cleandoc(inspect.getsource(kind))
-    return _code(text)
+    return _code(ast.parse(text))
 
 
-def _code(text: str) -> str:
+def _code(tree: ast.Module) -> str:
     """Python source without comments, docstrings and layout."""
-    tree, documented = ast.parse(text), ast.Module | ast.ClassDef | ast.FunctionDef
+    documented = ast.Module | ast.ClassDef | ast.FunctionDef
     for node in ast.walk(tree):
         if isinstance(node, documented) and ast.get_docstring(node, clean=False):
             node.body = node.body[1:] or [ast.Pass()]
@@ -91,6 +113,26 @@ def versions() -> dict[str, str]:
     """Versions that a result depends on, to be kept beside it."""
     found = {module.__name__: module.__version__ for module in (nbtrack, torch)}
     return found | {"python": platform.python_version()}
+
+
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Writes tensors and plain values as one file that begins with the digest of the rest."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    content = buffer.getvalue()
+    write_atomic(path, hashlib.sha256(content).digest() + content)
+
+
+@contextlib.contextmanager
+def loaded_checkpoint(path: Path) -> Iterator[dict[str, Any]]:
+    """What `save_checkpoint` wrote, on the CPU. Raises DataError, also for what is made of it
+    within the block, if the file is damaged or of another kind."""
+    with naming_damaged(path):
+        content = path.read_bytes()
+        digest, content = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+        if hashlib.sha256(content).digest() != digest:
+            raise ValueError("its content is not what was written")
+        yield torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:

@@ -190,6 +190,14 @@ def _told_by_files(folder: Path) -> str:
     return best[0]
 
 
+def holds_recording(folder: Path) -> bool:
+    """Whether a folder has both colour and depth of a known format."""
+    return any(
+        all(any(any(folder.glob(p)) for p in patterns) for patterns in (layout.color, layout.depth))
+        for layout in FORMATS.values()
+    )
+
+
 def _shares(folder: Path) -> dict[str, float]:
     """How much of what each format needs is in a folder."""
     return {

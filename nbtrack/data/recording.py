@@ -1,7 +1,6 @@
 """A recording whose files are found and whose texts are read, before any pixel is decoded."""
 
 import hashlib
-import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -52,15 +51,15 @@ class Recording:
         step = np.median(np.diff(self.times)) if len(self.times) > 1 else 0.0
         return float(1 / step if step > 0 else self.declared.frame_rate)
 
-    def contents(self) -> tuple[list[tuple[str, str, int]], list[str], Declaration]:
-        """What changes when a recording does: images' names and sizes, texts, the declaration.
-
-        An image that changes in place and keeps its size is not noticed.
-        """
-        files = self.color_files + self.depth_files
-        sizes = [(file.parent.name, file.name, os.path.getsize(file)) for file in files]
+    def contents(self) -> tuple[list[tuple[str, str, int, int]], list[str], Declaration]:
+        """What changes when a recording does: texts, the declaration, and of every image its name,
+        size and time of change (ns)."""
+        images = []
+        for file in self.color_files + self.depth_files:
+            status = file.stat()
+            images.append((file.parent.name, file.name, status.st_size, status.st_mtime_ns))
         texts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in self.text_files]
-        return sizes, texts, self.declared
+        return images, texts, self.declared
 
 
 def open_recording(

@@ -1,7 +1,9 @@
 """RGB-D sequences with known camera poses, whatever format they are stored in."""
 
+import hashlib
 import re
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +60,14 @@ class RgbdSequence:
     def depth(self, index: int) -> Float[np.ndarray, "height width"]:
         """Z-depth image in metres, 0 where there is no measurement."""
         return self.depths_mm[index].astype(np.float32) * np.float32(MILLIMETRE)
+
+    @cached_property
+    def digest(self) -> str:
+        """Sixteen hexadecimal digits: they change with any pixel, pose, frame number and camera."""
+        found = hashlib.blake2b(repr(self.intrinsics).encode(), digest_size=8)
+        for array in (self.frame_ids, self.T_world_camera, self.colors, self.depths_mm):
+            found.update(np.ascontiguousarray(array).data)
+        return found.hexdigest()
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
         """The sequence of some of the frames, in the order given; slices copy nothing."""

@@ -16,13 +16,14 @@ import torch
 from nbtrack import tables
 from nbtrack.core.device import advise_on_memory, choose_device, device_name
 from nbtrack.core.errors import ConfigError, MissingError, NbtrackError
-from nbtrack.core.files import project_folder, runs_folder, tables_folder, write_atomic
+from nbtrack.core.files import project_folder, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.experiments.commands import preset_of
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Method, find_methods
+from nbtrack.experiments.output import output_folder
 from nbtrack.experiments.presets import PRESETS, Preset
 from nbtrack.experiments.results import track_scenes
 from nbtrack.experiments.scenes import open_scene, open_scenes
@@ -50,12 +51,19 @@ def tables_command(options: Namespace) -> None:
     methods = _words(options.trackers) or (TABLE_3 if options.beyond else TABLE_1)
     find_methods(methods)  # a bad name is told before a room is made
     execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
+    with output_folder(options.out, "table_1.csv", "table_2.csv", "table_3.csv"):
+        _fill_tables(options, preset, methods, execution)
+
+
+def _fill_tables(
+    options: Namespace, preset: Preset, methods: Sequence[str], execution: Execution
+) -> None:
     scenes, clock = open_scenes(preset), options.budget == "clock"
     results = track_scenes(
         scenes, methods, preset, RATES_3_HZ if options.beyond else None, clock=clock,
         seeds=options.seeds, execution=execution,
     )  # fmt: skip
-    folder = options.out or tables_folder() / (preset.name + "_clock" * clock)
+    folder = options.out or runs_folder() / "tables" / (preset.name + "_clock" * clock)
     number, note = "III" if options.beyond else "I", _note(preset, clock)
     print(f"Table {number}: ATE (m), {note}")
     print(tables.style_table_1(tables.naming_points(results) if options.beyond else results))
@@ -85,9 +93,10 @@ def bench_command(options: Namespace) -> None:
     if "NBTRACK_PRESET" not in os.environ:
         options.preset = options.preset or "synthetic"
     preset = preset_of(options, "scenes.n_frames=2")  # one image is enough
-    steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset).read(":1"))
-    folder = options.out or runs_folder() / "bench" / preset.name
-    print(tables.write_csv(folder / "table_2.csv", steps))
+    with output_folder(options.out, "table_2.csv"):
+        steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset).read(":1"))
+        folder = options.out or runs_folder() / "bench" / preset.name
+        print(tables.write_csv(folder / "table_2.csv", steps))
 
 
 def notebooks_command(options: Namespace) -> None:

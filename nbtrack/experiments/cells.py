@@ -10,17 +10,22 @@ from filelock import FileLock
 
 from nbtrack.core.device import advise_on_memory, choose_device
 from nbtrack.core.errors import NbtrackError
-from nbtrack.core.files import fingerprint, foreign_source, runs_folder, sources_fingerprint
+from nbtrack.core.files import (
+    fingerprint,
+    foreign_source,
+    modules_of,
+    runs_folder,
+    sources_fingerprint,
+)
 from nbtrack.core.settings import as_dict, with_settings
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
+from nbtrack.mapping.correct import correct_map
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
-from nbtrack.mapping.fit import correct_map, map_sequence
+from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
 from nbtrack.mapping.quality import score_map
 
-SHARED_SOURCES = ("core.geometry", "core.camera", "core.bounds", "data", "fields")
-"""What maps and runs both go through, beside their own rooms."""
 Report = Callable[[float, str], None]
 """Called by a cell with the share of it that is done and a word on how it goes."""
 
@@ -82,10 +87,15 @@ class MapCell(Cell):
     def key(self) -> str:
         """Of code, device, data, settings and seed."""
         if self.is_given:
-            return fingerprint(read_map(self.folder).key, choose_device().type)
-        code = sources_fingerprint(*SHARED_SOURCES, "mapping")
+            given = read_map(self.folder)
+            code = sources_fingerprint(*modules_of(type(given.field)))
+            return fingerprint(given.key, code, choose_device().type)
+        kind = field_class(self.field)
+        modules = [*modules_of(kind), "mapping.fit"]
+        if self.base:
+            modules.append("mapping.correct")
         return fingerprint(
-            code, foreign_source(field_class(self.field)), choose_device().type,
+            sources_fingerprint(*modules), foreign_source(kind), choose_device().type,
             self.scene.fingerprint, self.field, self.preset.network_of(self.field), self.settings,
             self.frames, self.seed,
         )  # fmt: skip
@@ -135,13 +145,16 @@ class MapCell(Cell):
         base = self.base
         if base and isinstance(failure := base.outcome(None, report), NbtrackError):
             raise failure
-        sequence = self.scene.read(self.frames)
+        sequence, network = self.scene.read(self.frames), self.preset.network_of(self.field)
+        if (self.folder / MAP_FILE).is_file():  # a folder of the user's, with another finished map
+            recipe = recipe_of(self.field, sequence, network, self.settings, self.seed)
+            check_recipe(self.folder / MAP_FILE, read_map(self.folder).made, recipe)
         if base:
             made = correct_map(base.map(), sequence, self.settings)
         else:
             made = map_sequence(
-                self.field, sequence, self.preset.network_of(self.field), self.settings,
-                self.seed, choose_device(), checkpoint, tell,
+                self.field, sequence, network, self.settings, self.seed, choose_device(),
+                checkpoint, tell,
             )  # fmt: skip
         quality = score_map(made, sequence, self.scene.room)
         told = {"quality": quality, "frames": self.frames, "key": self.key}

@@ -9,43 +9,60 @@ import trimesh
 from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import tell
+from nbtrack.core.settings import as_dict
 from nbtrack.data.check import check_recording
 from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import parse_frames
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import run_cells
+from nbtrack.experiments.output import new_file, output_folder
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
-from nbtrack.experiments.runs import METRICS_FILE, TrackCell
+from nbtrack.experiments.runs import METRICS_FILE, OF_MAPS, RUN_FILES, TrackCell
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
-from nbtrack.fields import NetworkSettings, PointCloud, field_class, supervised_field
-from nbtrack.mapping.files import MAP_FILE, MESH_FILE, Map, read_map
+from nbtrack.fields import NetworkSettings, PointCloud
+from nbtrack.mapping.files import (
+    CHECKPOINT_FILE,
+    HISTORY_FILE,
+    MAP_FILE,
+    MESH_FILE,
+    Map,
+    read_map,
+)
 from nbtrack.mapping.meshes import extract_mesh
 from nbtrack.tracking import check_pair, make_budget
+from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 from nbtrack.tracking.trajectories import read_tum, write_kitti
 
 _FORMATS = ["tum", "kitti", "ply", "glb", "map"]
 _PRINTED = (
     "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
-    "lost_frames", "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
+    "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
 )  # fmt: skip
 _SETTINGS = {"pixels": "n_pixels", "bake": "bake_voxel", "correct": "correct_voxel"}
+_MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
 _UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": ("s", 0)}
 
 
 def map_command(options: Namespace) -> None:
     """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
-    field, preset = _field_of(options), preset_of(options)
+    preset = preset_of(options)
     scene = _checked_scene(options, preset, options.frames)
-    cell = MapCell(scene, field, preset, options.frames, options.seed, options.out)
+    cell = MapCell(scene, options.field, preset, options.frames, options.seed, options.out)
+    with output_folder(options.out, *_MAP_FILES):
+        _make_map(cell, options.frames)
+
+
+def _make_map(cell: MapCell, frames: str) -> None:
+    """Map and say how good the map is; draw the mesh of what was seen."""
     _map(cell)
-    found = cell.map()
+    found, scene = cell.map(), cell.scene
     print(f"{cell.folder}: {found.field.label} map of {scene.name}")
     print(f"  mapped in {found.made['seconds']:.0f} s on {found.made['device']}")
     _print_numbers({k: v for k, v in found.made["quality"].items() if v is not None})
     try:
         # Every tenth frame says enough of what has been seen: neighbours see the same.
-        sequence = scene.read(options.frames)
+        sequence = scene.read(frames)
         mesh = extract_mesh(found.field, sequence.select(slice(None, None, 10)))
     except DataError as error:
         print(f"  no mesh: {error}")
@@ -59,21 +76,26 @@ def track_command(options: Namespace) -> None:
     field, given = _field_and_map(options)
     preset, map_frames = preset_of(options), options.map_frames or ":"
     if given is not None:
-        network = NetworkSettings(**given.made["network"])
-        preset = replace(preset, network={**preset.network, field: network})
+        preset = _with_network_of(given, preset, options)
     check_pair(options.tracker, field)
     budget = make_budget(options.steps, options.rate)  # told before a room is made
     scene = _checked_scene(options, preset, options.frames, map_frames)
     is_given, seed = given is not None, options.seed
     cell = MapCell(scene, field, preset, map_frames, seed, options.map_from, is_given)
     budgeted = (options.steps, options.rate)
-    run = TrackCell(cell, scene, options.tracker, *budgeted, options.frames, seed, options.out)
-    if not is_given:
-        _map(cell)
-    run = replace(run, out=run.folder)  # made anew, whatever the cache holds
-    (metrics,) = run_cells([run], f"tracking {scene.name}")
+    run = TrackCell(
+        cell, scene, options.tracker, *budgeted, options.frames, seed, options.out, options.threads
+    )
+    with output_folder(options.out, *RUN_FILES):
+        if not is_given:
+            _map(cell)
+        run = replace(run, out=run.folder)  # made anew, whatever the cache holds
+        (metrics,) = run_cells([run], f"tracking {scene.name}")
     print(f"{run.folder}: {options.tracker} in {cell.map().field.label}, {budget}")
     _print_numbers({name: metrics[name] for name in _PRINTED})
+    print(f"  frames off by more than {LOST_THRESHOLD_M:g} m: {metrics['lost_frames']}")
+    if "flagged_frames" in metrics:
+        print(f"  frames that the tracker itself calls lost: {metrics['flagged_frames']}")
     if metrics["frames_without_depth"]:
         print(f"  frames without any depth, not searched: {metrics['frames_without_depth']}")
     print(f"  on {metrics['device']}")
@@ -84,15 +106,14 @@ def track_command(options: Namespace) -> None:
 def export_command(options: Namespace) -> None:
     """Write a run's trajectory, or a map (of folders or files), in another format; print what.
 
-    Raises ConfigError for an unknown format, or a file that would replace its source; MissingError
-    and DataError where the result is not there, unfinished, damaged, or not what the format is for.
+    Raises ConfigError for an unknown format, or where a file would be replaced; MissingError and
+    DataError where the result is not there, unfinished, damaged, or not what the format is for.
     """
     source, name, out = options.source, options.to, options.out
     if name not in _FORMATS:
         raise ConfigError(f"unknown format {name!r}: {nearest_name(name, _FORMATS)}")
-    if source.exists() and out.exists() and source.samefile(out):
-        raise ConfigError(f"{out} is the source itself: choose another file to write")
-    told = (_export_trajectory if name in ("tum", "kitti") else _export_map)(source, name, out)
+    export = _export_trajectory if name in ("tum", "kitti") else _export_map
+    told = export(source, name, new_file(out))
     print(f"{out}: {told}")
 
 
@@ -140,7 +161,7 @@ def check_command(options: Namespace) -> None:
     from nbtrack.plots import plot_recording
 
     is_picture = options.out.suffix.lower() == ".png"
-    path = options.out if is_picture else options.out / "check.png"
+    path = new_file(options.out if is_picture else options.out / "check.png")
     path.parent.mkdir(parents=True, exist_ok=True)
     T_world_camera = recording.T_world_camera[recording.has_pose]
     apart = f"surfaces of two frames lie {1e3 * report.readings[0].median_m:.1f} mm apart (median)"
@@ -161,16 +182,9 @@ def preset_of(options: Namespace, *settings: str) -> Preset:
     for option, key in _SETTINGS.items():
         if (value := getattr(options, option, None)) is not None:
             is_map = key == "correct_voxel"
-            part = f"mapping.{_field_of(options)}" if is_map else f"tracking.{options.tracker}"
+            part = f"mapping.{options.field}" if is_map else f"tracking.{options.tracker}"
             settings += (f"{part}.{key}={value}",)
     return load_preset(options.preset, options.config, settings)
-
-
-def _field_of(options: Namespace) -> str:
-    """The field under its supervision. Raises ConfigError where none is named."""
-    if options.field is None:
-        raise ConfigError("--correct belongs to --field, which is mapped: name one or leave it out")
-    return supervised_field(options.field, options.supervision or "rendering")
 
 
 def _checked_scene(options: Namespace, preset: Preset, *slices: str) -> Scene:
@@ -184,26 +198,34 @@ def _checked_scene(options: Namespace, preset: Preset, *slices: str) -> Scene:
 
 
 def _field_and_map(options: Namespace) -> tuple[str, Map | None]:
-    """What to track in: a field under its supervision, or a given map, which knows its field."""
-    if options.field is None and options.map_from is None:
-        raise ConfigError("track needs --field, or --map-from with a map that knows its own")
-    if options.field is None and options.supervision is not None:
-        raise ConfigError("--supervision belongs to --field: name that too, or leave both out")
-    asked = options.field and _field_of(options)
+    """What to track in: a field to be mapped, or a given map, which knows its own."""
     if options.map_from is None:
-        return asked, None
+        if options.field is None:
+            raise ConfigError("track needs --field, or --map-from with a map that knows its own")
+        return options.field, None
     if options.map_frames is not None or options.correct is not None:
         raise ConfigError("--map-from names a map that is made: leave --map-frames, --correct out")
     given = read_map(options.map_from)
-    name = given.field.name
-    # A field's variants, as NeuS+ is one of NeuS, differ in what teaches them.
-    kind, wanted = field_class(name), field_class(asked or name)
-    is_variant = issubclass(kind, wanted) and kind.supervision != wanted.supervision
-    if kind is not wanted and not is_variant:
+    if options.field not in (None, given.field.name):
         raise ConfigError(
-            f"{options.map_from} is a map of field {name!r}, not {asked!r}: leave it out"
+            f"{options.map_from} is a map of field {given.field.name!r}, not {options.field!r}: "
+            "leave --field out"
         )
-    return name, given
+    return given.field.name, given
+
+
+def _with_network_of(given: Map, preset: Preset, options: Namespace) -> Preset:
+    """The preset with a map's own network. Raises ConfigError for --set of a map made otherwise."""
+    name, made = given.field.name, given.made
+    asked = as_dict(preset.network_of(name)), as_dict(preset.mapping_of(name))
+    of_maps = [text for text in options.settings if text.startswith(OF_MAPS)]
+    if of_maps and asked != (made["network"], made["settings"]):
+        raise ConfigError(
+            f"{options.map_from} was made with other settings than --set {of_maps[0]}: leave out "
+            f"what begins with {' or '.join(OF_MAPS)}, or map anew"
+        )
+    network = NetworkSettings(**made["network"])
+    return replace(preset, network={**preset.network, name: network})
 
 
 def _map(cell: MapCell) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 from jaxtyping import Float
 
 from nbtrack.core.errors import MissingError, NbtrackError
@@ -73,24 +74,25 @@ def track_scenes(
         seeds: of map and run together, so many or these: their spread is that of the method.
         tracked: other recordings of the same rooms, in the same order, which no map has seen.
 
-    Returns:
-        A row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), ate_m (NaN
-        where it failed), failure (why) and the other metrics.
+    Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), ate_m (NaN
+    where it failed), failure (why) and the other metrics.
     """
-    rates = [None] if steps else rates_hz or preset.tables.rates_hz
-    frames = frames or preset.scenes.track_frames
-    seeds, cells, rows = range(seeds) if isinstance(seeds, int) else seeds, [], []
-    pairs = zip(scenes, tracked or scenes, strict=True)
-    for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
+    execution, rates = execution or Execution(), [None] if steps else rates_hz
+    seeds = range(seeds) if isinstance(seeds, int) else seeds
+    options = {"frames": frames or preset.scenes.track_frames, "n_threads": execution.threads}
+    if clock:  # how far a run comes depends on its threads
+        options["n_threads"] = execution.threads or torch.get_num_threads()
+    pairs, cells, rows = list(zip(scenes, tracked or scenes, strict=True)), [], []
+    grid = product(find_methods(methods), seeds, rates or preset.tables.rates_hz, pairs)
+    for method, seed, rate_hz, (scene, seen) in grid:
         map_cell = MapCell(scene, method.field, with_settings(preset, *method.settings), seed=seed)
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
         budget = n_steps, rate_hz if clock else None
-        cells.append(TrackCell(map_cell, seen, method.tracker, *budget, frames, seed))
-        place = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label}
-        place |= {"n_pixels": cells[-1].settings.n_pixels, "scene": scene.name, "seed": seed}
-        rows.append(place | {"run": cells[-1].folder.name})
-    found = _run(cells, clock, execution or Execution())
-    return pd.DataFrame(row | _told(result) for row, result in zip(rows, found, strict=True))
+        cells.append(TrackCell(map_cell, seen, method.tracker, *budget, seed=seed, **options))
+        row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
+        rows.append({**row, "seed": seed, "run": cells[-1].folder.name})
+    found = _run(cells, clock, execution)
+    return pd.DataFrame(map(_told, rows, cells, found))
 
 
 def _run(cells: Sequence[TrackCell], clock: bool, execution: Execution) -> list[Any]:
@@ -104,11 +106,15 @@ def _run(cells: Sequence[TrackCell], clock: bool, execution: Execution) -> list[
     return run_cells(cells, "by the clock" if clock else "tracking", execution)
 
 
-def _told(result: dict[str, Any] | NbtrackError) -> dict[str, Any]:
+def _told(
+    row: dict[str, Any], cell: TrackCell, result: dict[str, Any] | NbtrackError
+) -> dict[str, Any]:
+    """A whole row. Its scene is the mapped one; metrics name the one that was tracked."""
+    row |= {"n_pixels": cell.settings.n_pixels, "failure": "", "ate_m": float("nan")}
     if isinstance(result, NbtrackError):
-        return {"ate_m": float("nan"), "failure": str(result)}
+        return row | {"failure": str(result)}
     metrics = {k: v for k, v in result.items() if k not in ("config", "versions")}
-    return {"ate_m": result["ate_rmse_m"], "failure": "", **metrics}
+    return {**metrics, **row, "ate_m": result["ate_rmse_m"]}
 
 
 @dataclass(frozen=True)

@@ -10,20 +10,23 @@ from typing import Any
 import torch
 
 from nbtrack.core import files
-from nbtrack.core.device import choose_device, device_name
+from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.settings import as_dict, changed_settings
-from nbtrack.experiments.cells import SHARED_SOURCES, Cell, MapCell, Report
+from nbtrack.experiments.cells import Cell, MapCell, Report
+from nbtrack.experiments.output import METRICS_FILE
 from nbtrack.experiments.presets import PRESETS
 from nbtrack.experiments.scenes import Scene
+from nbtrack.fields import field_class
 from nbtrack.fields.grid import BakedField
 from nbtrack.mapping.quality import check_belongs
-from nbtrack.synthetic import ROOMS
-from nbtrack.tables import PAPER_SCENE_LABELS
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, trajectory_metrics
 from nbtrack.tracking.trajectories import tum_text
 
-RUN_FILE, METRICS_FILE = "run.pt", "metrics.json"
+RUN_FILE = "run.pt"
+RUN_FILES = ("trajectory.txt", "groundtruth.txt", "frames.csv", METRICS_FILE)
+OF_MAPS = ("network.", "mapping.")
+"""How keys of settings begin that only matter where a map is made."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ class TrackCell(Cell):
     frames: str = ":"
     seed: int = 0
     out: Path | None = None
+    n_threads: int | None = None  # CPU threads to track with; by default the process's
 
     kind = "tracks"
 
@@ -48,13 +52,14 @@ class TrackCell(Cell):
 
     @cached_property
     def key(self) -> str:
-        """Of code, map, tracker, budget, frames and seed; by the clock, of the machine too."""
-        machine = (device_name(choose_device()), torch.get_num_threads())
-        clock = None if self.rate_hz is None else (self.rate_hz, *machine)
-        code = files.sources_fingerprint(*SHARED_SOURCES, "tracking")
+        """Of code, map, tracker, budget, threads, frames and seed; by the clock, of the machine."""
+        kind, field = tracker_class(self.tracker), field_class(self.needs.field)
+        modules = (*files.modules_of(kind), *files.modules_of(field), "tracking.trajectories")
+        clock = None if self.rate_hz is None else (self.rate_hz, device_name(choose_device()))
         return files.fingerprint(
-            code, files.foreign_source(tracker_class(self.tracker)), self.needs.key, self.tracker,
-            self.settings, self.steps, clock, self.frames, self.seed, self.scene.fingerprint,
+            files.sources_fingerprint(*modules), files.foreign_source(kind), self.needs.key,
+            self.tracker, self.settings, self.steps, clock, self.n_threads, self.frames, self.seed,
+            self.scene.fingerprint,
         )  # fmt: skip
 
     @property
@@ -85,42 +90,52 @@ class TrackCell(Cell):
         one, whose pose was given: so public tools report the error of the paper's formula. Raises
         DataError where a given map does not fit the first frame at its given pose.
         """
+        with threads(self.n_threads or torch.get_num_threads()):
+            tracked, notes = self._tracked(report)
+            metrics = self._metrics(tracked) | notes
+        ids = tracked.frames["frame_id"].to_numpy()[1:]
+        # The metrics come last: where they stand, the run is complete.
+        texts = (
+            tum_text(ids, tracked.T_estimated[1:]),
+            tum_text(ids, tracked.T_true[1:]),
+            tracked.frames.to_csv(index=False),
+            files.json_text(metrics),
+        )
+        files.write_together(self.folder, dict(zip(RUN_FILES, texts, strict=True)))
+        self._checkpoint.unlink(missing_ok=True)
+        return metrics
+
+    @property
+    def _checkpoint(self) -> Path:
+        return self.cache / RUN_FILE  # a folder of the user's holds results alone
+
+    def _tracked(self, report: Report) -> tuple[Trajectory, dict[str, Any]]:
+        """The trajectory, and what is to be said of the run beside its errors."""
         made, sequence = self.needs.map(), self.scene.read(self.frames)
-        notes = {"map_from": made.made} if self.is_elsewhere else {}
+        budget = make_budget(self.steps, self.rate_hz)
+        notes = {"map_seconds": made.made["seconds"], "budget": str(budget)}
+        if self.is_elsewhere:
+            notes["map_from"] = made.made
         if self.needs.is_given:  # another path of a room we know may begin where no map reaches
             notes["map_warning"] = check_belongs(made, sequence[0])
-        budget, start = make_budget(self.steps, self.rate_hz), time.perf_counter()
-        tracker = make_tracker(
-            self.tracker, made.field, sequence.T_world_camera[0], budget, self.settings, self.seed
-        )
+        start, T_start = time.perf_counter(), sequence.T_world_camera[0]
+        tracker = make_tracker(self.tracker, made.field, T_start, budget, self.settings, self.seed)
         if isinstance(tracker.field, BakedField):
             notes["bake_seconds"] = time.perf_counter() - start
             notes["grid_bytes"] = tracker.field.n_bytes
-        checkpoint = self.cache / RUN_FILE  # a folder of the user's holds results alone
 
         def tell(done: int, error_m: float) -> None:
             report(done / len(sequence), f"off by {100 * error_m:.1f} cm")
 
-        tracked = track_sequence(tracker, sequence, checkpoint, tell)
-        notes |= {"map_seconds": made.made["seconds"], "budget": str(budget)}
-        metrics = self._metrics(tracked) | notes
-        ids = tracked.frames["frame_id"].to_numpy()[1:]
-        # The metrics come last: where they stand, the run is complete.
-        files.write_together(self.folder, {
-            "trajectory.txt": tum_text(ids, tracked.T_estimated[1:]),
-            "groundtruth.txt": tum_text(ids, tracked.T_true[1:]),
-            "frames.csv": tracked.frames.to_csv(index=False),
-            METRICS_FILE: files.json_text(metrics),
-        })  # fmt: skip
-        checkpoint.unlink(missing_ok=True)
-        return metrics
+        return track_sequence(tracker, sequence, self._checkpoint, tell), notes
 
     def _metrics(self, tracked: Trajectory) -> dict[str, Any]:
         metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
         rows = tracked.frames.iloc[1:]
         if "lost" in rows:
-            errors = rows["translation_error_m"].to_numpy()
-            metrics |= score_detection(rows["lost"].to_numpy(dtype=bool), errors)
+            flags, errors = rows["lost"].to_numpy(dtype=bool), rows["translation_error_m"]
+            metrics["flagged_frames"] = int(flags.sum())
+            metrics |= score_detection(flags, errors.to_numpy())
         steps, seconds, map_cell = int(rows["steps"].sum()), rows["seconds"], self.needs
         return {
             **metrics,
@@ -148,17 +163,20 @@ class TrackCell(Cell):
     def _command(self) -> str:
         """What makes this run anew, and its map where that is not cached."""
         cell, preset = self.needs, self.needs.preset
-        is_known = self.scene.name in (*ROOMS, *PAPER_SCENE_LABELS) and not self.is_elsewhere
+        is_room = self.scene.made_by and not self.is_elsewhere
         made = {"field": cell.field, "map-frames": cell.frames}
         options = {
             "format": self.scene.format,
             **({"map-from": cell.folder} if self.is_elsewhere else made),
             "tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps,
             "frames": self.frames, "seed": self.seed, "device": choose_device().type,
-            "threads": torch.get_num_threads(), "preset": preset.name,
+            "threads": self.n_threads, "preset": preset.name,
         }  # fmt: skip
         given = [f"--{name}={value}" for name, value in options.items() if value is not None]
-        settings = [f"--set={text}" for text in changed_settings(preset, PRESETS[preset.name])]
-        sequence = self.scene.name if is_known else str(self.scene.folder)
+        settings = changed_settings(preset, PRESETS[preset.name])
+        if self.is_elsewhere:
+            settings = [text for text in settings if not text.startswith(OF_MAPS)]
+        settings = [f"--set={text}" for text in settings]
+        sequence = self.scene.name if is_room else str(self.scene.folder)
         words = ["python", "-m", "nbtrack", "track", sequence, *settings, *given]
         return shlex.join([*words, "--out", f"again_{self.name}"])

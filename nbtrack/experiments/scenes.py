@@ -8,12 +8,13 @@ from pathlib import Path
 from filelock import FileLock
 
 from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
-from nbtrack.core.files import data_folder, fingerprint, runs_folder, sources_fingerprint
+from nbtrack.core.files import data_folder, fingerprint, runs_folder
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames, select_frames
+from nbtrack.experiments.output import is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
-from nbtrack.synthetic import ROOMS, Room, make_room, room_of
+from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
 from nbtrack.tables import PAPER_SCENE_LABELS
 
 
@@ -24,6 +25,7 @@ class Scene:
     name: str
     folder: Path
     format: str | None = None  # None: told by the files that are there
+    made_by: str = ""  # of a room in the cache: what tells its generator from others; else empty
 
     @property
     def room(self) -> Room | None:
@@ -37,8 +39,8 @@ class Scene:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Changes with what is read and how it is read."""
-        return fingerprint(*self.recording.contents(), sources_fingerprint("data"))
+        """Changes with what is read. A room of the cache is made anew as it was."""
+        return self.made_by or fingerprint(*self.recording.contents())
 
     def read(self, frames: str = ":") -> RgbdSequence:
         """The frames of a slice such as `10:50:2`. Raises as `read_sequence` does."""
@@ -57,12 +59,15 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
 
     It is a folder in a supported layout, the name of a synthetic room (made here at the size that
     the preset gives, unless it is there already), or of a scene of the Neural RGB-D dataset below
-    the data folder. The format of a folder is by default told by its files.
+    the data folder. A folder of that name comes first, unless nbtrack wrote its results there. The
+    format of a folder is by default told by its files.
     """
     text, folder = str(sequence), Path(sequence)
-    if text in ROOMS and (preset.scenes.synthetic or text not in PAPER_SCENE_LABELS):
-        return Scene(text, _room_folder(text, preset.scenes))
-    if text in PAPER_SCENE_LABELS:
+    if text in (*ROOMS, *PAPER_SCENE_LABELS) and folder.is_dir() and not is_own_output(folder):
+        tell(f"{text}: the folder {folder.resolve()} is read, not the room or scene of that name")
+    elif text in ROOMS and (preset.scenes.synthetic or text not in PAPER_SCENE_LABELS):
+        return _room(text, preset.scenes)
+    elif text in PAPER_SCENE_LABELS:
         if (folder := data_folder() / text).is_dir():
             return Scene(text, folder, format)
         raise MissingError(
@@ -113,10 +118,10 @@ def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
         make_room(name, folder, config.n_frames, *size, config.seed, bar.move_to)
 
 
-def _room_folder(name: str, config: ScenesConfig) -> Path:
-    """The folder of a room of this size, length and seed, made if it is not there."""
-    size = f"{config.n_frames}x{config.width}"
-    folder = runs_folder() / "rooms" / f"{name}-{size}-seed{config.seed}" / name
+def _room(name: str, config: ScenesConfig) -> Scene:
+    """A room of this size, length and seed in the cache, made if it is not there."""
+    recipe = f"{config.n_frames}x{config.width}-seed{config.seed}-{room_version(name)}"
+    folder = runs_folder() / "rooms" / f"{name}-{recipe}" / name
     if not folder.is_dir():
         # Another command may want the same room: it waits, and finds it made.
         with FileLock(folder.with_suffix(".lock")):
@@ -124,4 +129,4 @@ def _room_folder(name: str, config: ScenesConfig) -> Path:
                 shutil.rmtree(unfinished, ignore_errors=True)
             if not folder.is_dir():
                 write_room(name, folder, config)
-    return folder
+    return Scene(name, folder, made_by=f"{name}-{recipe}")

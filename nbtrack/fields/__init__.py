@@ -27,17 +27,6 @@ def field_class(name: str) -> type[Field | PointCloud]:
     return FIELDS[name]
 
 
-def supervised_field(name: str, supervision: str) -> str:
-    """The field that is `name` under a supervision ("rendering+sdf"), or ConfigError."""
-    kind = field_class(name)
-    kin = [other for other in FIELDS if issubclass(FIELDS[other], kind)]
-    variants = {FIELDS[other].supervision: other for other in (*kin, name)}
-    if supervision not in variants:
-        nearest = nearest_name(supervision, sorted(variants))
-        raise ConfigError(f"field {name!r} knows no supervision {supervision!r}: {nearest}")
-    return variants[supervision]
-
-
 def make_field(name: str, network: NetworkSettings, bounds: SceneBounds, seed: int) -> Field:
     """A fresh, seeded field inside `bounds`."""
     return field_class(name)(network, bounds, torch.Generator().manual_seed(seed))

@@ -61,7 +61,6 @@ class Field(nn.Module, abc.ABC):
 
     name: str  # on the command line and in file names
     label: str  # in tables and figures
-    supervision: str = "rendering"  # what teaches it: tells variants of one field apart
     is_distance: bool = True  # whether its value is a signed distance (m), else a density
     surface_level: float  # the value whose isosurface is drawn as the scene's surface
     # By how much its distance (m) and intensity are off at surfaces, together with depth cameras:

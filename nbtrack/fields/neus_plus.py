@@ -46,7 +46,6 @@ class NeuSPlusField(NeuSField):
     name = "neus_plus"
     label = "NeuS+"
     Settings = NeusPlusMapping
-    supervision = "rendering+sdf"
 
     def prepare(self, sequence: RgbdSequence, frames: Frames) -> None:
         """Collect the surface that the frames saw: distances in free space are measured from it."""

@@ -33,7 +33,6 @@ class PointCloud:
 
     name: ClassVar[str] = "points"  # this and what follows: as fields have it
     label: ClassVar[str] = "Points"
-    supervision: ClassVar[str] = "rendering"
     Settings: ClassVar[type[PointMapping]] = PointMapping
 
     points: Points  # m, world frame

@@ -1,10 +1,9 @@
 """Fit a field to posed RGB-D frames: one loop for every field, with checkpoints and resume."""
 
-import io
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,12 @@ import torch
 
 from nbtrack.core.device import advise_on_memory, device_name, suitable_threads
 from nbtrack.core.errors import DataError, NumericalError
-from nbtrack.core.files import naming_damaged, versions, write_atomic
+from nbtrack.core.files import loaded_checkpoint, save_checkpoint, versions
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import LearnedField, MappingSettings, NetworkSettings, PointMapping, make_field
-from nbtrack.fields.correction import corrected
 from nbtrack.fields.points import fuse_points
-from nbtrack.mapping.files import MAP_FILE, Map, read_map
+from nbtrack.mapping.files import Map
 from nbtrack.mapping.quality import split_holdout, usual_misfit
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
@@ -52,12 +50,9 @@ def map_sequence(
 
     A `checkpoint` is written every few seconds and, where it exists, resumed from with the batches
     of an uninterrupted run. Who has written the finished map removes it. Raises DataError where no
-    pixel has a depth, or its folder holds another map; NumericalError; OutOfMemory.
+    pixel has a depth, or the checkpoint is of another map; NumericalError; OutOfMemory.
     """
-    recipe = {"field": field_name, "scene": sequence.name, "n_frames": len(sequence), "seed": seed}
-    recipe |= {"network": asdict(network), "settings": asdict(settings)}
-    if checkpoint and (checkpoint.parent / MAP_FILE).is_file():
-        _check_recipe(checkpoint.parent / MAP_FILE, read_map(checkpoint.parent).made, recipe)
+    recipe = recipe_of(field_name, sequence, network, settings, seed)
     start, device = time.perf_counter(), device or torch.device("cpu")
     mapped, _ = split_holdout(len(sequence), settings.holdout_every)
     bounds = observed_bounds(sequence)
@@ -79,28 +74,33 @@ def map_sequence(
     return Map(field, sequence.intrinsics, made, pd.DataFrame(history).rename_axis("iteration"))
 
 
-def correct_map(finished: Map, sequence: RgbdSequence, settings: MappingSettings) -> Map:
-    """A map corrected at its surfaces by the frames it was made from; see `fields.correction`.
+def recipe_of(
+    field_name: str,
+    sequence: RgbdSequence,
+    network: NetworkSettings,
+    settings: MappingSettings | PointMapping,
+    seed: int,
+) -> dict[str, Any]:
+    """What a map is made of, as plain values: two maps of one recipe are the same map."""
+    ids = sequence.frame_ids
+    return {
+        "field": field_name,
+        "scene": sequence.name,
+        "n_frames": len(sequence),
+        "first_and_last_frame": [int(ids[0]), int(ids[-1])],
+        "data": sequence.digest,
+        "seed": seed,
+        "network": asdict(network),
+        "settings": asdict(settings),
+    }
 
-    It says how long that took, and how much memory network and corrections take.
-    """
-    start = time.perf_counter()
-    mapped, _ = split_holdout(len(sequence), settings.holdout_every)
-    field = corrected(finished.field, sequence, mapped, settings.correct_voxel)
-    seconds = time.perf_counter() - start
-    made = {**finished.made, "settings": asdict(settings), "correction_seconds": seconds}
-    made["map_bytes"] = sum(tensor.nbytes for tensor in field.state_dict().values())
-    made["seconds"] += seconds
-    made["misfit_m"] = usual_misfit(field, sequence, mapped)
-    return replace(finished, field=field, made=made)
 
-
-def _check_recipe(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
+def check_recipe(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
     """Raises DataError if a map or checkpoint at a path was made of something else."""
-    changed = ", ".join(name for name in wanted if found.get(name) != wanted[name])
+    changed = [name.replace("_", " ") for name in wanted if found.get(name) != wanted[name]]
     if changed:
         raise DataError(
-            f"{path} was made with another {changed}: remove it, or choose another --out"
+            f"{path} was made with another {', '.join(changed)}: remove it, or choose another --out"
         )
 
 
@@ -157,14 +157,11 @@ class _Fit:
     def _save(self, checkpoint: Path) -> None:
         state = {name: getattr(self, name) for name in ("recipe", "seconds", "history")}
         state |= {"field": self.field.state_dict(), "optimizer": self.optimizer.state_dict()}
-        buffer = io.BytesIO()
-        torch.save({**state, "generator": self.generator.get_state()}, buffer)
-        write_atomic(checkpoint, buffer.getvalue())
+        save_checkpoint(checkpoint, {**state, "generator": self.generator.get_state()})
 
     def _load(self, checkpoint: Path) -> None:
-        with naming_damaged(checkpoint):
-            state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-            _check_recipe(checkpoint, state["recipe"], self.recipe)
+        with loaded_checkpoint(checkpoint) as state:
+            check_recipe(checkpoint, state["recipe"], self.recipe)
             self.field.load_state_dict(state["field"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.generator.set_state(state["generator"])

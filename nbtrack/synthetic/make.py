@@ -12,11 +12,11 @@ import numpy as np
 from nbtrack.core.arrays import Pose
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError, DataError
-from nbtrack.core.files import json_text, naming_damaged
+from nbtrack.core.files import fingerprint, json_text, naming_damaged, sources_fingerprint
 from nbtrack.data.writer import WrittenFrame, write_sequence
 from nbtrack.synthetic.motion import handheld_trajectory
 from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame
-from nbtrack.synthetic.room import Room, build_room
+from nbtrack.synthetic.room import Room, build_room, description
 
 ROOM_FILE = "room.json"
 ROOM_VERSION = 2  # raise it when a room, the motion or the sensor model changes
@@ -82,6 +82,14 @@ def make_room(
     notes = {ROOM_FILE: json_text(record)}
     write_sequence(folder, room_intrinsics(width, height), frames, notes, progress)
     return folder
+
+
+def room_version(name: str) -> str:
+    """Twelve hexadecimal digits that change with the room's description and the generator's code.
+
+    Raises MissingError for an unknown room.
+    """
+    return fingerprint(description(name), sources_fingerprint("synthetic.make"))
 
 
 def room_of(folder: Path) -> Room | None:

@@ -105,14 +105,20 @@ class Room:
         return t, self.light.shade(albedo, points, normals, openness), index
 
 
-@cache
-def build_room(name: str) -> Room:
-    """The synthetic room of that name. Raises `MissingError` with the nearest of all names."""
+def description(name: str) -> dict[str, Any]:
+    """What `rooms.toml` says of a room. Raises MissingError with the nearest of all names."""
     if name not in ROOMS:
         raise MissingError(f"no synthetic room '{name}'; {nearest_name(name, list(ROOMS))}")
     table = _TABLES[name]
+    return {**table, "materials": _PALETTE | table["materials"]}
+
+
+@cache
+def build_room(name: str) -> Room:
+    """The synthetic room of that name. Raises MissingError as `description` does."""
+    table = description(name)
     named: dict[str, Material] = {}
-    for label, material in (_PALETTE | table["materials"]).items():
+    for label, material in table["materials"].items():
         named[label] = _resolved(material, named)
     width, height, depth = table["size"]
     shell = primitives.RoomShell((0.0, height / 2, 0.0), (width, height, depth))

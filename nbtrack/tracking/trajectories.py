@@ -1,6 +1,5 @@
 """Trajectories: tracked through a recorded sequence, and as text files for evaluation tools."""
 
-import io
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
@@ -61,8 +59,7 @@ def track_sequence(
     last_saved = time.perf_counter()
     with advise_on_memory(f"tracking.{tracker.name}.n_pixels={tracker.settings.n_pixels}"):
         if checkpoint and checkpoint.exists():
-            with files.naming_damaged(checkpoint):
-                state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+            with files.loaded_checkpoint(checkpoint) as state:
                 tracker.restore(state["tracker"])
                 rows = state["rows"]
         for index in range(len(rows), len(sequence)):
@@ -70,9 +67,7 @@ def track_sequence(
             if on_frame:
                 on_frame(index, rows[-1]["translation_error_m"])
             if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
-                buffer = io.BytesIO()
-                torch.save({"rows": rows, "tracker": tracker.state()}, buffer)
-                files.write_atomic(checkpoint, buffer.getvalue())
+                files.save_checkpoint(checkpoint, {"rows": rows, "tracker": tracker.state()})
                 last_saved = time.perf_counter()
     return Trajectory(np.stack(tracker.estimates), sequence.T_world_camera, pd.DataFrame(rows))
 

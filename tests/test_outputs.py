@@ -1,0 +1,231 @@
+"""Where commands write, what they take for what, and when a cached result still holds: nothing of
+a user's is overwritten, mixed or confused."""
+
+import json
+import shlex
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from filelock import FileLock
+from finished import GIVEN, MAP, OWN, SET
+from recordings import write_recording
+from test_faults import assert_refused, contents
+from tiny import tiny_words
+
+from nbtrack.cli import main
+from nbtrack.core import files
+from nbtrack.core.settings import with_settings
+from nbtrack.experiments.cells import MapCell
+from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.output import LOCK_FILE
+from nbtrack.experiments.presets import load_preset
+from nbtrack.experiments.results import track_scenes
+from nbtrack.experiments.runs import TrackCell
+from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
+from nbtrack.synthetic import make, room
+
+PROJECT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("kind", ["tum", "plain", "neural_rgbd"])
+def test_a_recording_is_never_written_to(
+    kind: str, work: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Catches `track REC --out REC`, which replaced the recording's own poses by the estimate."""
+    write_recording(kind, work / "rec")
+    commands = [
+        ["track", "rec", *OWN[2:], "--out", "rec"],
+        ["map", "rec", *MAP[2:], "--out", "rec"],
+        ["export", "run", "--to", "tum", "rec/poses_again.txt"],
+        ["data", "check", "rec", "--out", "rec"],
+        ["tables", *SET, "--out", "rec"],
+        ["bench", *SET, "--out", "rec"],
+    ]
+    for command in commands:
+        assert_refused(work, capsys, command, "rec holds a recording, where nothing is written")
+
+
+def test_files_of_others_stay(work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches an --out that overwrites what nbtrack did not write; other files beside are fine."""
+    (work / "mine").mkdir()
+    (work / "mine/trajectory.txt").write_text("0 1 2 3 0 0 0 1\n")
+    says = "mine has a trajectory.txt that nbtrack did not write"
+    assert_refused(work, capsys, [*OWN, "--out", "mine"], says)
+    assert_refused(work, capsys, ["export", "run", "--to", "tum", "mine/trajectory.txt"], "exists")
+    (work / "mine/trajectory.txt").rename(work / "mine/notes.txt")
+    for _ in range(2):  # what it wrote itself, it replaces
+        assert main([*OWN, "--out", "mine"]) == 0
+    assert (work / "mine/notes.txt").read_text() == "0 1 2 3 0 0 0 1\n"
+
+
+def test_one_command_at_a_time_writes_to_a_folder(
+    work: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Catches two processes with one --out, of which the last one won in silence."""
+    with FileLock(work / "run" / LOCK_FILE):
+        assert_refused(work, capsys, OWN, "another nbtrack command is writing to run")
+    assert main(OWN) == 0
+
+
+def test_places_are_told_before_the_work(work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches hours of mapping that end at a place where nothing can be written."""
+    with mock.patch("nbtrack.experiments.commands.run_cells") as run_cells:
+        for place in ("room", "room/run", "/proc/nbtrack"):
+            new = ["--set", "mapping.neus.n_rays=31"]
+            assert_refused(work, capsys, [*OWN, *new, "--out", place], place.split("/")[-1])
+        run_cells.assert_not_called()
+
+
+def _killed(command: list[str]) -> None:
+    with mock.patch("safetensors.torch.save", side_effect=OSError(28, "No space left on device")):
+        assert main(command) == 2
+
+
+def test_maps_of_other_data_are_not_mixed(work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches a map that begins with one recording's frames and ends with another's: poses that
+    were corrected in between, another recording of the same name and length, other frames."""
+    write_recording("plain", work / "one/rec")
+    command = ["map", "one/rec", *MAP[2:4], *SET, "--out", "m"]
+    _killed(command)
+    says = "mapping.pt was made with another "
+    assert_refused(work, capsys, [*command, "--frames", "1:"], f"{says}n frames, first and last")
+    poses = work / "one/rec/trajectory.txt"
+    kept, lines = poses.read_text(), poses.read_text().splitlines()
+    first = lines[1].split()
+    first[1] = str(float(first[1]) + 0.01)
+    poses.write_text("\n".join([lines[0], " ".join(first), *lines[2:]]) + "\n")
+    assert_refused(work, capsys, command, f"{says}data")
+    poses.write_text(kept)
+    shutil.copytree(work / "one/rec", work / "two/rec")
+    image = next((work / "two/rec/color").iterdir())
+    cv2.imwrite(str(image), 255 - cv2.imread(str(image)))
+    assert_refused(work, capsys, ["map", "two/rec", *command[2:]], f"{says}data")
+    assert main(command) == 0
+    says = "m/map.safetensors was made with another n frames, first and last frame, data"
+    assert_refused(work, capsys, [*command, "--frames", "1:"], says)
+
+
+def test_a_finished_map_of_points_is_kept(work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches a finished map that is replaced after "no finished map"."""
+    command = ["map", "living_room", "--field", "points", "--out", "cloud", *SET]
+    assert main(command) == 0
+    says = "cloud/map.safetensors was made with another n frames, first and last frame, data"
+    assert_refused(work, capsys, [*command, "--frames", ":3"], says)
+
+
+@pytest.mark.parametrize("name", ["map/mapping.pt", "run.pt"])
+def test_a_flipped_bit_in_a_checkpoint_is_noticed(name: str, tmp_path: Path) -> None:
+    """Catches a run that goes on from a damaged checkpoint to another trajectory."""
+    path = tmp_path / name
+    files.save_checkpoint(path, {"weights": torch.arange(1000.0), "rows": [1, 2]})
+    with files.loaded_checkpoint(path) as state:
+        assert state["rows"] == [1, 2]
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    says = "not a readable checkpoint .*its content is not what was written"
+    with pytest.raises(files.DataError, match=says), files.loaded_checkpoint(path):
+        pass
+
+
+def test_tables_do_not_touch_the_evidence(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches a command that writes into `paper_tables`, which holds committed evidence."""
+    before = contents(PROJECT / "paper_tables")
+    words = tiny_words("scenes.names=['office']", "scenes.track_frames=:2")
+    assert main(["tables", "--workers", "1", "--preset", "nine_rooms", *words]) == 0
+    assert contents(PROJECT / "paper_tables") == before
+    written = tmp_path / "runs/tables/nine_rooms"
+    assert {path.name for path in written.iterdir()} >= {"table_1.csv", "table_1.tex"}
+
+
+def test_a_folder_comes_before_a_room_of_its_name(
+    work: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Catches an own recording `office/` in whose place the synthetic room is tracked, an own
+    `kitchen/` that is to be downloaded, and results in `office/` that are taken for a recording."""
+    preset = load_preset(settings=["scenes.n_frames=2", "scenes.width=32"])
+    for name in ("office", "kitchen"):
+        write_recording("plain", work / name)
+        assert open_scene(name, preset).folder == work / name
+        said = capsys.readouterr().err
+        assert said.startswith(f"{name}: the folder {work / name} is read, not the room or scene")
+    assert main(["track", "office", *OWN[2:]]) == 0
+    command = shlex.split(json.loads((work / "run/metrics.json").read_text())["command"])
+    assert command[4] == str(work / "office")
+    shutil.rmtree(work / "office")
+    shutil.copytree(work / "run", work / "office")
+    assert open_scene("office", preset).made_by
+
+
+def test_an_image_mended_in_place_counts(tmp_path: Path) -> None:
+    """Catches a map made of images that are no longer there: same name, same size, other pixels."""
+    write_recording("plain", tmp_path / "rec")
+    before, image = Scene("rec", tmp_path / "rec").fingerprint, tmp_path / "rec/depth"
+    image = sorted(image.iterdir())[0]
+    content = image.read_bytes()
+    image.write_bytes(content[:-1] + content[-1:])
+    assert Scene("rec", tmp_path / "rec").fingerprint != before
+
+
+def test_a_room_is_made_anew_where_its_maker_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches runs in a room that `rooms.toml` no longer describes, and other rooms made anew."""
+    names = ("office", "living_room")
+    before = [make.room_version(name) for name in names]
+    changed = {**room._TABLES["office"], "size": [9.0, 2.5, 3.0]}
+    monkeypatch.setitem(room._TABLES, "office", changed)
+    assert [make.room_version(n) == b for n, b in zip(names, before, strict=True)] == [False, True]
+
+
+def test_flagged_and_wrong_frames_are_told_apart(work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches "lost frames" that mean errors in one place and the tracker's verdict in another."""
+    lm = [
+        "--tracker",
+        "lm",
+        "--set",
+        "tracking.lm.n_pixels=64",
+        "--set",
+        "tracking.lm.n_restarts=0",
+    ]
+    assert main([*GIVEN, "map", *lm, "--out", "by_lm"]) == 0
+    printed = capsys.readouterr().out
+    metrics = json.loads((work / "by_lm/metrics.json").read_text())
+    flagged = np.genfromtxt(
+        work / "by_lm/frames.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
+    )["lost"]
+    # The given first frame has no verdict.
+    assert metrics["flagged_frames"] == sum(str(flag) == "True" for flag in flagged[1:])
+    assert f"frames off by more than 0.2 m: {metrics['lost_frames']}\n" in printed
+    assert f"tracker itself calls lost: {metrics['flagged_frames']}\n" in printed
+    assert main([*GIVEN, "map"]) == 0
+    assert "calls lost" not in capsys.readouterr().out
+
+
+def test_rows_say_which_scene_was_mapped(work: Path) -> None:
+    """Catches one scene that splits in two rows where some of its runs fail."""
+    preset = load_preset(settings=[*SET[1::2], "scenes.names=['living_room']"])
+    (mapped,) = open_scenes(preset)
+    (other,) = open_scenes(with_settings(preset, "scenes.seed=1"))
+    tracked = replace(other, name="a second path")
+    execution = Execution(workers=1, keep_going=True)
+    runs = track_scenes([mapped], ["sdf"], preset, steps=2, tracked=[tracked], execution=execution)
+    assert runs["scene"].tolist() == ["living_room"]
+
+
+def test_threads_belong_to_a_run_and_its_key(work: Path) -> None:
+    """Catches seconds a frame of two threads that are given out as those of one."""
+    preset = load_preset(settings=[*SET[1::2], "scenes.names=['living_room']"])
+    scenes = open_scenes(preset)
+    cell = TrackCell(MapCell(scenes[0], "neus", preset), scenes[0], "sdf", 2)
+    assert cell.key != replace(cell, n_threads=2).key
+    found = [
+        track_scenes(scenes, ["sdf"], preset, [30], clock=True, execution=Execution(threads=n))
+        for n in (1, 2)
+    ]
+    assert [runs["threads"][0] for runs in found] == [1, 2]
+    assert found[0]["run"][0] != found[1]["run"][0]
