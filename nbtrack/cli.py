@@ -41,13 +41,14 @@ OPTIONS = {
     "source": _option("folder of a run or a map, or a map file", a_path),
     "out": _option("file or folder to write", a_path),
     "--format NAME": _option("neural_rgbd, tum, replica, 7scenes, scannet, plain (default: found)"),
-    "--field": _option("imap, neus, neus_plus or another"),
-    "--tracker": _option("vr, sdf, lm or another"),
+    "--method NAME": _option("one of `nbtrack methods` (default: corrected); tables take several, "
+                             "as vr,sdf"),
+    "--field": _option("in place of a method: imap, neus, neus_plus or another field"),
+    "--tracker": _option("in place of a method: vr, sdf, lm or another tracker"),
     "--rate HZ": _option("frames a second, by the clock", float),
-    "--steps N": _option("optimisation steps a frame", float),
+    "--steps N": _option("steps a frame (default: until converged; vr, sdf: the paper's at 2 Hz)",
+                         float),
     "--pixels N": _option("pixels a step", int),
-    "--bake METRES": _option("ask a grid of such cells, as 0.04, not the network", float),
-    "--correct METRES": _option("correct the map at surfaces in such cells, as 0.04", float),
     "--frames": _option("Python slice of frames, A:B:S", default=":"),
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from MAP": _option("track in this map of the room: its folder or file", a_path),
@@ -55,7 +56,6 @@ OPTIONS = {
     "--budget BY": _option("steps, the paper's counts (default), or this machine's clock",
                            choices=("steps", "clock"), default="steps"),
     "--scenes A,B": _option("only these scenes of the preset's kind"),
-    "--trackers A,B": _option("rows (default: the paper's, vr,sdf)"),
     "--seeds K": _option("K maps and runs a cell: mean ± deviation", a_count, default=1),
     "--workers N": _option("cells side by side (default: one a core, or one on a GPU)", a_count),
     "--dask ADDRESS": _option("run on a Dask cluster, as tcp://HOST:8786"),
@@ -82,13 +82,14 @@ _PARTS = " --format --depth-folder --poses"
 # `map_command`, `data make` by `make_command`.
 COMMANDS = {
     "map": ("fit a field to a sequence with known poses",
-            "sequence --field! --correct --format " + _MADE),
+            "sequence --method --field --format " + _MADE),
     "track": ("track a camera; maps first where no map fits",
-              "sequence --field --correct --format --tracker! --rate --steps "
-              "--pixels --bake --map-frames --map-from " + _MADE),
+              "sequence --method --field --tracker --format --rate --steps --pixels "
+              "--map-frames --map-from " + _MADE),
+    "methods": ("list what --method takes", ""),
     "export": ("a run's trajectory or a map elsewhere", "source out --to!"),
     "tables": ("the paper's tables, and one beyond, CSV and LaTeX",
-               "--budget --scenes --trackers --beyond --seeds --workers --dask --out" + _RUN),
+               "--budget --scenes --method --beyond --seeds --workers --dask --out" + _RUN),
     "notebooks": ("run all notebooks headless, with HTML copies", _PRESET),
     "data make": ("write a synthetic room in the dataset's layout",
                   "room --out! --n-frames --width --seed"),
@@ -97,6 +98,15 @@ COMMANDS = {
                      "folder out --frames" + _PARTS),
     "bench": ("Table II on this machine, full-size networks", "--out" + _RUN),
 }  # fmt: skip
+
+
+# Options of earlier versions: what to write now.
+_EARLIER = {
+    "--supervision": "write --field neus_plus for rendering+sdf",
+    "--correct": "write --method corrected, or --set mapping.neus_plus.correct_voxel=METRES",
+    "--bake": "lm always works in a grid: write --set tracking.lm.voxel=METRES",
+    "--trackers": "write --method A,B",
+}
 
 
 class Parser(argparse.ArgumentParser):
@@ -150,7 +160,9 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     found, unknown = parser.parse_known_args(arguments)
     if unknown:
         known = [option for option in found.parser._option_string_actions if option[:2] == "--"]
-        found.parser.error(f"unknown argument {unknown[0]!r}: {nearest_name(unknown[0], known)}")
+        name = unknown[0].partition("=")[0]
+        advice = _EARLIER.get(name) or nearest_name(name, known)
+        found.parser.error(f"unknown argument {unknown[0]!r}: {advice}")
     return found
 
 

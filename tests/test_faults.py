@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from finished import GIVEN, MAP, OWN, TRACK
+from finished import GIVEN, MAP, OWN
 
 from nbtrack.cli import main
 from nbtrack.core.files import loaded_checkpoint, save_checkpoint
@@ -197,10 +197,15 @@ ARGUMENTS = {
     "no output": (["export", "map", "--to", "glb"], "out"),
     "empty output": (["export", "map", "--to", "glb", ""], "the path is empty"),
     "onto itself": (["export", "room", "--to", "map", "room"], "room exists: choose another"),
-    "no field": (TRACK, "track needs --field, or --map-from"),
-    "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames, --correct out"),
-    "made map": ([*GIVEN, "map", "--correct", "0.1"], "leave --map-frames, --correct out"),
-    "field not the map's": ([*GIVEN, "map", "--field", "imap"], "is a map of field 'neus'"),
+    "a method and a field": ([*OWN, "--method", "sdf"], "leave --field and --tracker out"),
+    "unknown method": (["track", "living_room", "--method", "corected"], "mean 'corrected'"),
+    "a method in another map": ([*GIVEN[:2], "--method", "vr", "--map-from", "map"], "not 'imap'"),
+    "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames out"),
+    "an earlier option": ([*GIVEN, "map", "--correct", "0.1"], "write --method corrected"),
+    "field not the map's": (
+        [*GIVEN, "map", "--field", "imap", "--tracker", "vr"],
+        "is a map of field 'neus'",
+    ),
     "another kind of NeuS": ([*GIVEN, "map", "--field", "neus_plus"], "not 'neus_plus'"),
     "another network": (
         [*GIVEN, "map", "--set", "network.neus.width=17"],
@@ -210,7 +215,7 @@ ARGUMENTS = {
     "steps that are none": ([*OWN, "--steps", "nan"], "steps_per_frame is nan"),
     "steps in words": ([*OWN, "--steps", "few"], "invalid float value: 'few'"),
     "endless steps": ([*OWN, "--steps", "inf"], "steps_per_frame is inf"),
-    "no grid": ([*OWN, "--bake", "nan"], "bake_voxel"),
+    "no grid": ([*OWN, "--bake", "nan"], "lm always works in a grid"),
     "negative pixels": ([*OWN, "--pixels", "-5"], "must be 1 or more"),
     "negative seed": ([*OWN, "--seed", "-1"], "is 0 or more"),
     "giant seed": ([*OWN, "--seed", "9" * 30], "is 0 or more"),
@@ -225,7 +230,7 @@ ARGUMENTS = {
     "empty folder name": ([*OWN, "--out", ""], "the path is empty"),
     "no seeds": (["tables", "--seeds", "0"], "seeds"),
     "no workers": (["tables", "--workers", "0"], "is 1 or more"),
-    "unknown row": (["tables", "--trackers", "vr,sfd"], "did you mean 'sdf'"),
+    "unknown row": (["tables", "--method", "vr,sfd"], "did you mean 'sdf'"),
     "unknown budget": (["tables", "--budget", "tick"], "unknown 'tick'"),
     "unknown command": (["trak", "living_room"], "did you mean 'track'"),
     "unknown action": (["data", "chekc", "room"], "did you mean 'check'"),
@@ -235,8 +240,6 @@ ARGUMENTS = {
     "unknown field": ([*MAP, "--field", "imapp"], "did you mean 'imap'"),
     "unknown tracker": ([*OWN, "--tracker", "sfd"], "did you mean 'sdf'"),
     "tracker not the field's": ([*OWN, "--field", "imap"], "take one of neus"),
-    "baked and rendered": ([*OWN, "--tracker", "vr", "--bake", "0.04"], "'tracking.lm.bake_voxel'"),
-    "no budget": (NO_STEPS, "give one of the two"),
     "both budgets": ([*OWN, "--rate", "2"], "give one of the two"),
     "rate of zero": ([*NO_STEPS, "--rate", "0"], "rate_hz is 0"),
     "negative rate": ([*NO_STEPS, "--rate", "-1"], "rate_hz is -1"),

@@ -69,6 +69,6 @@ def test_a_row_in_both_tables(own_file: None, tmp_path: Path) -> None:
         "mapping.fading.iterations=6", "mapping.fading.n_rays=8",
     )  # fmt: skip
     words += ["--scenes", "office", "--workers", "1", "--out", str(tmp_path / "out")]
-    assert main(["tables", "--trackers", "sdf,mine", *words]) == 0
+    assert main(["tables", "--method", "sdf,mine", *words]) == 0
     assert (tmp_path / "out/table_1.csv").read_text().count("Mine,office") == 1
     assert "DISTANCE,8," in (tmp_path / "out/table_2.csv").read_text()

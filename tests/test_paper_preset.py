@@ -39,7 +39,7 @@ def run(monkeypatch: pytest.MonkeyPatch, dataset: Path, folder: Path) -> int:
     for field in ("imap", "neus"):
         kept += [f"mapping.{field}.holdout_every=0", f"mapping.{field}.iterations=2"]
     words = [word for setting in kept for word in ("--set", setting)]
-    words += ["--trackers", "sdf", "--workers", "1", "--out", str(folder / "out")]
+    words += ["--method", "sdf", "--workers", "1", "--out", str(folder / "out")]
     return main(["tables", "--preset", "paper", *words])
 
 

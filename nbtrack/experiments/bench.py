@@ -45,10 +45,10 @@ def tables_command(options: Namespace) -> None:
     Raises NbtrackError at the end where cells failed, and left gaps.
     """
     names = [f"scenes.names={_words(options.scenes)}"] if options.scenes else []
-    preset = preset_of(options, *names)
-    if options.beyond and options.trackers:
-        raise ConfigError("--beyond has rows of its own: leave --trackers out")
-    methods = _words(options.trackers) or (TABLE_3 if options.beyond else TABLE_1)
+    preset = preset_of(options, None, *names)
+    if options.beyond and options.method:
+        raise ConfigError("--beyond has rows of its own: leave --method out")
+    methods = _words(options.method) or (TABLE_3 if options.beyond else TABLE_1)
     find_methods(methods)  # a bad name is told before a room is made
     execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
     with output_folder(options.out, "table_1.csv", "table_2.csv", "table_3.csv"):
@@ -92,7 +92,7 @@ def bench_command(options: Namespace) -> None:
     # The paper's sizes unless something else is asked for: small networks measure bookkeeping.
     if "NBTRACK_PRESET" not in os.environ:
         options.preset = options.preset or "synthetic"
-    preset = preset_of(options, "scenes.n_frames=2")  # one image is enough
+    preset = preset_of(options, None, "scenes.n_frames=2")  # one image is enough
     with output_folder(options.out, "table_2.csv"):
         steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset).read(":1"))
         folder = options.out or runs_folder() / "bench" / preset.name

@@ -16,6 +16,7 @@ from nbtrack.data.sequence import parse_frames
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import run_cells
+from nbtrack.experiments.methods import DEFAULT_METHOD, METHODS, Method, method_of
 from nbtrack.experiments.output import new_file, output_folder
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
 from nbtrack.experiments.runs import METRICS_FILE, OF_MAPS, RUN_FILES, TrackCell
@@ -30,7 +31,7 @@ from nbtrack.mapping.files import (
     read_map,
 )
 from nbtrack.mapping.meshes import extract_mesh
-from nbtrack.tracking import check_pair, make_budget
+from nbtrack.tracking import make_budget
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 from nbtrack.tracking.trajectories import read_tum, write_kitti
 
@@ -39,16 +40,24 @@ _PRINTED = (
     "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
     "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
 )  # fmt: skip
-_SETTINGS = {"pixels": "n_pixels", "bake": "bake_voxel", "correct": "correct_voxel"}
 _MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
 _UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": ("s", 0)}
 
 
+def methods_command(options: Namespace) -> None:
+    """List every method that --method takes."""
+    width = max(map(len, METHODS))
+    for name, method in METHODS.items():
+        usual = "  (default)" if name == DEFAULT_METHOD else ""
+        print(f"  {name:<{width}}  {method.label}{usual}")
+
+
 def map_command(options: Namespace) -> None:
     """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
-    preset = preset_of(options)
+    method = method_of(options.method, options.field, None)
+    preset = preset_of(options, method)
     scene = _checked_scene(options, preset, options.frames)
-    cell = MapCell(scene, options.field, preset, options.frames, options.seed, options.out)
+    cell = MapCell(scene, method.field, preset, options.frames, options.seed, options.out)
     with output_folder(options.out, *_MAP_FILES):
         _make_map(cell, options.frames)
 
@@ -73,25 +82,27 @@ def _make_map(cell: MapCell, frames: str) -> None:
 
 def track_command(options: Namespace) -> None:
     """Track a sequence in its map, made first where none fits, or in a given one."""
-    field, given = _field_and_map(options)
-    preset, map_frames = preset_of(options), options.map_frames or ":"
-    if given is not None:
+    given = read_map(options.map_from) if options.map_from else None
+    method = _method_in(given, options)
+    preset, map_frames = preset_of(options, method), options.map_frames or ":"
+    if given:
         preset = _with_network_of(given, preset, options)
-    check_pair(options.tracker, field)
-    budget = make_budget(options.steps, options.rate)  # told before a room is made
+    steps = method.usual_steps if options.steps is options.rate is None else options.steps
+    budget = make_budget(steps, options.rate)  # told before a room is made
     scene = _checked_scene(options, preset, options.frames, map_frames)
-    is_given, seed = given is not None, options.seed
-    cell = MapCell(scene, field, preset, map_frames, seed, options.map_from, is_given)
-    budgeted = (options.steps, options.rate)
-    run = TrackCell(
-        cell, scene, options.tracker, *budgeted, options.frames, seed, options.out, options.threads
+    cell = MapCell(
+        scene, method.field, preset, map_frames, options.seed, options.map_from, given is not None
     )
+    run = TrackCell(
+        cell, scene, method.tracker, steps, options.rate, options.frames, options.seed,
+        options.out, options.threads,
+    )  # fmt: skip
     with output_folder(options.out, *RUN_FILES):
-        if not is_given:
+        if not given:
             _map(cell)
         run = replace(run, out=run.folder)  # made anew, whatever the cache holds
         (metrics,) = run_cells([run], f"tracking {scene.name}")
-    print(f"{run.folder}: {options.tracker} in {cell.map().field.label}, {budget}")
+    print(f"{run.folder}: {method.tracker} in {cell.map().field.label}, {budget}")
     _print_numbers({name: metrics[name] for name in _PRINTED})
     print(f"  frames off by more than {LOST_THRESHOLD_M:g} m: {metrics['lost_frames']}")
     if "flagged_frames" in metrics:
@@ -176,15 +187,12 @@ def convert_command(options: Namespace) -> None:
     print(convert_sequence(recording, options.out, frames, progress=True))
 
 
-def preset_of(options: Namespace, *settings: str) -> Preset:
-    """The preset with all that changes it."""
-    settings = (*options.settings, *settings)
-    for option, key in _SETTINGS.items():
-        if (value := getattr(options, option, None)) is not None:
-            is_map = key == "correct_voxel"
-            part = f"mapping.{options.field}" if is_map else f"tracking.{options.tracker}"
-            settings += (f"{part}.{key}={value}",)
-    return load_preset(options.preset, options.config, settings)
+def preset_of(options: Namespace, method: Method | None = None, *settings: str) -> Preset:
+    """The preset with what a method changes, and then the user."""
+    changed = [*(method.settings if method else ()), *options.settings, *settings]
+    if getattr(options, "pixels", None) is not None:
+        changed.append(f"tracking.{method.tracker}.n_pixels={options.pixels}")
+    return load_preset(options.preset, options.config, changed)
 
 
 def _checked_scene(options: Namespace, preset: Preset, *slices: str) -> Scene:
@@ -197,21 +205,21 @@ def _checked_scene(options: Namespace, preset: Preset, *slices: str) -> Scene:
     return scene
 
 
-def _field_and_map(options: Namespace) -> tuple[str, Map | None]:
-    """What to track in: a field to be mapped, or a given map, which knows its own."""
-    if options.map_from is None:
-        if options.field is None:
-            raise ConfigError("track needs --field, or --map-from with a map that knows its own")
-        return options.field, None
-    if options.map_frames is not None or options.correct is not None:
-        raise ConfigError("--map-from names a map that is made: leave --map-frames, --correct out")
-    given = read_map(options.map_from)
-    if options.field not in (None, given.field.name):
+def _method_in(given: Map | None, options: Namespace) -> Method:
+    """What to track with: as named, or what suits a given map, which knows its own field."""
+    name, field, tracker = options.method, options.field, options.tracker
+    if given is None:
+        return method_of(name, field, tracker)
+    if options.map_frames is not None:
+        raise ConfigError("--map-from names a map that is made: leave --map-frames out")
+    own = given.field.name
+    method = method_of(name, field or (None if name else own), tracker)
+    if method.field != own:
         raise ConfigError(
-            f"{options.map_from} is a map of field {given.field.name!r}, not {options.field!r}: "
-            "leave --field out"
+            f"{options.map_from} is a map of field {own!r}, not {method.field!r}: "
+            f"leave --{'method' if name else 'field'} out"
         )
-    return given.field.name, given
+    return method
 
 
 def _with_network_of(given: Map, preset: Preset, options: Namespace) -> Preset:

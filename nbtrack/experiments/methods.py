@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from nbtrack.core.errors import ConfigError, nearest_name
-from nbtrack.tracking import check_pair, paper_steps, tracker_class
+from nbtrack.fields import field_class
+from nbtrack.tracking import TRACKERS, check_pair, paper_steps, tracker_class
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,14 @@ class Method:
     def paper_steps(self, rate_hz: float | int) -> float:
         """Steps a frame on the paper's hardware: of VR for what renders, else of SDF."""
         return paper_steps("vr" if tracker_class(self.tracker).renders else "sdf", rate_hz)
+
+    @property
+    def usual_steps(self) -> float:
+        """Steps a frame where nobody says how many: up to 30 of a tracker that ends by itself.
+
+        The paper's trackers do not; they take the steps of its slowest rate, 2 Hz.
+        """
+        return 30 if tracker_class(self.tracker).converges else self.paper_steps(2)
 
 
 _COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
@@ -58,6 +67,8 @@ METHODS = {
 }
 """By name. A method of your own joins by `METHODS["mine"] = Method(...)`."""
 
+DEFAULT_METHOD = "corrected"
+"""What the command line takes where nothing is named: the most accurate, and fast."""
 TABLE_1 = ("vr", "sdf")
 """The rows of the paper's Table I."""
 TABLE_3 = (
@@ -67,6 +78,27 @@ TABLE_3 = (
 """The paper's methods beside those that go beyond it."""
 RATES_3_HZ = (30.0, 10.0, 5.0, 2.0)
 """The rates of Table III: the paper's, and that of the camera itself."""
+
+
+def method_of(name: str | None, field: str | None, tracker: str | None) -> Method:
+    """A row of `METHODS` by its name, or a free combination of a field and a tracker.
+
+    A field alone takes the first of lm, icp and vr that works in it, a tracker alone the field of
+    the first row with it; without anything it is `DEFAULT_METHOD`. Raises ConfigError for a name
+    beside the others, and as `find_methods` does.
+    """
+    if name and (field or tracker):
+        raise ConfigError("--method names a field and a tracker: leave --field and --tracker out")
+    if field is None and tracker is None:
+        return find_methods([name or DEFAULT_METHOD])[0]
+    if tracker is None:
+        kind = field_class(field)
+        tracker = next(t for t in ("lm", "icp", "vr") if TRACKERS[t].works_in(kind))
+    if field is None:
+        tracker_class(tracker)
+        rows = [row.field for row in METHODS.values() if row.tracker == tracker]
+        field = rows[0] if rows else "neus"
+    return find_methods([Method(f"{field_class(field).label} with {tracker}", field, tracker)])[0]
 
 
 def find_methods(methods: Sequence[str | Method]) -> list[Method]:

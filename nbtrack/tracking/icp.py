@@ -42,6 +42,7 @@ class IcpTracker(Tracker):
     name = "icp"
     package = "small_gicp"
     Settings = IcpSettings
+    converges = True
     copes_without_depth = True
 
     def __init__(self, field: PointCloud, *arguments: Any, **settings: Any) -> None:

@@ -47,6 +47,7 @@ class LmTracker(Tracker):
 
     name = "lm"
     Settings = LmSettings
+    converges = True
     copes_without_depth = True
     remembers = ("last_good", "was_lost")
     last_good: Transform | None = None  # of the latest frame not taken for lost

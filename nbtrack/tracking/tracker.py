@@ -76,6 +76,7 @@ class Tracker(abc.ABC):
     Settings: type[TrackerSettings] = TrackerSettings
     renders: bool = False  # whether it renders the field, rather than asking it for distances
     package: str | None = None  # what it needs beside this project's own requirements
+    converges: bool = False  # whether it ends a frame by itself, before its budget is spent
     copes_without_depth: bool = False  # whether it is shown frames without any measured depth
     remembers: tuple[str, ...] = ()  # attributes that one frame leaves to the next
     is_converged: bool = False  # whether further steps would change nothing: the rest is spared
