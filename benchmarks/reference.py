@@ -91,7 +91,8 @@ def tracked_path(method, sequence, preset):
         made = correct_map(made, sequence, settings)
     how = sequence.T_world_camera[0], StepBudget(30), changed.tracking_of(method.tracker)
     found = track_sequence(make_tracker(method.tracker, made.field, *how), sequence)
-    return replace(sequence, T_world_camera=found.T_estimated)
+    given = sequence.T_world_camera[:1]
+    return replace(sequence, T_world_camera=np.concatenate([given, found.T_estimated]))
 
 
 def apart(path, other, aligned: bool = False) -> float:

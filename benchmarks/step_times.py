@@ -42,7 +42,9 @@ def noise(n_frames: int) -> RgbdSequence:
     depths_mm = rng.integers(1950, 2050, size).astype(np.uint16)
     poses = np.tile(np.eye(4), (n_frames, 1, 1))
     camera = Intrinsics.from_focal(WIDTH, HEIGHT, float(HEIGHT))
-    return RgbdSequence("wall", camera, colors, depths_mm, poses, np.arange(n_frames))
+    return RgbdSequence(
+        "wall", camera, colors, depths_mm, poses, np.arange(n_frames), np.arange(n_frames)
+    )
 
 
 SEQUENCE = noise(20)

@@ -79,7 +79,7 @@ def sequence_of(
     colors = np.full((n, *size, 3), 128, np.uint8) if colors is None else colors
     poses = np.tile(np.eye(4), (n, 1, 1)) if poses is None else poses
     depths_mm = depths_mm.round().astype(np.uint16)
-    return RgbdSequence(name, camera, colors, depths_mm, poses, np.arange(n))
+    return RgbdSequence(name, camera, colors, depths_mm, poses, np.arange(n), np.arange(n) / 30)
 
 
 def box_sequence(places, room: BoxRoom | None = None, height: int = 24) -> RgbdSequence:

@@ -39,8 +39,8 @@ def test_track_writes_what_it_promises(tmp_path: Path, capsys: pytest.CaptureFix
     error = np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=1)
     assert np.sqrt((error**2).mean()) == pytest.approx(metrics["ate_rmse_m"])
     rows = (out / "frames.csv").read_text().splitlines()
-    assert rows[0].startswith("frame_id,steps,seconds,loss,translation_error_m")
-    assert len(rows) == 7
+    assert rows[0].startswith("frame_id,time,steps,seconds,loss,translation_error_m")
+    assert len(rows) == 6
 
 
 def test_a_second_run_finds_the_map(capsys: pytest.CaptureFixture, tmp_path: Path) -> None:

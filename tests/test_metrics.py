@@ -13,6 +13,7 @@ from nbtrack.tracking.metrics import (
     align_rigidly,
     pose_errors,
     score_detection,
+    still_metrics,
     trajectory_metrics,
 )
 from nbtrack.tracking.trajectories import read_tum, tum_text
@@ -34,15 +35,15 @@ def wandering(frames: int, seed: int = 0) -> np.ndarray:
 
 
 def test_values_by_hand() -> None:
-    """Catches a wrong mean, a counted first frame, a shifted threshold; radians for degrees, half
-    angles, and transposed rotations that add instead."""
-    true = poses([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
+    """Catches a wrong mean, a frame without reference that counts, a shifted threshold; radians for
+    degrees, half angles, and transposed rotations that add instead."""
+    true = poses([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]])
     true[:, :3, :3] = Rotation.from_euler("x", 50, degrees=True).as_matrix()
-    # The first row is wrong on purpose: it was given, so it must not count.
-    estimated = poses([[9, 9, 9], [1, 0.1, 0], [2, 0, 0.2], [3, 0.4, 0]])
-    turned = Rotation.from_euler("x", [[90], [53], [46], [50]], degrees=True)
+    estimated = poses([[1, 0.1, 0], [2, 0, 0.2], [3, 0.4, 0], [9, 9, 9]])
+    turned = Rotation.from_euler("x", [[53], [46], [50], [90]], degrees=True)
     estimated[:, :3, :3] = turned.as_matrix()
-    np.testing.assert_allclose(pose_errors(estimated, true)[1], [40, 3, 4, 0], atol=1e-9)
+    np.testing.assert_allclose(pose_errors(estimated, true)[1], [3, 4, 0, 40], atol=1e-9)
+    true[3] = np.nan
     metrics = trajectory_metrics(estimated, true)
     assert metrics.pop("ate_rmse_aligned_m") < metrics["ate_rmse_m"]
     assert metrics == {
@@ -50,9 +51,21 @@ def test_values_by_hand() -> None:
         "rotation_rmse_deg": pytest.approx(np.sqrt(25 / 3)),
         "median_error_m": pytest.approx(0.2),
         "max_error_m": pytest.approx(0.4),
-        "frames": 3,
+        "frames": 4,
+        "frames_without_reference": 1,
         "lost_frames": 1,  # 0.2 is not above 0.2
     }
+    nothing_known = {"frames": 4, "frames_without_reference": 4}
+    assert trajectory_metrics(estimated, np.full_like(true, np.nan)) == nothing_known
+
+
+def test_standing_still_by_hand() -> None:
+    """Catches a baseline that counts the first frame, or a path over frames that are not known."""
+    true = poses([[1, 0, 0], [1, 3, 0], [0, 0, 0], [1, 3, 4]])
+    true[2] = np.nan
+    # Distances from the first pose: 3 and 5. Steps: 3 and 4.
+    assert still_metrics(true) == {"still_ate_m": pytest.approx(np.sqrt(17)), "path_m": 7.0}
+    assert still_metrics(true[:1]) == {}
 
 
 @pytest.mark.parametrize("true", [wandering(20), poses([[1, 2, 3]] * 5), poses([[1, 2, 3]] * 2)])
@@ -63,7 +76,7 @@ def test_an_offset_counts_unless_aligned(true: np.ndarray) -> None:
     metrics = trajectory_metrics(estimated, true)
     assert metrics["ate_rmse_m"] == pytest.approx(1.3)
     assert metrics["ate_rmse_aligned_m"] == pytest.approx(0, abs=1e-12)
-    assert metrics["lost_frames"] == len(true) - 1
+    assert metrics["lost_frames"] == len(true)
 
 
 def test_aligned_error_ignores_rigid_motion_alone() -> None:
@@ -87,10 +100,10 @@ def test_poses_that_cannot_be_compared(position: int) -> None:
     pair = [wandering(6), wandering(6)]
     pair[position][4, 0, 3] = np.nan
     with pytest.raises(NumericalError, match="pose of frame 4 is not finite"):
-        trajectory_metrics(*pair)
+        pose_errors(*pair)
     for n_estimated, n_true in ((1, 6), (0, 0)):
         with pytest.raises(DataError, match=f"{n_estimated} estimated and {n_true} true"):
-            trajectory_metrics(pair[0][:n_estimated], pair[1][:n_true])
+            pose_errors(pair[0][:n_estimated], pair[1][:n_true])
 
 
 def test_detection_of_lost_frames() -> None:
@@ -105,9 +118,9 @@ def test_detection_of_lost_frames() -> None:
 def test_tum_round_trip(tmp_path: Path) -> None:
     """Catches digits cut off, an inverted pose, a wrong quaternion order; and blanks too many and
     negative zeros, which strict readers refuse or show."""
-    true, frame_ids = wandering(50, seed=7), np.arange(3, 153, 3)
+    true, times = wandering(50, seed=7), 1305031102.175304 + np.arange(50) / 30
     true[0] = np.diag([1.0, -1, -1, 1])
-    text = tum_text(frame_ids, true)
+    text = tum_text(times, true)
     for line in text.splitlines()[1:]:
         assert line == " ".join(line.split())
         assert "-0.0 " not in line
@@ -115,13 +128,13 @@ def test_tum_round_trip(tmp_path: Path) -> None:
     write_atomic(tmp_path / "new" / "t.txt", text)
     timestamps, read = read_tum(tmp_path / "new" / "t.txt")
     np.testing.assert_allclose(read, true, atol=1e-12, rtol=0)
-    np.testing.assert_array_equal(timestamps, frame_ids / 30)
+    np.testing.assert_array_equal(timestamps, times)
 
 
 def test_a_rotation_by_hand() -> None:
     """Catches w x y z order: a quarter turn about z has z = w = sqrt(1/2)."""
     pose = np.array([[0.0, -1, 0, 1.5], [1, 0, 0, -2], [0, 0, 1, 0.25], [0, 0, 0, 1]])
-    header, line, end = tum_text(np.array([15]), pose[None]).split("\n")
+    header, line, end = tum_text(np.array([0.5]), pose[None]).split("\n")
     assert (header, end) == ("# timestamp tx ty tz qx qy qz qw", "")
     assert line.startswith("0.5 1.5 -2.0 0.25 0.0 0.0 0.7071067811865")
     expected = [0.5, 1.5, -2, 0.25, 0, 0, np.sqrt(0.5), np.sqrt(0.5)]

@@ -44,8 +44,8 @@ IMAP = pd.DataFrame({"depth": FALLING, "color": FALLING, "total": FALLING, "devi
 HISTORIES = {"iMAP": IMAP, "NeuS": IMAP.copy()}
 HISTORIES["NeuS"].insert(2, "eikonal", FALLING)
 FRAMES = pd.DataFrame({
-    "frame_id": [30, 33, 36], "translation_error_m": [0.0, 0.01, 0.3],
-    "rotation_error_deg": [0.0, 0.1, 0.2],
+    "frame_id": [33, 36], "time": [1.1, 1.2], "translation_error_m": [0.01, 0.3],
+    "rotation_error_deg": [0.1, 0.2],
 })  # fmt: skip
 
 
@@ -59,7 +59,8 @@ def sequence() -> RgbdSequence:
     T_world_camera = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (n, 1, 1))  # upright, y is up
     T_world_camera[:, 0, 3] = 0.01 * np.arange(n)
     intrinsics = Intrinsics.from_focal(width, height, 12.0)
-    return RgbdSequence("six", intrinsics, colors, depths_mm, T_world_camera, np.arange(n) + 30)
+    ids = np.arange(n) + 30
+    return RgbdSequence("six", intrinsics, colors, depths_mm, T_world_camera, ids, ids / 30)
 
 
 def room_mesh() -> trimesh.Trimesh:
@@ -267,10 +268,10 @@ def test_losses_show_the_terms_and_no_diagnostics() -> None:
     assert depth.lines[5].get_ydata()[2] == 4.0
 
 
-def test_errors_run_in_seconds_without_the_given_frame() -> None:
-    """Catches frame numbers taken for seconds, metres for centimetres, and a counted first row."""
+def test_errors_run_in_seconds() -> None:
+    """Catches frame numbers taken for seconds, and metres for centimetres."""
     line = FIGURES["errors"](None).axes[0].lines[0]
-    assert line.get_xdata() == pytest.approx([1.1, 1.2])
+    assert line.get_xdata() == pytest.approx([0.0, 0.1])
     assert line.get_ydata() == pytest.approx([1.0, 30.0])
 
 

@@ -69,7 +69,7 @@ def test_table_1_is_complete_cached_and_repeatable(
     assert set(cells["method"]) == {"iMAP with VR", "NeuS with SDF"}
     run = read_run(cells["run"][0])
     assert run.T_estimated.shape == run.T_true.shape == (4, 4, 4)
-    assert len(run.frames) == 5
+    assert len(run.frames) == 4
     with monkeypatch.context() as patch:
         for name in ("cells.map_sequence", "runs.track_sequence"):
             patch.delattr(f"nbtrack.experiments.{name}")

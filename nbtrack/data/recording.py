@@ -12,7 +12,9 @@ from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import DataError, MissingError
 from nbtrack.data.formats import DECLARATION_FILE, FORMATS, Declaration, Format, declaration
 from nbtrack.data.pairs import check_paired, listed_pairs, numbered_files, numbers_of, posed_by_time
-from nbtrack.data.text_files import Calibration, Times, read_calibration, read_poses
+from nbtrack.data.text_files import Calibration, Times, read_calibration, read_poses, read_rows
+
+TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +29,7 @@ class Recording:
     depth_files: list[Path]
     times: Times  # of the frames, as recorded, or by their numbers and the rate declared
     file_poses: Poses  # as `declared` says; NaN without a pose
-    pose_file: Path  # named in messages; with `*` where every frame has a file
+    pose_file: Path | None  # named in messages; with `*` where every frame has a file
     calibration: Calibration  # of the depth images, and of the colour that lies on them
     text_files: list[Path]  # everything read beside the images
     notes: list[str]  # what was assumed, and left out
@@ -47,9 +49,9 @@ class Recording:
 
     @property
     def rate_hz(self) -> float:
-        """Frames a second; as declared where the frames have neither times nor numbers."""
-        step = np.median(np.diff(self.times)) if len(self.times) > 1 else 0.0
-        return float(1 / step if step > 0 else self.declared.frame_rate)
+        """Frames a second, in the median; as declared for a single one."""
+        steps = np.diff(self.times)
+        return float(1 / np.median(steps)) if len(steps) else self.declared.frame_rate
 
     def contents(self) -> tuple[list[tuple[str, str, int, int]], list[str], Declaration]:
         """What changes when a recording does: texts, the declaration, and of every image its name,
@@ -75,24 +77,60 @@ def open_recording(
     """
     folder = Path(folder)
     declared = declaration(folder, format)
-    layout, lists, left_out = FORMATS[declared.format], [], ""
+    layout = FORMATS[declared.format]
+    colors, depths, times, lists, left_out = _images(folder, declared, depth_folder)
+    poses, path, pose_files, chosen = _poses(folder, declared, pose_file, colors, times)
+    camera, notes = _calibration(folder, layout), [left_out, chosen]
+    if not camera.source.is_file():
+        notes.append(f"{camera.source.name}, {camera.fx:g} px at 640x480: no {layout.cameras[0]}")
+    texts = [*lists, *pose_files, camera.source, folder / DECLARATION_FILE, folder / TIMES_FILE]
+    return Recording(
+        folder=folder,
+        name=folder.resolve().name,
+        format=layout,
+        declared=declared,
+        color_files=colors,
+        depth_files=depths,
+        times=times,
+        file_poses=poses,
+        pose_file=path,
+        calibration=camera,
+        text_files=[text for text in texts if text.is_file()],
+        notes=[note for note in notes if note],
+    )
+
+
+def _images(
+    folder: Path, declared: Declaration, depth_folder: str | None
+) -> tuple[list[Path], list[Path], Times, list[Path], str]:
+    """Colours and depths in pairs, their times, the lists that name them, and who is left out."""
+    layout = FORMATS[declared.format]
     if layout.color[0].endswith(".txt"):
         names = (layout.color, layout.depth)
         lists = [_first_there(folder, name, "images", layout) for name in names]
         colors, depths, times, left_out = listed_pairs(*lists)
-    else:
-        places = [(depth_folder or Path(p).parent, Path(p).name) for p in layout.depth]
-        colors = numbered_files([folder / pattern for pattern in layout.color])
-        depths = numbered_files([folder / place / name for place, name in places])
-        check_paired(colors, depths)
-        times = (numbers_of(colors) - numbers_of(colors[:1])) / declared.frame_rate
-    poses, path, pose_files, chosen = _poses(folder, declared, pose_file, colors, times)
-    camera, what = _calibration(folder, layout), (folder.resolve().name, layout, declared)
-    texts = [*lists, *pose_files, camera.source, folder / DECLARATION_FILE]
-    texts = [text for text in texts if text.is_file()]
-    assumed = f"{camera.source.name}, {camera.fx:g} px at 640x480: no {layout.cameras[0]}"
-    notes = [*filter(None, [left_out, chosen]), *[assumed] * (not camera.source.is_file())]
-    return Recording(folder, *what, colors, depths, times, poses, path, camera, texts, notes)
+        return colors, depths, times, lists, left_out
+    places = [(depth_folder or Path(p).parent, Path(p).name) for p in layout.depth]
+    colors = numbered_files([folder / pattern for pattern in layout.color])
+    depths = numbered_files([folder / place / name for place, name in places])
+    check_paired(colors, depths)
+    return colors, depths, _times(folder, colors, declared.frame_rate), [], ""
+
+
+def _times(folder: Path, colors: list[Path], rate_hz: float) -> Times:
+    """Of frames that no list of files times: from a file, else by the numbers in their names."""
+    path, numbers = folder / TIMES_FILE, numbers_of(colors)
+    if not path.is_file():
+        is_counted = (np.diff(numbers) > 0).all()
+        return (numbers - numbers[0] if is_counted else np.arange(len(colors))) / rate_hz
+    rows = read_rows(path, lambda line: [float(line)], (1,), "the time (s) of a frame")
+    times = np.array(rows).ravel()
+    if len(times) != len(colors) or not (np.diff(times) > 0).all():
+        raise DataError(
+            f"{path} has {len(times)} times for {len(colors)} images: write one a line (s), in "
+            "rising order, or remove it"
+        )
+    return times
 
 
 def _first_there(folder: Path, names: tuple[str, ...], what: str, layout: Format) -> Path:
@@ -116,8 +154,11 @@ def _calibration(folder: Path, layout: Format) -> Calibration:
 
 def _poses(
     folder: Path, declared: Declaration, pose_file: str | None, colors: list[Path], times: Times
-) -> tuple[Poses, Path, list[Path], str]:
-    """A pose a frame, the files that they were read from, by one name and all, and how chosen."""
+) -> tuple[Poses, Path | None, list[Path], str]:
+    """A pose a frame, the files that they were read from, by one name and all, and how chosen.
+
+    Without a file all poses are NaN.
+    """
     layout = FORMATS[declared.format]
     names = (pose_file,) if pose_file else layout.poses
     files = [folder / name for name in names if (folder / name).is_file()]
@@ -130,18 +171,14 @@ def _poses(
         path, files = patterns[0], numbered_files(patterns, (".txt",))
         check_paired(colors, files)
     else:
+        if not files and not pose_file:
+            return np.full((len(colors), 4, 4), np.nan), None, [], "no poses"
         path = _first_there(folder, names, "poses", layout)
         files = [path]
     found = [read_poses(file, declared.quaternion) for file in files]
-    poses, pose_times, chosen = np.concatenate([T for T, _ in found]), found[0][1], ""
-    if pose_times is not None and layout.color[0].endswith(".txt"):
-        poses = posed_by_time(times, poses, pose_times, path)
-    elif pose_times is not None and len(poses) != len(colors):
-        # nbtrack's own trajectories leave frames out.
-        placed = posed_by_time(times, poses, pose_times, path, tolerance=1e-3)
-        # Unless all poses find a frame the times are something else.
-        if np.isfinite(placed).sum() == np.isfinite(poses).sum():
-            poses = placed
+    poses, chosen = np.concatenate([T for T, _ in found]), ""
+    if (pose_times := found[0][1]) is not None:
+        poses = _placed(poses, pose_times, times, path, layout.color[0].endswith(".txt"))
     numbers = numbers_of(colors)
     if len(poses) > len(colors) and 0 <= numbers.min() <= numbers.max() < len(poses):
         chosen = f"of {len(poses)} poses in {path.name} those of the {len(colors)} images' numbers"
@@ -152,3 +189,17 @@ def _poses(
             "one; write 'nan' for each number of a frame without a pose"
         )
     return poses, path, files, chosen
+
+
+def _placed(poses: Poses, pose_times: Times, times: Times, path: Path, is_by_time: bool) -> Poses:
+    """The pose of every frame, in formats by time; else as they stand, one a frame.
+
+    nbtrack's own trajectories leave frames out, and are placed by time in any format.
+    """
+    if is_by_time:
+        return posed_by_time(times, poses, pose_times, path)
+    if len(poses) == len(times):
+        return poses
+    placed = posed_by_time(times, poses, pose_times, path, tolerance=1e-3)
+    # Unless all poses find a frame the times are something else.
+    return placed if np.isfinite(placed).sum() == np.isfinite(poses).sum() else poses

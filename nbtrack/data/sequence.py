@@ -13,12 +13,11 @@ from jaxtyping import Float, Int, UInt8, UInt16
 from nbtrack.core.arrays import Poses
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError
+from nbtrack.core.errors import DataError, MissingError
 from nbtrack.data.frame import MILLIMETRE, Frame
 from nbtrack.data.images import decode
 from nbtrack.data.recording import Recording, open_recording
 
-FRAMES_PER_SECOND = 30.0  # of the recordings; turns frame ids into time stamps
 # Of bounds (our choice): pixels looked at in each frame, on a regular grid, and the share of points
 # cut off at either end of each axis, so that a few wild depths do not stretch the box.
 _POINTS_PER_FRAME, _CUT_OFF = 2000, 0.002
@@ -36,8 +35,9 @@ class RgbdSequence:
     intrinsics: Intrinsics
     colors: UInt8[np.ndarray, "frames height width 3"]  # RGB
     depths_mm: UInt16[np.ndarray, "frames height width"]  # z-depth, 0 = no measurement
-    T_world_camera: Poses  # OpenCV camera axes
+    T_world_camera: Poses  # OpenCV camera axes; NaN where not known
     frame_ids: Int[np.ndarray, "frames"]  # position in the folder's natural order
+    times: Float[np.ndarray, "frames"]  # s, the recording's own, or by its numbers and rate
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -50,8 +50,9 @@ class RgbdSequence:
         """One frame, with the pose that it was recorded with."""
         color = torch.from_numpy(self.colors[index])
         depth_mm = torch.from_numpy(self.depths_mm[index].astype(np.int32))
-        name = f"frame {self.frame_ids[index]} of {self.name}"
-        return Frame(self.intrinsics, color, depth_mm, self.T_world_camera[index], name)
+        name, pose = f"frame {self.frame_ids[index]} of {self.name}", self.T_world_camera[index]
+        known = pose if np.isfinite(pose).all() else None
+        return Frame(self.intrinsics, color, depth_mm, known, name)
 
     def color(self, index: int) -> Float[np.ndarray, "height width 3"]:
         """Colour image in [0, 1]."""
@@ -71,7 +72,7 @@ class RgbdSequence:
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
         """The sequence of some of the frames, in the order given; slices copy nothing."""
-        arrays = ("colors", "depths_mm", "T_world_camera", "frame_ids")
+        arrays = ("colors", "depths_mm", "T_world_camera", "frame_ids", "times")
         return replace(self, **{name: getattr(self, name)[indices] for name in arrays})
 
 
@@ -106,25 +107,38 @@ def read_sequence(
 
 
 def read_frames(
-    recording: Recording, frames: slice = slice(None), progress: bool = False
+    recording: Recording,
+    frames: slice = slice(None),
+    progress: bool = False,
+    needs_poses: bool = True,
 ) -> RgbdSequence:
-    """The frames of an opened recording that a slice selects and that have a pose.
+    """The frames of an opened recording that a slice selects and, where needed, that have a pose.
 
-    Raises MissingError or DataError if an image cannot be read, or no selected frame has a pose.
+    Raises MissingError or DataError if an image cannot be read, or no frame is left.
     """
-    frame_ids = select_frames(recording, frames)
-    known = frame_ids[recording.has_pose[frame_ids]]
-    images = decode(recording, known, progress)
-    return RgbdSequence(recording.name, *images, recording.T_world_camera[known], known)
+    frame_ids = select_frames(recording, frames, needs_poses)
+    if needs_poses:
+        frame_ids = frame_ids[recording.has_pose[frame_ids]]
+    images = decode(recording, frame_ids, progress)
+    poses, times = recording.T_world_camera[frame_ids], recording.times[frame_ids]
+    return RgbdSequence(recording.name, *images, poses, frame_ids, times)
 
 
-def select_frames(recording: Recording, frames: slice) -> Int[np.ndarray, "n"]:
-    """Numbers of the selected frames. Raises DataError if none of them has a pose."""
+def select_frames(
+    recording: Recording, frames: slice, needs_poses: bool = True
+) -> Int[np.ndarray, "n"]:
+    """Numbers of the selected frames. Raises DataError if there is none, or none with a pose."""
     frame_ids = np.arange(len(recording))[frames]
-    if not recording.has_pose[frame_ids].any():
+    if not (recording.has_pose[frame_ids].any() if needs_poses else len(frame_ids)):
         parts = (frames.start, frames.stop, frames.step)
         text = ":".join("" if part is None else str(part) for part in parts)
         n_frames, file = len(recording), recording.pose_file
+        if file is None:
+            needed = " or ".join(recording.format.poses)
+            raise MissingError(
+                f"no poses in {recording.folder}: {recording.format.label} needs {needed}; add it, "
+                "or track in a map of the same place with --map-from"
+            )
         raise DataError(
             f"frames {text} select {len(frame_ids)} of the {n_frames} frames in {recording.folder},"
             f" but no pose in {file} that is not NaN: choose others of 0:{n_frames}, or other poses"

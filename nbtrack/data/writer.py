@@ -15,7 +15,7 @@ from nbtrack.core.errors import DataError
 from nbtrack.core.progress import ProgressBar
 from nbtrack.data.formats import FORMATS
 from nbtrack.data.images import decode
-from nbtrack.data.recording import Recording
+from nbtrack.data.recording import TIMES_FILE, Recording
 from nbtrack.data.sequence import select_frames
 from nbtrack.data.text_files import camera_matrix
 
@@ -103,7 +103,8 @@ def convert_sequence(
     numbers = select_frames(recording, frames)
     camera, _, _ = decode(recording, numbers[:1])
     with ProgressBar("converting", len(numbers), progress) as bar:
-        write_sequence(out, camera, _frames(recording, numbers), progress=bar.move_to)
+        times = {TIMES_FILE: _text(recording.times[numbers, None])}
+        write_sequence(out, camera, _frames(recording, numbers), times, bar.move_to)
     n_lost = int((~recording.has_pose[numbers]).sum())
     lost = f" ({n_lost} without a pose)" if n_lost else ""
     said = f"{out}: {len(numbers)} frames{lost} of {camera.width}x{camera.height}"

@@ -19,7 +19,7 @@ from nbtrack.experiments.grid import run_cells
 from nbtrack.experiments.methods import DEFAULT_METHOD, METHODS, Method, method_of
 from nbtrack.experiments.output import new_file, output_folder
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
-from nbtrack.experiments.runs import METRICS_FILE, OF_MAPS, RUN_FILES, TrackCell
+from nbtrack.experiments.runs import OF_MAPS, RUN_FILES, TrackCell
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.fields import NetworkSettings, PointCloud
 from nbtrack.mapping.files import (
@@ -33,11 +33,12 @@ from nbtrack.mapping.files import (
 from nbtrack.mapping.meshes import extract_mesh
 from nbtrack.tracking import make_budget
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
-from nbtrack.tracking.trajectories import read_tum, write_kitti
+from nbtrack.tracking.trajectories import METRICS_FILE, read_tum, write_kitti
 
 _FORMATS = ["tum", "kitti", "ply", "glb", "map"]
 _PRINTED = (
-    "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
+    "ate_rmse_m", "still_ate_m", "path_m", "ate_rmse_aligned_m", "rotation_rmse_deg",
+    "max_error_m", "frames",
     "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
 )  # fmt: skip
 _MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
@@ -103,8 +104,11 @@ def track_command(options: Namespace) -> None:
         run = replace(run, out=run.folder)  # made anew, whatever the cache holds
         (metrics,) = run_cells([run], f"tracking {scene.name}")
     print(f"{run.folder}: {method.tracker} in {cell.map().field.label}, {budget}")
-    _print_numbers({name: metrics[name] for name in _PRINTED})
-    print(f"  frames off by more than {LOST_THRESHOLD_M:g} m: {metrics['lost_frames']}")
+    _print_numbers({name: metrics[name] for name in _PRINTED if name in metrics})
+    if "lost_frames" in metrics:
+        print(f"  frames off by more than {LOST_THRESHOLD_M:g} m: {metrics['lost_frames']}")
+    else:
+        print("  no true pose is known after the first frame: errors cannot be told")
     if "flagged_frames" in metrics:
         print(f"  frames that the tracker itself calls lost: {metrics['flagged_frames']}")
     if metrics["frames_without_depth"]:

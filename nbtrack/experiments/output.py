@@ -9,8 +9,8 @@ from filelock import FileLock, Timeout
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.formats import holds_recording
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE
+from nbtrack.tracking.trajectories import METRICS_FILE
 
-METRICS_FILE = "metrics.json"  # of a finished run
 LOCK_FILE = ".nbtrack.lock"
 """It stays in every folder that was given with --out, and tells that nbtrack wrote there."""
 

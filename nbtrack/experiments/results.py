@@ -1,28 +1,26 @@
 """Maps and tracked runs of scenes, from the cache or made now, as DataFrames."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
-from jaxtyping import Float
 
-from nbtrack.core.errors import MissingError, NbtrackError
-from nbtrack.core.files import read_json, runs_folder
+from nbtrack.core.errors import NbtrackError
+from nbtrack.core.files import runs_folder
 from nbtrack.core.progress import tell
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import Execution, run_cells
 from nbtrack.experiments.methods import Method, find_methods
 from nbtrack.experiments.presets import Preset
-from nbtrack.experiments.runs import METRICS_FILE, TrackCell
+from nbtrack.experiments.runs import TrackCell
 from nbtrack.experiments.scenes import Scene
 from nbtrack.mapping.files import Map
-from nbtrack.tracking.trajectories import read_tum
+from nbtrack.tracking.trajectories import Trajectory, read_trajectory
 
 
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0, frames: str = ":") -> Map:
@@ -117,25 +115,6 @@ def _told(
     return {**metrics, **row, "ate_m": result["ate_rmse_m"]}
 
 
-@dataclass(frozen=True)
-class Run:
-    """A finished run, as it is kept."""
-
-    # Camera to world, OpenCV axes; of the tracked frames, without the given first one.
-    T_estimated: Float[np.ndarray, "frames 4 4"]
-    T_true: Float[np.ndarray, "frames 4 4"]
-    frames: pd.DataFrame  # steps, seconds, loss and errors of each frame, the first included
-    metrics: dict[str, Any]
-
-
-def read_run(name: str | Path) -> Run:
+def read_run(name: str | Path) -> Trajectory:
     """A run by its name in the column `run`, or by its folder; MissingError if there is none."""
-    folder = Path(name) if Path(name).is_dir() else runs_folder() / "tracks" / name
-    if not (folder / METRICS_FILE).is_file():
-        raise MissingError(f"no finished run {name}: give a name in column `run`, or a folder")
-    return Run(
-        read_tum(folder / "trajectory.txt")[1],
-        read_tum(folder / "groundtruth.txt")[1],
-        pd.read_csv(folder / "frames.csv"),
-        read_json(folder / METRICS_FILE),
-    )
+    return read_trajectory(Path(name) if Path(name).is_dir() else runs_folder() / "tracks" / name)

@@ -4,6 +4,7 @@ import shlex
 import time
 from dataclasses import dataclass
 from functools import cached_property
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,14 @@ from nbtrack.core import files
 from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.settings import as_dict, changed_settings
 from nbtrack.experiments.cells import Cell, MapCell, Report
-from nbtrack.experiments.output import METRICS_FILE
 from nbtrack.experiments.presets import PRESETS
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
 from nbtrack.fields.grid import BakedField
 from nbtrack.mapping.quality import check_belongs
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
-from nbtrack.tracking.metrics import score_detection, trajectory_metrics
-from nbtrack.tracking.trajectories import tum_text
+from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
+from nbtrack.tracking.trajectories import METRICS_FILE, tum_text
 
 RUN_FILE = "run.pt"
 RUN_FILES = ("trajectory.txt", "groundtruth.txt", "frames.csv", METRICS_FILE)
@@ -87,21 +87,24 @@ class TrackCell(Cell):
         """Track, or take a killed run up where its last checkpoint stands; write the files.
 
         `trajectory.txt` and `groundtruth.txt` (TUM) hold the tracked frames, without the first
-        one, whose pose was given: so public tools report the error of the paper's formula. Raises
-        DataError where a given map does not fit the first frame at its given pose.
+        one, whose pose was given: so public tools report the error of the paper's formula. Where no
+        true pose is known there is no `groundtruth.txt`. Raises DataError where a given map does
+        not fit the first frame at its given pose.
         """
         with threads(self.n_threads or torch.get_num_threads()):
             tracked, notes = self._tracked(report)
             metrics = self._metrics(tracked) | notes
-        ids = tracked.frames["frame_id"].to_numpy()[1:]
-        # The metrics come last: where they stand, the run is complete.
-        texts = (
-            tum_text(ids, tracked.T_estimated[1:]),
-            tum_text(ids, tracked.T_true[1:]),
-            tracked.frames.to_csv(index=False),
-            files.json_text(metrics),
-        )
-        files.write_together(self.folder, dict(zip(RUN_FILES, texts, strict=True)))
+        times = tracked.frames["time"].to_numpy()
+        texts = {
+            "trajectory.txt": tum_text(times, tracked.T_estimated),
+            "groundtruth.txt": tum_text(times, tracked.T_true),
+            "frames.csv": tracked.frames.to_csv(index=False),
+            METRICS_FILE: files.json_text(metrics),
+        }
+        if "ate_rmse_m" not in metrics:
+            del texts["groundtruth.txt"]
+            (self.folder / "groundtruth.txt").unlink(missing_ok=True)
+        files.write_together(self.folder, texts)
         self._checkpoint.unlink(missing_ok=True)
         return metrics
 
@@ -111,9 +114,10 @@ class TrackCell(Cell):
 
     def _tracked(self, report: Report) -> tuple[Trajectory, dict[str, Any]]:
         """The trajectory, and what is to be said of the run beside its errors."""
-        made, sequence = self.needs.map(), self.scene.read(self.frames)
+        made, sequence = self.needs.map(), self.scene.read(self.frames, needs_poses=False)
         budget = make_budget(self.steps, self.rate_hz)
         notes = {"map_seconds": made.made["seconds"], "budget": str(budget)}
+        notes |= still_metrics(sequence.T_world_camera)
         if self.is_elsewhere:
             notes["map_from"] = made.made
         if self.needs.is_given:  # another path of a room we know may begin where no map reaches
@@ -125,16 +129,18 @@ class TrackCell(Cell):
             notes["grid_bytes"] = tracker.field.n_bytes
 
         def tell(done: int, error_m: float) -> None:
-            report(done / len(sequence), f"off by {100 * error_m:.1f} cm")
+            status = f"frame {done}" if isnan(error_m) else f"off by {100 * error_m:.1f} cm"
+            report(done / len(sequence), status)
 
         return track_sequence(tracker, sequence, self._checkpoint, tell), notes
 
     def _metrics(self, tracked: Trajectory) -> dict[str, Any]:
         metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
-        rows = tracked.frames.iloc[1:]
+        rows = tracked.frames
         if "lost" in rows:
-            flags, errors = rows["lost"].to_numpy(dtype=bool), rows["translation_error_m"]
-            metrics["flagged_frames"] = int(flags.sum())
+            metrics["flagged_frames"] = int(rows["lost"].sum())
+            rated = rows.dropna(subset="translation_error_m")
+            flags, errors = rated["lost"].to_numpy(dtype=bool), rated["translation_error_m"]
             metrics |= score_detection(flags, errors.to_numpy())
         steps, seconds, map_cell = int(rows["steps"].sum()), rows["seconds"], self.needs
         return {

@@ -42,16 +42,13 @@ class Scene:
         """Changes with what is read. A room of the cache is made anew as it was."""
         return self.made_by or fingerprint(*self.recording.contents())
 
-    def read(self, frames: str = ":") -> RgbdSequence:
-        """The frames of a slice such as `10:50:2`. Raises as `read_sequence` does."""
-        return read_frames(self.recording, parse_frames(frames))
+    def read(self, frames: str = ":", needs_poses: bool = True) -> RgbdSequence:
+        """The frames of a slice such as `10:50:2`. Raises as `read_frames` does."""
+        return read_frames(self.recording, parse_frames(frames), needs_poses=needs_poses)
 
-    def count(self, frames: str) -> int:
-        """How many frames a slice selects, those with a NaN pose included.
-
-        Raises DataError if none of them has a pose.
-        """
-        return len(select_frames(self.recording, parse_frames(frames)))
+    def count(self, frames: str, needs_poses: bool = True) -> int:
+        """How many frames a slice selects; raises as `select_frames` does."""
+        return len(select_frames(self.recording, parse_frames(frames), needs_poses))
 
 
 def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) -> Scene:

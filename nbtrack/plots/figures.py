@@ -11,7 +11,7 @@ from matplotlib.image import AxesImage
 
 from nbtrack.core.arrays import Values
 from nbtrack.data.frame import MILLIMETRE
-from nbtrack.data.sequence import FRAMES_PER_SECOND, RgbdSequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import View
 from nbtrack.plots.style import DASHED, WIDTH, log_axes, method_colors, new_axes, styled
 from nbtrack.tables import table_1
@@ -125,13 +125,13 @@ def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figur
 def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """Errors of every frame over time: position (cm, logarithmic) and orientation (degrees).
 
-    `frames` are those of runs by method, as in frames.csv. The first, whose pose was given, is left
-    out. Above the dashed line, 0.2 m, the paper calls the camera lost.
+    `frames` are those of runs by method, as in frames.csv. Above the dashed line, 0.2 m, the paper
+    calls the camera lost.
     """
     above, below = new_axes(title, 4.9, 2, sharex=True)[:, 0]
     for label, color in method_colors(frames).items():
-        tracked = frames[label].iloc[1:]
-        seconds = tracked["frame_id"] / FRAMES_PER_SECOND
+        tracked = frames[label]
+        seconds = tracked["time"] - tracked["time"].iloc[0]
         above.plot(seconds, 100 * tracked["translation_error_m"], color=color, label=label)
         below.plot(seconds, tracked["rotation_error_deg"], color=color)
     above.axhline(100 * LOST_THRESHOLD_M, label="lost above 0.2 m", **DASHED)

@@ -16,13 +16,19 @@ LOST_THRESHOLD_M = 0.2
 
 
 def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | int]:
-    """All errors of one trajectory, from camera-to-world poses (m) of at least two frames.
+    """All errors of one trajectory, from camera-to-world poses (m) of the tracked frames.
 
-    Row 0 is dropped here: its pose was given to the tracker. Source: paper, evaluation protocol
-    (`ate_rmse_m`); the others tell a map that is offset from a tracker that drifts (our choice).
+    Frames whose true pose is not known (NaN) are in none of them; without any known one only their
+    number is told. Source: paper, evaluation protocol (`ate_rmse_m`); the others tell a map that
+    is offset from a tracker that drifts (our choice).
     """
-    errors, angles = (error[1:] for error in pose_errors(T_estimated, T_true))
-    found, true = (np.asarray(poses, np.float64)[1:, :3, 3] for poses in (T_estimated, T_true))
+    is_known = np.isfinite(T_true).all(axis=(1, 2))
+    counts = {"frames": len(T_true), "frames_without_reference": int((~is_known).sum())}
+    if not is_known.any():
+        return counts
+    T_estimated, T_true = T_estimated[is_known], T_true[is_known]
+    errors, angles = pose_errors(T_estimated, T_true)
+    found, true = (np.asarray(poses, np.float64)[:, :3, 3] for poses in (T_estimated, T_true))
     aligned_errors = np.linalg.norm(align_rigidly(found, true) - true, axis=1)
     return {
         "ate_rmse_m": _root_mean_square(errors),  # unaligned: the paper's equation
@@ -30,9 +36,22 @@ def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | i
         "rotation_rmse_deg": _root_mean_square(angles),
         "median_error_m": float(np.median(errors)),
         "max_error_m": float(errors.max()),
-        "frames": len(errors),
+        **counts,
         "lost_frames": int((errors > LOST_THRESHOLD_M).sum()),
     }
+
+
+def still_metrics(T_true: Poses) -> dict[str, float]:
+    """What a camera that stays at the first of some poses (m) scores, and how long their path is.
+
+    No tracker is better than nothing unless its error is well below `still_ate_m`.
+    """
+    positions = T_true[np.isfinite(T_true).all(axis=(1, 2)), :3, 3]
+    if len(positions) < 2:
+        return {}
+    distances = np.linalg.norm(positions[1:] - positions[0], axis=1)
+    path_m = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
+    return {"still_ate_m": _root_mean_square(distances), "path_m": float(path_m)}
 
 
 def score_detection(called_lost: Flags, errors_m: Errors) -> dict[str, float | None]:

@@ -2,35 +2,37 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core import files
 from nbtrack.core.arrays import Poses
 from nbtrack.core.device import advise_on_memory
 from nbtrack.core.errors import DataError, MissingError
-from nbtrack.data.sequence import FRAMES_PER_SECOND, RgbdSequence
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.data.text_files import read_poses
 from nbtrack.tracking.metrics import pose_errors
 from nbtrack.tracking.tracker import Estimate, Tracker
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
+METRICS_FILE = "metrics.json"  # written last: where it stands, a run is complete
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Estimated and true poses of a tracked sequence, the given first frame included."""
+    """The tracked frames of a sequence. A first frame whose pose was given is none of them."""
 
     T_estimated: Poses  # camera to world, OpenCV axes
-    T_true: Poses
-    frames: pd.DataFrame  # a row each: id, steps, seconds, loss, errors, without_depth, report
+    T_true: Poses  # NaN where not known
+    frames: pd.DataFrame  # a row each: id, time, steps, seconds, loss, errors, report
+    metrics: dict[str, Any] = field(default_factory=dict)  # of a run that is finished and kept
 
 
 def track_sequence(
@@ -43,8 +45,8 @@ def track_sequence(
 
     Source: paper, Sec. I-A and the evaluation protocol: every frame is processed, none is dropped.
     A checkpoint of this run is written every few seconds and resumed from; `on_frame` is told the
-    index in the sequence and the translation error (m). Raises DataError if there are fewer than
-    two frames, or none of them has a measured depth.
+    index in the sequence and the translation error (m; NaN where no true pose is known). Raises
+    DataError if there are fewer than two frames, or none of them has a measured depth.
     """
     if len(sequence) < 2:
         raise DataError(f"{sequence!r} is too short to track: give at least two frames")
@@ -53,49 +55,66 @@ def track_sequence(
             f"no frame of {sequence.name} has a measured depth: check the depth folder and its "
             "unit (uint16 millimetres), or choose other --frames"
         )
+    first, rows = 1, []
     tracker.restart(sequence.T_world_camera[0])
-    given = Estimate(sequence.T_world_camera[0], without_depth=not sequence[0].has_depth)
-    rows = [_row(sequence, 0, given)]
     last_saved = time.perf_counter()
     with advise_on_memory(f"tracking.{tracker.name}.n_pixels={tracker.settings.n_pixels}"):
         if checkpoint and checkpoint.exists():
             with files.loaded_checkpoint(checkpoint) as state:
                 tracker.restore(state["tracker"])
                 rows = state["rows"]
-        for index in range(len(rows), len(sequence)):
+        for index in range(first + len(rows), len(sequence)):
             rows.append(_row(sequence, index, tracker.track(sequence[index])))
             if on_frame:
                 on_frame(index, rows[-1]["translation_error_m"])
             if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
                 files.save_checkpoint(checkpoint, {"rows": rows, "tracker": tracker.state()})
                 last_saved = time.perf_counter()
-    return Trajectory(np.stack(tracker.estimates), sequence.T_world_camera, pd.DataFrame(rows))
+    T_estimated = np.stack(tracker.estimates[first:])
+    return Trajectory(T_estimated, sequence.T_world_camera[first:], pd.DataFrame(rows))
+
+
+def read_trajectory(folder: Path) -> Trajectory:
+    """A finished run from its folder; MissingError if there is none."""
+    if not (folder / METRICS_FILE).is_file():
+        raise MissingError(f"no finished run in {folder}: give a folder that `track` wrote")
+    times, T_estimated = read_tum(folder / "trajectory.txt")
+    T_true, truth = np.full_like(T_estimated, np.nan), folder / "groundtruth.txt"
+    if truth.is_file():
+        known, poses = read_tum(truth)
+        T_true[np.searchsorted(times, known)] = poses
+    frames, metrics = pd.read_csv(folder / "frames.csv"), files.read_json(folder / METRICS_FILE)
+    return Trajectory(T_estimated, T_true, frames, metrics)
 
 
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
+    translation_error, rotation_error = [np.nan], [np.nan]
     T_true = sequence.T_world_camera[index : index + 1]
-    (translation_error,), (rotation_error,) = pose_errors(estimate.T_world_camera[None], T_true)
+    if np.isfinite(T_true).all():
+        translation_error, rotation_error = pose_errors(estimate.T_world_camera[None], T_true)
     return {
         "frame_id": int(sequence.frame_ids[index]),
+        "time": float(sequence.times[index]),
         "steps": estimate.steps,
         "seconds": estimate.seconds,
         "loss": estimate.loss,
-        "translation_error_m": float(translation_error),
-        "rotation_error_deg": float(rotation_error),
+        "translation_error_m": float(translation_error[0]),
+        "rotation_error_deg": float(rotation_error[0]),
         "without_depth": estimate.without_depth,
         **estimate.report,
     }
 
 
-def tum_text(frame_ids: Int[np.ndarray, "n"], T_world_camera: Poses) -> str:
-    """Camera-to-world poses (m, OpenCV camera axes) in TUM format, one frame a line, qw >= 0.
+def tum_text(times: Float[np.ndarray, "n"], T_world_camera: Poses) -> str:
+    """Times (s) and camera-to-world poses (m, OpenCV camera axes) in TUM format, qw >= 0.
 
-    Numbers have the digits that restore the same double. The timestamp (s) is the frame's number
-    divided by 30, the recordings' rate, whatever rate tracking ran at. Source: TUM RGB-D benchmark.
+    A line a frame whose pose is known. Numbers have the digits that restore the same double.
+    Source: TUM RGB-D benchmark.
     """
+    known = np.isfinite(T_world_camera).all(axis=(1, 2))
+    times, T_world_camera = np.asarray(times)[known], T_world_camera[known]
     T_world_camera = np.asarray(T_world_camera, dtype=np.float64)
     q_xyzw = Rotation.from_matrix(T_world_camera[:, :3, :3]).as_quat(canonical=True)
-    times = frame_ids / FRAMES_PER_SECOND
     return f"# {_COLUMNS}\n" + _lines(np.column_stack([times, T_world_camera[:, :3, 3], q_xyzw]))
 
 
