@@ -9,6 +9,8 @@ from recordings import write_recording
 from tiny import tiny_words
 
 from nbtrack.cli import main
+from nbtrack.core.errors import DataError
+from nbtrack.data.recording import open_recording
 from nbtrack.tracking.trajectories import read_tum
 
 TINY = tiny_words("scenes.n_frames=6", "tracking.sdf.n_pixels=32")
@@ -71,3 +73,44 @@ def test_tracking_command_reads_any_format(tmp_path: Path, capsys: pytest.Captur
     assert main(track(folder, "--format", "tum")) == 0
     assert main(track(folder, "--format", "plain")) == 2
     assert "nbtrack: no file " in capsys.readouterr().err
+
+
+def test_only_the_first_pose_is_known(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches a recording that is refused because nothing is known to compare with, an error that
+    is made up, and a reference of an earlier run that stays beside a trajectory without one."""
+    folder, out = write_recording("plain", tmp_path / "r"), tmp_path / "result"
+    assert main(["map", str(folder), "--field", "neus", *TINY, "--out", str(tmp_path / "m")]) == 0
+    given = ["track", str(folder), "--map-from", str(tmp_path / "m"), "--tracker", "sdf"]
+    given += ["--steps", "2", *TINY, "--out", str(out)]
+    assert main(given) == 0
+    assert (out / "groundtruth.txt").is_file()
+    poses = (folder / "trajectory.txt").read_text().splitlines()
+    unknown = [line.split()[0] + " nan" * 7 for line in poses[1:]]
+    (folder / "trajectory.txt").write_text("\n".join([poses[0], *unknown]) + "\n")
+    capsys.readouterr()
+    assert main(given) == 0
+    assert "errors cannot be told" in capsys.readouterr().out
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert (metrics["frames"], metrics["frames_without_reference"]) == (5, 5)
+    assert "ate_rmse_m" not in metrics
+    assert not (out / "groundtruth.txt").exists()
+    assert len(read_tum(out / "trajectory.txt")[0]) == 5
+
+
+def test_times_are_the_recordings_own(tmp_path: Path) -> None:
+    """Catches frame numbers in place of times, which evaluation tools cannot associate with the
+    recording's own reference; also after a conversion, and with a declared frame rate."""
+    folder, out = write_recording("tum", tmp_path / "r"), tmp_path / "result"
+    times = open_recording(folder).times
+    assert main(track(folder, "--out", str(out))) == 0
+    found, _ = read_tum(out / "trajectory.txt")
+    assert found.tolist() == times[1:].tolist()
+    assert found[0] > 1.3e9
+    assert main(["data", "convert", str(folder), str(tmp_path / "c"), "--frames", "::2"]) == 0
+    assert open_recording(tmp_path / "c").times.tolist() == times[::2].tolist()
+    (tmp_path / "c/timestamps.txt").write_text("1\n2\n")
+    with pytest.raises(DataError, match="has 2 times for 3 images"):
+        open_recording(tmp_path / "c")
+    (tmp_path / "c/timestamps.txt").unlink()
+    (tmp_path / "c/sequence.toml").write_text("frame_rate = 5\n")
+    assert open_recording(tmp_path / "c").times == pytest.approx([0, 0.2, 0.4])
