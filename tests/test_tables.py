@@ -131,6 +131,40 @@ def test_red_and_bold_together() -> None:
     assert re.findall(r"level1_row(\d)", bold) == ["1", "4"]
 
 
+def test_marks_stand_without_the_style_sheet() -> None:
+    """Catches marks that only a style sheet holds, which pages drop that do not trust a notebook,
+    and signs that no caption explains."""
+    html = style_table_1(published_table_1(), "Caption").to_html().split("</style>")[1]
+    cells = [
+        re.sub("<b>(.*)</b>", r"\1b", cell).replace(" †b", "rb").replace(" †", "r")
+        for cell in re.findall(r"<td [^>]*>(.*?)</td>", html)
+    ]
+    assert cells == " ".join(PAPER_TABLE_1.values()).split()
+    legend = "bold: best at this rate; † and red: above 0.2 m"
+    assert f"<caption>Caption; {legend}</caption>" in html
+    assert f"<caption>{legend}</caption>" in style_table_1(OURS_1).to_html()
+    html = style_table_2(published_table_2()).to_html().split("</style>")[1]
+    labels = re.findall(r'<th [^>]*class="row_heading level1[^>]*>(.*?)</th>', html)
+    assert labels == ["128", "<b>512 *</b>", "1024", "2048", "<b>4096 *</b>", "16384"]
+    assert "<caption>* and bold: the n used for tracking</caption>" in html
+
+
+def test_every_table_has_an_id_of_its_own() -> None:
+    """Catches ids that tables share: on one page the style sheets of all of them then colour each.
+    By content, caption and what is marked; the same table keeps its id."""
+
+    def table_id(styler) -> str:
+        return re.search(r'<table id="T_(.*?)"', styler.to_html()).group(1)
+
+    def all_ids() -> list[str]:
+        tables = [style_table_1(OURS_1), style_table_1(OURS_1, "A"), style_table_1(OURS_1[1:])]
+        tables += [style_table_2(OURS_2, default_pixels={"LM": n}) for n in (64, 65)]
+        return [table_id(table) for table in tables]
+
+    assert len(set(all_ids())) == 5
+    assert all_ids() == all_ids()
+
+
 def test_marks_and_gaps_by_hand() -> None:
     """Catches ties that only one row wins, a lone value praised, 0.2 m called a failure, missing
     cells and rows that vanish, rates that do not fall, wrong row spans, unescaped underscores."""
@@ -181,7 +215,7 @@ def test_styled_tables_are_the_same_every_time(style, cells: pd.DataFrame) -> No
     first, second = style(cells, "Caption"), style(cells, "Caption")
     latex(first)  # must not change what the notebook shows
     assert first.to_html() == second.to_html()
-    assert "<caption>Caption</caption>" in first.to_html()
+    assert "<caption>Caption; " in first.to_html()
     assert repr(first) == repr(second)
     assert " at 0x" not in repr(first)
     assert "–" in repr(first)
