@@ -240,7 +240,7 @@ ARGUMENTS = {
     "unknown field": ([*MAP, "--field", "imapp"], "did you mean 'imap'"),
     "unknown tracker": ([*OWN, "--tracker", "sfd"], "did you mean 'sdf'"),
     "tracker not the field's": ([*OWN, "--field", "imap"], "take one of neus"),
-    "both budgets": ([*OWN, "--rate", "2"], "give one of the two"),
+    "both budgets": ([*OWN, "--rate", "2"], "2.0 steps and 2.0 Hz: a frame has one budget; give"),
     "rate of zero": ([*NO_STEPS, "--rate", "0"], "rate_hz is 0"),
     "negative rate": ([*NO_STEPS, "--rate", "-1"], "rate_hz is -1"),
     "rate that is none": ([*NO_STEPS, "--rate", "nan"], "rate_hz is nan"),

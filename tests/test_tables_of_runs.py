@@ -25,6 +25,9 @@ from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, M
 from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.results import map_scene, map_scenes, read_run, track_scenes
 from nbtrack.experiments.scenes import Scene, open_scenes
+from nbtrack.fields import PointCloud
+from nbtrack.fields.correction import CorrectedField
+from nbtrack.tracking import make_tracker
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -177,10 +180,36 @@ def test_a_second_path_is_tracked_in_the_map_of_the_first(
 def test_table_2_of_this_machine(preset: Preset, scenes: list[Scene]) -> None:
     """Catches empty cells: even a slow machine fits a step of 16 points into 20 ms sometimes; and
     rows that stand there twice, where two methods share a tracker."""
-    steps = measure_steps(preset, scenes[0].read(":1"), [*TABLE_1, "vr_neus"])
+    steps = measure_steps(preset, scenes[0], [*TABLE_1, "vr_neus"])
     assert steps[["tracker", "n_pixels"]].to_numpy().tolist() == [["VR", 4], ["SDF", 8]]
     assert (steps["steps"] >= 0).all()
     assert default_pixels(preset) == {"VR": 8, "SDF": 16}
+
+
+def test_table_2_measures_what_a_method_uses(
+    tmp_path: Path, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches points without a map, and settings of a method that Table II does not know: then raw,
+    untrained networks are measured in place of corrected maps, and another n."""
+    fields = {}
+
+    def seen(name: str, field: object, *arguments: object) -> object:
+        fields[name] = field
+        return make_tracker(name, field, *arguments)
+
+    monkeypatch.setattr("nbtrack.experiments.bench.make_tracker", seen)
+    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 2000)
+    settings = ("mapping.neus_plus.correct_voxel=0.3", "tracking.lm.n_pixels=16")
+    monkeypatch.setitem(METHODS, "corrected", replace(METHODS["corrected"], settings=settings))
+    words = tiny_words("scenes.names=office", "tables.rates_hz=[10]", "scenes.track_frames=:2")
+    words += ["--workers", "1", "--out", str(tmp_path)]
+    assert main(["tables", "--trackers", "icp,corrected", *words]) == 0
+    assert isinstance(fields["icp"], PointCloud)
+    assert isinstance(fields["lm"], CorrectedField)
+    steps = pd.read_csv(tmp_path / "table_2.csv")
+    found = steps[["tracker", "n_pixels"]].to_numpy().tolist()
+    assert found == [["ICP", 8], ["ICP", 64], ["LM", 8], ["LM", 16]]
+    assert "\\bfseries 16 " in (tmp_path / "table_2.tex").read_text()
 
 
 def test_wrong_scenes_are_told_before_anything_is_made(

@@ -18,16 +18,16 @@ from nbtrack.core.device import advise_on_memory, choose_device, device_name
 from nbtrack.core.errors import ConfigError, MissingError, NbtrackError
 from nbtrack.core.files import project_folder, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
-from nbtrack.core.settings import changed_settings
-from nbtrack.data.sequence import RgbdSequence, observed_bounds
+from nbtrack.core.settings import changed_settings, with_settings
+from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.commands import preset_of
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Method, find_methods
 from nbtrack.experiments.output import output_folder
 from nbtrack.experiments.presets import PRESETS, Preset
-from nbtrack.experiments.results import track_scenes
-from nbtrack.experiments.scenes import open_scene, open_scenes
-from nbtrack.fields import make_field
+from nbtrack.experiments.results import map_scene, track_scenes
+from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
+from nbtrack.fields import Field, LearnedField, PointCloud, field_class, make_field
 from nbtrack.tracking import ClockBudget, StepBudget, make_tracker
 
 _FRAMES_A_CELL = 3  # that a mean of steps in Table II is taken over
@@ -72,10 +72,10 @@ def _fill_tables(
     else:
         print("Table I beside the paper's")
         print(tables.beside_published(results).to_string(float_format="%.3f", na_rep="–"))
-        steps, pixels = _table_2(preset, scenes[0].read(":1"), methods)
+        steps, pixels = _table_2(preset, scenes[0], methods)
         paths = tables.write_tables(folder, results, steps, note, pixels)
     cells = results[[name for name in _CELL_COLUMNS if name in results]]
-    cells_file = folder / f"table_{len(number)}_cells.csv"
+    cells_file = folder / f"table_{3 if options.beyond else 1}_cells.csv"
     paths.append(tables.write_csv(cells_file, cells, float_format=None))
     print("\n".join(str(path) for path in paths))
     failed = results[results["failure"] != ""]
@@ -94,7 +94,7 @@ def bench_command(options: Namespace) -> None:
         options.preset = options.preset or "synthetic"
     preset = preset_of(options, None, "scenes.n_frames=2")  # one image is enough
     with output_folder(options.out, "table_2.csv"):
-        steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset).read(":1"))
+        steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset))
         folder = options.out or runs_folder() / "bench" / preset.name
         print(tables.write_csv(folder / "table_2.csv", steps))
 
@@ -126,10 +126,10 @@ def notebooks_command(options: Namespace) -> None:
 
 
 def _table_2(
-    preset: Preset, sequence: RgbdSequence, methods: Sequence[str | Method] = TABLE_1
+    preset: Preset, scene: Scene, methods: Sequence[str | Method] = TABLE_1
 ) -> tuple[pd.DataFrame, dict[str, int]]:
     """Measure and print it; the n of Table I besides."""
-    steps, pixels = measure_steps(preset, sequence, methods), default_pixels(preset, methods)
+    steps, pixels = measure_steps(preset, scene, methods), default_pixels(preset, methods)
     machine = f"{device_name(choose_device())}, {torch.get_num_threads()} threads"
     print(f"Table II: steps, {preset.name} networks, on {machine}")
     print(tables.style_table_2(steps, default_pixels=pixels))
@@ -137,32 +137,33 @@ def _table_2(
 
 
 def measure_steps(
-    preset: Preset, sequence: RgbdSequence, methods: Sequence[str | Method] = TABLE_1
+    preset: Preset, scene: Scene, methods: Sequence[str | Method] = TABLE_1
 ) -> pd.DataFrame:
     """Steps within each budget for every tracker, in its first method's field, and its n (pixels).
 
     A tracker first spends one frame that is not counted, so that allocations and compilations are
-    done. The sequence's first frame feeds it. Fields are untrained: a step costs the same whatever
-    the weights are.
+    done. The scene's first frame feeds it. Networks are untrained: a step costs the same whatever
+    the weights are. Points and corrected fields are those of the scene's map.
 
     A row is a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames) and
     steps_deviation (over frames). Source: paper, Table II and evaluation protocol.
     """
-    firsts: dict[str, Method] = {}
-    for method in find_methods(methods):
-        firsts.setdefault(method.tracker, method)
-    pixels, rows = preset.tables.pixels, []
-    plan = [(m, n) for m in firsts.values() for n in pixels.get(m.tracker, pixels["sdf"])]
-    bounds, T_first = observed_bounds(sequence), sequence.T_world_camera[0]
+    firsts, pixels, rows = _first_methods(preset, methods), preset.tables.pixels, []
+    own_settings = {name: own.tracking_of(name) for name, (_, own) in firsts.items()}
+    plan = [
+        (name, n_pixels)
+        for name, own in own_settings.items()
+        for n_pixels in pixels.get(name, sorted({own.n_pixels, *pixels["sdf"]}))
+    ]
+    fields = {name: _field_to_measure(scene, *first) for name, first in firsts.items()}
+    sequence = scene.read(":1")
+    T_first = sequence.T_world_camera[0]
     with ProgressBar("Table II", len(plan)) as bar:
-        for done, (method, n_pixels) in enumerate(plan):
-            name = method.tracker
+        for done, (name, n_pixels) in enumerate(plan):
             bar.move_to(done, f"{name}={n_pixels}")
-            settings = replace(preset.tracking_of(name), n_pixels=n_pixels)
+            settings = replace(own_settings[name], n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
-                field = make_field(method.field, preset.network_of(method.field), bounds, seed=0)
-                field = field.to(choose_device())
-                tracker = make_tracker(name, field, T_first, StepBudget(1), settings)
+                tracker = make_tracker(name, fields[name], T_first, StepBudget(1), settings)
                 for budget_ms in preset.tables.budgets_ms:
                     tracker.budget, counts = ClockBudget(1000 / budget_ms), []
                     for _ in range(1 + _FRAMES_A_CELL):
@@ -176,9 +177,28 @@ def measure_steps(
 
 
 def default_pixels(preset: Preset, methods: Sequence[str | Method] = TABLE_1) -> dict[str, int]:
-    """The n that each tracker uses for Table I, by its label in Table II."""
-    trackers = [method.tracker for method in find_methods(methods)]
-    return {name.upper(): preset.tracking_of(name).n_pixels for name in trackers}
+    """The n that each tracker's first method uses for Table I, by its label in Table II."""
+    firsts = _first_methods(preset, methods)
+    return {name.upper(): own.tracking_of(name).n_pixels for name, (_, own) in firsts.items()}
+
+
+def _first_methods(
+    preset: Preset, methods: Sequence[str | Method]
+) -> dict[str, tuple[str, Preset]]:
+    """Of each tracker's first method the field, and the preset with the method's own settings."""
+    firsts: dict[str, tuple[str, Preset]] = {}
+    for method in find_methods(methods):
+        firsts.setdefault(method.tracker, (method.field, with_settings(preset, *method.settings)))
+    return firsts
+
+
+def _field_to_measure(scene: Scene, name: str, preset: Preset) -> Field | PointCloud:
+    """A field as a method uses it: untrained where the weights do not matter, else a map's."""
+    is_corrected = getattr(preset.mapping_of(name), "correct_voxel", 0.0) > 0
+    if is_corrected or not issubclass(field_class(name), LearnedField):
+        return map_scene(scene, name, preset).field
+    bounds = observed_bounds(scene.read(":1"))
+    return make_field(name, preset.network_of(name), bounds, seed=0).to(choose_device())
 
 
 def _note(preset: Preset, clock: bool) -> str:

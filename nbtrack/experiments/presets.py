@@ -37,7 +37,7 @@ class TablesConfig:
 
     rates_hz: tuple[float, ...] = (10.0, 5.0, 2.0)  # paper, Table I
     budgets_ms: tuple[float, ...] = (50.0, 100.0, 500.0)  # paper, Table II
-    # Pixels n of each tracker in Table II (paper); others take those of the SDF tracker.
+    # Pixels n of each tracker in Table II (paper); others take SDF's and their own.
     pixels: dict[str, tuple[int, ...]] = field(
         default_factory=lambda: {"vr": (128, 512, 1024), "sdf": (2048, 4096, 16384)}
     )
