@@ -1,6 +1,7 @@
-"""One progress bar: a line that moves where somebody watches, elsewhere one line at the end."""
+"""One progress bar: a line that moves where somebody watches, elsewhere a line now and then."""
 
 import sys
+import threading
 import time
 from typing import Any
 
@@ -8,6 +9,9 @@ from tqdm import tqdm
 
 _DELAY_SECONDS = 1.0  # so that a mistake which ends the work at once is told alone
 _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+# Where nobody watches: seconds before the first line, between two later ones, and their form.
+_FIRST_LINE_SECONDS, _LINE_SECONDS = 2.0, 30.0
+_LINE_FORMAT = "{desc}: {percentage:.0f} %, {elapsed} gone, {remaining} left{postfix}"
 
 
 def tell(news: str) -> None:
@@ -51,20 +55,34 @@ class ProgressBar:
         is_hidden = not (is_shown and (is_notebook or sys.stderr.isatty()))
         where = {"file": file, "mininterval": pause, "disable": is_hidden, "ascii": False}
         self._bar = tqdm(total=total, desc=title, bar_format=_FORMAT, delay=_DELAY_SECONDS, **where)
+        self._done, self._status, self._ended = 0.0, "", threading.Event()
+        self._is_logged = is_shown and is_hidden
 
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much is done, and a word on how it goes."""
         # Sums of fractions may end a rounding error above the total, which a bar does not like.
-        done = min(done, self._bar.total)
+        done = self._done = min(done, self._bar.total)
+        self._status = status
         self._bar.set_postfix_str(status, refresh=False)
         self._bar.update(done - self._bar.n)
 
     def __enter__(self) -> "ProgressBar":
+        if self._is_logged:
+            threading.Thread(target=self._log, daemon=True).start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        seconds, is_hidden = time.monotonic() - self._start, self._bar.disable
+        seconds = time.monotonic() - self._start
+        self._ended.set()
         self._bar.close()
-        is_told = self.is_shown and is_hidden and kind is None
-        if is_told and seconds > _DELAY_SECONDS:
+        if self._is_logged and kind is None and seconds > _DELAY_SECONDS:
             print(f"{self.title}: done in {seconds:.0f} s", file=sys.stderr)
+
+    def _log(self) -> None:
+        """Lines with an ETA from the mean speed, also while a long step has nothing to report."""
+        pause = _FIRST_LINE_SECONDS
+        while not self._ended.wait(pause):
+            pause, seconds = _LINE_SECONDS, time.monotonic() - self._start
+            how = {"prefix": self.title, "postfix": self._status, "bar_format": _LINE_FORMAT}
+            line = tqdm.format_meter(self._done, self._bar.total, seconds, **how)
+            print(line, file=sys.stderr)
