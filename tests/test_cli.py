@@ -8,6 +8,7 @@ import pytest
 from recordings import write_recording
 from tiny import tiny_words
 
+import nbtrack
 from nbtrack.cli import main
 from nbtrack.core.errors import DataError
 from nbtrack.data.recording import open_recording
@@ -114,3 +115,21 @@ def test_times_are_the_recordings_own(tmp_path: Path) -> None:
     (tmp_path / "c/timestamps.txt").unlink()
     (tmp_path / "c/sequence.toml").write_text("frame_rate = 5\n")
     assert open_recording(tmp_path / "c").times == pytest.approx([0, 0.2, 0.4])
+
+
+def test_version(capsys: pytest.CaptureFixture) -> None:
+    """Catches a package that cannot say which one it is."""
+    with pytest.raises(SystemExit, match="0"):
+        main(["--version"])
+    assert capsys.readouterr().out == f"nbtrack {nbtrack.__version__}\n"
+
+
+@pytest.mark.parametrize("words", [["-dash"], ["office", "--out", "-dash"], ["-dash", "office"]])
+def test_a_folder_that_looks_like_an_option(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Catches a refusal that leaves a folder of such a name without a way to give it."""
+    monkeypatch.chdir(tmp_path)
+    Path("-dash").mkdir()
+    assert main(["map", *words, "--field", "neus"]) == 2
+    assert "write ./-dash for the file or folder -dash" in capsys.readouterr().err
