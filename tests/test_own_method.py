@@ -1,15 +1,24 @@
-"""Adding a field or a tracker: one short file that registers it, and it has rows in the tables."""
+"""Adding a field or a tracker: a short file or cell registers it, and it has rows in the tables."""
 
 import importlib
+import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
+import cloudpickle
+import nbformat
 import pytest
-from tiny import tiny_words
+from nbconvert.preprocessors import ExecutePreprocessor
+from tiny import TINY, tiny_words
 
 from nbtrack.cli import main
+from nbtrack.core.files import foreign_source
+from nbtrack.core.settings import with_settings
 from nbtrack.experiments.methods import METHODS
+from nbtrack.experiments.presets import load_preset
 from nbtrack.fields import FIELDS
 from nbtrack.tracking import TRACKERS
 
@@ -72,3 +81,116 @@ def test_a_row_in_both_tables(own_file: None, tmp_path: Path) -> None:
     assert main(["tables", "--method", "sdf,mine", *words]) == 0
     assert (tmp_path / "out/table_1.csv").read_text().count("Mine,office") == 1
     assert "DISTANCE,8," in (tmp_path / "out/table_2.csv").read_text()
+
+
+# What a notebook's cells may hold: constants and helpers, a base class, decorators, settings.
+CELL = """
+import torch
+from nbtrack.tracking import SdfTracker, SdfSettings
+HALF = 0.5
+KINDS = {"a", "b", "c", "d"}
+def halved(x):
+    return x * HALF
+class Base(SdfTracker):
+    @property
+    def speed(self):
+        "How fast."
+        return [halved(x) for x in (1, 2)]
+class Mine(Base):
+    name = "mine"
+    @classmethod
+    def works_in(cls, field):
+        return super().works_in(field) and "neus" in {"neus", "volsdf", "points"}
+    @torch.no_grad()
+    def report(self):
+        return {kind: 1.0 for kind in KINDS}
+"""
+
+
+def in_a_cell(source: str) -> type:
+    """The tracker, from a module without a file."""
+    module = ModuleType("cell")
+    exec(compile(source, "<cell>", "exec"), module.__dict__)
+    return module.Mine
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "counts"),
+    [
+        ("* HALF", "+ HALF", True), ("HALF = 0.5", "HALF = 0.4", True), ("(1, 2)", "(1, 3)", True),
+        ('"points"', '"imap"', True), ("1.0 for", "2.0 for", True), ('"d"}', '"e"}', True),
+        ('name = "mine"', 'name = "my"', True), ("class Mine", "# Mine\n\nclass Mine", False),
+        ("How fast.", "Its speed.", False), ("HALF = 0.5", "HALF, report = 0.5, 3", False),
+    ],
+)  # fmt: skip
+def test_code_without_a_file_counts(old: str, new: str, counts: bool) -> None:
+    """Catches an edited cell that is answered from the cache, be it in a helper or a base class,
+    and results lost for a comment or for another variable of the notebook."""
+    assert old in CELL
+    before = foreign_source(in_a_cell(CELL))
+    assert (foreign_source(in_a_cell(CELL.replace(old, new, 1))) != before) == counts
+
+
+def test_code_without_a_file_is_the_same_in_every_process(tmp_path: Path) -> None:
+    """Catches keys that hold addresses, the order of a set, or what only this process knows: a
+    kernel started again, or a worker, would make everything anew."""
+    kind = in_a_cell(CELL)
+    (tmp_path / "kind").write_bytes(cloudpickle.dumps(kind))
+    read = "import pickle, sys; from nbtrack.core.files import foreign_source as source; "
+    read += f"sys.stdout.write(source(pickle.load(open({str(tmp_path / 'kind')!r}, 'rb'))))"
+    for seed in "12":
+        command, environment = [sys.executable, "-c", read], {"PYTHONHASHSEED": seed}
+        found = subprocess.run(command, env=os.environ | environment, capture_output=True)
+        assert found.stdout.decode() == foreign_source(kind), found.stderr.decode()
+
+
+def test_a_base_class_in_a_file_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a change to the base class, in a file of its own, that is answered from the cache."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_base.py").write_text("class Base: speed = 1")
+    base = importlib.import_module("own_base").Base
+    sources = [foreign_source(type("Mine", (base,), {}))]
+    (tmp_path / "own_base.py").write_text("class Base: speed = 2")
+    sources.append(foreign_source(type("Mine", (base,), {})))
+    del sys.modules["own_base"]
+    assert sources[0] != sources[1]
+
+
+def test_settings_of_what_is_registered_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches settings that only a preset loaded afterwards knows, or that a class written anew, as
+    a cell run again does, loses."""
+    preset = with_settings(load_preset("smoke"), "tracking.sdf.lambda_sdf=3.0")
+    monkeypatch.setitem(TRACKERS, "mine", in_a_cell(CELL))
+    once = with_settings(preset, "tracking.mine.n_pixels=7")
+    assert once.tracking_of("mine").n_pixels == 7
+    assert once.tracking_of("mine").lambda_sdf == 3.0
+    more = "class Settings(SdfSettings):\n        extra: float = 0.5"
+    more = CELL.replace('name = "mine"', f'name = "mine"\n    @dataclass(frozen=True)\n    {more}')
+    monkeypatch.setitem(TRACKERS, "mine", in_a_cell("from dataclasses import dataclass\n" + more))
+    again = with_settings(once, "tracking.mine.extra=2.0")
+    assert again.tracking_of("mine").extra == 2.0
+    assert again.tracking_of("mine").n_pixels == 7
+
+
+def test_a_method_in_a_notebook(tmp_path: Path) -> None:
+    """Catches a class in a cell that has no source for a key, here or in workers; and a kernel
+    started again that finds nothing of what the first one made."""
+    run = f"""
+import nbtrack
+from nbtrack.experiments.grid import Execution
+from nbtrack.tracking import TRACKERS
+preset = nbtrack.load_preset(settings={[*TINY, "scenes.names=['office']"]!r})
+TRACKERS["mine"] = Mine
+mine = nbtrack.Method("Mine", "neus", "mine", ("tracking.mine.n_pixels=8",))
+scenes = nbtrack.open_scenes(preset)
+"""
+    runs = []
+    for workers, rates in ((1, [10]), (2, [10, 8, 5])):  # two runs are left for two workers
+        how = f"{rates}, execution=Execution(workers={workers})"
+        print_runs = f"print(*nbtrack.track_scenes(scenes, [mine], preset, {how})['run'])"
+        cells = [nbformat.v4.new_code_cell(text) for text in (CELL, run, print_runs)]
+        notebook = nbformat.v4.new_notebook(cells=cells)
+        ExecutePreprocessor(kernel_name="python3").preprocess(notebook, {})
+        runs.append(cells[-1]["outputs"][-1]["text"].split())
+    assert runs[0] == runs[1][:1]
+    assert {path.name for path in (tmp_path / "runs/tracks").iterdir()} == {*runs[1]}

@@ -7,16 +7,18 @@ meet half a file. So every result is written aside, then moved into place.
 import ast
 import contextlib
 import dataclasses
+import dis
 import hashlib
-import inspect
 import io
 import json
 import os
 import platform
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
+from types import CodeType, FunctionType
 from typing import Any
 
 import torch
@@ -32,6 +34,7 @@ _WITHOUT_EFFECT = {
 }  # fmt: skip
 """Modules that change no digit of a result."""
 _DIGEST_BYTES = hashlib.sha256().digest_size
+_LIBRARIES = ("nbtrack", "torch", "abc", "typing", "builtins")  # what own classes are built on
 
 
 def project_folder() -> Path:
@@ -92,12 +95,44 @@ def modules_of(kind: type) -> tuple[str, ...]:
 
 
 def foreign_source(kind: type) -> str:
-    """The code of a class that somebody wrote outside this package, in a file or a notebook."""
-    if kind.__module__.startswith("nbtrack."):
-        return ""
-    file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-    text = Path(file).read_text("utf-8") if file else inspect.cleandoc(inspect.getsource(kind))
-    return _code(ast.parse(text))
+    """The code of a class that somebody wrote outside this package, in a file or a notebook.
+
+    Its own base classes count too. Of a module that is a file all counts. What a notebook, a script
+    or a prompt defines is told by what Python compiled of it, which worker processes hold as well:
+    methods, and the constants, functions and classes of the same place that they name.
+    """
+    sources = {}
+    for own in (c for c in kind.__mro__ if c.__module__.partition(".")[0] not in _LIBRARIES):
+        home, file = own.__module__, getattr(sys.modules.get(own.__module__), "__file__", None)
+        is_file = file and home != "__main__"
+        sources[home if is_file else str(own)] = (
+            _code(ast.parse(Path(file).read_text("utf-8")))
+            if is_file
+            else str(_compiled(own, home, {}, []))
+        )
+    return "\n".join(sources.values())
+
+
+def _compiled(thing: Any, home: str, names: dict[str, Any], seen: list[int]) -> Any:
+    """What a thing of a home module is made of, as plain text; the same in every process."""
+    thing = getattr(thing, "fget", None) or getattr(thing, "__func__", thing)  # of a property
+    if isinstance(thing, CodeType):
+        steps = [(step.opname, step.argval) for step in dis.get_instructions(thing)]
+        thing = [*steps, [names.get(name) for kind, name in steps if kind == "LOAD_GLOBAL"]]
+    elif getattr(thing, "__module__", None) == home and id(thing) not in seen:
+        seen.append(id(thing))
+        if isinstance(thing, type):
+            members = vars(thing).items()
+            thing = {n: v for n, v in members if callable(v) or not n.startswith("__")}
+        elif isinstance(thing, FunctionType):
+            names, cells = thing.__globals__, thing.__closure__ or ()
+            thing = [thing.__code__, thing.__defaults__, thing.__kwdefaults__]
+            thing += [cell.cell_contents for cell in cells]
+    if isinstance(thing, dict | set | frozenset):  # whose order changes from process to process
+        thing = sorted(thing.items() if isinstance(thing, dict) else thing, key=repr)
+    if isinstance(thing, list | tuple):
+        return [_compiled(part, home, names, seen) for part in thing]
+    return re.sub(r" at 0x\w+| from '.*'", "", repr(thing))  # without addresses
 
 
 def _code(tree: ast.Module) -> str:

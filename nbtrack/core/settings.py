@@ -53,6 +53,7 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
 
     Raises ConfigError for an unknown key, or a value of the wrong type or range.
     """
+    config = dataclasses.replace(config)  # a class may take up what was added since it was made
     valid = [key for key, _ in _leaves(config)]
     for key, value in _leaves(dict(values)):
         if key not in valid:

@@ -37,7 +37,7 @@ class TablesConfig:
 
     rates_hz: tuple[float, ...] = (10.0, 5.0, 2.0)  # paper, Table I
     budgets_ms: tuple[float, ...] = (50.0, 100.0, 500.0)  # paper, Table II
-    # Pixels n of each tracker in Table II (paper); others take SDF's and their own.
+    # Pixels n of each tracker in Table II (paper); others take those of the SDF tracker.
     pixels: dict[str, tuple[int, ...]] = field(
         default_factory=lambda: {"vr": (128, 512, 1024), "sdf": (2048, 4096, 16384)}
     )
@@ -66,22 +66,28 @@ class Preset:
     scenes: ScenesConfig = ScenesConfig()
     tables: TablesConfig = TablesConfig()
 
+    def __post_init__(self) -> None:
+        """Fields and trackers that somebody has added since then have settings too."""
+        object.__setattr__(self, "mapping", {name: self.mapping_of(name) for name in FIELDS})
+        object.__setattr__(self, "tracking", {name: self.tracking_of(name) for name in TRACKERS})
+
     def network_of(self, field_name: str) -> NetworkSettings:
         """Network of a field; a field without its own takes that of NeuS."""
         return self.network.get(field_name, self.network["neus"])
 
     def mapping_of(self, field_name: str) -> MappingSettings | PointMapping:
         """Mapping settings of a field; a field without its own takes what it shares with NeuS."""
-        own = self.mapping.get(field_name)
-        return own or _shared(field_class(field_name).Settings, self.mapping["neus"])
+        own = self.mapping.get(field_name, self.mapping["neus"])
+        return _shared(field_class(field_name).Settings, own)
 
     def tracking_of(self, tracker_name: str) -> TrackerSettings:
         """Settings of a tracker; one without its own takes what it shares with SDF tracking."""
-        own = self.tracking.get(tracker_name)
-        return own or _shared(tracker_class(tracker_name).Settings, self.tracking["sdf"])
+        own = self.tracking.get(tracker_name, self.tracking["sdf"])
+        return _shared(tracker_class(tracker_name).Settings, own)
 
 
 def _shared(kind: type, other: Any) -> Any:
+    """Settings of a class, with those that the others have too; of the same class, the same."""
     return kind(**{f.name: getattr(other, f.name) for f in fields(kind) if hasattr(other, f.name)})
 
 
@@ -138,11 +144,6 @@ def load_preset(
     if name not in PRESETS:
         raise ConfigError(f"unknown preset {name!r}: {nearest_name(name, list(PRESETS))}")
     preset = PRESETS[name]
-    preset = replace(  # fields and trackers that somebody has added have settings too
-        preset,
-        mapping={known: preset.mapping_of(known) for known in FIELDS},
-        tracking={known: preset.tracking_of(known) for known in TRACKERS},
-    )
     file_name, text = config_file or os.environ.get("NBTRACK_CONFIG"), os.environ.get("NBTRACK_SET")
     if file_name:
         preset = with_values(preset, _read_toml(Path(file_name)))
