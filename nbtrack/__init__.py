@@ -24,6 +24,10 @@ _FACE = {
 __all__ = [*_FACE]
 
 
+def __dir__() -> list[str]:
+    return __all__
+
+
 def __getattr__(name: str) -> Any:
     if name not in _FACE:
         raise AttributeError(f"module 'nbtrack' has no attribute {name!r}")
