@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
-import nbtrack
+from nbtrack import __version__
 from nbtrack.core.errors import ConfigError, NbtrackError, nearest_name
 
 
@@ -113,17 +113,12 @@ _EARLIER = {
 class Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, with the nearest name, as every other user error does."""
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As usual, and remember the words: an error may be about one of them."""
-        self._words = sys.argv[1:] if args is None else args
-        return super().parse_known_args(args, namespace)
-
     def error(self, message: str) -> NoReturn:
         """Raise a mistake in place of leaving the program."""
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
             choices = [choice.strip("' ") for choice in wrong[2].split(",")]
             message = f"unknown {wrong[1]!r}: {nearest_name(wrong[1], choices)}"
-        dashed = [word for word in self._words if word.startswith("-") and Path(word).exists()]
+        dashed = [word for word in sys.argv[1:] if word.startswith("-") and Path(word).exists()]
         message += "".join(f"; write ./{word} for the file or folder {word}" for word in dashed)
         raise ConfigError(f"{message}; see {self.prog} --help")
 
@@ -151,8 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
-    version = f"nbtrack {nbtrack.__version__}"
-    parser.add_argument("--version", action="version", version=version)
+    parser.add_argument("--version", action="version", version=f"nbtrack {__version__}")
     groups = {"": parser.add_subparsers(required=True, metavar="COMMAND")}
     known = {name.split()[0]: (name.split(), option) for name, option in OPTIONS.items()}
     for name, (about, options) in COMMANDS.items():

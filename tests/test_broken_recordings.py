@@ -170,7 +170,7 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "distortion": (camera(distortion=[1, 2, 3]), r"distortion is '\[1, 2, 3\]': write 0 or 4"),
         "matrix of eight": (camera(intrinsic_matrix=[1] * 8), "intrinsic_matrix is .*: write 9"),
         "no poses": (without("trajectory.txt"), "no poses in .*trajectory.txt or poses.txt"),
-        "two pose files": (text("poses.txt", "1 2 3"), "rename all but one, or .* convert"),
+        "two pose files": (text("poses.txt", "1 2 3"), "keep one, or choose by `data convert"),
         "9 columns": (text("trajectory.txt", "1 2 3 4 5 6 7 8 9\n"), "trajectory.txt line 1 is"),
         "a line less": (text("trajectory.txt", "0.5001 0 0 0 0 0 0 1\n"), "no pose within 0.001"),
         "order of columns": (text("trajectory.txt", "0 0 0 0 1 2 3 4\n" * 6), "norm 5.48: columns"),

@@ -131,5 +131,12 @@ def test_a_folder_that_looks_like_an_option(
     """Catches a refusal that leaves a folder of such a name without a way to give it."""
     monkeypatch.chdir(tmp_path)
     Path("-dash").mkdir()
-    assert main(["map", *words, "--field", "neus"]) == 2
+    monkeypatch.setattr("sys.argv", ["nbtrack", "map", *words, "--field", "neus"])
+    assert main() == 2
     assert "write ./-dash for the file or folder -dash" in capsys.readouterr().err
+
+
+def test_what_completion_offers() -> None:
+    """Catches `nbtrack.<Tab>` that offers imports of the module and none of the public names."""
+    assert dir(nbtrack) == sorted(nbtrack.__all__)
+    assert all(hasattr(nbtrack, name) for name in dir(nbtrack))

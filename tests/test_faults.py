@@ -240,7 +240,7 @@ ARGUMENTS = {
     "unknown field": ([*MAP, "--field", "imapp"], "did you mean 'imap'"),
     "unknown tracker": ([*OWN, "--tracker", "sfd"], "did you mean 'sdf'"),
     "tracker not the field's": ([*OWN, "--field", "imap"], "take one of neus"),
-    "both budgets": ([*OWN, "--rate", "2"], "2.0 steps and 2.0 Hz: a frame has one budget; give"),
+    "both budgets": ([*OWN, "--rate", "2"], "steps=2.0 and rate_hz=2.0: a frame has one budget"),
     "rate of zero": ([*NO_STEPS, "--rate", "0"], "rate_hz is 0"),
     "negative rate": ([*NO_STEPS, "--rate", "-1"], "rate_hz is -1"),
     "rate that is none": ([*NO_STEPS, "--rate", "nan"], "rate_hz is nan"),

@@ -1,5 +1,6 @@
 """One progress bar: a line that moves where somebody watches, elsewhere a line now and then."""
 
+import math
 import sys
 import threading
 import time
@@ -9,9 +10,9 @@ from tqdm import tqdm
 
 _DELAY_SECONDS = 1.0  # so that a mistake which ends the work at once is told alone
 _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
-# Where nobody watches: seconds before the first line, between two later ones, and their form.
-_FIRST_LINE_SECONDS, _LINE_SECONDS = 2.0, 30.0
+# Where nobody watches: the form of a line, and seconds before the first and between later ones.
 _LINE_FORMAT = "{desc}: {percentage:.0f} %, {elapsed} gone, {remaining} left{postfix}"
+_FIRST_LINE_SECONDS, _LINE_SECONDS = 2.0, 30.0
 
 
 def tell(news: str) -> None:
@@ -48,21 +49,22 @@ class ProgressBar:
     """Progress with an ETA over a known amount of work, to be used in a `with` block."""
 
     def __init__(self, title: str, total: float | int, is_shown: bool = True) -> None:
-        is_notebook = _is_notebook()
-        self.title, self.is_shown, self._start = title, is_shown, time.monotonic()
+        is_notebook, form = _is_notebook(), _FORMAT
+        self.title, self._start, self._ended = title, time.monotonic(), threading.Event()
         # A notebook's kernel drops messages once a thousand wait to be read.
         file, pause = (_NotebookLine(), 1.0) if is_notebook else (sys.stderr, 0.1)
-        is_hidden = not (is_shown and (is_notebook or sys.stderr.isatty()))
-        where = {"file": file, "mininterval": pause, "disable": is_hidden, "ascii": False}
-        self._bar = tqdm(total=total, desc=title, bar_format=_FORMAT, delay=_DELAY_SECONDS, **where)
-        self._done, self._status, self._ended = 0.0, "", threading.Event()
-        self._is_logged = is_shown and is_hidden
+        self._is_logged = is_shown and not (is_notebook or sys.stderr.isatty())
+        if self._is_logged:  # never by itself: `_log` asks for what would be shown
+            form, pause = _LINE_FORMAT, math.inf
+        # Without smoothing the ETA comes from the mean speed, not from that of the last step.
+        how = {"mininterval": pause, "disable": not is_shown, "ascii": False, "smoothing": 0}
+        how |= {"file": file, "bar_format": form, "delay": _DELAY_SECONDS}
+        self._bar = tqdm(total=total, desc=title, **how)
 
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much is done, and a word on how it goes."""
         # Sums of fractions may end a rounding error above the total, which a bar does not like.
-        done = self._done = min(done, self._bar.total)
-        self._status = status
+        done = min(done, self._bar.total)
         self._bar.set_postfix_str(status, refresh=False)
         self._bar.update(done - self._bar.n)
 
@@ -79,10 +81,8 @@ class ProgressBar:
             print(f"{self.title}: done in {seconds:.0f} s", file=sys.stderr)
 
     def _log(self) -> None:
-        """Lines with an ETA from the mean speed, also while a long step has nothing to report."""
+        """A line now and then, also while a long step has nothing to report."""
         pause = _FIRST_LINE_SECONDS
         while not self._ended.wait(pause):
-            pause, seconds = _LINE_SECONDS, time.monotonic() - self._start
-            how = {"prefix": self.title, "postfix": self._status, "bar_format": _LINE_FORMAT}
-            line = tqdm.format_meter(self._done, self._bar.total, seconds, **how)
-            print(line, file=sys.stderr)
+            print(self._bar, file=sys.stderr)
+            pause = _LINE_SECONDS

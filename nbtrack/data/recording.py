@@ -164,10 +164,7 @@ def _poses(
     files = [folder / name for name in names if (folder / name).is_file()]
     if len(files) > 1:
         found = " and ".join(file.name for file in files)
-        raise DataError(
-            f"{folder} has {found}: rename all but one, or choose one with --poses, an option of "
-            "`nbtrack data check` and `nbtrack data convert`"
-        )
+        raise DataError(f"{folder} has {found}: keep one, or choose by `data convert --poses FILE`")
     patterns = [folder / (f"{n}/*.txt" if (folder / n).is_dir() else n) for n in names]
     patterns = [p for p in patterns if "*" in p.name and p.parent.is_dir()]
     if patterns and not files:

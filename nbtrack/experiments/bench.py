@@ -148,22 +148,21 @@ def measure_steps(
     A row is a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames) and
     steps_deviation (over frames). Source: paper, Table II and evaluation protocol.
     """
-    firsts, pixels, rows = _first_methods(preset, methods), preset.tables.pixels, []
-    own_settings = {name: own.tracking_of(name) for name, (_, own) in firsts.items()}
-    plan = [
-        (name, n_pixels)
-        for name, own in own_settings.items()
-        for n_pixels in pixels.get(name, sorted({own.n_pixels, *pixels["sdf"]}))
-    ]
-    fields = {name: _field_to_measure(scene, *first) for name, first in firsts.items()}
+    firsts: dict[str, Method] = {}
+    for method in find_methods(methods):
+        firsts.setdefault(method.tracker, method)
+    pixels, rows = preset.tables.pixels, []
+    plan = [(m, n) for m in firsts.values() for n in pixels.get(m.tracker, pixels["sdf"])]
     sequence = scene.read(":1")
     T_first = sequence.T_world_camera[0]
     with ProgressBar("Table II", len(plan)) as bar:
-        for done, (name, n_pixels) in enumerate(plan):
+        for done, (method, n_pixels) in enumerate(plan):
+            name, own = method.tracker, with_settings(preset, *method.settings)
             bar.move_to(done, f"{name}={n_pixels}")
-            settings = replace(own_settings[name], n_pixels=n_pixels)
+            settings = replace(own.tracking_of(name), n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
-                tracker = make_tracker(name, fields[name], T_first, StepBudget(1), settings)
+                field = _field_to_measure(scene, method.field, own)
+                tracker = make_tracker(name, field, T_first, StepBudget(1), settings)
                 for budget_ms in preset.tables.budgets_ms:
                     tracker.budget, counts = ClockBudget(1000 / budget_ms), []
                     for _ in range(1 + _FRAMES_A_CELL):
@@ -178,18 +177,10 @@ def measure_steps(
 
 def default_pixels(preset: Preset, methods: Sequence[str | Method] = TABLE_1) -> dict[str, int]:
     """The n that each tracker's first method uses for Table I, by its label in Table II."""
-    firsts = _first_methods(preset, methods)
-    return {name.upper(): own.tracking_of(name).n_pixels for name, (_, own) in firsts.items()}
-
-
-def _first_methods(
-    preset: Preset, methods: Sequence[str | Method]
-) -> dict[str, tuple[str, Preset]]:
-    """Of each tracker's first method the field, and the preset with the method's own settings."""
-    firsts: dict[str, tuple[str, Preset]] = {}
-    for method in find_methods(methods):
-        firsts.setdefault(method.tracker, (method.field, with_settings(preset, *method.settings)))
-    return firsts
+    return {
+        m.tracker.upper(): with_settings(preset, *m.settings).tracking_of(m.tracker).n_pixels
+        for m in reversed(find_methods(methods))
+    }
 
 
 def _field_to_measure(scene: Scene, name: str, preset: Preset) -> Field | PointCloud:

@@ -48,10 +48,6 @@ class TableStyler(Styler):
     def __repr__(self) -> str:
         return self.data.to_string()
 
-    def with_own_id(self) -> "TableStyler":
-        """The same with an id made of all that it shows: on a page style sheets go by the id."""
-        return self.set_uuid(fingerprint(self.set_uuid("table").to_html()))
-
 
 def style_table_1(results: pd.DataFrame, caption: str | None = None) -> TableStyler:
     """Table I, mean ± deviation over seeds: best bold, above 0.2 m red with a dagger, missing "–".
@@ -67,13 +63,13 @@ def style_table_1(results: pd.DataFrame, caption: str | None = None) -> TableSty
     css = lost.replace({True: _RED, False: ""}) + best.replace({True: _BOLD, False: ""})
     texts = _texts(shown, "{:.3f}", _MISSING)
     texts += _texts(table_1(results, "ate_deviation_m"), " ± {:.3f}")
-    styler = TableStyler(texts, caption=_explained(caption, _LEGEND_1))
+    styler = TableStyler(texts)
     styler.format_index("{:g} Hz", level="rate_hz")
     forms = {"<b>{}</b>": best & ~lost, "{} †": lost & ~best, "<b>{} †</b>": best & lost}
     for form, cells in forms.items():
         for column in cells:
             styler.format(form, subset=(cells[column], [column]))
-    return styler.apply(lambda _: css, axis=None).with_own_id()
+    return _labelled(styler.apply(lambda _: css, axis=None), caption, _LEGEND_1)
 
 
 def style_table_2(
@@ -88,14 +84,14 @@ def style_table_2(
     texts = _texts(wide, "{:.1f}", _MISSING)
     texts[is_whole] = _texts(wide[is_whole], "{:.0f}", _MISSING)
     texts += _texts(table_2(steps, "steps_deviation"), " ± {:.1f}")
-    styler = TableStyler(texts, caption=_explained(caption, _LEGEND_2))
+    styler = TableStyler(texts)
     # Notebooks show every row label in bold, so the others must be told not to be.
-    is_default = [default_pixels.get(tracker) == n_pixels for tracker, n_pixels in wide.index]
-    weights = [_BOLD if bold else _PLAIN for bold in is_default]
+    weights = [_BOLD if default_pixels.get(row[0]) == row[1] else _PLAIN for row in wide.index]
     styler.format_index("{:g} ms", axis="columns")
-    labels = ["<b>{} *</b>" if bold else "{}" for bold in is_default]
-    styler.relabel_index(labels, axis="index", level="n_pixels")
-    return styler.apply_index(lambda _: weights, axis="index", level="n_pixels").with_own_id()
+    labels = ["<b>{} *</b>" if weight == _BOLD else "{}" for weight in weights]
+    styler.relabel_index(labels, level="n_pixels")
+    styler.apply_index(lambda _: weights, axis="index", level="n_pixels")
+    return _labelled(styler, caption, _LEGEND_2)
 
 
 def latex_file(styler: TableStyler, path: Path, kind: str, note: str) -> str:
@@ -194,8 +190,13 @@ def _latex_number(text: str) -> str:
     return re.sub(" ± (.+)", r"${\\scriptscriptstyle\\pm\1}$", text).replace(_MISSING, "--")
 
 
-def _explained(caption: str | None, legend: str) -> str:
-    return f"{caption}; {legend}" if caption else legend
+def _labelled(styler: TableStyler, caption: str | None, legend: str) -> TableStyler:
+    """With a caption that explains the marks, and an id made of all that the table shows.
+
+    A page's style sheets go by ids: tables that share one would colour each other.
+    """
+    styler.set_caption(f"{caption}; {legend}" if caption else legend)
+    return styler.set_uuid(fingerprint(styler.set_uuid("table").to_html()))
 
 
 def _texts(wide: pd.DataFrame, form: str, missing: str = "") -> pd.DataFrame:

@@ -87,10 +87,8 @@ def make_budget(steps: float | int | None, rate_hz: float | int | None) -> Budge
     Raises ConfigError if there are both or neither, or the number is not above zero.
     """
     if (steps is None) == (rate_hz is None):
-        found = "neither steps nor a rate" if steps is None else f"{steps} steps and {rate_hz} Hz"
         raise ConfigError(
-            f"{found}: a frame has one budget; give one of --steps N and --rate HZ (in a program "
-            "steps and rate_hz)"
+            f"steps={steps} and rate_hz={rate_hz}: a frame has one budget; give --steps or --rate"
         )
     return StepBudget(steps) if rate_hz is None else ClockBudget(rate_hz)
 
