@@ -43,3 +43,11 @@ def test_nothing_of_one_machine(cells: list[dict[str, Any]]) -> None:
         shown = [(o.get("text"), o.get("data", {}).get("text/plain")) for o in outputs]
         found = re.search(r"/(home|root|tmp|work|Users)/", f"{cell['source']} {shown}")
         assert not found, cell["source"]
+
+
+def test_no_two_tables_share_an_id(cells: list[dict[str, Any]]) -> None:
+    """Catches tables that colour each other: a page's style sheets go by the id of a table."""
+    outputs = [output for cell in cells for output in cell.get("outputs", [])]
+    pages = ["".join(output.get("data", {}).get("text/html", "")) for output in outputs]
+    ids = re.findall(r'<table id="(.*?)"', " ".join(pages))
+    assert len(set(ids)) == len(ids)
