@@ -145,15 +145,28 @@ def test_code_without_a_file_is_the_same_in_every_process(tmp_path: Path) -> Non
 
 
 def test_a_base_class_in_a_file_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a change to the base class, in a file of its own, that is answered from the cache."""
+    """Catches a change to the base class, or to what numba compiled, in a file of its own, that is
+    answered from the cache."""
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "own_base.py").write_text("class Base: speed = 1")
-    base = importlib.import_module("own_base").Base
-    sources = [foreign_source(type("Mine", (base,), {}))]
-    (tmp_path / "own_base.py").write_text("class Base: speed = 2")
-    sources.append(foreign_source(type("Mine", (base,), {})))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # three versions within a second
+    text = """
+import numba
+@numba.njit
+def kernel(x): return x + 1
+class Base:
+    speed = 1
+    def fast(self): return kernel(self.speed)
+"""
+    sources = []
+    texts = text, text.replace("speed = 1", "speed = 2"), text.replace("x + 1", "x + 2")
+    for new in texts:
+        (tmp_path / "own_base.py").write_text(new)
+        sys.modules.pop("own_base", None)
+        importlib.invalidate_caches()
+        base = importlib.import_module("own_base").Base
+        sources.append(foreign_source(type("Mine", (base,), {})))
     del sys.modules["own_base"]
-    assert sources[0] != sources[1]
+    assert len({*sources}) == len(texts)
 
 
 def test_settings_of_what_is_registered_later(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,6 @@ import json
 import os
 import platform
 import re
-import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -95,35 +94,27 @@ def modules_of(kind: type) -> tuple[str, ...]:
 
 
 def foreign_source(kind: type) -> str:
-    """The code of a class that somebody wrote outside this package, in a file or a notebook.
+    """What makes up a class that somebody wrote outside this package, in a file or a notebook.
 
-    Its own base classes count too. Of a module that is a file all counts. What a notebook, a script
-    or a prompt defines is told by what Python compiled of it, which worker processes hold as well:
-    methods, and the constants, functions and classes of the same place that they name.
+    It is told by what Python compiled, which worker processes hold as well, and which has neither
+    comments nor docstrings: the methods, of its own base classes too, and the constants, functions
+    and classes of the same module or notebook that they name.
     """
-    sources = {}
-    for own in (c for c in kind.__mro__ if c.__module__.partition(".")[0] not in _LIBRARIES):
-        home, file = own.__module__, getattr(sys.modules.get(own.__module__), "__file__", None)
-        is_file = file and home != "__main__"
-        sources[home if is_file else str(own)] = (
-            _code(ast.parse(Path(file).read_text("utf-8")))
-            if is_file
-            else str(_compiled(own, home, {}, []))
-        )
-    return "\n".join(sources.values())
+    own = [c for c in kind.__mro__ if c.__module__.partition(".")[0] not in _LIBRARIES]
+    return "\n".join(str(_compiled(c, c.__module__, {}, [])) for c in own)
 
 
 def _compiled(thing: Any, home: str, names: dict[str, Any], seen: list[int]) -> Any:
     """What a thing of a home module is made of, as plain text; the same in every process."""
-    thing = getattr(thing, "fget", None) or getattr(thing, "__func__", thing)  # of a property
+    if not isinstance(thing, FunctionType):  # of a property, or of what was cached or compiled
+        thing = getattr(thing, "fget", None) or getattr(thing, "__wrapped__", thing)
     if isinstance(thing, CodeType):
         steps = [(step.opname, step.argval) for step in dis.get_instructions(thing)]
         thing = [*steps, [names.get(name) for kind, name in steps if kind == "LOAD_GLOBAL"]]
     elif getattr(thing, "__module__", None) == home and id(thing) not in seen:
         seen.append(id(thing))
         if isinstance(thing, type):
-            members = vars(thing).items()
-            thing = {n: v for n, v in members if callable(v) or not n.startswith("__")}
+            thing = {n: v for n, v in vars(thing).items() if callable(v) or n[:2] != "__"}
         elif isinstance(thing, FunctionType):
             names, cells = thing.__globals__, thing.__closure__ or ()
             thing = [thing.__code__, thing.__defaults__, thing.__kwdefaults__]

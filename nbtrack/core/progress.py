@@ -1,6 +1,5 @@
 """One progress bar: a line that moves where somebody watches, elsewhere a line now and then."""
 
-import math
 import sys
 import threading
 import time
@@ -55,7 +54,7 @@ class ProgressBar:
         file, pause = (_NotebookLine(), 1.0) if is_notebook else (sys.stderr, 0.1)
         self._is_logged = is_shown and not (is_notebook or sys.stderr.isatty())
         if self._is_logged:  # never by itself: `_log` asks for what would be shown
-            form, pause = _LINE_FORMAT, math.inf
+            form, pause = _LINE_FORMAT, float("inf")
         # Without smoothing the ETA comes from the mean speed, not from that of the last step.
         how = {"mininterval": pause, "disable": not is_shown, "ascii": False, "smoothing": 0}
         how |= {"file": file, "bar_format": form, "delay": _DELAY_SECONDS}

@@ -19,7 +19,6 @@ from nbtrack.core.errors import ConfigError, MissingError, NbtrackError
 from nbtrack.core.files import project_folder, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings, with_settings
-from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.commands import preset_of
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Method, find_methods
@@ -27,7 +26,6 @@ from nbtrack.experiments.output import output_folder
 from nbtrack.experiments.presets import PRESETS, Preset
 from nbtrack.experiments.results import map_scene, track_scenes
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
-from nbtrack.fields import Field, LearnedField, PointCloud, field_class, make_field
 from nbtrack.tracking import ClockBudget, StepBudget, make_tracker
 
 _FRAMES_A_CELL = 3  # that a mean of steps in Table II is taken over
@@ -92,7 +90,9 @@ def bench_command(options: Namespace) -> None:
     # The paper's sizes unless something else is asked for: small networks measure bookkeeping.
     if "NBTRACK_PRESET" not in os.environ:
         options.preset = options.preset or "synthetic"
-    preset = preset_of(options, None, "scenes.n_frames=2")  # one image is enough
+    # One image is enough, and hardly a map: a step costs the same whatever the weights are.
+    quick = ("scenes.n_frames=2", "mapping.imap.iterations=1", "mapping.neus.iterations=1")
+    preset = preset_of(options, None, *quick)
     with output_folder(options.out, "table_2.csv"):
         steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset))
         folder = options.out or runs_folder() / "bench" / preset.name
@@ -142,8 +142,7 @@ def measure_steps(
     """Steps within each budget for every tracker, in its first method's field, and its n (pixels).
 
     A tracker first spends one frame that is not counted, so that allocations and compilations are
-    done. The scene's first frame feeds it. Networks are untrained: a step costs the same whatever
-    the weights are. Points and corrected fields are those of the scene's map.
+    done. The scene's first frame feeds it, in the scene's map, which is made if it is not cached.
 
     A row is a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames) and
     steps_deviation (over frames). Source: paper, Table II and evaluation protocol.
@@ -161,7 +160,7 @@ def measure_steps(
             bar.move_to(done, f"{name}={n_pixels}")
             settings = replace(own.tracking_of(name), n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
-                field = _field_to_measure(scene, method.field, own)
+                field = map_scene(scene, method.field, own).field
                 tracker = make_tracker(name, field, T_first, StepBudget(1), settings)
                 for budget_ms in preset.tables.budgets_ms:
                     tracker.budget, counts = ClockBudget(1000 / budget_ms), []
@@ -181,15 +180,6 @@ def default_pixels(preset: Preset, methods: Sequence[str | Method] = TABLE_1) ->
         m.tracker.upper(): with_settings(preset, *m.settings).tracking_of(m.tracker).n_pixels
         for m in reversed(find_methods(methods))
     }
-
-
-def _field_to_measure(scene: Scene, name: str, preset: Preset) -> Field | PointCloud:
-    """A field as a method uses it: untrained where the weights do not matter, else a map's."""
-    is_corrected = getattr(preset.mapping_of(name), "correct_voxel", 0.0) > 0
-    if is_corrected or not issubclass(field_class(name), LearnedField):
-        return map_scene(scene, name, preset).field
-    bounds = observed_bounds(scene.read(":1"))
-    return make_field(name, preset.network_of(name), bounds, seed=0).to(choose_device())
 
 
 def _note(preset: Preset, clock: bool) -> str:
