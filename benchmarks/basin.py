@@ -17,7 +17,7 @@ from nbtrack.experiments.methods import find_methods
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.tracking import StepBudget
-from nbtrack.tracking.registration import moved
+from nbtrack.tracking.lm_solver import retract
 
 OFFSETS = ((1, 1), (2, 2), (4, 4), (8, 6), (12, 9), (20, 15), (30, 20), (50, 30))
 """How far off the starts are: cm and degrees, from a frame's motion to a lost camera's."""
@@ -58,15 +58,15 @@ def find_from_afar(
         with ProgressBar(f"searches, {method.label}", len(searches)) as bar:
             for done, ((cm, degrees), start) in enumerate(searches, start=1):
                 frame = sequence[start % len(sequence)]
-                T_true = torch.from_numpy(frame.T_world_camera)
-                tracker.restart(moved(T_true, twist(start, cm, degrees).double()).numpy())
+                offset = twist(start, cm, degrees).double().numpy()
+                tracker.restart(retract(frame.T_world_camera, offset))
                 found = tracker.track(frame)
                 off = np.linalg.inv(frame.T_world_camera) @ found.T_world_camera
                 error_m = float(np.linalg.norm(off[:3, 3]))
                 error_deg = float(np.degrees(Rotation.from_matrix(off[:3, :3]).magnitude()))
                 is_near = error_m < RECOVERED_M and error_deg < RECOVERED_DEG
-                offset = f"{cm} cm, {degrees}°"
-                rows.append((method.label, offset, error_m, error_deg, is_near, found.lost))
+                name = f"{cm} cm, {degrees}°"
+                rows.append((method.label, name, error_m, error_deg, is_near, found.lost))
                 bar.move_to(done)
     columns = ["method", "offset", "error_m", "error_deg", "recovered", "lost"]
     return pd.DataFrame(rows, columns=columns)

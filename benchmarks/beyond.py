@@ -41,7 +41,7 @@ _CHANGES = {
 }
 # LM with one thing changed at a time.
 INGREDIENTS = [
-    METHODS["lm"],
+    METHODS["baked"],
     *(Method(label, "neus_plus", "lm", (setting,)) for label, setting in _CHANGES.items()),
     Method("in NeuS, as in the paper", "neus", "lm"),
 ]
@@ -66,7 +66,7 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     write("speed", speed[_COLUMNS])
     write("convergence", convergence(scenes[0], preset))
     write("points", points_time_and_bytes(scenes, preset))
-    searches = find_from_afar(scenes[0], {"sdf_plus": 79, "lm": 30, "baked": 30}, preset)
+    searches = find_from_afar(scenes[0], {"sdf_plus": 79, "baked": 30}, preset)
     write("basin", searches)
     parts = [
         track_scenes(scenes[:1], INGREDIENTS, preset, steps=30, frames=frames).assign(kept=frames)
@@ -112,7 +112,7 @@ def points_time_and_bytes(scenes: Sequence[Scene], preset: Preset) -> pd.DataFra
 
 def _maps(scene: Scene, preset: Preset) -> Iterator[tuple[str, tuple[int, Field, str, tuple]]]:
     """Labels; with each the bytes of a map, the map, a tracker and settings."""
-    methods = [METHODS["lm"], METHODS["corrected"]]
+    methods = [METHODS["baked"], METHODS["corrected"]]
     for cm in (2, 5, 10):
         settings = (f"mapping.points.voxel={cm / 100}",)
         methods.append(Method(f"ICP, cells of {cm} cm", "points", "icp", settings))

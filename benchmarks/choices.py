@@ -70,7 +70,7 @@ def _falling(name: str) -> Method:
 
 
 SEARCHES = {
-    METHODS["lm"]: (30, 100),
+    METHODS["baked"]: (30, 100),
     METHODS["icp"]: (1, 100),
     _falling("sdf"): (FALLING_STEPS, 20),
     _falling("vr"): (FALLING_STEPS, 20),

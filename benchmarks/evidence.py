@@ -30,6 +30,7 @@ from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.scenes import Scene
+from nbtrack.fields.grid import BakedField
 from nbtrack.mapping.quality import split_holdout
 from nbtrack.tables import write_table_1
 from nbtrack.tracking import StepBudget, track_sequence
@@ -139,7 +140,7 @@ def steps(seed: int) -> Iterator[Chunk]:
         yield place, partial(track, open_scenes(PRESET), TABLE_1, PRESET, **there)
 
 
-LEARNED = {"NeuS+ corrected": "corrected", "NeuS+": "lm", "NeuS": "sdf"}  # the methods' names
+LEARNED = {"NeuS+ corrected": "corrected", "NeuS+": "baked", "NeuS": "sdf"}  # the methods' names
 ORACLES = ("exact distance", "NeuS+ corrected", "fused voxels", "NeuS+", "NeuS")
 DEPTHS = {"exact": "depth", "filtered": "depth_filtered", "noisy": "depth_with_noise"}
 
@@ -159,9 +160,9 @@ def _on_each_depth(scene: Scene, name: str, seed: int) -> pd.DataFrame:
         whole = scene.read()
         bounds, mapped = observed_bounds(whole), split_holdout(len(whole), 10)[0]
         if name == "exact distance":
-            field = ExactDistance(bounds, scene.room)
+            field = BakedField(ExactDistance(bounds, scene.room), 0.02)
         else:
-            field = FusedDistance(whole, mapped, bounds)
+            field = BakedField(FusedDistance(whole, mapped, bounds), 0.05)  # its own voxels
     settings = replace(PRESET.tracking_of("lm"), n_pixels=2048, lambda_intensity=0.0)
     rows = []
     for depth, folder in DEPTHS.items():

@@ -33,6 +33,7 @@ from nbtrack.mapping.correct import correct_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.tables import write_csv
 from nbtrack.tracking import StepBudget, track_sequence
+from nbtrack.tracking.lm_solver import draw_points
 
 TRACKED = METHODS["corrected_dense"], METHODS["icp_dense"]
 # Smooth errors like a registration's: so far (m, degrees) about a point ahead (m), with so many
@@ -109,7 +110,7 @@ def registered_pairs(sequence) -> np.ndarray:
     are the starts."""
     seeded, clouds = torch.Generator().manual_seed(0), []
     for index in range(len(sequence)):
-        points = sequence[index].smooth_points(PAIR_POINTS, seeded)[0].double().numpy()
+        points = draw_points(sequence[index], PAIR_POINTS, seeded)[0]
         clouds.append(small_gicp.preprocess_points(points, downsampling_resolution=PAIR_VOXEL))
     starts = np.linalg.inv(sequence.T_world_camera[:-GAP]) @ sequence.T_world_camera[GAP:]
     pairs = [

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import inf
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, silu
@@ -19,7 +18,7 @@ from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import FIELDS, Field, IMapField, Linearization, NeuSField
+from nbtrack.fields import FIELDS, Field, IMapField, NeuSField
 from nbtrack.fields.base import rendered_losses
 from nbtrack.synthetic import Room
 from nbtrack.tracking import TRACKERS, AdamTracker, SdfTracker, VrTracker
@@ -180,7 +179,7 @@ class _Uncoloured(Field):
 
 
 class ExactDistance(_Uncoloured):
-    """The room's own distance; its gradient from differences over 1 µm in double precision."""
+    """The room's own distance."""
 
     name, label = "exact", "exact distance"
 
@@ -191,15 +190,6 @@ class ExactDistance(_Uncoloured):
     def value(self, points_world: Tensor) -> Tensor:
         """Signed distance (m)."""
         return torch.from_numpy(self.room.sdf(points_world.double().numpy())).to(points_world)
-
-    def linearize(self, points_world: Tensor) -> Linearization:
-        """Distance and gradient; the colour says nothing."""
-        points, steps = points_world.double().numpy(), 1e-6 * np.eye(3)
-        value = self.room.sdf(points)
-        slopes = [(self.room.sdf(points + step) - value) / 1e-6 for step in steps]
-        gradient = torch.from_numpy(np.stack(slopes, axis=-1)).to(points_world)
-        grey, value = torch.full_like(gradient[:, 0], 0.5), torch.from_numpy(value).to(gradient)
-        return Linearization(value, gradient, grey, torch.zeros_like(gradient))
 
 
 class FusedDistance(_Uncoloured):
@@ -237,12 +227,3 @@ class FusedDistance(_Uncoloured):
         places = (2 * (points_world - self.low) / self.extent - 1).flip(-1)
         sample = partial(grid_sample, padding_mode="border", align_corners=True)
         return sample(self.values, places[None, None, None])[0, 0, 0, 0]
-
-    def linearize(self, points_world: Tensor) -> Linearization:
-        """Distance and gradient; the colour says nothing."""
-        points = points_world.detach().requires_grad_()
-        with torch.enable_grad():
-            value = self.value(points)
-            (gradient,) = torch.autograd.grad(value.sum(), points)
-        grey = torch.full_like(value.detach(), 0.5)
-        return Linearization(value.detach(), gradient, grey, torch.zeros_like(gradient))

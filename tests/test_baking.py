@@ -9,14 +9,12 @@ from torch import Tensor
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError
 from nbtrack.fields import FIELDS, grid
-from nbtrack.fields.base import intensity_of
 from nbtrack.fields.grid import BakedField
 
 BOX = SceneBounds((-0.5, -0.25, 0.25), (0.55, 0.5, 1.0))  # x is no multiple of VOXEL
 VOXEL = 0.125  # exact in binary, as all corners' coordinates are
 SLOPE = torch.tensor([0.3, -0.7, 0.2])
 MIX = torch.tensor([[0.2, 0.0, 0.1], [0.0, 0.3, 0.1], [-0.1, 0.1, 0.2]])
-PARTS = ("value", "value_gradient", "intensity", "intensity_gradient")
 
 
 def formula(value) -> Formula:
@@ -28,18 +26,22 @@ def linear(points: Tensor) -> Tensor:
     return points @ SLOPE + 0.1
 
 
-def wavy(points: Tensor) -> Tensor:
-    return torch.sin(7 * points).sum(dim=-1) + points.prod(dim=-1)
+def with_gradient(field: BakedField, points: Tensor) -> tuple[Tensor, Tensor]:
+    """The value at points, and its gradient."""
+    points = points.clone().requires_grad_()
+    value = field(points)[1]
+    return value.detach(), torch.autograd.grad(value.sum(), points)[0]
 
 
 def test_linear_field_is_reproduced() -> None:
     """Catches swapped axes or channels, a shifted origin and gradients per cell, not per metre:
     interpolation of a linear function is exact everywhere, and its gradient constant."""
     source, points = formula(linear), points_inside(BOX, 500)
-    baked, exact = BakedField(source, VOXEL), source.linearize(points)
+    baked = BakedField(source, VOXEL)
     torch.testing.assert_close(baked(points)[0], source(points)[0])
-    for name, found in vars(baked.linearize(points)).items():
-        torch.testing.assert_close(found, getattr(exact, name), atol=5e-6, rtol=0)
+    value, gradient = with_gradient(baked, points)
+    torch.testing.assert_close(value, linear(points), atol=5e-6, rtol=0)
+    torch.testing.assert_close(gradient, SLOPE.expand(500, 3), atol=5e-6, rtol=0)
 
 
 def test_product_in_the_middle_of_a_cell() -> None:
@@ -50,27 +52,11 @@ def test_product_in_the_middle_of_a_cell() -> None:
     cell, with value 81/4096 and derivatives 27/256, 27/256 and 9/256.
     """
     points = torch.tensor([[0.25, 0.125, 0.5], [3 / 16, 3 / 16, 9 / 16]])
-    found = BakedField(formula(lambda points: points.prod(dim=-1)), VOXEL).linearize(points)
-    torch.testing.assert_close(found.value, torch.tensor([1 / 64, 81 / 4096]))
+    baked = BakedField(formula(lambda points: points.prod(dim=-1)), VOXEL)
+    value, gradient = with_gradient(baked, points)
+    torch.testing.assert_close(value, torch.tensor([1 / 64, 81 / 4096]))
     expected = torch.tensor([27 / 256, 27 / 256, 9 / 256])
-    torch.testing.assert_close(found.value_gradient[1], expected)
-
-
-@pytest.mark.parametrize("beyond", [0.0, 1.0])
-def test_forward_and_linearize_agree(beyond: float) -> None:
-    """Catches the gradient of something else than the interpolant, two interpolants (inside and,
-    where each axis is clamped, outside), and a graph that is dragged along."""
-    baked = BakedField(formula(wavy), VOXEL)
-    points = points_inside(BOX, 500, -beyond).requires_grad_()
-    found, (color, value) = baked.linearize(points), baked(points)
-    intensity = intensity_of(color)
-    of_value, of_intensity = (
-        torch.autograd.grad(answer.sum(), points, retain_graph=True)[0]
-        for answer in (value, intensity)
-    )
-    for name, expected in zip(PARTS, (value, of_value, intensity, of_intensity), strict=True):
-        torch.testing.assert_close(getattr(found, name), expected.detach(), rtol=1e-4, atol=1e-4)
-        assert not getattr(found, name).requires_grad
+    torch.testing.assert_close(gradient[1], expected)
 
 
 def test_outside_is_clamped_to_the_border() -> None:
@@ -83,14 +69,13 @@ def test_outside_is_clamped_to_the_border() -> None:
     baked = BakedField(formula(linear), VOXEL)
     far = torch.tensor([[-50.0, 0.1, 0.5], [50.0, 0.1, 0.5], [0.1, 0.1, 50.0], [9.0, 9.0, 9.0]])
     low, high = torch.tensor([-0.625, -0.375, 0.125]), torch.tensor([0.75, 0.625, 1.125])
-    border, found = far.clamp(low, high), baked.linearize(far)
-    torch.testing.assert_close(found.value, linear(border))
+    border, (value, gradient) = far.clamp(low, high), with_gradient(baked, far)
+    torch.testing.assert_close(value, linear(border))
     torch.testing.assert_close(baked(far)[0], formula(linear)(border)[0])
-    torch.testing.assert_close(found.value_gradient, SLOPE * (far == border), atol=5e-6, rtol=0)
+    torch.testing.assert_close(gradient, SLOPE * (far == border), atol=5e-6, rtol=0)
     for points in (torch.full((1, 3), float("nan")), torch.zeros(0, 3)):
-        assert baked.linearize(points).value.isnan().all()
         assert baked(points)[1].isnan().all()
-        assert baked(points)[0].shape == baked.linearize(points).value_gradient.shape
+        assert baked(points)[0].shape == points.shape
 
 
 def test_what_is_taken_from_the_source() -> None:

@@ -3,11 +3,10 @@
 What is refused: `test_faults.py`.
 """
 
-from types import SimpleNamespace
-
 import pytest
+import torch
 
-from nbtrack.tracking import ClockBudget, StepBudget, make_budget, paper_steps
+from nbtrack.tracking import ClockBudget, StepBudget, paper_steps
 
 
 class FakeClock:
@@ -61,20 +60,17 @@ def test_mean_is_over_the_whole_frame() -> None:
     assert clock.steps(1 / 8) == resumed.steps(1 / 8) == 0
 
 
-def test_device_is_synchronized_before_each_reading(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches GPU steps that look free because they are only queued."""
-    events: list[str] = []
-
-    def clock() -> float:
-        events.append("clock")
-        return len(events) / 64
-
+def test_the_trackers_device_is_waited_for_before_each_reading(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches GPU steps that look free because they are only queued, perhaps on another device than
+    the first one."""
+    events, device = [], torch.device("cuda:1")
     module = "nbtrack.tracking.budget"
-    monkeypatch.setattr(f"{module}.synchronize", lambda device: events.append("wait"))
-    monkeypatch.setattr(f"{module}.time", SimpleNamespace(perf_counter=clock))
-    list(make_budget(None, 4).frame())
-    assert events == ["wait", "clock"] * (len(events) // 2)
-    assert len(events) >= 6
+    monkeypatch.setattr(f"{module}.synchronize", events.append)
+    budget = ClockBudget(4, lambda: events.append("clock") or len(events) / 64)
+    assert len(list(budget.frame(device))) > 2
+    assert events == [device, "clock"] * (len(events) // 2)
 
 
 COUNTS = {

@@ -216,6 +216,10 @@ ARGUMENTS = {
     "steps in words": ([*OWN, "--steps", "few"], "invalid float value: 'few'"),
     "endless steps": ([*OWN, "--steps", "inf"], "steps_per_frame is inf"),
     "no grid": ([*OWN, "--bake", "nan"], "lm always works in a grid"),
+    "no grid size": (
+        [*OWN, "--tracker", "lm", "--set", "tracking.lm.voxel=nan"],
+        "must be 0 or more",
+    ),
     "negative pixels": ([*OWN, "--pixels", "-5"], "must be 1 or more"),
     "negative seed": ([*OWN, "--seed", "-1"], "is 0 or more"),
     "giant seed": ([*OWN, "--seed", "9" * 30], "is 0 or more"),
@@ -241,6 +245,7 @@ ARGUMENTS = {
     "unknown tracker": ([*OWN, "--tracker", "sfd"], "did you mean 'sdf'"),
     "tracker not the field's": ([*OWN, "--field", "imap"], "take one of neus"),
     "both budgets": ([*OWN, "--rate", "2"], "steps=2.0 and rate_hz=2.0: a frame has one budget"),
+    "setting of old": ([*OWN, "--set", "tracking.lm.bake_voxel=1"], "mean 'tracking.lm.voxel'"),
     "rate of zero": ([*NO_STEPS, "--rate", "0"], "rate_hz is 0"),
     "negative rate": ([*NO_STEPS, "--rate", "-1"], "rate_hz is -1"),
     "rate that is none": ([*NO_STEPS, "--rate", "nan"], "rate_hz is nan"),

@@ -1,5 +1,6 @@
 """The fused point cloud and the classical tracker in it."""
 
+import re
 import sys
 
 import numpy as np
@@ -9,7 +10,7 @@ from box_room import sequence_of
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import MissingError
+from nbtrack.core.errors import ConfigError, MissingError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, PointMapping
 from nbtrack.fields.points import fuse_points
@@ -18,8 +19,8 @@ from nbtrack.mapping.fit import map_sequence
 from nbtrack.mapping.quality import score_map
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
 from nbtrack.tracking import IcpSettings, StepBudget, Tracker, make_tracker
+from nbtrack.tracking.lm_solver import retract
 from nbtrack.tracking.metrics import pose_errors
-from nbtrack.tracking.registration import moved
 
 BOX = SceneBounds((-1.0, -1.0, 0.0), (1.0, 1.0, 3.0))
 Room = tuple[RgbdSequence, Map]
@@ -94,8 +95,8 @@ def test_icp_lands_on_the_true_pose(room: Room) -> None:
     """Catches a pose taken for its inverse, or wrong axes: from 5 cm and 3 degrees off."""
     pytest.importorskip("small_gicp")
     tracker, frame, turn = tracker_in(room), room[0][5], float(np.radians(1))
-    twist = torch.tensor([2 * turn, -turn, 2 * turn, 0.033, 0.033, 0.017])
-    T_start = moved(torch.from_numpy(frame.T_world_camera).float(), twist)
+    twist = np.array([2 * turn, -turn, 2 * turn, 0.033, 0.033, 0.017])
+    T_start = torch.from_numpy(retract(frame.T_world_camera, twist)).float()
     tracker.begin(frame, T_start[None])
     assert not tracker.is_converged
     assert torch.equal(tracker.T_world_camera, T_start)
@@ -125,3 +126,23 @@ def test_missing_package_is_one_line(room: Room, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     with pytest.raises(MissingError, match=r"^tracker icp needs .* 'nbtrack\[icp\]'$"):
         tracker_in(room)
+
+
+@pytest.mark.parametrize("voxel", [0.0, 1e-9, 1e9])
+def test_voxels_that_are_no_cells_of_the_scene_are_one_line(voxel: float) -> None:
+    """Catches a division by zero, cells whose numbers overflow, and a cloud of a single point."""
+    sequence = two_pixels([[2000, 2000]], [[10, 10]])
+    says = f"voxel is {voxel:g} m: the scene is 3 m long, so allowed are 2.9e-06 to 3 m; "
+    with pytest.raises(ConfigError, match=f"^{re.escape(says)}set for instance 0.02$"):
+        fuse_points(sequence, np.array([0]), BOX, voxel)
+
+
+def test_maps_and_draws_that_icp_cannot_use_are_one_line(room: Room) -> None:
+    """Catches pages of a library's warnings, and a frame that never ends."""
+    pytest.importorskip("small_gicp")
+    cloud = fuse_points(two_pixels([[2000, 2000]], [[10, 10]]), np.array([0]), BOX, voxel=1.0)
+    with pytest.raises(ConfigError, match=r"^the map has 2 points of 1 m cells; .*voxel, or map"):
+        make_tracker("icp", cloud, np.eye(4), StepBudget(1))
+    settings = IcpSettings(n_pixels=999_999_999)
+    with pytest.raises(ConfigError, match=r"^tracking\.icp\.n_pixels = 999999999: allowed"):
+        make_tracker("icp", room[1].field, np.eye(4), StepBudget(1), settings)

@@ -41,8 +41,8 @@ def test_figures_of_the_presets() -> None:
     assert paper.tables.rates_hz == (10.0, 5.0, 2.0)
     assert paper.tables.budgets_ms == (50.0, 100.0, 500.0)
     assert paper.scenes.names[:2] == ("breakfast_room", "complete_kitchen")
-    steps = {name: METHODS[name].paper_steps(10) for name in ("vr_neus", "sdf", "lm")}
-    assert steps == {"vr_neus": 6.8, "sdf": 15.3, "lm": 15.3}
+    steps = {name: METHODS[name].paper_steps(10) for name in ("vr_neus", "sdf", "baked")}
+    assert steps == {"vr_neus": 6.8, "sdf": 15.3, "baked": 15.3}
     assert PRESETS["synthetic"].scenes.names == REPORTED_ROOMS
     assert not {"bedroom", "kitchen_nook"} & {*REPORTED_ROOMS}
     assert {*PRESETS["smoke"].scenes.names} <= {*REPORTED_ROOMS}

@@ -137,6 +137,7 @@ def test_table_3(tmp_path: Path, scenes: list[Scene], monkeypatch: pytest.Monkey
     monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 2000)
     for name in TABLE_3:  # a grid of a whole room in cells of 4 cm takes seconds to fill
         settings = tuple(text.replace("voxel=0.04", "voxel=0.3") for text in METHODS[name].settings)
+        settings += ("tracking.lm.voxel=0.3",)
         monkeypatch.setitem(METHODS, name, replace(METHODS[name], settings=settings))
     words = tiny_words("scenes.names=office", "scenes.track_frames=:2")
     assert main(["tables", "--beyond", "--workers", "1", "--out", str(tmp_path), *words]) == 0
@@ -265,7 +266,7 @@ def test_searches_from_afar(
         twist = basin.twist(seed, 20, 15)
         assert float(twist[:3].norm()) == pytest.approx(math.radians(15), abs=1e-6)
         assert float(twist[3:].norm()) == pytest.approx(0.2, abs=1e-6)
-    methods = {"sdf": 2, "lm": 2}
+    methods = {"sdf": 2, "baked": 2}
     found = basin.find_from_afar(scenes[1], methods, preset, ((0, 0), (4, 4)), 2, "::2")
     assert len(found) == 2 * 2 * 2
     shares = found.groupby(["method", "offset"], sort=False)["recovered"].mean()

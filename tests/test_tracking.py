@@ -12,6 +12,7 @@ from box_room import BoxRoom, box_sequence, walk
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
+from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.grid import BakedField
 from nbtrack.tracking import (
@@ -146,11 +147,25 @@ def test_wrong_arguments() -> None:
         track_sequence(tracker, sequence)
 
 
-def test_a_field_is_baked_where_the_settings_say_so() -> None:
-    """Catches a setting without effect: the grid's answers differ, and are nearly as good."""
-    tracker = tracker_of("sdf", 20, replace(SETTINGS["sdf"], bake_voxel=0.05))
-    assert isinstance(tracker.field, BakedField)
-    assert track_sequence(tracker, walk(3)).frames["translation_error_m"].max() < 0.01
+def test_a_grid_is_tracked_in_by_one_thread() -> None:
+    """Catches a wide network, kept with the grid that was made from it, that sets the threads."""
+    grid = BakedField(BoxRoom(), 0.2)
+    grid.source = torch.nn.Linear(3, 512)
+    assert make_tracker("sdf", grid, np.eye(4), StepBudget(1))._width == 0
+
+
+def test_the_frame_is_copied_within_its_time() -> None:
+    """Catches images on their way to a device that cost no time, and the clock of another device
+    than the tracker's."""
+    events, tracker, sequence = [], tracker_of("sdf", 1), walk(2)
+    tracker.track(sequence[0])
+    begin, frames = tracker.budget.frame, Frame.to
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Frame, "to", lambda *a: events.append("copied") or frames(*a))
+        told = lambda device: events.append(device) or begin(device)  # noqa: E731
+        patch.setattr(tracker.budget, "frame", told)
+        tracker.track(sequence[1])
+    assert events == [tracker.device, "copied"]
 
 
 @pytest.mark.parametrize("name", ["vr", "sdf"])

@@ -44,18 +44,6 @@ def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
     return entries.flip(-1).unflatten(-1, (3, 3))
 
 
-def rotation_vector_to_matrix(rotation_vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Rotation matrix of an axis times an angle (rad), by way of the quaternion: exact near zero.
-
-    >>> rotation_vector_to_matrix(torch.zeros(3)).equal(torch.eye(3))
-    True
-    """
-    half = rotation_vector / 2
-    # torch's sinc divides by pi and knows its limit at zero.
-    sine_over_angle = torch.sinc(half.norm() / torch.pi)
-    return quaternion_to_matrix(torch.cat([half.norm().cos()[None], half * sine_over_angle]))
-
-
 def matrix_to_quaternion(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternion (w, x, y, z) of a rotation matrix; w >= 0.
 

@@ -13,11 +13,6 @@ from nbtrack.core.errors import DataError
 
 MILLIMETRE = 1e-3
 _MOST_MILLIMETRES = np.iinfo(np.uint16).max
-# Points to track: a neighbouring depth that differs by more, as a share, marks an edge.
-EDGE_JUMP, DRAWN_PER_POINT = 0.05, 4
-# They are spread evenly: of the sequence R2 (Roberts 2018), the fractions of n g and n g^2 with
-# g^3 + g^2 = 1, every beginning is. In units of 1 / MODULUS; down and across.
-EVEN_STEPS, MODULUS = (0xC13FA9A9, 0x91E10DA5), 2**32
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,27 +90,6 @@ class Frame:
         behind = torch.full_like(depth, torch.inf)
         behind[inside] = torch.where(measured > 0, depth[inside] - measured, torch.inf)
         return behind
-
-    def smooth_points(self, n_points: int, generator: torch.Generator) -> tuple[Points, Colors]:
-        """Observed points (m, camera frame), evenly spread pixels, and their colours in [0, 1].
-
-        Not those at depth edges, which may belong to either side, nor at the border. Only a few
-        times as many pixels as wanted are looked at, from a random one on: where little is
-        measured, fewer points come back.
-        """
-        starts = torch.randint(MODULUS, (2,), generator=generator, device=generator.device)
-        order = torch.arange(DRAWN_PER_POINT * n_points, device=generator.device)
-        rows, columns = (
-            1 + ((start + step * order) % MODULUS * (size - 2) // MODULUS)
-            for start, step, size in zip(starts, EVEN_STEPS, self.depth_mm.shape, strict=True)
-        )
-        depth = self.at(rows, columns)[1]
-        is_smooth = depth > 0
-        for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-            beside = self.at(rows + down, columns + right)[1]
-            is_smooth &= (beside - depth).abs() < EDGE_JUMP * depth
-        kept = torch.nonzero(is_smooth).squeeze(-1)[:n_points]
-        return self.points(rows[kept], columns[kept])
 
 
 def _check(

@@ -53,15 +53,13 @@ METHODS = {
     "color_volsdf": Method("VolSDF with VR, colour only", "volsdf", "vr", _COLOR_ONLY),
     "color_occupancy": Method("Occupancy with VR, colour only", "occupancy", "vr", _COLOR_ONLY),
     "sdf_plus": Method("NeuS+ with SDF (Adam)", "neus_plus", "sdf"),
-    "lm": Method("NeuS+ with SDF (LM)", "neus_plus", "lm"),
-    "baked": Method("NeuS+ baked (LM)", "neus_plus", "lm", ("tracking.lm.bake_voxel=0.04",)),
+    "baked": Method("NeuS+ baked (LM)", "neus_plus", "lm"),
     "corrected": Method("NeuS+ corrected (LM)", "neus_plus", "lm", _PLUS_CORRECTED),
     "corrected_dense": Method(
         "NeuS+ corrected (LM), dense", "neus_plus", "lm", _PLUS_CORRECTED + _DENSE
     ),
     "neus_corrected": Method("NeuS corrected (LM)", "neus", "lm", _CORRECTED),
     "sdf_corrected": Method("NeuS corrected with SDF (Adam)", "neus", "sdf", _CORRECTED),
-    "lm_dense": Method("NeuS+ with SDF (LM), dense", "neus_plus", "lm", _DENSE),
     "icp": Method("ICP", "points", "icp"),
     "icp_dense": Method("ICP, dense", "points", "icp", ("tracking.icp.n_pixels=4096",)),
 }
@@ -72,8 +70,8 @@ DEFAULT_METHOD = "corrected"
 TABLE_1 = ("vr", "sdf")
 """The rows of the paper's Table I."""
 TABLE_3 = (
-    "vr", "vr_velocity", "vr_neus", "sdf", "sdf_velocity", "sdf_plus", "sdf_corrected", "lm",
-    "baked", "lm_dense", "neus_corrected", "corrected", "corrected_dense", "icp", "icp_dense",
+    "vr", "vr_velocity", "vr_neus", "sdf", "sdf_velocity", "sdf_plus", "sdf_corrected",
+    "baked", "neus_corrected", "corrected", "corrected_dense", "icp", "icp_dense",
 )  # fmt: skip
 """The paper's methods beside those that go beyond it."""
 RATES_3_HZ = (30.0, 10.0, 5.0, 2.0)

@@ -4,7 +4,7 @@ import torch
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError, nearest_name
-from nbtrack.fields.base import Field, LearnedField, Linearization, MappingSettings
+from nbtrack.fields.base import Field, LearnedField, MappingSettings
 from nbtrack.fields.imap import IMapField
 from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.neus import NeuSField, NeusMapping

@@ -46,16 +46,6 @@ class MappingSettings:
     holdout_every: int = may_be_zero(10)  # every n-th frame is only scored
 
 
-@dataclass(frozen=True)
-class Linearization:
-    """A field's value and intensity at points, with their spatial gradients; all without graph."""
-
-    value: Values  # signed distance, m
-    value_gradient: Float[Tensor, "n 3"]  # no unit, length 1 for a true distance
-    intensity: Values  # luma of the colour, in [0, 1]
-    intensity_gradient: Float[Tensor, "n 3"]  # 1/m
-
-
 class Field(nn.Module, abc.ABC):
     """A scene as a function of position: colour, and a value that says where surfaces are."""
 
@@ -76,20 +66,6 @@ class Field(nn.Module, abc.ABC):
     @abc.abstractmethod
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour in [0, 1] and the field's value at points (m, world frame)."""
-
-    def linearize(self, points_world: Points) -> Linearization:
-        """Value and intensity with their gradients at points (m), by automatic differentiation."""
-        points = points_world.detach().requires_grad_()
-        with torch.enable_grad():
-            color, value = self(points)
-            intensity = intensity_of(color)
-            (value_gradient,) = torch.autograd.grad(value.sum(), points, retain_graph=True)
-            (intensity_gradient,) = torch.autograd.grad(intensity.sum(), points)
-        return Linearization(value.detach(), value_gradient, intensity.detach(), intensity_gradient)
-
-    def confidence(self, points_world: Points) -> Values:
-        """How well the surface is known at points (m), in [0, 1]; of a network 1, its own word."""
-        return points_world.new_ones(len(points_world))
 
     @property
     def device(self) -> torch.device:

@@ -13,9 +13,11 @@ from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Frames, Points, Values, WorldPoints
 from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.errors import ConfigError
 from nbtrack.core.settings import may_be_zero
 from nbtrack.data.sequence import RgbdSequence
 
+_MAX_CELLS_A_SIDE = 2**20  # so that a cell's number fits into 64 bits
 _FRAMES_AT_ONCE = 8  # frames whose voxels wait to be merged: what the memory is bounded by
 
 
@@ -75,9 +77,15 @@ def fuse_points(
     The frames' measured pixels inside the bounds count, `stride` apart, in voxels that have at
     `least` so many of them (or as many as any has). The mean takes noise off, and leaves planes
     where they are. Memory grows with the surface that was seen, not with the frames.
+    Raises ConfigError for a voxel that is not positive, far too fine, or longer than the scene.
     """
-    low = np.array(bounds.minimum)
-    shape = np.floor((np.array(bounds.maximum) - low) / voxel).astype(np.int64) + 1
+    low, extent = np.array(bounds.minimum), np.subtract(bounds.maximum, bounds.minimum)
+    if not extent.max() / _MAX_CELLS_A_SIDE <= voxel <= extent.max():
+        raise ConfigError(
+            f"voxel is {voxel:g} m: the scene is {extent.max():.3g} m long, so allowed are "
+            f"{extent.max() / _MAX_CELLS_A_SIDE:.2g} to {extent.max():.2g} m; set for instance 0.02"
+        )
+    shape = np.floor(extent / voxel).astype(np.int64) + 1
     # For each voxel's number the sums of x, y, z (m), red, green, blue, and one a pixel.
     parts = []
     for count, index in enumerate(frames.tolist(), start=1):

@@ -5,7 +5,6 @@ import importlib.util
 from nbtrack.core.arrays import Pose
 from nbtrack.core.errors import ConfigError, MissingError, nearest_name
 from nbtrack.fields import FIELDS, Field, PointCloud, field_class
-from nbtrack.fields.grid import BakedField
 from nbtrack.tracking.budget import Budget, ClockBudget, StepBudget, make_budget, paper_steps
 from nbtrack.tracking.icp import IcpSettings, IcpTracker
 from nbtrack.tracking.lm import LmSettings, LmTracker
@@ -51,12 +50,8 @@ def make_tracker(
 ) -> Tracker:
     """A tracker by name, for one trajectory; `tracker.track(frame)` then gives pose after pose.
 
-    The arguments are those of `Tracker`; a field is baked first if the settings say so. Raises
-    ConfigError or MissingError as `check_pair` does, and DataError for a pose that is none.
+    The arguments are those of `Tracker`. Raises ConfigError or MissingError as `check_pair` does,
+    and DataError for a pose that is none.
     """
     check_pair(name, type(field))
-    settings = settings or tracker_class(name).Settings()
-    voxel = getattr(settings, "bake_voxel", 0.0)
-    if voxel and not isinstance(field, BakedField):
-        field = BakedField(field, voxel)
     return tracker_class(name)(field, T_world_camera, budget, settings, seed)

@@ -9,13 +9,12 @@ from collections.abc import Callable, Iterator
 from fractions import Fraction
 from math import floor, isfinite
 
-from nbtrack.core.device import choose_device, synchronize
+import torch
+
+from nbtrack.core.device import synchronize
 from nbtrack.core.errors import ConfigError
 
-
-def _device_clock() -> float:
-    synchronize(choose_device())  # steps that are only queued would look free
-    return time.perf_counter()
+_HOST = torch.device("cpu")
 
 
 class ClockBudget:
@@ -27,11 +26,14 @@ class ClockBudget:
     compiles or allocates) would stop tracking for good.
 
     Time runs from the call of `frame`: a tracker that prepares its frame before the first step pays
-    for it, though not as part of a step. Unused time is lost. Source: paper, evaluation protocol;
-    for the first step of a frame, our choice.
+    for it, though not as part of a step. Before every reading of the clock the tracker's device is
+    waited for: steps that are only queued would look free. Unused time is lost. Source: paper,
+    evaluation protocol; for the first step of a frame, our choice.
     """
 
-    def __init__(self, rate_hz: float | int, clock: Callable[[], float] = _device_clock) -> None:
+    def __init__(
+        self, rate_hz: float | int, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
         """Of frames a second and a clock (s); ConfigError if the rate is not finite and above 0."""
         self.rate_hz, self._clock = _positive("rate_hz", rate_hz), clock
         self.memory: float | None = None  # mean seconds of a step in the last frame
@@ -39,18 +41,25 @@ class ClockBudget:
     def __str__(self) -> str:
         return f"wall clock, {1000 / self.rate_hz:g} ms per frame"
 
-    def frame(self) -> Iterator[int]:
-        """Starts the next frame; gives 0, 1, 2, ... as long as another step is allowed."""
-        return self._steps(start=self._clock())
+    def frame(self, device: torch.device = _HOST) -> Iterator[int]:
+        """Starts the next frame of a tracker on a device.
 
-    def _steps(self, start: float) -> Iterator[int]:
-        prepared = now = self._clock()
+        Gives 0, 1, 2, ... as long as another step is allowed.
+        """
+        return self._steps(self._now(device), device)
+
+    def _now(self, device: torch.device) -> float:
+        synchronize(device)
+        return self._clock()
+
+    def _steps(self, start: float, device: torch.device) -> Iterator[int]:
+        prepared = now = self._now(device)
         mean, self.memory = self.memory, None
         step = 0
         while mean is None or start + 1 / self.rate_hz - now >= mean:
             yield step
             step += 1
-            now = self._clock()
+            now = self._now(device)
             mean = self.memory = (now - prepared) / step
 
 
@@ -71,8 +80,8 @@ class StepBudget:
     def __str__(self) -> str:
         return f"{self.steps_per_frame:g} steps per frame"
 
-    def frame(self) -> Iterator[int]:
-        """Starts the next frame; yields 0, 1, 2, ... as long as another step is allowed."""
+    def frame(self, device: torch.device = _HOST) -> Iterator[int]:
+        """Starts the next frame, on any device; yields 0, 1, ... while another step is allowed."""
         done = floor(self.memory * self._exact)
         self.memory += 1
         yield from range(floor(self.memory * self._exact) - done)

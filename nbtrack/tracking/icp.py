@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
 from nbtrack.fields import PointCloud
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
@@ -46,8 +47,16 @@ class IcpTracker(Tracker):
     copes_without_depth = True
 
     def __init__(self, field: PointCloud, *arguments: Any, **settings: Any) -> None:
-        """Prepare the map: planes of its points, and a search tree."""
+        """Prepare the map: planes of its points, and a search tree.
+
+        Raises ConfigError where it has too few points for a plane.
+        """
         super().__init__(field, *arguments, **settings)
+        if len(field.points) < _NEIGHBOURS:
+            raise ConfigError(
+                f"the map has {len(field.points)} points of {field.voxel:g} m cells; ICP needs "
+                f"{_NEIGHBOURS} or more: set a smaller mapping.points.voxel, or map more frames"
+            )
         self.small_gicp = importlib.import_module(self.package)
         points = field.points.cpu().double().numpy()
         self.target, self.target_tree = self._with_planes(self.small_gicp.PointCloud(points))

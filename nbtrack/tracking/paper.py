@@ -146,7 +146,6 @@ class SdfSettings(AdamSettings):
 
     lambda_sdf: float = 1.0  # per metre
     lambda_color: float = 0.3
-    bake_voxel: float = 0.0  # m; the field is asked on a grid of such cells, 0: itself
 
 
 class SdfTracker(AdamTracker):

@@ -18,8 +18,10 @@ from nbtrack.core.errors import ConfigError, NumericalError, nearest_name
 from nbtrack.data.frame import Frame
 from nbtrack.data.text_files import checked_poses
 from nbtrack.fields import Field, LearnedField, PointCloud
+from nbtrack.fields.grid import BakedField
 from nbtrack.tracking.budget import Budget
 
+_MAX_PIXELS = 2**24
 MOTION_MODELS = ("previous_pose", "constant_velocity", "better_of_both")
 
 
@@ -78,7 +80,8 @@ class Tracker(abc.ABC):
     package: str | None = None  # what it needs beside this project's own requirements
     converges: bool = False  # whether it ends a frame by itself, before its budget is spent
     copes_without_depth: bool = False  # whether it is shown frames without any measured depth
-    remembers: tuple[str, ...] = ()  # attributes that one frame leaves to the next
+    # Attributes that one frame leaves to the next; their class has their values before the first.
+    remembers: tuple[str, ...] = ()
     is_converged: bool = False  # whether further steps would change nothing: the rest is spared
     T_world_camera: Transform
 
@@ -92,12 +95,20 @@ class Tracker(abc.ABC):
     ) -> None:
         """In a map, from a pose before the first frame (m), with a budget of its own.
 
-        Raises ConfigError for an unknown motion model, DataError for a pose that is not rigid.
+        Raises ConfigError for an unknown motion model or too many pixels, DataError for a pose that
+        is not rigid.
         """
         self.settings = settings or self.Settings()
-        weights = []  # of a grid or a cloud of points, which one thread serves best
+        if self.settings.n_pixels > _MAX_PIXELS:
+            raise ConfigError(
+                f"tracking.{self.name}.n_pixels = {self.settings.n_pixels}: allowed are 1 to "
+                f"{_MAX_PIXELS}, more than any depth image has; set for instance 4096"
+            )
         if isinstance(field, Field):
-            weights = [*field.eval().requires_grad_(False).parameters()]
+            field.eval().requires_grad_(False)
+        # One thread serves a grid, even one that keeps the network it was made from, and points.
+        is_network = isinstance(field, Field) and not isinstance(field, BakedField)
+        weights = [*field.parameters()] if is_network else []
         self._width = max((len(weight) for weight in weights if weight.dim()), default=0)
         self.field, self.device, self.budget = field, field.device, budget
         self.generator = torch.Generator(self.device).manual_seed(seed)
@@ -133,16 +144,22 @@ class Tracker(abc.ABC):
         estimate = Estimate(T_starts[0], without_depth=True)
         if self.copes_without_depth or frame.has_depth:
             with suitable_threads(self._width):
-                estimate = self._search(frame.to(self.device), T_starts)
+                estimate = self._search(frame, T_starts)
         self.estimates.append(estimate.T_world_camera)
         return estimate
 
     def restart(self, T_world_camera: Pose) -> None:
-        """Go on from another pose (m), as after an interruption; velocities are forgotten."""
+        """Go on from another pose (m), as after an interruption.
+
+        What the frames before left is forgotten: velocities, and whatever a subclass remembers.
+        Random numbers and the budget go on.
+        """
         pose = np.array(T_world_camera, dtype=np.float64)
         pose[~np.isfinite(pose)] = np.finfo(pose.dtype).max  # which no rigid transform has
         self.estimates = [*checked_poses(pose[None], Path("T_world_camera"))]
         expected_poses(self.settings.motion_model, self.estimates)  # a wrong name is told now
+        for name in self.remembers:
+            setattr(self, name, getattr(type(self), name))
 
     def state(self) -> dict[str, Any]:
         """What the frames so far leave to the next one; tensors and plain values."""
@@ -161,19 +178,22 @@ class Tracker(abc.ABC):
         for name in self.remembers:
             setattr(self, name, state[name])
 
+    def _begin(self, frame: Frame, T_starts: Poses) -> None:
+        starts = torch.from_numpy(T_starts).float()
+        self.begin(frame.to(self.device), starts.to(self.device))
+
     def _search(self, frame: Frame, T_starts: Poses) -> Estimate:
-        starts = torch.from_numpy(T_starts).float().to(self.device)
         if not self._is_warm and frame.has_depth:
             # Steps that count nowhere: first calls load, allocate and record for a second or more.
             state, self._is_warm = self.state(), True
-            self.begin(frame, starts[:1])
+            self._begin(frame, T_starts[:1])
             for _ in range(capture.WARM_STEPS + 1 if capture.can_record(self.device) else 1):
                 self.step()
             self.report()
             self.restore(state)
             synchronize(self.device)
-        began, allowed = time.perf_counter(), self.budget.frame()
-        self.begin(frame, starts)
+        began, allowed = time.perf_counter(), self.budget.frame(self.device)
+        self._begin(frame, T_starts)
         steps, loss = 0, float("nan")
         for step in allowed:
             loss, steps = self.step(), step + 1
