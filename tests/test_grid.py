@@ -129,7 +129,7 @@ def words(folder: Path, *options: str) -> list[str]:
     """The command for two rooms, and trackers of first and second order."""
     settings = tiny_words("tables.rates_hz=[10]", "scenes.track_frames=:4")
     out = ["--threads", "1", "--out", str(folder / "out")]
-    return ["tables", "--method", "sdf,lm", *out, *settings, *options]
+    return ["tables", "--method", "sdf,baked", *out, *settings, *options]
 
 
 def tables(folder: Path, *options: str) -> int:
