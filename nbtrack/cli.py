@@ -53,6 +53,8 @@ OPTIONS = {
     "--frames": _option("Python slice of frames, A:B:S", default=":"),
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from MAP": _option("track in this map of the room: its folder or file", a_path),
+    "--start": _option("given: the first frame's own pose (default where it has one), or unknown",
+                       choices=("given", "unknown")),
     "--to FORMAT": _option("tum, kitti: trajectory; ply, glb: coloured mesh; map: one file"),
     "--budget BY": _option("steps, the paper's counts (default), or this machine's clock",
                            choices=("steps", "clock"), default="steps"),
@@ -86,7 +88,7 @@ COMMANDS = {
             "sequence --method --field --format " + _MADE),
     "track": ("track a camera; maps first where no map fits",
               "sequence --method --field --tracker --format --rate --steps --pixels "
-              "--map-frames --map-from " + _MADE),
+              "--map-frames --map-from --start " + _MADE),
     "methods": ("list what --method takes", ""),
     "export": ("a run's trajectory or a map elsewhere", "source out --to!"),
     "tables": ("the paper's tables, and one beyond, CSV and LaTeX",

@@ -1,5 +1,6 @@
 """The corrected field: better at surfaces that were measured, as before elsewhere; in a file."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -123,3 +124,26 @@ def test_a_kidnapped_camera_is_found(found: CorrectedField, sequence: RgbdSequen
     assert not estimate.lost
     off = estimate.T_world_camera[:3, 3] - sequence.T_world_camera[1, :3, 3]
     assert np.linalg.norm(off) < 0.05
+
+
+def test_colours_are_those_of_the_surface(found: CorrectedField, sequence: RgbdSequence) -> None:
+    """Catches colours that are smeared along normals, as where they are asked for off the surface
+    too, or that are as stiff as distances: an eightieth of the error would be left."""
+    grey = Formula(wavy, ROOM.bounds)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nbtrack.fields.correction._N_POINTS", 40_000)
+        assert errors(corrected(grey, sequence, np.arange(12), VOXEL))[1] < errors(grey)[1] / 150
+
+
+def test_the_least_scales_follow_the_sensor(
+    found: CorrectedField, sequence: RgbdSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a tracker that takes a noisy camera's residuals for outliers, or a good one's for
+    noise: 5.5 medians of normal noise are 3.7 of its standard deviations."""
+    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 40_000)
+    assert found.accuracy == pytest.approx((0.01, 0.05))  # nearly exact: no less than these
+    noise = np.random.default_rng(0).normal(scale=6.0, size=sequence.depths_mm.shape)
+    noisy = replace(sequence, depths_mm=(sequence.depths_mm + noise).astype(np.uint16))
+    field = corrected(found.source, noisy, np.arange(12), VOXEL)
+    # Walls are mostly seen at an angle, where less of the noise is along the normal.
+    assert 0.5 * 3.7 * 0.006 < field.accuracy[0] < 3.7 * 0.006

@@ -83,7 +83,7 @@ OTHER, CHANGED = "is not a readable map file", "is not what was written"
 # What a file may hold in place of a map: a part of its header or a tensor, and what it is instead.
 # Where something else than the digest must tell, the file has one that is right.
 MAP_CONTENT: dict[str, tuple[str, Any, str]] = {
-    "a later version": ("format_version", 3, "format 3; this nbtrack reads 2"),
+    "a later version": ("format_version", 4, "format 4; this nbtrack reads 3"),
     "no version": ("format_version", GONE, "format None"),
     "a word for a version": ("format_version", "new", "format 'new'"),
     "unknown field": ("field", "nerf", "this nbtrack has no field 'nerf'"),

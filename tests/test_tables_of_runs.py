@@ -204,7 +204,7 @@ def test_table_2_measures_what_a_method_uses(
     monkeypatch.setitem(METHODS, "corrected", replace(METHODS["corrected"], settings=settings))
     words = tiny_words("scenes.names=office", "tables.rates_hz=[10]", "scenes.track_frames=:2")
     words += ["--workers", "1", "--out", str(tmp_path)]
-    assert main(["tables", "--trackers", "icp,corrected", *words]) == 0
+    assert main(["tables", "--method", "icp,corrected", *words]) == 0
     assert isinstance(fields["icp"], PointCloud)
     assert isinstance(fields["lm"], CorrectedField)
     steps = pd.read_csv(tmp_path / "table_2.csv")

@@ -3,7 +3,10 @@
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pandas as pd
 import trimesh
 
 from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
@@ -12,7 +15,7 @@ from nbtrack.core.progress import tell
 from nbtrack.core.settings import as_dict
 from nbtrack.data.check import check_recording
 from nbtrack.data.recording import open_recording
-from nbtrack.data.sequence import parse_frames
+from nbtrack.data.sequence import parse_frames, read_frames
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import run_cells
@@ -33,14 +36,21 @@ from nbtrack.mapping.files import (
 from nbtrack.mapping.meshes import extract_mesh
 from nbtrack.tracking import make_budget
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
-from nbtrack.tracking.trajectories import METRICS_FILE, read_tum, write_kitti
+from nbtrack.tracking.trajectories import (
+    METRICS_FILE,
+    read_trajectory,
+    read_tum,
+    write_kitti,
+)
 
+OVERVIEW_FILE = "overview.png"  # beside the files of a run
 _FORMATS = ["tum", "kitti", "ply", "glb", "map"]
 _PRINTED = (
     "ate_rmse_m", "still_ate_m", "path_m", "ate_rmse_aligned_m", "rotation_rmse_deg",
     "max_error_m", "frames",
     "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
 )  # fmt: skip
+_FRAMES_SHOWN, _CELLS = 20, 120  # of an overview: frames that tell what was seen; cells across
 _MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
 _UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": ("s", 0)}
 
@@ -90,25 +100,30 @@ def track_command(options: Namespace) -> None:
         preset = _with_network_of(given, preset, options)
     steps = method.usual_steps if options.steps is options.rate is None else options.steps
     budget = make_budget(steps, options.rate)  # told before a room is made
-    scene = _checked_scene(options, preset, options.frames, map_frames)
+    scene = _checked_scene(options, preset, *([] if given else [map_frames]))
     cell = MapCell(
         scene, method.field, preset, map_frames, options.seed, options.map_from, given is not None
     )
     run = TrackCell(
         cell, scene, method.tracker, steps, options.rate, options.frames, options.seed,
-        options.out, options.threads,
+        options.out, options.threads, options.start or "given",
     )  # fmt: skip
-    with output_folder(options.out, *RUN_FILES):
+    with output_folder(options.out, *RUN_FILES, OVERVIEW_FILE):
         if not given:
             _map(cell)
         run = replace(run, out=run.folder)  # made anew, whatever the cache holds
         (metrics,) = run_cells([run], f"tracking {scene.name}")
+        _draw_overview(run)
     print(f"{run.folder}: {method.tracker} in {cell.map().field.label}, {budget}")
+    _print_metrics(metrics)
+
+
+def _print_metrics(metrics: dict[str, Any]) -> None:
     _print_numbers({name: metrics[name] for name in _PRINTED if name in metrics})
     if "lost_frames" in metrics:
         print(f"  frames off by more than {LOST_THRESHOLD_M:g} m: {metrics['lost_frames']}")
     else:
-        print("  no true pose is known after the first frame: errors cannot be told")
+        print("  no true pose is known of the tracked frames: errors cannot be told")
     if "flagged_frames" in metrics:
         print(f"  frames that the tracker itself calls lost: {metrics['flagged_frames']}")
     if metrics["frames_without_depth"]:
@@ -116,6 +131,39 @@ def track_command(options: Namespace) -> None:
     print(f"  on {metrics['device']}")
     if metrics.get("map_warning"):
         tell(f"nbtrack: warning: {metrics['map_warning']}")
+
+
+def _draw_overview(run: TrackCell) -> None:
+    """A picture of a finished run, beside its files: the path in what was seen of the map."""
+    from nbtrack.plots import plot_overview
+
+    tracked, metrics, field = read_trajectory(run.folder), run.result(), run.needs.map().field
+    ids, known = tracked.frames["frame_id"].to_numpy(), np.isfinite(tracked.T_true).all(axis=(1, 2))
+    stride = max(1, len(ids) // _FRAMES_SHOWN)
+    some = range(len(run.scene.recording))[parse_frames(run.frames)][1::stride]
+    seen = read_frames(
+        run.scene.recording, slice(some.start, some.stop, some.step), needs_poses=False
+    )
+    poses = tracked.T_estimated[np.searchsorted(ids, seen.frame_ids)]
+    size = max(np.subtract(field.bounds.maximum, field.bounds.minimum))
+    try:
+        mesh = extract_mesh(
+            field, replace(seen, T_world_camera=poses), voxel=max(0.05, size / _CELLS)
+        )
+    except DataError as error:
+        print(f"  no picture: {error}")
+        return
+    colors = mesh.colors if isinstance(field, PointCloud) else mesh.visual.vertex_colors
+    cloud = pd.DataFrame(mesh.vertices, columns=["x", "y", "z"])
+    cloud[["red", "green", "blue"]] = np.asarray(colors)[:, :3]
+    paths = {"true": tracked.T_true[known]} if known.any() else {}
+    title = f"{run.scene.name}: {run.tracker} in {field.label}, {len(ids)} frames"
+    if known.any():
+        still = 100 * metrics.get("still_ate_m", float("nan"))
+        title += f", ATE {100 * metrics['ate_rmse_m']:.2f} cm (standing still {still:.0f} cm)"
+    figure = plot_overview(cloud, paths | {"tracked": tracked.T_estimated}, tracked.frames, title)
+    figure.savefig(run.folder / OVERVIEW_FILE, dpi=120)
+    print(f"  picture: {run.folder / OVERVIEW_FILE}")
 
 
 def export_command(options: Namespace) -> None:
@@ -199,12 +247,13 @@ def preset_of(options: Namespace, method: Method | None = None, *settings: str) 
     return load_preset(options.preset, options.config, changed)
 
 
-def _checked_scene(options: Namespace, preset: Preset, *slices: str) -> Scene:
-    """The scene, from which all slices select something; a bad one is told before it is made."""
-    for frames in slices:
+def _checked_scene(options: Namespace, preset: Preset, *mapped: str) -> Scene:
+    """The scene, of which slices to map have poses; a bad slice is told before a room is made."""
+    for frames in (options.frames, *mapped):
         parse_frames(frames)
     scene = open_scene(options.sequence, preset, options.format)
-    for frames in slices:
+    scene.count(options.frames, needs_poses=False)
+    for frames in mapped:
         scene.count(frames)
     return scene
 

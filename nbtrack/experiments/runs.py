@@ -8,6 +8,7 @@ from math import isnan
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from nbtrack.core import files
@@ -42,6 +43,7 @@ class TrackCell(Cell):
     seed: int = 0
     out: Path | None = None
     n_threads: int | None = None  # CPU threads to track with; by default the process's
+    start: str = "given"  # the first frame's true pose, where known; or "unknown"
 
     kind = "tracks"
 
@@ -58,8 +60,8 @@ class TrackCell(Cell):
         clock = None if self.rate_hz is None else (self.rate_hz, device_name(choose_device()))
         return files.fingerprint(
             files.sources_fingerprint(*modules), files.foreign_source(kind), self.needs.key,
-            self.tracker, self.settings, self.steps, clock, self.n_threads, self.frames, self.seed,
-            self.scene.fingerprint,
+            self.tracker, self.settings, self.steps, clock, self.n_threads, self.start, self.frames,
+            self.seed, self.scene.fingerprint,
         )  # fmt: skip
 
     @property
@@ -120,9 +122,11 @@ class TrackCell(Cell):
         notes |= still_metrics(sequence.T_world_camera)
         if self.is_elsewhere:
             notes["map_from"] = made.made
-        if self.needs.is_given:  # another path of a room we know may begin where no map reaches
+        T_first = sequence.T_world_camera[0]
+        is_start_known = self.start == "given" and bool(np.isfinite(T_first).all())
+        if self.needs.is_given and is_start_known:  # another path may begin where no map reaches
             notes["map_warning"] = check_belongs(made, sequence[0])
-        start, T_start = time.perf_counter(), sequence.T_world_camera[0]
+        start, T_start = time.perf_counter(), T_first if is_start_known else np.eye(4)
         tracker = make_tracker(self.tracker, made.field, T_start, budget, self.settings, self.seed)
         if isinstance(tracker.field, BakedField):
             notes["bake_seconds"] = time.perf_counter() - start
@@ -132,7 +136,8 @@ class TrackCell(Cell):
             status = f"frame {done}" if isnan(error_m) else f"off by {100 * error_m:.1f} cm"
             report(done / len(sequence), status)
 
-        return track_sequence(tracker, sequence, self._checkpoint, tell), notes
+        found = track_sequence(tracker, sequence, self._checkpoint, tell, is_start_known)
+        return found, notes | {"start": "given" if is_start_known else "unknown"}
 
     def _metrics(self, tracked: Trajectory) -> dict[str, Any]:
         metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
@@ -174,7 +179,7 @@ class TrackCell(Cell):
         options = {
             "format": self.scene.format,
             **({"map-from": cell.folder} if self.is_elsewhere else made),
-            "tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps,
+            "tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps, "start": self.start,
             "frames": self.frames, "seed": self.seed, "device": choose_device().type,
             "threads": self.n_threads, "preset": preset.name,
         }  # fmt: skip

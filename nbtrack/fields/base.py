@@ -56,6 +56,7 @@ class Field(nn.Module, abc.ABC):
     # By how much its distance (m) and intensity are off at surfaces, together with depth cameras:
     # larger residuals lose their say in second-order tracking. Our choice, for small networks.
     accuracy: tuple[float, float] = (0.02, 0.05)
+    inlier_distance: float = 0.05  # m from its surface within which a point fits
     least_inliers: float = 0.6  # share of a frame's points that fit where the camera is not lost
     Settings: type[MappingSettings] = MappingSettings  # of mapping
 

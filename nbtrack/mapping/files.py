@@ -22,7 +22,7 @@ from nbtrack.fields.correction import CORRECTIONS, CorrectedField
 MAP_FILE, HISTORY_FILE = "map.safetensors", "history.csv"
 MESH_FILE = "mesh.ply"  # what a map's frames have seen
 CHECKPOINT_FILE = "mapping.pt"  # of a map in the making
-_FORMAT, _VERSION = "nbtrack map", 2
+_FORMAT, _VERSION = "nbtrack map", 3
 _AGAIN = "map again, and give the folder or its map.safetensors; an earlier nbtrack's are none"
 AnyField = Field | PointCloud
 

@@ -16,6 +16,7 @@ from nbtrack.plots.figures import (
 from nbtrack.plots.rooms import (
     mesh_viewer,
     plot_mesh,
+    plot_overview,
     plot_points,
     plot_recording,
     plot_slice,

@@ -108,14 +108,40 @@ def plot_recording(cloud: pd.DataFrame, T_world_camera: Poses, title: str) -> Fi
     The cloud's columns are x, y, z (m, world frame), red, green, blue (0 to 255).
     """
     axes = new_axes(title, 6.0)[0, 0]
-    up, places = _draw_from_above(axes, {"true": T_world_camera}), cloud[["x", "y", "z"]]
+    _draw_cloud(axes, cloud, {"true": T_world_camera})
+    return axes.figure
+
+
+@styled
+def plot_overview(
+    cloud: pd.DataFrame, T_paths: Mapping[str, Poses], frames: pd.DataFrame, title: str
+) -> Figure:
+    """A tracked run: paths over the map's coloured points from above, and errors over time.
+
+    The cloud is as in `plot_recording`, `frames` are the run's; without a known true pose the
+    errors are left out.
+    """
+    has_errors = frames["translation_error_m"].notna().any()
+    left, *right = new_axes(title, 5.0, 1, 2 if has_errors else 1)[0]
+    _draw_cloud(left, cloud, T_paths)
+    left.legend(loc="upper right")
+    for axes in right:
+        seconds = frames["time"] - frames["time"].iloc[0]
+        axes.plot(seconds, 100 * frames["translation_error_m"], color="#d7191c")
+        axes.set(xlabel="time (s)", ylabel="translation error (cm)", ylim=(0, None))
+    return left.figure
+
+
+def _draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) -> None:
+    """Coloured points from above, but for those higher than all cameras; and paths."""
+    up, places = _draw_from_above(axes, T_paths), cloud[["x", "y", "z"]]
     inside = (places >= places.quantile(_CUT)) & (places <= places.quantile(1 - _CUT))
     heights = (places @ up)[inside.all(axis=1)].sort_values()  # drawn from the floor up
-    shown = cloud.loc[heights.index[heights <= (T_world_camera[:, :3, 3] @ up).max() + 0.1]]
+    highest = max((path[:, :3, 3] @ up).max() for path in T_paths.values())
+    shown = cloud.loc[heights.index[heights <= highest + 0.1]]
     page = shown[["x", "y", "z"]].to_numpy()[:, page_axes(up)]
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
     axes.scatter(*page.T, c=colors, s=1.5, linewidths=0)
-    return axes.figure
 
 
 @styled

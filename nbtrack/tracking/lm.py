@@ -83,6 +83,14 @@ class LmTracker(Tracker):
         super().__init__(grid, T_world_camera, budget, settings, seed)
         self.grid = Grid(grid)
 
+    def restart_anywhere(self) -> None:
+        """Look for the camera near all poses that the map was made from; see `_hypotheses`."""
+        cameras = getattr(self.field, "T_world_cameras", None)
+        if cameras is None:
+            super().restart_anywhere()
+        self.restart(cameras[len(cameras) // 2].double().numpy())
+        self.was_lost = True
+
     def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
         """Draw the frame's points; take up the descent from the start that fits them best."""
         starts = T_starts.double().numpy()

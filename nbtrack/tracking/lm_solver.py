@@ -55,8 +55,8 @@ MARGIN = 0.3  # m beyond a field's bounds, where walls lie if the pose is off
 # So weak that it decides only where the frame says nothing, as along a corridor: one point's worth
 # at a twist of 0.5 rad or 0.5 m (our choice).
 PRIOR_WEIGHT = 1 / 0.5**2
-# A point fits if it is so many accuracies of the field near to its surface, and so like in luma.
-_INLIER_ACCURACIES, _INLIER_INTENSITY = 2.5, 0.25
+# A point fits if it lies as near to the surface as the field says, and is so like it in luma.
+_INLIER_INTENSITY = 0.25
 _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e-9, 1e3
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.2
 # The coarse stage may lead away from a good start: the better of both goes on, at these scales.
@@ -103,7 +103,7 @@ class Grid:
         # Vertices as (distance, intensity, confidence), their numbers along x, y and z, and their
         # place: the first vertex, the voxel, and both corners of the box whose points are usable.
         self.arrays = vertices, np.array(field.n_vertices), place
-        self.accuracy = np.array(field.accuracy)
+        self.accuracy, self.inlier_distance = np.array(field.accuracy), field.inlier_distance
 
 
 class Descent:
@@ -156,7 +156,7 @@ class Descent:
         for error bars.
         """
         distance, intensity, reliability = self.terms[:3]
-        is_inlier = np.abs(distance) < _INLIER_ACCURACIES * self.grid.accuracy[0]
+        is_inlier = np.abs(distance) < self.grid.inlier_distance
         is_inlier &= reliability > 0
         if self.lambda_intensity:
             # A picture that is darker as a whole says nothing against a pose.

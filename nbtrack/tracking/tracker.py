@@ -134,8 +134,10 @@ class Tracker(abc.ABC):
         """What it says about its estimate, by column name; `lost`, where given, is its verdict."""
         return {}
 
-    def track(self, frame: Frame) -> Estimate:
+    def track(self, frame: Frame, steps: int | None = None) -> Estimate:
         """The camera's pose at the next frame; NumericalError if it is not finite.
+
+        A number of steps replaces the budget for this frame.
 
         Without any measured depth, and where the tracker does not cope with that, it is the one
         that the motion model expects: the frames after it still can be found (our choice).
@@ -144,7 +146,7 @@ class Tracker(abc.ABC):
         estimate = Estimate(T_starts[0], without_depth=True)
         if self.copes_without_depth or frame.has_depth:
             with suitable_threads(self._width):
-                estimate = self._search(frame, T_starts)
+                estimate = self._search(frame, T_starts, steps)
         self.estimates.append(estimate.T_world_camera)
         return estimate
 
@@ -160,6 +162,13 @@ class Tracker(abc.ABC):
         expected_poses(self.settings.motion_model, self.estimates)  # a wrong name is told now
         for name in self.remembers:
             setattr(self, name, getattr(type(self), name))
+
+    def restart_anywhere(self) -> None:
+        """Go on although nobody knows where the camera is. ConfigError if it cannot be found."""
+        raise ConfigError(
+            f"tracker {self.name!r} cannot find a camera whose first pose is not known: take lm in "
+            "a corrected map (--method corrected), or begin with a frame that has a pose"
+        )
 
     def state(self) -> dict[str, Any]:
         """What the frames so far leave to the next one; tensors and plain values."""
@@ -182,7 +191,7 @@ class Tracker(abc.ABC):
         starts = torch.from_numpy(T_starts).float()
         self.begin(frame.to(self.device), starts.to(self.device))
 
-    def _search(self, frame: Frame, T_starts: Poses) -> Estimate:
+    def _search(self, frame: Frame, T_starts: Poses, n_steps: int | None) -> Estimate:
         if not self._is_warm and frame.has_depth:
             # Steps that count nowhere: first calls load, allocate and record for a second or more.
             state, self._is_warm = self.state(), True

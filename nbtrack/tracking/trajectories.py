@@ -21,6 +21,7 @@ from nbtrack.tracking.metrics import pose_errors
 from nbtrack.tracking.tracker import Estimate, Tracker
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
+STEPS_TO_FIND = 1000  # a few dozen descents
 METRICS_FILE = "metrics.json"  # written last: where it stands, a run is complete
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
@@ -40,23 +41,23 @@ def track_sequence(
     sequence: RgbdSequence,
     checkpoint: Path | None = None,
     on_frame: Callable[[int, float], None] | None = None,
+    is_start_known: bool = True,
 ) -> Trajectory:
     """Estimate every frame's pose from the first frame's true one, wherever the tracker was.
 
     Source: paper, Sec. I-A and the evaluation protocol: every frame is processed, none is dropped.
+    Where the start is not known, the first frame is tracked too, and until one frame is not lost
+    each has `STEPS_TO_FIND` steps, whatever the budget (our choice).
     A checkpoint of this run is written every few seconds and resumed from; `on_frame` is told the
     index in the sequence and the translation error (m; NaN where no true pose is known). Raises
     DataError if there are fewer than two frames, or none of them has a measured depth.
     """
-    if len(sequence) < 2:
-        raise DataError(f"{sequence!r} is too short to track: give at least two frames")
-    if not sequence.depths_mm.any():
-        raise DataError(
-            f"no frame of {sequence.name} has a measured depth: check the depth folder and its "
-            "unit (uint16 millimetres), or choose other --frames"
-        )
-    first, rows = 1, []
-    tracker.restart(sequence.T_world_camera[0])
+    _check_trackable(sequence)
+    first, rows = int(is_start_known), []
+    if is_start_known:
+        tracker.restart(sequence.T_world_camera[0])
+    else:
+        tracker.restart_anywhere()
     last_saved = time.perf_counter()
     with advise_on_memory(f"tracking.{tracker.name}.n_pixels={tracker.settings.n_pixels}"):
         if checkpoint and checkpoint.exists():
@@ -64,14 +65,26 @@ def track_sequence(
                 tracker.restore(state["tracker"])
                 rows = state["rows"]
         for index in range(first + len(rows), len(sequence)):
-            rows.append(_row(sequence, index, tracker.track(sequence[index])))
+            is_found = is_start_known or not all(row["lost"] for row in rows)
+            estimate = tracker.track(sequence[index], None if is_found else STEPS_TO_FIND)
+            rows.append(_row(sequence, index, estimate))
             if on_frame:
                 on_frame(index, rows[-1]["translation_error_m"])
             if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
                 files.save_checkpoint(checkpoint, {"rows": rows, "tracker": tracker.state()})
                 last_saved = time.perf_counter()
-    T_estimated = np.stack(tracker.estimates[first:])
+    T_estimated = np.stack(tracker.estimates[1:])  # after the start, known or not
     return Trajectory(T_estimated, sequence.T_world_camera[first:], pd.DataFrame(rows))
+
+
+def _check_trackable(sequence: RgbdSequence) -> None:
+    if len(sequence) < 2:
+        raise DataError(f"{sequence!r} is too short to track: give at least two frames")
+    if not sequence.depths_mm.any():
+        raise DataError(
+            f"no frame of {sequence.name} has a measured depth: check the depth folder and its "
+            "unit (uint16 millimetres), or choose other --frames"
+        )
 
 
 def read_trajectory(folder: Path) -> Trajectory:
