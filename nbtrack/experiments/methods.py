@@ -33,7 +33,7 @@ class Method:
 _COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
 _VR_VELOCITY = ("tracking.vr.motion_model=constant_velocity",)
 _SDF_VELOCITY = ("tracking.sdf.motion_model=constant_velocity",)
-_DENSE = ("tracking.lm.n_pixels=4096",)
+_SPARSE, _MIDDLE, _DENSE = ((f"tracking.lm.n_pixels={n}",) for n in (512, 2048, 4096))
 _CORRECTED = ("mapping.neus.correct_voxel=0.04",)
 # As good as from 1400 iterations, in half the time (benchmarks/README.md; rooms for tuning).
 _PLUS_CORRECTED = ("mapping.neus_plus.correct_voxel=0.04", "mapping.neus_plus.iterations=600")
@@ -54,7 +54,10 @@ METHODS = {
     "color_occupancy": Method("Occupancy with VR, colour only", "occupancy", "vr", _COLOR_ONLY),
     "sdf_plus": Method("NeuS+ with SDF (Adam)", "neus_plus", "sdf"),
     "baked": Method("NeuS+ baked (LM)", "neus_plus", "lm"),
-    "corrected": Method("NeuS+ corrected (LM)", "neus_plus", "lm", _PLUS_CORRECTED),
+    "corrected": Method("NeuS+ corrected (LM)", "neus_plus", "lm", _PLUS_CORRECTED + _MIDDLE),
+    "corrected_sparse": Method(
+        "NeuS+ corrected (LM), sparse", "neus_plus", "lm", _PLUS_CORRECTED + _SPARSE
+    ),
     "corrected_dense": Method(
         "NeuS+ corrected (LM), dense", "neus_plus", "lm", _PLUS_CORRECTED + _DENSE
     ),
@@ -71,7 +74,8 @@ TABLE_1 = ("vr", "sdf")
 """The rows of the paper's Table I."""
 TABLE_3 = (
     "vr", "vr_velocity", "vr_neus", "sdf", "sdf_velocity", "sdf_plus", "sdf_corrected",
-    "baked", "neus_corrected", "corrected", "corrected_dense", "icp", "icp_dense",
+    "baked", "neus_corrected", "corrected_sparse", "corrected", "corrected_dense", "icp",
+    "icp_dense",
 )  # fmt: skip
 """The paper's methods beside those that go beyond it."""
 RATES_3_HZ = (30.0, 10.0, 5.0, 2.0)
