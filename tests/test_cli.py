@@ -3,8 +3,11 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
+import pandas as pd
 import pytest
+from finished import GIVEN
 from recordings import write_recording
 from tiny import tiny_words
 
@@ -15,6 +18,7 @@ from nbtrack.data.recording import open_recording
 from nbtrack.tracking.trajectories import read_tum
 
 TINY = tiny_words("scenes.n_frames=6", "tracking.sdf.n_pixels=32")
+TINY_MAP = ["--set", "network.neus.width=32", "--set", "mapping.neus.n_rays=48"]
 
 
 def track(path: Path | str, *more: str) -> list[str]:
@@ -140,3 +144,37 @@ def test_what_completion_offers() -> None:
     """Catches `nbtrack.<Tab>` that offers imports of the module and none of the public names."""
     assert dir(nbtrack) == sorted(nbtrack.__all__)
     assert all(hasattr(nbtrack, name) for name in dir(nbtrack))
+
+
+def test_a_recording_without_poses_is_tracked_in_a_map(
+    work: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches `no poses in ...` where a map of the room is given: the camera is found first, every
+    frame is tracked, and nothing is said of errors; and a picture that is not there."""
+    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 20_000)
+    recording = work / "rec"
+    words = ["--set", "mapping.neus.iterations=200", "--set", "mapping.neus.correct_voxel=0.15"]
+    made = ["data", "make", "office", "--out", str(recording), "--n-frames", "12", "--width", "64"]
+    assert main(made) == 0
+    small = [*TINY_MAP, *words]
+    assert main(["map", str(recording), "--field", "neus", *small, "--out", "corrected"]) == 0
+    capsys.readouterr()
+    assert main(["track", str(recording), "--map-from", "corrected", "--out", "known"]) == 0
+    assert "still ate" in capsys.readouterr().out
+    for name in ("poses.txt", "trainval_poses.txt"):
+        (recording / name).unlink()
+    assert main(["track", str(recording), "--map-from", "corrected", "--out", "found"]) == 0
+    assert "errors cannot be told" in capsys.readouterr().out
+    metrics = json.loads((work / "found/metrics.json").read_text())
+    assert (metrics["start"], metrics["frames"]) == ("unknown", 12)
+    assert not (work / "found/groundtruth.txt").exists()
+    known, found = (read_tum(work / name / "trajectory.txt")[1] for name in ("known", "found"))
+    off = np.linalg.norm(found[1:, :3, 3] - known[:, :3, 3], axis=1)
+    flagged = pd.read_csv(work / "found/frames.csv")["lost"].to_numpy()[1:]
+    assert (flagged | (off < 0.05)).all()
+    for name in ("known", "found"):
+        assert cv2.imread(str(work / name / "overview.png")).shape[1] > 800
+    assert main(["track", str(recording), "--out", "own"]) == 2
+    assert "or track in a map of the same place with --map-from" in capsys.readouterr().err
+    assert main([*GIVEN, "map", "--start", "unknown"]) == 2
+    assert "cannot find a camera whose first pose is not known" in capsys.readouterr().err

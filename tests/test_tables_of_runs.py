@@ -3,6 +3,7 @@
 import importlib
 import json
 import math
+import os
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -145,20 +146,30 @@ def test_table_3(tmp_path: Path, scenes: list[Scene], monkeypatch: pytest.Monkey
     assert (tmp_path / "table_3.tex").read_text().count("NeuS+ baked (LM)") == 1
 
 
-def test_a_run_is_made_again_from_its_command(
+def test_every_method_is_made_again_from_its_command(
     preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a command that lacks a setting, a seed or a slice: its map is made anew too."""
-    runs = track_scenes(scenes[1:], ["sdf"], preset, [10], frames="1:4", seeds=2)
-    assert runs["ate_m"].nunique() == 2  # one a seed
-    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "elsewhere"))
+    """Catches a command that lacks a setting, a seed or a slice, or is refused; of the first method
+    the map is made anew too."""
+    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 2000)
+    coarse = with_settings(preset, "tracking.lm.voxel=0.3")
+    for name, method in METHODS.items():
+        settings = tuple(text.replace("voxel=0.04", "voxel=0.3") for text in method.settings)
+        monkeypatch.setitem(METHODS, name, replace(method, settings=settings))
+    how = {"steps": 2, "frames": "1:4", "seeds": [1], "execution": Execution(workers=1, threads=1)}
+    runs = track_scenes(scenes[1:], [*METHODS], coarse, **how)
+    assert runs["failure"].eq("").all()
     monkeypatch.chdir(tmp_path)
-    arguments = shlex.split(runs["command"][1])
-    assert arguments[:3] == ["python", "-m", "nbtrack"]
-    assert main(arguments[3:]) == 0
-    metrics = json.loads((tmp_path / arguments[-1] / "metrics.json").read_text())
-    assert metrics["ate_rmse_m"] == runs["ate_m"][1]
-    assert metrics["seed"] == 1
+    monkeypatch.setattr("nbtrack.experiments.commands._draw_overview", lambda run: None)
+    here, elsewhere = os.environ["NBTRACK_RUNS"], str(tmp_path / "elsewhere")
+    for row in runs.itertuples():
+        monkeypatch.setenv("NBTRACK_RUNS", here if row.Index else elsewhere)
+        arguments = shlex.split(row.command)
+        assert arguments[:3] == ["python", "-m", "nbtrack"]
+        assert main(arguments[3:]) == 0, row.method
+        again = read_run(tmp_path / arguments[-1])
+        assert again.metrics["ate_rmse_m"] == row.ate_m, row.method
+        assert again.metrics["seed"] == 1
 
 
 def test_a_second_path_is_tracked_in_the_map_of_the_first(
