@@ -25,13 +25,14 @@ from recordings import (
     write_recording,
 )
 from scipy.spatial.transform import Rotation
+from tiny import TINY
 
 from nbtrack import synthetic
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.settings import with_settings
-from nbtrack.data.check import DataReport, check_recording
+from nbtrack.data.check import DataReport, check_recording, quick_warning
 from nbtrack.data.formats import WORLD_TO_CAMERA
 from nbtrack.data.readings import CONVENTIONS
 from nbtrack.data.recording import open_recording
@@ -243,6 +244,22 @@ def camera(f: float, c: float) -> Change:
     return change
 
 
+def moved(unit: float) -> Change:
+    """Positions in another unit than metres, so many of which are one."""
+
+    def change(data: Source) -> Source:
+        other = data.poses.copy()
+        other[:, :3, 3] *= unit
+        return data._replace(poses=other)
+
+    return change
+
+
+def turned(*axes: int) -> Change:
+    """Rows or columns of depth images in reverse order."""
+    return lambda data: data._replace(depths_mm=np.flip(data.depths_mm, axes).copy())
+
+
 INVERSE = "world-to-camera"
 MISTAKES = [
     Case('OpenGL axes .*camera-to-world; set camera_axes = "opengl" in', change=poses("opengl")),
@@ -265,6 +282,10 @@ MISTAKES = [
     Case("one with its principal point in the middle of the image; set", change=camera(1.0, 2.0)),
     Case("one for images twice as large; set", change=camera(2.0, 2.0)),
     Case("one for images half as large; set", change=camera(0.5, 0.5)),
+    Case("ones in millimetres; multiply .* by 0.001 ", change=moved(1000.0)),
+    Case("ones in centimetres; multiply .* by 0.01 ", change=moved(100.0)),
+    Case(".*images upside down", change=turned(1)),
+    Case(".*images turned by 180 degrees", change=turned(1, 2)),
 ]
 RIGHT = [
     Case("", f'camera_axes = "{axes}"\nposes = "{direction}"', poses(axes, direction))
@@ -300,6 +321,35 @@ def test_no_false_alarm(tmp_path: Path, name: str) -> None:
     """Catches warnings about recordings that are right, however they are declared."""
     for number, case in enumerate(RIGHT):
         assert check(write(tmp_path / str(number), name, case)).warnings == [], case
+
+
+@pytest.mark.parametrize("name", SEEN)
+def test_a_quick_look_before_mapping(tmp_path: Path, name: str) -> None:
+    """Catches a recording with wrong axes that is mapped and tracked without a word, and words
+    about one that is right; absurd numbers too."""
+    for number, case in enumerate([*MISTAKES, *RIGHT]):
+        said = quick_warning(open_recording(write(tmp_path / str(number), name, case)))
+        wanted = f"your (poses look|(depth|calibration) looks) like {case.says}"
+        assert re.match(wanted if case.says else "$", said), (case, said)
+    depth = Case("", change=lambda data: data._replace(depths_mm=data.depths_mm * 0 + 65535))
+    far = Case("", change=moved(1e5))
+    for case, says in ((depth, "depth"), (far, "is not proved: two")):
+        said = quick_warning(open_recording(write(tmp_path / says[:5], name, case)))
+        assert says in said, said
+
+
+def test_map_and_track_warn(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches 153 s of work on wrong axes that end at 5 m with status 0; and frames without a pose
+    that are left out in silence."""
+    folder = write(tmp_path / "r", "office", Case("", change=poses("opengl")))
+    lines = (folder / "poses.txt").read_text().splitlines()
+    lines[3] = " ".join(["nan"] * 16)
+    (folder / "poses.txt").write_text("\n".join(lines) + "\n")
+    words = [word for setting in TINY for word in ("--set", setting)]
+    assert main(["track", str(folder), "--method", "sdf", "--steps", "1", *words]) == 0
+    said = capsys.readouterr().err
+    assert "nbtrack: warning: your poses look like OpenGL axes" in said
+    assert "nbtrack: 1 of 18 frames have no pose: not mapped" in said
 
 
 @pytest.mark.parametrize("stride", [40, 80])

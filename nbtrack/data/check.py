@@ -5,16 +5,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 import torch
+from jaxtyping import Int
 from scipy.spatial.transform import Rotation
 
+from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import DataError
-from nbtrack.data.readings import ROTATED, Reading, best_reading, diagnosis, fitted, readings
+from nbtrack.data.readings import (
+    ROTATED,
+    Reading,
+    best_reading,
+    diagnosis,
+    fitted,
+    preferring_edges,
+    readings,
+)
 from nbtrack.data.recording import Recording
 from nbtrack.data.sequence import RgbdSequence, read_frames
 
 _CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
-_N_PAIRS, _GAPS = 20, (5, 10, 15)  # frames between the two: they moved, and still see the same,
+_N_PAIRS, _QUICK_PAIRS, _GAPS = (
+    20,
+    6,
+    (5, 10, 15),
+)  # frames between the two: they moved, and still see the same,
 _TURNED_DEG = 60  # which they do where the camera has not turned by more in between
 _CELL = 0.1  # m: edge of the cells of surface that coverage counts
 _CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
@@ -129,23 +143,65 @@ def check_recording(recording: Recording, progress: bool = False) -> DataReport:
 
     All images are kept meanwhile. Raises what `read_frames` does, or DataError without any depth.
     """
-    # As the files have it, so that any unit can be tried.
-    as_in_files = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
-    sequence = read_frames(replace(recording, declared=as_in_files), progress=progress)
-    frames, ids = _by_frame(sequence), sequence.frame_ids
+    sequence = read_frames(_as_in_files(recording), progress=progress)
+    frames = _by_frame(sequence)
     if not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
-    # Pairs of frames that see much the same, spread over the sequence, with all gaps alike. How far
-    # the camera turns is the same in all conventions.
-    turn = max(1.0, np.nan_to_num(frames.turned_deg.median()))
-    most = max(1, min(len(ids) - 1, int(_TURNED_DEG / turn)))
-    gaps = np.minimum(np.resize(_GAPS, _N_PAIRS), most)
-    first = np.rint(np.linspace(0, 1, _N_PAIRS) * (len(ids) - 1 - gaps)).astype(int)
-    pairs = np.unique([first, first + gaps], axis=1)[:, : _N_PAIRS * (len(ids) > 1)]
-    in_files = sequence.depths_mm[pairs], recording.file_poses[ids[pairs.ravel()]]
-    found = readings(recording.declared, sequence.intrinsics)
-    found = [fitted(reading, *in_files, recording.declared.quaternion) for reading in found]
+    pairs = _pairs(sequence.T_world_camera, _N_PAIRS)
+    found = _fitted_to(sequence, recording, pairs)
     return DataReport(recording, frames, _cloud(found[0], sequence), found, best_reading(found))
+
+
+def quick_warning(recording: Recording) -> str:
+    """What a look at a few pairs of frames finds wrong, in a sentence; empty where nothing is.
+
+    As `check_recording`, but that only these frames are read, which takes about a second.
+    """
+    ids = np.flatnonzero(recording.has_pose)
+    if len(ids) < 2:
+        return ""
+    pairs = _pairs(recording.T_world_camera[ids], _QUICK_PAIRS)
+    kept, places = np.unique(pairs, return_inverse=True)
+    sequence = read_frames(_as_in_files(recording), ids[kept])
+    if not sequence.depths_mm.any():
+        return ""  # whoever needs depth says so
+    found = _fitted_to(sequence, recording, places.reshape(pairs.shape))
+    best, depth = best_reading(found), _cloud(found[0], sequence).depth.median()
+    if best is found[0] and not _DEPTH[0] <= depth <= _DEPTH[1]:
+        return f"the median depth is {depth:.3g} m: set depth_scale or no_depth in sequence.toml"
+    return diagnosis(found, best, recording, needs_proof=False)
+
+
+def _as_in_files(recording: Recording) -> Recording:
+    """With depth values as they stand in the files, so that any unit can be tried."""
+    return replace(
+        recording, declared=replace(recording.declared, depth_scale=1000.0, depth_along="axis")
+    )
+
+
+def _pairs(T_world_camera: Poses, most: int) -> Int[np.ndarray, "2 pairs"]:
+    """Positions of frames that see much the same, spread over a sequence, with all gaps alike.
+
+    How far the camera turns is the same in all conventions.
+    """
+    n_frames = len(T_world_camera)
+    turns = Rotation.from_matrix(T_world_camera[:-1, :3, :3].mT @ T_world_camera[1:, :3, :3])
+    turn = max(1.0, np.degrees(np.median(turns.magnitude())) if n_frames > 1 else 0.0)
+    gaps = np.minimum(np.resize(_GAPS, most), max(1, min(n_frames - 1, int(_TURNED_DEG / turn))))
+    first = np.rint(np.linspace(0, 1, most) * (n_frames - 1 - gaps)).astype(int)
+    return np.unique([first, first + gaps], axis=1)[:, : most * (n_frames > 1)]
+
+
+def _fitted_to(
+    sequence: RgbdSequence, recording: Recording, pairs: Int[np.ndarray, "2 pairs"]
+) -> list[Reading]:
+    """All readings, the declared one first, and how well pairs of the frames agree under each."""
+    poses = recording.file_poses[sequence.frame_ids[pairs.ravel()]]
+    found = readings(recording.declared, sequence.intrinsics)
+    some = np.unique(pairs)
+    found = preferring_edges(found, sequence.colors[some], sequence.depths_mm[some])
+    in_files = sequence.depths_mm[pairs], poses, recording.declared.quaternion
+    return [fitted(reading, *in_files) for reading in found]
 
 
 def _by_frame(sequence: RgbdSequence) -> pd.DataFrame:

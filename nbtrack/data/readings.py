@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import UInt16
+from jaxtyping import UInt8, UInt16
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -23,6 +23,7 @@ _POINTS_PER_FRAME = 1000  # 20 pairs of frames have enough for a median
 _CLEARLY_BETTER = 0.5  # of the distance as declared (our choice)
 _LEAST_GAIN = 5e-4  # of the depth: 1 mm at 2 m, depth's resolution on disk
 _FAR_APART = 0.05  # m, median distance above which a map of the scene would be blurred (our choice)
+_FAR_APART_OF_FEW = 0.15  # the same where less than the first share overlaps (our choice)
 # Shares of points below which a median tells nothing, and below which not even a large one does: of
 # a right recording hardly a point lies in front of what another frame sees there (our choice).
 _LEAST_OVERLAP, _LEAST_CONTRADICTION = 0.15, 0.02
@@ -31,6 +32,8 @@ ROTATED = (8000.0, 80_000.0)  # depth values a metre: millimetres, and tenths, t
 # and micrometres, which 16 bits hold badly.
 _SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, *ROTATED, 256.0, 100.0, 1.0, 1e6)
 _ALONG = {"axis": "depth along the optical axis", "ray": "distances along the ray, not z-depth"}
+_EDGES_ALIKE = 0.02  # by which a correlation of edges must be higher to decide (our choice)
+_FLIPPED = {(1,): "images upside down", (1, 2): "images turned by 180 degrees"}
 # The common camera axes first: where several fit alike, the first is named.
 _USUAL = {
     "right up backward": "OpenGL axes",
@@ -70,6 +73,8 @@ class Reading:
     median_m: float = math.nan  # median |z difference| over the points that overlap
     relative: float = math.nan  # the same as a share of the depth, which no unit makes small
     overlap: float = 0.0  # share of all points that fall onto a measured, not nearer, surface
+    metres: float = 1.0  # of one unit of the poses' positions
+    flipped: tuple[int, ...] = ()  # axes of (frames, rows, columns) that depth has in reverse order
 
     def points(self, columns: Tensor, rows: Tensor, values: Tensor) -> Tensor:
         """Points (..., 3; m, camera frame) of pixels with depth values as in the files."""
@@ -80,6 +85,7 @@ class Reading:
 
     def grid_points(self, values: UInt16[np.ndarray, "frames h w"], stride: int) -> Tensor:
         """Points (frames, n, 3) of every `stride`-th row and column; 0 if unmeasured."""
+        values = np.flip(values, self.flipped)
         values = torch.from_numpy(values[:, ::stride, ::stride].astype(np.float32))
         rows, columns = (stride * torch.from_numpy(np.indices(values.shape[1:]))).flatten(1)
         return self.points(columns, rows, values.flatten(1))
@@ -91,6 +97,7 @@ class Reading:
             # Numbers a b c d read as xyzw that are wxyz: x y z w is b c d a.
             q = np.roll(Rotation.from_matrix(T[:, :3, :3]).as_quat(), 1 - 2 * (order == "xyzw"), 1)
             T[:, :3, :3] = Rotation.from_quat(q).as_matrix()
+        T[:, :3, 3] *= self.metres
         return self.declared.poses_to_opencv(T)
 
 
@@ -108,6 +115,9 @@ def readings(declared: Declaration, camera: Intrinsics) -> list[Reading]:
     table += [("depth", f"{n:g} depth values a metre", {"depth_scale": n}) for n in _SCALES]
     table += [("depth", name, {"depth_along": along}) for along, name in _ALONG.items()]
     found = [Reading(what, name, replace(declared, **keys), camera) for what, name, keys in table]
+    others = [Reading("depth", n, declared, camera, flipped=axes) for axes, n in _FLIPPED.items()]
+    for unit, metres in (("millimetres", 1e-3), ("centimetres", 1e-2)):
+        others.append(Reading("poses", f"ones in {unit}", declared, camera, metres=metres))
     factors = {"with its principal point in the middle of the image": 1.0}
     factors |= {"for images twice as large": 0.5, "for images half as large": 2.0}
     lengths = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
@@ -116,7 +126,8 @@ def readings(declared: Declaration, camera: Intrinsics) -> list[Reading]:
         scaled = Intrinsics(camera.width, camera.height, *(factor * lengths).tolist())
         middle = replace(scaled, cx=camera.width / 2, cy=camera.height / 2)
         found += [Reading("calibration", f"one {name}", declared, c) for c in (scaled, middle)]
-    return found[:1] + [r for r in found if (r.declared, r.camera) != (declared, camera)]
+    found = found[:1] + [r for r in found if (r.declared, r.camera) != (declared, camera)]
+    return found + others
 
 
 def fitted(
@@ -137,7 +148,8 @@ def fitted(
     columns, rows, depth = project(reading.camera, points_b)
     # From -1 at the first pixel to 1 at the last.
     at = 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1)[:, None] - 1
-    inverse = 1 / torch.from_numpy(values[1, :, None].astype(np.float32))
+    seen_by_b = np.flip(values[1], reading.flipped).astype(np.float32)
+    inverse = 1 / torch.from_numpy(seen_by_b[:, None])
     blended = 1 / grid_sample(inverse, at, "bilinear", align_corners=True)[:, 0, 0]
     nearest = 1 / grid_sample(inverse, at, "nearest", align_corners=True)[:, 0, 0]
     measured = reading.points(columns, rows, blended)[..., 2]
@@ -149,6 +161,37 @@ def fitted(
     median_m, relative = float(apart.median()), float((apart / measured).median())
     overlap = float(seen.sum() / is_measured.sum().clamp(1))
     return replace(reading, median_m=median_m, relative=relative, overlap=overlap)
+
+
+def preferring_edges(
+    found: list[Reading],
+    colors: UInt8[np.ndarray, "frames h w 3"],
+    values: UInt16[np.ndarray, "frames h w"],
+) -> list[Reading]:
+    """Readings in an order in which flipped depth comes second where it fits the colours better.
+
+    Depth upside down fits other frames as well as mirrored camera axes do. But its edges are then
+    not where the edges of the colour images are.
+    """
+    if not len(colors):
+        return found
+    luma = colors.mean(axis=-1)
+    # A middle pixel's differences from its neighbours on both sides, so that flips stay in place.
+    strength = [
+        np.abs(image[:, 2:, 1:-1] - image[:, :-2, 1:-1])
+        + np.abs(image[:, 1:-1, 2:] - image[:, 1:-1, :-2])
+        for image in (luma, np.log1p(values))
+    ]
+    edges = [(image > np.quantile(image, 0.9)).astype(float) for image in strength]
+    with np.errstate(invalid="ignore"):  # images without any edge
+        alike = {
+            axes: np.nan_to_num(np.corrcoef(edges[0].flat, np.flip(edges[1], axes).flat)[0, 1])
+            for axes in ((), *_FLIPPED)
+        }
+    best = max(alike, key=alike.__getitem__)
+    if best and alike[best] > alike[()] + _EDGES_ALIKE:
+        return [found[0], *sorted(found[1:], key=lambda reading: reading.flipped != best)]
+    return found
 
 
 def best_reading(found: list[Reading]) -> Reading:
@@ -171,19 +214,29 @@ def _is_clearly_less(relative: float, other: float) -> bool:
     return relative <= min(_CLEARLY_BETTER * other, other - _LEAST_GAIN)
 
 
-def diagnosis(found: list[Reading], best: Reading, recording: Recording) -> str:
-    """What is wrong with how the numbers are read, in a sentence; empty where nothing is."""
+def diagnosis(
+    found: list[Reading], best: Reading, recording: Recording, needs_proof: bool = True
+) -> str:
+    """What is wrong with how the numbers are read, in a sentence; empty where nothing is.
+
+    Where proof is needed, it is wrong too that the camera moves too little to tell readings apart.
+    """
     own, file = found[0], os.path.relpath(recording.pose_file, recording.folder)
     apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
     if best is not own:
         look = "look" if best.subject == "poses" else "looks"
-        return (
+        told = (
             f"your {best.subject} {look} like {best.name}; {_remedy(best, own)} (surfaces that two "
             f"frames see then lie {1e3 * best.median_m:.0f} mm apart; as declared they {apart})"
         )
+        # Mirrored or turned axes and flipped images may fit alike, and colours not tell.
+        alike = [r for r in found if r.flipped and r.relative < best.relative / _CLEARLY_BETTER]
+        return told if best.flipped or not alike else f"{told}; so would depth {alike[0].name}"
     if recording.has_pose.sum() < 2:
         return f"{file} is not proved: that takes two frames with a pose"
-    is_far = own.median_m > _FAR_APART
+    # Of few points, such as key frames share, not even a right reading's lie close.
+    few = own.overlap < _LEAST_OVERLAP
+    is_far = own.median_m > (_FAR_APART_OF_FEW if few else _FAR_APART)
     if own.overlap < (_LEAST_CONTRADICTION if is_far else _LEAST_OVERLAP):
         little = f"{file} is not proved: two frames see too little of the same"
         where = f"{own.overlap:.0%} of the points, whose surfaces {apart}"
@@ -194,6 +247,8 @@ def diagnosis(found: list[Reading], best: Reading, recording: Recording) -> str:
             f"overlap) and no other reading fits: check {recording.calibration.source.name}, "
             f"the depth unit and {file}, and that image, depth and pose belong to one moment"
         )
+    if not needs_proof:
+        return ""
     poses = [r for r in found[1:] if r.subject == "poses" and r.overlap >= own.overlap / 2]
     alike = [r.name for r in poses if not _is_clearly_less(own.relative, r.relative)]
     little = f"{file} is not proved: the camera moves too little to tell {len(alike)} other "
@@ -202,6 +257,10 @@ def diagnosis(found: list[Reading], best: Reading, recording: Recording) -> str:
 
 def _remedy(reading: Reading, own: Reading) -> str:
     """What to change, so that a reading is the declared one."""
+    if reading.flipped:
+        return "turn the depth images as the colour images are"
+    if reading.metres != 1:
+        return f"multiply the positions in the pose file by {reading.metres:g}"
     c, keys = reading.camera, asdict(reading.declared).items()
     if c != own.camera:
         numbers = f"{c.fx:.6g} {c.fy:.6g} {c.cx - 0.5:.6g} {c.cy - 0.5:.6g}"

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8, UInt16
 
-from nbtrack.core.arrays import Poses
+from nbtrack.core.arrays import Frames, Poses
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError, MissingError
@@ -108,15 +108,17 @@ def read_sequence(
 
 def read_frames(
     recording: Recording,
-    frames: slice = slice(None),
+    frames: slice | Frames = slice(None),
     progress: bool = False,
     needs_poses: bool = True,
 ) -> RgbdSequence:
-    """The frames of an opened recording that a slice selects and, where needed, that have a pose.
+    """The frames of an opened recording of some numbers, or that a slice selects and, where needed,
+    that have a pose.
 
     Raises MissingError or DataError if an image cannot be read, or no frame is left.
     """
-    frame_ids = select_frames(recording, frames, needs_poses)
+    is_slice = isinstance(frames, slice)
+    frame_ids = select_frames(recording, frames, needs_poses) if is_slice else frames
     if needs_poses:
         frame_ids = frame_ids[recording.has_pose[frame_ids]]
     images = decode(recording, frame_ids, progress)

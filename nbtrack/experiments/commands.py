@@ -13,7 +13,7 @@ from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_na
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import tell
 from nbtrack.core.settings import as_dict
-from nbtrack.data.check import check_recording
+from nbtrack.data.check import check_recording, quick_warning
 from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import parse_frames, read_frames
 from nbtrack.data.writer import convert_sequence
@@ -126,6 +126,8 @@ def _print_metrics(metrics: dict[str, Any]) -> None:
         print("  no true pose is known of the tracked frames: errors cannot be told")
     if "flagged_frames" in metrics:
         print(f"  frames that the tracker itself calls lost: {metrics['flagged_frames']}")
+    if 0 < metrics["frames_without_reference"] < metrics["frames"]:
+        print(f"  frames without a true pose, in no error: {metrics['frames_without_reference']}")
     if metrics["frames_without_depth"]:
         print(f"  frames without any depth, not searched: {metrics['frames_without_depth']}")
     print(f"  on {metrics['device']}")
@@ -140,11 +142,8 @@ def _draw_overview(run: TrackCell) -> None:
     tracked, metrics, field = read_trajectory(run.folder), run.result(), run.needs.map().field
     ids, known = tracked.frames["frame_id"].to_numpy(), np.isfinite(tracked.T_true).all(axis=(1, 2))
     stride = max(1, len(ids) // _FRAMES_SHOWN)
-    some = range(len(run.scene.recording))[parse_frames(run.frames)][1::stride]
-    seen = read_frames(
-        run.scene.recording, slice(some.start, some.stop, some.step), needs_poses=False
-    )
-    poses = tracked.T_estimated[np.searchsorted(ids, seen.frame_ids)]
+    seen = read_frames(run.scene.recording, ids[::stride], needs_poses=False)
+    poses = tracked.T_estimated[::stride]
     size = max(np.subtract(field.bounds.maximum, field.bounds.minimum))
     try:
         mesh = extract_mesh(
@@ -255,6 +254,9 @@ def _checked_scene(options: Namespace, preset: Preset, *mapped: str) -> Scene:
     scene.count(options.frames, needs_poses=False)
     for frames in mapped:
         scene.count(frames)
+    # A room of the cache is as it should be.
+    if not scene.made_by and (said := quick_warning(scene.recording)):
+        tell(f"nbtrack: warning: {said}; `data check` tells more")
     return scene
 
 
@@ -294,6 +296,9 @@ def _map(cell: MapCell) -> None:
         print(f"map found in {cell.folder}")
         return
     print(f"no finished map in {cell.folder}: mapping")
+    has_pose = cell.scene.recording.has_pose[parse_frames(cell.frames)]
+    if not has_pose.all():
+        tell(f"nbtrack: {(~has_pose).sum()} of {len(has_pose)} frames have no pose: not mapped")
     run_cells([cell], f"mapping {cell.scene.name}")
 
 
