@@ -9,6 +9,7 @@ from pathlib import Path
 from unittest import mock
 
 import cv2
+import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -29,6 +30,7 @@ from nbtrack.experiments.results import track_scenes
 from nbtrack.experiments.runs import TrackCell
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.synthetic import make, room
+from nbtrack.tracking.trajectories import read_tum
 
 PROJECT = Path(__file__).parents[1]
 
@@ -226,3 +228,30 @@ def test_threads_belong_to_a_run_and_its_key(work: Path) -> None:
     ]
     assert [runs["threads"][0] for runs in found] == [1, 2]
     assert found[0]["run"][0] != found[1]["run"][0]
+
+
+def test_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches positions in map coordinates that single precision rounds to half a metre, also where
+    another recording is tracked in such a map; and one pose that is far from all others."""
+    utm, found = np.array([4.5e5, 5.4e6, 100.0]), {}
+    words = [*SET, "--set", "network.neus.width=32", "--set", "mapping.neus.iterations=200"]
+    for name, offset in (("near", 0 * utm), ("far", utm)):
+        folder = write_recording("plain", tmp_path / name / "rec")
+        rows = np.loadtxt(folder / "trajectory.txt")
+        rows[:, 1:4] += offset
+        np.savetxt(folder / "trajectory.txt", rows, fmt="%.17g")
+        for tracker, field in (("lm", "neus"), ("icp", "points")):
+            made, out = tmp_path / name / field, tmp_path / name / tracker
+            assert main(["map", str(folder), "--field", field, *words, "--out", str(made)]) == 0
+            given = ["track", str(folder), "--map-from", str(made), "--out", str(out)]
+            assert main(given) == 0
+            found[name, tracker] = read_tum(out / "trajectory.txt")[1]
+    off = {t: found["far", t][:, :3, 3] - found["near", t][:, :3, 3] - utm for t in ("lm", "icp")}
+    assert np.abs(off["icp"]).max() < 1e-4
+    assert np.abs(off["lm"]).max() < 0.03  # a network that is trained elsewhere is another one
+    assert "relative to [" in capsys.readouterr().out
+    rows[2, 1] = 1e6 + 5e5
+    np.savetxt(folder / "trajectory.txt", rows, fmt="%.17g")
+    assert main(["map", str(folder), "--field", "points", *SET]) == 2
+    said = capsys.readouterr().err
+    assert "frame 2 lies 1.05e+06 m from the others, which keep within" in said

@@ -6,6 +6,7 @@ from torch import Tensor
 
 Pose = Float[np.ndarray, "4 4"]  # a rigid transform, in double precision
 Poses = Float[np.ndarray, "_ 4 4"]
+Position = Float[np.ndarray, "3"]  # m, in double precision
 ColorImage = UInt8[np.ndarray, "height width 3"]  # RGB
 DepthImage = UInt16[np.ndarray, "height width"]  # mm, 0 = no measurement
 Transform = Float[Tensor, "4 4"]  # a rigid transform, where gradients may flow

@@ -6,14 +6,16 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
-from nbtrack.core.arrays import Poses
+from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.errors import DataError, MissingError
 from nbtrack.data.formats import DECLARATION_FILE, FORMATS, Declaration, Format, declaration
 from nbtrack.data.pairs import check_paired, listed_pairs, numbered_files, numbers_of, posed_by_time
 from nbtrack.data.text_files import Calibration, Times, read_calibration, read_poses, read_rows
 
+_FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
+_ALONE = 1000.0  # m from the middle, and so many times as far as nine in ten: no camera went there
 TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
 
 
@@ -46,6 +48,14 @@ class Recording:
     def has_pose(self) -> Bool[np.ndarray, "frames"]:
         """Which frames have a pose."""
         return np.isfinite(self.file_poses).all(axis=(1, 2))
+
+    @cached_property
+    def origin(self) -> Position:
+        """Where (m) sequences have their origin: whole metres near the cameras of a recording that
+        is far from zero, as in map coordinates, since single precision would lose them; else 0."""
+        center = np.median(self.T_world_camera[self.has_pose, :3, 3], axis=0)
+        is_far = self.has_pose.any() and np.abs(center).max() > _FAR_FROM_ZERO
+        return np.round(center) if is_far else np.zeros(3)
 
     @property
     def rate_hz(self) -> float:
@@ -80,6 +90,7 @@ def open_recording(
     layout = FORMATS[declared.format]
     colors, depths, times, lists, left_out = _images(folder, declared, depth_folder)
     poses, path, pose_files, chosen = _poses(folder, declared, pose_file, colors, times)
+    _check_together(declared.poses_to_opencv(poses)[:, :3, 3], path)
     camera, notes = _calibration(folder, layout), [left_out, chosen]
     if not camera.source.is_file():
         notes.append(f"{camera.source.name}, {camera.fx:g} px at 640x480: no {layout.cameras[0]}")
@@ -189,6 +200,20 @@ def _poses(
             "one; write 'nan' for each number of a frame without a pose"
         )
     return poses, path, files, chosen
+
+
+def _check_together(positions: Float[np.ndarray, "frames 3"], path: Path | None) -> None:
+    """Raises DataError for a pose that lies far from all others."""
+    known = np.isfinite(positions).all(axis=1)
+    if not known.any():
+        return
+    away = np.linalg.norm(positions - np.median(positions[known], axis=0), axis=1)
+    usual = np.quantile(away[known], 0.9, method="lower")
+    for i in np.flatnonzero((away > _ALONE) & (away > _ALONE * usual)):
+        raise DataError(
+            f"{path} frame {i} lies {away[i]:.3g} m from the others, which keep within {usual:.3g} "
+            "m: correct its pose, or write nan for it"
+        )
 
 
 def _placed(poses: Poses, pose_times: Times, times: Times, path: Path, is_by_time: bool) -> Poses:

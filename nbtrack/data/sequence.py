@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8, UInt16
 
-from nbtrack.core.arrays import Frames, Poses
+from nbtrack.core.arrays import Frames, Poses, Position
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError, MissingError
@@ -38,6 +38,9 @@ class RgbdSequence:
     T_world_camera: Poses  # OpenCV camera axes; NaN where not known
     frame_ids: Int[np.ndarray, "frames"]  # position in the folder's natural order
     times: Float[np.ndarray, "frames"]  # s, the recording's own, or by its numbers and rate
+    origin: Position = field(
+        default_factory=lambda: np.zeros(3)
+    )  # of poses, in the recording's world
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -111,9 +114,10 @@ def read_frames(
     frames: slice | Frames = slice(None),
     progress: bool = False,
     needs_poses: bool = True,
+    origin: Position | None = None,
 ) -> RgbdSequence:
     """The frames of an opened recording of some numbers, or that a slice selects and, where needed,
-    that have a pose.
+    that have a pose. Poses are relative to an origin (m), by default the recording's.
 
     Raises MissingError or DataError if an image cannot be read, or no frame is left.
     """
@@ -123,7 +127,9 @@ def read_frames(
         frame_ids = frame_ids[recording.has_pose[frame_ids]]
     images = decode(recording, frame_ids, progress)
     poses, times = recording.T_world_camera[frame_ids], recording.times[frame_ids]
-    return RgbdSequence(recording.name, *images, poses, frame_ids, times)
+    origin = recording.origin if origin is None else origin
+    poses[:, :3, 3] -= origin
+    return RgbdSequence(recording.name, *images, poses, frame_ids, times, origin)
 
 
 def select_frames(

@@ -40,6 +40,7 @@ from nbtrack.tracking.trajectories import (
     METRICS_FILE,
     read_trajectory,
     read_tum,
+    shifted,
     write_kitti,
 )
 
@@ -88,7 +89,9 @@ def _make_map(cell: MapCell, frames: str) -> None:
         print(f"  no mesh: {error}")
     else:
         write_atomic(cell.folder / MESH_FILE, mesh.export(file_type="ply"))
-        print(f"  mesh of what was seen: {cell.folder / MESH_FILE}")
+        origin = found.made["origin"]
+        where = f", relative to {origin} m" if any(origin) else ""
+        print(f"  mesh of what was seen: {cell.folder / MESH_FILE}{where}")
 
 
 def track_command(options: Namespace) -> None:
@@ -225,7 +228,7 @@ def check_command(options: Namespace) -> None:
     is_picture = options.out.suffix.lower() == ".png"
     path = new_file(options.out if is_picture else options.out / "check.png")
     path.parent.mkdir(parents=True, exist_ok=True)
-    T_world_camera = recording.T_world_camera[recording.has_pose]
+    T_world_camera = shifted(recording.T_world_camera[recording.has_pose], -recording.origin)
     apart = f"surfaces of two frames lie {1e3 * report.readings[0].median_m:.1f} mm apart (median)"
     plot_recording(report.cloud, T_world_camera, f"{recording.name}: {apart}").savefig(path)
     print(f"  picture         {path}")

@@ -22,7 +22,7 @@ from nbtrack.fields.grid import BakedField
 from nbtrack.mapping.quality import check_belongs
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
-from nbtrack.tracking.trajectories import METRICS_FILE, tum_text
+from nbtrack.tracking.trajectories import METRICS_FILE, shifted, tum_text
 
 RUN_FILE = "run.pt"
 RUN_FILES = ("trajectory.txt", "groundtruth.txt", "frames.csv", METRICS_FILE)
@@ -96,10 +96,10 @@ class TrackCell(Cell):
         with threads(self.n_threads or torch.get_num_threads()):
             tracked, notes = self._tracked(report)
             metrics = self._metrics(tracked) | notes
-        times = tracked.frames["time"].to_numpy()
+        times, origin = tracked.frames["time"].to_numpy(), np.array(notes.get("origin", [0, 0, 0]))
         texts = {
-            "trajectory.txt": tum_text(times, tracked.T_estimated),
-            "groundtruth.txt": tum_text(times, tracked.T_true),
+            "trajectory.txt": tum_text(times, shifted(tracked.T_estimated, origin)),
+            "groundtruth.txt": tum_text(times, shifted(tracked.T_true, origin)),
             "frames.csv": tracked.frames.to_csv(index=False),
             METRICS_FILE: files.json_text(metrics),
         }
@@ -116,9 +116,13 @@ class TrackCell(Cell):
 
     def _tracked(self, report: Report) -> tuple[Trajectory, dict[str, Any]]:
         """The trajectory, and what is to be said of the run beside its errors."""
-        made, sequence = self.needs.map(), self.scene.read(self.frames, needs_poses=False)
+        made = self.needs.map()
+        origin = np.array(made.made["origin"])
+        sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
         budget = make_budget(self.steps, self.rate_hz)
         notes = {"map_seconds": made.made["seconds"], "budget": str(budget)}
+        if origin.any():
+            notes["origin"] = origin.tolist()
         notes |= still_metrics(sequence.T_world_camera)
         if self.is_elsewhere:
             notes["map_from"] = made.made

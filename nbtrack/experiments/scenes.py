@@ -4,6 +4,7 @@ import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock
 
@@ -42,9 +43,9 @@ class Scene:
         """Changes with what is read. A room of the cache is made anew as it was."""
         return self.made_by or fingerprint(*self.recording.contents())
 
-    def read(self, frames: str = ":", needs_poses: bool = True) -> RgbdSequence:
-        """The frames of a slice such as `10:50:2`. Raises as `read_frames` does."""
-        return read_frames(self.recording, parse_frames(frames), needs_poses=needs_poses)
+    def read(self, frames: str = ":", **how: Any) -> RgbdSequence:
+        """The frames of a slice such as `10:50:2`; more options and errors: see `read_frames`."""
+        return read_frames(self.recording, parse_frames(frames), **how)
 
     def count(self, frames: str, needs_poses: bool = True) -> int:
         """How many frames a slice selects; raises as `select_frames` does."""

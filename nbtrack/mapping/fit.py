@@ -89,6 +89,7 @@ def recipe_of(
         "n_frames": len(sequence),
         "first_and_last_frame": [int(ids[0]), int(ids[-1])],
         "data": sequence.digest,
+        "origin": sequence.origin.tolist(),
         "seed": seed,
         "network": asdict(network),
         "settings": asdict(settings),

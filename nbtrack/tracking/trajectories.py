@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core import files
-from nbtrack.core.arrays import Poses
+from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.device import advise_on_memory
 from nbtrack.core.errors import DataError, MissingError
 from nbtrack.data.sequence import RgbdSequence
@@ -88,7 +88,10 @@ def _check_trackable(sequence: RgbdSequence) -> None:
 
 
 def read_trajectory(folder: Path) -> Trajectory:
-    """A finished run from its folder; MissingError if there is none."""
+    """A finished run from its folder, its poses relative to the map's origin as in tracking.
+
+    Raises MissingError if there is none.
+    """
     if not (folder / METRICS_FILE).is_file():
         raise MissingError(f"no finished run in {folder}: give a folder that `track` wrote")
     times, T_estimated = read_tum(folder / "trajectory.txt")
@@ -97,7 +100,8 @@ def read_trajectory(folder: Path) -> Trajectory:
         known, poses = read_tum(truth)
         T_true[np.searchsorted(times, known)] = poses
     frames, metrics = pd.read_csv(folder / "frames.csv"), files.read_json(folder / METRICS_FILE)
-    return Trajectory(T_estimated, T_true, frames, metrics)
+    back = -np.array(metrics.get("origin", [0, 0, 0]))
+    return Trajectory(shifted(T_estimated, back), shifted(T_true, back), frames, metrics)
 
 
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
@@ -116,6 +120,13 @@ def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, An
         "without_depth": estimate.without_depth,
         **estimate.report,
     }
+
+
+def shifted(T_world_camera: Poses, by: Position) -> Poses:
+    """Poses (m) in a world whose origin lies `-by` away: positions plus an offset (m)."""
+    T_world_camera = T_world_camera.copy()
+    T_world_camera[:, :3, 3] += by
+    return T_world_camera
 
 
 def tum_text(times: Float[np.ndarray, "n"], T_world_camera: Poses) -> str:
