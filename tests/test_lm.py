@@ -1,5 +1,7 @@
 """The second-order tracker, in a box whose distance is exact."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -117,3 +119,45 @@ def test_images_without_an_inside_are_lost_frames(size: tuple[int, int]) -> None
     estimate = begun().track(sequence_of(np.full((1, *size), 1000.0), camera)[0])
     assert estimate.lost
     np.testing.assert_array_equal(estimate.T_world_camera, T_TRUE)
+
+
+def test_a_fast_camera_that_stops_is_found() -> None:
+    """Catches a start that is chosen by its cost alone, where the motion model is half a metre
+    ahead of a camera that has stopped: coarse stages from both starts tell them apart."""
+    tracker = begun(n_restarts=0)
+    ahead = retract(T_TRUE, np.array([0.0, 0.5, 0.0, 0.3, 0.0, 0.5]))
+    tracker.begin(FRAME, torch.from_numpy(np.stack([ahead, T_TRUE])))
+    np.testing.assert_array_equal(tracker.descent.T_start, T_TRUE)
+    assert abs(tracker.T_world_camera.numpy() - T_TRUE).max() < 0.01
+
+
+def test_a_pose_that_still_moves_when_the_budget_ends_is_lost() -> None:
+    """Catches a pose on its way along a wall that passes for found: most points fit on the wall."""
+    offset, tracker = retract(T_TRUE, np.array([0.0, 0.05, 0.0, 0.1, 0.05, 0.1])), begun()
+    assert run(tracker, offset, 1)
+    assert tracker.best.last_step > 0.01
+    assert not run(begun(), offset, 40)
+
+
+def test_in_doubt_intensities_must_be_as_usual(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a pose on a surface that the map made up: enough points fit there, but intensities
+    are off by several times what they were; and a dark picture that is taken for one."""
+    textured = FRAME.color.clone()
+    textured[:, ::2] //= 4
+    for color, is_lost in ((FRAME.color, False), (textured, True), (0 * textured, False)):
+        tracker = begun(n_restarts=0, lambda_intensity=0.0)  # any intensity fits
+        assert not run(tracker, T_TRUE, 20)
+        assert tracker.usual_mad == max(tracker.report()["intensity_mad"], 1 / 255)
+        with monkeypatch.context() as patch:
+            patch.setattr("nbtrack.tracking.lm._DOUBTED", 1.1)
+            assert run(tracker, T_TRUE, 20, replace(FRAME, color=color)) is is_lost
+
+
+def test_a_lost_camera_is_looked_for_at_its_last_good_pose_too() -> None:
+    """Catches a camera that stood still, lost for good: hypotheses lie near mapped poses alone."""
+    known = BakedField(narrow_room(), 0.04)
+    known.T_world_cameras = torch.from_numpy(retract(T_TRUE, np.array([0, 0, 0, 5.0, 5, 5])))[None]
+    tracker = LmTracker(known, T_TRUE, StepBudget(1), LmSettings())
+    assert not run(tracker, T_TRUE, 20)
+    assert not run(tracker, retract(T_TRUE, FAR), 60)
+    assert errors(tracker)[0] < 0.01

@@ -25,9 +25,15 @@ _MIN_POINTS = 20  # below, a frame says too little for six unknowns
 _COARSE_SHARE, _MIN_COARSE = 8, 128
 # Starts are compared by widely robust costs: narrow ones say the same of all that are off.
 _WIDE_SCALES = np.array([0.1, 0.2])
+# Starts that differ by more (m, rad), as of a fast camera that may have stopped, are compared after
+# their coarse stages, of so many steps at most: at the starts themselves walls hide who is right.
+_FAR_APART, _MAX_COARSE_STEPS = 0.06, 30
 _MAX_STD = 0.04  # m; a pose whose position is less certain is taken for lost
 # With fewer inliers even a pose is lost to which the frame before led, within so much (m, rad).
 _MIN_INLIERS, _FOLLOWED = 0.6, 0.15
+_SETTLED = 2e-3  # m, rad; a longer last step says that the budget has ended too early
+# With fewer inliers intensities may be off by so many times what they were, and a grey level.
+_DOUBTED, _MAX_MAD_RATIO, _GREY_LEVEL = 0.85, 4.0, 1 / 255
 _RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
 # Where a map knows its cameras, a lost one is looked for at so many random poses, so far (m) from
 # theirs; from the cheapest some steps are taken, before the cheapest of those are followed.
@@ -49,10 +55,12 @@ class LmTracker(Tracker):
     """Levenberg-Marquardt on SE(3), on points drawn once a frame; knows when it is lost.
 
     It works on a grid on the host: one that is given, or any field with a signed distance, sampled
-    once in cells of `settings.voxel`. A descent that ends lost is followed by others, while the
-    budget lasts: from the last good pose, then around it, or, where the map knows its own cameras,
-    from pose hypotheses near theirs that fit the frame best after a few steps, which count as one.
-    The first that is not lost counts; if all are, that from the motion model. A frame with too few
+    once in cells of `settings.voxel`. Of the motion model's starts the better one is followed: by
+    their costs, or, where they are far apart, by those after coarse stages, which count as no step.
+    A descent that ends lost is followed by others, while the budget lasts: from the last good pose
+    and around it, or, where the map knows its own cameras, from those of the last good pose and of
+    hypotheses near the cameras that fit the frame best after a few steps, which count as one. The
+    first that is not lost counts; if all are, that from the motion model. A frame with too few
     points keeps the start that this gave.
 
     Source: Levenberg 1944, Marquardt 1963; residuals of the paper's Eq. 2, as `lm_solver` states
@@ -64,9 +72,10 @@ class LmTracker(Tracker):
     Settings = LmSettings
     converges = True
     copes_without_depth = True
-    remembers = ("last_good", "was_lost")
+    remembers = ("last_good", "was_lost", "usual_mad")
     last_good: Transform | None = None  # of the latest frame not taken for lost
     was_lost: bool = False  # in the frame before
+    usual_mad: float = np.inf  # of intensities, in the latest frame beyond doubt
 
     def __init__(
         self,
@@ -109,8 +118,12 @@ class LmTracker(Tracker):
             return
         n_coarse = max(_MIN_COARSE, n_points // _COARSE_SHARE)
         self.points = with_normals(frame, observed, n_coarse), observed
-        self.descent = self.best = _by_cost([self._descent_from(T) for T in starts])[0]
-        self.was_followed = not self.was_lost
+        self.expected, self.was_followed = starts, not self.was_lost
+        descents = [self._descent_from(T) for T in starts]
+        if np.abs(starts - starts[0]).max() > _FAR_APART:
+            for descent in descents:
+                _take_steps(descent, _MAX_COARSE_STEPS)
+        self.descent = self.best = _by_cost(descents)[0]
 
     def step(self) -> float:
         """One step of Levenberg-Marquardt, taken or refused; returns the cost before it."""
@@ -118,10 +131,10 @@ class LmTracker(Tracker):
             return float("nan")
         self.verdict = None if self.descent is self.best else self.verdict
         before = self.descent.step()
-        if self.descent.is_ended and not self.descent.stage.is_fine:
-            self.descent.refine()
-        elif self.descent.is_ended:
+        if self.descent.is_finished:
             self._follow_up()
+        elif self.descent.is_ended:
+            self.descent.refine()
         return before
 
     @property
@@ -135,20 +148,31 @@ class LmTracker(Tracker):
             self.verdict = {"inlier_ratio": 0.0, "lost": True}
         elif self.verdict is None:
             self.verdict = self._judge(self.best)
-        self.was_lost = bool(self.verdict["lost"])
+        self.was_lost = self.verdict["lost"]
         if not self.was_lost:
             self.last_good = self.T_world_camera
+            if self.verdict["inlier_ratio"] >= _DOUBTED:
+                self.usual_mad = max(self.verdict["intensity_mad"], _GREY_LEVEL)
         return self.verdict
 
     def _judge(self, descent: Descent) -> dict[str, float | bool]:
-        """What a descent says of its pose; where the frame before led to it, fewer inliers do."""
+        """What a descent says of its pose; where the frame before led to it, fewer inliers do.
+
+        One that the budget ended while it still moved is lost: it may be on its way along a wall.
+        So is one that has slid along a wall onto what the map made up: fewer points fit, and
+        intensities, which did not hold it there, are off by several times what is usual.
+        """
         found = descent.certainty()
-        change = np.linalg.inv(descent.T_start) @ descent.T_world_camera
-        is_near = np.abs(change - np.eye(4)).max() < _FOLLOWED
+        changes = np.linalg.inv(self.expected) @ descent.T_world_camera - np.eye(4)
+        is_near = np.abs(changes).max(axis=(1, 2)).min() < _FOLLOWED
         is_followed = self.was_followed and self.starts is None and is_near
         enough = _MIN_INLIERS if is_followed else self.field.least_inliers
-        is_uncertain = found["position_deviation_m"] > _MAX_STD
-        return {**found, "lost": found["inlier_ratio"] < enough or is_uncertain}
+        is_settled = descent.is_finished or (is_followed and descent.last_step < _SETTLED)
+        is_odd = found["intensity_mad"] > _MAX_MAD_RATIO * self.usual_mad
+        has_contrast = self.points[1][1].std() > self.usual_mad  # else it is dark, or overexposed
+        is_odd &= found["inlier_ratio"] < _DOUBTED and has_contrast
+        is_sure = found["inlier_ratio"] >= enough and found["position_deviation_m"] <= _MAX_STD
+        return {**found, "lost": bool(is_odd or not (is_sure and is_settled))}
 
     def _descent_from(self, T_start: Pose) -> Descent:
         return Descent(self.grid, *self.points, self.settings.lambda_intensity, T_start)
@@ -166,16 +190,14 @@ class LmTracker(Tracker):
 
     def _other_starts(self) -> list[Pose]:
         """Where else the camera may be, the likeliest first."""
-        around = [_around(self.anchor, number) for number in range(self.settings.n_restarts)]
         cameras = getattr(self.field, "T_world_cameras", None)
         if cameras is None:
-            return around
-        hypotheses = self._hypotheses(cameras.double().numpy())
+            return [_around(self.anchor, number) for number in range(self.settings.n_restarts)]
+        hypotheses = [self.anchor, *self._hypotheses(cameras.double().numpy())]
         tried = _by_cost([self._descent_from(T) for T in hypotheses])[:_TRIED]
         for descent in tried:
-            for _ in range(_TRIED_STEPS):
-                descent.step()
-        return around[:1] + [descent.T_world_camera for descent in _by_cost(tried)]
+            _take_steps(descent, _TRIED_STEPS)
+        return [descent.T_world_camera for descent in _by_cost(tried)]
 
     def _hypotheses(self, T_world_cameras: Poses) -> Poses:
         """Where else a camera may be: near the known ones, turned about the vertical they share."""
@@ -192,6 +214,14 @@ class LmTracker(Tracker):
 def _by_cost(descents: Sequence[Descent]) -> list[Descent]:
     """Descents in the order of their robust costs, all at equal scales."""
     return sorted(descents, key=lambda d: d.cost(_WIDE_SCALES)) if descents[1:] else [*descents]
+
+
+def _take_steps(descent: Descent, at_most: int) -> None:
+    """Steps of the stage that a descent is in."""
+    for _ in range(at_most):
+        if descent.is_ended:
+            return
+        descent.step()
 
 
 def _around(T_world_camera: Pose, number: int) -> Pose:

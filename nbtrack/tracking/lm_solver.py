@@ -121,12 +121,13 @@ class Descent:
         """With some points for the coarse stage, and all for the fine one."""
         self.grid, self.points, self.lambda_intensity = grid, (some, all), lambda_intensity
         self.T_start = self.T_world_camera = T_start
+        self.last_step = np.inf  # rad or m, whichever is more
         self._begin(COARSE)
         self._start_cost = self.cost(_NEAR_SCALES)
 
     def step(self) -> float:
         """One step, taken or refused; returns the robust cost before it."""
-        is_better, self.T_world_camera, self.terms, before, length = _try_step(
+        is_better, self.T_world_camera, self.terms, before, self.last_step = _try_step(
             self.points[self.stage.is_fine], self.grid.arrays, self.stage.is_fine, self.weight,
             self.T_start, self.T_world_camera, self.terms, self.scales, self.damping,
         )  # fmt: skip
@@ -134,7 +135,7 @@ class Descent:
             self._narrow()
         down = max(self.damping * _DAMPING_DOWN, _MIN_DAMPING)
         self.damping = down if is_better else self.damping * _DAMPING_UP
-        self.is_ended = length < self.stage.min_step or self.damping > _MAX_DAMPING
+        self.is_ended = self.last_step < self.stage.min_step or self.damping > _MAX_DAMPING
         return before
 
     def refine(self) -> None:
@@ -143,6 +144,11 @@ class Descent:
             self.T_world_camera = self.T_start
         self._begin(FINE)
 
+    @property
+    def is_finished(self) -> bool:
+        """Whether further steps would change nothing."""
+        return self.is_ended and self.stage.is_fine
+
     def cost(self, scales: Float[np.ndarray, "2"]) -> float:
         """The robust cost of both residuals at given scales, by which descents are compared."""
         return robust_cost(self.terms, scales, 1.0)
@@ -150,18 +156,19 @@ class Descent:
     def certainty(self) -> dict[str, float]:
         """The share of points that fit, and how well the curvature of their cost holds the pose.
 
-        Standard deviations are along the least certain direction, the condition number without the
-        pose prior, rotations at a lever arm of 1 m. Errors of the map are not independent, as
-        residuals are here taken to be: these are lower bounds, good for telling poses apart, not
-        for error bars.
+        Intensities count by their differences from the median of all; `intensity_mad` is the median
+        of those (MAD). Standard deviations are along the least certain direction, the condition
+        number without the pose prior, rotations at a lever arm of 1 m. Errors of the map are not
+        independent, as residuals are here taken to be: these are lower bounds, good for telling
+        poses apart, not for error bars.
         """
         distance, intensity, reliability = self.terms[:3]
         is_inlier = np.abs(distance) < self.grid.inlier_distance
         is_inlier &= reliability > 0
+        # A picture that is darker as a whole says nothing against a pose.
+        off = np.abs(intensity - _median(intensity))
         if self.lambda_intensity:
-            # A picture that is darker as a whole says nothing against a pose.
-            middle = np.partition(intensity, len(intensity) // 2)[len(intensity) // 2]
-            is_inlier &= np.abs(intensity - middle) < _INLIER_INTENSITY
+            is_inlier &= off < _INLIER_INTENSITY
         matrix, _ = normal_equations(self.terms, self.scales, self.weight)
         values = np.linalg.eigvalsh(matrix)
         covariance = np.linalg.inv(matrix + PRIOR_WEIGHT * np.eye(6)) / _SIGMAS**2  # rad, m
@@ -169,6 +176,7 @@ class Descent:
         rotation, position = np.linalg.eigvalsh(blocks)[:, -1] ** 0.5
         return {
             "inlier_ratio": float(is_inlier.mean()),
+            "intensity_mad": float(_median(off)),
             "position_deviation_m": float(position),
             "rotation_deviation_deg": float(np.rad2deg(rotation)),
             "condition_number": float(values[-1] / max(values[0], 1e-9)),
@@ -185,6 +193,10 @@ class Descent:
     def _narrow(self) -> None:
         accuracy, factor = self.grid.accuracy, self.stage.mad_factor
         self.scales = scales_of(self.terms, self.scales, accuracy, factor)
+
+
+def _median(values: Float[np.ndarray, "n"]) -> float:
+    return np.partition(values, len(values) // 2)[len(values) // 2]
 
 
 def draw_points(frame: Frame, n_points: int, generator: torch.Generator) -> Observed:
