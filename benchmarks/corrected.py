@@ -198,9 +198,9 @@ def _error(field, sequence, settings) -> float:
 
 
 def fast() -> pd.DataFrame:
-    """Nine rooms on a path that was never mapped, by a fast camera: every fourth, every eighth frame.
+    """Nine rooms on a path that was never mapped: every fourth and every eighth frame.
 
-    `wrong_frames` are off by more than 5 cm, `missed_frames` those of them that are not called lost.
+    `wrong_frames` are off by more than 5 cm, `missed_frames` are wrong and not called lost.
     """
     preset, second = (load_preset("nine_rooms", settings=[f"scenes.seed={n}"]) for n in (0, 1))
     rooms, elsewhere, rows = open_scenes(preset), open_scenes(second), []
