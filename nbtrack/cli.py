@@ -127,6 +127,7 @@ class Parser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status: 0, or 2 after a user's mistake."""
+    _open_streams()
     try:
         options = _parsed(arguments)
         _set_device(options)
@@ -144,6 +145,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         told, status = "interrupted; run the same command again to go on", 130
     print(f"nbtrack: {told}", file=sys.stderr)
     return status
+
+
+def _open_streams() -> None:
+    """Let nothing that is printed end a command: a daemon's streams are closed, and a terminal's
+    encoding may lack letters of a path."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+        if hasattr(stream := getattr(sys, name), "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -8,10 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recordings import WRITERS, write_recording
+from recordings import N_FRAMES, WRITERS, write_recording
 
 from nbtrack.cli import main
-from nbtrack.core.errors import NbtrackError
+from nbtrack.core.errors import DataError, NbtrackError
+from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import read_sequence
 
 Damage = Callable[[Path], object]
@@ -260,3 +261,17 @@ def test_command(whole, tmp_path: Path, capfd, format: str) -> None:
     error = capfd.readouterr().err
     assert error.startswith("nbtrack: ")
     assert error.count("\n") == 1
+
+
+def test_files_of_the_system_and_poses_too_many(tmp_path: Path) -> None:
+    """Catches hidden files that are taken for images, and the advice to write 'nan' where poses are
+    left over."""
+    folder = write_recording("plain", tmp_path / "r")
+    for name in (".DS_Store", "._img1.png"):
+        (folder / "color" / name).write_bytes(b"no image")
+    assert len(open_recording(folder)) == N_FRAMES
+    path = next(p for p in folder.iterdir() if p.name == "trajectory.txt")
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join([*rows, "9 " + rows[-1].split(maxsplit=1)[1]]) + "\n")
+    with pytest.raises(DataError, match="7 poses but there are 6 images.*; remove those without"):
+        open_recording(folder)

@@ -6,6 +6,8 @@ import os
 import resource
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
@@ -330,3 +332,31 @@ def test_a_disk_that_fills_up_while_results_are_written(
                 command = ["export", source, "--to", kind, "new"]
                 assert_refused(work, capsys, command, "File too large")
     assert json.loads((work / "run/metrics.json").read_text())["frames"] == 5
+
+
+def test_streams_and_letters(tmp_path: Path) -> None:
+    """Catches a daemon's command that ends at its first message, with nothing written, and one that
+    has done its work and cannot print or keep a path with letters of other languages."""
+    nbtrack, small = f"{sys.executable} -m nbtrack", " ".join(["--n-frames 3", "--width 16"])
+    points = "--field points --set mapping.points.holdout_every=0"
+    script = f"""set -e
+{nbtrack} data make office --out Küche {small} >&- 2>&-
+{nbtrack} map Küche {points} --out Größe
+{nbtrack} track Küche --map-from Größe --out Spur
+"""
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    environment["NBTRACK_RUNS"] = str(tmp_path / "runs")
+    found = subprocess.run(
+        ["bash", "-c", script.encode()], cwd=tmp_path, env=environment, capture_output=True
+    )
+    assert found.returncode == 0, found.stderr
+    metrics = json.loads((tmp_path / "Spur/metrics.json").read_text(encoding="utf-8"))
+    assert "Küche" in metrics["command"]
+
+
+def test_a_full_disk_while_a_room_is_made(work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches "122684 requested and 36864 written", which names no cause and no folder."""
+    command = ["data", "make", "office", "--out", "new", "--n-frames", "2", "--width", "64"]
+    with files_limited_to(400):
+        error = assert_refused(work, capsys, command, os.strerror(errno.EFBIG))
+    assert "new" in error

@@ -182,7 +182,9 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for aside, content in zip(asides.values(), contents.values(), strict=True):
-            aside.write_bytes(content.encode() if isinstance(content, str) else content)
+            # Paths whose letters the system's encoding lacks come as surrogates.
+            is_text = isinstance(content, str)
+            aside.write_bytes(content.encode(errors="surrogateescape") if is_text else content)
         if len(contents) > 1:
             last.unlink(missing_ok=True)
         for path, aside in asides.items():

@@ -96,6 +96,9 @@ def _check(
     what: str, image: np.ndarray, shape: tuple[int, ...], kinds: str, quantile: float, limit: float
 ) -> None:
     """Raises DataError for another shape or type, or where so many positive values are larger."""
+    if not isinstance(image, np.ndarray):
+        kind = type(image).__name__
+        raise DataError(f"{what} is of type {kind}: give a numpy array, {kinds}, of shape {shape}")
     if image.shape == shape and str(image.dtype) == kinds.split()[0].strip(","):
         return
     values = image[np.isfinite(image) & (image > 0)]

@@ -21,6 +21,7 @@ def numbered_files(patterns: list[Path], suffixes: tuple[str, ...] = _IMAGES) ->
     """Files of the first pattern with a folder, `img2` before `img10`; or raises MissingError."""
     pattern = next((p for p in patterns if p.parent.is_dir()), patterns[0])
     found = [path for path in pattern.parent.glob(pattern.name) if path.is_file()]
+    found = [path for path in found if not path.name.startswith(".")]  # of the system
     files = [path for path in found if path.suffix.lower() in suffixes]
     if not files:
         unread = ", ".join(sorted({path.suffix for path in found}))

@@ -195,9 +195,12 @@ def _poses(
         chosen = f"of {len(poses)} poses in {path.name} those of the {len(colors)} images' numbers"
         poses = poses[numbers]
     if len(poses) != len(colors):
+        advice = "write 'nan' for each number of a frame without a pose"
+        if len(poses) > len(colors):
+            advice = "remove those without an image, or number the images as the poses"
         raise DataError(
             f"{path} has {len(poses)} poses but there are {len(colors)} images: every frame needs "
-            "one; write 'nan' for each number of a frame without a pose"
+            f"one; {advice}"
         )
     return poses, path, files, chosen
 

@@ -169,8 +169,9 @@ def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
     points_world = np.concatenate(clouds)
     if len(points_world) == 0:
         raise DataError(
-            f"no pixel of {sequence.name} has a depth: all {len(sequence)} depth maps are 0; "
-            "check the depth folder and its unit (uint16 millimetres)"
+            f"no pixel of {sequence.name} has a depth, of one in {stride**2} in {len(sequence)} "
+            f"frames ({(sequence.depths_mm > 0).mean():.2%} of all have one): check the depth "
+            "folder and its unit (uint16 millimetres)"
         )
     positions = sequence.T_world_camera[:, :3, 3]
     low, high = np.quantile(points_world, [_CUT_OFF, 1 - _CUT_OFF], axis=0)

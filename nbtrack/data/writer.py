@@ -70,7 +70,11 @@ def _write_images(
             )
         path.parent.mkdir(exist_ok=True)
         # The fastest compression: rooms are made often and read from a local disk.
-        cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tofile(path)
+        content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+        try:
+            path.write_bytes(content)
+        except OSError as error:  # a full disk's has no name of its own
+            raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
 def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:

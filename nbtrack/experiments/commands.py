@@ -163,6 +163,7 @@ def _draw_overview(run: TrackCell) -> None:
     if known.any():
         still = 100 * metrics.get("still_ate_m", float("nan"))
         title += f", ATE {100 * metrics['ate_rmse_m']:.2f} cm (standing still {still:.0f} cm)"
+    title = title.encode(errors="replace").decode()  # letters that the system's encoding lacks
     figure = plot_overview(cloud, paths | {"tracked": tracked.T_estimated}, tracked.frames, title)
     figure.savefig(run.folder / OVERVIEW_FILE, dpi=120)
     print(f"  picture: {run.folder / OVERVIEW_FILE}")

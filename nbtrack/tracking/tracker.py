@@ -14,7 +14,7 @@ from torch import Tensor
 from nbtrack.core import capture
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform
 from nbtrack.core.device import suitable_threads, synchronize
-from nbtrack.core.errors import ConfigError, NumericalError, nearest_name
+from nbtrack.core.errors import ConfigError, DataError, NumericalError, nearest_name
 from nbtrack.data.frame import Frame
 from nbtrack.data.text_files import checked_poses
 from nbtrack.fields import Field, LearnedField, PointCloud
@@ -157,6 +157,8 @@ class Tracker(abc.ABC):
         Random numbers and the budget go on.
         """
         pose = np.array(T_world_camera, dtype=np.float64)
+        if pose.shape != (4, 4):
+            raise DataError(f"T_world_camera is of shape {pose.shape}: give a 4x4 rigid transform")
         pose[~np.isfinite(pose)] = np.finfo(pose.dtype).max  # which no rigid transform has
         self.estimates = [*checked_poses(pose[None], Path("T_world_camera"))]
         expected_poses(self.settings.motion_model, self.estimates)  # a wrong name is told now
