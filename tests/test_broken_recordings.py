@@ -263,15 +263,14 @@ def test_command(whole, tmp_path: Path, capfd, format: str) -> None:
     assert error.count("\n") == 1
 
 
-def test_files_of_the_system_and_poses_too_many(tmp_path: Path) -> None:
-    """Catches hidden files that are taken for images, and the advice to write 'nan' where poses are
-    left over."""
-    folder = write_recording("plain", tmp_path / "r")
-    for name in (".DS_Store", "._img1.png"):
-        (folder / "color" / name).write_bytes(b"no image")
+def test_files_of_the_system_and_images_too_many(tmp_path: Path) -> None:
+    """Catches hidden files that are taken for images, and advice that fits only one of two ways in
+    which images and poses may differ in number."""
+    folder = write_recording("replica", tmp_path / "r")
+    for name in (".DS_Store", "._frame000001.jpg"):
+        (folder / "results" / name).write_bytes(b"no image")
     assert len(open_recording(folder)) == N_FRAMES
-    path = next(p for p in folder.iterdir() if p.name == "trajectory.txt")
-    rows = path.read_text().splitlines()
-    path.write_text("\n".join([*rows, "9 " + rows[-1].split(maxsplit=1)[1]]) + "\n")
-    with pytest.raises(DataError, match="7 poses but there are 6 images.*; remove those without"):
+    rows = (folder / "traj.txt").read_text().splitlines()
+    (folder / "traj.txt").write_text("\n".join(rows[:-1]) + "\n")
+    with pytest.raises(DataError, match=r"5 poses but there are 6 images.*, or remove its images"):
         open_recording(folder)

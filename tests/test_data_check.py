@@ -379,7 +379,7 @@ def test_command_prints_the_sentence_and_draws(tmp_path: Path, capsys) -> None:
     assert main(["data", "check", str(folder), "--out", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
     assert "warning: your poses look like OpenGL axes" in printed
-    assert "start with: --preset" in printed
+    assert "start with: track " in printed
     assert (tmp_path / "out/check.png").stat().st_size > 5000
     assert sorted(folder.rglob("*")) == before
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-import torch
 from jaxtyping import Int
 from scipy.spatial.transform import Rotation
 
@@ -99,16 +98,14 @@ class DataReport:
 
     @property
     def suggestion(self) -> str:
-        """Options to start with. The preset goes by the machine, the rest by the motion."""
+        """What to do first, by how the camera moved."""
         mm, deg = self.frames[["moved_mm", "turned_deg"]].quantile(0.95).fillna(0)  # not jumps
         n_steps = max(10, round(max(mm / _STEP_MM, deg / _STEP_DEG)))
-        rate = min(30, max(1, round(self.recording.rate_hz)))
-        how = f"--rate {rate}, or --tracker sdf --steps {n_steps}"
+        told = f"track {self.recording.folder}; the paper's way: --method sdf --steps {n_steps}"
         if mm > _FOLLOWED_MM or deg > _FOLLOWED_DEG:
             apart = f"frames are up to {mm / 10:.0f} cm and {deg:.1f} deg apart"
-            how = f"--steps 20, but {apart}: record slower or at a higher rate"
-        preset = "paper" if torch.cuda.is_available() else "smoke"
-        return f"--preset {preset} --field neus --tracker lm {how}"
+            told += f"; {apart}: if it gets lost, record slower or at a higher rate"
+        return told
 
     def __str__(self) -> str:
         cloud, recording, (own, *others) = self.cloud, self.recording, self.readings

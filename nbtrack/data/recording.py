@@ -195,7 +195,7 @@ def _poses(
         chosen = f"of {len(poses)} poses in {path.name} those of the {len(colors)} images' numbers"
         poses = poses[numbers]
     if len(poses) != len(colors):
-        advice = "write 'nan' for each number of a frame without a pose"
+        advice = "write 'nan' for each number of a frame without a pose, or remove its images"
         if len(poses) > len(colors):
             advice = "remove those without an image, or number the images as the poses"
         raise DataError(
