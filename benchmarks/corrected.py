@@ -64,18 +64,11 @@ COLUMNS = [
 ]  # fmt: skip
 
 # What a correction is made with, changed one at a time: settings, and constants of its module.
-LONG = "mapping.neus_plus.iterations=1400"
 ABLATION = [
     ("as it is", (), {}),
-    ("from NeuS", (), {}),
-    ("from NeuS+ of 1400 iterations", (LONG,), {}),
     ("at the surface alone", (), {"_OFFSETS": (0.0,)}),
-    ("offsets up to 1.5 cm", (), {"_OFFSETS": (0.0, -0.015, 0.015)}),
     ("30,000 points", (), {"_N_POINTS": 30_000}),
-    ("smoothness 1", (), {"_SMOOTHNESS": 1.0}),
-    ("weights judged twice", (), {"_ROUNDS": 2}),
     ("every point alike", (), {"_GUESS": 1.0}),  # confidence is 1 everywhere
-    ("at every vertex", (), {"_FADE": 0}),  # which scipy takes for: as often as anything changes
     ("cells of 8 cm", ("mapping.neus_plus.correct_voxel=0.08",), {}),
     ("colours as the network has them", (), {"_COLOR_STIFFNESS": 1e9}),
     ("colours as stiff as distances", (), {"_COLOR_STIFFNESS": 1.0}),
@@ -165,9 +158,8 @@ def ablation(recordings) -> pd.DataFrame:
     ]
     places += [(scene, {"mapped": scene}) for scene in (open_scene(r, preset) for r in recordings)]
     for what, settings, constants in ABLATION:
-        method = METHODS["neus_corrected" if what == "from NeuS" else "corrected"]
-        points = "tracking.lm.n_pixels=2048"
-        changed = with_settings(preset, *method.settings, points, *settings)
+        method = METHODS["corrected"]
+        changed = with_settings(preset, *method.settings, *settings)
         with mock.patch.multiple(correction, **constants):
             for mapped, paths in places:
                 field, seconds = _corrected_now(mapped, method.field, changed)

@@ -53,9 +53,10 @@ class Recording:
     def origin(self) -> Position:
         """Where (m) sequences have their origin: whole metres near the cameras of a recording that
         is far from zero, as in map coordinates, since single precision would lose them; else 0."""
+        if not self.has_pose.any():
+            return np.zeros(3)
         center = np.median(self.T_world_camera[self.has_pose, :3, 3], axis=0)
-        is_far = self.has_pose.any() and np.abs(center).max() > _FAR_FROM_ZERO
-        return np.round(center) if is_far else np.zeros(3)
+        return np.round(center) if np.abs(center).max() > _FAR_FROM_ZERO else np.zeros(3)
 
     @property
     def rate_hz(self) -> float:
