@@ -160,7 +160,7 @@ def ablation(recordings) -> pd.DataFrame:
     for what, settings, constants in ABLATION:
         method = METHODS["corrected"]
         changed = with_settings(preset, *method.settings, *settings)
-        with mock.patch.multiple(correction, **constants):
+        with mock.patch.dict(vars(correction), constants):
             for mapped, paths in places:
                 field, seconds = _corrected_now(mapped, method.field, changed)
                 for (path, scene), frames in product(paths.items(), (":", "::4")):
