@@ -98,7 +98,7 @@ def test_facts(box: Path) -> None:
     assert report.best.declared.camera_axes == "opengl"
     assert report.best.median_m < 0.02
     assert report.best.overlap > 0.5
-    lines = str(report).splitlines()
+    lines = str(report).replace(str(box), "box").splitlines()  # wherever the test runs
     assert max(map(len, lines)) <= 100
     assert lines[0] == "box: Neural RGB-D, 16 of 16 frames have a pose, 64 x 48 px"
     assert "48.00 and 48.00 px (67.4 deg wide), principal point (32, 24)" in lines[1]

@@ -23,11 +23,8 @@ from nbtrack.data.sequence import RgbdSequence, read_frames
 
 _CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
-_N_PAIRS, _QUICK_PAIRS, _GAPS = (
-    20,
-    6,
-    (5, 10, 15),
-)  # frames between the two: they moved, and still see the same,
+_N_PAIRS, _QUICK_PAIRS = 20, 6  # of frames that are compared
+_GAPS = (5, 10, 15)  # frames between the two: they moved, and still see the same,
 _TURNED_DEG = 60  # which they do where the camera has not turned by more in between
 _CELL = 0.1  # m: edge of the cells of surface that coverage counts
 _CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
