@@ -25,7 +25,7 @@ from nbtrack.mapping.correct import correct_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.tables import write_csv
 from nbtrack.tracking import StepBudget, track_sequence
-from nbtrack.tracking.lm_solver import draw_points
+from nbtrack.tracking.observed import draw_points
 
 TRACKED = METHODS["corrected_dense"], METHODS["icp_dense"]
 # Smooth errors like a registration's: so far (m, degrees) about a point ahead (m), with so many

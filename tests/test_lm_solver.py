@@ -14,14 +14,13 @@ from nbtrack.tracking.lm_solver import (
     Descent,
     Grid,
     damped_step,
-    draw_points,
     normal_equations,
     residual_terms,
     retract,
     robust_cost,
     scales_of,
-    with_normals,
 )
+from nbtrack.tracking.observed import draw_points, with_normals
 
 BOX = SceneBounds((-1.0, -1.2, -0.8), (1.0, 1.2, 0.8))
 ROOM = BakedField(BoxRoom(), 0.05)  # known better here, worse there, as corrected grids are

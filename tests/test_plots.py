@@ -45,7 +45,7 @@ HISTORIES = {"iMAP": IMAP, "NeuS": IMAP.copy()}
 HISTORIES["NeuS"].insert(2, "eikonal", FALLING)
 FRAMES = pd.DataFrame({
     "frame_id": [33, 36], "time": [1.1, 1.2], "translation_error_m": [0.01, 0.3],
-    "rotation_error_deg": [0.1, 0.2],
+    "rotation_error_deg": [0.1, 0.2], "still_error_m": [0.02, 0.04],
 })  # fmt: skip
 
 
@@ -270,9 +270,11 @@ def test_losses_show_the_terms_and_no_diagnostics() -> None:
 
 def test_errors_run_in_seconds() -> None:
     """Catches frame numbers taken for seconds, and metres for centimetres."""
-    line = FIGURES["errors"](None).axes[0].lines[0]
+    line, _, still, _ = FIGURES["errors"](None).axes[0].lines
     assert line.get_xdata() == pytest.approx([0.0, 0.1])
     assert line.get_ydata() == pytest.approx([1.0, 30.0])
+    assert still.get_label() == "standing still"
+    assert still.get_ydata() == pytest.approx([2.0, 4.0])
 
 
 def test_bars_are_the_errors_of_their_cell() -> None:
@@ -284,6 +286,9 @@ def test_bars_are_the_errors_of_their_cell() -> None:
     (spread,) = second.errorbar.lines[2][0].get_segments()[1:]
     assert np.ptp(spread[:, 1]) == pytest.approx(2 * 0.05 * 2**0.5)
     assert axes.get_title(loc="left") == "Whiteroom"
+    with_still = plots.plot_ate_bars(CELLS.assign(still_ate_m=0.3)).axes[0]
+    assert len(with_still.patches) == len(axes.patches)
+    assert {"standing still", "lost above 0.2 m"} == {str(s.get_label()) for s in with_still.lines}
 
 
 def test_unmeasured_pixels_are_not_errors(sequence) -> None:

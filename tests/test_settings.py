@@ -9,12 +9,20 @@ import pytest
 from nbtrack.core.errors import ConfigError
 from nbtrack.core.files import fingerprint
 from nbtrack.core.settings import as_dict, changed_settings, with_settings
+from nbtrack.data.sequence import parse_frames
 from nbtrack.experiments.methods import METHODS, TABLE_1
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.fields import NetworkSettings
 from nbtrack.synthetic import REPORTED_ROOMS
+from nbtrack.synthetic.motion import handheld_trajectory
+from nbtrack.synthetic.room import build_room
+from nbtrack.tracking.metrics import still_metrics
 
 KEY = "mapping.neus.iterations"
+
+
+# What a camera that stands still must be off (m) in the frames that a preset tracks.
+FLOORS = [("smoke", 0.3), ("nine_rooms", 0.5), ("synthetic", 0.5)]
 
 
 def iterations(preset: Preset) -> int:
@@ -27,6 +35,17 @@ def test_presets_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NBTRACK_PRESET", "synthetic")
     assert load_preset() == PRESETS["synthetic"]
     assert load_preset("paper") == PRESETS["paper"]
+
+
+@pytest.mark.parametrize(("name", "floor_m"), FLOORS)
+def test_tracked_frames_leave_their_start(name: str, floor_m: float) -> None:
+    """Catches a preset that tracks frames in which a camera that stands still does nearly as well
+    as one that is tracked."""
+    scenes = PRESETS[name].scenes
+    tracked = parse_frames(scenes.track_frames)
+    for room in scenes.names:
+        path = handheld_trajectory(build_room(room), scenes.n_frames, scenes.seed)
+        assert still_metrics(path[tracked])["still_ate_m"] > floor_m, room
 
 
 def test_figures_of_the_presets() -> None:

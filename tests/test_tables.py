@@ -11,6 +11,7 @@ import pytest
 from nbtrack.core.errors import DataError
 from nbtrack.tables import (
     PAPER_SCENE_LABELS,
+    STANDING_STILL,
     beside_published,
     over_rooms,
     published_table_1,
@@ -235,6 +236,20 @@ def test_mean_and_deviation_over_seeds() -> None:
     assert average_over_seeds(failed)["ate_m"].isna().tolist() == [True, False]
     assert style_table_1(failed).data["x"].tolist() == ["–", "1.000 ± 0.000"]
     assert "±" not in repr(style_table_1(OURS_1))
+
+
+def test_standing_still_is_a_row() -> None:
+    """Catches a table without the dullest alternative, one row of it for each method, or one in the
+    published table, where nobody knows it."""
+    still = SEEDS.assign(still_ate_m=SEEDS["method"].map({"A": 0.25, "B": 0.25}))
+    wide = table_1(still)
+    assert wide["x"].to_dict() == {
+        (10, "A"): pytest.approx(0.2),
+        (10, "B"): pytest.approx(1.0),
+        (10, STANDING_STILL): 0.25,
+    }
+    assert f" & {STANDING_STILL} & " in latex(style_table_1(still))
+    assert STANDING_STILL not in table_1(published_table_1()).index.get_level_values("method")
 
 
 def test_comparison_scene_by_scene() -> None:

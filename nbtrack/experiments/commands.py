@@ -47,9 +47,9 @@ from nbtrack.tracking.trajectories import (
 OVERVIEW_FILE = "overview.png"  # beside the files of a run
 _FORMATS = ["tum", "kitti", "ply", "glb", "map"]
 _PRINTED = (
-    "ate_rmse_m", "still_ate_m", "path_m", "ate_rmse_aligned_m", "rotation_rmse_deg",
-    "max_error_m", "frames",
-    "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
+    "ate_rmse_m", "still_ate_m", "path_m", "ate_over_path", "ate_rmse_aligned_m",
+    "rotation_rmse_deg", "max_error_m", "frames", "steps_per_frame",
+    "seconds_per_step", "seconds_per_frame", "map_seconds",
 )  # fmt: skip
 _FRAMES_SHOWN, _CELLS = 20, 120  # of an overview: frames that tell what was seen; cells across
 _MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)

@@ -100,7 +100,7 @@ network.occupancy.width = 96
 names = ["living_room", "office"]
 n_frames = 240
 width = 96
-track_frames = ":60"
+track_frames = "100:200"
 [mapping]
 imap = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
 neus = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
@@ -121,7 +121,7 @@ vr = [16, 64, 128]
 sdf = [256, 512, 2048]
 """
 _SMALL = with_values(Preset("smoke"), tomllib.loads(_SMOKE))
-_NINE = replace(_SMALL.scenes, names=REPORTED_ROOMS, track_frames=":120")
+_NINE = replace(_SMALL.scenes, names=REPORTED_ROOMS, track_frames=":")
 _ALL = (
     _SMALL,
     replace(_SMALL, name="nine_rooms", scenes=_NINE),

@@ -96,6 +96,8 @@ class TrackCell(Cell):
         with threads(self.n_threads or torch.get_num_threads()):
             tracked, notes = self._tracked(report)
             metrics = self._metrics(tracked) | notes
+        if metrics.get("path_m") and "ate_rmse_m" in metrics:
+            metrics["ate_over_path"] = metrics["ate_rmse_m"] / metrics["path_m"]
         times, origin = tracked.frames["time"].to_numpy(), np.array(notes.get("origin", [0, 0, 0]))
         texts = {
             "trajectory.txt": tum_text(times, shifted(tracked.T_estimated, origin)),

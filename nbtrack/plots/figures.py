@@ -13,8 +13,8 @@ from nbtrack.core.arrays import Values
 from nbtrack.data.frame import MILLIMETRE
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import View
-from nbtrack.plots.style import DASHED, WIDTH, log_axes, method_colors, new_axes, styled
-from nbtrack.tables import table_1
+from nbtrack.plots.style import DASHED, DOTTED, WIDTH, log_axes, method_colors, new_axes, styled
+from nbtrack.tables import STANDING_STILL, table_1
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 
@@ -125,8 +125,8 @@ def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figur
 def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """Errors of every frame over time: position (cm, logarithmic) and orientation (degrees).
 
-    `frames` are those of runs by method, as in frames.csv. Above the dashed line, 0.2 m, the paper
-    calls the camera lost.
+    `frames` are those of runs by method on the same frames, as in frames.csv. Above the dashed
+    line, 0.2 m, the paper calls the camera lost; the dotted one is a camera that stands still.
     """
     above, below = new_axes(title, 4.9, 2, sharex=True)[:, 0]
     for label, color in method_colors(frames).items():
@@ -134,6 +134,7 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
         seconds = tracked["time"] - tracked["time"].iloc[0]
         above.plot(seconds, 100 * tracked["translation_error_m"], color=color, label=label)
         below.plot(seconds, tracked["rotation_error_deg"], color=color)
+    above.plot(seconds, 100 * tracked["still_error_m"], label=STANDING_STILL, **DOTTED)
     above.axhline(100 * LOST_THRESHOLD_M, label="lost above 0.2 m", **DASHED)
     above.set_ylabel("translation error (cm)")
     below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
@@ -171,15 +172,19 @@ def plot_ate_bars(results: pd.DataFrame, title: str = "") -> Figure:
 
     `results` are as `table_1` takes them. A bar that crosses the dashed line at 0.2 m is a lost
     camera, which the table prints red; a missing bar is a run without result. Thin lines span a
-    deviation over seeds either way.
+    deviation over seeds either way; the dotted line is a camera that stands still.
     """
     means, deviations = table_1(results), table_1(results, "ate_deviation_m")
+    is_still = means.index.get_level_values("method") == STANDING_STILL
+    still, means, deviations = means[is_still], means[~is_still], deviations[~is_still]
     rows = -(-len(means.columns) // 5)
     panels = new_axes(title, 0.9 + 2.1 * rows, rows, min(5, len(means.columns)), sharey=True).flat
     for axes, scene in zip(panels, means, strict=False):
         bars = means[scene].unstack(sort=False).rename("{:g}".format)
         look = {"width": 0.8, "rot": 0, "legend": False, "color": method_colors(bars)}
         bars.plot.bar(ax=axes, yerr=deviations[scene].unstack(sort=False).to_numpy().T, **look)
+        for ate_m in still[scene][:1]:
+            axes.axhline(ate_m, label=STANDING_STILL, **DOTTED)
         axes.axhline(LOST_THRESHOLD_M, label="lost above 0.2 m", **DASHED)
         axes.set(title=scene.replace("_", " "), xlabel="rate (Hz)", ylabel="ATE (m)")
         log_axes(axes, "y")

@@ -18,8 +18,9 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.mapping.meshes import query_field, seen_by
-from nbtrack.plots.style import method_colors, new_axes, styled
+from nbtrack.plots.style import DOTTED, log_axes, method_colors, new_axes, styled
 from nbtrack.synthetic import Room
+from nbtrack.tables import STANDING_STILL
 
 _POINTS_ALONG = 240  # grid points along the longer side of a slice
 _DIMMED = 0.72  # how white the unseen becomes
@@ -122,13 +123,17 @@ def plot_overview(
     errors are left out.
     """
     has_errors = frames["translation_error_m"].notna().any()
-    left, *right = new_axes(title, 5.0, 1, 2 if has_errors else 1)[0]
+    left, *right = new_axes(title, 4.2, 1, 2 if has_errors else 1)[0]
     _draw_cloud(left, cloud, T_paths)
     left.legend(loc="upper right")
     for axes in right:
         seconds = frames["time"] - frames["time"].iloc[0]
-        axes.plot(seconds, 100 * frames["translation_error_m"], color="#d7191c")
-        axes.set(xlabel="time (s)", ylabel="translation error (cm)", ylim=(0, None))
+        tracked, still = 100 * frames["translation_error_m"], 100 * frames["still_error_m"]
+        axes.plot(seconds, tracked, color=method_colors(["tracked"])["tracked"], label="tracked")
+        axes.plot(seconds, still, label=STANDING_STILL, **DOTTED)
+        axes.set(xlabel="time (s)", ylabel="translation error (cm)")
+        log_axes(axes, "y")
+        axes.legend(loc="best")
     return left.figure
 
 
@@ -141,7 +146,7 @@ def _draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) -
     shown = cloud.loc[heights.index[heights <= highest + 0.1]]
     page = shown[["x", "y", "z"]].to_numpy()[:, page_axes(up)]
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
-    axes.scatter(*page.T, c=colors, s=1.5, linewidths=0)
+    axes.scatter(*page.T, c=colors, s=4, linewidths=0)
 
 
 @styled
@@ -217,12 +222,14 @@ def _draw_from_above(axes: Axes, T_paths: Mapping[str, Poses]) -> np.ndarray:
 
 
 def _draw_paths(axes: Axes, T_paths: Mapping[str, Poses], to_page: np.ndarray) -> None:
-    """Trajectories by label on a page, (2, 3), with a dot at the start."""
+    """Trajectories by label on a page, (2, 3), with a dot at the start of each."""
+    starts = []
     for label, color in method_colors(T_paths).items():
         path = T_paths[label][:, :3, 3] @ to_page.T
         look = {"linewidth": 2.6 if label == "true" else 1.4, "zorder": 3}
         axes.plot(*path.T, color=color, label=label, **look)
-        axes.plot(*path[0], "o", color="black", markersize=5, zorder=4)
+        starts.append(path[0])
+    axes.plot(*np.transpose(starts), "o", color="black", markersize=5, zorder=4, label="start")
 
 
 def _plane(

@@ -22,6 +22,7 @@ _FIXED = {
 }
 WIDTH = 9.0  # inches of every figure: a notebook's text width
 DASHED = {"color": "0.3", "linestyle": "--", "linewidth": 1}
+DOTTED = {"color": "0.3", "linestyle": ":", "linewidth": 1.5}
 _STYLE = {
     "figure.dpi": 90, "figure.titlesize": 11, "figure.titleweight": "bold", "font.size": 9,
     "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.spines.top": False,

@@ -2,6 +2,7 @@
 
 from nbtrack.tables.layout import (
     PAPER_SCENE_LABELS,
+    STANDING_STILL,
     beside_published,
     naming_points,
     over_rooms,

@@ -22,6 +22,8 @@ PAPER_SCENE_LABELS = {
 """Folders of the Neural RGB-D dataset and the names that the paper's Table I gives them."""
 PAPER_PIXELS = {"VR": 512, "SDF": 4096}
 """The n that the paper's Table II prints in bold: the one used for Table I."""
+STANDING_STILL = "standing still"
+"""The row of a camera that stays at its first pose, the dullest alternative to any tracker."""
 _CELL_1, _CELL_2 = ["rate_hz", "method", "scene"], ["tracker", "n_pixels", "budget_ms"]
 
 
@@ -46,10 +48,16 @@ def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
 
     Columns are rate_hz, method, scene, ate_m, and seed where there are several: then the column
     ate_deviation_m tells their deviation (m) as a sample. A cell with a seed that failed is NaN: a
-    mean over the others would hide the failure. Raises DataError where a column is missing, there
-    is no row, or two rows have one place.
+    mean over the others would hide the failure. Where results have a column still_ate_m, the method
+    `STANDING_STILL` is added. Raises DataError where a column is missing, there is no row, or two
+    rows have one place.
     """
-    _check(results, "ate_m", [*_CELL_1, "seed"] if "seed" in results else _CELL_1)
+    keys = [*_CELL_1, "seed"] if "seed" in results else _CELL_1
+    _check(results, "ate_m", keys)
+    if "still_ate_m" in results:
+        still = results.dropna(subset="still_ate_m").assign(method=STANDING_STILL)
+        still = still.assign(ate_m=still["still_ate_m"]).drop_duplicates(keys)
+        results = pd.concat([results, still], ignore_index=True)
     results = results.replace({"scene": PAPER_SCENE_LABELS})
     groups = results.groupby(_CELL_1, sort=False)["ate_m"]
     averaged = groups.mean(skipna=False).to_frame()

@@ -12,12 +12,13 @@ from torch import Tensor
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
 from nbtrack.fields import PointCloud
+from nbtrack.tracking.observed import draw_points
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 # How far from the map a point may be to have a partner there, m: first wide, to get home from
 # where the motion model errs, then so narrow that what was not mapped pulls no more.
 _REACHES = (0.3, 0.1)
-_SOURCE_VOXEL = 0.01  # m: pixels drawn twice, and close ones, count once
+_SOURCE_VOXEL = 0.01  # m: points that are closer count once
 _NEIGHBOURS = 20  # points that tell a point's plane
 _LEAST_POINTS, _LEAST_INLIERS = 20, 0.5  # a number and a share; below, a frame is lost
 # A move of less than the epsilons (rad, m) ends a search.
@@ -29,7 +30,7 @@ _OPTIONS |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}
 class IcpSettings(TrackerSettings):
     """Of ICP."""
 
-    n_pixels: int = 512  # points a frame; as many as LM's, so that their rows compare
+    n_pixels: int = 512  # points a frame; drawn as LM's are, so that their rows compare
     motion_model: str = "constant_velocity"
 
 
@@ -51,14 +52,14 @@ class IcpTracker(Tracker):
 
         Raises ConfigError where it has too few points for a plane.
         """
-        super().__init__(field, *arguments, **settings)
+        super().__init__(field.to("cpu"), *arguments, **settings)
         if len(field.points) < _NEIGHBOURS:
             raise ConfigError(
                 f"the map has {len(field.points)} points of {field.voxel:g} m cells; ICP needs "
                 f"{_NEIGHBOURS} or more: set a smaller mapping.points.voxel, or map more frames"
             )
         self.small_gicp = importlib.import_module(self.package)
-        points = field.points.cpu().double().numpy()
+        points = self.field.points.double().numpy()
         self.target, self.target_tree = self._with_planes(self.small_gicp.PointCloud(points))
 
     @classmethod
@@ -70,11 +71,8 @@ class IcpTracker(Tracker):
         """Draw the frame's points and find their planes; the first pose is the start."""
         self.T_world_camera, self.source = T_starts[0], None
         self.is_converged, self.inlier_ratio = False, 0.0
-        measured = frame.measured_pixels()
-        if measured.numel():
-            size, seeded = (self.settings.n_pixels,), self.generator
-            drawn = torch.randint(measured.shape[1], size, generator=seeded, device=self.device)
-            points = frame.points(*measured[:, drawn])[0].cpu().double().numpy()
+        points = draw_points(frame, self.settings.n_pixels, self.generator)[0]
+        if len(points):
             thinned = self.small_gicp.voxelgrid_sampling(points, _SOURCE_VOXEL)
             self.source, _ = self._with_planes(thinned)
 
@@ -86,7 +84,7 @@ class IcpTracker(Tracker):
         self.is_converged = True
         if self.source is None or self.source.size() < _LEAST_POINTS:
             return float("nan")
-        T_world_camera = self.T_world_camera.cpu().double().numpy()
+        T_world_camera = self.T_world_camera.double().numpy()
         map_and_frame = self.target, self.source, self.target_tree
         for reach in _REACHES:
             options = {**_OPTIONS, "max_correspondence_distance": reach}
@@ -94,7 +92,7 @@ class IcpTracker(Tracker):
             if not result.num_inliers or not np.isfinite(result.T_target_source).all():
                 return float("nan")
             T_world_camera = result.T_target_source
-        self.T_world_camera = torch.from_numpy(T_world_camera.copy()).to(self.T_world_camera)
+        self.T_world_camera = torch.from_numpy(T_world_camera.copy()).float()
         self.inlier_ratio = result.num_inliers / self.source.size()
         return result.error / result.num_inliers
 

@@ -16,7 +16,8 @@ from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
 from nbtrack.fields.grid import BakedField
 from nbtrack.tracking.budget import Budget
-from nbtrack.tracking.lm_solver import Descent, Grid, draw_points, retract, with_normals
+from nbtrack.tracking.lm_solver import Descent, Grid, retract
+from nbtrack.tracking.observed import draw_points, with_normals
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 _MIN_POINTS = 20  # below, a frame says too little for six unknowns

@@ -45,10 +45,9 @@ from jaxtyping import Float
 from numba import njit
 
 from nbtrack.core.arrays import Pose
-from nbtrack.data.frame import MILLIMETRE, Frame
-from nbtrack.data.pixels import PLANE_JUMP, PLANE_REACH
-from nbtrack.fields.base import LUMA, intensity_of
+from nbtrack.fields.base import intensity_of
 from nbtrack.fields.grid import BakedField
+from nbtrack.tracking.observed import JIT, Observed
 
 G_MIN, G_MAX, G_SCALE = 0.3, 2.0, 0.5
 MARGIN = 0.3  # m beyond a field's bounds, where walls lie if the pose is off
@@ -61,19 +60,7 @@ _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e-9, 1e3
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.2
 # The coarse stage may lead away from a good start: the better of both goes on, at these scales.
 _NEAR_SCALES = np.array([0.02, 0.05])
-# Points to track: a neighbouring depth that differs by more, as a share, marks an edge. So many
-# pixels are looked at for every point that is wanted.
-_EDGE_JUMP, _DRAWN_PER_POINT = 0.05, 4
-# Pixels are spread evenly: of the sequence R2 (Roberts 2018), the fractions of n g and n g^2 with
-# g^3 + g^2 = 1, every beginning is. In units of 1 / _MODULUS; down and across.
-_EVEN_STEPS, _MODULUS = (0xC13FA9A9, 0x91E10DA5), 2**32
-_RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
-# Sums may be reordered, so that they fill vector registers; NaN stays NaN.
-_JIT = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 _ONE, _ZERO = np.float32(1), np.float32(0)
-
-# Points (n x 3, m, camera frame), their intensities, and normals (n x 3) or none (0 x 3).
-Observed = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Stage(NamedTuple):
@@ -199,79 +186,8 @@ def _median(values: Float[np.ndarray, "n"]) -> float:
     return np.partition(values, len(values) // 2)[len(values) // 2]
 
 
-def draw_points(frame: Frame, n_points: int, generator: torch.Generator) -> Observed:
-    """Observed points (m, camera frame) of evenly spread pixels, and intensities; no normals.
-
-    Not those at depth edges, which may belong to either side, nor at the border. Only a few times
-    as many pixels as wanted are looked at, from a random one on: where little is measured, fewer
-    points come back.
-    """
-    starts = torch.randint(_MODULUS, (2,), generator=generator).numpy()
-    images = frame.depth_mm.numpy(), frame.color.numpy()
-    return *_drawn_points(*images, _pinhole(frame), n_points, starts), np.empty((0, 3))
-
-
-def with_normals(frame: Frame, observed: Observed, n_points: int) -> Observed:
-    """The first points with unit normals (camera frame, towards it); 0 where not known."""
-    points, intensity = observed[0][:n_points], observed[1][:n_points]
-    return points, intensity, _normals(frame.depth_mm.numpy(), _pinhole(frame), points)
-
-
-def _pinhole(frame: Frame) -> tuple[float, float, float, float]:
-    c = frame.camera
-    return c.fx, c.fy, c.cx, c.cy
-
-
 @no_type_check
-@njit(**_JIT)
-def _drawn_points(depth_mm, color, pinhole, n_points, starts):
-    (height, width), (fx, fy, cx, cy), found = depth_mm.shape, pinhole, 0
-    points, luma = np.empty((n_points, 3)), np.empty(n_points)
-    n_looked_at = _DRAWN_PER_POINT * n_points if min(height, width) > 2 else 0
-    for order in range(n_looked_at):
-        if found == n_points:
-            break
-        v = 1 + (starts[0] + _EVEN_STEPS[0] * order) % _MODULUS * (height - 2) // _MODULUS
-        u = 1 + (starts[1] + _EVEN_STEPS[1] * order) % _MODULUS * (width - 2) // _MODULUS
-        z = depth_mm[v, u]
-        jump = _EDGE_JUMP * z
-        is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
-        is_smooth &= abs(depth_mm[v, u + 1] - z) < jump and abs(depth_mm[v, u - 1] - z) < jump
-        if is_smooth:  # never without a depth: nothing is below a jump of zero
-            point, metres = points[found], z * MILLIMETRE
-            point[0], point[1] = (u + 0.5 - cx) / fx * metres, (v + 0.5 - cy) / fy * metres
-            point[2] = metres
-            red, green, blue = color[v, u, 0], color[v, u, 1], color[v, u, 2]
-            luma[found] = (_RED * red + _GREEN * green + _BLUE * blue) / 255
-            found += 1
-    return points[:found], luma[:found]
-
-
-@no_type_check
-@njit(**_JIT)
-def _normals(depth_mm, pinhole, points):
-    """`PixelSampler.normals_camera` at observed points (m, camera frame)."""
-    (height, width), (fx, fy, cx, cy) = depth_mm.shape, pinhole
-    reach, normals = max(1, round(width * PLANE_REACH)), np.zeros((len(points), 3))
-    for i in range(len(points)):
-        x, y = points[i, 0] / points[i, 2], points[i, 1] / points[i, 2]
-        u, v = round(fx * x + cx - 0.5), round(fy * y + cy - 0.5)
-        if reach <= u < width - reach and reach <= v < height - reach:
-            z, left, right = depth_mm[v, u], depth_mm[v, u - reach], depth_mm[v, u + reach]
-            above, below = depth_mm[v - reach, u], depth_mm[v + reach, u]
-            jump = max(abs(left - z), abs(right - z), abs(above - z), abs(below - z))
-            if jump < PLANE_JUMP * z:
-                # How fast the logarithm of the depth grows along x / z and y / z.
-                a = fx / reach * (right - left) / (right + left)
-                b = fy / reach * (below - above) / (below + above)
-                c = -1 - x * a - y * b
-                length = np.sqrt(a * a + b * b + c * c)
-                normals[i, 0], normals[i, 1], normals[i, 2] = a / length, b / length, c / length
-    return normals
-
-
-@no_type_check
-@njit(**_JIT)
+@njit(**JIT)
 def _weigh(terms, normals, T):
     """Reliability by the gradient norm and the angle to normals, and division by the norm."""
     for i in range(terms.shape[1]):
@@ -291,7 +207,7 @@ def _weigh(terms, normals, T):
 
 
 @no_type_check
-@njit(**_JIT)
+@njit(**JIT)
 def _locate(terms, points, T, shape, place):
     """Lever arms, and whether points are usable; their cells, where in them, and 1 / voxel."""
     inverse, numbers = 1 / place[3], np.zeros(len(points), np.int64)
@@ -314,7 +230,7 @@ def _locate(terms, points, T, shape, place):
 
 
 @no_type_check
-@njit(**_JIT)
+@njit(**JIT)
 def residual_terms(observed, T, grid, is_fine):
     """Of every point a column of twelve: r_d, r_i, w, a (3), q_d (3), q_i (3), at a pose.
 
@@ -357,7 +273,7 @@ def scales_of(terms, before, accuracy, mad_factor):
 
 
 @no_type_check
-@njit(**_JIT)
+@njit(**JIT)
 def robust_cost(terms, scales, weight):
     """The mean cost of the points; `weight` is that of intensity."""
     total, weight = 0.0, np.float32(weight)
@@ -370,7 +286,7 @@ def robust_cost(terms, scales, weight):
 
 
 @no_type_check
-@njit(**_JIT)
+@njit(**JIT)
 def normal_equations(terms, scales, weight):
     """H (6 x 6) and b (6), in double precision."""
     n_points = terms.shape[1]
@@ -399,7 +315,7 @@ def normal_equations(terms, scales, weight):
 
 
 @no_type_check
-@njit(**_JIT)
+@njit(**JIT)
 def retract(T, twist):
     """The pose after a twist (omega in rad, v in m), by Rodrigues' formula; finite at zero."""
     x, y, z = twist[0], twist[1], twist[2]
@@ -418,7 +334,7 @@ def retract(T, twist):
 
 
 @no_type_check
-@njit(**_JIT)
+@njit(**JIT)
 def damped_step(terms, scales, weight, T_start, T, damping):
     """The twist of a step."""
     matrix, vector = normal_equations(terms, scales, weight)
@@ -445,7 +361,7 @@ def damped_step(terms, scales, weight, T_start, T, damping):
 
 
 @no_type_check
-@njit(**_JIT)
+@njit(**JIT)
 def _try_step(observed, grid, is_fine, weight, T_start, T, terms, scales, damping):
     """A step: whether it is better, pose and terms after it, cost before, and its length.
 

@@ -13,6 +13,10 @@ Positions = Float[np.ndarray, "frames 3"]
 
 LOST_THRESHOLD_M = 0.2
 """Above this translation error (m) a frame counts as lost. Source: the paper's Table I, in red."""
+FOLLOWED_SHARE = 1 / 3
+"""A camera is followed if its ATE is below this share of what standing still scores. Our choice: on
+a short path an error below `LOST_THRESHOLD_M` says nothing, since a camera that never moves has it.
+"""
 
 
 def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | int]:
@@ -44,7 +48,8 @@ def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | i
 def still_metrics(T_true: Poses) -> dict[str, float]:
     """What a camera that stays at the first of some poses (m) scores, and how long their path is.
 
-    No tracker is better than nothing unless its error is well below `still_ate_m`.
+    These are `still_ate_m` and `path_m`; nothing of fewer than two known poses. Whether a tracker
+    is better than nothing is judged by `still_ate_m` and `FOLLOWED_SHARE`.
     """
     positions = T_true[np.isfinite(T_true).all(axis=(1, 2)), :3, 3]
     if len(positions) < 2:

@@ -107,6 +107,7 @@ def read_trajectory(folder: Path) -> Trajectory:
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
     translation_error, rotation_error = [np.nan], [np.nan]
     T_true = sequence.T_world_camera[index : index + 1]
+    from_first = T_true[0, :3, 3] - sequence.T_world_camera[0, :3, 3]
     if np.isfinite(T_true).all():
         translation_error, rotation_error = pose_errors(estimate.T_world_camera[None], T_true)
     return {
@@ -117,6 +118,7 @@ def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, An
         "loss": estimate.loss,
         "translation_error_m": float(translation_error[0]),
         "rotation_error_deg": float(rotation_error[0]),
+        "still_error_m": float(np.linalg.norm(from_first)),  # of a camera that stands still
         "without_depth": estimate.without_depth,
         **estimate.report,
     }

@@ -1,0 +1,95 @@
+"""Points that a frame observed, as LM and ICP take them: evenly spread, and away from edges."""
+
+from typing import no_type_check
+
+import numpy as np
+import torch
+from numba import njit
+
+from nbtrack.data.frame import MILLIMETRE, Frame
+from nbtrack.data.pixels import PLANE_JUMP, PLANE_REACH
+from nbtrack.fields.base import LUMA
+
+# Points to track: a neighbouring depth that differs by more, as a share, marks an edge. So many
+# pixels are looked at for every point that is wanted.
+_EDGE_JUMP, _DRAWN_PER_POINT = 0.05, 4
+# Pixels are spread evenly: of the sequence R2 (Roberts 2018), the fractions of n g and n g^2 with
+# g^3 + g^2 = 1, every beginning is. In units of 1 / _MODULUS; down and across.
+_EVEN_STEPS, _MODULUS = (0xC13FA9A9, 0x91E10DA5), 2**32
+_RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
+# Sums may be reordered, so that they fill vector registers; NaN stays NaN.
+JIT = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
+
+# Points (n x 3, m, camera frame), their intensities, and normals (n x 3) or none (0 x 3).
+Observed = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def draw_points(frame: Frame, n_points: int, generator: torch.Generator) -> Observed:
+    """Observed points (m, camera frame) of evenly spread pixels, and intensities; no normals.
+
+    Not those at depth edges, which may belong to either side, nor at the border. Only a few times
+    as many pixels as wanted are looked at, from a random one on: where little is measured, fewer
+    points come back.
+    """
+    starts = torch.randint(_MODULUS, (2,), generator=generator).numpy()
+    images = frame.depth_mm.numpy(), frame.color.numpy()
+    return *_drawn_points(*images, _pinhole(frame), n_points, starts), np.empty((0, 3))
+
+
+def with_normals(frame: Frame, observed: Observed, n_points: int) -> Observed:
+    """The first points with unit normals (camera frame, towards it); 0 where not known."""
+    points, intensity = observed[0][:n_points], observed[1][:n_points]
+    return points, intensity, _normals(frame.depth_mm.numpy(), _pinhole(frame), points)
+
+
+def _pinhole(frame: Frame) -> tuple[float, float, float, float]:
+    c = frame.camera
+    return c.fx, c.fy, c.cx, c.cy
+
+
+@no_type_check
+@njit(**JIT)
+def _drawn_points(depth_mm, color, pinhole, n_points, starts):
+    (height, width), (fx, fy, cx, cy), found = depth_mm.shape, pinhole, 0
+    points, luma = np.empty((n_points, 3)), np.empty(n_points)
+    n_looked_at = _DRAWN_PER_POINT * n_points if min(height, width) > 2 else 0
+    for order in range(n_looked_at):
+        if found == n_points:
+            break
+        v = 1 + (starts[0] + _EVEN_STEPS[0] * order) % _MODULUS * (height - 2) // _MODULUS
+        u = 1 + (starts[1] + _EVEN_STEPS[1] * order) % _MODULUS * (width - 2) // _MODULUS
+        z = depth_mm[v, u]
+        jump = _EDGE_JUMP * z
+        is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
+        is_smooth &= abs(depth_mm[v, u + 1] - z) < jump and abs(depth_mm[v, u - 1] - z) < jump
+        if is_smooth:  # never without a depth: nothing is below a jump of zero
+            point, metres = points[found], z * MILLIMETRE
+            point[0], point[1] = (u + 0.5 - cx) / fx * metres, (v + 0.5 - cy) / fy * metres
+            point[2] = metres
+            red, green, blue = color[v, u, 0], color[v, u, 1], color[v, u, 2]
+            luma[found] = (_RED * red + _GREEN * green + _BLUE * blue) / 255
+            found += 1
+    return points[:found], luma[:found]
+
+
+@no_type_check
+@njit(**JIT)
+def _normals(depth_mm, pinhole, points):
+    """`PixelSampler.normals_camera` at observed points (m, camera frame)."""
+    (height, width), (fx, fy, cx, cy) = depth_mm.shape, pinhole
+    reach, normals = max(1, round(width * PLANE_REACH)), np.zeros((len(points), 3))
+    for i in range(len(points)):
+        x, y = points[i, 0] / points[i, 2], points[i, 1] / points[i, 2]
+        u, v = round(fx * x + cx - 0.5), round(fy * y + cy - 0.5)
+        if reach <= u < width - reach and reach <= v < height - reach:
+            z, left, right = depth_mm[v, u], depth_mm[v, u - reach], depth_mm[v, u + reach]
+            above, below = depth_mm[v - reach, u], depth_mm[v + reach, u]
+            jump = max(abs(left - z), abs(right - z), abs(above - z), abs(below - z))
+            if jump < PLANE_JUMP * z:
+                # How fast the logarithm of the depth grows along x / z and y / z.
+                a = fx / reach * (right - left) / (right + left)
+                b = fy / reach * (below - above) / (below + above)
+                c = -1 - x * a - y * b
+                length = np.sqrt(a * a + b * b + c * c)
+                normals[i, 0], normals[i, 1], normals[i, 2] = a / length, b / length, c / length
+    return normals
