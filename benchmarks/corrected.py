@@ -24,7 +24,6 @@ from turns import in_turns
 
 from nbtrack import (
     METHODS,
-    Method,
     load_preset,
     make_tracker,
     map_scene,
@@ -45,7 +44,6 @@ from nbtrack.tracking import StepBudget, track_sequence
 from nbtrack.tracking.metrics import trajectory_metrics
 
 ALONE, FOUND_M, FOUND_DEG = Execution(workers=1), 0.05, 3.0
-ICP_MIDDLE = Method("ICP, 2048", "points", "icp", ("tracking.icp.n_pixels=2048",))
 COMPARED = [
     METHODS["baked"],
     METHODS["corrected_sparse"],
@@ -53,7 +51,7 @@ COMPARED = [
     METHODS["corrected_dense"],
     METHODS["neus_corrected"],
     METHODS["icp"],
-    ICP_MIDDLE,
+    METHODS["icp_middle"],
     METHODS["icp_dense"],
 ]
 ON_RECORDINGS = [method for method in COMPARED if method != METHODS["neus_corrected"]]
@@ -198,7 +196,8 @@ def fast() -> pd.DataFrame:
     rooms, elsewhere, rows = open_scenes(preset), open_scenes(second), []
     methods = [method for method in ON_RECORDINGS if method != METHODS["baked"]]
     for frames in ("::4", "::8"):
-        how = {"steps": 30, "frames": frames, "tracked": elsewhere, "execution": ALONE}
+        how = {"steps": 30, "frames": frames, "tracked": elsewhere, "seeds": SEEDS}
+        how["execution"] = ALONE
         for run in track_scenes(rooms, methods, preset, **how).itertuples():
             tracked = read_run(run.run).frames
             is_wrong, is_lost = (

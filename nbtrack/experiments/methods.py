@@ -34,6 +34,7 @@ _COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
 _VR_VELOCITY = ("tracking.vr.motion_model=constant_velocity",)
 _SDF_VELOCITY = ("tracking.sdf.motion_model=constant_velocity",)
 _SPARSE, _MIDDLE, _DENSE = ((f"tracking.lm.n_pixels={n}",) for n in (512, 2048, 4096))
+_GEOMETRY = (*_MIDDLE, "tracking.lm.lambda_intensity=0")
 _CORRECTED = ("mapping.neus.correct_voxel=0.04",)
 # As good as from 1400 iterations, in half the time (benchmarks/README.md; rooms for tuning).
 _PLUS_CORRECTED = ("mapping.neus_plus.correct_voxel=0.04", "mapping.neus_plus.iterations=600")
@@ -61,9 +62,13 @@ METHODS = {
     "corrected_dense": Method(
         "NeuS+ corrected (LM), dense", "neus_plus", "lm", _PLUS_CORRECTED + _DENSE
     ),
+    "corrected_geometry": Method(
+        "NeuS+ corrected (LM), without colour", "neus_plus", "lm", _PLUS_CORRECTED + _GEOMETRY
+    ),
     "neus_corrected": Method("NeuS corrected (LM)", "neus", "lm", _CORRECTED),
     "sdf_corrected": Method("NeuS corrected with SDF (Adam)", "neus", "sdf", _CORRECTED),
     "icp": Method("ICP", "points", "icp"),
+    "icp_middle": Method("ICP, 2048", "points", "icp", ("tracking.icp.n_pixels=2048",)),
     "icp_dense": Method("ICP, dense", "points", "icp", ("tracking.icp.n_pixels=4096",)),
 }
 """By name. A method of your own joins by `METHODS["mine"] = Method(...)`."""
@@ -74,8 +79,8 @@ TABLE_1 = ("vr", "sdf")
 """The rows of the paper's Table I."""
 TABLE_3 = (
     "vr", "vr_velocity", "vr_neus", "sdf", "sdf_velocity", "sdf_plus", "sdf_corrected",
-    "baked", "neus_corrected", "corrected_sparse", "corrected", "corrected_dense", "icp",
-    "icp_dense",
+    "baked", "neus_corrected", "corrected_sparse", "corrected", "corrected_dense",
+    "corrected_geometry", "icp", "icp_middle", "icp_dense",
 )  # fmt: skip
 """The paper's methods beside those that go beyond it."""
 RATES_3_HZ = (30.0, 10.0, 5.0, 2.0)

@@ -28,7 +28,8 @@ MOTION_MODELS = ("previous_pose", "constant_velocity", "better_of_both")
 def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
     """Where a frame's search may start, given the poses found so far.
 
-    At the previous pose (the paper does not say); at constant velocity as the camera sees it,
+    At the previous pose (most likely the paper's: Sec. II-B.1 renders "at the previous estimate",
+    Sec. II-B.2 uses "the previous pose estimate"); at constant velocity as the camera sees it,
     T_k-1 (T_k-2^-1 T_k-1) (ORB-SLAM); or at both, for the tracker to choose: hands start and stop
     within a frame. Raises ConfigError, naming the nearest, for any other model.
     """
