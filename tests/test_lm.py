@@ -146,10 +146,22 @@ def test_in_doubt_intensities_must_be_as_usual(monkeypatch: pytest.MonkeyPatch) 
     for color, is_lost in ((FRAME.color, False), (other, True), (0 * other, False)):
         tracker = begun(n_restarts=0, lambda_intensity=0.0)  # any intensity fits
         assert not run(tracker, T_TRUE, 20)
-        assert tracker.usual_mad == max(tracker.report()["intensity_mad"], 1 / 255)
+        assert tracker.usual_mad == tracker.report()["intensity_mad"]
         with monkeypatch.context() as patch:
             patch.setattr("nbtrack.tracking.lm._DOUBTED", 1.1)
             assert run(tracker, T_TRUE, 20, replace(FRAME, color=color)) is is_lost
+
+
+def test_at_first_intensities_must_be_as_in_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a first frame on a made-up surface that passes, as nothing came before it, though the
+    map knows how well its own frames agreed with it."""
+    monkeypatch.setattr("nbtrack.tracking.lm._DOUBTED", 1.1)
+    other = replace(FRAME, color=FRAME.color.flip(1))
+    for intensity_mad, is_lost in ((np.inf, False), (0.002, True)):
+        tracker = begun(n_restarts=0, lambda_intensity=0.0)
+        monkeypatch.setattr(tracker.field, "intensity_mad", intensity_mad)
+        assert run(tracker, T_TRUE, 20, other) is is_lost
+    assert not run(tracker, T_TRUE, 20)
 
 
 def test_a_lost_camera_is_looked_for_at_its_last_good_pose_too() -> None:

@@ -38,15 +38,16 @@ _COLOR_STIFFNESS, _COLOR_HUBER, _COLOR_ROUNDS = 0.1, 0.05, 3
 _MEDIANS, _MIN_SCALES = np.array([5.5, 2.3]), np.array([0.01, 0.05])
 _GUESS = 0.1  # confidence where nothing was measured: the word of the network is a guess
 _MOST_CAMERAS = 200  # poses kept, evenly spread: where a lost camera may be looked for
-CORRECTIONS = ("numbers", "corrections", "T_world_cameras", "min_scales")
+CORRECTIONS = ("numbers", "corrections", "T_world_cameras", "residual_medians")
 """What a file keeps of a correction: arguments of `CorrectedField`, in their order."""
 
 
 class CorrectedField(BakedField):
     """A grid of a learned field with corrections at vertices near surfaces. Our choice.
 
-    What a file keeps is the field itself, the corrections in half precision, mapped poses, and the
-    scales of what the corrections leave unexplained, below which residuals of tracking say nothing.
+    What a file keeps is the field itself, the corrections in half precision, mapped poses, and how
+    large residuals of distance (m) and luma are that the corrections leave at measured points: from
+    them follow the least scales of a tracker's residuals.
     """
 
     inlier_distance, least_inliers = 0.025, 0.8
@@ -58,7 +59,7 @@ class CorrectedField(BakedField):
         numbers: Int[Tensor, "corrected"],
         corrections: Float[Tensor, "corrected 5"],
         T_world_cameras: Float[Tensor, "cameras 4 4"],
-        min_scales: Float[Tensor, "2"],
+        residual_medians: Float[Tensor, "2"],
     ) -> None:
         """Add to colour, distance (m) and confidence at the numbered vertices of a baked field."""
         super().__init__(source, voxel)
@@ -66,8 +67,10 @@ class CorrectedField(BakedField):
         self.register_buffer("numbers", numbers)
         self.register_buffer("corrections", corrections.half())
         self.register_buffer("T_world_cameras", T_world_cameras)
-        self.register_buffer("min_scales", min_scales)
-        self.accuracy = tuple(min_scales.tolist())
+        self.register_buffer("residual_medians", residual_medians)
+        medians = residual_medians.double().numpy()
+        self.accuracy = tuple(np.maximum(_MEDIANS * medians, _MIN_SCALES).tolist())
+        self.intensity_mad = float(medians[1])
         self.volume[4] = _GUESS
         self.volume[:, numbers.long()] += self.corrections.float().T
 
@@ -102,7 +105,6 @@ def corrected(
     colors, _ = _solve(at_surface, soft, missing_color, reliability, _COLOR_HUBER, _COLOR_ROUNDS)
 
     left = missing - at_surface @ distance[:, 0], (missing_color - at_surface @ colors) @ LUMA
-    min_scales = np.maximum(_MEDIANS * np.median(np.abs(left), axis=1), _MIN_SCALES)
     spread = np.linspace(0, len(frames) - 1, min(_MOST_CAMERAS, len(frames))).round().astype(int)
     return CorrectedField(
         source,
@@ -110,7 +112,7 @@ def corrected(
         numbers=torch.from_numpy(numbers).int(),
         corrections=torch.from_numpy(np.column_stack([colors, distance, confidence])).float(),
         T_world_cameras=torch.from_numpy(sequence.T_world_camera[frames[spread]]).float(),
-        min_scales=torch.from_numpy(min_scales).float(),
+        residual_medians=torch.from_numpy(np.median(np.abs(left), axis=1)).float(),
     )
 
 

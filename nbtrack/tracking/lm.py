@@ -33,8 +33,9 @@ _MAX_STD = 0.04  # m; a pose whose position is less certain is taken for lost
 # With fewer inliers even a pose is lost to which the frame before led, within so much (m, rad).
 _MIN_INLIERS, _FOLLOWED = 0.6, 0.15
 _SETTLED = 2e-3  # m, rad; a longer last step says that the budget has ended too early
-# With fewer inliers intensities may be off by so many times what they were, and a grey level.
-_DOUBTED, _MAX_MAD_RATIO, _GREY_LEVEL = 0.85, 4.0, 1 / 255
+# With fewer inliers intensities may be off by so many times what is usual.
+# (No less than what rounding to 256 grey levels leaves in the median.)
+_DOUBTED, _MAX_MAD_RATIO, _ROUNDING = 0.85, 4.0, 0.25 / 255
 _RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
 # Where a map knows its cameras, a lost one is looked for at so many random poses, so far (m) from
 # theirs; from the cheapest some steps are taken, before the cheapest of those are followed.
@@ -76,7 +77,7 @@ class LmTracker(Tracker):
     remembers = ("last_good", "was_lost", "usual_mad")
     last_good: Transform | None = None  # of the latest frame not taken for lost
     was_lost: bool = False  # in the frame before
-    usual_mad: float = np.inf  # of intensities, in the latest frame beyond doubt
+    usual_mad: float | None = None  # of intensities, in the latest frame beyond doubt
 
     def __init__(
         self,
@@ -153,7 +154,7 @@ class LmTracker(Tracker):
         if not self.was_lost:
             self.last_good = self.T_world_camera
             if self.verdict["inlier_ratio"] >= _DOUBTED:
-                self.usual_mad = max(self.verdict["intensity_mad"], _GREY_LEVEL)
+                self.usual_mad = self.verdict["intensity_mad"]
         return self.verdict
 
     def _judge(self, descent: Descent) -> dict[str, float | bool]:
@@ -161,7 +162,8 @@ class LmTracker(Tracker):
 
         One that the budget ended while it still moved is lost: it may be on its way along a wall.
         So is one that has slid along a wall onto what the map made up: fewer points fit, and
-        intensities, which did not hold it there, are off by several times what is usual.
+        intensities, which did not hold it there, are off by several times what is usual in the
+        latest frame beyond doubt, or, before there was one, in the map's own frames.
         """
         found = descent.certainty()
         changes = np.linalg.inv(self.expected) @ descent.T_world_camera - np.eye(4)
@@ -169,8 +171,10 @@ class LmTracker(Tracker):
         is_followed = self.was_followed and self.starts is None and is_near
         enough = _MIN_INLIERS if is_followed else self.field.least_inliers
         is_settled = descent.is_finished or (is_followed and descent.last_step < _SETTLED)
-        is_odd = found["intensity_mad"] > _MAX_MAD_RATIO * self.usual_mad
-        has_contrast = self.points[1][1].std() > self.usual_mad  # else it is dark, or overexposed
+        usual_mad = self.field.intensity_mad if self.usual_mad is None else self.usual_mad
+        usual_mad = max(usual_mad, _ROUNDING)
+        is_odd = found["intensity_mad"] > _MAX_MAD_RATIO * usual_mad
+        has_contrast = self.points[1][1].std() > usual_mad  # else it is dark, or overexposed
         is_odd &= found["inlier_ratio"] < _DOUBTED and has_contrast
         is_sure = found["inlier_ratio"] >= enough and found["position_deviation_m"] <= _MAX_STD
         return {**found, "lost": bool(is_odd or not (is_sure and is_settled))}
