@@ -282,17 +282,18 @@ def test_comparison_of_other_rooms_by_hand() -> None:
 def test_written_files(tmp_path: Path) -> None:
     """Catches CSV files that do not read back, gaps that are lost, files that differ each time."""
     ours = pd.concat([OURS_1, pd.DataFrame([(10, "C", "room_a", None)], columns=COLUMNS_1)])
-    paths = write_tables(tmp_path / "smoke", ours, OURS_2, NOTE)
+    paths = write_tables(tmp_path / "smoke", ours, OURS_2, NOTE, steps_note="By the clock.")
     endings = [".csv", ".tex", "_vs_paper.csv"]
     names = [f"table_{number}{ending}" for ending in endings for number in (1, 2)]
     assert sorted(path.name for path in paths) == sorted(names)
     contents = [path.read_bytes() for path in paths]
-    again = write_tables(tmp_path / "smoke", ours, OURS_2, NOTE)
+    again = write_tables(tmp_path / "smoke", ours, OURS_2, NOTE, steps_note="By the clock.")
     assert [path.read_bytes() for path in again] == contents
     pd.testing.assert_frame_equal(table_1(pd.read_csv(paths[0])), table_1(ours))
     pd.testing.assert_frame_equal(table_2(pd.read_csv(paths[3])), table_2(OURS_2))
     assert "10,C,room_a,\n" in paths[0].read_text()
     assert r"\label{tab:ate-smoke}" in paths[1].read_text()
+    assert [path.name for path in paths if "By the clock." in path.read_text()] == ["table_2.tex"]
     _, third = write_table_3(tmp_path / "smoke", ours.assign(n_pixels=512), NOTE)
     assert r"\label{tab:beyond-smoke}" in third.read_text()
     assert "C, n = 512 &" in third.read_text()

@@ -174,7 +174,9 @@ def _told_by_files(folder: Path) -> str:
     best = [name for name, share in shares.items() if share == most]
     folders = sorted(path for path in folder.iterdir() if path.is_dir()) if most < 1 else []
     if inner := [path for path in folders if 1 in _shares(path).values()]:
-        names = ", ".join(path.name for path in inner[:4]) + " ..." * (len(inner) > 4)
+        names = ", ".join(path.name for path in inner[:4])
+        if len(inner) > 4:
+            names += " ..."
         raise MissingError(f"{folder} is one level too high, above {names}: give {inner[0]}")
     if most == 0:
         files = (f"{name} ({', '.join(map(' or '.join, FORMATS[name].needs))})" for name in best)

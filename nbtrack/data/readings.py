@@ -110,7 +110,8 @@ def readings(declared: Declaration, camera: Intrinsics) -> list[Reading]:
     order = "wxyz" if declared.quaternion == "xyzw" else "xyzw"
     for name, keys in conventions.items():
         if name == own or name.startswith("Open"):
-            name = f"quaternions in the order {order}" + f", and {name}" * (name != own)
+            in_order = f"quaternions in the order {order}"
+            name = in_order if name == own else f"{in_order}, and {name}"
             table.append(("poses", name, keys | {"quaternion": order}))
     table += [("depth", f"{n:g} depth values a metre", {"depth_scale": n}) for n in _SCALES]
     table += [("depth", name, {"depth_along": along}) for along, name in _ALONG.items()]

@@ -126,9 +126,10 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
     is_wrong |= np.abs(np.linalg.det(R) - 1) > _RIGID
     is_wrong |= (np.abs(bottom) > _RIGID).any(axis=1) | far.any(axis=1)
     for i in np.flatnonzero(is_wrong):
+        frame = f" frame {i}" if len(poses) > 1 else ""
         found = " ".join(f"{number:.4g}" for number in poses[i].flat)
         raise DataError(
-            f"{path}{f' frame {i}' * (len(poses) > 1)} is no rigid transform in metres ({found}): "
+            f"{path}{frame} is no rigid transform in metres ({found}): "
             f"rows must be [R | t], right-handed rotation R and t up to {_FARTHEST:g}, and 0 0 0 1"
         )
     return np.where(is_known, poses, np.nan)

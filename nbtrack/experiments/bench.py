@@ -61,7 +61,8 @@ def _fill_tables(
         scenes, methods, preset, RATES_3_HZ if options.beyond else None, clock=clock,
         seeds=options.seeds, execution=execution,
     )  # fmt: skip
-    folder = options.out or runs_folder() / "tables" / (preset.name + "_clock" * clock)
+    name = f"{preset.name}_clock" if clock else preset.name
+    folder = options.out or runs_folder() / "tables" / name
     number, note = "III" if options.beyond else "I", _note(preset, clock)
     print(f"Table {number}: ATE (m), {note}")
     print(tables.style_table_1(tables.naming_points(results) if options.beyond else results))
@@ -71,7 +72,8 @@ def _fill_tables(
         print("Table I beside the paper's")
         print(tables.beside_published(results).to_string(float_format="%.3f", na_rep="–"))
         steps, pixels = _table_2(preset, scenes[0], methods)
-        paths = tables.write_tables(folder, results, steps, note, pixels)
+        by_clock = _note(preset, clock=True)
+        paths = tables.write_tables(folder, results, steps, note, pixels, steps_note=by_clock)
     cells = results[[name for name in _CELL_COLUMNS if name in results]]
     cells_file = folder / f"table_{3 if options.beyond else 1}_cells.csv"
     paths.append(tables.write_csv(cells_file, cells, float_format=None))

@@ -108,8 +108,10 @@ class MapCell(Cell):
     @property
     def name(self) -> str:
         """Scene and field, and the seed if it is not the first."""
-        corrected = "-corrected" * (self.base is not None)
-        return f"{self.scene.name}-{self.field}{corrected}" + f"-seed{self.seed}" * bool(self.seed)
+        name = f"{self.scene.name}-{self.field}"
+        if self.base is not None:
+            name += "-corrected"
+        return f"{name}-seed{self.seed}" if self.seed else name
 
     @property
     def base(self) -> "MapCell | None":

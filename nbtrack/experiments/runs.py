@@ -68,8 +68,9 @@ class TrackCell(Cell):
     def name(self) -> str:
         """Scene, method and budget, and the seed if it is not the first."""
         budget = f"{self.rate_hz:g}hz" if self.rate_hz else f"{self.steps:g}steps"
-        method = f"{self.needs.field}-{self.tracker}{'-unmapped' * self.is_elsewhere}"
-        return f"{self.scene.name}-{method}-{budget}" + f"-seed{self.seed}" * bool(self.seed)
+        elsewhere = "-unmapped" if self.is_elsewhere else ""
+        name = f"{self.scene.name}-{self.needs.field}-{self.tracker}{elsewhere}-{budget}"
+        return f"{name}-seed{self.seed}" if self.seed else name
 
     @property
     def is_elsewhere(self) -> bool:

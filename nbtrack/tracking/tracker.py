@@ -160,7 +160,8 @@ class Tracker(abc.ABC):
         pose = np.array(T_world_camera, dtype=np.float64)
         if pose.shape != (4, 4):
             raise DataError(f"T_world_camera is of shape {pose.shape}: give a 4x4 rigid transform")
-        pose[~np.isfinite(pose)] = np.finfo(pose.dtype).max  # which no rigid transform has
+        if not np.isfinite(pose).all():
+            raise DataError("T_world_camera is no rigid transform: its numbers must be finite")
         self.estimates = [*checked_poses(pose[None], Path("T_world_camera"))]
         expected_poses(self.settings.motion_model, self.estimates)  # a wrong name is told now
         for name in self.remembers:
