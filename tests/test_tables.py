@@ -20,6 +20,7 @@ from nbtrack.tables import (
     style_table_2,
     table_1,
     table_2,
+    write_table_1,
     write_table_3,
     write_tables,
 )
@@ -339,7 +340,13 @@ def latex_is_installed() -> bool:
 def test_tables_compile(tmp_path: Path) -> None:
     """Catches a table that needs more than its comment says: the document there is compiled."""
     steps = OURS_2.assign(steps_deviation=0.5)
-    for path in (p for p in write_tables(tmp_path, SEEDS, steps, NOTE) if p.suffix == ".tex"):
+    nine = published_table_1().assign(still_ate_m=0.5)
+    nine = pd.concat([nine.assign(seed=seed, ate_m=nine["ate_m"] + seed / 100) for seed in (0, 1)])
+    paths = [
+        *write_tables(tmp_path, SEEDS, steps, NOTE),
+        *write_table_1(tmp_path / "9", nine, NOTE),
+    ]
+    for path in (p for p in paths if p.suffix == ".tex"):
         comments = re.findall(r"^%   (.*)$", path.read_text(), re.MULTILINE)
         assert comments[0].startswith(r"\documentclass")
         (path.parent / "document.tex").write_text("\n".join(comments) + "\n")

@@ -142,7 +142,7 @@ def test_table_3(tmp_path: Path, scenes: list[Scene], monkeypatch: pytest.Monkey
         monkeypatch.setitem(METHODS, name, replace(METHODS[name], settings=settings))
     words = tiny_words("scenes.names=office", "scenes.track_frames=:2")
     assert main(["tables", "--beyond", "--workers", "1", "--out", str(tmp_path), *words]) == 0
-    assert len(pd.read_csv(tmp_path / "table_3.csv")) == len(TABLE_3)
+    assert len(pd.read_csv(tmp_path / "table_3.csv")) == len(TABLE_3) + 1  # and standing still
     assert (tmp_path / "table_3.tex").read_text().count("NeuS+ baked (LM)") == 1
 
 

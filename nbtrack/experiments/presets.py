@@ -100,7 +100,7 @@ network.occupancy.width = 96
 names = ["living_room", "office"]
 n_frames = 240
 width = 96
-track_frames = "100:200"
+track_frames = "-120:"
 [mapping]
 imap = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
 neus = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}

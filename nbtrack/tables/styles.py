@@ -14,6 +14,7 @@ from nbtrack.tables.layout import PAPER_PIXELS, table_1, table_2
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 _MISSING = "–"
+_MANY_COLUMNS = 6
 _RED, _BOLD, _PLAIN = "color: red;", "font-weight: bold;", "font-weight: normal;"
 # What the marks mean, for the caption: they stand in the cells too, because pages that do not trust
 # a notebook drop its style sheets.
@@ -101,7 +102,8 @@ def latex_file(styler: TableStyler, path: Path, kind: str, note: str) -> str:
     """
     table, caption, note = styler.data, _CAPTIONS[kind], " ".join(note.split())
     has_steps = "n_pixels" in table.index.names
-    if table.map(lambda text: "±" in text).any(axis=None):
+    has_deviations = table.map(lambda text: "±" in text).any(axis=None)
+    if has_deviations:
         caption += f" Small: deviation over {'frames' if has_steps else 'seeds'}."
     styler = copy.deepcopy(styler).format(_latex_number)
     for axis, labels in enumerate(table.axes):
@@ -120,6 +122,8 @@ def latex_file(styler: TableStyler, path: Path, kind: str, note: str) -> str:
     text = re.sub(r"\\cline\{[\d-]+\}", r"\\midrule", text)
     if has_steps:
         text = text.replace(" &  & ", " & $n$ & ", 1)
+    if has_deviations and len(table.columns) > _MANY_COLUMNS:  # else they run off the page
+        text = text.replace("\\scriptsize\n", "\\scriptsize\n\\setlength{\\tabcolsep}{2.2pt}\n", 1)
     return _PREAMBLE.format(note=note, name=path.stem) + text
 
 
