@@ -16,6 +16,8 @@ from nbtrack.core.files import tables_folder
 README = Path(__file__).parent / "README.md"
 # Short heads of the methods' columns; LM is that in the corrected NeuS+ map.
 _HEADS = {
+    "iMAP with VR": "VR",
+    "NeuS with SDF": "SDF",
     "NeuS+ baked (LM)": "baked",
     "NeuS corrected (LM)": "NeuS",
     "NeuS+ corrected (LM), sparse": "LM 512",
