@@ -67,7 +67,7 @@ ABLATION = [
     ("as it is", (), {}),
     ("at the surface alone", (), {"_OFFSETS": (0.0,)}),
     ("30,000 points", (), {"_N_POINTS": 30_000}),
-    ("every point alike", (), {"_GUESS": 1.0}),  # confidence is 1 everywhere
+    ("every point alike", (), {"_UNMEASURED": 1.0}),  # confidence is 1 everywhere
     ("cells of 8 cm", ("mapping.neus_plus.correct_voxel=0.08",), {}),
     ("colours as the network has them", (), {"_COLOR_STIFFNESS": 1e9}),
     ("colours as stiff as distances", (), {"_COLOR_STIFFNESS": 1.0}),

@@ -34,7 +34,7 @@ from nbtrack.fields.grid import BakedField
 from nbtrack.mapping.quality import split_holdout
 from nbtrack.tables import write_table_1
 from nbtrack.tracking import StepBudget, track_sequence
-from nbtrack.tracking.metrics import LOST_THRESHOLD_M, trajectory_metrics
+from nbtrack.tracking.metrics import LOST_THRESHOLD_M, still_metrics, trajectory_metrics
 
 Chunk = tuple[dict[str, str | int], Callable[[], pd.DataFrame]]
 """What names some rows, and what makes them."""
@@ -45,8 +45,8 @@ THREE_ROOMS = ["living_room", "office", "stairwell"]
 PRESET = with_variants(load_preset("smoke", settings=[f"scenes.names={THREE_ROOMS}"]))
 SHORT, SHORTER = ":60", ":30"  # frames: nine rooms have 120; fewer here, for time
 KEPT = [
-    "rate_hz", "method", "scene", "frames", "steps_per_frame", "ate_m", "ate_rmse_aligned_m",
-    "rotation_rmse_deg", "max_error_m", "lost_frames",
+    "rate_hz", "method", "scene", "frames", "steps_per_frame", "path_m", "still_ate_m", "ate_m",
+    "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "lost_frames",
 ]  # fmt: skip
 
 
@@ -172,6 +172,7 @@ def _on_each_depth(scene: Scene, name: str, seed: int) -> pd.DataFrame:
             tracker = make_tracker("lm", field, T_first, StepBudget(30), settings, seed)
             tracked = track_sequence(tracker, sequence)
         metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
+        metrics |= still_metrics(sequence.T_world_camera)
         rows.append({"depth": depth, **metrics, "ate_m": metrics["ate_rmse_m"]})
     return pd.DataFrame(rows)[["depth", *(c for c in KEPT[3:] if c in rows[0])]]
 

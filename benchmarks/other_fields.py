@@ -29,7 +29,8 @@ ROWS = (
 )  # fmt: skip
 RATES_HZ = (10.0, 2.0)
 COLUMNS = [
-    "scene", "seed", "rate_hz", "method", "frames", "steps_per_frame", "ate_m",
+    "scene", "seed", "rate_hz", "method", "frames", "steps_per_frame",
+    "path_m", "still_ate_m", "ate_m",
     "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "lost_frames", "device", "date",
 ]  # fmt: skip
 

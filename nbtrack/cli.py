@@ -21,10 +21,10 @@ def a_path(text: str) -> Path:
     return Path(text)
 
 
-def a_count(text: str, least: int = 1, most: int = 2**63 - 1) -> int:
+def a_count(text: str, minimum: int = 1, maximum: int = 2**63 - 1) -> int:
     """A number of things, of which there is at least one, that every random generator takes."""
-    if not (text.lstrip("-").isdecimal() and least <= int(text) <= most):
-        limits = f"from {least} to {most}" if most < 2**31 else f"that is {least} or more"
+    if not (text.lstrip("-").isdecimal() and minimum <= int(text) <= maximum):
+        limits = f"from {minimum} to {maximum}" if maximum < 2**31 else f"that is {minimum} or more"
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number {limits}")
     return int(text)
 
@@ -68,10 +68,12 @@ OPTIONS = {
     "--width": _option("pixels; the height is 3/4 of it", int, default=640),
     "--depth-folder": _option("default: the format's; filtered before raw depth"),
     "--poses FILE": _option("pose file (default: the format's)"),
-    "--seed": _option("of all random numbers (default: 0)", partial(a_count, least=0), default=0),
+    "--seed": _option("of all random numbers (default: 0)", partial(a_count, minimum=0), default=0),
     "--out": _option("where to write (default: in runs/)", a_path),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
-    "--threads N": _option("CPU threads (default: all cores)", partial(a_count, most=_MAX_THREADS)),
+    "--threads N": _option(
+        "CPU threads (default: all cores)", partial(a_count, maximum=_MAX_THREADS)
+    ),
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
     "--config": _option("TOML file of settings", a_path),
     "--set KEY=VALUE": _option("one setting, as mapping.neus.iterations=500; may be repeated",

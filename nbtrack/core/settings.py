@@ -82,10 +82,10 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield from _leaves(value, f"{prefix}.{name}" if prefix else name)
 
 
-def _replaced(node: Any, path: list[str], key: str, value: Any, least: int = 1) -> Any:
+def _replaced(node: Any, path: list[str], key: str, value: Any, minimum: int = 1) -> Any:
     """The tree with one key set. Nested parts are rebuilt, never changed in place."""
     if not path:
-        return _converted(key, node, value, least)
+        return _converted(key, node, value, minimum)
     name, *rest = path
     if isinstance(node, dict):
         return {**node, name: _replaced(node[name], rest, key, value)}
@@ -94,11 +94,11 @@ def _replaced(node: Any, path: list[str], key: str, value: Any, least: int = 1) 
     return dataclasses.replace(node, **{name: new})
 
 
-def _converted(key: str, old: Any, value: Any, least: int) -> Any:
+def _converted(key: str, old: Any, value: Any, minimum: int) -> Any:
     wanted = type(old)
     if wanted is tuple and isinstance(value, list | str | int | float):
         values = value if isinstance(value, list) else [value]
-        return tuple(_converted(key, old[0], v, least) if old else v for v in values)
+        return tuple(_converted(key, old[0], v, minimum) if old else v for v in values)
     # Integers of TOML may be too large for a float.
     if wanted is float and type(value) is int and abs(value) < 1e300:
         value = float(value)
@@ -107,7 +107,9 @@ def _converted(key: str, old: Any, value: Any, least: int) -> Any:
             f"{key} = {value!r} is of type {type(value).__name__}: it must be {wanted.__name__}, "
             f"for example {old!r}"
         )
-    least = least if wanted is int else 0
-    if wanted in (int, float) and not least <= value < math.inf:
-        raise ConfigError(f"{key} = {value!r}: it must be {least} or more; the preset has {old!r}")
+    minimum = minimum if wanted is int else 0
+    if wanted in (int, float) and not minimum <= value < math.inf:
+        raise ConfigError(
+            f"{key} = {value!r}: it must be {minimum} or more; the preset has {old!r}"
+        )
     return value

@@ -33,7 +33,7 @@ _DEPTH = (0.2, 20.0)  # m, plausible median of a depth camera's measurements
 _FLICKER = 0.35  # share by which brightness may change between frames (our choice)
 _SAME_VIEW_DEG = 10  # where they are turned by no more
 _ROTATED_SHARE = 0.9  # of the values there are: multiples of 8 (our choice; by chance an eighth)
-_LEAST_MEASURED = 0.3  # share of pixels with a depth, below which maps have holes (our choice)
+_MIN_MEASURED = 0.3  # share of pixels with a depth, below which maps have holes (our choice)
 # What the second-order tracker still followed, of a real recording thinned to every third frame.
 _FOLLOWED_MM, _FOLLOWED_DEG = 70, 3.6
 # A step of the paper's trackers moves at most so far: the learning rates of their optimiser.
@@ -86,7 +86,7 @@ class DataReport:
                 "tracking.lm.lambda_intensity=0, or tracking.sdf.lambda_color=0 for --tracker sdf",
             ),
             (
-                measured < _LEAST_MEASURED,
+                measured < _MIN_MEASURED,
                 f"only {measured:.0%} of the pixels have a depth: stay within the camera's range, "
                 "or record less glass and black; maps will have holes",
             ),
@@ -173,7 +173,7 @@ def _as_in_files(recording: Recording) -> Recording:
     )
 
 
-def _pairs(T_world_camera: Poses, most: int) -> Int[np.ndarray, "2 pairs"]:
+def _pairs(T_world_camera: Poses, maximum: int) -> Int[np.ndarray, "2 pairs"]:
     """Positions of frames that see much the same, spread over a sequence, with all gaps alike.
 
     How far the camera turns is the same in all conventions.
@@ -181,9 +181,9 @@ def _pairs(T_world_camera: Poses, most: int) -> Int[np.ndarray, "2 pairs"]:
     n_frames = len(T_world_camera)
     turns = Rotation.from_matrix(T_world_camera[:-1, :3, :3].mT @ T_world_camera[1:, :3, :3])
     turn = max(1.0, np.degrees(np.median(turns.magnitude())) if n_frames > 1 else 0.0)
-    gaps = np.minimum(np.resize(_GAPS, most), max(1, min(n_frames - 1, int(_TURNED_DEG / turn))))
-    first = np.rint(np.linspace(0, 1, most) * (n_frames - 1 - gaps)).astype(int)
-    return np.unique([first, first + gaps], axis=1)[:, : most * (n_frames > 1)]
+    gaps = np.minimum(np.resize(_GAPS, maximum), max(1, min(n_frames - 1, int(_TURNED_DEG / turn))))
+    first = np.rint(np.linspace(0, 1, maximum) * (n_frames - 1 - gaps)).astype(int)
+    return np.unique([first, first + gaps], axis=1)[:, : maximum * (n_frames > 1)]
 
 
 def _fitted_to(

@@ -170,21 +170,21 @@ def declaration(folder: Path, format: str | None = None) -> Declaration:
 def _told_by_files(folder: Path) -> str:
     """The format with the largest share of what it needs."""
     shares = _shares(folder)
-    most = max(shares.values())
-    best = [name for name, share in shares.items() if share == most]
-    folders = sorted(path for path in folder.iterdir() if path.is_dir()) if most < 1 else []
+    maximum = max(shares.values())
+    best = [name for name, share in shares.items() if share == maximum]
+    folders = sorted(path for path in folder.iterdir() if path.is_dir()) if maximum < 1 else []
     if inner := [path for path in folders if 1 in _shares(path).values()]:
         names = ", ".join(path.name for path in inner[:4])
         if len(inner) > 4:
             names += " ..."
         raise MissingError(f"{folder} is one level too high, above {names}: give {inner[0]}")
-    if most == 0:
+    if maximum == 0:
         files = (f"{name} ({', '.join(map(' or '.join, FORMATS[name].needs))})" for name in best)
         raise MissingError(
             f"{folder} is no known recording: it needs the files of {'; '.join(files)}; of a scene "
             "in parts, give one part's folder"
         )
-    if len(best) > 1 and most == 1:
+    if len(best) > 1 and maximum == 1:
         raise DataError(
             f"{folder} can be read as {' or '.join(best)}: choose with --format, or format = "
             f'"{best[0]}" in {DECLARATION_FILE}'

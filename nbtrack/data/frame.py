@@ -12,7 +12,7 @@ from nbtrack.core.camera import Intrinsics, backproject, project
 from nbtrack.core.errors import DataError
 
 MILLIMETRE = 1e-3
-_MOST_MILLIMETRES = np.iinfo(np.uint16).max
+_MAX_MILLIMETRES = np.iinfo(np.uint16).max
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Frame:
         if depth.dtype != np.uint16:
             metres = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float64)
             depth = (metres / MILLIMETRE).round()
-            depth = np.where(depth > _MOST_MILLIMETRES, 0, depth)
+            depth = np.where(depth > _MAX_MILLIMETRES, 0, depth)
         if color.dtype != np.uint8:
             is_known = np.isfinite(color).all(axis=-1)
             color = np.where(is_known[..., None], color, 0)

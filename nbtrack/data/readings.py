@@ -21,12 +21,12 @@ _HIDDEN_BEHIND = 0.25  # m behind a surface points are hidden: several times a c
 _SAME_SURFACE = 0.025  # of the depth: where neighbours blend to more, they lie on two surfaces
 _POINTS_PER_FRAME = 1000  # 20 pairs of frames have enough for a median
 _CLEARLY_BETTER = 0.5  # of the distance as declared (our choice)
-_LEAST_GAIN = 5e-4  # of the depth: 1 mm at 2 m, depth's resolution on disk
+_MIN_GAIN = 5e-4  # of the depth: 1 mm at 2 m, depth's resolution on disk
 _FAR_APART = 0.05  # m, median distance above which a map of the scene would be blurred (our choice)
 _FAR_APART_OF_FEW = 0.15  # the same where less than the first share overlaps (our choice)
 # Shares of points below which a median tells nothing, and below which not even a large one does: of
 # a right recording hardly a point lies in front of what another frame sees there (our choice).
-_LEAST_OVERLAP, _LEAST_CONTRADICTION = 0.15, 0.02
+_MIN_OVERLAP, _MIN_CONTRADICTION = 0.15, 0.02
 ROTATED = (8000.0, 80_000.0)  # depth values a metre: millimetres, and tenths, times 8 (SUN3D)
 # Those that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1 mm; and metres
 # and micrometres, which 16 bits hold badly.
@@ -202,17 +202,17 @@ def best_reading(found: list[Reading]) -> Reading:
     cameras turned away from each other may agree on the few points that are left.
     """
     own, half = found[0], max(reading.overlap / 2 for reading in found)
-    enough = max(_LEAST_OVERLAP, half)
+    enough = max(_MIN_OVERLAP, half)
     meeting = [r for r in found if r.overlap >= enough and r.median_m < _FAR_APART]
-    least = min((reading.relative for reading in meeting), default=math.inf)
-    if own.overlap >= half and not _is_clearly_less(least, own.relative):
+    minimum = min((reading.relative for reading in meeting), default=math.inf)
+    if own.overlap >= half and not _is_clearly_less(minimum, own.relative):
         return own
-    near = max(1.1 * least, least + _LEAST_GAIN)  # the common ones come first
+    near = max(1.1 * minimum, minimum + _MIN_GAIN)  # the common ones come first
     return next((reading for reading in meeting if reading.relative <= near), own)
 
 
 def _is_clearly_less(relative: float, other: float) -> bool:
-    return relative <= min(_CLEARLY_BETTER * other, other - _LEAST_GAIN)
+    return relative <= min(_CLEARLY_BETTER * other, other - _MIN_GAIN)
 
 
 def diagnosis(
@@ -236,9 +236,9 @@ def diagnosis(
     if recording.has_pose.sum() < 2:
         return f"{file} is not proved: that takes two frames with a pose"
     # Of few points, such as key frames share, not even a right reading's lie close.
-    few = own.overlap < _LEAST_OVERLAP
+    few = own.overlap < _MIN_OVERLAP
     is_far = own.median_m > (_FAR_APART_OF_FEW if few else _FAR_APART)
-    if own.overlap < (_LEAST_CONTRADICTION if is_far else _LEAST_OVERLAP):
+    if own.overlap < (_MIN_CONTRADICTION if is_far else _MIN_OVERLAP):
         little = f"{file} is not proved: two frames see too little of the same"
         where = f"{own.overlap:.0%} of the points, whose surfaces {apart}"
         return f"{little} ({where}): check it, and a piece with smaller steps"

@@ -31,7 +31,7 @@ _CAMERA = '{"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, 
 _FARTHEST = 1e7  # m from the origin: beyond map coordinates, within what floats can square
 _RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 _LARGEST = 1e6  # pixels: no image is so wide
-_LEAST_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
+_MIN_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -175,7 +175,7 @@ def read_calibration(path: Path) -> Calibration:
     fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     is_matrix = np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6)
     # NaN fails both: numpy's minimum keeps it, unlike Python's.
-    is_camera = np.min([fx, fy]) >= _LEAST_FOCAL and np.abs([fx, fy, cx, cy]).max() < _LARGEST
+    is_camera = np.min([fx, fy]) >= _MIN_FOCAL and np.abs([fx, fy, cx, cy]).max() < _LARGEST
     if not (is_matrix and is_camera):
         raise DataError(
             f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "

@@ -139,10 +139,15 @@ class MapCell(Cell):
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Map and score, or resume; write the map's files."""
-        checkpoint, most = self.folder / CHECKPOINT_FILE, getattr(self.settings, "iterations", 1)
+        checkpoint, iterations = (
+            self.folder / CHECKPOINT_FILE,
+            getattr(self.settings, "iterations", 1),
+        )
 
         def tell(done: int, losses: dict[str, float | int]) -> None:
-            report(done / most, " ".join(f"{name} {loss:.3f}" for name, loss in losses.items()))
+            report(
+                done / iterations, " ".join(f"{name} {loss:.3f}" for name, loss in losses.items())
+            )
 
         base = self.base
         if base and isinstance(failure := base.outcome(None, report), NbtrackError):

@@ -58,7 +58,7 @@ class Field(nn.Module, abc.ABC):
     accuracy: tuple[float, float] = (0.02, 0.05)
     inlier_distance: float = 0.05  # m from its surface within which a point fits
     intensity_mad: float = np.inf  # median residual of luma at what was mapped, where known
-    least_inliers: float = 0.6  # share of a frame's points that fit where the camera is not lost
+    min_inliers: float = 0.6  # share of a frame's points that fit where the camera is not lost
     Settings: type[MappingSettings] = MappingSettings  # of mapping
 
     def __init__(self, bounds: SceneBounds) -> None:

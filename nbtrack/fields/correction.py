@@ -36,8 +36,8 @@ _COLOR_STIFFNESS, _COLOR_HUBER, _COLOR_ROUNDS = 0.1, 0.05, 3
 # points leave, and no less. Chosen in the rooms for tuning and on a real recording, whose medians
 # are 1.8 mm and 0.002, and 4 mm and 0.02.
 _MEDIANS, _MIN_SCALES = np.array([5.5, 2.3]), np.array([0.01, 0.05])
-_GUESS = 0.1  # confidence where nothing was measured: the word of the network is a guess
-_MOST_CAMERAS = 200  # poses kept, evenly spread: where a lost camera may be looked for
+_UNMEASURED = 0.1  # confidence where nothing was measured: the word of the network is a guess
+_MAX_CAMERAS = 200  # poses kept, evenly spread: where a lost camera may be looked for
 CORRECTIONS = ("numbers", "corrections", "T_world_cameras", "residual_medians")
 """What a file keeps of a correction: arguments of `CorrectedField`, in their order."""
 
@@ -50,7 +50,7 @@ class CorrectedField(BakedField):
     them follow the least scales of a tracker's residuals.
     """
 
-    inlier_distance, least_inliers = 0.025, 0.8
+    inlier_distance, min_inliers = 0.025, 0.8
 
     def __init__(
         self,
@@ -71,7 +71,7 @@ class CorrectedField(BakedField):
         medians = residual_medians.double().numpy()
         self.accuracy = tuple(np.maximum(_MEDIANS * medians, _MIN_SCALES).tolist())
         self.intensity_mad = float(medians[1])
-        self.volume[4] = _GUESS
+        self.volume[4] = _UNMEASURED
         self.volume[:, numbers.long()] += self.corrections.float().T
 
 
@@ -98,14 +98,14 @@ def corrected(
     weights = np.tile(reliability, len(_OFFSETS))
     distance, diagonal = _solve(design, stiffness, missing, weights, _HUBER, _ROUNDS)
     # The share of measurements, not stiffness, in a vertex's diagonal.
-    confidence = (1 - _GUESS) * (1 - stiffness.diagonal() / diagonal)
+    confidence = (1 - _UNMEASURED) * (1 - stiffness.diagonal() / diagonal)
 
     at_surface, missing = design[: len(points)], missing[: len(points), 0]
     missing_color, soft = color - at_surface @ values[:, :3], _COLOR_STIFFNESS * stiffness
     colors, _ = _solve(at_surface, soft, missing_color, reliability, _COLOR_HUBER, _COLOR_ROUNDS)
 
     left = missing - at_surface @ distance[:, 0], (missing_color - at_surface @ colors) @ LUMA
-    spread = np.linspace(0, len(frames) - 1, min(_MOST_CAMERAS, len(frames))).round().astype(int)
+    spread = np.linspace(0, len(frames) - 1, min(_MAX_CAMERAS, len(frames))).round().astype(int)
     return CorrectedField(
         source,
         voxel,

@@ -18,7 +18,7 @@ from nbtrack.fields.points import cells_of, fuse_points
 
 # Distances are kept at corners so far apart (m), unless there would be more of them a side, and
 # measured from the mean points of cells half as wide, of three or more: single ones are noise.
-_LEAST_VOXEL, _MOST_CELLS_A_SIDE, _LEAST_POINTS = 0.05, 128, 3
+_MIN_VOXEL, _MAX_CELLS_A_SIDE, _MIN_POINTS = 0.05, 128, 3
 _POINTS_PER_FRAME = 10_000  # about, on a regular grid of its pixels
 # How much the distances to a tangent plane and to the nearest point may differ for the plane to be
 # believed (m): by half a point voxel, and the cells' rounding of distances near the surface.
@@ -117,12 +117,12 @@ class ObservedDistance:
         self, sequence: RgbdSequence, frames: Frames, bounds: SceneBounds, device: torch.device
     ) -> None:
         low, high = np.array(bounds.minimum), np.array(bounds.maximum)
-        self.voxel = max(_LEAST_VOXEL, (high - low).max() / _MOST_CELLS_A_SIDE)
+        self.voxel = max(_MIN_VOXEL, (high - low).max() / _MAX_CELLS_A_SIDE)
         fine = self.voxel / 2
         shape = np.ceil((high - low) / fine).astype(int) + 1
         n_pixels = sequence.intrinsics.width * sequence.intrinsics.height
         stride = max(1, round((n_pixels / _POINTS_PER_FRAME) ** 0.5))
-        cloud = fuse_points(sequence, frames, bounds, fine, stride, _LEAST_POINTS)
+        cloud = fuse_points(sequence, frames, bounds, fine, stride, _MIN_POINTS)
         points = cloud.points.double().numpy()
         number = np.full(shape, -1)  # of each cell's point
         cells, inside = cells_of(points, low, shape, fine)

@@ -70,12 +70,12 @@ def fuse_points(
     bounds: SceneBounds,
     voxel: float,
     stride: int = 1,
-    least: int = 1,
+    min_count: int = 1,
 ) -> PointCloud:
     """One point a voxel (m): mean position (m, world frame) and mean colour (in [0, 1]).
 
-    The frames' measured pixels inside the bounds count, `stride` apart, in voxels that have at
-    `least` so many of them (or as many as any has). The mean takes noise off, and leaves planes
+    The frames' measured pixels inside the bounds count, `stride` apart, in voxels that have
+    `min_count` of them or more (or as many as any has). The mean takes noise off, and leaves planes
     where they are. Memory grows with the surface that was seen, not with the frames.
     Raises ConfigError for a voxel that is not positive, far too fine, or longer than the scene.
     """
@@ -100,7 +100,7 @@ def fuse_points(
         if count % _FRAMES_AT_ONCE == 0 or count == len(frames):
             parts = [pd.concat(parts).groupby(level=0).sum()]
     sums = parts[0].to_numpy()
-    sums = sums[sums[:, 6] >= min(least, sums[:, 6].max(initial=0))]
+    sums = sums[sums[:, 6] >= min(min_count, sums[:, 6].max(initial=0))]
     means = torch.from_numpy((sums[:, :6] / sums[:, 6:]).astype(np.float32))
     return PointCloud(means[:, :3].contiguous(), means[:, 3:].contiguous(), voxel, bounds)
 

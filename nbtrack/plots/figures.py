@@ -30,7 +30,7 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     left, right = new_axes(title, 0.4 + 0.5 * height, 1, 2)[0]
     _show(left, sequence.color(index), f"frame {sequence.frame_ids[index]}: colour")
     depth = np.ma.masked_equal(sequence.depth(index), 0)
-    image = _show(right, depth, "depth", MILLIMETRE * _most(some))
+    image = _show(right, depth, "depth", MILLIMETRE * _upper_limit(some))
     right.figure.colorbar(image, ax=right, label="depth (m)", extend="max", aspect=25, pad=0.02)
     return right.figure
 
@@ -47,9 +47,9 @@ def plot_views(
     """
     depths = np.ma.stack([np.ma.masked_equal(sequence.depth(index), 0) for index in indices])
     errors = 100 * np.abs(np.stack([depth for _, depth in views]) - depths)
-    far, worst = _most(depths), _most(errors)
-    slope = sequence.intrinsics.height / sequence.intrinsics.width
-    height = 0.9 + len(views) * (0.2 + 0.2 * WIDTH * slope)
+    far, worst = _upper_limit(depths), _upper_limit(errors)
+    aspect = sequence.intrinsics.height / sequence.intrinsics.width
+    height = 0.9 + len(views) * (0.2 + 0.2 * WIDTH * aspect)
     grid = new_axes(title, height, len(views), 5)
     parts = zip(grid, indices, views, depths, errors, strict=True)
     for row, index, (color, rendered), depth, error in parts:
@@ -65,16 +65,16 @@ def plot_views(
 
 
 def _show(
-    axes: Axes, image: np.ndarray, title: str, most: float | None = None, colors: str = "viridis"
+    axes: Axes, image: np.ndarray, title: str, maximum: float | None = None, colors: str = "viridis"
 ) -> AxesImage:
     """An image without ticks, grid and frame; unknown pixels are grey."""
     axes.set_title(title)
     axes.set_axis_off()
     cmap = matplotlib.colormaps[colors].with_extremes(bad="#bdbdbd")
-    return axes.imshow(image, cmap=cmap, vmin=0, vmax=most)
+    return axes.imshow(image, cmap=cmap, vmin=0, vmax=maximum)
 
 
-def _most(images: np.ndarray) -> float:
+def _upper_limit(images: np.ndarray) -> float:
     values = np.ma.masked_equal(images, 0).compressed()
     return float(np.quantile(values, 0.98)) if len(values) else 1.0
 

@@ -25,7 +25,7 @@ from nbtrack.tables import STANDING_STILL
 _POINTS_ALONG = 240  # grid points along the longer side of a slice
 _DIMMED = 0.72  # how white the unseen becomes
 _CUT = 0.01  # share of a recording's points cut off at either end: wild depths hide the room
-_MOST_FACES, _MOST_FACES_TO_TURN = 120_000, 10_000  # more are merged first
+_MAX_FACES, _MAX_FACES_TO_TURN = 120_000, 10_000  # more are merged first
 _ELEVATION = np.radians(45)  # of the viewer of a mesh
 _AMBIENT = 0.55  # share of the light on a mesh that comes from everywhere
 
@@ -125,7 +125,7 @@ def plot_overview(
     has_errors = frames["translation_error_m"].notna().any()
     left, *right = new_axes(title, 4.2, 1, 2 if has_errors else 1)[0]
     _draw_cloud(left, cloud, T_paths)
-    left.legend(loc="upper right")
+    left.figure.legend_below()
     for axes in right:
         seconds = frames["time"] - frames["time"].iloc[0]
         tracked, still = 100 * frames["translation_error_m"], 100 * frames["still_error_m"]
@@ -157,7 +157,7 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
     where most surface shows. Parallel projection; lengths across the picture are true (m). The
     camera-to-world poses by label are drawn on top; "true" is green, "tracked" red.
     """
-    mesh, up = _at_most(mesh, _MOST_FACES), up_of(*T_paths.values())
+    mesh, up = _simplified(mesh, _MAX_FACES), up_of(*T_paths.values())
     # Marching cubes orients faces by the sign of the field, which differs between densities and
     # distances. The room's shell outweighs what stands in it, so the middle votes.
     inwards = mesh.bounds.mean(axis=0) - mesh.triangles_center
@@ -190,7 +190,7 @@ def mesh_viewer(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses]) -> trimesh.
 
     The mesh is made coarser: the viewer adds 1.0 MB to the notebook, 0.7 MB of it the viewer's own.
     """
-    scene = trimesh.Scene([_at_most(mesh, _MOST_FACES_TO_TURN)])
+    scene = trimesh.Scene([_simplified(mesh, _MAX_FACES_TO_TURN)])
     for label, color in method_colors(T_paths).items():
         path = trimesh.load_path(T_paths[label][:, :3, 3])
         path.colors = [trimesh.visual.color.hex_to_rgba(color)] * len(path.entities)
@@ -254,7 +254,7 @@ def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
     return np.stack([right, np.cross(viewer, right), viewer])
 
 
-def _at_most(mesh: trimesh.Trimesh, n_faces: int) -> trimesh.Trimesh:
+def _simplified(mesh: trimesh.Trimesh, n_faces: int) -> trimesh.Trimesh:
     """The mesh, or where it has too many faces a coarser one: vertices of a grid cell merge."""
     if len(mesh.faces) <= n_faces:
         return mesh

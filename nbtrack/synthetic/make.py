@@ -40,9 +40,9 @@ def room_frames(
     Raises `ConfigError` for a number that is too small.
     """
     asked = [("frames", n_frames, 2), ("width", width, 8), ("height", height, 8), ("seed", seed, 0)]
-    for label, value, least in asked:
-        if value < least:
-            raise ConfigError(f"{label} = {value}; {least} or more are allowed; raise it")
+    for label, value, minimum in asked:
+        if value < minimum:
+            raise ConfigError(f"{label} = {value}; {minimum} or more are allowed; raise it")
     poses = handheld_trajectory(room, n_frames, seed)
     make = partial(_make_frame, room, room_intrinsics(width, height), seed)
     # NumPy releases the interpreter lock, so threads suffice.

@@ -32,8 +32,8 @@ def _row_max(rows: Vectors) -> Values:
 def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Interval:
     """Where a ray is inside the box |local| <= half."""
     # A direction parallel to a slab: a tiny slope sends both crossings far away, without 0/0.
-    slope = np.where(directions == 0.0, 1e-30, directions)
-    first, second = (-half - origins) / slope, (half - origins) / slope
+    direction = np.where(directions == 0.0, 1e-30, directions)
+    first, second = (-half - origins) / direction, (half - origins) / direction
     return _row_max(np.minimum(first, second)), -_row_max(-np.maximum(first, second))
 
 
@@ -213,9 +213,9 @@ class Cylinder(Solid):
 
     def _crossing(self, origins: Origins, directions: Points) -> Interval:
         offset_along, offset_across = self._split(origins - self.center)
-        slope_along, slope_across = self._split(directions)
-        side = _round_interval(offset_across, slope_across, self.radius)
-        caps = _slab_interval(offset_along[..., None], slope_along[:, None], self._half[1:])
+        direction_along, direction_across = self._split(directions)
+        side = _round_interval(offset_across, direction_across, self.radius)
+        caps = _slab_interval(offset_along[..., None], direction_along[:, None], self._half[1:])
         return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
 
     def normals(self, points: Points) -> Points:

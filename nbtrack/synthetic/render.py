@@ -107,16 +107,17 @@ def _is_grazing(disparity: Depth, focal: float) -> Bool[np.ndarray, "h w"]:
     is parallel to the normal: the slopes of disparity give the normal without back-projection.
     """
     height, width = disparity.shape
-    slope_y, slope_x = focal * _gentler_slope(disparity), focal * _gentler_slope(disparity.T).T
+    gradient_y = focal * _smaller_difference(disparity)
+    gradient_x = focal * _smaller_difference(disparity.T).T
     y = ((np.arange(height) + 0.5 - height / 2) / focal)[:, None]
     x = ((np.arange(width) + 0.5 - width / 2) / focal)[None, :]
-    constant = disparity - slope_x * x - slope_y * y
-    normal = np.sqrt(slope_x**2 + slope_y**2 + constant**2)
+    constant = disparity - gradient_x * x - gradient_y * y
+    normal = np.sqrt(gradient_x**2 + gradient_y**2 + constant**2)
     cosine = disparity / np.maximum(normal * np.sqrt(1 + x * x + y * y), 1e-12)
     return cosine < np.cos(MAX_INCIDENCE)
 
 
-def _gentler_slope(values: Depth) -> Depth:
+def _smaller_difference(values: Depth) -> Depth:
     """Difference per row to the next or the last row, whichever is less: no slope over an edge."""
     steps = np.diff(values, axis=0)
     forward = np.concatenate([steps, steps[-1:]])

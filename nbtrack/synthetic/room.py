@@ -79,8 +79,8 @@ class Room:
             # Only rays in the cone around the solid may meet it; from within the sphere, all. The
             # tangent is taken slightly short, so that rounding never drops a ray that grazes.
             squared = row_dot(towards, towards) - (part.solid.reach * 1.001) ** 2
-            least = np.where(squared > 0.0, lengths * np.sqrt(np.maximum(squared, 0.0)), -np.inf)
-            rays = np.flatnonzero(row_dot(directions, towards) >= least)
+            minimum = np.where(squared > 0.0, lengths * np.sqrt(np.maximum(squared, 0.0)), -np.inf)
+            rays = np.flatnonzero(row_dot(directions, towards) >= minimum)
             starts = origins if origins.ndim == 1 else origins[rays]
             candidate = part.solid.hit(starts, directions[rays])
             closer = candidate < t[rays]

@@ -20,7 +20,7 @@ from nbtrack.tracking.tracker import Tracker, TrackerSettings
 _REACHES = (0.3, 0.1)
 _SOURCE_VOXEL = 0.01  # m: points that are closer count once
 _NEIGHBOURS = 20  # points that tell a point's plane
-_LEAST_POINTS, _LEAST_INLIERS = 20, 0.5  # a number and a share; below, a frame is lost
+_MIN_POINTS, _MIN_INLIERS = 20, 0.5  # a number and a share; below, a frame is lost
 # A move of less than the epsilons (rad, m) ends a search.
 _OPTIONS = {"registration_type": "GICP", "num_threads": 1, "max_iterations": 30}
 _OPTIONS |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}
@@ -82,7 +82,7 @@ class IcpTracker(Tracker):
         Where too little was measured, or no point has a partner, the start remains.
         """
         self.is_converged = True
-        if self.source is None or self.source.size() < _LEAST_POINTS:
+        if self.source is None or self.source.size() < _MIN_POINTS:
             return float("nan")
         T_world_camera = self.T_world_camera.double().numpy()
         map_and_frame = self.target, self.source, self.target_tree
@@ -98,7 +98,7 @@ class IcpTracker(Tracker):
 
     def report(self) -> dict[str, float | bool]:
         """The share of the points that lie near the map; lost where most do not."""
-        return {"inlier_ratio": self.inlier_ratio, "lost": self.inlier_ratio < _LEAST_INLIERS}
+        return {"inlier_ratio": self.inlier_ratio, "lost": self.inlier_ratio < _MIN_INLIERS}
 
     def _with_planes(self, cloud: Any) -> tuple[Any, Any]:
         """A cloud of small_gicp with covariances, and its tree."""

@@ -169,7 +169,7 @@ class LmTracker(Tracker):
         changes = np.linalg.inv(self.expected) @ descent.T_world_camera - np.eye(4)
         is_near = np.abs(changes).max(axis=(1, 2)).min() < _FOLLOWED
         is_followed = self.was_followed and self.starts is None and is_near
-        enough = _MIN_INLIERS if is_followed else self.field.least_inliers
+        enough = _MIN_INLIERS if is_followed else self.field.min_inliers
         is_settled = descent.is_finished or (is_followed and descent.last_step < _SETTLED)
         usual_mad = self.field.intensity_mad if self.usual_mad is None else self.usual_mad
         usual_mad = max(usual_mad, _ROUNDING)
@@ -221,9 +221,9 @@ def _by_cost(descents: Sequence[Descent]) -> list[Descent]:
     return sorted(descents, key=lambda d: d.cost(_WIDE_SCALES)) if descents[1:] else [*descents]
 
 
-def _take_steps(descent: Descent, at_most: int) -> None:
+def _take_steps(descent: Descent, max_steps: int) -> None:
     """Steps of the stage that a descent is in."""
-    for _ in range(at_most):
+    for _ in range(max_steps):
         if descent.is_ended:
             return
         descent.step()

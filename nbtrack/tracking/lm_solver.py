@@ -216,9 +216,9 @@ def _locate(terms, points, T, shape, place):
     for k in range(3):
         last = shape[k] - 1.0
         for i in range(len(points)):
-            arm = T[k, 0] * points[i, 0] + T[k, 1] * points[i, 1] + T[k, 2] * points[i, 2]
-            world = arm + T[k, 3]
-            terms[3 + k, i] = arm
+            lever_arm = T[k, 0] * points[i, 0] + T[k, 1] * points[i, 1] + T[k, 2] * points[i, 2]
+            world = lever_arm + T[k, 3]
+            terms[3 + k, i] = lever_arm
             terms[2, i] *= (place[4 + k] <= world) & (world <= place[7 + k])
             scaled = (world - place[k]) * inverse
             # Points outside are moved to the border, where the gradient is 0; so are NaNs.
