@@ -107,10 +107,10 @@ def main() -> None:
     _write("searches.csv", found)
     for recording in recordings:
         for frames in (":", "::2", "::4"):
-            how = [recording], ON_RECORDINGS, preset, frames, "mapped"
-            runs.append(_track(*how, seeds=SEEDS))
-            how[1] = [METHODS[name] for name in TABLE_1]
-            runs.append(_track(*how, seeds=SEEDS, steps=None))
+            how = preset, frames, "mapped"
+            paper = [METHODS[name] for name in TABLE_1]
+            runs.append(_track([recording], ON_RECORDINGS, *how, seeds=SEEDS))
+            runs.append(_track([recording], paper, *how, seeds=SEEDS, steps=None))
         runs += [_held_out(recording, preset, seed) for seed in range(SEEDS)]
         _write("tracking.csv", pd.concat(runs))
     if recordings:

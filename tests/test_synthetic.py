@@ -15,6 +15,7 @@ from nbtrack.synthetic.motion import handheld_trajectory, motion_statistics
 from nbtrack.synthetic.primitives import Box, Cylinder, RoomShell, Sphere
 from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame
 from nbtrack.synthetic.room import REPORTED_ROOMS, ROOMS, Room, build_room, true_surface_points
+from nbtrack.synthetic.tour import tour
 
 SOLIDS = {
     "box": Box((0.1, -0.2, 0.3), (0.8, 0.5, 1.1)),
@@ -219,6 +220,31 @@ def test_two_paths_cross_the_room(room):
     assert np.linalg.norm(position[:, -1] - position[:, 0], axis=-1).min() > 0.8
     assert np.linalg.norm(position[0] - position[1], axis=1).max() > 0.15
     assert np.degrees(np.arccos((forward[0] * forward[1]).sum(axis=1).mean())) < 40
+
+
+@each_room
+def test_a_tour_passes_all_of_the_room(room):
+    """Catches a tour that leaves out a part of the room or comes near a wall, that does not return,
+    jerks, or turns faster than a hand-held camera does."""
+    poses = tour(room, 1200, 0)
+    positions = poses[:, :3, 3]
+    _, max_mm, _, max_deg = motion_statistics(poses)
+    assert room.sdf(positions).min() >= 0.35
+    assert max_deg < 3
+    assert np.linalg.norm((positions[-1] - positions[0])[::2]) < 2 * max_mm / 1e3
+    # A place at eye level with half a metre around it is at most 2 m of walking away.
+    rng, size = np.random.default_rng(0), np.array(room.parts[0].solid.size)
+    places = (rng.random((500, 3)) - 0.5) * size * [1, 0, 1] + [0, 1.4, 0]
+    free = places[room.sdf(places) > 0.5]
+    assert cKDTree(positions[:, ::2]).query(free[:, ::2])[0].max() < 2.0
+
+
+def test_a_tour_sees_both_ends():
+    """Catches a camera that stays in one half of the hall, or passes the door less than twice."""
+    for name, sides in (("long_hall", 2), ("two_rooms", 2)):
+        z = tour(EACH_ROOM[name], 1200, 0)[:, 2, 3]
+        assert (np.diff(np.sign(z)) != 0).sum() >= sides
+        assert z.max() > 2 > -2 > z.min()
 
 
 def test_sensor_range_and_invalid_pixels():

@@ -211,7 +211,8 @@ def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
 
 def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
-    made = ScenesConfig(n_frames=options.n_frames, width=options.width, seed=options.seed)
+    chosen = "motion", "n_frames", "width", "seed"
+    made = ScenesConfig(**{name: getattr(options, name) for name in chosen})
     write_room(options.room, options.out, made)
     size = f"{options.n_frames} frames of {options.width}x{options.width * 3 // 4}"
     print(f"{options.out}: {options.room}, {size}, seed {options.seed}")

@@ -113,12 +113,13 @@ def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
     """A room as a sequence folder, under a bar."""
     with ProgressBar(f"room {name}", config.n_frames) as bar:
         size = config.width, config.width * 3 // 4
-        make_room(name, folder, config.n_frames, *size, config.seed, bar.move_to)
+        make_room(name, folder, config.n_frames, *size, config.seed, config.motion, bar.move_to)
 
 
 def _room(name: str, config: ScenesConfig) -> Scene:
     """A room of this size, length and seed in the cache, made if it is not there."""
-    recipe = f"{config.n_frames}x{config.width}-seed{config.seed}-{room_version(name)}"
+    recipe = f"{config.motion}-{config.n_frames}x{config.width}-seed{config.seed}"
+    recipe += f"-{room_version(name)}"
     folder = runs_folder() / "rooms" / f"{name}-{recipe}" / name
     if not folder.is_dir():
         # Another command may want the same room: it waits, and finds it made.

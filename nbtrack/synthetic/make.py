@@ -11,17 +11,19 @@ import numpy as np
 
 from nbtrack.core.arrays import Pose
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import ConfigError, DataError
+from nbtrack.core.errors import ConfigError, DataError, nearest_name
 from nbtrack.core.files import fingerprint, json_text, naming_damaged, sources_fingerprint
 from nbtrack.data.writer import WrittenFrame, write_sequence
 from nbtrack.synthetic.motion import handheld_trajectory
 from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame
 from nbtrack.synthetic.room import Room, build_room, description
+from nbtrack.synthetic.tour import tour
 
 ROOM_FILE = "room.json"
 ROOM_VERSION = 2  # raise it when a room, the motion or the sensor model changes
 _AGAIN = "remove the folder and make the room again"
 _FRAMES_AT_ONCE = 32  # in flight, so that memory is bounded where writing is slower
+MOTIONS = {"handheld": handheld_trajectory, "tour": tour}
 FIELD_OF_VIEW = np.radians(60.0)  # horizontal, as in the Neural RGB-D dataset
 
 
@@ -31,19 +33,21 @@ def room_intrinsics(width: int, height: int) -> Intrinsics:
 
 
 def room_frames(
-    room: Room, n_frames: int, width: int, height: int, seed: int
+    room: Room, n_frames: int, width: int, height: int, seed: int, motion: str = "handheld"
 ) -> Iterator[WrittenFrame]:
     """Render a room's frames in order; memory does not grow with their number.
 
     `seed` is that of the camera's path and of the depth noise. Every frame has its own random
     numbers, so that the result does not depend on the number of threads.
-    Raises `ConfigError` for a number that is too small.
+    Raises `ConfigError` for a number that is too small, and for an unknown motion.
     """
     asked = [("frames", n_frames, 2), ("width", width, 8), ("height", height, 8), ("seed", seed, 0)]
     for label, value, minimum in asked:
         if value < minimum:
             raise ConfigError(f"{label} = {value}; {minimum} or more are allowed; raise it")
-    poses = handheld_trajectory(room, n_frames, seed)
+    if motion not in MOTIONS:
+        raise ConfigError(f"unknown motion {motion!r}: {nearest_name(motion, [*MOTIONS])}")
+    poses = MOTIONS[motion](room, n_frames, seed)
     make = partial(_make_frame, room, room_intrinsics(width, height), seed)
     # NumPy releases the interpreter lock, so threads suffice.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -68,6 +72,7 @@ def make_room(
     width: int,
     height: int,
     seed: int = 0,
+    motion: str = "handheld",
     progress: Callable[[int], object] = lambda done: None,
 ) -> Path:
     """Write a synthetic scene as the Neural RGB-D dataset does; returns `folder`.
@@ -76,9 +81,9 @@ def make_room(
     poses are exact in both pose files. `room.json` records how the scene was made. The same
     arguments give the same bytes. Raises as `build_room`, `room_frames` and `write_sequence` do.
     """
-    record = {"room": name, "version": ROOM_VERSION, "seed": seed, "frames": n_frames}
-    record |= {"width": width, "height": height}
-    frames = room_frames(build_room(name), n_frames, width, height, seed)
+    record = {"room": name, "version": ROOM_VERSION, "motion": motion, "seed": seed}
+    record |= {"frames": n_frames, "width": width, "height": height}
+    frames = room_frames(build_room(name), n_frames, width, height, seed, motion)
     notes = {ROOM_FILE: json_text(record)}
     write_sequence(folder, room_intrinsics(width, height), frames, notes, progress)
     return folder

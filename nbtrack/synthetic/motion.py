@@ -5,7 +5,7 @@ from scipy.interpolate import CubicSpline
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import NumericalError
-from nbtrack.synthetic.primitives import Values
+from nbtrack.synthetic.primitives import Points, Values
 from nbtrack.synthetic.room import Room, Walk
 
 MEAN_STEP_MM = 6.0  # translation a frame; hand-held recordings at 30 Hz move 5 to 7
@@ -72,48 +72,68 @@ def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses
     values[:, 3] += walk.pitch
     values[:, 5] = np.clip(values[:, 5] + rng.uniform(1.3, 1.5), 1.15, 1.65)
     path = CubicSpline(knots * _KNOT_SPACING, values)  # over the angle turned
-    bursts = np.arange(-1.0, length / _BURST_FRAMES + 3.0)
-    values = 0.4 * np.clip(rng.normal(size=len(bursts)), -1.6, 1.6)
-    speed = np.exp(CubicSpline(bursts, values)(np.arange(length) / _BURST_FRAMES))
-    speed /= speed.mean()
-    # A hand's tremor, (n, 6): translation (m) and rotation (rad), four sines of 1.5 to 5 Hz each.
-    cycles_per_frame, phases = rng.uniform(1.5, 5.0, (4, 6)) / 30, rng.uniform(0, 2 * np.pi, (4, 6))
-    amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / 2.0
-    waves = np.sin(2 * np.pi * cycles_per_frame * np.arange(length)[:, None, None] + phases)
-    tremor = amplitude * waves.sum(axis=1)
+    speed = relative_speed(length, rng)
+    trembling = tremor(length, rng)
     center = np.asarray(walk.center) + rng.uniform(-_CENTER_REACH, _CENTER_REACH, 2)
     heading = walk.start_yaw + rng.uniform(-_HEADING_REACH, _HEADING_REACH)
     rate, radius = np.radians(0.5), 0.7
     for _ in range(12):
         turned = rate * np.concatenate([[0.0], np.cumsum(speed)[:-1]])
-        poses = _poses(center, heading, walk.turn * turned, path(turned), radius, tremor)
+        poses = _poses(center, heading, walk.turn * turned, path(turned), radius, trembling)
         mean_mm, _, mean_deg, _ = motion_statistics(poses)
         rate *= np.clip(MEAN_STEP_DEG / mean_deg, 0.7, 1.4)
         radius *= np.clip(MEAN_STEP_MM / mean_mm, 0.7, 1.4)
     return poses
 
 
-def _poses(center, heading: float, turned: Values, wander, radius: float, tremor) -> Poses:
+def relative_speed(length: int, rng: np.random.Generator) -> Values:
+    """A smooth speed of each frame, up to threefold from slow to fast, of mean 1."""
+    bursts = np.arange(-1.0, length / _BURST_FRAMES + 3.0)
+    values = 0.4 * np.clip(rng.normal(size=len(bursts)), -1.6, 1.6)
+    speed = np.exp(CubicSpline(bursts, values)(np.arange(length) / _BURST_FRAMES))
+    return speed / speed.mean()
+
+
+def tremor(length: int, rng: np.random.Generator) -> Points:
+    """A hand's tremor, (length, 6): translation (m) and rotation (pitch, yaw, roll; rad).
+
+    Four sines of 1.5 to 5 Hz each.
+    """
+    cycles_per_frame, phases = rng.uniform(1.5, 5.0, (4, 6)) / 30, rng.uniform(0, 2 * np.pi, (4, 6))
+    amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / 2.0
+    waves = np.sin(2 * np.pi * cycles_per_frame * np.arange(length)[:, None, None] + phases)
+    return amplitude * waves.sum(axis=1)
+
+
+def _poses(center, heading: float, turned: Values, wander, radius: float, trembling) -> Poses:
     """Poses (OpenCV axes) along an ellipse by the angle turned (rad), wandering and trembling.
 
     `center` (m) is x and z of the ellipse, `heading` (rad) the yaw from its first end to the other,
     `radius` (m) half its length.
     """
     relative_radius, side, yaw_offset, pitch, roll, height = wander.T
-    yaw = heading + turned + yaw_offset + tremor[:, 4]
     # Opposite to the direction of view, so that the room lies before the camera.
     along, across = -np.cos(turned + side), -_FLATTENING * np.sin(turned + side)
     axes = -np.array([[np.sin(heading), np.cos(heading)], [np.cos(heading), -np.sin(heading)]])
     reach = radius * (1.0 + relative_radius[:, None])
     x, z = (center + reach * (np.stack([along, across], axis=1) @ axes)).T
-    poses = np.tile(np.eye(4), (len(turned), 1, 1))
-    poses[:, :3, 3] = np.stack([x, height, z], axis=1) + tremor[:, :3]
-    # Yaw 0 looks along -z, positive turns left.
-    pitch, roll = pitch + tremor[:, 3], (roll + tremor[:, 5])[:, None]
+    positions = np.stack([x, height, z], axis=1)
+    return camera_poses(positions, heading + turned + yaw_offset, pitch, roll, trembling)
+
+
+def camera_poses(positions: Points, yaw: Values, pitch: Values, roll: Values, trembling) -> Poses:
+    """Poses (OpenCV axes) at positions (n x 3, m) with angles (rad), and a tremor on top.
+
+    Yaw 0 looks along -z and positive turns left; positive pitch looks up.
+    """
+    yaw, pitch = yaw + trembling[:, 4], pitch + trembling[:, 3]
+    roll = (roll + trembling[:, 5])[:, None]
     forward = [-np.sin(yaw) * np.cos(pitch), np.sin(pitch), -np.cos(yaw) * np.cos(pitch)]
     forward = np.stack(forward, axis=-1)
     right = np.stack([np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)], axis=-1)
     down, cosine, sine = np.cross(forward, right), np.cos(roll), np.sin(roll)
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, 3] = positions + trembling[:, :3]
     axes = [cosine * right + sine * down, cosine * down - sine * right, forward]
     poses[:, :3, :3] = np.stack(axes, axis=-1)
     return poses
