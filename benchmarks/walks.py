@@ -1,0 +1,91 @@
+"""Long walks: 1,200 frames around the whole of each room, mapped from every fourth frame.
+
+    python benchmarks/walks.py
+
+Writes walks.csv to paper_tables/corrected: LM in the corrected map and in the baked one, and ICP,
+at every and at every fourth frame of all nine rooms; then the paper's two methods with the steps of
+2 Hz in the first two. Half an hour on one core for LM and ICP, as long again for the paper's two.
+Maps and runs are kept (`NBTRACK_RUNS`), so that a killed benchmark goes on. Times count: run
+nothing else.
+"""
+
+from collections.abc import Iterator
+from itertools import product
+
+import pandas as pd
+import torch
+
+from nbtrack import METHODS, Method, load_preset, open_scenes, read_run
+from nbtrack.core.device import choose_device, device_name
+from nbtrack.core.files import tables_folder
+from nbtrack.core.settings import with_settings
+from nbtrack.experiments.cells import MapCell
+from nbtrack.experiments.grid import run_cells
+from nbtrack.experiments.methods import TABLE_1
+from nbtrack.experiments.runs import TrackCell
+from nbtrack.experiments.scenes import Scene
+from nbtrack.tables import write_csv
+
+PRESET = load_preset("nine_rooms", settings=["scenes.motion=tour", "scenes.n_frames=1200"])
+MAPPED, STEPS, RATE_HZ = "::4", 30, 2
+METHODS_OF_WALKS = [METHODS[name] for name in ("corrected", "baked", "icp_middle")]
+WRONG_M = 0.05
+KEPT = ["still_ate_m", "path_m", "max_error_m", "map_seconds"]
+
+
+def main() -> None:
+    """A row a run; the file grows room by room."""
+    torch.set_num_threads(1)
+    rooms, rows = open_scenes(PRESET), []
+    paper = [METHODS[name] for name in TABLE_1]
+    for room in rooms:
+        rows += [run(room, method, frames) for method, frames in on(METHODS_OF_WALKS)]
+        write(rows)
+    for room, method in product(rooms[:2], paper):
+        rows.append(run(room, method, ":", method.paper_steps(RATE_HZ)))
+        write(rows)
+
+
+def on(methods: list[Method]) -> Iterator[tuple[Method, str]]:
+    """Every method with every and with every fourth frame."""
+    return product(methods, (":", "::4"))
+
+
+def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
+    """One tracked walk. A frame that is off by more than 5 cm is wrong, and missed where the
+    tracker does not call it lost; `found_again` counts how often a wrong frame is followed by a
+    right one."""
+    preset = with_settings(PRESET, *method.settings)
+    made = MapCell(room, method.field, preset, MAPPED)
+    cell = TrackCell(made, room, method.tracker, steps, frames=frames, n_threads=1)
+    found = run_cells([cell], f"{room.name}, {method.label}")[0]
+    tracked = read_run(cell.folder.name).frames
+    is_wrong = (tracked["translation_error_m"] > WRONG_M).to_numpy()
+    is_lost = tracked["lost"].to_numpy(bool)
+    width, _, depth = room.room.parts[0].solid.size
+    field = made.map().field
+    return {
+        "scene": room.name,
+        "floor_m2": width * depth,
+        "method": method.label,
+        "n_pixels": preset.tracking_of(method.tracker).n_pixels,
+        "frames": frames,
+        "ate_m": found["ate_rmse_m"],
+        "milliseconds": 1e3 * tracked["seconds"].median(),
+        **{name: found[name] for name in KEPT},
+        "wrong_frames": int(is_wrong.sum()),
+        "lost_frames": int(is_lost.sum()),
+        "missed_frames": int((is_wrong & ~is_lost).sum()),
+        "found_again": int((is_wrong[:-1] & ~is_wrong[1:]).sum()),
+        "map_mb": sum(part.nbytes for part in field.state_dict().values()) / 1e6,
+    }
+
+
+def write(rows: list[dict]) -> None:
+    """With the machine."""
+    table = pd.DataFrame(rows).assign(device=device_name(choose_device()))
+    write_csv(tables_folder() / "corrected" / "walks.csv", table)
+
+
+if __name__ == "__main__":
+    main()
