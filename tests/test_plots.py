@@ -12,7 +12,6 @@ import trimesh
 from box_room import Formula
 from ipywidgets import fixed, interactive
 from matplotlib.axis import Axis
-from matplotlib.container import BarContainer
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from trimesh.viewer.notebook import scene_to_notebook
@@ -92,7 +91,7 @@ FIGURES = {
     ),
     "errors": lambda s: plots.plot_errors({"VR": FRAMES, "SDF": FRAMES}, "lost"),
     "curves": lambda s: plots.plot_curves(SWEEP, *SWEEP, "fast"),
-    "ate": lambda s: plots.plot_ate_bars(published_table_1(), "rates matter"),
+    "ate": lambda s: plots.plot_ate(published_table_1(), "rates matter"),
 }  # fmt: skip
 COLORS = ["red", "green", "blue"]
 
@@ -277,18 +276,34 @@ def test_errors_run_in_seconds() -> None:
     assert still.get_ydata() == pytest.approx([2.0, 4.0])
 
 
-def test_bars_are_the_errors_of_their_cell() -> None:
-    """Catches bars in the wrong group, a missing run drawn as a perfect one, seeds not averaged."""
-    (axes,) = plots.plot_ate_bars(CELLS).axes
-    first, second = (c for c in axes.containers if isinstance(c, BarContainer))
-    assert [bar.get_height() for bar in first] == [0.4, 0.1]  # 10 Hz stands left
-    assert [bar.get_height() for bar in second] == pytest.approx([0, 0.2])  # none at 10 Hz
-    (spread,) = second.errorbar.lines[2][0].get_segments()[1:]
+def test_points_are_the_errors_of_their_cell() -> None:
+    """Catches points in the wrong group, a missing run drawn as a perfect one, seeds not averaged,
+    and methods that cover each other."""
+    (axes,) = plots.plot_ate(CELLS).axes
+    first, second = axes.containers
+    assert list(first.lines[0].get_ydata()) == [0.4, 0.1]  # 10 Hz stands left
+    assert second.lines[0].get_ydata() == pytest.approx([np.nan, 0.2], nan_ok=True)
+    spread = second.lines[2][0].get_segments()[1]
     assert np.ptp(spread[:, 1]) == pytest.approx(2 * 0.05 * 2**0.5)
+    apart = second.lines[0].get_xdata() - first.lines[0].get_xdata()
+    assert (apart > 0.05).all()
     assert axes.get_title(loc="left") == "Whiteroom"
-    with_still = plots.plot_ate_bars(CELLS.assign(still_ate_m=0.3)).axes[0]
-    assert len(with_still.patches) == len(axes.patches)
-    assert {"standing still", "lost above 0.2 m"} == {str(s.get_label()) for s in with_still.lines}
+    with_still = plots.plot_ate(CELLS.assign(still_ate_m=0.3)).axes[0]
+    assert len(with_still.containers) == len(axes.containers)
+    assert {"standing still", "lost above 0.2 m"} <= {str(s.get_label()) for s in with_still.lines}
+
+
+def test_points_carry_their_labels() -> None:
+    """Catches a legend of many entries with repeated colours, and labels that cover each other."""
+    x = np.linspace(1.0, 1.1, 12)
+    near = pd.DataFrame(
+        {"time (ms)": x, "ATE (cm)": x, "method": [f"method {i}" for i in range(12)]}
+    )
+    figure = plots.plot_curves(near, "time (ms)", "ATE (cm)", "method", log="")
+    assert not figure.legends
+    boxes = [text.get_window_extent() for text in figure.axes[0].texts]
+    assert len(boxes) == len(near)
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
 
 
 def test_unmeasured_pixels_are_not_errors(sequence) -> None:

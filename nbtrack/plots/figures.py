@@ -13,7 +13,16 @@ from nbtrack.core.arrays import Values
 from nbtrack.data.frame import MILLIMETRE
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import View
-from nbtrack.plots.style import DASHED, DOTTED, WIDTH, log_axes, method_colors, new_axes, styled
+from nbtrack.plots.style import (
+    DASHED,
+    DOTTED,
+    WIDTH,
+    label_points,
+    log_axes,
+    method_colors,
+    new_axes,
+    styled,
+)
 from nbtrack.tables import STANDING_STILL, table_1
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
@@ -147,46 +156,71 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
 def plot_curves(
     table: pd.DataFrame, x: str, y: str, group: str | list[str], title: str = "", log: str = "xy"
 ) -> Figure:
-    """One column over another, a line a group; a group of one row is a point.
+    """One column over another, a line a group; groups of one row are points with their labels.
 
-    Columns x and y are named as the axes are to be labelled, "time a frame (ms)"; text on x keeps
-    the order of its first appearance. Methods among the labels get their colours. Where there are
-    columns `from` and `to`, thin lines span that interval of y. Axes of `log` are logarithmic.
+    Columns x and y are named as the axes are to be labelled, "time a frame (ms)". Text on x keeps
+    the order of its first appearance; its points stand side by side, without lines. Methods among
+    the labels get their colours. Where there are columns `from` and `to`, thin lines span that
+    interval of y. Axes of `log` are logarithmic.
     """
     axes = new_axes(title, 3.6)[0, 0]
     labels = table[[group] if isinstance(group, str) else group].agg(", ".join, axis=1)
-    for index, (label, color) in enumerate(method_colors(labels).items()):
-        rows = table[labels == label]
-        axes.plot(rows[x], rows[y], marker="os^Dv"[index % 5], color=color, label=label)
+    colors, at = method_colors(labels), table[x]
+    is_text = not pd.api.types.is_numeric_dtype(at)
+    if is_text:
+        names = at.unique()
+        at = at.map({name: place for place, name in enumerate(names)}) + _beside(labels)
+        turned = {"rotation": 20, "ha": "right"} if sum(map(len, names)) > 90 else {}
+        axes.set_xticks(range(len(names)), names, **turned)
+    for index, (label, color) in enumerate(colors.items()):
+        rows, places = table[labels == label], at[labels == label]
+        look = {"marker": "os^Dv"[index % 5], "color": color, "label": label}
+        axes.plot(places, rows[y], linestyle="none" if is_text else "-", **look)
         if "from" in rows:
-            axes.vlines(rows[x], rows["from"], rows["to"], color=color, linewidth=0.8)
+            axes.vlines(places, rows["from"], rows["to"], color=color, linewidth=0.8)
     axes.set(xlabel=x, ylabel=y)
-    log_axes(axes, log)
-    axes.figure.legend(loc="outside right center")
+    log_axes(axes, log.replace("x", "") if is_text else log)
+    if labels.is_unique and not is_text and len(labels) > 1:
+        label_points(axes, at, table[y], colors)
+    else:
+        axes.figure.legend(loc="outside right center")
     return axes.figure
 
 
-@styled
-def plot_ate_bars(results: pd.DataFrame, title: str = "") -> Figure:
-    """Table I as bars: mean ATE (m, logarithmic) by rate and method, a panel a scene.
+def _beside(labels: pd.Series) -> pd.Series:
+    """For every row a small offset of its label, so that points of one category stand apart."""
+    order = {label: number for number, label in enumerate(labels.unique())}
+    return labels.map(order).sub((len(order) - 1) / 2) * 0.5 / max(len(order), 4)
 
-    `results` are as `table_1` takes them. A bar that crosses the dashed line at 0.2 m is a lost
-    camera, which the table prints red; a missing bar is a run without result. Thin lines span a
+
+@styled
+def plot_ate(results: pd.DataFrame, title: str = "") -> Figure:
+    """Table I as points: mean ATE (m, logarithmic) by rate and method, a panel a scene.
+
+    `results` are as `table_1` takes them. A point above the dashed line at 0.2 m is a lost camera,
+    which the table prints red; a missing point is a run without result. Thin lines span a
     deviation over seeds either way; the dotted line is a camera that stands still.
     """
     means, deviations = table_1(results), table_1(results, "ate_deviation_m")
     is_still = means.index.get_level_values("method") == STANDING_STILL
     still, means, deviations = means[is_still], means[~is_still], deviations[~is_still]
+    rates = means.index.get_level_values("rate_hz").unique()
+    labels = means.index.get_level_values("method").to_series(index=means.index)
+    at = means.index.get_level_values("rate_hz").map(list(rates).index) + _beside(labels)
     rows = -(-len(means.columns) // 5)
     panels = new_axes(title, 0.9 + 2.1 * rows, rows, min(5, len(means.columns)), sharey=True).flat
     for axes, scene in zip(panels, means, strict=False):
-        bars = means[scene].unstack(sort=False).rename("{:g}".format)
-        look = {"width": 0.8, "rot": 0, "legend": False, "color": method_colors(bars)}
-        bars.plot.bar(ax=axes, yerr=deviations[scene].unstack(sort=False).to_numpy().T, **look)
+        for index, (label, color) in enumerate(method_colors(labels).items()):
+            of_method = (labels == label).to_numpy()
+            look = {"marker": "os^Dv"[index % 5], "color": color, "linestyle": "none"}
+            spread = deviations[scene][of_method]
+            axes.errorbar(at[of_method], means[scene][of_method], spread, label=label, **look)
         for ate_m in still[scene][:1]:
             axes.axhline(ate_m, label=STANDING_STILL, **DOTTED)
         axes.axhline(LOST_THRESHOLD_M, label="lost above 0.2 m", **DASHED)
         axes.set(title=scene.replace("_", " "), xlabel="rate (Hz)", ylabel="ATE (m)")
+        axes.set_xticks(range(len(rates)), [f"{rate:g}" for rate in rates])
+        axes.set_xlim(-0.5, len(rates) - 0.5)
         log_axes(axes, "y")
     for axes in panels[len(means.columns) :]:
         axes.remove()

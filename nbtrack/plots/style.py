@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
+from matplotlib.transforms import Bbox
 
 PALETTE = (
     "#3b6fb6", "#e08214", "#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d4d4d", "#a6911a",
@@ -62,6 +63,26 @@ def method_colors(labels: Iterable[str]) -> dict[str, str]:
     """One colour a label: those of the paper's methods stay, others get the next that is free."""
     free = cycle(color for color in PALETTE if color not in _FIXED.values())
     return {label: _FIXED.get(label) or next(free) for label in dict.fromkeys(labels)}
+
+
+def label_points(
+    axes: Axes, x: Iterable[float], y: Iterable[float], colors: dict[str, str]
+) -> None:
+    """Beside every point its label in its colour, moved up or down where it would cover another."""
+    axes.margins(x=0.3, y=0.1)
+    axes.figure.draw_without_rendering()
+    rows = sorted(zip(x, y, colors, strict=True), key=lambda row: row[1])
+    pixels = axes.transData.transform([row[:2] for row in rows])
+    taken = [Bbox.from_bounds(left - 5, bottom - 5, 10, 10) for left, bottom in pixels]
+    for x_point, y_point, label in rows:
+        text = axes.annotate(label, (x_point, y_point), (6, -3), textcoords="offset points")
+        text.set(fontsize="small", color=colors[label])
+        for shift in sorted(range(-60, 61, 3), key=abs):
+            text.set_position((6, shift - 3))
+            box = text.get_window_extent()
+            if not any(box.overlaps(other) for other in taken):
+                break
+        taken.append(box)
 
 
 def log_axes(axes: Axes, names: str) -> None:
