@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -100,22 +101,37 @@ def step_rows() -> Iterator[dict]:
 
 
 def mapping_rows() -> Iterator[dict]:
-    """Time of a mapping iteration, after a warm-up."""
+    """Time of a mapping iteration, in turns after a warm-up; NeuS also with the eikonal term on one
+    sample only and on all of them."""
     from nbtrack.mapping.fit import _Fit
 
-    for name in ("imap", "neus", "neus_plus"):
+    fits = {}
+    for name, share in [
+        ("imap", None),
+        ("neus", 0),
+        ("neus", None),
+        ("neus", 1),
+        ("neus_plus", None),
+    ]:
         field = make_field(name, NETWORK, BOUNDS, seed=0).to(DEVICE)
         settings = field_class(name).Settings()
+        if share is not None:
+            settings = replace(settings, eikonal_share=float(share))
         settings = settings if IS_FULL else replace(settings, n_rays=16)
+        shown = getattr(settings, "eikonal_share", None)
         fit = _Fit({"seed": 0}, settings, field, SEQUENCE, np.arange(len(SEQUENCE)))
+        fits[name, settings.n_rays, shown] = fit
         fit._advance(range(N_WARM))
+    seconds = dict.fromkeys(fits, 0.0)
+    for first, (key, fit) in product(range(0, N_TIMED, 2), fits.items()):
         synchronize(DEVICE)
         start = time.perf_counter()
-        for first in range(0, N_TIMED, 10):
-            fit._advance(range(first, min(N_TIMED, first + 10)))
+        fit._advance(range(first, first + 2))
         synchronize(DEVICE)
-        seconds = time.perf_counter() - start
-        yield {"field": name, "n_rays": settings.n_rays, "ms": 1e3 * seconds / N_TIMED}
+        seconds[key] += time.perf_counter() - start
+    for (name, n_rays, share), total in seconds.items():
+        ms = 1e3 * total / N_TIMED
+        yield {"field": name, "n_rays": n_rays, "eikonal_share": share, "ms": ms}
 
 
 def main(part: str) -> None:

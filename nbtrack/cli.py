@@ -55,7 +55,8 @@ OPTIONS = {
     "--map-from MAP": _option("track in this map of the room: its folder or file", a_path),
     "--start": _option("given: the first frame's own pose (default where it has one), or unknown",
                        choices=("given", "unknown")),
-    "--to FORMAT": _option("tum, kitti: trajectory; ply, glb: coloured mesh; map: one file"),
+    "--to FORMAT": _option("tum, kitti: trajectory; gif, mp4: movie of a run; ply, glb: "
+                            "coloured mesh; map: one file"),
     "--budget BY": _option("steps, the paper's counts (default), or this machine's clock",
                            choices=("steps", "clock"), default="steps"),
     "--scenes A,B": _option("only these scenes of the preset's kind"),

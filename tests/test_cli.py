@@ -174,6 +174,12 @@ def test_a_recording_without_poses_is_tracked_in_a_map(
     assert (flagged | (off < 0.05)).all()
     for name in ("known", "found"):
         assert cv2.imread(str(work / name / "overview.png")).shape[1] > 800
+    assert main(["export", "found", "--to", "gif", "found.gif"]) == 0
+    assert "12 of 12 frames" in capsys.readouterr().out
+    (work / "corrected").rename(work / "moved")
+    assert main(["export", "found", "--to", "gif", "again.gif"]) == 2
+    assert "corrected" in capsys.readouterr().err
+    (work / "moved").rename(work / "corrected")
     assert main(["track", str(recording), "--out", "own"]) == 2
     assert "or track in a map of the same place with --map-from" in capsys.readouterr().err
     assert main([*GIVEN, "map", "--start", "unknown"]) == 2

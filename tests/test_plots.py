@@ -1,5 +1,6 @@
 """Figures: every axis has its unit, every line lies where the data are, nothing leaks."""
 
+import io
 from dataclasses import replace
 
 import matplotlib
@@ -14,12 +15,14 @@ from ipywidgets import fixed, interactive
 from matplotlib.axis import Axis
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
+from PIL import Image
 from trimesh.viewer.notebook import scene_to_notebook
 
 from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.plots.movie import view_of
 from nbtrack.plots.rooms import screen_axes
 from nbtrack.plots.style import PALETTE, method_colors
 from nbtrack.synthetic import build_room
@@ -312,3 +315,23 @@ def test_unmeasured_pixels_are_not_errors(sequence) -> None:
     error_cm = plots.plot_views(sequence, [0], [view]).axes[4].images[0].get_array()
     assert error_cm.mask.sum() == 1
     assert error_cm.compressed() == pytest.approx(2.0, abs=1e-3)
+
+
+def test_a_movie_shows_every_frame(sequence) -> None:
+    """Catches frames that repeat the first, a view from elsewhere, and a movie that no reader of
+    images takes. A red wall is 2 m ahead of the camera; seen from behind it there is nothing."""
+    wall = trimesh.creation.box(
+        (8.0, 8.0, 0.1), trimesh.transformations.translation_matrix((0, 0, 2))
+    )
+    wall.visual.vertex_colors = (200, 0, 0, 255)
+    frames = FRAMES.iloc[:2].assign(frame_id=[3, 8], translation_error_m=[0.01, np.nan])
+    poses = np.stack([np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])])  # ahead, and turned about y
+    seen = [view_of(wall, sequence.intrinsics, pose) for pose in poses]
+    assert (seen[0] == (200, 0, 0)).all()
+    assert (seen[1] == 255).all()
+    pictures = plots.movie_pictures(wall, sequence, frames, poses, "A wall")
+    assert len(pictures) == 2
+    assert not np.array_equal(*pictures)
+    with Image.open(io.BytesIO(plots.movie_bytes(pictures, "gif"))) as movie:
+        assert movie.n_frames == 2
+        assert movie.size == pictures[0].shape[1::-1]

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import trimesh
 
 from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
-from nbtrack.core.files import naming_damaged, write_atomic
-from nbtrack.core.progress import tell
+from nbtrack.core.files import naming_damaged, read_json, write_atomic
+from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import as_dict
 from nbtrack.data.check import check_recording, quick_warning
 from nbtrack.data.recording import open_recording
@@ -45,13 +44,14 @@ from nbtrack.tracking.trajectories import (
 )
 
 OVERVIEW_FILE = "overview.png"  # beside the files of a run
-_FORMATS = ["tum", "kitti", "ply", "glb", "map"]
+_FORMATS = ["tum", "kitti", "ply", "glb", "map", "gif", "mp4"]
 _PRINTED = (
     "ate_rmse_m", "still_ate_m", "path_m", "ate_over_path", "ate_rmse_aligned_m",
     "rotation_rmse_deg", "max_error_m", "frames", "steps_per_frame",
     "seconds_per_step", "seconds_per_frame", "map_seconds",
 )  # fmt: skip
 _FRAMES_SHOWN, _CELLS = 20, 120  # of an overview: frames that tell what was seen; cells across
+_MOVIE_FRAMES = 100
 _MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
 _UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": ("s", 0)}
 
@@ -140,24 +140,19 @@ def _print_metrics(metrics: dict[str, Any]) -> None:
 
 def _draw_overview(run: TrackCell) -> None:
     """A picture of a finished run, beside its files: the path in what was seen of the map."""
-    from nbtrack.plots import plot_overview
+    from nbtrack.plots import cloud_of, plot_overview
 
     tracked, metrics, field = read_trajectory(run.folder), run.result(), run.needs.map().field
     ids, known = tracked.frames["frame_id"].to_numpy(), np.isfinite(tracked.T_true).all(axis=(1, 2))
     stride = max(1, len(ids) // _FRAMES_SHOWN)
     seen = read_frames(run.scene.recording, ids[::stride], needs_poses=False)
-    poses = tracked.T_estimated[::stride]
-    size = max(np.subtract(field.bounds.maximum, field.bounds.minimum))
+    seen = replace(seen, T_world_camera=tracked.T_estimated[::stride])
     try:
-        mesh = extract_mesh(
-            field, replace(seen, T_world_camera=poses), voxel=max(0.05, size / _CELLS)
-        )
+        surface = extract_mesh(field, seen, voxel=_cell_of(field))
     except DataError as error:
         print(f"  no picture: {error}")
         return
-    colors = mesh.colors if isinstance(field, PointCloud) else mesh.visual.vertex_colors
-    cloud = pd.DataFrame(mesh.vertices, columns=["x", "y", "z"])
-    cloud[["red", "green", "blue"]] = np.asarray(colors)[:, :3]
+    cloud = cloud_of(surface)
     paths = {"true": tracked.T_true[known]} if known.any() else {}
     title = f"{run.scene.name}: {run.tracker} in {field.label}, {len(ids)} frames"
     if known.any():
@@ -169,6 +164,12 @@ def _draw_overview(run: TrackCell) -> None:
     print(f"  picture: {run.folder / OVERVIEW_FILE}")
 
 
+def _cell_of(field: Any) -> float:
+    """The edge (m) of a picture's cells: large places have larger ones."""
+    size = max(np.subtract(field.bounds.maximum, field.bounds.minimum))
+    return max(0.05, float(size) / _CELLS)
+
+
 def export_command(options: Namespace) -> None:
     """Write a run's trajectory, or a map (of folders or files), in another format; print what.
 
@@ -178,7 +179,11 @@ def export_command(options: Namespace) -> None:
     source, name, out = options.source, options.to, options.out
     if name not in _FORMATS:
         raise ConfigError(f"unknown format {name!r}: {nearest_name(name, _FORMATS)}")
-    export = _export_trajectory if name in ("tum", "kitti") else _export_map
+    export = _export_map
+    if name in ("tum", "kitti"):
+        export = _export_trajectory
+    elif name in ("gif", "mp4"):
+        export = _export_movie
     told = export(source, name, new_file(out))
     print(f"{out}: {told}")
 
@@ -195,6 +200,32 @@ def _export_map(source: Path, format_name: str, out: Path) -> str:
         content = mesh.export(file_type=format_name)
     write_atomic(out, content)
     return f"{len(mesh.vertices)} coloured vertices of {'what was seen' if is_seen else 'all'}"
+
+
+def _export_movie(source: Path, format_name: str, out: Path) -> str:
+    """Of a run, whose recording and map must still be where they were."""
+    from nbtrack.plots import movie_bytes, movie_pictures
+
+    tracked, metrics = read_trajectory(source), read_json(source / METRICS_FILE)
+    if "map" not in metrics:
+        raise MissingError(f"{source} is of an earlier version: track again")
+    found, recording = read_map(Path(metrics["map"])), Path(metrics["recording"])
+    if not recording.is_dir():
+        raise MissingError(f"the recording {recording} of this run is gone: track again")
+    shown = np.linspace(0, len(tracked.frames) - 1, _MOVIE_FRAMES).round().astype(int)
+    shown = np.unique(shown)
+    rows, T_estimated = tracked.frames.iloc[shown], tracked.T_estimated[shown]
+    opened = open_recording(recording, metrics["format"])
+    origin = np.array(metrics.get("origin", [0, 0, 0]))
+    sequence = read_frames(opened, rows["frame_id"].to_numpy(), needs_poses=False, origin=origin)
+    seen = replace(sequence, T_world_camera=T_estimated)
+    surface = extract_mesh(found.field, seen, voxel=_cell_of(found.field) / 2)
+    title = f"{metrics['scene']}: {metrics['tracker']} in {found.field.label}"
+    with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
+        of_run = surface, sequence, rows, T_estimated, title
+        content = movie_bytes(movie_pictures(*of_run, bar.move_to), format_name)
+    write_atomic(out, content)
+    return f"{len(shown)} of {len(tracked.frames)} frames, {len(content) / 1e6:.1f} MB"
 
 
 def _export_trajectory(source: Path, format_name: str, out: Path) -> str:

@@ -170,6 +170,9 @@ class TrackCell(Cell):
             "key": self.key,
             "versions": files.versions(),
             "command": self._command(),
+            "recording": str(self.scene.folder),
+            "format": self.scene.format,
+            "map": str(map_cell.folder),
             "config": {
                 "preset": as_dict(map_cell.preset),
                 "map_frames": map_cell.frames,

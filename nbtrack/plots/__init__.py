@@ -13,6 +13,7 @@ from nbtrack.plots.figures import (
     plot_losses,
     plot_views,
 )
+from nbtrack.plots.movie import cloud_of, movie_bytes, movie_pictures
 from nbtrack.plots.rooms import (
     mesh_viewer,
     plot_mesh,

@@ -109,7 +109,7 @@ def plot_recording(cloud: pd.DataFrame, T_world_camera: Poses, title: str) -> Fi
     The cloud's columns are x, y, z (m, world frame), red, green, blue (0 to 255).
     """
     axes = new_axes(title, 6.0)[0, 0]
-    _draw_cloud(axes, cloud, {"true": T_world_camera})
+    draw_cloud(axes, cloud, {"true": T_world_camera})
     return axes.figure
 
 
@@ -124,7 +124,7 @@ def plot_overview(
     """
     has_errors = frames["translation_error_m"].notna().any()
     left, *right = new_axes(title, 4.2, 1, 2 if has_errors else 1)[0]
-    _draw_cloud(left, cloud, T_paths)
+    draw_cloud(left, cloud, T_paths)
     left.figure.legend_below()
     for axes in right:
         seconds = frames["time"] - frames["time"].iloc[0]
@@ -137,8 +137,11 @@ def plot_overview(
     return left.figure
 
 
-def _draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) -> None:
-    """Coloured points from above, but for those higher than all cameras; and paths."""
+def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) -> list[int]:
+    """Coloured points from above, but for those higher than all cameras; and paths.
+
+    Returns the indices of the world's axes to the right and ahead.
+    """
     up, places = _draw_from_above(axes, T_paths), cloud[["x", "y", "z"]]
     inside = (places >= places.quantile(_CUT)) & (places <= places.quantile(1 - _CUT))
     heights = (places @ up)[inside.all(axis=1)].sort_values()  # drawn from the floor up
@@ -147,6 +150,7 @@ def _draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) -
     page = shown[["x", "y", "z"]].to_numpy()[:, page_axes(up)]
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
     axes.scatter(*page.T, c=colors, s=4, linewidths=0)
+    return page_axes(up)
 
 
 @styled
