@@ -6,14 +6,13 @@ from torch import Tensor
 
 from nbtrack.core.device import constant
 
-# The entries of a rotation matrix: twice these products of a unit quaternion's components, and on
-# the diagonal one minus that. From the last to the first: their gradients then add up in the order
-# of entries written one by one, and results stay the same to the last bit.
-_ENTRIES = ["xx+yy", "yz+wx", "xz-wy", "yz-wx", "xx+zz", "xy+wz", "xz+wy", "xy-wz", "yy+zz"]
-_FACTORS = tuple("wxyz".index(letter) for entry in _ENTRIES for letter in entry[3:] + entry[:2])
-_SIGNS = tuple(-1 if "-" in entry else 1 for entry in _ENTRIES)
-_ONES = tuple(int(entry[0] == entry[1]) for entry in _ENTRIES)
-_TWICE = tuple(2 - 4 * one for one in _ONES)
+# Rows: the entries of the matrix K with K x = v × x, for each component of v.
+_CROSS = (
+    (0, 0, 0, 0, 0, -1, 0, 1, 0),
+    (0, 0, 1, 0, 0, 0, -1, 0, 0),
+    (0, -1, 0, 1, 0, 0, 0, 0, 0),
+)
+_IDENTITY = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
 def normalize_quaternion(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
@@ -25,7 +24,7 @@ def normalize_quaternion(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
 
 
 def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrix of a quaternion (order w, x, y, z).
+    """Rotation matrix of a quaternion (order w, x, y, z): R = I + 2 [v]× (w I + [v]×).
 
     The norm is divided out here, so that the gradient is tangential: a radial part would dominate
     Adam's coordinate-wise step and be lost again in the renormalisation after it.
@@ -33,15 +32,11 @@ def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
     >>> quaternion_to_matrix(torch.tensor([0.0, 0.0, 0.0, 2.0])).diagonal().tolist()
     [-1.0, -1.0, 1.0]
     """
-    # All at once, for a GPU: one by one, entries and gradients are 150 kernels.
     like = q_wxyz.device, q_wxyz.dtype
-    factors = constant(_FACTORS, q_wxyz.device, torch.int64)
-    drawn = normalize_quaternion(q_wxyz).index_select(-1, factors)
-    left, right = drawn.unflatten(-1, (-1, 2)).unbind(-1)
-    second, first = (left * right).unflatten(-1, (9, 2)).unbind(-1)
-    sums = torch.addcmul(first, constant(_SIGNS, *like), second)
-    entries = torch.addcmul(constant(_ONES, *like), constant(_TWICE, *like), sums)
-    return entries.flip(-1).unflatten(-1, (3, 3))
+    w, v = normalize_quaternion(q_wxyz).split([1, 3], dim=-1)
+    identity = constant(_IDENTITY, *like)
+    cross = (v[..., None] * constant(_CROSS, *like)).sum(-2).unflatten(-1, (3, 3))
+    return torch.add(identity, cross @ torch.addcmul(cross, w[..., None], identity), alpha=2)
 
 
 def matrix_to_quaternion(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
