@@ -20,7 +20,7 @@ from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.cells import MapCell
-from nbtrack.experiments.grid import run_cells
+from nbtrack.experiments.grid import Execution, run_cells
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.runs import TrackCell
 from nbtrack.experiments.scenes import Scene
@@ -58,7 +58,7 @@ def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
     preset = with_settings(PRESET, *method.settings)
     made = MapCell(room, method.field, preset, MAPPED)
     cell = TrackCell(made, room, method.tracker, steps, frames=frames, n_threads=1)
-    found = run_cells([cell], f"{room.name}, {method.label}")[0]
+    found = run_cells([cell], f"{room.name}, {method.label}", Execution(workers=1))[0]
     tracked = read_run(cell.folder.name).frames
     is_wrong = (tracked["translation_error_m"] > WRONG_M).to_numpy()
     is_lost = tracked["lost"].to_numpy(bool)
