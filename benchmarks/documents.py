@@ -34,7 +34,7 @@ def tracking(runs: pd.DataFrame) -> pd.DataFrame:
     """ATE (cm) of every method in each place, and of a camera that stands still."""
     still = runs.assign(method="standing still", ate_m=runs["still_ate_m"])
     runs = pd.concat([runs, still])
-    path = runs["path"].replace({"mapped": "", "second": ", second path"})
+    path = runs["path"].replace({"mapped": "", "second": ", 2nd"})
     path = path.replace("odd, mapped even", ", even mapped")
     runs["place"] = runs["scene"] + path + ", `" + runs["frames"] + "`"
     cm = 100 * runs.pivot_table(index="place", columns="method", values="ate_m", sort=False)
@@ -87,7 +87,7 @@ def _table(match: re.Match) -> str:
 
 def _markdown(table: pd.DataFrame) -> str:
     """Row labels to the left, numbers to the right."""
-    rows = [[table.index.name or "", *table.columns], ["-"] + ["-:"] * len(table.columns)]
+    rows = [["", *table.columns], ["-"] + ["-:"] * len(table.columns)]
     rows += [[str(label), *values] for label, values in zip(table.index, table.values, strict=True)]
     return "".join(f"| {' | '.join(str(cell).strip() for cell in row)} |\n" for row in rows)
 

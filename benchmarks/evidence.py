@@ -104,7 +104,7 @@ def track(scenes: list[Scene], methods, preset, workers: int | None = 1, **how) 
 
 
 def nine_rooms(seed: int) -> Iterator[Chunk]:
-    """Table I, on the mapped path and on a second one. A seed takes 40 minutes on two cores."""
+    """Table I, on the mapped path and on a second one. A seed takes an hour on two cores."""
     scenes = open_scenes(NINE)
     second = open_scenes(load_preset("nine_rooms", settings=["scenes.seed=1"]))
     for (path, paths), number in product({"mapped": scenes, "second": second}.items(), range(9)):

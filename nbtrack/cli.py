@@ -141,14 +141,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         getattr(commands, f"{options.command}_command")(options)
         return 0
     except NbtrackError as error:
-        told, status = " ".join(str(error).split()), 2
+        message, status = " ".join(str(error).split()), 2
     except OSError as error:  # a disk that is full or read-only, a file where a folder should be
         where = error.filename2 or error.filename or "the output"
-        told, status = f"{where}: {error.strerror or error}; what was finished is kept: ", 2
-        told += "make room or choose another place, and run the same command again"
+        message, status = f"{where}: {error.strerror or error}; what was finished is kept: ", 2
+        message += "make room or choose another place, and run the same command again"
     except KeyboardInterrupt:
-        told, status = "interrupted; run the same command again to go on", 130
-    print(f"nbtrack: {told}", file=sys.stderr)
+        message, status = "interrupted; run the same command again to go on", 130
+    print(f"nbtrack: {message}", file=sys.stderr)
     return status
 
 
@@ -179,13 +179,13 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
             how = how | {"required": True} if word.endswith("!") else how
             command.add_argument(option, **how)
         command.set_defaults(command=last, parser=command)
-    found, unknown = parser.parse_known_args(arguments)
+    namespace, unknown = parser.parse_known_args(arguments)
     if unknown:
-        known = [option for option in found.parser._option_string_actions if option[:2] == "--"]
+        known = [option for option in namespace.parser._option_string_actions if option[:2] == "--"]
         name = unknown[0].partition("=")[0]
         advice = _EARLIER.get(name) or nearest_name(name, known)
-        found.parser.error(f"unknown argument {unknown[0]!r}: {advice}")
-    return found
+        namespace.parser.error(f"unknown argument {unknown[0]!r}: {advice}")
+    return namespace
 
 
 def _set_device(options: argparse.Namespace) -> None:

@@ -27,13 +27,13 @@ class OutOfMemory(NbtrackError, MemoryError):
     """Host or device have too little memory; the message names the setting to lower."""
 
 
-def nearest_name(found: str, allowed: list[str]) -> str:
+def nearest_name(text: str, allowed: list[str]) -> str:
     """Hint for a misspelt name, with every valid one in the order given; of many, the nearest few.
 
     >>> nearest_name("imapp", ["imap", "neus"])
     "did you mean 'imap'? Allowed: imap, neus"
     """
-    close = difflib.get_close_matches(found, allowed, n=5, cutoff=0.5)
+    close = difflib.get_close_matches(text, allowed, n=5, cutoff=0.5)
     hint = f"did you mean '{close[0]}'? " if close else ""
     if len(allowed) > 40:  # a message lists no more
         return f"{hint}Allowed are {len(allowed)} names, such as {', '.join(close or allowed[:5])}"

@@ -72,19 +72,19 @@ def sources_fingerprint(*modules: str) -> str:
     `__init__` do not count, nor do modules that read settings, write files or word messages, nor
     comments, docstrings and layout.
     """
-    found, waiting = {}, [*modules]
+    modules_read, waiting = {}, [*modules]
     while waiting:
         name = waiting.pop()
         path = PACKAGE / f"{name.replace('.', '/')}.py"
-        if name in found or name in _WITHOUT_EFFECT or not path.is_file():
+        if name in modules_read or name in _WITHOUT_EFFECT or not path.is_file():
             continue
         tree = ast.parse(path.read_text("utf-8"))
-        found[name] = _code(tree)
+        modules_read[name] = _code(tree)
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("nbtrack."):
                 module = node.module.removeprefix("nbtrack.")
                 waiting += [module, *(f"{module}.{alias.name}" for alias in node.names)]
-    return fingerprint(found)
+    return fingerprint(modules_read)
 
 
 def modules_of(kind: type) -> tuple[str, ...]:
@@ -137,8 +137,8 @@ def _code(tree: ast.Module) -> str:
 
 def versions() -> dict[str, str]:
     """Versions that a result depends on, to be kept beside it."""
-    found = {module.__name__: module.__version__ for module in (nbtrack, torch)}
-    return found | {"python": platform.python_version()}
+    of_packages = {module.__name__: module.__version__ for module in (nbtrack, torch)}
+    return of_packages | {"python": platform.python_version()}
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:

@@ -98,11 +98,11 @@ class DataReport:
         """What to do first, by how the camera moved."""
         mm, deg = self.frames[["moved_mm", "turned_deg"]].quantile(0.95).fillna(0)  # not jumps
         n_steps = max(10, round(max(mm / _STEP_MM, deg / _STEP_DEG)))
-        told = f"track {self.recording.folder}; the paper's way: --method sdf --steps {n_steps}"
+        advice = f"track {self.recording.folder}; the paper's way: --method sdf --steps {n_steps}"
         if mm > _FOLLOWED_MM or deg > _FOLLOWED_DEG:
             apart = f"frames are up to {mm / 10:.0f} cm and {deg:.1f} deg apart"
-            told += f"; {apart}: if it gets lost, record slower or at a higher rate"
-        return told
+            advice += f"; {apart}: if it gets lost, record slower or at a higher rate"
+        return advice
 
     def __str__(self) -> str:
         cloud, recording, (own, *others) = self.cloud, self.recording, self.readings
@@ -142,8 +142,10 @@ def check_recording(recording: Recording, progress: bool = False) -> DataReport:
     if not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     pairs = _pairs(sequence.T_world_camera, _N_PAIRS)
-    found = _fitted_to(sequence, recording, pairs)
-    return DataReport(recording, frames, _cloud(found[0], sequence), found, best_reading(found))
+    results = _fitted_to(sequence, recording, pairs)
+    return DataReport(
+        recording, frames, _cloud(results[0], sequence), results, best_reading(results)
+    )
 
 
 def quick_warning(recording: Recording) -> str:
@@ -159,11 +161,11 @@ def quick_warning(recording: Recording) -> str:
     sequence = read_frames(_as_in_files(recording), ids[kept])
     if not sequence.depths_mm.any():
         return ""  # whoever needs depth says so
-    found = _fitted_to(sequence, recording, places.reshape(pairs.shape))
-    best, depth = best_reading(found), _cloud(found[0], sequence).depth.median()
-    if best is found[0] and not _DEPTH[0] <= depth <= _DEPTH[1]:
+    results = _fitted_to(sequence, recording, places.reshape(pairs.shape))
+    best, depth = best_reading(results), _cloud(results[0], sequence).depth.median()
+    if best is results[0] and not _DEPTH[0] <= depth <= _DEPTH[1]:
         return f"the median depth is {depth:.3g} m: set depth_scale or no_depth in sequence.toml"
-    return diagnosis(found, best, recording, needs_proof=False)
+    return diagnosis(results, best, recording, needs_proof=False)
 
 
 def _as_in_files(recording: Recording) -> Recording:
@@ -191,11 +193,11 @@ def _fitted_to(
 ) -> list[Reading]:
     """All readings, the declared one first, and how well pairs of the frames agree under each."""
     poses = recording.file_poses[sequence.frame_ids[pairs.ravel()]]
-    found = readings(recording.declared, sequence.intrinsics)
+    candidates = readings(recording.declared, sequence.intrinsics)
     some = np.unique(pairs)
-    found = preferring_edges(found, sequence.colors[some], sequence.depths_mm[some])
+    candidates = preferring_edges(candidates, sequence.colors[some], sequence.depths_mm[some])
     in_files = sequence.depths_mm[pairs], poses, recording.declared.quaternion
-    return [fitted(reading, *in_files) for reading in found]
+    return [fitted(reading, *in_files) for reading in candidates]
 
 
 def _by_frame(sequence: RgbdSequence) -> pd.DataFrame:

@@ -20,12 +20,12 @@ _TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark'
 def numbered_files(patterns: list[Path], suffixes: tuple[str, ...] = _IMAGES) -> list[Path]:
     """Files of the first pattern with a folder, `img2` before `img10`; or raises MissingError."""
     pattern = next((p for p in patterns if p.parent.is_dir()), patterns[0])
-    found = [path for path in pattern.parent.glob(pattern.name) if path.is_file()]
-    found = [path for path in found if not path.name.startswith(".")]  # of the system
-    files = [path for path in found if path.suffix.lower() in suffixes]
+    paths = [path for path in pattern.parent.glob(pattern.name) if path.is_file()]
+    paths = [path for path in paths if not path.name.startswith(".")]  # of the system
+    files = [path for path in paths if path.suffix.lower() in suffixes]
     if not files:
-        unread = ", ".join(sorted({path.suffix for path in found}))
-        advice = f"convert {unread}, which is not read" if found else "add some"
+        unread = ", ".join(sorted({path.suffix for path in paths}))
+        advice = f"convert {unread}, which is not read" if paths else "add some"
         places = " or ".join(map(str, patterns))
         raise MissingError(
             f"no file {places} ({', '.join(suffixes)}): {advice}, with the frame's number in the "

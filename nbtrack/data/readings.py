@@ -115,7 +115,9 @@ def readings(declared: Declaration, camera: Intrinsics) -> list[Reading]:
             table.append(("poses", name, keys | {"quaternion": order}))
     table += [("depth", f"{n:g} depth values a metre", {"depth_scale": n}) for n in _SCALES]
     table += [("depth", name, {"depth_along": along}) for along, name in _ALONG.items()]
-    found = [Reading(what, name, replace(declared, **keys), camera) for what, name, keys in table]
+    candidates = [
+        Reading(what, name, replace(declared, **keys), camera) for what, name, keys in table
+    ]
     others = [Reading("depth", n, declared, camera, flipped=axes) for axes, n in _FLIPPED.items()]
     for unit, metres in (("millimetres", 1e-3), ("centimetres", 1e-2)):
         others.append(Reading("poses", f"ones in {unit}", declared, camera, metres=metres))
@@ -126,9 +128,11 @@ def readings(declared: Declaration, camera: Intrinsics) -> list[Reading]:
         # The principal point scales with the rest, or is in the middle of any image.
         scaled = Intrinsics(camera.width, camera.height, *(factor * lengths).tolist())
         middle = replace(scaled, cx=camera.width / 2, cy=camera.height / 2)
-        found += [Reading("calibration", f"one {name}", declared, c) for c in (scaled, middle)]
-    found = found[:1] + [r for r in found if (r.declared, r.camera) != (declared, camera)]
-    return found + others
+        candidates += [Reading("calibration", f"one {name}", declared, c) for c in (scaled, middle)]
+    candidates = candidates[:1] + [
+        r for r in candidates if (r.declared, r.camera) != (declared, camera)
+    ]
+    return candidates + others
 
 
 def fitted(
@@ -165,7 +169,7 @@ def fitted(
 
 
 def preferring_edges(
-    found: list[Reading],
+    results: list[Reading],
     colors: UInt8[np.ndarray, "frames h w 3"],
     values: UInt16[np.ndarray, "frames h w"],
 ) -> list[Reading]:
@@ -175,7 +179,7 @@ def preferring_edges(
     not where the edges of the colour images are.
     """
     if not len(colors):
-        return found
+        return results
     luma = colors.mean(axis=-1)
     # A middle pixel's differences from its neighbours on both sides, so that flips stay in place.
     strength = [
@@ -191,19 +195,19 @@ def preferring_edges(
         }
     best = max(alike, key=alike.__getitem__)
     if best and alike[best] > alike[()] + _EDGES_ALIKE:
-        return [found[0], *sorted(found[1:], key=lambda reading: reading.flipped != best)]
-    return found
+        return [results[0], *sorted(results[1:], key=lambda reading: reading.flipped != best)]
+    return results
 
 
-def best_reading(found: list[Reading]) -> Reading:
+def best_reading(results: list[Reading]) -> Reading:
     """The declared one (the first), unless another fits clearly better.
 
     Clearly: surfaces meet at half the distance or less, with no less than half the overlap, since
     cameras turned away from each other may agree on the few points that are left.
     """
-    own, half = found[0], max(reading.overlap / 2 for reading in found)
+    own, half = results[0], max(reading.overlap / 2 for reading in results)
     enough = max(_MIN_OVERLAP, half)
-    meeting = [r for r in found if r.overlap >= enough and r.median_m < _FAR_APART]
+    meeting = [r for r in results if r.overlap >= enough and r.median_m < _FAR_APART]
     minimum = min((reading.relative for reading in meeting), default=math.inf)
     if own.overlap >= half and not _is_clearly_less(minimum, own.relative):
         return own
@@ -216,23 +220,23 @@ def _is_clearly_less(relative: float, other: float) -> bool:
 
 
 def diagnosis(
-    found: list[Reading], best: Reading, recording: Recording, needs_proof: bool = True
+    results: list[Reading], best: Reading, recording: Recording, needs_proof: bool = True
 ) -> str:
     """What is wrong with how the numbers are read, in a sentence; empty where nothing is.
 
     Where proof is needed, it is wrong too that the camera moves too little to tell readings apart.
     """
-    own, file = found[0], os.path.relpath(recording.pose_file, recording.folder)
+    own, file = results[0], os.path.relpath(recording.pose_file, recording.folder)
     apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
     if best is not own:
         look = "look" if best.subject == "poses" else "looks"
-        told = (
+        note = (
             f"your {best.subject} {look} like {best.name}; {_remedy(best, own)} (surfaces that two "
             f"frames see then lie {1e3 * best.median_m:.0f} mm apart; as declared they {apart})"
         )
         # Mirrored or turned axes and flipped images may fit alike, and colours not tell.
-        alike = [r for r in found if r.flipped and r.relative < best.relative / _CLEARLY_BETTER]
-        return told if best.flipped or not alike else f"{told}; so would depth {alike[0].name}"
+        alike = [r for r in results if r.flipped and r.relative < best.relative / _CLEARLY_BETTER]
+        return note if best.flipped or not alike else f"{note}; so would depth {alike[0].name}"
     if recording.has_pose.sum() < 2:
         return f"{file} is not proved: that takes two frames with a pose"
     # Of few points, such as key frames share, not even a right reading's lie close.
@@ -250,7 +254,7 @@ def diagnosis(
         )
     if not needs_proof:
         return ""
-    poses = [r for r in found[1:] if r.subject == "poses" and r.overlap >= own.overlap / 2]
+    poses = [r for r in results[1:] if r.subject == "poses" and r.overlap >= own.overlap / 2]
     alike = [r.name for r in poses if not _is_clearly_less(own.relative, r.relative)]
     little = f"{file} is not proved: the camera moves too little to tell {len(alike)} other "
     return f"{little}readings apart, such as {alike[0]}" if alike else ""

@@ -175,8 +175,8 @@ def _poses(
     names = (pose_file,) if pose_file else layout.poses
     files = [folder / name for name in names if (folder / name).is_file()]
     if len(files) > 1:
-        found = " and ".join(file.name for file in files)
-        raise DataError(f"{folder} has {found}: keep one, or choose by `data convert --poses FILE`")
+        both = " and ".join(file.name for file in files)
+        raise DataError(f"{folder} has {both}: keep one, or choose by `data convert --poses FILE`")
     patterns = [folder / (f"{n}/*.txt" if (folder / n).is_dir() else n) for n in names]
     patterns = [p for p in patterns if "*" in p.name and p.parent.is_dir()]
     if patterns and not files:
@@ -187,9 +187,9 @@ def _poses(
             return np.full((len(colors), 4, 4), np.nan), None, [], "no poses"
         path = _first_there(folder, names, "poses", layout)
         files = [path]
-    found = [read_poses(file, declared.quaternion) for file in files]
-    poses, chosen = np.concatenate([T for T, _ in found]), ""
-    if (pose_times := found[0][1]) is not None:
+    tables = [read_poses(file, declared.quaternion) for file in files]
+    poses, chosen = np.concatenate([T for T, _ in tables]), ""
+    if (pose_times := tables[0][1]) is not None:
         poses = _placed(poses, pose_times, times, path, layout.color[0].endswith(".txt"))
     numbers = numbers_of(colors)
     if len(poses) > len(colors) and 0 <= numbers.min() <= numbers.max() < len(poses):

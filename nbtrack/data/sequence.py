@@ -68,10 +68,10 @@ class RgbdSequence:
     @cached_property
     def digest(self) -> str:
         """Sixteen hexadecimal digits: they change with any pixel, pose, frame number and camera."""
-        found = hashlib.blake2b(repr(self.intrinsics).encode(), digest_size=8)
+        digest = hashlib.blake2b(repr(self.intrinsics).encode(), digest_size=8)
         for array in (self.frame_ids, self.T_world_camera, self.colors, self.depths_mm):
-            found.update(np.ascontiguousarray(array).data)
-        return found.hexdigest()
+            digest.update(np.ascontiguousarray(array).data)
+        return digest.hexdigest()
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
         """The sequence of some of the frames, in the order given; slices copy nothing."""

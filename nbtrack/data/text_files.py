@@ -64,8 +64,8 @@ def read_rows(
         except ValueError:
             row = ()
         if len(row) not in (columns if not rows else (len(rows[0]),)):
-            found = f"{path} line {number} is {line[:60]!r}"
-            raise DataError(f"{found}: every line holds {meaning}; correct it")
+            line_shown = f"{path} line {number} is {line[:60]!r}"
+            raise DataError(f"{line_shown}: every line holds {meaning}; correct it")
         rows.append(row)
     if not rows:
         raise DataError(f"{path} is empty: every line holds {meaning}; write it anew")
@@ -127,9 +127,9 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
     is_wrong |= (np.abs(bottom) > _RIGID).any(axis=1) | far.any(axis=1)
     for i in np.flatnonzero(is_wrong):
         frame = f" frame {i}" if len(poses) > 1 else ""
-        found = " ".join(f"{number:.4g}" for number in poses[i].flat)
+        numbers = " ".join(f"{number:.4g}" for number in poses[i].flat)
         raise DataError(
-            f"{path}{frame} is no rigid transform in metres ({found}): "
+            f"{path}{frame} is no rigid transform in metres ({numbers}): "
             f"rows must be [R | t], right-handed rotation R and t up to {_FARTHEST:g}, and 0 0 0 1"
         )
     return np.where(is_known, poses, np.nan)
@@ -209,13 +209,13 @@ def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
 
     def numbers(key: str, *counts: int) -> list[float]:
         """A single one needs no list."""
-        found = camera.get(key)
-        values = found if isinstance(found, list) else [found]
+        entry = camera.get(key)
+        values = entry if isinstance(entry, list) else [entry]
         # NaN is not below anything, and True is no number here.
         are_numbers = all(type(v) in (int, float) and abs(v) < _LARGEST for v in values)
         if not (are_numbers and len(values) in counts):
             allowed = " or ".join(map(str, counts))
-            text = f"{path}: {key} is {str(found)[:40]!r}: write {allowed} finite number(s)"
+            text = f"{path}: {key} is {str(entry)[:40]!r}: write {allowed} finite number(s)"
             raise DataError(f"{text}, as in {_CAMERA}")
         return [float(value) for value in values]
 

@@ -83,8 +83,8 @@ def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
     T_file = FORMATS["neural_rgbd"].declared.poses_to_opencv(T_world_camera)
     poses = _text(T_file.reshape(-1, 4))
     texts = {"poses.txt": poses, "trainval_poses.txt": poses}
-    told = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
-    if np.allclose(astuple(camera), astuple(told), rtol=0, atol=_SAME_CAMERA):
+    stored = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
+    if np.allclose(astuple(camera), astuple(stored), rtol=0, atol=_SAME_CAMERA):
         return texts | {"focal.txt": f"{float(camera.fx)!r}\n"}
     # Programs that know only `focal.txt` then stop, instead of reading another camera.
     K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)

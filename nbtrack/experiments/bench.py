@@ -109,7 +109,8 @@ def notebooks_command(options: Namespace) -> None:
     notebooks or Jupyter, NbtrackError if a cell failed; the copy up to there is kept.
     """
     preset = preset_of(options).name  # a wrong setting is refused before the first kernel starts
-    if any(importlib.util.find_spec(name) is None for name in ("nbconvert", "ipykernel")):
+    wanted = ("nbconvert", "ipykernel", "latex2mathml")
+    if any(importlib.util.find_spec(name) is None for name in wanted):
         raise MissingError("notebooks need Jupyter: pip install 'nbtrack[notebooks]'")
     paths = sorted((project_folder() / "notebooks").glob("[0-9A]*_*.ipynb"))
     if not paths:
@@ -188,9 +189,9 @@ def _note(preset: Preset, clock: bool) -> str:
     """How the numbers came about, in a sentence. Which scenes there are the columns tell."""
     changed = changed_settings(preset, PRESETS[preset.name])
     changed = [setting for setting in changed if not setting.startswith("scenes.names")]
-    told = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name
+    label = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name
     budget = "wall clock" if clock else "the paper's step counts"
-    return f"Preset: {told}; budget: {budget}; device: {device_name(choose_device())}."
+    return f"Preset: {label}; budget: {budget}; device: {device_name(choose_device())}."
 
 
 def _words(text: str | None) -> list[str]:
@@ -201,8 +202,9 @@ def _words(text: str | None) -> list[str]:
 def _run_notebook(path: Path, folder: Path) -> None:
     """Run one notebook in a fresh kernel; its copies go to the folder."""
     import nbformat
-    from nbconvert import HTMLExporter
     from nbconvert.preprocessors import CellExecutionError, ExecutePreprocessor
+
+    from nbtrack.experiments.pages import write_page
 
     notebook, page, start = nbformat.read(path, 4), folder / f"{path.stem}.html", time.monotonic()
     how = {"record_timing": False, "extra_arguments": ["--log-level=ERROR"]}  # no talk of ports
@@ -216,5 +218,5 @@ def _run_notebook(path: Path, folder: Path) -> None:
         ) from None
     finally:
         write_atomic(folder / path.name, nbformat.writes(notebook) + "\n")
-    write_atomic(page, HTMLExporter().from_notebook_node(notebook)[0])
+    write_page(notebook, path, page)
     print(f"{page}: {time.monotonic() - start:.0f} s")

@@ -134,8 +134,8 @@ class MapCell(Cell):
 
     def map(self) -> Map:
         """The finished map, ready for tracking."""
-        found = _read(self.folder, self.key)
-        return replace(found, field=found.field.to(choose_device()))
+        finished = _read(self.folder, self.key)
+        return replace(finished, field=finished.field.to(choose_device()))
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Map and score, or resume; write the map's files."""
@@ -157,15 +157,17 @@ class MapCell(Cell):
             recipe = recipe_of(self.field, sequence, network, self.settings, self.seed)
             check_recipe(self.folder / MAP_FILE, read_map(self.folder).made, recipe)
         if base:
-            made = correct_map(base.map(), sequence, self.settings)
+            finished_map = correct_map(base.map(), sequence, self.settings)
         else:
-            made = map_sequence(
+            finished_map = map_sequence(
                 self.field, sequence, network, self.settings, self.seed, choose_device(),
                 checkpoint, tell,
             )  # fmt: skip
-        quality = score_map(made, sequence, self.scene.room)
-        told = {"quality": quality, "frames": self.frames, "key": self.key}
-        finished = replace(made, made={**made.made, **told, "config": as_dict(self.preset)})
+        quality = score_map(finished_map, sequence, self.scene.room)
+        record = {"quality": quality, "frames": self.frames, "key": self.key}
+        finished = replace(
+            finished_map, made={**finished_map.made, **record, "config": as_dict(self.preset)}
+        )
         write_map(self.folder / MAP_FILE, finished)
         checkpoint.unlink(missing_ok=True)
         return finished.made

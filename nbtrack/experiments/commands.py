@@ -77,19 +77,19 @@ def map_command(options: Namespace) -> None:
 def _make_map(cell: MapCell, frames: str) -> None:
     """Map and say how good the map is; draw the mesh of what was seen."""
     _map(cell)
-    found, scene = cell.map(), cell.scene
-    print(f"{cell.folder}: {found.field.label} map of {scene.name}")
-    print(f"  mapped in {found.made['seconds']:.0f} s on {found.made['device']}")
-    _print_numbers({k: v for k, v in found.made["quality"].items() if v is not None})
+    finished, scene = cell.map(), cell.scene
+    print(f"{cell.folder}: {finished.field.label} map of {scene.name}")
+    print(f"  mapped in {finished.made['seconds']:.0f} s on {finished.made['device']}")
+    _print_numbers({k: v for k, v in finished.made["quality"].items() if v is not None})
     try:
         # Every tenth frame says enough of what has been seen: neighbours see the same.
         sequence = scene.read(frames)
-        mesh = extract_mesh(found.field, sequence.select(slice(None, None, 10)))
+        mesh = extract_mesh(finished.field, sequence.select(slice(None, None, 10)))
     except DataError as error:
         print(f"  no mesh: {error}")
     else:
         write_atomic(cell.folder / MESH_FILE, mesh.export(file_type="ply"))
-        origin = found.made["origin"]
+        origin = finished.made["origin"]
         where = f", relative to {origin} m" if any(origin) else ""
         print(f"  mesh of what was seen: {cell.folder / MESH_FILE}{where}")
 
@@ -184,19 +184,21 @@ def export_command(options: Namespace) -> None:
         export = _export_trajectory
     elif name in ("gif", "mp4"):
         export = _export_movie
-    told = export(source, name, new_file(out))
-    print(f"{out}: {told}")
+    summary = export(source, name, new_file(out))
+    print(f"{out}: {summary}")
 
 
 def _export_map(source: Path, format_name: str, out: Path) -> str:
-    found, seen = read_map(source), source / MESH_FILE
+    finished, seen = read_map(source), source / MESH_FILE
     if format_name == "map":
         content = (source / MAP_FILE if source.is_dir() else source).read_bytes()
         write_atomic(out, content)
-        return f"{found.field.label} map of {found.made['scene']}, {len(content) / 1e6:.2f} MB"
-    is_seen = seen.is_file() and not isinstance(found.field, PointCloud)
+        return (
+            f"{finished.field.label} map of {finished.made['scene']}, {len(content) / 1e6:.2f} MB"
+        )
+    is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
     with naming_damaged(seen, "mesh", "remove it and map again"):
-        mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(found.field)
+        mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)
         content = mesh.export(file_type=format_name)
     write_atomic(out, content)
     return f"{len(mesh.vertices)} coloured vertices of {'what was seen' if is_seen else 'all'}"
@@ -209,7 +211,7 @@ def _export_movie(source: Path, format_name: str, out: Path) -> str:
     tracked, metrics = read_trajectory(source), read_json(source / METRICS_FILE)
     if "map" not in metrics:
         raise MissingError(f"{source} is of an earlier version: track again")
-    found, recording = read_map(Path(metrics["map"])), Path(metrics["recording"])
+    finished, recording = read_map(Path(metrics["map"])), Path(metrics["recording"])
     if not recording.is_dir():
         raise MissingError(f"the recording {recording} of this run is gone: track again")
     shown = np.linspace(0, len(tracked.frames) - 1, _MOVIE_FRAMES).round().astype(int)
@@ -219,8 +221,8 @@ def _export_movie(source: Path, format_name: str, out: Path) -> str:
     origin = np.array(metrics.get("origin", [0, 0, 0]))
     sequence = read_frames(opened, rows["frame_id"].to_numpy(), needs_poses=False, origin=origin)
     seen = replace(sequence, T_world_camera=T_estimated)
-    surface = extract_mesh(found.field, seen, voxel=_cell_of(found.field) / 2)
-    title = f"{metrics['scene']}: {metrics['tracker']} in {found.field.label}"
+    surface = extract_mesh(finished.field, seen, voxel=_cell_of(finished.field) / 2)
+    title = f"{metrics['scene']}: {metrics['tracker']} in {finished.field.label}"
     with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
         of_run = surface, sequence, rows, T_estimated, title
         content = movie_bytes(movie_pictures(*of_run, bar.move_to), format_name)
@@ -243,8 +245,8 @@ def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
 def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
     chosen = "motion", "n_frames", "width", "seed"
-    made = ScenesConfig(**{name: getattr(options, name) for name in chosen})
-    write_room(options.room, options.out, made)
+    config = ScenesConfig(**{name: getattr(options, name) for name in chosen})
+    write_room(options.room, options.out, config)
     size = f"{options.n_frames} frames of {options.width}x{options.width * 3 // 4}"
     print(f"{options.out}: {options.room}, {size}, seed {options.seed}")
 
@@ -315,15 +317,15 @@ def _method_in(given: Map | None, options: Namespace) -> Method:
 
 def _with_network_of(given: Map, preset: Preset, options: Namespace) -> Preset:
     """The preset with a map's own network. Raises ConfigError for --set of a map made otherwise."""
-    name, made = given.field.name, given.made
+    name, record = given.field.name, given.made
     asked = as_dict(preset.network_of(name)), as_dict(preset.mapping_of(name))
     of_maps = [text for text in options.settings if text.startswith(OF_MAPS)]
-    if of_maps and asked != (made["network"], made["settings"]):
+    if of_maps and asked != (record["network"], record["settings"]):
         raise ConfigError(
             f"{options.map_from} was made with other settings than --set {of_maps[0]}: leave out "
             f"what begins with {' or '.join(OF_MAPS)}, or map anew"
         )
-    network = NetworkSettings(**made["network"])
+    network = NetworkSettings(**record["network"])
     return replace(preset, network={**preset.network, name: network})
 
 

@@ -113,10 +113,10 @@ def find_methods(methods: Sequence[str | Method]) -> list[Method]:
 
     Raises ConfigError if a name is unknown, or its field and tracker do not go together.
     """
-    found = []
+    chosen = []
     for method in dict.fromkeys(methods):
         if isinstance(method, str) and method not in METHODS:
             raise ConfigError(f"unknown method {method!r}: {nearest_name(method, [*METHODS])}")
-        found.append(METHODS[method] if isinstance(method, str) else method)
-        check_pair(found[-1].tracker, found[-1].field)
-    return found
+        chosen.append(METHODS[method] if isinstance(method, str) else method)
+        check_pair(chosen[-1].tracker, chosen[-1].field)
+    return chosen

@@ -43,11 +43,11 @@ def map_scenes(
     """
     places = [*product(fields, range(seeds), scenes)]
     cells = [MapCell(scene, field, preset, seed=seed) for field, seed, scene in places]
-    made = run_cells(cells, "mapping", execution)
+    records = run_cells(cells, "mapping", execution)
     return pd.DataFrame(
         {"field": field, "scene": scene.name, "seed": seed}
-        | {"seconds": found["seconds"], **found["quality"]}
-        for (field, seed, scene), found in zip(places, made, strict=True)
+        | {"seconds": record["seconds"], **record["quality"]}
+        for (field, seed, scene), record in zip(places, records, strict=True)
     )
 
 
@@ -89,8 +89,8 @@ def track_scenes(
         cells.append(TrackCell(map_cell, seen, method.tracker, *budget, seed=seed, **options))
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
         rows.append({**row, "seed": seed, "run": cells[-1].folder.name})
-    found = _run(cells, clock, execution)
-    return pd.DataFrame(map(_told, rows, cells, found))
+    outcomes = _run(cells, clock, execution)
+    return pd.DataFrame(map(_told, rows, cells, outcomes))
 
 
 def _run(cells: Sequence[TrackCell], clock: bool, execution: Execution) -> list[Any]:

@@ -119,22 +119,24 @@ class TrackCell(Cell):
 
     def _tracked(self, report: Report) -> tuple[Trajectory, dict[str, Any]]:
         """The trajectory, and what is to be said of the run beside its errors."""
-        made = self.needs.map()
-        origin = np.array(made.made["origin"])
+        finished_map = self.needs.map()
+        origin = np.array(finished_map.made["origin"])
         sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
         budget = make_budget(self.steps, self.rate_hz)
-        notes = {"map_seconds": made.made["seconds"], "budget": str(budget)}
+        notes = {"map_seconds": finished_map.made["seconds"], "budget": str(budget)}
         if origin.any():
             notes["origin"] = origin.tolist()
         notes |= still_metrics(sequence.T_world_camera)
         if self.is_elsewhere:
-            notes["map_from"] = made.made
+            notes["map_from"] = finished_map.made
         T_first = sequence.T_world_camera[0]
         is_start_known = self.start == "given" and bool(np.isfinite(T_first).all())
         if self.needs.is_given and is_start_known:  # another path may begin where no map reaches
-            notes["map_warning"] = check_belongs(made, sequence[0])
+            notes["map_warning"] = check_belongs(finished_map, sequence[0])
         start, T_start = time.perf_counter(), T_first if is_start_known else np.eye(4)
-        tracker = make_tracker(self.tracker, made.field, T_start, budget, self.settings, self.seed)
+        tracker = make_tracker(
+            self.tracker, finished_map.field, T_start, budget, self.settings, self.seed
+        )
         if isinstance(tracker.field, BakedField):
             notes["bake_seconds"] = time.perf_counter() - start
             notes["grid_bytes"] = tracker.field.n_bytes
@@ -143,8 +145,8 @@ class TrackCell(Cell):
             status = f"frame {done}" if isnan(error_m) else f"off by {100 * error_m:.1f} cm"
             report(done / len(sequence), status)
 
-        found = track_sequence(tracker, sequence, self._checkpoint, tell, is_start_known)
-        return found, notes | {"start": "given" if is_start_known else "unknown"}
+        trajectory = track_sequence(tracker, sequence, self._checkpoint, tell, is_start_known)
+        return trajectory, notes | {"start": "given" if is_start_known else "unknown"}
 
     def _metrics(self, tracked: Trajectory) -> dict[str, Any]:
         metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
@@ -185,10 +187,10 @@ class TrackCell(Cell):
         """What makes this run anew, and its map where that is not cached."""
         cell, preset = self.needs, self.needs.preset
         is_room = self.scene.made_by and not self.is_elsewhere
-        made = {"field": cell.field, "map-frames": cell.frames}
+        of_map = {"field": cell.field, "map-frames": cell.frames}
         options = {
             "format": self.scene.format,
-            **({"map-from": cell.folder} if self.is_elsewhere else made),
+            **({"map-from": cell.folder} if self.is_elsewhere else of_map),
             "tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps, "start": self.start,
             "frames": self.frames, "seed": self.seed, "device": choose_device().type,
             "threads": self.n_threads, "preset": preset.name,

@@ -184,13 +184,13 @@ def _solve(
     W holds the reliability, times huber / |residual| where the largest residual of an equation's
     columns is above that; it is judged anew in every round.
     """
-    found = np.zeros((design.shape[1], wanted.shape[1]))
+    solution = np.zeros((design.shape[1], wanted.shape[1]))
     for _ in range(rounds):
-        residual = np.abs(wanted - design @ found).max(axis=1)
+        residual = np.abs(wanted - design @ solution).max(axis=1)
         weighted = (design * (reliability * huber / residual.clip(huber))[:, None]).tocsr()
         matrix, vectors = design.T @ weighted + stiffness, weighted.T @ wanted
         scaling = sparse.dia_array((1 / matrix.diagonal()[None], 0), shape=matrix.shape)
         for column, vector in enumerate(vectors.T):
-            start = found[:, column].copy()
-            found[:, column], _ = cg(matrix, vector, start, rtol=1e-3, M=scaling)
-    return found, matrix.diagonal()
+            start = solution[:, column].copy()
+            solution[:, column], _ = cg(matrix, vector, start, rtol=1e-3, M=scaling)
+    return solution, matrix.diagonal()

@@ -61,8 +61,8 @@ class BakedField(Field):
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour in [0, 1] and value (m for a signed distance) at points (m); differentiable."""
-        found = self._at(points_world)
-        return found[:3].T, found[3]
+        values = self._at(points_world)
+        return values[:3].T, values[3]
 
     def confidence(self, points_world: Points) -> Values:
         """How well the surface is known at points (m), in [0, 1]."""
@@ -76,9 +76,9 @@ class BakedField(Field):
         normalized = (2 * (points_world - self.low) / last - 1).flip(-1)
         normalized, volume = normalized[None, None, None], self.volume.view(1, 5, *self.n_vertices)
         how = {"padding_mode": "border", "align_corners": True}
-        found = nn.functional.grid_sample(volume, normalized, **how)[0, :, 0, 0]
+        values = nn.functional.grid_sample(volume, normalized, **how)[0, :, 0, 0]
         # A point that is not a number is taken for one at the border.
-        return torch.where(points_world.isnan().any(dim=-1), torch.nan, found)
+        return torch.where(points_world.isnan().any(dim=-1), torch.nan, values)
 
 
 def _checked_size(field: Field, voxel: float | int) -> tuple[int, int, int]:

@@ -98,21 +98,21 @@ def _read_file(file: Path) -> Map:
         raise ValueError("its content is not what was written")
     if not all(tensor.isfinite().all() for tensor in tensors.values()):
         raise ValueError("its numbers are not finite")
-    name, made = header["field"], header["made"]
+    name, record = header["field"], header["made"]
     bounds = SceneBounds(*(tuple(map(float, corner)) for corner in header["bounds"]))
     if name not in FIELDS:
         raise ValueError(f"this nbtrack has no field {name!r}")
     if FIELDS[name] is PointCloud:
-        mapped = PointCloud(**tensors, voxel=float(made["settings"]["voxel"]), bounds=bounds)
+        mapped = PointCloud(**tensors, voxel=float(record["settings"]["voxel"]), bounds=bounds)
     else:
-        mapped = make_field(name, NetworkSettings(**made["network"]), bounds, seed=0)
+        mapped = make_field(name, NetworkSettings(**record["network"]), bounds, seed=0)
         own = {key.removeprefix("source."): tensors[key] for key in names if key not in CORRECTIONS}
         mapped.load_state_dict(own)
         mapped.eval().requires_grad_(False)
         if correction := [tensors[key] for key in CORRECTIONS if key in tensors]:
-            voxel = float(made["settings"]["correct_voxel"])
+            voxel = float(record["settings"]["correct_voxel"])
             mapped = CorrectedField(mapped, voxel, *correction)
-    return Map(mapped, Intrinsics(**header["camera"]), made)
+    return Map(mapped, Intrinsics(**header["camera"]), record)
 
 
 def _tensors(mapped: AnyField) -> dict[str, Tensor]:
@@ -123,7 +123,7 @@ def _tensors(mapped: AnyField) -> dict[str, Tensor]:
 
 def _digest(plain: Any, tensors: dict[str, Tensor]) -> str:
     """SHA-256 over plain values and tensors, whatever the order of names."""
-    found = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
     for name, tensor in sorted(tensors.items()):
-        found.update(f"{name} {tuple(tensor.shape)}".encode() + tensor.numpy().tobytes())
-    return found.hexdigest()
+        digest.update(f"{name} {tuple(tensor.shape)}".encode() + tensor.numpy().tobytes())
+    return digest.hexdigest()

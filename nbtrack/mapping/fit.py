@@ -69,9 +69,9 @@ def map_sequence(
             fit = _Fit(recipe, settings, field, sequence, mapped)
             fit.run(checkpoint, on_iteration)
         history, seconds = fit.history, fit.seconds
-    made = {**recipe, "seconds": seconds, "misfit_m": usual_misfit(field, sequence, mapped)}
-    made |= {"mapped_frames": len(mapped), "device": device_name(device), "versions": versions()}
-    return Map(field, sequence.intrinsics, made, pd.DataFrame(history).rename_axis("iteration"))
+    record = {**recipe, "seconds": seconds, "misfit_m": usual_misfit(field, sequence, mapped)}
+    record |= {"mapped_frames": len(mapped), "device": device_name(device), "versions": versions()}
+    return Map(field, sequence.intrinsics, record, pd.DataFrame(history).rename_axis("iteration"))
 
 
 def recipe_of(
@@ -96,9 +96,9 @@ def recipe_of(
     }
 
 
-def check_recipe(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
+def check_recipe(path: Path, recipe: dict[str, Any], wanted: dict[str, Any]) -> None:
     """Raises DataError if a map or checkpoint at a path was made of something else."""
-    changed = [name.replace("_", " ") for name in wanted if found.get(name) != wanted[name]]
+    changed = [name.replace("_", " ") for name in wanted if recipe.get(name) != wanted[name]]
     if changed:
         raise DataError(
             f"{path} was made with another {', '.join(changed)}: remove it, or choose another --out"
@@ -146,13 +146,13 @@ class _Fit:
             pending.append(losses.detach())
         diagnostics = self.field.diagnostics()
         for iteration, row in zip(iterations, torch.stack(pending).tolist(), strict=True):
-            found = dict(zip(terms, row, strict=True))
+            values = dict(zip(terms, row, strict=True))
             if not all(map(math.isfinite, row)):
                 raise NumericalError(
-                    f"losses {found} at mapping iteration {iteration}: lower the learning rate "
+                    f"losses {values} at mapping iteration {iteration}: lower the learning rate "
                     f"({self.settings.learning_rate:g}) or check the depth and poses"
                 )
-            self.history.append({**found, "total": sum(row), **diagnostics})
+            self.history.append({**values, "total": sum(row), **diagnostics})
         self.seconds += time.perf_counter() - start
 
     def _save(self, checkpoint: Path) -> None:

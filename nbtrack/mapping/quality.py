@@ -163,13 +163,13 @@ def check_belongs(finished: Map, frame: Frame) -> str | None:
     Raises DataError if it is more.
     """
     name, usual = f"the map of {finished.made['scene']}", finished.made["misfit_m"]
-    found = map_misfit(finished.field, frame)
-    if np.isnan(found):
+    misfit_m = map_misfit(finished.field, frame)
+    if np.isnan(misfit_m):
         return f"{frame.name} has no depth: whether {name} belongs to it cannot be told"
     allowed = max(MISFIT_ALLOWED, MISFIT_FACTOR * usual)
-    if found > allowed:
+    if misfit_m > allowed:
         raise DataError(
-            f"at its given pose {frame.name} is off {name} by {found:.3f} m (usual in this map "
+            f"at its given pose {frame.name} is off {name} by {misfit_m:.3f} m (usual in this map "
             f"{usual:.3f} m, allowed {allowed:.3f} m): give the room's own map, poses in the map's "
             "world frame, or begin where it was mapped"
         )

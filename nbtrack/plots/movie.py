@@ -43,28 +43,15 @@ def movie_pictures(
     estimated path so far from above. `run` has the rows of frames.csv of the sequence's frames,
     `T_estimated` their camera-to-world poses (m).
     """
-    left, middle, right = new_axes(title, 2.8, 1, 3, width_ratios=[1, 1, 0.9])[0]
-    page = draw_cloud(right, cloud_of(surface), {"tracked": T_estimated})
-    for line in right.lines:
-        line.remove()
-    look = {"color": method_colors(["tracked"])["tracked"], "zorder": 3}
-    (path,), (here,) = right.plot([], [], **look), right.plot([], [], "o", **look)
-    camera = _scaled(sequence.intrinsics, _WIDTH)
-    views = [left.imshow(sequence.color(0)), middle.imshow(np.zeros((camera.height, _WIDTH, 3)))]
-    for axes, label in ((left, "observed"), (middle, "the map from the estimated pose")):
-        axes.set_title(label)
-        axes.axis("off")
-    canvas, pictures = FigureCanvasAgg(left.figure), []
-    left.figure.set_dpi(_DPI)
-    words = right.text(0, 1.03, "", transform=right.transAxes)
-    moving = [*views, path, here, words]
-    for artist in moving:
-        artist.set_animated(True)
+    moving, page = _panels(surface, sequence, T_estimated, title)
+    observed, view, path, here, words = moving
+    figure, camera = words.figure, _scaled(sequence.intrinsics, _WIDTH)
+    canvas, pictures = FigureCanvasAgg(figure), []
     canvas.draw()
-    background = canvas.copy_from_bbox(left.figure.bbox)  # all that stays is drawn once
+    background = canvas.copy_from_bbox(figure.bbox)  # all that stays is drawn once
     for index, error_m in enumerate(run["translation_error_m"]):
-        views[0].set_data(sequence.color(index))
-        views[1].set_data(view_of(surface, camera, T_estimated[index]))
+        observed.set_data(sequence.color(index))
+        view.set_data(view_of(surface, camera, T_estimated[index]))
         places = T_estimated[: index + 1, :3, 3][:, page].T
         path.set_data(*places)
         here.set_data(*places[:, -1:])
@@ -72,10 +59,30 @@ def movie_pictures(
         words.set_text(f"frame {run['frame_id'].iloc[index]}{error}")
         canvas.restore_region(background)
         for artist in moving:
-            left.figure.draw_artist(artist)
+            figure.draw_artist(artist)
         pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
         progress(index + 1)
     return pictures
+
+
+def _panels(surface: Surface, sequence: RgbdSequence, T_estimated: Poses, title: str) -> tuple:
+    """What changes from frame to frame, in panels where all else is drawn; and the page's axes."""
+    left, middle, right = new_axes(title, 2.8, 1, 3, width_ratios=[1, 1, 0.9])[0]
+    left.figure.set_dpi(_DPI)
+    page = draw_cloud(right, cloud_of(surface), {"tracked": T_estimated})
+    for line in right.lines:
+        line.remove()
+    look = {"color": method_colors(["tracked"])["tracked"], "zorder": 3}
+    (path,), (here,) = right.plot([], [], **look), right.plot([], [], "o", **look)
+    words = right.text(0, 1.03, "", transform=right.transAxes)
+    shape = _scaled(sequence.intrinsics, _WIDTH).height, _WIDTH, 3
+    moving = [left.imshow(sequence.color(0)), middle.imshow(np.zeros(shape)), path, here, words]
+    for axes, label in ((left, "observed"), (middle, "the map from the estimated pose")):
+        axes.set_title(label)
+        axes.axis("off")
+    for artist in moving:
+        artist.set_animated(True)
+    return moving, page
 
 
 def view_of(surface: Surface, camera: Intrinsics, T_world_camera: Pose) -> np.ndarray:

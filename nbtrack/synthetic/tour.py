@@ -75,8 +75,8 @@ def _closed_walk(room: Room, rng: np.random.Generator) -> Points:
     passed = [tuple(cells[rng.integers(len(cells))])]
     # Begin as far from a random place as one can walk, then go where one has not been.
     passed = [_farthest(free, passed)[0]]
-    while (found := _farthest(free, passed))[1] > _COVERED:
-        passed.append(found[0])
+    while (farthest := _farthest(free, passed))[1] > _COVERED:
+        passed.append(farthest[0])
     ordered = [passed.pop(0)]
     while passed:
         nearest = min(passed, key=_walked(free, ordered[-1:]).__getitem__)

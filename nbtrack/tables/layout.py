@@ -145,5 +145,5 @@ def _check(cells: pd.DataFrame, value: str, keys: list[str]) -> None:
         )
     twice = cells[cells.duplicated(keys)]
     if len(twice):
-        found = ", ".join(str(key) for key in twice[keys].iloc[0])
-        raise DataError(f"two rows for ({found}); allowed: one per cell; remove one of them")
+        cell = ", ".join(str(key) for key in twice[keys].iloc[0])
+        raise DataError(f"two rows for ({cell}); allowed: one per cell; remove one of them")

@@ -165,7 +165,7 @@ class LmTracker(Tracker):
         intensities, which did not hold it there, are off by several times what is usual in the
         latest frame beyond doubt, or, before there was one, in the map's own frames.
         """
-        found = descent.certainty()
+        certainty = descent.certainty()
         changes = np.linalg.inv(self.expected) @ descent.T_world_camera - np.eye(4)
         is_near = np.abs(changes).max(axis=(1, 2)).min() < _FOLLOWED
         is_followed = self.was_followed and self.starts is None and is_near
@@ -173,11 +173,13 @@ class LmTracker(Tracker):
         is_settled = descent.is_finished or (is_followed and descent.last_step < _SETTLED)
         usual_mad = self.field.intensity_mad if self.usual_mad is None else self.usual_mad
         usual_mad = max(usual_mad, _ROUNDING)
-        is_odd = found["intensity_mad"] > _MAX_MAD_RATIO * usual_mad
+        is_odd = certainty["intensity_mad"] > _MAX_MAD_RATIO * usual_mad
         has_contrast = self.points[1][1].std() > usual_mad  # else it is dark, or overexposed
-        is_odd &= found["inlier_ratio"] < _DOUBTED and has_contrast
-        is_sure = found["inlier_ratio"] >= enough and found["position_deviation_m"] <= _MAX_STD
-        return {**found, "lost": bool(is_odd or not (is_sure and is_settled))}
+        is_odd &= certainty["inlier_ratio"] < _DOUBTED and has_contrast
+        is_sure = (
+            certainty["inlier_ratio"] >= enough and certainty["position_deviation_m"] <= _MAX_STD
+        )
+        return {**certainty, "lost": bool(is_odd or not (is_sure and is_settled))}
 
     def _descent_from(self, T_start: Pose) -> Descent:
         return Descent(self.grid, *self.points, self.settings.lambda_intensity, T_start)

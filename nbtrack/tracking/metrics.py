@@ -32,8 +32,8 @@ def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | i
         return counts
     T_estimated, T_true = T_estimated[is_known], T_true[is_known]
     errors, angles = pose_errors(T_estimated, T_true)
-    found, true = (np.asarray(poses, np.float64)[:, :3, 3] for poses in (T_estimated, T_true))
-    aligned_errors = np.linalg.norm(align_rigidly(found, true) - true, axis=1)
+    estimated, true = (np.asarray(poses, np.float64)[:, :3, 3] for poses in (T_estimated, T_true))
+    aligned_errors = np.linalg.norm(align_rigidly(estimated, true) - true, axis=1)
     return {
         "ate_rmse_m": _root_mean_square(errors),  # unaligned: the paper's equation
         "ate_rmse_aligned_m": _root_mean_square(aligned_errors),  # after the best rigid motion

@@ -50,11 +50,11 @@ def _pinhole(frame: Frame) -> tuple[float, float, float, float]:
 @no_type_check
 @njit(**JIT)
 def _drawn_points(depth_mm, color, pinhole, n_points, starts):
-    (height, width), (fx, fy, cx, cy), found = depth_mm.shape, pinhole, 0
+    (height, width), (fx, fy, cx, cy), n_drawn = depth_mm.shape, pinhole, 0
     points, luma = np.empty((n_points, 3)), np.empty(n_points)
     n_looked_at = _DRAWN_PER_POINT * n_points if min(height, width) > 2 else 0
     for order in range(n_looked_at):
-        if found == n_points:
+        if n_drawn == n_points:
             break
         v = 1 + (starts[0] + _EVEN_STEPS[0] * order) % _MODULUS * (height - 2) // _MODULUS
         u = 1 + (starts[1] + _EVEN_STEPS[1] * order) % _MODULUS * (width - 2) // _MODULUS
@@ -63,13 +63,13 @@ def _drawn_points(depth_mm, color, pinhole, n_points, starts):
         is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
         is_smooth &= abs(depth_mm[v, u + 1] - z) < jump and abs(depth_mm[v, u - 1] - z) < jump
         if is_smooth:  # never without a depth: nothing is below a jump of zero
-            point, metres = points[found], z * MILLIMETRE
+            point, metres = points[n_drawn], z * MILLIMETRE
             point[0], point[1] = (u + 0.5 - cx) / fx * metres, (v + 0.5 - cy) / fy * metres
             point[2] = metres
             red, green, blue = color[v, u, 0], color[v, u, 1], color[v, u, 2]
-            luma[found] = (_RED * red + _GREEN * green + _BLUE * blue) / 255
-            found += 1
-    return points[:found], luma[:found]
+            luma[n_drawn] = (_RED * red + _GREEN * green + _BLUE * blue) / 255
+            n_drawn += 1
+    return points[:n_drawn], luma[:n_drawn]
 
 
 @no_type_check
