@@ -9,7 +9,6 @@ Maps and runs are kept (`NBTRACK_RUNS`), so that a killed benchmark goes on. Tim
 nothing else.
 """
 
-from collections.abc import Iterator
 from itertools import product
 
 import pandas as pd
@@ -34,21 +33,16 @@ KEPT = ["still_ate_m", "path_m", "max_error_m", "map_seconds"]
 
 
 def main() -> None:
-    """A row a run; the file grows room by room."""
+    """A row a run; the file grows run by run."""
     torch.set_num_threads(1)
     rooms, rows = open_scenes(PRESET), []
     paper = [METHODS[name] for name in TABLE_1]
-    for room in rooms:
-        rows += [run(room, method, frames) for method, frames in on(METHODS_OF_WALKS)]
+    for method, room, frames in product(METHODS_OF_WALKS, rooms, (":", "::4")):
+        rows.append(run(room, method, frames))
         write(rows)
     for room, method in product(rooms[:2], paper):
         rows.append(run(room, method, ":", method.paper_steps(RATE_HZ)))
         write(rows)
-
-
-def on(methods: list[Method]) -> Iterator[tuple[Method, str]]:
-    """Every method with every and with every fourth frame."""
-    return product(methods, (":", "::4"))
 
 
 def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
