@@ -5,7 +5,7 @@ import textwrap
 from collections.abc import Iterable
 from itertools import cycle
 
-import matplotlib
+import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -24,15 +24,7 @@ _FIXED = {
 WIDTH = 9.0  # inches of every figure: a notebook's text width
 DASHED = {"color": "0.3", "linestyle": "--", "linewidth": 1}
 DOTTED = {"color": "0.3", "linestyle": ":", "linewidth": 1.5}
-_STYLE = {
-    "figure.dpi": 90, "figure.titlesize": 11, "figure.titleweight": "bold", "font.size": 9,
-    "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.spines.top": False,
-    "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e4e4e4",
-    "xtick.labelsize": 8, "ytick.labelsize": 8, "legend.frameon": False, "legend.fontsize": 8.5,
-    "image.interpolation": "nearest",
-}  # fmt: skip
-
-styled = matplotlib.rc_context(_STYLE)
+styled = matplotlib.style.context("nbtrack.plots.house")
 """Decorator: draw in the house style and leave matplotlib's own settings as they were."""
 
 
