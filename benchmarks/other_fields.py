@@ -56,7 +56,7 @@ def opacity(seeds: int) -> pd.DataFrame:
         sequence, generator = scene.read(preset.scenes.track_frames), torch.Generator()
         draw = PixelSampler(sequence, torch.device("cpu")).draw
         rays = draw(5000, generator.manual_seed(0), torch.arange(len(sequence)))
-        seen = field.render_in_two_passes(rays, vr.n_stratified, vr.n_importance, generator)
+        seen = field.render_hierarchically(rays, vr.n_stratified, vr.n_importance, generator)
         measured, row = rays.depth > 0, {"field": field.label, "scene": scene.name, "seed": seed}
         row |= {**field.diagnostics(), "opacity": seen.opacity[measured].mean().item()}
         rows.append({**row, "depth_bias_m": (seen.depth - rays.depth)[measured].mean().item()})

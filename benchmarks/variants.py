@@ -119,7 +119,7 @@ class UnguidedNeus(NeuSField):
         """The terms of NeuS."""
         rays = draw(settings.n_rays)
         n_samples = settings.n_stratified, settings.n_surface
-        depths = self.two_pass_depths(rays, *n_samples, generator)
+        depths = self.hierarchical_depths(rays, *n_samples, generator)
         lambdas = settings.lambda_color, settings.lambda_depth
         return {
             **rendered_losses(self.render(rays, depths), rays, *lambdas),

@@ -64,9 +64,9 @@ def test_project_undoes_backproject(shape: tuple[int, ...]) -> None:
         ((0, 0, 3), (0, 0, 1), -2.0),  # outside and away: it left 2 m ago
     ],
 )
-def test_exit_depth(origin: tuple, direction: tuple, expected: float) -> None:
+def test_far_bound(origin: tuple, direction: tuple, expected: float) -> None:
     """Catches NaN for rays along an axis, the near wall taken for the far, and a wrong unit."""
-    found = UNIT.exit_depth(torch.tensor([origin]).float(), torch.tensor([direction]).float())
+    found = UNIT.far_bound(torch.tensor([origin]).float(), torch.tensor([direction]).float())
     assert found.item() == pytest.approx(expected, abs=1e-6)
 
 
@@ -80,7 +80,7 @@ def test_box_by_hand() -> None:
     low, high = torch.tensor(box.minimum), torch.tensor(box.maximum)
     origins = low + (high - low) * torch.rand(500, 3, generator=generator)
     directions = torch.randn(500, 3, generator=generator)
-    exits = origins + box.exit_depth(origins, directions)[:, None] * directions
+    exits = origins + box.far_bound(origins, directions)[:, None] * directions
     beyond = torch.maximum(low - exits, exits - high).amax(dim=-1)
     torch.testing.assert_close(beyond, torch.zeros(500), rtol=0, atol=1e-5)
 

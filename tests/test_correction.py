@@ -141,9 +141,9 @@ def test_the_least_scales_follow_the_sensor(
     """Catches a tracker that takes a noisy camera's residuals for outliers, or a good one's for
     noise: 5.5 medians of normal noise are 3.7 of its standard deviations."""
     monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 40_000)
-    assert found.accuracy == pytest.approx((0.01, 0.05))  # nearly exact: no less than these
+    assert found.residual_sigma == pytest.approx((0.01, 0.05))  # nearly exact: no less than these
     noise = np.random.default_rng(0).normal(scale=6.0, size=sequence.depths_mm.shape)
     noisy = replace(sequence, depths_mm=(sequence.depths_mm + noise).astype(np.uint16))
     field = corrected(found.source, noisy, np.arange(12), VOXEL)
     # Walls are mostly seen at an angle, where less of the noise is along the normal.
-    assert 0.5 * 3.7 * 0.006 < field.accuracy[0] < 3.7 * 0.006
+    assert 0.5 * 3.7 * 0.006 < field.residual_sigma[0] < 3.7 * 0.006

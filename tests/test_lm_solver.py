@@ -78,7 +78,7 @@ def test_terms_and_sums_are_the_formulas(field: BakedField, is_fine: bool) -> No
     g = np.maximum(g, 0.3)[:, None]
     r, q = np.stack([f / g[:, 0], intensity - LUMAS]), np.stack([df / g, di])
     np.testing.assert_allclose(terms[:3], [*r, w], atol=2e-5)
-    scales = scales_of(terms, np.full(2, np.inf), grid.accuracy, 3.0)
+    scales = scales_of(terms, np.full(2, np.inf), grid.residual_sigma, 3.0)
     np.testing.assert_allclose(scales, 3 * np.median(abs(r), axis=1), rtol=0.02)
     square = (r / scales[:, None]) ** 2
     rho = square / (1 + square)
@@ -222,8 +222,8 @@ def test_what_is_no_number_stays_none() -> None:
     """Catches compiled sums that turn NaN into a pose, and reads outside of the grid."""
     grid = Grid(ROOM)
     terms = residual_terms((POINTS, LUMAS, NONE), np.full((4, 4), np.nan), grid.arrays, True)
-    assert np.isnan(robust_cost(terms, grid.accuracy, 1.0)) or not terms[2].any()
-    sums = normal_equations(terms, grid.accuracy, 1.0)
+    assert np.isnan(robust_cost(terms, grid.residual_sigma, 1.0)) or not terms[2].any()
+    sums = normal_equations(terms, grid.residual_sigma, 1.0)
     assert np.isnan(sums[0]).any() or not terms[2].any()
 
 

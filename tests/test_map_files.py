@@ -28,7 +28,7 @@ from nbtrack.experiments.output import LOCK_FILE
 from nbtrack.fields import NetworkSettings, PointMapping, make_field
 from nbtrack.mapping.files import MAP_FILE, Map, _digest, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.mapping.quality import check_belongs, map_misfit
+from nbtrack.mapping.quality import check_belongs, depth_residual_of
 from nbtrack.tracking.trajectories import read_tum
 
 
@@ -216,7 +216,7 @@ def test_whether_a_map_belongs(case: str, field_name: str) -> None:
     if belongs:
         assert check_belongs(stored, frame) is None
     else:
-        assert map_misfit(stored.field, frame) > 0.1
+        assert depth_residual_of(stored.field, frame) > 0.1
         with pytest.raises(DataError, match=r"frame 2 of wall is off the map of wall by 0\.\d+ m"):
             check_belongs(stored, frame)
 
@@ -225,7 +225,7 @@ def test_a_frame_without_depth_tells_nothing() -> None:
     """Catches NaN that passes for a good fit without a word."""
     sequence = wall_sequence()
     sequence.depths_mm[:] = 0
-    assert np.isnan(map_misfit(finished_wall().field, sequence[0]))
+    assert np.isnan(depth_residual_of(finished_wall().field, sequence[0]))
     assert "frame 0 of wall has no depth" in check_belongs(finished_wall(), sequence[0])
 
 

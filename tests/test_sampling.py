@@ -138,7 +138,7 @@ def test_guided_depths(generator: torch.Generator) -> None:
 
 @pytest.mark.parametrize("seeded", [False, True])
 @pytest.mark.parametrize("signed", [False, True])
-def test_two_passes_find_the_wall(signed: bool, seeded: bool) -> None:
+def test_hierarchical_find_the_wall(signed: bool, seeded: bool) -> None:
     """Catches a second pass beside the surface: the sections' weights lie between the samples; and
     where every sample is asked for once, answers sorted unlike their depths, and other draws.
 
@@ -147,12 +147,12 @@ def test_two_passes_find_the_wall(signed: bool, seeded: bool) -> None:
     field, rays = wall(signed), rays_ahead(20, torch.zeros(20))
     rays = replace(rays, origins_world=rays.origins_world.clone().requires_grad_())
     again = [torch.Generator().manual_seed(1) if seeded else None for _ in range(2)]
-    depths = field.two_pass_depths(rays, 32, 12, again[0])
+    depths = field.hierarchical_depths(rays, 32, 12, again[0])
     assert depths.shape == (20, 44)
     assert not depths.requires_grad
     assert (depths.diff(dim=-1) >= 0).all()
     assert ((depths - 2.0).abs() < 0.25).sum(dim=-1).min() >= 12
-    both = field.render(rays, depths), field.render_in_two_passes(rays, 32, 12, again[1])
+    both = field.render(rays, depths), field.render_hierarchically(rays, 32, 12, again[1])
     assert (both[0].depth - 2.0).abs().mean() < 0.05
     for name in ("color", "depth", "depth_variance", "opacity", "weights"):
         torch.testing.assert_close(*(getattr(r, name) for r in both), atol=1e-6, rtol=1e-5)

@@ -33,7 +33,7 @@ class SceneBounds:
         low, high = self._corners(points_world)
         return ((points_world >= low - margin) & (points_world <= high + margin)).all(dim=-1)
 
-    def exit_depth(self, origins_world: Points, directions_world: Points) -> Values:
+    def far_bound(self, origins_world: Points, directions_world: Points) -> Values:
         """Where rays from inside leave the box, in units of the direction (z-depth, m, for z = 1).
 
         Rays that start outside, as a lost camera's do, may give small or negative values.

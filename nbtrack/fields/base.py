@@ -55,7 +55,7 @@ class Field(nn.Module, abc.ABC):
     surface_level: float  # the value whose isosurface is drawn as the scene's surface
     # By how much its distance (m) and intensity are off at surfaces, together with depth cameras:
     # larger residuals lose their say in second-order tracking. Our choice, for small networks.
-    accuracy: tuple[float, float] = (0.02, 0.05)
+    residual_sigma: tuple[float, float] = (0.02, 0.05)
     inlier_distance: float = 0.05  # m from its surface within which a point fits
     intensity_mad: float = np.inf  # median residual of luma at what was mapped, where known
     min_inliers: float = 0.6  # share of a frame's points that fit where the camera is not lost
@@ -96,33 +96,33 @@ class LearnedField(Field):
         """Scalars worth a curve over training, beside the losses."""
         return {}
 
-    def along(self, rays: Rays, depths: RaySamples) -> tuple[RayColors, RaySamples]:
+    def query_along(self, rays: Rays, depths: RaySamples) -> tuple[RayColors, RaySamples]:
         """Colour and value at z-depths (m) along rays."""
         colors, values = self(rays.points(depths).flatten(0, 1))
         return colors.view(*depths.shape, 3), values.view_as(depths)
 
     def render(self, rays: Rays, depths: RaySamples) -> Rendering:
         """Volume rendering with samples at ascending z-depths (m)."""
-        return self.composite(*self.along(rays, depths), rays, depths)
+        return self.composite(*self.query_along(rays, depths), rays, depths)
 
     @torch.no_grad()
-    def two_pass_depths(
+    def hierarchical_depths(
         self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None = None
     ) -> RaySamples:
         """Ascending sample depths (m): spread over the scene, and more where those found something.
 
         Without a generator nothing is random. Source: iMAP, Sec. 3.2 (32 and 12 samples).
         """
-        spread, _, extra = self._two_passes(rays, n_stratified, n_importance, generator)
-        return torch.cat([spread, extra], dim=-1).sort(dim=-1).values
+        coarse, _, fine = self._hierarchical(rays, n_stratified, n_importance, generator)
+        return torch.cat([coarse, fine], dim=-1).sort(dim=-1).values
 
-    def render_in_two_passes(
+    def render_hierarchically(
         self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None = None
     ) -> Rendering:
-        """What `render` gives at `two_pass_depths`, with every sample asked for once."""
-        spread, answers, extra = self._two_passes(rays, n_stratified, n_importance, generator)
-        depths, order = torch.cat([spread, extra], dim=-1).sort(dim=-1)
-        both = zip(answers, self.along(rays, extra), strict=True)
+        """What `render` gives at `hierarchical_depths`, with every sample asked for once."""
+        coarse, answers, fine = self._hierarchical(rays, n_stratified, n_importance, generator)
+        depths, order = torch.cat([coarse, fine], dim=-1).sort(dim=-1)
+        both = zip(answers, self.query_along(rays, fine), strict=True)
         colors, values = (torch.cat(parts, dim=1) for parts in both)
         colors = colors.gather(1, order[..., None].expand_as(colors))
         return self.composite(colors, values.gather(1, order), rays, depths)
@@ -143,22 +143,22 @@ class LearnedField(Field):
         for start in range(0, len(origins_world), _RAYS_AT_ONCE):
             place = [x[start : start + _RAYS_AT_ONCE] for x in (origins_world, directions_world)]
             rays = Rays(*place, torch.zeros_like(place[0]), place[0].new_zeros(len(place[0])))
-            parts.append(self.render_in_two_passes(rays, _N_STRATIFIED, _N_IMPORTANCE))
+            parts.append(self.render_hierarchically(rays, _N_STRATIFIED, _N_IMPORTANCE))
         color = torch.cat([part.color.clamp(0, 1) for part in parts])
         return color, torch.cat([part.depth for part in parts])
 
-    def _two_passes(self, rays: Rays, n_stratified: int, n_importance: int, generator) -> tuple:
+    def _hierarchical(self, rays: Rays, n_stratified: int, n_importance: int, generator) -> tuple:
         """Z-depths (m) of the first pass, the field's answers there, and z-depths of the second."""
         with torch.no_grad():  # where samples lie is given: a pose does not move them along
             far = rays_end(rays, self.bounds)
-            spread = stratified_depths(NEAR, far, n_stratified, generator)
-        answers = self.along(rays, spread)
+            coarse = stratified_depths(NEAR, far, n_stratified, generator)
+        answers = self.query_along(rays, coarse)
         with torch.no_grad():
-            weights = self.composite(*answers, rays, spread).weights
-            if weights.shape != spread.shape:  # NeuS weighs sections: both ends of one get a share
+            weights = self.composite(*answers, rays, coarse).weights
+            if weights.shape != coarse.shape:  # NeuS weighs sections: both ends of one get a share
                 weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
-            extra = importance_depths(spread, weights, n_importance, generator)
-        return spread, answers, extra
+            fine = importance_depths(coarse, weights, n_importance, generator)
+        return coarse, answers, fine
 
 
 def intensity_of(color: Colors) -> Values:
@@ -168,8 +168,8 @@ def intensity_of(color: Colors) -> Values:
 
 def rays_end(rays: Rays, bounds: SceneBounds) -> Values:
     """Z-depth (m) at which rays leave the scene, at least a little in front of the camera."""
-    exit_depth = bounds.exit_depth(rays.origins_world, rays.directions_world)
-    return exit_depth.clamp_min(2 * NEAR)
+    far_bound = bounds.far_bound(rays.origins_world, rays.directions_world)
+    return far_bound.clamp_min(2 * NEAR)
 
 
 def measured_mean(error: Float[Tensor, "*some"], measured: Float[Tensor, "*some"]) -> Scalar:

@@ -69,7 +69,7 @@ class CorrectedField(BakedField):
         self.register_buffer("T_world_cameras", T_world_cameras)
         self.register_buffer("residual_medians", residual_medians)
         medians = residual_medians.double().numpy()
-        self.accuracy = tuple(np.maximum(_MEDIANS * medians, _MIN_SCALES).tolist())
+        self.residual_sigma = tuple(np.maximum(_MEDIANS * medians, _MIN_SCALES).tolist())
         self.intensity_mad = float(medians[1])
         self.volume[4] = _UNMEASURED
         self.volume[:, numbers.long()] += self.corrections.float().T

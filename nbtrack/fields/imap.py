@@ -48,7 +48,7 @@ class IMapField(LearnedField):
         rays = draw(settings.n_rays)
         # Not guided by measured depths: tracking has no such help, and would see a thinner map.
         n_samples = settings.n_stratified, settings.n_surface
-        rendering = self.render(rays, self.two_pass_depths(rays, *n_samples, generator))
+        rendering = self.render(rays, self.hierarchical_depths(rays, *n_samples, generator))
         return rendering_losses(rendering, rays, settings.lambda_color)
 
 

@@ -118,10 +118,10 @@ def guided_depths(
     Nothing is known of what lies behind a surface, so no samples are spent there. Rays without a
     depth are sampled to the end of the scene. Our choice; NICE-SLAM and its followers do alike.
     """
-    exit_depth, measured = base.rays_end(rays, bounds), rays.depth > 0
-    far = torch.where(measured, rays.depth + settings.surface_band, exit_depth)
-    spread = stratified_depths(base.NEAR, far, settings.n_stratified, generator)
+    far_bound, measured = base.rays_end(rays, bounds), rays.depth > 0
+    far = torch.where(measured, rays.depth + settings.surface_band, far_bound)
+    coarse = stratified_depths(base.NEAR, far, settings.n_stratified, generator)
     around = stratified_depths(-1.0, torch.ones_like(far), settings.n_surface, generator)
-    center = torch.where(measured, rays.depth, exit_depth)
+    center = torch.where(measured, rays.depth, far_bound)
     around = (center[:, None] + settings.surface_band * around).clamp_min(base.NEAR)
-    return torch.cat([spread, around], dim=-1).sort(dim=-1).values
+    return torch.cat([coarse, around], dim=-1).sort(dim=-1).values

@@ -56,7 +56,7 @@ class NeuSPlusField(NeuSField):
         rays = draw(settings.n_rays, tangent_planes=True)
         depths = guided_depths(rays, self.bounds, settings, generator)
         surface = draw(settings.n_surface_points)
-        colors, sdf = self.along(rays, depths)
+        colors, sdf = self.query_along(rays, depths)
         nearest, is_free = self.observed(rays.points(depths))
         target, known = distance_targets(rays, depths, nearest, is_free, settings)
         lambdas = settings.lambda_color, settings.lambda_depth

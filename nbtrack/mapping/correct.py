@@ -7,7 +7,7 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import MappingSettings
 from nbtrack.fields.correction import corrected
 from nbtrack.mapping.files import Map
-from nbtrack.mapping.quality import split_holdout, usual_misfit
+from nbtrack.mapping.quality import split_holdout, usual_depth_residual
 
 
 def correct_map(finished: Map, sequence: RgbdSequence, settings: MappingSettings) -> Map:
@@ -22,5 +22,5 @@ def correct_map(finished: Map, sequence: RgbdSequence, settings: MappingSettings
     record = {**finished.made, "settings": asdict(settings), "correction_seconds": seconds}
     record["map_bytes"] = sum(tensor.nbytes for tensor in field.state_dict().values())
     record["seconds"] += seconds
-    record["misfit_m"] = usual_misfit(field, sequence, mapped)
+    record["misfit_m"] = usual_depth_residual(field, sequence, mapped)
     return replace(finished, field=field, made=record)

@@ -19,7 +19,7 @@ from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import LearnedField, MappingSettings, NetworkSettings, PointMapping, make_field
 from nbtrack.fields.points import fuse_points
 from nbtrack.mapping.files import Map
-from nbtrack.mapping.quality import split_holdout, usual_misfit
+from nbtrack.mapping.quality import split_holdout, usual_depth_residual
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 _PENDING = 10  # iterations between two looks at the losses, which wait for the device
@@ -69,7 +69,11 @@ def map_sequence(
             fit = _Fit(recipe, settings, field, sequence, mapped)
             fit.run(checkpoint, on_iteration)
         history, seconds = fit.history, fit.seconds
-    record = {**recipe, "seconds": seconds, "misfit_m": usual_misfit(field, sequence, mapped)}
+    record = {
+        **recipe,
+        "seconds": seconds,
+        "misfit_m": usual_depth_residual(field, sequence, mapped),
+    }
     record |= {"mapped_frames": len(mapped), "device": device_name(device), "versions": versions()}
     return Map(field, sequence.intrinsics, record, pd.DataFrame(history).rename_axis("iteration"))
 

@@ -126,7 +126,7 @@ def _score_surface(field: AnyField, sequence, mapped: Frames, room: Room) -> Sco
     }
 
 
-def map_misfit(field: AnyField, frame: Frame) -> float:
+def depth_residual_of(field: AnyField, frame: Frame) -> float:
     """How far (m) a map is from what a frame measured, at the frame's given pose.
 
     The median over random pixels of |rendered depth - measured depth|; of points and grids, which
@@ -149,11 +149,11 @@ def map_misfit(field: AnyField, frame: Frame) -> float:
     return float((field.render_rays(origins, directions)[1] - measured).abs().median())
 
 
-def usual_misfit(field: AnyField, sequence: RgbdSequence, mapped: Frames) -> float:
+def usual_depth_residual(field: AnyField, sequence: RgbdSequence, mapped: Frames) -> float:
     """The median misfit (m) of some of the mapped frames, evenly spread; 0 if none has a depth."""
     spread = np.linspace(0, len(mapped) - 1, min(_MISFIT_FRAMES, len(mapped))).round().astype(int)
     frames = [sequence[index] for index in mapped[spread].tolist()]
-    return float(np.median([map_misfit(field, f) for f in frames if f.has_depth] or [0.0]))
+    return float(np.median([depth_residual_of(field, f) for f in frames if f.has_depth] or [0.0]))
 
 
 def check_belongs(finished: Map, frame: Frame) -> str | None:
@@ -163,7 +163,7 @@ def check_belongs(finished: Map, frame: Frame) -> str | None:
     Raises DataError if it is more.
     """
     name, usual = f"the map of {finished.made['scene']}", finished.made["misfit_m"]
-    misfit_m = map_misfit(finished.field, frame)
+    misfit_m = depth_residual_of(finished.field, frame)
     if np.isnan(misfit_m):
         return f"{frame.name} has no depth: whether {name} belongs to it cannot be told"
     allowed = max(MISFIT_ALLOWED, MISFIT_FACTOR * usual)

@@ -17,7 +17,7 @@ from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 # How far from the map a point may be to have a partner there, m: first wide, to get home from
 # where the motion model errs, then so narrow that what was not mapped pulls no more.
-_REACHES = (0.3, 0.1)
+_MAX_CORRESPONDENCE_DISTANCES = (0.3, 0.1)
 _SOURCE_VOXEL = 0.01  # m: points that are closer count once
 _NEIGHBOURS = 20  # points that tell a point's plane
 _MIN_POINTS, _MIN_INLIERS = 20, 0.5  # a number and a share; below, a frame is lost
@@ -38,7 +38,7 @@ class IcpTracker(Tracker):
     """Generalised ICP, plane to plane, from the first start. One step is the whole alignment.
 
     Source: Segal, Haehnel, Thrun, "Generalized-ICP", RSS 2009, as in the package small_gicp (Koide
-    2024). Reaches, neighbours and voxels: our choice, tried on synthetic and real rooms.
+    2024). Distances, neighbours and voxels: our choice, tried on synthetic and real rooms.
     """
 
     name = "icp"
@@ -86,8 +86,8 @@ class IcpTracker(Tracker):
             return float("nan")
         T_world_camera = self.T_world_camera.double().numpy()
         map_and_frame = self.target, self.source, self.target_tree
-        for reach in _REACHES:
-            options = {**_OPTIONS, "max_correspondence_distance": reach}
+        for distance in _MAX_CORRESPONDENCE_DISTANCES:
+            options = {**_OPTIONS, "max_correspondence_distance": distance}
             result = self.small_gicp.align(*map_and_frame, T_world_camera, **options)
             if not result.num_inliers or not np.isfinite(result.T_target_source).all():
                 return float("nan")

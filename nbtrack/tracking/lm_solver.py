@@ -34,7 +34,7 @@ step solves, with the damping m and the prior weight P,
     (H + P + m diag H) twist = -(b + P [sin(angle) axis, offset])
 
 of the turn and the offset since the start: the pose prior P (1 - cos(angle) + offset^2 / 2).
-Scales are a factor times the median of |r|, never below the grid's accuracy, and never grow.
+Scales are a factor times the median of |r|, never below the field's residual sigma, and never grow.
 """
 
 from typing import NamedTuple, no_type_check
@@ -90,7 +90,8 @@ class Grid:
         # Vertices as (distance, intensity, confidence), their numbers along x, y and z, and their
         # place: the first vertex, the voxel, and both corners of the box whose points are usable.
         self.arrays = vertices, np.array(field.n_vertices), place
-        self.accuracy, self.inlier_distance = np.array(field.accuracy), field.inlier_distance
+        self.residual_sigma = np.array(field.residual_sigma)
+        self.inlier_distance = field.inlier_distance
 
 
 class Descent:
@@ -178,8 +179,8 @@ class Descent:
         self._narrow()
 
     def _narrow(self) -> None:
-        accuracy, factor = self.grid.accuracy, self.stage.mad_factor
-        self.scales = scales_of(self.terms, self.scales, accuracy, factor)
+        residual_sigma, factor = self.grid.residual_sigma, self.stage.mad_factor
+        self.scales = scales_of(self.terms, self.scales, residual_sigma, factor)
 
 
 def _median(values: Float[np.ndarray, "n"]) -> float:
@@ -263,13 +264,13 @@ def residual_terms(observed, T, grid, is_fine):
 
 
 @no_type_check
-def scales_of(terms, before, accuracy, mad_factor):
+def scales_of(terms, before, residual_sigma, mad_factor):
     """Robust scales of both residuals; numpy's own median, whose compilation would take seconds."""
-    if (before <= accuracy).all():  # as in most steps: a median takes as long as many sums
+    if (before <= residual_sigma).all():  # as in most steps: a median takes as long as many sums
         return before
     middle = (terms.shape[1] - 1) // 2
     median = np.partition(np.abs(terms[:2]), middle, axis=1)[:, middle]
-    return np.minimum(np.maximum(mad_factor * median, accuracy), before)
+    return np.minimum(np.maximum(mad_factor * median, residual_sigma), before)
 
 
 @no_type_check

@@ -135,7 +135,7 @@ class VrTracker(AdamTracker):
         directions_world = directions_camera @ rotation.T
         rays = Rays(position.T.expand_as(directions_world), directions_world, color, depth)
         n_samples = self.settings.n_stratified, self.settings.n_importance
-        rendering = self.field.render_in_two_passes(rays, *n_samples, self.generator)
+        rendering = self.field.render_hierarchically(rays, *n_samples, self.generator)
         terms = rendering_losses(rendering, rays, self.settings.lambda_color)
         return self.settings.lambda_depth * terms["depth"] + terms["color"]
 
