@@ -35,6 +35,15 @@ def test_complete_and_small(cells: list[dict[str, Any]]) -> None:
         assert not re.search(r"^\s*(def |class |[%!])", source, re.M), source
 
 
+def test_progress_is_not_compared(cells: list[dict[str, Any]]) -> None:
+    """Catches a stored progress bar in a cell whose output is compared: where an earlier notebook
+    made the map already, no bar appears."""
+    for cell in cells:
+        shown = [output.get("data", {}).get("text/plain", "") for output in cell.get("outputs", [])]
+        if any("%|" in "".join(text) for text in shown):
+            assert "nbval-ignore-output" in cell["metadata"].get("tags", []), cell["source"]
+
+
 def test_nothing_of_one_machine(cells: list[dict[str, Any]]) -> None:
     """Catches absolute paths that readers would take for their own, and an end without text."""
     assert cells[0]["cell_type"] == cells[-1]["cell_type"] == "markdown"
