@@ -1,4 +1,4 @@
-"""What the paper leaves open, one choice at a time (docs/choices.md); a larger size; searches."""
+"""What the paper leaves open, one choice at a time (docs/choices.md); and searches."""
 
 from dataclasses import replace
 
@@ -7,13 +7,6 @@ from variants import FALLING_STEPS
 from nbtrack import METHODS, Method
 
 VR, SDF = METHODS["vr"], METHODS["sdf"]
-# Images, networks, rays and pixels between those of `smoke` and the paper's.
-LARGER_SIZE = [
-    "scenes.width=160", "network.imap.width=128", "network.neus.width=128",
-    "mapping.imap.iterations=2000", "mapping.imap.n_rays=160",
-    "mapping.neus.iterations=2000", "mapping.neus.n_rays=160",
-    "tracking.vr.n_pixels=128", "tracking.sdf.n_pixels=1024",
-]  # fmt: skip
 
 
 def _both(vr: Method | None = None, sdf: Method | None = None, raw: str = "") -> tuple:
