@@ -60,7 +60,7 @@ OPTIONS = {
     "--budget BY": _option("steps, the paper's counts (default), or this machine's clock",
                            choices=("steps", "clock"), default="steps"),
     "--scenes A,B": _option("only these scenes of the preset's kind"),
-    "--seeds K": _option("K maps and runs a cell: mean ± deviation", a_count, default=1),
+    "--seeds K": _option("K maps and runs a cell: mean ± std", a_count, default=1),
     "--workers N": _option("cells side by side (default: one a core, or one on a GPU)", a_count),
     "--dask ADDRESS": _option("run on a Dask cluster, as tcp://HOST:8786"),
     "--beyond": {"help": "Table III instead: the paper's methods and ours, 30 Hz too",

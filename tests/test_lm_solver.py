@@ -176,7 +176,7 @@ def test_a_single_plane_leaves_three_directions_open() -> None:
     found = Descent(wall(), seen, seen, 0.0, POSE).certainty()
     assert found["condition_number"] > 1e6
     # Along the wall the position is as uncertain as the prior allows.
-    assert found["position_deviation_m"] == pytest.approx(0.5 / (3 * 0.6745), rel=0.01)
+    assert found["position_std_m"] == pytest.approx(0.5 / (3 * 0.6745), rel=0.01)
 
 
 def test_a_rejected_step_leaves_the_pose_unchanged() -> None:

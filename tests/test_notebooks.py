@@ -35,6 +35,16 @@ def test_complete_and_small(cells: list[dict[str, Any]]) -> None:
         assert not re.search(r"^\s*(def |class |[%!])", source, re.M), source
 
 
+def test_prose_is_short(request: pytest.FixtureRequest, cells: list[dict[str, Any]]) -> None:
+    """Catches a notebook beyond the paper that turns into an essay: words outside formulas, code
+    and addresses."""
+    name = request.node.callspec.id
+    prose = " ".join(cell["source"] for cell in cells if cell["cell_type"] == "markdown")
+    prose = re.sub(r"\$\$.*?\$\$|\$.*?\$|`[^`]*`|\]\([^)]*\)", "", prose, flags=re.S)
+    words = re.findall(r"[A-Za-z][\w’'-]*", prose)
+    assert len(words) <= (700 if name[:2] in ("06", "07", "A1", "A2", "A3") else 850)
+
+
 def test_progress_is_not_compared(cells: list[dict[str, Any]]) -> None:
     """Catches a stored progress bar in a cell whose output is compared: where an earlier notebook
     made the map already, no bar appears."""
@@ -60,3 +70,10 @@ def test_no_two_tables_share_an_id(cells: list[dict[str, Any]]) -> None:
     pages = ["".join(output.get("data", {}).get("text/html", "")) for output in outputs]
     ids = re.findall(r'<table id="(.*?)"', " ".join(pages))
     assert len(set(ids)) == len(ids)
+
+
+def test_the_page_of_benchmarks_is_short() -> None:
+    """Catches a page of results that becomes a diary again."""
+    lines = (Path(__file__).parents[1] / "benchmarks" / "README.md").read_text().splitlines()
+    assert len(lines) <= 150
+    assert max(map(len, lines)) <= 100

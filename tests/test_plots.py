@@ -42,7 +42,7 @@ CELLS = pd.DataFrame({
 })  # fmt: skip
 AT, RAY = torch.linspace(0, 2, 20), torch.linspace(1, -1, 20).requires_grad_()
 FALLING = 1 / (1 + np.arange(40.0))
-IMAP = pd.DataFrame({"depth": FALLING, "color": FALLING, "total": FALLING, "deviation_m": FALLING})
+IMAP = pd.DataFrame({"depth": FALLING, "color": FALLING, "total": FALLING, "std_m": FALLING})
 HISTORIES = {"iMAP": IMAP, "NeuS": IMAP.copy()}
 HISTORIES["NeuS"].insert(2, "eikonal", FALLING)
 FRAMES = pd.DataFrame({

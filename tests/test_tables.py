@@ -206,7 +206,7 @@ def test_steps_of_our_own_cells() -> None:
         [r"\multirow{2}{*}{VR}", "16", "4", "--"],
         ["", "512", "2", "--"],
     ]
-    spread = style_table_2(OURS_2.assign(steps_deviation=[0.5, 1.5, 0.25, 0.75])).data
+    spread = style_table_2(OURS_2.assign(steps_std=[0.5, 1.5, 0.25, 0.75])).data
     assert spread.loc[("LM", 64)].tolist() == ["1.0 ± 1.5", "3.0 ± 0.5"]
     assert spread.loc[("VR", 16)].tolist() == ["4 ± 0.8", "–"]
 
@@ -228,11 +228,11 @@ def test_mean_and_deviation_over_seeds() -> None:
     cells = average_over_seeds(SEEDS)
     assert cells["method"].tolist() == ["A", "B"]
     assert cells["ate_m"].tolist() == pytest.approx([0.2, 1.0])
-    assert cells["ate_deviation_m"].tolist() == pytest.approx([0.1, 0.0])
+    assert cells["ate_std_m"].tolist() == pytest.approx([0.1, 0.0])
     styler = style_table_1(SEEDS)
     assert styler.data["x"].tolist() == ["0.200 ± 0.100", "1.000 ± 0.000"]
     assert r"\bfseries 0.200${\scriptscriptstyle\pm0.100}$" in latex(styler)
-    assert "Small: deviation over seeds." in latex(styler)
+    assert "Small: std over seeds." in latex(styler)
     failed = SEEDS.assign(ate_m=[0.1, 1.0, None, 1.0, 0.3, 1.0])
     assert average_over_seeds(failed)["ate_m"].isna().tolist() == [True, False]
     assert style_table_1(failed).data["x"].tolist() == ["–", "1.000 ± 0.000"]
@@ -339,7 +339,7 @@ def latex_is_installed() -> bool:
 @pytest.mark.skipif(not latex_is_installed(), reason="no LaTeX with the packages needed")
 def test_tables_compile(tmp_path: Path) -> None:
     """Catches a table that needs more than its comment says: the document there is compiled."""
-    steps = OURS_2.assign(steps_deviation=0.5)
+    steps = OURS_2.assign(steps_std=0.5)
     nine = published_table_1().assign(still_ate_m=0.5)
     nine = pd.concat([nine.assign(seed=seed, ate_m=nine["ate_m"] + seed / 100) for seed in (0, 1)])
     paths = [

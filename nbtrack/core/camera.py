@@ -24,7 +24,7 @@ class Intrinsics:
 
     @classmethod
     def from_focal(cls, width: int, height: int, focal: float) -> "Intrinsics":
-        """Square pixels and a centred principal point: what the Neural RGB-D layout stores."""
+        """Square pixels and a centred principal point, as in the Neural RGB-D layout."""
         return cls(width, height, focal, focal, width / 2, height / 2)
 
 

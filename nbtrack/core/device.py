@@ -81,7 +81,7 @@ def suitable_threads(width: int) -> contextlib.AbstractContextManager[None]:
 
 
 def has_room_for(device: torch.device, n_bytes: int) -> bool:
-    """Whether a GPU could hold so much more and keep as much again free for the work itself."""
+    """Whether a GPU can hold `n_bytes` more and then still has as much free for the work itself."""
     if device.type != "cuda":
         return True  # the CPU's and Apple's memory is the one that the data are in already
     free_bytes, _ = torch.cuda.mem_get_info(device)

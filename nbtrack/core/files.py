@@ -1,7 +1,7 @@
-"""Where results are kept, files that are complete or absent, and what a result was made by.
+"""The folder of results, atomic writes, and the provenance of results.
 
-Two processes may work on the same results folder and either may be killed; a reader must never
-meet half a file. So every result is written aside, then moved into place.
+Two processes may use the same folder, and either may be killed. A reader must never see half a
+file, so every result is written to a temporary file, which is then moved into place.
 """
 
 import ast

@@ -1,4 +1,6 @@
-"""Ways to read a recording: under the right one, surfaces that two frames see lie on each other."""
+"""Conventions under which a recording can be read: of poses, depth and calibration.
+
+Under the right convention the surfaces that two frames both see coincide."""
 
 import json
 import math
@@ -200,10 +202,11 @@ def preferring_edges(
 
 
 def best_reading(results: list[Reading]) -> Reading:
-    """The declared one (the first), unless another fits clearly better.
+    """The declared convention (the first), unless another fits clearly better.
 
-    Clearly: surfaces meet at half the distance or less, with no less than half the overlap, since
-    cameras turned away from each other may agree on the few points that are left.
+    Another fits clearly better if its surfaces are at most half as far apart and overlap at least
+    half as much. The second condition is needed because cameras that are turned away from each
+    other may agree on the few points that remain.
     """
     own, half = results[0], max(reading.overlap / 2 for reading in results)
     enough = max(_MIN_OVERLAP, half)

@@ -67,7 +67,7 @@ class RgbdSequence:
 
     @cached_property
     def digest(self) -> str:
-        """Sixteen hexadecimal digits: they change with any pixel, pose, frame number and camera."""
+        """A hash over pixels, poses, frame numbers and camera, as sixteen hexadecimal digits."""
         digest = hashlib.blake2b(repr(self.intrinsics).encode(), digest_size=8)
         for array in (self.frame_ids, self.T_world_camera, self.colors, self.depths_mm):
             digest.update(np.ascontiguousarray(array).data)

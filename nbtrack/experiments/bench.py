@@ -148,7 +148,7 @@ def measure_steps(
     done. The scene's first frame feeds it, in the scene's map, which is made if it is not cached.
 
     A row is a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames) and
-    steps_deviation (over frames). Source: paper, Table II and evaluation protocol.
+    steps_std (over frames). Source: paper, Table II and evaluation protocol.
     """
     firsts: dict[str, Method] = {}
     for method in find_methods(methods):
@@ -170,10 +170,10 @@ def measure_steps(
                     for _ in range(1 + _FRAMES_A_CELL):
                         tracker.restart(T_first)
                         counts.append(tracker.track(sequence[0]).steps)
-                    mean, deviation = float(np.mean(counts[1:])), float(np.std(counts[1:]))
-                    rows.append((name.upper(), n_pixels, budget_ms, mean, deviation))
+                    mean, std = float(np.mean(counts[1:])), float(np.std(counts[1:]))
+                    rows.append((name.upper(), n_pixels, budget_ms, mean, std))
         bar.move_to(len(plan))
-    columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_deviation"]
+    columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_std"]
     return pd.DataFrame(rows, columns=columns)
 
 

@@ -82,7 +82,7 @@ class Preset:
         return _shared(field_class(field_name).Settings, own)
 
     def tracking_of(self, tracker_name: str) -> TrackerSettings:
-        """Settings of a tracker; one without its own takes what it shares with SDF tracking."""
+        """Settings of a tracker. Without settings of its own it takes those of SDF tracking."""
         own = self.tracking.get(tracker_name, self.tracking["sdf"])
         return _shared(tracker_class(tracker_name).Settings, own)
 

@@ -1,4 +1,4 @@
-"""What every field offers to mapping and tracking."""
+"""The interface of fields to mapping and tracking."""
 
 import abc
 import itertools
@@ -42,7 +42,7 @@ class MappingSettings:
     # Samples a ray at the surface: iMAP's second pass, or around the measured depth (NeuS).
     n_surface: int = may_be_zero(12)
     learning_rate: float = 1e-3  # Adam's, at the start; falls to a twentieth along a cosine (NeuS)
-    lambda_color: float = 5.0  # iMAP's, whose depth errors are relative to their deviation
+    lambda_color: float = 5.0  # iMAP's, whose depth errors are relative to their std
     holdout_every: int = may_be_zero(10)  # every n-th frame is only scored
 
 
@@ -182,14 +182,14 @@ def rendered_losses(
     rays: Rays,
     lambda_color: float,
     lambda_depth: float = 1.0,
-    deviation: Values | float = 1.0,
+    std: Values | float = 1.0,
 ) -> Losses:
-    """Weighted L1 errors of rendered depth (m, over a deviation) and colour.
+    """Weighted L1 errors of rendered depth (m, over a std) and colour.
 
     Rays without a depth measurement take part in neither term.
     """
     measured = (rays.depth > 0).float()
-    depth_error = (rendering.depth - rays.depth).abs() / deviation
+    depth_error = (rendering.depth - rays.depth).abs() / std
     color_error = (rendering.color - rays.color).abs().mean(dim=-1)
     return {
         "depth": lambda_depth * measured_mean(depth_error, measured),

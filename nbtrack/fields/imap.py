@@ -11,9 +11,9 @@ from nbtrack.fields.mlp import FourierMlp, NetworkSettings
 from nbtrack.fields.rendering import Rendering, composite, weights_from_density
 
 DENSITY_PER_UNIT = 10.0  # 1/m of one unit of network output (vMAP's re-implementation of iMAP)
-# Least standard deviation (m) that a depth error is divided by: a perfectly sharp ray would
+# Minimum standard deviation (m) that a depth error is divided by: a perfectly sharp ray would
 # otherwise outweigh all others (our choice; depth noise is of this size).
-MIN_DEVIATION = 0.02
+MIN_STD = 0.02
 
 
 class IMapField(LearnedField):
@@ -57,8 +57,8 @@ def rendering_losses(rendering: Rendering, rays: Rays, lambda_color: float) -> L
 
     L = mean(|D - D_rendered| / sqrt(variance)) + lambda_color mean|I - I_rendered|.
 
-    The deviation is detached, as in NICE-SLAM: its gradient would reward blurred surfaces.
+    The std is detached, as in NICE-SLAM: its gradient would reward blurred surfaces.
     Source: iMAP, Sec. 3.3.
     """
-    deviation = rendering.depth_variance.detach().sqrt().clamp_min(MIN_DEVIATION)
-    return rendered_losses(rendering, rays, lambda_color, deviation=deviation)
+    std = rendering.depth_variance.detach().sqrt().clamp_min(MIN_STD)
+    return rendered_losses(rendering, rays, lambda_color, std=std)

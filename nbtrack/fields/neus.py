@@ -46,7 +46,7 @@ class NeuSField(LearnedField):
         self._start_as_empty_room(generator)
 
     @property
-    def inverse_deviation(self) -> Scalar:
+    def inverse_std(self) -> Scalar:
         """s (1/m)."""
         return torch.exp(10 * self.variance)
 
@@ -62,7 +62,7 @@ class NeuSField(LearnedField):
 
         That is its mid-point (our choice; NeuS evaluates the network there once more).
         """
-        weights = weights_from_sdf(values, self.inverse_deviation)
+        weights = weights_from_sdf(values, self.inverse_std)
         middles = ((ends[:, 1:] + ends[:, :-1]) / 2 for ends in (colors, depths))
         return composite(weights, *middles)
 
@@ -88,7 +88,7 @@ class NeuSField(LearnedField):
 
     def diagnostics(self) -> dict[str, float]:
         """The s-density's standard deviation 1/s, in metres."""
-        return {"deviation_m": float(1 / self.inverse_deviation.detach())}
+        return {"std_m": float(1 / self.inverse_std.detach())}
 
     @torch.no_grad()
     def _start_as_empty_room(self, generator: Generator) -> None:

@@ -42,7 +42,7 @@ def weights_from_density(
     return opacity * transmittance
 
 
-def weights_from_sdf(sdf: RaySamples, inverse_deviation: Scalar) -> Float[Tensor, "rays sections"]:
+def weights_from_sdf(sdf: RaySamples, inverse_std: Scalar) -> Float[Tensor, "rays sections"]:
     """NeuS's unbiased, occlusion-aware weights of the sections between neighbouring samples.
 
     alpha_i = max((Phi(f_i) - Phi(f_{i+1})) / Phi(f_i), 0) with Phi(f) = sigmoid(s f) and weights
@@ -52,12 +52,12 @@ def weights_from_sdf(sdf: RaySamples, inverse_deviation: Scalar) -> Float[Tensor
     inside something is dark. NeuS lets such rays leave the solid unharmed, for it looks at
     objects from outside; in rooms seen from inside the camera's own surroundings then filled up.
 
-    The signed distance f is in m, positive in free space, `inverse_deviation` s in 1/m. Source:
+    The signed distance f is in m, positive in free space, `inverse_std` s in 1/m. Source:
     Wang et al. 2021 (NeuS), Eq. 13; the published code extrapolates f from mid-points, where the
     paper's own formula spares second derivatives.
     """
     # Phi(f_i+1) / Phi(f_i) in logarithms: a plain quotient is 0/0 deep inside objects.
-    log_phi = torch.nn.functional.logsigmoid(inverse_deviation * sdf)
+    log_phi = torch.nn.functional.logsigmoid(inverse_std * sdf)
     log_ratio = log_phi.diff(dim=-1).clamp_max(0)
     passed = log_phi[:, :1] + log_ratio.cumsum(dim=-1) - log_ratio
     return -torch.expm1(log_ratio) * torch.exp(passed)

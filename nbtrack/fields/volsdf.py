@@ -23,7 +23,7 @@ class VolSdfField(NeuSField):
         self, colors: RayColors, values: RaySamples, rays: Rays, depths: RaySamples
     ) -> Rendering:
         """Volume rendering from the density that belongs to the signed distance."""
-        density = density_from_sdf(values, self.inverse_deviation)
+        density = density_from_sdf(values, self.inverse_std)
         weights = weights_from_density(density, depths, rays.directions_world.norm(dim=-1))
         return composite(weights, colors, depths)
 

@@ -112,7 +112,7 @@ def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figur
     """Every loss term over mapping: each iteration pale, the running median on top.
 
     `histories` are those of maps by label. A term that several maps share is one panel, though its
-    unit may differ: iMAP divides depth errors by their deviation.
+    unit may differ: iMAP divides depth errors by their std.
     """
     # Loss terms are the columns before their total; what is behind it are diagnostics.
     terms = {label: history.loc[:, :"total"].iloc[:, :-1] for label, history in histories.items()}
@@ -199,11 +199,11 @@ def plot_ate(results: pd.DataFrame, title: str = "") -> Figure:
 
     `results` are as `table_1` takes them. A point above the dashed line at 0.2 m is a lost camera,
     which the table prints red; a missing point is a run without result. Thin lines span a
-    deviation over seeds either way; the dotted line is a camera that stands still.
+    std over seeds either way; the dotted line is a camera that stands still.
     """
-    means, deviations = table_1(results), table_1(results, "ate_deviation_m")
+    means, stds = table_1(results), table_1(results, "ate_std_m")
     is_still = means.index.get_level_values("method") == STANDING_STILL
-    still, means, deviations = means[is_still], means[~is_still], deviations[~is_still]
+    still, means, stds = means[is_still], means[~is_still], stds[~is_still]
     rates = means.index.get_level_values("rate_hz").unique()
     labels = means.index.get_level_values("method").to_series(index=means.index)
     at = means.index.get_level_values("rate_hz").map(list(rates).index) + _beside(labels)
@@ -213,7 +213,7 @@ def plot_ate(results: pd.DataFrame, title: str = "") -> Figure:
         for index, (label, color) in enumerate(method_colors(labels).items()):
             of_method = (labels == label).to_numpy()
             look = {"marker": "os^Dv"[index % 5], "color": color, "linestyle": "none"}
-            spread = deviations[scene][of_method]
+            spread = stds[scene][of_method]
             axes.errorbar(at[of_method], means[scene][of_method], spread, label=label, **look)
         for ate_m in still[scene][:1]:
             axes.axhline(ate_m, label=STANDING_STILL, **DOTTED)

@@ -51,11 +51,12 @@ def _round_interval(offsets: Origins, directions: Points, radius: float) -> Inte
 
 
 class Solid:
-    """A closed convex body that is a box in coordinates of its own.
+    """A closed convex body that is a box in its own coordinates.
 
-    Each has its `center` (world); `_coordinates` of points (m, at least 0), and `_half`, up to
-    which they are inside; `_crossing`, where endless lines are inside; `normals`, unit and outward,
-    at points on the surface; `area` of it (m²); and `sample_surface`, uniform points there.
+    A subclass has a `center` (world frame, m) and an `area` of its surface (m²). `_coordinates`
+    maps points to coordinates (m, not negative), which are inside up to `_half`. `_crossing` gives
+    the interval in which a line is inside. `normals` gives unit outward normals at points on the
+    surface, and `sample_surface` draws uniform points there.
     """
 
     @cached_property

@@ -47,7 +47,7 @@ def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
     """Table I in long form from a row for every seed; rates fall, dataset's scenes are labelled.
 
     Columns are rate_hz, method, scene, ate_m, and seed where there are several: then the column
-    ate_deviation_m tells their deviation (m) as a sample. A cell with a seed that failed is NaN: a
+    ate_std_m is their std (m) as a sample. A cell with a seed that failed is NaN: a
     mean over the others would hide the failure. Where results have a column still_ate_m, the method
     `STANDING_STILL` is added. Raises DataError where a column is missing, there is no row, or two
     rows have one place.
@@ -62,7 +62,7 @@ def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
     groups = results.groupby(_CELL_1, sort=False)["ate_m"]
     averaged = groups.mean(skipna=False).to_frame()
     if groups.size().max() > 1:
-        averaged["ate_deviation_m"] = groups.std(skipna=False)
+        averaged["ate_std_m"] = groups.std(skipna=False)
     averaged = averaged.reset_index()
     return averaged.sort_values("rate_hz", ascending=False, kind="stable", ignore_index=True)
 
@@ -70,8 +70,8 @@ def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
 def table_1(results: pd.DataFrame, value: str = "ate_m") -> pd.DataFrame:
     """Table I as printed: ATE (m), a row per rate and method, a column per scene.
 
-    Results and what is raised: see `average_over_seeds`; for the deviation over seeds the value is
-    "ate_deviation_m". Methods and scenes keep the order of their first appearance. Every method
+    Results and what is raised: see `average_over_seeds`; for the std over seeds the value is
+    "ate_std_m". Methods and scenes keep the order of their first appearance. Every method
     gets a row at every rate; what has no result is NaN.
     """
     cells = average_over_seeds(results)
@@ -84,8 +84,8 @@ def table_1(results: pd.DataFrame, value: str = "ate_m") -> pd.DataFrame:
 def table_2(steps: pd.DataFrame, value: str = "steps") -> pd.DataFrame:
     """Table II as printed: mean steps, a row per tracker and n (pixels), a column per budget (ms).
 
-    Made of a row a cell with columns tracker, n_pixels, budget_ms, steps; for the deviation over
-    frames the value is "steps_deviation". Raises DataError as `average_over_seeds` does.
+    Made of a row a cell with columns tracker, n_pixels, budget_ms, steps; for the std over
+    frames the value is "steps_std". Raises DataError as `average_over_seeds` does.
     """
     _check(steps, "steps", _CELL_2)
     return _wide(steps, _CELL_2, value).reindex(steps["tracker"].unique(), level="tracker")

@@ -50,7 +50,7 @@ class TableStyler(Styler):
 
 
 def style_table_1(results: pd.DataFrame, caption: str | None = None) -> TableStyler:
-    """Table I, mean ± deviation over seeds: best bold, above 0.2 m red with a dagger, missing "–".
+    """Table I, mean ± std over seeds: best bold, above 0.2 m red with a dagger, missing "–".
 
     Both marks follow the three digits printed, so that they can be checked from the page: values
     equal to the last digit are equally good. A value without a rival at its rate is not bold.
@@ -62,7 +62,7 @@ def style_table_1(results: pd.DataFrame, caption: str | None = None) -> TableSty
     lost = shown > LOST_THRESHOLD_M
     css = lost.replace({True: _RED, False: ""}) + best.replace({True: _BOLD, False: ""})
     texts = _texts(shown, "{:.3f}", _MISSING)
-    texts += _texts(table_1(results, "ate_deviation_m"), " ± {:.3f}")
+    texts += _texts(table_1(results, "ate_std_m"), " ± {:.3f}")
     styler = TableStyler(texts)
     styler.format_index("{:g} Hz", level="rate_hz")
     forms = {"<b>{}</b>": best & ~lost, "{} †": lost & ~best, "<b>{} †</b>": best & lost}
@@ -75,7 +75,7 @@ def style_table_1(results: pd.DataFrame, caption: str | None = None) -> TableSty
 def style_table_2(
     steps: pd.DataFrame, caption: str | None = None, default_pixels: dict[str, int] = PAPER_PIXELS
 ) -> TableStyler:
-    """Table II, mean ± deviation over frames, without decimals in rows of whole numbers.
+    """Table II, mean ± std over frames, without decimals in rows of whole numbers.
 
     The default pixels of each tracker, the n used for Table I, are printed bold with an asterisk.
     """
@@ -83,7 +83,7 @@ def style_table_2(
     is_whole = (wide.isna() | (wide % 1 == 0)).all(axis=1)
     texts = _texts(wide, "{:.1f}", _MISSING)
     texts[is_whole] = _texts(wide[is_whole], "{:.0f}", _MISSING)
-    texts += _texts(table_2(steps, "steps_deviation"), " ± {:.1f}")
+    texts += _texts(table_2(steps, "steps_std"), " ± {:.1f}")
     styler = TableStyler(texts)
     # Notebooks show every row label in bold, so the others must be told not to be.
     weights = [_BOLD if default_pixels.get(row[0]) == row[1] else _PLAIN for row in wide.index]
@@ -102,9 +102,9 @@ def latex_file(styler: TableStyler, path: Path, kind: str, note: str) -> str:
     """
     table, caption, note = styler.data, _CAPTIONS[kind], " ".join(note.split())
     has_steps = "n_pixels" in table.index.names
-    has_deviations = table.map(lambda text: "±" in text).any(axis=None)
-    if has_deviations:
-        caption += f" Small: deviation over {'frames' if has_steps else 'seeds'}."
+    has_std = table.map(lambda text: "±" in text).any(axis=None)
+    if has_std:
+        caption += f" Small: std over {'frames' if has_steps else 'seeds'}."
     styler = copy.deepcopy(styler).format(_latex_number)
     for axis, labels in enumerate(table.axes):
         for level in labels.names:
@@ -122,7 +122,7 @@ def latex_file(styler: TableStyler, path: Path, kind: str, note: str) -> str:
     text = re.sub(r"\\cline\{[\d-]+\}", r"\\midrule", text)
     if has_steps:
         text = text.replace(" &  & ", " & $n$ & ", 1)
-    if has_deviations and len(table.columns) > _MANY_COLUMNS:  # else they run off the page
+    if has_std and len(table.columns) > _MANY_COLUMNS:  # else they run off the page
         text = text.replace("\\scriptsize\n", "\\scriptsize\n\\setlength{\\tabcolsep}{2.2pt}\n", 1)
     return _PREAMBLE.format(note=note, name=path.stem) + text
 
@@ -162,7 +162,7 @@ def write_table_1(folder: Path, results: pd.DataFrame, note: str) -> list[Path]:
 def write_table_3(folder: Path, results: pd.DataFrame, note: str) -> list[Path]:
     """Writes Table III, which is Table I with other rows, as CSV and LaTeX; see `write_tables`.
 
-    Its rows are named with n: a method with more points a frame is not the same.
+    Labels of rows contain n, since a method with more points a frame is another method.
     """
     results = layout.naming_points(results)
     return [
@@ -191,7 +191,7 @@ _LATEX_LABELS = {
 
 
 def _latex_number(text: str) -> str:
-    """A cell for LaTeX: the deviation small, and not bold beside a bold number."""
+    """A cell for LaTeX: the std small, and not bold beside a bold number."""
     return re.sub(" ± (.+)", r"${\\scriptscriptstyle\\pm\1}$", text).replace(_MISSING, "--")
 
 

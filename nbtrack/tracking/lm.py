@@ -44,7 +44,7 @@ _HYPOTHESES, _HYPOTHESIS_STD, _TRIED, _TRIED_STEPS = 1000, 0.3, 40, 6
 
 @dataclass(frozen=True)
 class LmSettings(TrackerSettings):
-    """Levenberg-Marquardt; all our choice."""
+    """Settings of the Levenberg-Marquardt tracker. All defaults are our choice."""
 
     n_pixels: int = 512  # points a frame
     motion_model: str = "better_of_both"
@@ -145,7 +145,7 @@ class LmTracker(Tracker):
         return torch.from_numpy(self.T_kept if self.descent is None else self.best.T_world_camera)
 
     def report(self) -> dict[str, float | bool]:
-        """Inliers, deviations, condition number and verdict; a good pose is kept for restarts."""
+        """Inliers, stds, condition number and verdict; a good pose is kept for restarts."""
         if self.descent is None:
             self.verdict = {"inlier_ratio": 0.0, "lost": True}
         elif self.verdict is None:
@@ -176,9 +176,7 @@ class LmTracker(Tracker):
         is_odd = certainty["intensity_mad"] > _MAX_MAD_RATIO * usual_mad
         has_contrast = self.points[1][1].std() > usual_mad  # else it is dark, or overexposed
         is_odd &= certainty["inlier_ratio"] < _DOUBTED and has_contrast
-        is_sure = (
-            certainty["inlier_ratio"] >= enough and certainty["position_deviation_m"] <= _MAX_STD
-        )
+        is_sure = certainty["inlier_ratio"] >= enough and certainty["position_std_m"] <= _MAX_STD
         return {**certainty, "lost": bool(is_odd or not (is_sure and is_settled))}
 
     def _descent_from(self, T_start: Pose) -> Descent:

@@ -165,8 +165,8 @@ class Descent:
         return {
             "inlier_ratio": float(is_inlier.mean()),
             "intensity_mad": float(_median(off)),
-            "position_deviation_m": float(position),
-            "rotation_deviation_deg": float(np.rad2deg(rotation)),
+            "position_std_m": float(position),
+            "rotation_std_deg": float(np.rad2deg(rotation)),
             "condition_number": float(values[-1] / max(values[0], 1e-9)),
         }
 

@@ -175,7 +175,7 @@ class Tracker(abc.ABC):
         )
 
     def state(self) -> dict[str, Any]:
-        """What the frames so far leave to the next one; tensors and plain values."""
+        """What the tracker remembers from past frames: tensors and plain values."""
         return {
             "estimates": torch.from_numpy(np.stack(self.estimates)),
             "budget": self.budget.memory,
