@@ -35,10 +35,10 @@ from nbtrack import (
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.jobs import MapJob
 from nbtrack.experiments.methods import TABLE_1
-from nbtrack.experiments.runs import TrackCell
+from nbtrack.experiments.runs import TrackJob
 from nbtrack.fields import correction
 from nbtrack.mapping.correct import correct_map
 from nbtrack.tracking import StepBudget, track_sequence
@@ -174,7 +174,7 @@ def ablation(recordings) -> pd.DataFrame:
 
 def _corrected_now(scene, field, preset):
     """A field corrected by the constants of this moment, which no cache knows; and its seconds."""
-    made = MapCell(scene, field, preset)
+    made = MapJob(scene, field, preset)
     made.base.outcome(None, lambda share, told: None)
     base, sequence, began = made.base.map(), scene.read(), time.perf_counter()
     return correct_map(base, sequence, made.settings).field, time.perf_counter() - began
@@ -233,10 +233,10 @@ def _held_out(scene, preset, seed: int) -> pd.DataFrame:
     rows = []
     for method in ON_RECORDINGS:
         changed = with_settings(preset, *method.settings)
-        made = MapCell(scene, method.field, changed, "::2", seed)
-        cell = TrackCell(made, scene, method.tracker, 30, frames="1::2", seed=seed)
+        made = MapJob(scene, method.field, changed, "::2", seed)
+        job = TrackJob(made, scene, method.tracker, 30, frames="1::2", seed=seed)
         made.outcome(None, print)
-        found = cell.outcome(None, lambda share, told: None)
+        found = job.outcome(None, lambda share, told: None)
         row = {name: found[name] for name in COLUMNS if name in found}
         n_pixels = changed.tracking_of(method.tracker).n_pixels
         row |= {"ate_m": found["ate_rmse_m"], "method": method.label, "n_pixels": n_pixels}

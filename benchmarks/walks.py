@@ -18,10 +18,10 @@ from nbtrack import METHODS, Method, load_preset, open_scenes, read_run
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments.cells import MapCell
-from nbtrack.experiments.grid import Execution, run_cells
+from nbtrack.experiments.grid import Execution, run_jobs
+from nbtrack.experiments.jobs import MapJob
 from nbtrack.experiments.methods import TABLE_1
-from nbtrack.experiments.runs import TrackCell
+from nbtrack.experiments.runs import TrackJob
 from nbtrack.experiments.scenes import Scene
 from nbtrack.tables import write_csv
 
@@ -50,9 +50,9 @@ def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
     tracker does not call it lost; `found_again` counts how often a wrong frame is followed by a
     right one."""
     preset = with_settings(PRESET, *method.settings)
-    made = MapCell(room, method.field, preset, MAPPED)
-    cell = TrackCell(made, room, method.tracker, steps, frames=frames, n_threads=1)
-    found = run_cells([cell], f"{room.name}, {method.label}", Execution(workers=1))[0]
+    made = MapJob(room, method.field, preset, MAPPED)
+    job = TrackJob(made, room, method.tracker, steps, frames=frames, n_threads=1)
+    found = run_jobs([job], f"{room.name}, {method.label}", Execution(workers=1))[0]
     tracked = read_run(cell.folder.name).frames
     is_wrong = (tracked["translation_error_m"] > WRONG_M).to_numpy()
     is_lost = tracked["lost"].to_numpy(bool)

@@ -61,7 +61,7 @@ OPTIONS = {
                            choices=("steps", "clock"), default="steps"),
     "--scenes A,B": _option("only these scenes of the preset's kind"),
     "--seeds K": _option("K maps and runs a cell: mean ± std", a_count, default=1),
-    "--workers N": _option("cells side by side (default: one a core, or one on a GPU)", a_count),
+    "--workers N": _option("jobs side by side (default: one a core, or one on a GPU)", a_count),
     "--dask ADDRESS": _option("run on a Dask cluster, as tcp://HOST:8786"),
     "--beyond": {"help": "Table III instead: the paper's methods and ours, 30 Hz too",
                  "action": "store_true"},

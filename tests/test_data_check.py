@@ -33,8 +33,8 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.settings import with_settings
 from nbtrack.data.check import DataReport, check_recording, quick_warning
+from nbtrack.data.conventions import CONVENTIONS
 from nbtrack.data.formats import WORLD_TO_CAMERA
-from nbtrack.data.readings import CONVENTIONS
 from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import read_sequence
 from nbtrack.experiments.presets import load_preset
@@ -121,7 +121,7 @@ def test_misread_is_named(tmp_path: Path, name: str, keys: dict[str, str], scale
     report = check(box)
     (warning,) = report.warnings
     assert f" like {name}; set " in warning
-    assert not report.readings[0].median_m < 0.03
+    assert not report.conventions[0].median_m < 0.03
     settings = re.findall(r'\w+ = (?:"[^"]+"|[\d.]+)', warning)
     (box / "sequence.toml").write_text("\n".join(settings) + "\n")
     report = check(box)
@@ -134,7 +134,7 @@ def test_misread_is_named(tmp_path: Path, name: str, keys: dict[str, str], scale
     [
         (walk(8, 0.0, 0.0), 1.0, "poses.txt is not proved: the camera moves too little to tell"),
         (walk(1), 1.0, "poses.txt is not proved: that takes two frames"),
-        (walk(N_FRAMES), 2.0, "no other reading fits: check focal.txt, the depth unit"),
+        (walk(N_FRAMES), 2.0, "no other convention fits: check focal.txt, the depth unit"),
         (
             JUMPING,
             1.0,
@@ -142,12 +142,12 @@ def test_misread_is_named(tmp_path: Path, name: str, keys: dict[str, str], scale
         ),
         (walk(6, 0.03, 120.0), 1.0, "poses.txt is not proved: two frames see too little of the sa"),
     ],
-    ids=["still", "one frame", "no reading fits", "jump", "turned away"],
+    ids=["still", "one frame", "no convention fits", "jump", "turned away"],
 )
 def test_one_warning(tmp_path: Path, poses: np.ndarray, scale: float, says: str) -> None:
     """Catches what is called right because nothing contradicts it, and statistics of nothing."""
     report = check(write_box(tmp_path / "box", poses, scale))
-    assert report.best is report.readings[0]
+    assert report.best is report.conventions[0]
     assert len(report.warnings) == 1
     assert re.search(f"  warning: .*{says}", str(report))
 
@@ -179,7 +179,7 @@ def test_real_recording() -> None:
     report = check(REAL_ROOM)
     assert report.warnings == []
     assert report.best.median_m < 0.02
-    assert min(r.relative for r in report.readings[1:]) > 4 * report.best.relative
+    assert min(r.relative for r in report.conventions[1:]) > 4 * report.best.relative
 
 
 @cache

@@ -29,8 +29,8 @@ from tiny import tiny_words
 
 from nbtrack.cli import main
 from nbtrack.core.errors import DataError, NbtrackError
-from nbtrack.experiments.cells import Cell, Report
-from nbtrack.experiments.grid import Execution, run_cells
+from nbtrack.experiments.grid import Execution, run_jobs
+from nbtrack.experiments.jobs import Job, Report
 from nbtrack.mapping.files import MAP_FILE, read_map
 from nbtrack.tracking.trajectories import read_tum
 
@@ -39,8 +39,8 @@ pytestmark = pytest.mark.filterwarnings("default")
 
 
 @dataclass(frozen=True)
-class Square(Cell):
-    """A cell that squares a number; or fails, or takes its process with it."""
+class Square(Job):
+    """A job that squares a number; or fails, or takes its process with it."""
 
     number: int
     how: str = "well"
@@ -81,26 +81,26 @@ def address() -> Iterator[str]:
 
 @pytest.fixture(params=["here", "on a cluster"])
 def execution(request: pytest.FixtureRequest, address: str) -> dict[str, Any]:
-    """Both ways of running cells."""
+    """Both ways of running jobs."""
     return {"workers": 1} if request.param == "here" else {"dask": address}
 
 
 def test_results_come_in_order(execution: dict, capsys: pytest.CaptureFixture) -> None:
     """Catches results in the order of their completion, twins computed twice, and early noise."""
-    cells = [Square(3), Square(1, needs=Square(4)), Square(3), Square(5, is_done=True)]
-    assert run_cells(cells, "squares", Execution(**execution)) == [9, 1, 9, 25]
+    jobs = [Square(3), Square(1, needs=Square(4)), Square(3), Square(5, is_done=True)]
+    assert run_jobs(jobs, "squares", Execution(**execution)) == [9, 1, 9, 25]
     if execution == {"workers": 1}:
         assert capsys.readouterr().err == ""
 
 
 def test_a_users_mistake_comes_through_and_others_go_on(execution: dict) -> None:
-    """Catches errors of workers that lose their class or message on the way, one bad cell that ends
+    """Catches errors of workers that lose their class or message on the way, one bad job that ends
     the grid, and dependants that do not know why they failed."""
     bad = Square(7, "badly")
-    cells = [bad, Square(2, needs=bad), Square(3)]
+    jobs = [bad, Square(2, needs=bad), Square(3)]
     with pytest.raises(DataError, match=r"depth7.png is empty"):
-        run_cells(cells, "mixed", Execution(**execution))
-    results = run_cells(cells, "mixed", Execution(**execution, keep_going=True))
+        run_jobs(jobs, "mixed", Execution(**execution))
+    results = run_jobs(jobs, "mixed", Execution(**execution, keep_going=True))
     assert isinstance(results[0], DataError)
     assert str(results[1]) == "not run, because square 7 failed: depth7.png is empty"
     assert results[2] == 9
@@ -109,7 +109,7 @@ def test_a_users_mistake_comes_through_and_others_go_on(execution: dict) -> None
 def test_a_worker_that_dies_is_explained(address: str) -> None:
     """Catches a traceback, or waiting for ever, where the system took a worker away."""
     with pytest.raises(NbtrackError, match="a worker process died at square 7") as caught:
-        run_cells([Square(7, "deadly"), Square(2)], "dying", Execution(dask=address))
+        run_jobs([Square(7, "deadly"), Square(2)], "dying", Execution(dask=address))
     assert "\n" not in str(caught.value)
 
 
@@ -120,7 +120,7 @@ def test_the_bar_moves_within_a_cell(monkeypatch: pytest.MonkeyPatch, execution:
         "nbtrack.core.progress.ProgressBar.move_to",
         lambda bar, done, status="": seen.append((done, status)),
     )
-    run_cells([Square(1, "slowly"), Square(2, "slowly")], "slow", Execution(**execution))
+    run_jobs([Square(1, "slowly"), Square(2, "slowly")], "slow", Execution(**execution))
     assert any(0 < done < 2 and "half" in status for done, status in seen)
     assert max(done for done, _ in seen) == 2
 
@@ -148,10 +148,10 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 def test_a_cluster_makes_the_same_table(address: str, tmp_path: Path, undisturbed: bytes) -> None:
-    """Catches cells that the cluster computes otherwise, or keeps where nobody looks."""
+    """Catches jobs that the cluster computes otherwise, or keeps where nobody looks."""
     assert tables(tmp_path, "--dask", address) == 0
     assert (tmp_path / "out/table_1_cells.csv").read_bytes() == undisturbed
-    # A failure in a worker comes back as one line, and the other cells still run.
+    # A failure in a worker comes back as one line, and the other jobs still run.
     for file in tmp_path.rglob("office*/**/depth_filtered/depth1.png"):
         file.write_bytes(b"no image")
     for kind in ("maps", "tracks"):
@@ -164,7 +164,7 @@ def test_a_cluster_makes_the_same_table(address: str, tmp_path: Path, undisturbe
 
 
 def test_killed_with_two_workers_and_told_again(tmp_path: Path, undisturbed: bytes) -> None:
-    """Catches workers that outlive their parent, finished cells that are made again, and
+    """Catches workers that outlive their parent, finished jobs that are made again, and
     half-written ones that count as done."""
     arguments = words(tmp_path, "--workers", "2")
     with forking() as context:

@@ -22,12 +22,12 @@ from tiny import tiny_words
 from nbtrack.cli import main
 from nbtrack.core import files
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.jobs import MapJob
 from nbtrack.experiments.output import LOCK_FILE
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.results import track_scenes
-from nbtrack.experiments.runs import TrackCell
+from nbtrack.experiments.runs import TrackJob
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.synthetic import make, room
 from nbtrack.tracking.trajectories import read_tum
@@ -77,11 +77,11 @@ def test_one_command_at_a_time_writes_to_a_folder(
 
 def test_places_are_told_before_the_work(work: Path, capsys: pytest.CaptureFixture) -> None:
     """Catches hours of mapping that end at a place where nothing can be written."""
-    with mock.patch("nbtrack.experiments.commands.run_cells") as run_cells:
+    with mock.patch("nbtrack.experiments.commands.run_jobs") as run_jobs:
         for place in ("room", "room/run", "/proc/nbtrack"):
             new = ["--set", "mapping.neus.n_rays=31"]
             assert_refused(work, capsys, [*OWN, *new, "--out", place], place.split("/")[-1])
-        run_cells.assert_not_called()
+        run_jobs.assert_not_called()
 
 
 def _killed(command: list[str]) -> None:
@@ -220,8 +220,8 @@ def test_threads_belong_to_a_run_and_its_key(work: Path) -> None:
     """Catches seconds a frame of two threads that are given out as those of one."""
     preset = load_preset(settings=[*SET[1::2], "scenes.names=['living_room']"])
     scenes = open_scenes(preset)
-    cell = TrackCell(MapCell(scenes[0], "neus", preset), scenes[0], "sdf", 2)
-    assert cell.key != replace(cell, n_threads=2).key
+    job = TrackJob(MapJob(scenes[0], "neus", preset), scenes[0], "sdf", 2)
+    assert job.key != replace(job, n_threads=2).key
     found = [
         track_scenes(scenes, ["sdf"], preset, [30], clock=True, execution=Execution(threads=n))
         for n in (1, 2)

@@ -20,8 +20,8 @@ from nbtrack.cli import main
 from nbtrack.core.errors import ConfigError, MissingError, NbtrackError
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.bench import default_pixels, measure_steps
-from nbtrack.experiments.cells import MapCell
 from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.jobs import MapJob
 from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, Method
 from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.results import map_scene, map_scenes, read_run, track_scenes
@@ -75,7 +75,7 @@ def test_table_1_is_complete_cached_and_repeatable(
     assert run.T_estimated.shape == run.T_true.shape == (4, 4, 4)
     assert len(run.frames) == 4
     with monkeypatch.context() as patch:
-        for name in ("cells.map_sequence", "runs.track_sequence"):
+        for name in ("jobs.map_sequence", "runs.track_sequence"):
             patch.delattr(f"nbtrack.experiments.{name}")
         again = track_scenes(open_scenes(preset), TABLE_1, preset)
     pd.testing.assert_frame_equal(again, cells)
@@ -88,16 +88,16 @@ def test_table_1_is_complete_cached_and_repeatable(
 def test_keys_change_with_what_matters(preset: Preset, scenes: list[Scene]) -> None:
     """Catches a cached result that is taken for one of another setting, seed or slice."""
     cells = [
-        MapCell(scenes[0], "neus", preset),
-        MapCell(scenes[0], "imap", preset),
-        MapCell(scenes[0], "neus", preset, seed=1),
-        MapCell(scenes[0], "neus", preset, frames=":3"),
-        MapCell(scenes[0], "neus", with_settings(preset, "mapping.neus.n_rays=9")),
-        MapCell(scenes[1], "neus", preset),
+        MapJob(scenes[0], "neus", preset),
+        MapJob(scenes[0], "imap", preset),
+        MapJob(scenes[0], "neus", preset, seed=1),
+        MapJob(scenes[0], "neus", preset, frames=":3"),
+        MapJob(scenes[0], "neus", with_settings(preset, "mapping.neus.n_rays=9")),
+        MapJob(scenes[1], "neus", preset),
     ]
     assert len({cell.key for cell in cells}) == 6
     untouched = with_settings(preset, "tracking.sdf.n_pixels=17")
-    assert MapCell(scenes[0], "neus", untouched).key == cells[0].key
+    assert MapJob(scenes[0], "neus", untouched).key == cells[0].key
 
 
 def test_maps_and_their_scores(preset: Preset, scenes: list[Scene]) -> None:

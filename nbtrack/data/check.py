@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import DataError
-from nbtrack.data.readings import (
+from nbtrack.data.conventions import (
     ROTATED,
-    Reading,
-    best_reading,
+    Convention,
+    best_convention,
+    conventions,
     diagnosis,
     fitted,
     preferring_edges,
-    readings,
 )
 from nbtrack.data.recording import Recording
 from nbtrack.data.sequence import RgbdSequence, read_frames
@@ -48,8 +48,8 @@ class DataReport:
     recording: Recording
     frames: pd.DataFrame  # what `_by_frame` tells
     cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m), frame
-    readings: list[Reading]  # the declared one first
-    best: Reading  # the declared one unless another is clearly better
+    conventions: list[Convention]  # the declared one first
+    best: Convention  # the declared one unless another is clearly better
 
     @property
     def warnings(self) -> list[str]:
@@ -61,9 +61,9 @@ class DataReport:
         measured, scale = self.frames.measured.mean(), self.recording.declared.depth_scale
         values = (self.cloud.depth * scale).round().unique()
         eights = np.mean(values % 8 == 0) * (len(values) > 8)  # of a few it may be so by chance
-        is_right = self.best is self.readings[0]  # else motion and depth tell nothing
+        is_right = self.best is self.conventions[0]  # else motion and depth tell nothing
         rules = [
-            (True, diagnosis(self.readings, self.best, self.recording)),
+            (True, diagnosis(self.conventions, self.best, self.recording)),
             (
                 scale not in ROTATED and eights > _ROTATED_SHARE,
                 f"{eights:.0%} of the depth values are multiples of 8, as where they are rotated "
@@ -105,7 +105,7 @@ class DataReport:
         return advice
 
     def __str__(self) -> str:
-        cloud, recording, (own, *others) = self.cloud, self.recording, self.readings
+        cloud, recording, (own, *others) = self.cloud, self.recording, self.conventions
         rivals = sorted((r for r in others if r.overlap > 0), key=lambda r: r.relative)[:3]
         c = own.camera
         wide = 2 * np.degrees(np.arctan(c.width / 2 / c.fx))
@@ -144,7 +144,7 @@ def check_recording(recording: Recording, progress: bool = False) -> DataReport:
     pairs = _pairs(sequence.T_world_camera, _N_PAIRS)
     results = _fitted_to(sequence, recording, pairs)
     return DataReport(
-        recording, frames, _cloud(results[0], sequence), results, best_reading(results)
+        recording, frames, _cloud(results[0], sequence), results, best_convention(results)
     )
 
 
@@ -162,7 +162,7 @@ def quick_warning(recording: Recording) -> str:
     if not sequence.depths_mm.any():
         return ""  # whoever needs depth says so
     results = _fitted_to(sequence, recording, places.reshape(pairs.shape))
-    best, depth = best_reading(results), _cloud(results[0], sequence).depth.median()
+    best, depth = best_convention(results), _cloud(results[0], sequence).depth.median()
     if best is results[0] and not _DEPTH[0] <= depth <= _DEPTH[1]:
         return f"the median depth is {depth:.3g} m: set depth_scale or no_depth in sequence.toml"
     return diagnosis(results, best, recording, needs_proof=False)
@@ -190,14 +190,14 @@ def _pairs(T_world_camera: Poses, maximum: int) -> Int[np.ndarray, "2 pairs"]:
 
 def _fitted_to(
     sequence: RgbdSequence, recording: Recording, pairs: Int[np.ndarray, "2 pairs"]
-) -> list[Reading]:
-    """All readings, the declared one first, and how well pairs of the frames agree under each."""
+) -> list[Convention]:
+    """All conventions, the declared one first, with how well pairs of frames agree under each."""
     poses = recording.file_poses[sequence.frame_ids[pairs.ravel()]]
-    candidates = readings(recording.declared, sequence.intrinsics)
+    candidates = conventions(recording.declared, sequence.intrinsics)
     some = np.unique(pairs)
     candidates = preferring_edges(candidates, sequence.colors[some], sequence.depths_mm[some])
     in_files = sequence.depths_mm[pairs], poses, recording.declared.quaternion
-    return [fitted(reading, *in_files) for reading in candidates]
+    return [fitted(convention, *in_files) for convention in candidates]
 
 
 def _by_frame(sequence: RgbdSequence) -> pd.DataFrame:
@@ -214,11 +214,11 @@ def _by_frame(sequence: RgbdSequence) -> pd.DataFrame:
     return frames.join(steps[np.diff(frames.index) == 1])
 
 
-def _cloud(reading: Reading, sequence: RgbdSequence) -> pd.DataFrame:
-    """Coloured points of some frames, as the reading places them; depth along the axis."""
+def _cloud(convention: Convention, sequence: RgbdSequence) -> pd.DataFrame:
+    """Coloured points of some frames, as the convention places them; depth along the axis."""
     some = sequence.select(slice(None, None, max(1, round(len(sequence) / _CLOUD_FRAMES))))
     stride = max(1, round((some.depths_mm[0].size / _POINTS_PER_FRAME) ** 0.5))
-    points = reading.grid_points(some.depths_mm, stride).numpy()
+    points = convention.grid_points(some.depths_mm, stride).numpy()
     world = points @ some.T_world_camera[:, :3, :3].mT + some.T_world_camera[:, None, :3, 3]
     colors = some.colors[:, ::stride, ::stride].reshape(*points.shape)
     cloud = np.concatenate([world, colors, points[..., 2:]], axis=-1).reshape(-1, 7)

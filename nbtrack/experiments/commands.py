@@ -16,12 +16,12 @@ from nbtrack.data.check import check_recording, quick_warning
 from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import parse_frames, read_frames
 from nbtrack.data.writer import convert_sequence
-from nbtrack.experiments.cells import MapCell
-from nbtrack.experiments.grid import run_cells
+from nbtrack.experiments.grid import run_jobs
+from nbtrack.experiments.jobs import MapJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, METHODS, Method, method_of
 from nbtrack.experiments.output import new_file, output_folder
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
-from nbtrack.experiments.runs import OF_MAPS, RUN_FILES, TrackCell
+from nbtrack.experiments.runs import OF_MAPS, RUN_FILES, TrackJob
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.fields import NetworkSettings, PointCloud
 from nbtrack.mapping.files import (
@@ -69,16 +69,16 @@ def map_command(options: Namespace) -> None:
     method = method_of(options.method, options.field, None)
     preset = preset_of(options, method)
     scene = _checked_scene(options, preset, options.frames)
-    cell = MapCell(scene, method.field, preset, options.frames, options.seed, options.out)
+    job = MapJob(scene, method.field, preset, options.frames, options.seed, options.out)
     with output_folder(options.out, *_MAP_FILES):
-        _make_map(cell, options.frames)
+        _make_map(job, options.frames)
 
 
-def _make_map(cell: MapCell, frames: str) -> None:
+def _make_map(job: MapJob, frames: str) -> None:
     """Map and say how good the map is; draw the mesh of what was seen."""
-    _map(cell)
-    finished, scene = cell.map(), cell.scene
-    print(f"{cell.folder}: {finished.field.label} map of {scene.name}")
+    _map(job)
+    finished, scene = job.map(), job.scene
+    print(f"{job.folder}: {finished.field.label} map of {scene.name}")
     print(f"  mapped in {finished.made['seconds']:.0f} s on {finished.made['device']}")
     _print_numbers({k: v for k, v in finished.made["quality"].items() if v is not None})
     try:
@@ -88,10 +88,10 @@ def _make_map(cell: MapCell, frames: str) -> None:
     except DataError as error:
         print(f"  no mesh: {error}")
     else:
-        write_atomic(cell.folder / MESH_FILE, mesh.export(file_type="ply"))
+        write_atomic(job.folder / MESH_FILE, mesh.export(file_type="ply"))
         origin = finished.made["origin"]
         where = f", relative to {origin} m" if any(origin) else ""
-        print(f"  mesh of what was seen: {cell.folder / MESH_FILE}{where}")
+        print(f"  mesh of what was seen: {job.folder / MESH_FILE}{where}")
 
 
 def track_command(options: Namespace) -> None:
@@ -104,20 +104,20 @@ def track_command(options: Namespace) -> None:
     steps = method.usual_steps if options.steps is options.rate is None else options.steps
     budget = make_budget(steps, options.rate)  # told before a room is made
     scene = _checked_scene(options, preset, *([] if given else [map_frames]))
-    cell = MapCell(
+    job = MapJob(
         scene, method.field, preset, map_frames, options.seed, options.map_from, given is not None
     )
-    run = TrackCell(
-        cell, scene, method.tracker, steps, options.rate, options.frames, options.seed,
+    run = TrackJob(
+        job, scene, method.tracker, steps, options.rate, options.frames, options.seed,
         options.out, options.threads, options.start or "given",
     )  # fmt: skip
     with output_folder(options.out, *RUN_FILES, OVERVIEW_FILE):
         if not given:
-            _map(cell)
+            _map(job)
         run = replace(run, out=run.folder)  # made anew, whatever the cache holds
-        (metrics,) = run_cells([run], f"tracking {scene.name}")
+        (metrics,) = run_jobs([run], f"tracking {scene.name}")
         _draw_overview(run)
-    print(f"{run.folder}: {method.tracker} in {cell.map().field.label}, {budget}")
+    print(f"{run.folder}: {method.tracker} in {job.map().field.label}, {budget}")
     _print_metrics(metrics)
 
 
@@ -138,7 +138,7 @@ def _print_metrics(metrics: dict[str, Any]) -> None:
         tell(f"nbtrack: warning: {metrics['map_warning']}")
 
 
-def _draw_overview(run: TrackCell) -> None:
+def _draw_overview(run: TrackJob) -> None:
     """A picture of a finished run, beside its files: the path in what was seen of the map."""
     from nbtrack.plots import cloud_of, plot_overview
 
@@ -264,7 +264,9 @@ def check_command(options: Namespace) -> None:
     path = new_file(options.out if is_picture else options.out / "check.png")
     path.parent.mkdir(parents=True, exist_ok=True)
     T_world_camera = shifted(recording.T_world_camera[recording.has_pose], -recording.origin)
-    apart = f"surfaces of two frames lie {1e3 * report.readings[0].median_m:.1f} mm apart (median)"
+    apart = (
+        f"surfaces of two frames lie {1e3 * report.conventions[0].median_m:.1f} mm apart (median)"
+    )
     plot_recording(report.cloud, T_world_camera, f"{recording.name}: {apart}").savefig(path)
     print(f"  picture         {path}")
 
@@ -329,15 +331,15 @@ def _with_network_of(given: Map, preset: Preset, options: Namespace) -> Preset:
     return replace(preset, network={**preset.network, name: network})
 
 
-def _map(cell: MapCell) -> None:
-    if cell.is_done:
-        print(f"map found in {cell.folder}")
+def _map(job: MapJob) -> None:
+    if job.is_done:
+        print(f"map found in {job.folder}")
         return
-    print(f"no finished map in {cell.folder}: mapping")
-    has_pose = cell.scene.recording.has_pose[parse_frames(cell.frames)]
+    print(f"no finished map in {job.folder}: mapping")
+    has_pose = job.scene.recording.has_pose[parse_frames(job.frames)]
     if not has_pose.all():
         tell(f"nbtrack: {(~has_pose).sum()} of {len(has_pose)} frames have no pose: not mapped")
-    run_cells([cell], f"mapping {cell.scene.name}")
+    run_jobs([job], f"mapping {job.scene.name}")
 
 
 def _print_numbers(numbers: dict[str, float | int]) -> None:

@@ -1,4 +1,4 @@
-"""Cells computed side by side by Dask's workers, or one after the other by this process.
+"""Jobs computed side by side by Dask's workers, or one after the other by this process.
 
 Small networks gain nothing from a second thread, so scenes and methods share the cores instead.
 """
@@ -19,14 +19,14 @@ from nbtrack.core.device import choose_device, threads
 from nbtrack.core.errors import MissingError, NbtrackError
 from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.progress import ProgressBar
-from nbtrack.experiments.cells import Cell
+from nbtrack.experiments.jobs import Job
 from nbtrack.fields import FIELDS
 from nbtrack.tracking import TRACKERS
 
 _REPORT_SECONDS = 0.3  # between two reports of a worker
 _SECONDS_TO_CONNECT = 10
 _LOCAL = {
-    # A cell that kills its worker is tried once more; memory is the user's to divide.
+    # A job that kills its worker is tried once more; memory is the user's to divide.
     "distributed.scheduler.allowed-failures": 1,
     # Without Dask's own malloc threshold, which gives every tensor's memory back to the system:
     # mapping then spent almost half of its time on getting it again.
@@ -36,15 +36,15 @@ _LOCAL = {
 
 @dataclass(frozen=True)
 class Execution:
-    """How cells are run; of all this only the threads may change last digits of a result."""
+    """How jobs are run; of all this only the threads may change last digits of a result."""
 
-    # Processes; by default one a core, or this process alone where a GPU does the work: cells on
+    # Processes; by default one a core, or this process alone where a GPU does the work: jobs on
     # one GPU only wait for each other.
     workers: int | None = None
-    threads: int | None = None  # of each cell; by default this process's, divided by the workers
-    dask: str | None = None  # address of a Dask scheduler whose workers run the cells instead
-    # A user's mistake in one cell stands in its place among the results, as the exception, and so
-    # does one for every cell that needs it; the others still run.
+    threads: int | None = None  # of each job; by default this process's, divided by the workers
+    dask: str | None = None  # address of a Dask scheduler whose workers run the jobs instead
+    # A user's mistake in one job stands in its place among the results, as the exception, and so
+    # does one for every job that needs it; the others still run.
     keep_going: bool = False
 
     def __post_init__(self) -> None:
@@ -55,15 +55,15 @@ class Execution:
             )
 
 
-def run_cells(cells: Sequence[Cell], title: str, execution: Execution | None = None) -> list[Any]:
-    """The results of all cells, in order; those that are missing, and what they need, are made.
+def run_jobs(jobs: Sequence[Job], title: str, execution: Execution | None = None) -> list[Any]:
+    """The results of all jobs, in order; those that are missing, and what they need, are made.
 
-    Unless it is to keep going, it raises what the first failing cell raised, and drops the others.
+    Unless it is to keep going, it raises what the first failing job raised, and drops the others.
     """
     execution, results = execution or Execution(), {}
-    wanted = [part for cell in cells if not cell.is_done for part in (cell.needs, cell) if part]
-    missing = {cell.folder: cell for cell in wanted if not cell.is_done}
-    done = dict.fromkeys(missing, 0.0)  # shares: each cell counts as one, however long it takes
+    wanted = [part for job in jobs if not job.is_done for part in (job.needs, job) if part]
+    missing = {job.folder: job for job in wanted if not job.is_done}
+    done = dict.fromkeys(missing, 0.0)  # shares: each job counts as one, however long it takes
 
     def show(folder: Path, share: float, status: str) -> None:
         done[folder] = share
@@ -79,23 +79,23 @@ def run_cells(cells: Sequence[Cell], title: str, execution: Execution | None = N
                 raise outcome
             results[folder] = outcome
             show(folder, 1.0, "done")
-    return [results[c.folder] if c.folder in results else c.result() for c in cells]
+    return [results[job.folder] if job.folder in results else job.result() for job in jobs]
 
 
 def _outcomes(
-    cells: dict[Path, Cell], results: dict[Path, Any], show: Callable, execution: Execution
+    jobs: dict[Path, Job], results: dict[Path, Any], show: Callable, execution: Execution
 ) -> Iterator[tuple[Path, Any]]:
-    """What becomes of each cell, as they end; what a cell needs comes before it."""
+    """What becomes of each job, as they end; what a job needs comes before it."""
     usual = os.cpu_count() or 1 if _has_dask() and choose_device().type == "cpu" else 1
-    workers = min(execution.workers or usual, len(cells))
-    if cells and (execution.dask is not None or workers > 1):
+    workers = min(execution.workers or usual, len(jobs))
+    if jobs and (execution.dask is not None or workers > 1):
         share = 1 if execution.dask else max(1, torch.get_num_threads() // workers)
-        yield from _on_workers(cells, show, execution.dask, workers, execution.threads or share)
+        yield from _on_workers(jobs, show, execution.dask, workers, execution.threads or share)
         return
     with threads(execution.threads or torch.get_num_threads()):
-        for folder, cell in cells.items():
-            needed = results.get(cell.needs.folder) if cell.needs else None
-            yield folder, cell.outcome(needed, partial(show, folder))
+        for folder, job in jobs.items():
+            needed = results.get(job.needs.folder) if job.needs else None
+            yield folder, job.outcome(needed, partial(show, folder))
 
 
 def _has_dask() -> bool:
@@ -103,11 +103,11 @@ def _has_dask() -> bool:
 
 
 def _on_workers(
-    cells: Mapping[Path, Cell], show: Callable, address: str | None, workers: int, n_threads: int
+    jobs: Mapping[Path, Job], show: Callable, address: str | None, workers: int, n_threads: int
 ) -> Iterator[tuple[Path, Any]]:
-    """The same by Dask: each cell begins as soon as what it needs is there.
+    """The same by Dask: each job begins as soon as what it needs is there.
 
-    `show` is told where a running cell is. Without the address of a Dask scheduler, `workers` local
+    `show` is told where a running job is. Without the address of a Dask scheduler, `workers` local
     processes are started.
     """
     import dask
@@ -120,10 +120,10 @@ def _on_workers(
         settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
         settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
         waiting: dict[Path, Any] = {}
-        for priority, (folder, cell) in enumerate(cells.items()):
-            needed = waiting.get(cell.needs.folder) if cell.needs else None
+        for priority, (folder, job) in enumerate(jobs.items()):
+            needed = waiting.get(job.needs.folder) if job.needs else None
             waiting[folder] = client.submit(
-                _outcome_there, cell, needed, topic, settings, n_threads, (FIELDS, TRACKERS),
+                _outcome_there, job, needed, topic, settings, n_threads, (FIELDS, TRACKERS),
                 key=f"{topic}-{folder.name}", pure=False, priority=-priority,
             )  # fmt: skip
         while waiting:
@@ -145,7 +145,7 @@ def _on_workers(
 
 
 def _outcome_there(
-    cell: Cell, needed: Any, topic: str, settings: dict[str, str], n_threads: int, known: Any
+    job: Job, needed: Any, topic: str, settings: dict[str, str], n_threads: int, known: Any
 ) -> Any:
     """Runs in a worker, which may have been started with other folders, or for another device.
 
@@ -162,10 +162,10 @@ def _outcome_there(
         nonlocal last
         if time.monotonic() - last > _REPORT_SECONDS:
             last = time.monotonic()
-            worker.log_event(topic, [str(cell.folder), share, status])
+            worker.log_event(topic, [str(job.folder), share, status])
 
     with threads(n_threads):
-        return cell.outcome(needed, report)
+        return job.outcome(needed, report)
 
 
 def _client(address: str | None, workers: int) -> Any:

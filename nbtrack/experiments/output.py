@@ -32,7 +32,7 @@ def new_file(path: Path) -> Path:
 def output_folder(folder: Path | None, *names: str) -> Iterator[None]:
     """Keep a folder for this process alone while files of these names are written there.
 
-    None stands for the cache, whose cells are kept apart already.
+    None stands for the cache, whose jobs are kept apart already.
 
     Raises ConfigError where it is no folder, holds a recording or such files of somebody else, or
     where another process writes; OSError where nothing can be written.

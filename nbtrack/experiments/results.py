@@ -13,11 +13,11 @@ from nbtrack.core.errors import NbtrackError
 from nbtrack.core.files import runs_folder
 from nbtrack.core.progress import tell
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments.cells import MapCell
-from nbtrack.experiments.grid import Execution, run_cells
+from nbtrack.experiments.grid import Execution, run_jobs
+from nbtrack.experiments.jobs import MapJob
 from nbtrack.experiments.methods import Method, find_methods
 from nbtrack.experiments.presets import Preset
-from nbtrack.experiments.runs import TrackCell
+from nbtrack.experiments.runs import TrackJob
 from nbtrack.experiments.scenes import Scene
 from nbtrack.mapping.files import Map
 from nbtrack.tracking.trajectories import Trajectory, read_trajectory
@@ -25,9 +25,9 @@ from nbtrack.tracking.trajectories import Trajectory, read_trajectory
 
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0, frames: str = ":") -> Map:
     """The map of a scene, from the cache or made now."""
-    cell = MapCell(scene, field, preset, frames, seed)
-    run_cells([cell], f"mapping {cell.name}")
-    return cell.map()
+    job = MapJob(scene, field, preset, frames, seed)
+    run_jobs([job], f"mapping {job.name}")
+    return job.map()
 
 
 def map_scenes(
@@ -42,8 +42,8 @@ def map_scenes(
     A row is a map: field, scene, seed, seconds, and the scores, `SCORES`.
     """
     places = [*product(fields, range(seeds), scenes)]
-    cells = [MapCell(scene, field, preset, seed=seed) for field, seed, scene in places]
-    records = run_cells(cells, "mapping", execution)
+    jobs = [MapJob(scene, field, preset, seed=seed) for field, seed, scene in places]
+    records = run_jobs(jobs, "mapping", execution)
     return pd.DataFrame(
         {"field": field, "scene": scene.name, "seed": seed}
         | {"seconds": record["seconds"], **record["quality"]}
@@ -80,35 +80,35 @@ def track_scenes(
     options = {"frames": frames or preset.scenes.track_frames, "n_threads": execution.threads}
     if clock:  # how far a run comes depends on its threads
         options["n_threads"] = execution.threads or torch.get_num_threads()
-    pairs, cells, rows = list(zip(scenes, tracked or scenes, strict=True)), [], []
+    pairs, jobs, rows = list(zip(scenes, tracked or scenes, strict=True)), [], []
     grid = product(find_methods(methods), seeds, rates or preset.tables.rates_hz, pairs)
     for method, seed, rate_hz, (scene, seen) in grid:
-        map_cell = MapCell(scene, method.field, with_settings(preset, *method.settings), seed=seed)
+        map_job = MapJob(scene, method.field, with_settings(preset, *method.settings), seed=seed)
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
         budget = n_steps, rate_hz if clock else None
-        cells.append(TrackCell(map_cell, seen, method.tracker, *budget, seed=seed, **options))
+        jobs.append(TrackJob(map_job, seen, method.tracker, *budget, seed=seed, **options))
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
-        rows.append({**row, "seed": seed, "run": cells[-1].folder.name})
-    outcomes = _run(cells, clock, execution)
-    return pd.DataFrame(map(_told, rows, cells, outcomes))
+        rows.append({**row, "seed": seed, "run": jobs[-1].folder.name})
+    outcomes = _run(jobs, clock, execution)
+    return pd.DataFrame(map(_row_of, rows, jobs, outcomes))
 
 
-def _run(cells: Sequence[TrackCell], clock: bool, execution: Execution) -> list[Any]:
+def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:
     """Side by side; by the clock one after the other, here: a neighbour would slow a clock down."""
-    n_done = sum(cell.is_done for cell in cells)
-    if 0 < n_done < len(cells):
-        tell(f"{n_done} of {len(cells)} runs are cached")
+    n_done = sum(job.is_done for job in jobs)
+    if 0 < n_done < len(jobs):
+        tell(f"{n_done} of {len(jobs)} runs are cached")
     if clock:
-        run_cells([cell.needs for cell in cells if not cell.is_done], "mapping", execution)
+        run_jobs([job.needs for job in jobs if not job.is_done], "mapping", execution)
         execution = replace(execution, workers=1, dask=None)
-    return run_cells(cells, "by the clock" if clock else "tracking", execution)
+    return run_jobs(jobs, "by the clock" if clock else "tracking", execution)
 
 
-def _told(
-    row: dict[str, Any], cell: TrackCell, result: dict[str, Any] | NbtrackError
+def _row_of(
+    row: dict[str, Any], job: TrackJob, result: dict[str, Any] | NbtrackError
 ) -> dict[str, Any]:
     """A whole row. Its scene is the mapped one; metrics name the one that was tracked."""
-    row |= {"n_pixels": cell.settings.n_pixels, "failure": "", "ate_m": float("nan")}
+    row |= {"n_pixels": job.settings.n_pixels, "failure": "", "ate_m": float("nan")}
     if isinstance(result, NbtrackError):
         return row | {"failure": str(result)}
     metrics = {k: v for k, v in result.items() if k not in ("config", "versions")}

@@ -1,4 +1,4 @@
-"""Tracked runs as cells: one tracker in one map, under one budget."""
+"""Tracked runs as jobs: one tracker in one map, under one budget."""
 
 import shlex
 import time
@@ -14,7 +14,7 @@ import torch
 from nbtrack.core import files
 from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.settings import as_dict, changed_settings
-from nbtrack.experiments.cells import Cell, MapCell, Report
+from nbtrack.experiments.jobs import Job, MapJob, Report
 from nbtrack.experiments.presets import PRESETS
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
@@ -31,10 +31,10 @@ OF_MAPS = ("network.", "mapping.")
 
 
 @dataclass(frozen=True)
-class TrackCell(Cell):
+class TrackJob(Job):
     """One tracked run in a map, under one budget: so many steps a frame, or a rate by the clock."""
 
-    needs: MapCell
+    needs: MapJob
     scene: Scene  # the mapped one, or another recording of the same room
     tracker: str
     steps: float | int | None = None
@@ -156,7 +156,7 @@ class TrackCell(Cell):
             rated = rows.dropna(subset="translation_error_m")
             flags, errors = rated["lost"].to_numpy(dtype=bool), rated["translation_error_m"]
             metrics |= score_detection(flags, errors.to_numpy())
-        steps, seconds, map_cell = int(rows["steps"].sum()), rows["seconds"], self.needs
+        steps, seconds, map_job = int(rows["steps"].sum()), rows["seconds"], self.needs
         return {
             **metrics,
             "frames_without_depth": int(rows["without_depth"].sum()),
@@ -166,7 +166,7 @@ class TrackCell(Cell):
             "device": device_name(choose_device()),
             "threads": torch.get_num_threads(),
             "scene": self.scene.name,
-            "field": map_cell.field,
+            "field": map_job.field,
             "tracker": self.tracker,
             "seed": self.seed,
             "key": self.key,
@@ -174,23 +174,23 @@ class TrackCell(Cell):
             "command": self._command(),
             "recording": str(self.scene.folder),
             "format": self.scene.format,
-            "map": str(map_cell.folder),
+            "map": str(map_job.folder),
             "config": {
-                "preset": as_dict(map_cell.preset),
-                "map_frames": map_cell.frames,
-                "map_seed": map_cell.seed,
+                "preset": as_dict(map_job.preset),
+                "map_frames": map_job.frames,
+                "map_seed": map_job.seed,
                 **{name: getattr(self, name) for name in ("frames", "steps", "rate_hz")},
             },
         }
 
     def _command(self) -> str:
         """What makes this run anew, and its map where that is not cached."""
-        cell, preset = self.needs, self.needs.preset
+        job, preset = self.needs, self.needs.preset
         is_room = self.scene.made_by and not self.is_elsewhere
-        of_map = {"field": cell.field, "map-frames": cell.frames}
+        of_map = {"field": job.field, "map-frames": job.frames}
         options = {
             "format": self.scene.format,
-            **({"map-from": cell.folder} if self.is_elsewhere else of_map),
+            **({"map-from": job.folder} if self.is_elsewhere else of_map),
             "tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps, "start": self.start,
             "frames": self.frames, "seed": self.seed, "device": choose_device().type,
             "threads": self.n_threads, "preset": preset.name,

@@ -1,4 +1,4 @@
-"""Cells, each named by all that it depends on and made once; and maps as cells."""
+"""Jobs, each named by all that it depends on and made once; and maps as jobs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -27,19 +27,19 @@ from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
 from nbtrack.mapping.quality import score_map
 
 Report = Callable[[float, str], None]
-"""Called by a cell with the share of it that is done and a word on how it goes."""
+"""Called by a job with the share of it that is done and a word on how it goes."""
 
 
-class Cell:
+class Job:
     """One piece of work: picklable, kept in a folder of its own, perhaps made of another's."""
 
     kind: str  # the part of the cache where it is kept
     name: str  # for readers
     key: str  # changes with everything that the result depends on
     out: Path | None = None  # where to keep it instead of in the cache
-    needs: "Cell | None"
+    needs: "Job | None"
     is_done: bool
-    result: Callable[[], Any]  # what a finished cell has kept
+    result: Callable[[], Any]  # what a finished job has kept
     compute: Callable[[Report], Any]  # makes it, or takes a killed attempt up; returns `result`
 
     @property
@@ -70,7 +70,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class MapCell(Cell):
+class MapJob(Job):
     """One map: a field fitted to some frames of a scene, or a map made earlier in its place."""
 
     scene: Scene
@@ -114,7 +114,7 @@ class MapCell(Cell):
         return f"{name}-seed{self.seed}" if self.seed else name
 
     @property
-    def base(self) -> "MapCell | None":
+    def base(self) -> "MapJob | None":
         """The map that this one corrects, if it is a corrected one."""
         if not getattr(self.settings, "correct_voxel", 0.0):
             return None

@@ -1,6 +1,7 @@
 """Conventions under which a recording can be read: of poses, depth and calibration.
 
-Under the right convention the surfaces that two frames both see coincide."""
+Under the right convention the surfaces that two frames both see coincide.
+"""
 
 import json
 import math
@@ -65,7 +66,7 @@ CONVENTIONS = {  # by name: what `sequence.toml` says of it
 
 
 @dataclass(frozen=True)
-class Reading:
+class Convention:
     """One way to understand poses, depth and calibration, and how well frames then agree."""
 
     subject: str  # what is read otherwise than declared: poses, depth or calibration
@@ -103,8 +104,8 @@ class Reading:
         return self.declared.poses_to_opencv(T)
 
 
-def readings(declared: Declaration, camera: Intrinsics) -> list[Reading]:
-    """The declared reading first, then the usual mistakes, common ones first."""
+def conventions(declared: Declaration, camera: Intrinsics) -> list[Convention]:
+    """The declared convention first, then the usual mistakes, common ones first."""
     own = _convention_name(declared.camera_axes, declared.poses)
     declared = replace(declared, **CONVENTIONS.get(own, {}))  # `opencv` for `right down forward`
     conventions = {own: {}} | CONVENTIONS
@@ -118,11 +119,13 @@ def readings(declared: Declaration, camera: Intrinsics) -> list[Reading]:
     table += [("depth", f"{n:g} depth values a metre", {"depth_scale": n}) for n in _SCALES]
     table += [("depth", name, {"depth_along": along}) for along, name in _ALONG.items()]
     candidates = [
-        Reading(what, name, replace(declared, **keys), camera) for what, name, keys in table
+        Convention(what, name, replace(declared, **keys), camera) for what, name, keys in table
     ]
-    others = [Reading("depth", n, declared, camera, flipped=axes) for axes, n in _FLIPPED.items()]
+    others = [
+        Convention("depth", n, declared, camera, flipped=axes) for axes, n in _FLIPPED.items()
+    ]
     for unit, metres in (("millimetres", 1e-3), ("centimetres", 1e-2)):
-        others.append(Reading("poses", f"ones in {unit}", declared, camera, metres=metres))
+        others.append(Convention("poses", f"ones in {unit}", declared, camera, metres=metres))
     factors = {"with its principal point in the middle of the image": 1.0}
     factors |= {"for images twice as large": 0.5, "for images half as large": 2.0}
     lengths = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
@@ -130,7 +133,9 @@ def readings(declared: Declaration, camera: Intrinsics) -> list[Reading]:
         # The principal point scales with the rest, or is in the middle of any image.
         scaled = Intrinsics(camera.width, camera.height, *(factor * lengths).tolist())
         middle = replace(scaled, cx=camera.width / 2, cy=camera.height / 2)
-        candidates += [Reading("calibration", f"one {name}", declared, c) for c in (scaled, middle)]
+        candidates += [
+            Convention("calibration", f"one {name}", declared, c) for c in (scaled, middle)
+        ]
     candidates = candidates[:1] + [
         r for r in candidates if (r.declared, r.camera) != (declared, camera)
     ]
@@ -138,8 +143,8 @@ def readings(declared: Declaration, camera: Intrinsics) -> list[Reading]:
 
 
 def fitted(
-    reading: Reading, values: UInt16[np.ndarray, "2 pairs h w"], file_poses: Poses, order: str
-) -> Reading:
+    convention: Convention, values: UInt16[np.ndarray, "2 pairs h w"], file_poses: Poses, order: str
+) -> Convention:
     """How far points that the first frames of pairs measured lie from the second ones' surfaces.
 
     Depth is interpolated between four pixels, in 1/z, which is exact for planes. Points are left
@@ -148,18 +153,18 @@ def fitted(
     """
     height, width = values.shape[2:]
     stride = math.ceil((height * width / _POINTS_PER_FRAME) ** 0.5)
-    points_a = reading.grid_points(values[0], stride)
-    T_world_a, T_world_b = np.split(reading.T_world_camera(file_poses, order), 2)
+    points_a = convention.grid_points(values[0], stride)
+    T_world_a, T_world_b = np.split(convention.T_world_camera(file_poses, order), 2)
     T_b_a = torch.from_numpy(np.linalg.solve(T_world_b, T_world_a)).float()
     points_b = points_a @ T_b_a[:, :3, :3].mT + T_b_a[:, None, :3, 3]
-    columns, rows, depth = project(reading.camera, points_b)
+    columns, rows, depth = project(convention.camera, points_b)
     # From -1 at the first pixel to 1 at the last.
     at = 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1)[:, None] - 1
-    seen_by_b = np.flip(values[1], reading.flipped).astype(np.float32)
+    seen_by_b = np.flip(values[1], convention.flipped).astype(np.float32)
     inverse = 1 / torch.from_numpy(seen_by_b[:, None])
     blended = 1 / grid_sample(inverse, at, "bilinear", align_corners=True)[:, 0, 0]
     nearest = 1 / grid_sample(inverse, at, "nearest", align_corners=True)[:, 0, 0]
-    measured = reading.points(columns, rows, blended)[..., 2]
+    measured = convention.points(columns, rows, blended)[..., 2]
     is_measured = points_a[..., 2] > 0
     seen = is_measured & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
     seen &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
@@ -167,15 +172,15 @@ def fitted(
     apart, measured = (depth - measured).abs()[seen], measured[seen]
     median_m, relative = float(apart.median()), float((apart / measured).median())
     overlap = float(seen.sum() / is_measured.sum().clamp(1))
-    return replace(reading, median_m=median_m, relative=relative, overlap=overlap)
+    return replace(convention, median_m=median_m, relative=relative, overlap=overlap)
 
 
 def preferring_edges(
-    results: list[Reading],
+    results: list[Convention],
     colors: UInt8[np.ndarray, "frames h w 3"],
     values: UInt16[np.ndarray, "frames h w"],
-) -> list[Reading]:
-    """Readings in an order in which flipped depth comes second where it fits the colours better.
+) -> list[Convention]:
+    """Conventions in an order in which flipped depth comes second where it fits the colours better.
 
     Depth upside down fits other frames as well as mirrored camera axes do. But its edges are then
     not where the edges of the colour images are.
@@ -197,25 +202,25 @@ def preferring_edges(
         }
     best = max(alike, key=alike.__getitem__)
     if best and alike[best] > alike[()] + _EDGES_ALIKE:
-        return [results[0], *sorted(results[1:], key=lambda reading: reading.flipped != best)]
+        return [results[0], *sorted(results[1:], key=lambda convention: convention.flipped != best)]
     return results
 
 
-def best_reading(results: list[Reading]) -> Reading:
+def best_convention(results: list[Convention]) -> Convention:
     """The declared convention (the first), unless another fits clearly better.
 
     Another fits clearly better if its surfaces are at most half as far apart and overlap at least
     half as much. The second condition is needed because cameras that are turned away from each
     other may agree on the few points that remain.
     """
-    own, half = results[0], max(reading.overlap / 2 for reading in results)
+    own, half = results[0], max(convention.overlap / 2 for convention in results)
     enough = max(_MIN_OVERLAP, half)
     meeting = [r for r in results if r.overlap >= enough and r.median_m < _FAR_APART]
-    minimum = min((reading.relative for reading in meeting), default=math.inf)
+    minimum = min((convention.relative for convention in meeting), default=math.inf)
     if own.overlap >= half and not _is_clearly_less(minimum, own.relative):
         return own
     near = max(1.1 * minimum, minimum + _MIN_GAIN)  # the common ones come first
-    return next((reading for reading in meeting if reading.relative <= near), own)
+    return next((convention for convention in meeting if convention.relative <= near), own)
 
 
 def _is_clearly_less(relative: float, other: float) -> bool:
@@ -223,11 +228,11 @@ def _is_clearly_less(relative: float, other: float) -> bool:
 
 
 def diagnosis(
-    results: list[Reading], best: Reading, recording: Recording, needs_proof: bool = True
+    results: list[Convention], best: Convention, recording: Recording, needs_proof: bool = True
 ) -> str:
     """What is wrong with how the numbers are read, in a sentence; empty where nothing is.
 
-    Where proof is needed, it is wrong too that the camera moves too little to tell readings apart.
+    Where proof is needed, a camera that moves too little to tell conventions apart is wrong too.
     """
     own, file = results[0], os.path.relpath(recording.pose_file, recording.folder)
     apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
@@ -242,7 +247,7 @@ def diagnosis(
         return note if best.flipped or not alike else f"{note}; so would depth {alike[0].name}"
     if recording.has_pose.sum() < 2:
         return f"{file} is not proved: that takes two frames with a pose"
-    # Of few points, such as key frames share, not even a right reading's lie close.
+    # Of few points, such as key frames share, not even a right convention's lie close.
     few = own.overlap < _MIN_OVERLAP
     is_far = own.median_m > (_FAR_APART_OF_FEW if few else _FAR_APART)
     if own.overlap < (_MIN_CONTRADICTION if is_far else _MIN_OVERLAP):
@@ -252,7 +257,7 @@ def diagnosis(
     if is_far:
         return (
             f"surfaces that two frames see {apart} (median, {own.overlap:.0%} of the points "
-            f"overlap) and no other reading fits: check {recording.calibration.source.name}, "
+            f"overlap) and no other convention fits: check {recording.calibration.source.name}, "
             f"the depth unit and {file}, and that image, depth and pose belong to one moment"
         )
     if not needs_proof:
@@ -260,16 +265,16 @@ def diagnosis(
     poses = [r for r in results[1:] if r.subject == "poses" and r.overlap >= own.overlap / 2]
     alike = [r.name for r in poses if not _is_clearly_less(own.relative, r.relative)]
     little = f"{file} is not proved: the camera moves too little to tell {len(alike)} other "
-    return f"{little}readings apart, such as {alike[0]}" if alike else ""
+    return f"{little}conventions apart, such as {alike[0]}" if alike else ""
 
 
-def _remedy(reading: Reading, own: Reading) -> str:
-    """What to change, so that a reading is the declared one."""
-    if reading.flipped:
+def _remedy(convention: Convention, own: Convention) -> str:
+    """What to change, so that a convention is the declared one."""
+    if convention.flipped:
         return "turn the depth images as the colour images are"
-    if reading.metres != 1:
-        return f"multiply the positions in the pose file by {reading.metres:g}"
-    c, keys = reading.camera, asdict(reading.declared).items()
+    if convention.metres != 1:
+        return f"multiply the positions in the pose file by {convention.metres:g}"
+    c, keys = convention.camera, asdict(convention.declared).items()
     if c != own.camera:
         numbers = f"{c.fx:.6g} {c.fy:.6g} {c.cx - 0.5:.6g} {c.cy - 0.5:.6g}"
         return f"set fx fy cx cy in the calibration to {numbers} (the first pixel's centre at 0)"
