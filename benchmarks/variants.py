@@ -57,8 +57,9 @@ class _Best(AdamTracker):
             self.least, self.best = float(loss), before.double().numpy()
         return loss
 
-    def _search(self, frame, T_starts):
-        return replace(super()._search(frame, T_starts), T_world_camera=self.best)
+    def _search(self, frame, T_starts, n_steps):
+        found = super()._search(frame, T_starts, n_steps)
+        return replace(found, T_world_camera=self.best)
 
 
 class _Falling(AdamTracker):

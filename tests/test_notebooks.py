@@ -70,10 +70,3 @@ def test_no_two_tables_share_an_id(cells: list[dict[str, Any]]) -> None:
     pages = ["".join(output.get("data", {}).get("text/html", "")) for output in outputs]
     ids = re.findall(r'<table id="(.*?)"', " ".join(pages))
     assert len(set(ids)) == len(ids)
-
-
-def test_the_page_of_benchmarks_is_short() -> None:
-    """Catches a page of results that becomes a diary again."""
-    lines = (Path(__file__).parents[1] / "benchmarks" / "README.md").read_text().splitlines()
-    assert len(lines) <= 150
-    assert max(map(len, lines)) <= 100

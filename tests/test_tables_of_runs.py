@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -26,9 +27,9 @@ from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, M
 from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.results import map_scene, map_scenes, read_run, track_scenes
 from nbtrack.experiments.scenes import Scene, open_scenes
-from nbtrack.fields import PointCloud
+from nbtrack.fields import FIELDS, PointCloud
 from nbtrack.fields.correction import CorrectedField
-from nbtrack.tracking import make_tracker
+from nbtrack.tracking import TRACKERS, make_tracker
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -282,3 +283,20 @@ def test_searches_from_afar(
     assert len(found) == 2 * 2 * 2
     shares = found.groupby(["method", "offset"], sort=False)["recovered"].mean()
     assert shares.index[0] == ("NeuS with SDF", "0 cm, 0°")
+
+
+def test_variants_of_the_evidence_run(
+    preset: Preset, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a variant that no longer fits what it is made from: the evidence would stop midway,
+    after an hour."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    with mock.patch.dict(TRACKERS), mock.patch.dict(FIELDS):
+        variants = importlib.import_module("variants")
+        names = variants.TRACKERS.keys() - {"vr", "sdf", "lm", "icp"}
+        methods = [Method(n, "imap" if n.startswith("vr") else "neus", n) for n in sorted(names)]
+        methods += [Method("a", "neus_unguided", "sdf"), Method("b", "imap_silu", "vr")]
+        changed = variants.with_variants(preset)
+        runs = track_scenes(scenes[1:], methods, changed, steps=2, frames=":3")
+    assert len(runs) == 8
+    assert runs["ate_m"].notna().all()
