@@ -26,6 +26,7 @@ _POINTS_ALONG = 240  # grid points along the longer side of a slice
 _DIMMED = 0.72  # how white the unseen becomes
 _CUT = 0.01  # share of a recording's points cut off at either end: wild depths hide the room
 _MAX_FACES, _MAX_FACES_TO_TURN = 120_000, 10_000  # more are merged first
+_MAX_TUBES = 80  # straight pieces of a path in the viewer
 _ELEVATION = np.radians(45)  # of the viewer of a mesh
 _AMBIENT = 0.55  # share of the light on a mesh that comes from everywhere
 
@@ -162,10 +163,7 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
     camera-to-world poses by label are drawn on top; "true" is green, "tracked" red.
     """
     mesh, up = _simplified(mesh, _MAX_FACES), up_of(*T_paths.values())
-    # Marching cubes orients faces by the sign of the field, which differs between densities and
-    # distances. The room's shell outweighs what stands in it, so the middle votes.
-    inwards = mesh.bounds.mean(axis=0) - mesh.triangles_center
-    side = np.sign((inwards * mesh.face_normals).sum(axis=1) @ mesh.area_faces)
+    side = _inward_side(mesh)
     # None of the azimuths looks along the walls of a room aligned to the axes.
     screens = np.stack([screen_axes(up, azimuth) for azimuth in np.arange(15.0, 360.0, 30.0)])
     fronts = side * mesh.face_normals @ screens[:, 2].T
@@ -189,17 +187,64 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
     return axes.figure
 
 
+class _UnlitScene(trimesh.Scene):
+    """A scene whose colours are shown as they are: the viewer's one light leaves sides black."""
+
+    def export(self, *args, **options) -> bytes:
+        """As its parent, with one unlit material for all meshes (glTF's KHR_materials_unlit)."""
+        return super().export(*args, tree_postprocessor=_make_unlit, **options)
+
+
+def _make_unlit(tree: dict) -> None:
+    tree["materials"] = [{"extensions": {"KHR_materials_unlit": {}}}]
+    tree["extensionsUsed"] = ["KHR_materials_unlit"]
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            primitive["material"] = 0
+
+
 def mesh_viewer(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses]) -> trimesh.Scene:
     """The same, to be turned by hand: `mesh_viewer(...).show()` in a notebook.
 
-    The mesh is made coarser: the viewer adds 1.0 MB to the notebook, 0.7 MB of it the viewer's own.
+    Each path is a tube that ends in a pyramid, which opens where the last camera looks. The mesh is
+    made coarser: the viewer adds 1.2 MB to the notebook, 0.7 MB of it the viewer's own.
     """
-    scene = trimesh.Scene([_simplified(mesh, _MAX_FACES_TO_TURN)])
+    room, up = _simplified(mesh, _MAX_FACES_TO_TURN).copy(), up_of(*T_paths.values())
+    if _inward_side(room) < 0:
+        room.faces = room.faces[:, ::-1]  # the viewer leaves out faces that show their back
+    scene = _UnlitScene({"mesh": room})
     for label, color in method_colors(T_paths).items():
-        path = trimesh.load_path(T_paths[label][:, :3, 3])
-        path.colors = [trimesh.visual.color.hex_to_rgba(color)] * len(path.entities)
+        path = _path_mesh(T_paths[label], 0.004 * mesh.scale)
+        path.visual.face_colors = trimesh.visual.color.hex_to_rgba(color)
         scene.add_geometry(path, geom_name=label)
+    view = np.eye(4)
+    view[:3, :3] = screen_axes(up, 15.0).T
+    scene.camera = trimesh.scene.Camera(name="viewer", fov=(60, 45))
+    scene.camera_transform = scene.camera.look_at(room.vertices, rotation=view)
     return scene
+
+
+def _inward_side(mesh: trimesh.Trimesh) -> float:
+    """1 where the normals of a room's shell point inwards, else -1.
+
+    Marching cubes orients faces by the sign of the field, which differs between densities and
+    distances. The room's shell outweighs what stands in it, so the middle votes.
+    """
+    inwards = mesh.bounds.mean(axis=0) - mesh.triangles_center
+    return np.sign((inwards * mesh.face_normals).sum(axis=1) @ mesh.area_faces)
+
+
+def _path_mesh(T_world_camera: Poses, radius: float) -> trimesh.Trimesh:
+    """A tube along camera positions, and a pyramid from the last one to where that camera looks."""
+    places = T_world_camera[:, :3, 3]
+    corners = places[np.linspace(0, len(places) - 1, _MAX_TUBES + 1).astype(int)]
+    segments = np.stack([corners[:-1], corners[1:]], axis=1)
+    moved = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > 1e-6
+    parts = [trimesh.creation.cylinder(radius, segment=s, sections=6) for s in segments[moved]]
+    image = np.array([[-1.0, -0.75], [1.0, -0.75], [1.0, 0.75], [-1.0, 0.75]])
+    pyramid = 6 * radius * np.vstack([np.zeros(3), np.column_stack([image, np.full(4, 1.5)])])
+    pyramid = pyramid @ T_world_camera[-1, :3, :3].T + places[-1]
+    return trimesh.util.concatenate([*parts, trimesh.convex.convex_hull(pyramid)])
 
 
 def up_of(*T_paths: Poses) -> np.ndarray:
