@@ -82,7 +82,7 @@ def convergence(scene: Scene, preset: Preset) -> pd.DataFrame:
     rows = []
     for name, iterations in product(("neus", "neus_plus"), (30, 60, 125, 250, 500, 1000)):
         longer = with_settings(preset, f"mapping.{name}.iterations={iterations}")
-        made = map_scene(scene, name, longer).made
+        made = map_scene(scene, name, longer).record
         rows.append((name, iterations, made["seconds"], made["quality"]["sdf_near_m"]))
     return pd.DataFrame(rows, columns=["field", "iterations", "seconds", "near_m"])
 

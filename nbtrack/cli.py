@@ -174,10 +174,10 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
             groups[group[0]] = part.add_subparsers(required=True, metavar="ACTION")
         command = groups["".join(group)].add_parser(last, help=about, description=about)
         for word in options.split():
-            (option, *metavar), how = known[word.rstrip("!")]
-            how = how | {"metavar": metavar[0]} if metavar else how
-            how = how | {"required": True} if word.endswith("!") else how
-            command.add_argument(option, **how)
+            (option, *metavar), keywords = known[word.rstrip("!")]
+            keywords = keywords | {"metavar": metavar[0]} if metavar else keywords
+            keywords = keywords | {"required": True} if word.endswith("!") else keywords
+            command.add_argument(option, **keywords)
         command.set_defaults(command=last, parser=command)
     namespace, unknown = parser.parse_known_args(arguments)
     if unknown:

@@ -112,7 +112,7 @@ def test_a_file_keeps_it_whole(
     assert stored.field.label == "NeuS corrected"
     assert stored.key == finished.key
     size = (tmp_path / "map.safetensors").stat().st_size
-    assert finished.made["map_bytes"] < size < finished.made["map_bytes"] + 20_000
+    assert finished.record["map_bytes"] < size < finished.record["map_bytes"] + 20_000
 
 
 def test_a_kidnapped_camera_is_found(found: CorrectedField, sequence: RgbdSequence) -> None:

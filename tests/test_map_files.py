@@ -48,10 +48,10 @@ def sound(tmp_path: Path) -> Path:
 def test_any_field_comes_back_as_it_was(name: str, tmp_path: Path) -> None:
     """Catches weights that lose a bit, a lost history, and points, which have no fixed number."""
     made = fused_wall() if name == "points" else map_wall(name, None)
-    made = replace(made, made={**made.made, "quality": {"psnr_db": 20.5}})
+    made = replace(made, record={**made.record, "quality": {"psnr_db": 20.5}})
     write_map(tmp_path / MAP_FILE, made)
     stored = read_map(tmp_path)
-    for part in ("key", "camera", "made"):
+    for part in ("key", "camera", "record"):
         assert getattr(stored, part) == getattr(made, part)
     assert stored.field.bounds == made.field.bounds
     pd.testing.assert_frame_equal(stored.history, made.history, check_exact=True)
@@ -66,14 +66,14 @@ def test_a_file_is_small_and_always_the_same(sound: Path, tmp_path: Path) -> Non
     """Catches optimiser states in the file, lost provenance, and files that are not equal."""
     stored = read_map(sound)
     assert stored.history.empty
-    assert {"torch", "nbtrack"} <= set(stored.made["versions"])
+    assert {"torch", "nbtrack"} <= set(stored.record["versions"])
     write_map(tmp_path / "again" / MAP_FILE, stored)
     assert (tmp_path / "again" / MAP_FILE).read_bytes() == sound.read_bytes()
     full = NetworkSettings()
     field = make_field("neus", full, SceneBounds((-3.0, -3.0, -1.5), (3.0, 3.0, 1.5)), seed=0)
-    made = {**stored.made, "network": {"width": 256, "n_frequencies": 93, "embedding_sigma": 2.5}}
-    write_map(tmp_path / "full", replace(stored, field=field, made=made))
-    assert vars(full) == read_map(tmp_path / "full").made["network"]
+    made = {**stored.record, "network": {"width": 256, "n_frequencies": 93, "embedding_sigma": 2.5}}
+    write_map(tmp_path / "full", replace(stored, field=field, record=made))
+    assert vars(full) == read_map(tmp_path / "full").record["network"]
     assert (tmp_path / "full").stat().st_size < 1.1e6
 
 
@@ -211,7 +211,7 @@ def test_whether_a_map_belongs(case: str, field_name: str) -> None:
     """Catches a refusal of the room's own map, and tracking in a room that the camera is not in."""
     usual, T_world_camera, belongs = BELONGS[case]
     wall = fused_wall() if field_name == "points" else finished_wall()
-    stored = replace(wall, made={**wall.made, "misfit_m": usual})
+    stored = replace(wall, record={**wall.record, "misfit_m": usual})
     frame = replace(wall_sequence()[2], T_world_camera=T_world_camera)
     if belongs:
         assert check_belongs(stored, frame) is None
@@ -274,7 +274,7 @@ def test_tracking_in_the_map_of_another_room(work: Path, capsys: pytest.CaptureF
     """Catches a room that the camera is not in."""
     # The map itself is poor: what is usual in it is said to be what a good map shows.
     stored = read_map("map")
-    write_map(work / "good" / MAP_FILE, replace(stored, made={**stored.made, "misfit_m": 0.01}))
+    write_map(work / "good" / MAP_FILE, replace(stored, record={**stored.record, "misfit_m": 0.01}))
     assert main(["track", "long_hall", *GIVEN[2:], "good", "--frames", "2:6"]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith("nbtrack: at its given pose frame 2 of long_hall is off the map of")

@@ -49,7 +49,7 @@ def test_neus_finds_a_wall() -> None:
     assert sdf[2].abs() < 0.05
     assert sdf[1] == pytest.approx(0.3, abs=0.1)
     assert (color[2] - 128 / 255).abs().max() < 0.1
-    assert mapped.made["misfit_m"] < 0.05
+    assert mapped.record["misfit_m"] < 0.05
 
 
 def test_imap_renders_a_wall() -> None:
@@ -72,8 +72,8 @@ def test_points_are_fused_at_once() -> None:
     assert seen == [(1, {"points": n_points, "bytes": 24 * n_points})]
     assert mapped.history.to_dict("records") == [seen[0][1]]
     assert (mapped.field.points[:, 2] - 2).abs().max() < 1e-5
-    assert mapped.made["mapped_frames"] == 4
-    assert mapped.made["misfit_m"] < 0.05
+    assert mapped.record["mapped_frames"] == 4
+    assert mapped.record["misfit_m"] < 0.05
 
 
 def map_wall(field_name: str, checkpoint: Path | None, on_iteration=None) -> Map:

@@ -56,9 +56,9 @@ class ProgressBar:
         if self._is_logged:  # never by itself: `_log` asks for what would be shown
             form, pause = _LINE_FORMAT, float("inf")
         # Without smoothing the ETA comes from the mean speed, not from that of the last step.
-        how = {"mininterval": pause, "disable": not is_shown, "ascii": False, "smoothing": 0}
-        how |= {"file": file, "bar_format": form, "delay": _DELAY_SECONDS}
-        self._bar = tqdm(total=total, desc=title, **how)
+        options = {"mininterval": pause, "disable": not is_shown, "ascii": False, "smoothing": 0}
+        options |= {"file": file, "bar_format": form, "delay": _DELAY_SECONDS}
+        self._bar = tqdm(total=total, desc=title, **options)
 
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much is done, and a word on how it goes."""

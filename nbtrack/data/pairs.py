@@ -51,10 +51,11 @@ def check_paired(colors: list[Path], others: list[Path]) -> None:
     if not np.array_equal(numbers, other_numbers):
         count = Counter([*numbers, *other_numbers])
         odd = [path.name for path in (*colors, *others) if count[numbers_of([path])[0]] != 2]
+        more = " ..." if len(odd) > 4 else ""
         raise DataError(
             f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
             f"{len(others)} {others[0].suffix} files, with other frame numbers in the names "
-            f"({len(odd)} without a partner: {', '.join(odd[:4])}{' ...' * (len(odd) > 4)}): every "
+            f"({len(odd)} without a partner: {', '.join(odd[:4])}{more}): every "
             "image needs one; rename or remove the odd files"
         )
 

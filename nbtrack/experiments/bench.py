@@ -207,8 +207,8 @@ def _run_notebook(path: Path, folder: Path) -> None:
     from nbtrack.experiments.pages import write_page
 
     notebook, page, start = nbformat.read(path, 4), folder / f"{path.stem}.html", time.monotonic()
-    how = {"record_timing": False, "extra_arguments": ["--log-level=ERROR"]}  # no talk of ports
-    run = ExecutePreprocessor(timeout=None, kernel_name="python3", **how)
+    options = {"record_timing": False, "extra_arguments": ["--log-level=ERROR"]}  # no talk of ports
+    run = ExecutePreprocessor(timeout=None, kernel_name="python3", **options)
     try:
         run.preprocess(notebook, {"metadata": {"path": str(path.parent)}})
     except CellExecutionError as error:

@@ -79,8 +79,8 @@ def _make_map(job: MapJob, frames: str) -> None:
     _map(job)
     finished, scene = job.map(), job.scene
     print(f"{job.folder}: {finished.field.label} map of {scene.name}")
-    print(f"  mapped in {finished.made['seconds']:.0f} s on {finished.made['device']}")
-    _print_numbers({k: v for k, v in finished.made["quality"].items() if v is not None})
+    print(f"  mapped in {finished.record['seconds']:.0f} s on {finished.record['device']}")
+    _print_numbers({k: v for k, v in finished.record["quality"].items() if v is not None})
     try:
         # Every tenth frame says enough of what has been seen: neighbours see the same.
         sequence = scene.read(frames)
@@ -89,7 +89,7 @@ def _make_map(job: MapJob, frames: str) -> None:
         print(f"  no mesh: {error}")
     else:
         write_atomic(job.folder / MESH_FILE, mesh.export(file_type="ply"))
-        origin = finished.made["origin"]
+        origin = finished.record["origin"]
         where = f", relative to {origin} m" if any(origin) else ""
         print(f"  mesh of what was seen: {job.folder / MESH_FILE}{where}")
 
@@ -194,7 +194,7 @@ def _export_map(source: Path, format_name: str, out: Path) -> str:
         content = (source / MAP_FILE if source.is_dir() else source).read_bytes()
         write_atomic(out, content)
         return (
-            f"{finished.field.label} map of {finished.made['scene']}, {len(content) / 1e6:.2f} MB"
+            f"{finished.field.label} map of {finished.record['scene']}, {len(content) / 1e6:.2f} MB"
         )
     is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
     with naming_damaged(seen, "mesh", "remove it and map again"):
@@ -319,7 +319,7 @@ def _method_in(given: Map | None, options: Namespace) -> Method:
 
 def _with_network_of(given: Map, preset: Preset, options: Namespace) -> Preset:
     """The preset with a map's own network. Raises ConfigError for --set of a map made otherwise."""
-    name, record = given.field.name, given.made
+    name, record = given.field.name, given.record
     asked = as_dict(preset.network_of(name)), as_dict(preset.mapping_of(name))
     of_maps = [text for text in options.settings if text.startswith(OF_MAPS)]
     if of_maps and asked != (record["network"], record["settings"]):

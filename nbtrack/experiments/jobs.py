@@ -126,11 +126,11 @@ class MapJob(Job):
         """Whether the map is finished and scored; in a folder of the user's, whether it is this."""
         if self.is_given or not (self.folder / MAP_FILE).is_file():
             return self.is_given
-        return self.out is None or read_map(self.folder).made.get("key") == self.key
+        return self.out is None or read_map(self.folder).record.get("key") == self.key
 
     def result(self) -> dict[str, Any]:
         """How the finished map was made, and its scores."""
-        return self.map().made
+        return self.map().record
 
     def map(self) -> Map:
         """The finished map, ready for tracking."""
@@ -155,7 +155,7 @@ class MapJob(Job):
         sequence, network = self.scene.read(self.frames), self.preset.network_of(self.field)
         if (self.folder / MAP_FILE).is_file():  # a folder of the user's, with another finished map
             recipe = recipe_of(self.field, sequence, network, self.settings, self.seed)
-            check_recipe(self.folder / MAP_FILE, read_map(self.folder).made, recipe)
+            check_recipe(self.folder / MAP_FILE, read_map(self.folder).record, recipe)
         if base:
             finished_map = correct_map(base.map(), sequence, self.settings)
         else:
@@ -166,11 +166,11 @@ class MapJob(Job):
         quality = score_map(finished_map, sequence, self.scene.room)
         record = {"quality": quality, "frames": self.frames, "key": self.key}
         finished = replace(
-            finished_map, made={**finished_map.made, **record, "config": as_dict(self.preset)}
+            finished_map, record={**finished_map.record, **record, "config": as_dict(self.preset)}
         )
         write_map(self.folder / MAP_FILE, finished)
         checkpoint.unlink(missing_ok=True)
-        return finished.made
+        return finished.record
 
 
 @lru_cache(maxsize=4)

@@ -120,15 +120,15 @@ class TrackJob(Job):
     def _tracked(self, report: Report) -> tuple[Trajectory, dict[str, Any]]:
         """The trajectory, and what is to be said of the run beside its errors."""
         finished_map = self.needs.map()
-        origin = np.array(finished_map.made["origin"])
+        origin = np.array(finished_map.record["origin"])
         sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
         budget = make_budget(self.steps, self.rate_hz)
-        notes = {"map_seconds": finished_map.made["seconds"], "budget": str(budget)}
+        notes = {"map_seconds": finished_map.record["seconds"], "budget": str(budget)}
         if origin.any():
             notes["origin"] = origin.tolist()
         notes |= still_metrics(sequence.T_world_camera)
         if self.is_elsewhere:
-            notes["map_from"] = finished_map.made
+            notes["map_from"] = finished_map.record
         T_first = sequence.T_world_camera[0]
         is_start_known = self.start == "given" and bool(np.isfinite(T_first).all())
         if self.needs.is_given and is_start_known:  # another path may begin where no map reaches

@@ -43,9 +43,9 @@ class Scene:
         """Changes with what is read. A room of the cache is made anew as it was."""
         return self.made_by or fingerprint(*self.recording.contents())
 
-    def read(self, frames: str = ":", **how: Any) -> RgbdSequence:
+    def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
         """The frames of a slice such as `10:50:2`; more options and errors: see `read_frames`."""
-        return read_frames(self.recording, parse_frames(frames), **how)
+        return read_frames(self.recording, parse_frames(frames), **options)
 
     def count(self, frames: str, needs_poses: bool = True) -> int:
         """How many frames a slice selects; raises as `select_frames` does."""

@@ -75,8 +75,8 @@ class BakedField(Field):
         # grid_sample wants x, y, z of a volume indexed z, y, x, from -1 to 1.
         normalized = (2 * (points_world - self.low) / last - 1).flip(-1)
         normalized, volume = normalized[None, None, None], self.volume.view(1, 5, *self.n_vertices)
-        how = {"padding_mode": "border", "align_corners": True}
-        values = nn.functional.grid_sample(volume, normalized, **how)[0, :, 0, 0]
+        options = {"padding_mode": "border", "align_corners": True}
+        values = nn.functional.grid_sample(volume, normalized, **options)[0, :, 0, 0]
         # A point that is not a number is taken for one at the border.
         return torch.where(points_world.isnan().any(dim=-1), torch.nan, values)
 

@@ -19,8 +19,8 @@ def correct_map(finished: Map, sequence: RgbdSequence, settings: MappingSettings
     mapped, _ = split_holdout(len(sequence), settings.holdout_every)
     field = corrected(finished.field, sequence, mapped, settings.correct_voxel)
     seconds = time.perf_counter() - start
-    record = {**finished.made, "settings": asdict(settings), "correction_seconds": seconds}
+    record = {**finished.record, "settings": asdict(settings), "correction_seconds": seconds}
     record["map_bytes"] = sum(tensor.nbytes for tensor in field.state_dict().values())
     record["seconds"] += seconds
     record["misfit_m"] = usual_depth_residual(field, sequence, mapped)
-    return replace(finished, field=field, made=record)
+    return replace(finished, field=field, record=record)

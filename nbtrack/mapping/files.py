@@ -35,14 +35,14 @@ class Map:
     camera: Intrinsics  # of the frames it was made from
     # Plain values: scene, n_frames, seed, network, settings, misfit_m, device, versions, seconds
     # spent in iterations; and whatever its maker adds, as `quality`, scores by name.
-    made: dict[str, Any]
+    record: dict[str, Any]
     # One row an iteration: weighted loss terms and diagnostics. Empty where it was not kept.
     history: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     @cached_property
     def key(self) -> str:
         """Twelve hexadecimal digits that change with the field, its bounds and its weights."""
-        plain = [self.field.name, self.made["network"], asdict(self.field.bounds)]
+        plain = [self.field.name, self.record["network"], asdict(self.field.bounds)]
         return _digest(plain, _tensors(self.field))[:12]
 
 
@@ -57,7 +57,7 @@ def write_map(path: Path, finished: Map) -> None:
         "field": finished.field.name,
         "bounds": [list(bounds.minimum), list(bounds.maximum)],
         "camera": asdict(finished.camera),
-        "made": finished.made,
+        "made": finished.record,
     }
     header["digest"] = _digest(header, tensors)
     content = safetensors.torch.save(tensors, {_FORMAT: json.dumps(header, allow_nan=False)})

@@ -56,7 +56,7 @@ def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -
     What has been seen is told by the mapped frames; the truth is known of synthetic rooms.
     """
     field, scores = finished.field, dict.fromkeys(SCORES)
-    mapped, held_out = split_holdout(len(sequence), finished.made["settings"]["holdout_every"])
+    mapped, held_out = split_holdout(len(sequence), finished.record["settings"]["holdout_every"])
     if len(held_out) and isinstance(field, LearnedField):
         scores |= _score_images(field, sequence, held_out, room)
     if room is not None:
@@ -162,7 +162,7 @@ def check_belongs(finished: Map, frame: Frame) -> str | None:
     The rule: its misfit is at most 5 cm, or three times what is usual in the map's own frames.
     Raises DataError if it is more.
     """
-    name, usual = f"the map of {finished.made['scene']}", finished.made["misfit_m"]
+    name, usual = f"the map of {finished.record['scene']}", finished.record["misfit_m"]
     misfit_m = depth_residual_of(finished.field, frame)
     if np.isnan(misfit_m):
         return f"{frame.name} has no depth: whether {name} belongs to it cannot be told"

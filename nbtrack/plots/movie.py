@@ -130,8 +130,8 @@ def movie_bytes(pictures: Sequence[np.ndarray], format_name: str) -> bytes:
     """A GIF that repeats, or an MP4. Raises DataError where OpenCV cannot write the latter."""
     if format_name == "gif":
         images = [Image.fromarray(picture).quantize(_GIF_COLORS) for picture in pictures]
-        content, how = io.BytesIO(), {"duration": 1000 // _RATE_HZ, "loop": 0, "optimize": True}
-        images[0].save(content, "GIF", save_all=True, append_images=images[1:], **how)
+        content, options = io.BytesIO(), {"duration": 1000 // _RATE_HZ, "loop": 0, "optimize": True}
+        images[0].save(content, "GIF", save_all=True, append_images=images[1:], **options)
         return content.getvalue()
     with tempfile.TemporaryDirectory() as folder:
         path, size = Path(folder) / "movie.mp4", pictures[0].shape[1::-1]

@@ -208,10 +208,10 @@ def _texts(wide: pd.DataFrame, form: str, missing: str = "") -> pd.DataFrame:
     return wide.map(lambda value: missing if pd.isna(value) else form.format(value))
 
 
-def write_csv(path: Path, table: pd.DataFrame, **how: Any) -> Path:
+def write_csv(path: Path, table: pd.DataFrame, **options: Any) -> Path:
     """Writes a table as CSV, by default without its index and with six digits; returns the path."""
-    how = {"index": False, "float_format": "%.6g", "lineterminator": "\n", **how}
-    write_atomic(path, table.to_csv(**how))
+    options = {"index": False, "float_format": "%.6g", "lineterminator": "\n", **options}
+    write_atomic(path, table.to_csv(**options))
     return path
 
 
