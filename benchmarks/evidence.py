@@ -2,7 +2,7 @@
 
     python benchmarks/evidence.py EXPERIMENT [SEEDS]
 
-EXPERIMENT is one of nine_rooms, scores, steps, oracle, choices, maps, basin. Rows are
+EXPERIMENT is one of nine_rooms, scores, steps, oracle, choices, basin. Rows are
 added to a CSV under paper_tables/ as they are finished, the first seed first; those that are there
 are not made again, whatever has changed since: remove the file to begin anew. Maps and runs are
 kept with all others (`NBTRACK_RUNS`). Only nine_rooms uses all cores: run others side by side.
@@ -22,7 +22,7 @@ from choices import CHOICES, FASTER, SDF, SEARCHES, VR
 from scipy.stats import binomtest, bootstrap
 from variants import ExactDistance, FusedDistance, OtherDepth, with_variants
 
-from nbtrack import METHODS, Method, load_preset, make_tracker, map_scene, open_scenes, track_scenes
+from nbtrack import METHODS, load_preset, make_tracker, map_scene, open_scenes, track_scenes
 from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
@@ -42,8 +42,6 @@ Chunk = tuple[dict[str, str | int], Callable[[], pd.DataFrame]]
 NINE = load_preset("nine_rooms")
 THREE_ROOMS = [*NINE.scenes.names[:3]]  # the first of the nine, whatever was found in them
 PRESET = with_variants(load_preset("smoke", settings=[f"scenes.names={THREE_ROOMS}"]))
-# Frames of the whole path, for time; the steps of 2 Hz are enough for 12 mm a frame.
-EVERY_SECOND = "::2"
 KEPT = [
     "rate_hz", "method", "scene", "frames", "steps_per_frame", "path_m", "still_ate_m", "ate_m",
     "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "lost_frames",
@@ -120,7 +118,7 @@ def scores(seed: int) -> Iterator[Chunk]:
 
 
 def _scores(scene: Scene, seed: int) -> pd.DataFrame:
-    made = (map_scene(scene, field, NINE, seed).made for field in ("imap", "neus"))
+    made = (map_scene(scene, field, NINE, seed).record for field in ("imap", "neus"))
     return pd.DataFrame([{"field": m["field"], **m["quality"]} for m in made])
 
 
@@ -178,48 +176,9 @@ def choices(seed: int) -> Iterator[Chunk]:
     for choice, rate_hz in places:
         vr, sdf, raw = CHOICES[choice]
         mapped, tracked = noisy if raw == "both" else filtered, noisy if raw else filtered
-        there = {"rates_hz": [rate_hz], "frames": ":" if rate_hz == 10 else EVERY_SECOND}
-        there |= {"seeds": [seed], "tracked": tracked}
+        there = {"rates_hz": [rate_hz], "frames": ":", "seeds": [seed], "tracked": tracked}
         place = {"choice": choice, "rate_hz": rate_hz}
         yield place, partial(track, mapped, [vr, sdf], PRESET, **there)
-
-
-MAPS = {  # in the order in which they are made
-    "iMAP, 1200 iterations": ("imap", 1200, "filtered"),
-    "NeuS, 1200 iterations": ("neus", 1200, "filtered"),
-    "NeuS+, 1400 iterations": ("neus_plus", 1400, "filtered"),
-    "iMAP, 300 iterations": ("imap", 300, "filtered"),
-    "NeuS, 300 iterations": ("neus", 300, "filtered"),
-    "iMAP, 150 iterations": ("imap", 150, "filtered"),
-    "NeuS, 600 iterations": ("neus", 600, "filtered"),
-    "NeuS, 150 iterations": ("neus", 150, "filtered"),
-    "NeuS, not guided, noisy depth": ("neus_unguided", 1200, "noisy"),
-    "NeuS, samples not guided": ("neus_unguided", 1200, "filtered"),
-    "iMAP, 600 iterations": ("imap", 600, "filtered"),
-}
-"""Maps of all qualities: the field, its iterations, and the depth it is made from."""
-
-
-def maps(seed: int) -> Iterator[Chunk]:
-    """Both trackers with the steps of 2 Hz in maps of every quality, in the first and last room."""
-    for label, (field, *_) in MAPS.items():
-        for tracker in {"imap": (VR,), "neus_plus": (SDF,)}.get(field, (SDF, VR)):
-            place = {"map": label, "tracker": tracker.tracker}
-            yield place, partial(_in_map, label, tracker, seed)
-
-
-def _in_map(label: str, method: Method, seed: int) -> pd.DataFrame:
-    field, iterations, depth = MAPS[label]
-    filtered = open_scenes(PRESET)[::2]
-    mapped = [OtherDepth(s.name, s.folder, depth_folder=DEPTHS["noisy"]) for s in filtered]
-    mapped = mapped if depth == "noisy" else filtered
-    preset = with_settings(PRESET, f"mapping.{field}.iterations={iterations}")
-    method = replace(method, field=field)
-    there = {"rates_hz": [2], "frames": EVERY_SECOND, "seeds": [seed], "tracked": filtered}
-    found = track(mapped, [method], preset, **there).drop(columns="method")
-    made = [map_scene(scene, field, preset, seed).made for scene in mapped]
-    scores = pd.DataFrame([m["quality"] | {"map_seconds": m["seconds"]} for m in made])
-    return pd.concat([found, scores], axis=1).assign(field=field, iterations=iterations)
 
 
 def basin(seed: int) -> Iterator[Chunk]:
@@ -235,7 +194,7 @@ EXPERIMENTS = {
     "nine_rooms": (nine_rooms, "nine_rooms/table_1_cells.csv"),
     **{
         f.__name__: (f, f"evidence/{f.__name__}.csv")
-        for f in (scores, steps, oracle, choices, maps, basin)
+        for f in (scores, steps, oracle, choices, basin)
     },
 }
 

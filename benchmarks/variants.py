@@ -18,8 +18,7 @@ from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import FIELDS, Field, IMapField, NeuSField
-from nbtrack.fields.base import rendered_losses
+from nbtrack.fields import FIELDS, Field, IMapField
 from nbtrack.synthetic import Room
 from nbtrack.tracking import TRACKERS, AdamTracker, SdfTracker, VrTracker
 
@@ -111,23 +110,6 @@ class SdfFalling(_Falling, SdfTracker):
     name = "sdf_falling"
 
 
-class UnguidedNeus(NeuSField):
-    """NeuS mapped with iMAP's samples, which know nothing of the measured depth."""
-
-    name = "neus_unguided"
-
-    def mapping_losses(self, draw, settings, generator) -> dict[str, Tensor]:
-        """The terms of NeuS."""
-        rays = draw(settings.n_rays)
-        n_samples = settings.n_stratified, settings.n_surface
-        depths = self.hierarchical_depths(rays, *n_samples, generator)
-        lambdas = settings.lambda_color, settings.lambda_depth
-        return {
-            **rendered_losses(self.render(rays, depths), rays, *lambdas),
-            "eikonal": self._eikonal(rays.points(depths), settings, generator),
-        }
-
-
 class SmoothImap(IMapField):
     """iMAP with the activation of NeuS."""
 
@@ -140,13 +122,13 @@ class SmoothImap(IMapField):
 
 _TRACKERS = (VrKept, SdfKept, VrBest, SdfBest, VrFalling, SdfFalling)
 TRACKERS.update({kind.name: kind for kind in _TRACKERS})
-FIELDS.update({kind.name: kind for kind in (UnguidedNeus, SmoothImap)})
+FIELDS[SmoothImap.name] = SmoothImap
 
 
 def with_variants(preset: Preset) -> Preset:
     """The preset, with settings for the variants: those of what each was made from."""
     trackers = {kind.name: preset.tracking[kind.name.split("_")[0]] for kind in _TRACKERS}
-    fields = {"neus_unguided": "neus", "imap_silu": "imap"}
+    fields = {"imap_silu": "imap"}
     return replace(
         preset,
         tracking=preset.tracking | trackers,
