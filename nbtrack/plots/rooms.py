@@ -95,9 +95,13 @@ def plot_points(points: Mapping[str, tuple[Points, Values, Transform]], title: s
 
 @styled
 def plot_trajectories(T_true: Poses, estimates: Mapping[str, Poses], title: str = "") -> Figure:
-    """Paths (m) from above: camera-to-world poses by method, the true ones green."""
-    axes = new_axes(title, 4.7)[0, 0]
-    _draw_from_above(axes, {"true": T_true, **estimates})
+    """Paths (m) from above: camera-to-world poses by method, the true ones green.
+
+    The world axis along which the true path is longer lies across the page.
+    """
+    axes, up = new_axes(title, 4.7)[0, 0], up_of(T_true, *estimates.values())
+    page = sorted(page_axes(up), key=lambda axis: -np.ptp(T_true[:, axis, 3]))
+    _draw_from_above(axes, {"true": T_true, **estimates}, page)
     axes.figure.legend_below()
     return axes.figure
 
@@ -259,10 +263,15 @@ def page_axes(up: np.ndarray) -> list[int]:
     return [axis for axis in range(3) if up[axis] == 0]
 
 
-def _draw_from_above(axes: Axes, T_paths: Mapping[str, Poses]) -> np.ndarray:
-    """Paths, and axes in metres, equal, and turned so that nothing is mirrored; returns up."""
+def _draw_from_above(
+    axes: Axes, T_paths: Mapping[str, Poses], page: list[int] | None = None
+) -> np.ndarray:
+    """Paths, and axes in metres, equal, and turned so that nothing is mirrored; returns up.
+
+    `page` has the world's axes across and along the page, by default those of `page_axes`.
+    """
     up = up_of(*T_paths.values())
-    right, ahead = page_axes(up)
+    right, ahead = page or page_axes(up)
     _draw_paths(axes, T_paths, np.eye(3)[[right, ahead]])
     axes.set(xlabel=f"{'xyz'[right]} (m)", ylabel=f"{'xyz'[ahead]} (m)", aspect="equal")
     # Right, page-up and up must be right-handed.

@@ -3,7 +3,7 @@
 import io
 import textwrap
 from collections.abc import Iterable
-from itertools import cycle
+from itertools import cycle, product
 
 import matplotlib.style
 import numpy as np
@@ -60,19 +60,24 @@ def method_colors(labels: Iterable[str]) -> dict[str, str]:
 def label_points(
     axes: Axes, x: Iterable[float], y: Iterable[float], colors: dict[str, str]
 ) -> None:
-    """Beside every point its label in its colour, moved up or down where it would cover another."""
+    """Beside every point its label in its colour, on the right or on the left.
+
+    A label that would cover another or leave the axes is moved up or down.
+    """
     axes.margins(x=0.3, y=0.1)
     axes.figure.draw_without_rendering()
     rows = sorted(zip(x, y, colors, strict=True), key=lambda row: row[1])
     pixels = axes.transData.transform([row[:2] for row in rows])
     taken = [Bbox.from_bounds(left - 5, bottom - 5, 10, 10) for left, bottom in pixels]
     for x_point, y_point, label in rows:
-        text = axes.annotate(label, (x_point, y_point), (6, -3), textcoords="offset points")
+        text = axes.annotate(label, (x_point, y_point), (0, 0), textcoords="offset points")
         text.set(fontsize="small", color=colors[label])
-        for shift in sorted(range(-60, 61, 3), key=abs):
-            text.set_position((6, shift - 3))
+        shifts = sorted(range(-60, 61, 3), key=abs)
+        for shift, (right, align) in product(shifts, {6: "left", -6: "right"}.items()):
+            text.set(position=(right, shift - 3), horizontalalignment=align)
             box = text.get_window_extent()
-            if not any(box.overlaps(other) for other in taken):
+            inside = (box.min > axes.bbox.min).all() and (box.max < axes.bbox.max).all()
+            if inside and not any(box.overlaps(other) for other in taken):
                 break
         taken.append(box)
 
