@@ -52,7 +52,7 @@ def test_track_writes_what_it_promises(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_a_second_run_finds_the_map(capsys: pytest.CaptureFixture, tmp_path: Path) -> None:
     """Catches maps that are made again although nothing changed, or not although it did, and a map
-    whose quality or folder is not told."""
+    whose quality or folder is not printed."""
     assert main(["map", "living_room", "--field", "neus", *TINY]) == 0
     printed = capsys.readouterr().out
     assert all(text in printed for text in (str(tmp_path / "runs"), "sdf near", "mesh"))
@@ -94,7 +94,7 @@ def test_only_the_first_pose_is_known(tmp_path: Path, capsys: pytest.CaptureFixt
     (folder / "trajectory.txt").write_text("\n".join([poses[0], *unknown]) + "\n")
     capsys.readouterr()
     assert main(given) == 0
-    assert "errors cannot be told" in capsys.readouterr().out
+    assert "errors cannot be computed" in capsys.readouterr().out
     metrics = json.loads((out / "metrics.json").read_text())
     assert (metrics["frames"], metrics["frames_without_reference"]) == (5, 5)
     assert "ate_rmse_m" not in metrics
@@ -164,7 +164,7 @@ def test_a_recording_without_poses_is_tracked_in_a_map(
     for name in ("poses.txt", "trainval_poses.txt"):
         (recording / name).unlink()
     assert main(["track", str(recording), "--map-from", "corrected", "--out", "found"]) == 0
-    assert "errors cannot be told" in capsys.readouterr().out
+    assert "errors cannot be computed" in capsys.readouterr().out
     metrics = json.loads((work / "found/metrics.json").read_text())
     assert (metrics["start"], metrics["frames"]) == ("unknown", 12)
     assert not (work / "found/groundtruth.txt").exists()

@@ -76,7 +76,7 @@ def test_a_map_knows_where_it_was_measured(found: CorrectedField) -> None:
 def test_the_same_data_give_the_same_corrections(
     found: CorrectedField, sequence: RgbdSequence
 ) -> None:
-    """Catches draws that follow no seed. Frames without any surface are told."""
+    """Catches draws that follow no seed. Frames without any surface are reported."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nbtrack.fields.correction._N_POINTS", 40_000)
         again = corrected(found.source, sequence, np.arange(12), VOXEL)
@@ -116,10 +116,10 @@ def test_a_file_keeps_it_whole(
 
 
 def test_a_kidnapped_camera_is_found(found: CorrectedField, sequence: RgbdSequence) -> None:
-    """Catches a tracker that looks only around where it last was: here it is told half a turn
+    """Catches a tracker that looks only around where it last was: here it starts half a turn
     off, and the map's own cameras stand 30 degrees apart."""
-    told = sequence.T_world_camera[7]
-    tracker = LmTracker(found, told, StepBudget(200), LmSettings(n_pixels=1024))
+    T_start = sequence.T_world_camera[7]
+    tracker = LmTracker(found, T_start, StepBudget(200), LmSettings(n_pixels=1024))
     estimate = tracker.track(sequence[1])
     assert not estimate.lost
     off = estimate.T_world_camera[:3, 3] - sequence.T_world_camera[1, :3, 3]
@@ -135,7 +135,7 @@ def test_colours_are_those_of_the_surface(found: CorrectedField, sequence: RgbdS
         assert errors(corrected(grey, sequence, np.arange(12), VOXEL))[1] < errors(grey)[1] / 150
 
 
-def test_the_least_scales_follow_the_sensor(
+def test_the_minimum_scales_follow_the_sensor(
     found: CorrectedField, sequence: RgbdSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a tracker that takes a noisy camera's residuals for outliers, or a good one's for

@@ -361,7 +361,8 @@ def test_key_frames_far_apart(tmp_path: Path, stride: int) -> None:
 
 
 def test_sentences_name_files_that_are_there(tmp_path: Path) -> None:
-    """Catches advice to look at folders, an assumed camera not told, and rotated bits unnoticed."""
+    """Catches advice to look at folders, an assumed camera that is not reported, and rotated bits
+    unnoticed."""
     folder, data = tmp_path / "seq-01", source("office", 12, 10)
     wrong = (1.5 * data.depths_mm).astype(np.uint16)
     write_recording("7scenes", folder, data._replace(depths_mm=wrong))

@@ -45,7 +45,7 @@ def poses(tracker: Tracker) -> np.ndarray:
 @pytest.mark.parametrize(("name", "field_name"), STEPS)
 def test_tracking_on_a_device(name: str, field_name: str, capsys: pytest.CaptureFixture) -> None:
     """Catches tensors left on the host, double precision on the device, waits and copies in a step,
-    more kernels than before; and a step that cannot be recorded, of which nobody is told."""
+    more kernels than before; and a step that cannot be recorded, that is not reported."""
     expected = poses(tracker_of(name, field_name, torch.device("cpu")))
     with emulated() as device:
         tracker = tracker_of(name, field_name, DEVICE)
@@ -147,8 +147,8 @@ class Owner:
 @pytest.mark.parametrize("looks", [True, False])
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=on_gpu)])
 def test_a_step_that_cannot_be_recorded_goes_on(device, looks, monkeypatch, capsys) -> None:
-    """Catches a failed recording that ends the run, draws random numbers or is not told; on a GPU,
-    a stream or generator that is left in it."""
+    """Catches a failed recording that ends the run, draws random numbers or is not reported; on a
+    GPU, a stream or generator that is left in it."""
     if device == "cpu":
         pretend(monkeypatch, refuse if looks else lambda step, generator: step)
     plain, owner = Owner(device, looks), Owner(device, looks)

@@ -1,5 +1,5 @@
-"""Cells here and on Dask: order, progress, failures that are told, and nothing left running. And
-mapping, tracking and tables killed at any moment, then told the same again: the same result.
+"""Jobs here and on Dask: order, progress, failures that are reported, and nothing left running. And
+mapping, tracking and tables killed at any moment, then started again: the same result.
 
 More kills: NBTRACK_TEST_KILLS=30.
 """
@@ -113,7 +113,7 @@ def test_a_worker_that_dies_is_explained(address: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_the_bar_moves_within_a_cell(monkeypatch: pytest.MonkeyPatch, execution: dict) -> None:
+def test_the_bar_moves_within_a_job(monkeypatch: pytest.MonkeyPatch, execution: dict) -> None:
     """Catches a bar that stands still for as long as a map takes."""
     seen = []
     monkeypatch.setattr(
@@ -163,7 +163,7 @@ def test_a_cluster_makes_the_same_table(address: str, tmp_path: Path, undisturbe
     assert text.count("office,\n") == 2
 
 
-def test_killed_with_two_workers_and_told_again(tmp_path: Path, undisturbed: bytes) -> None:
+def test_killed_with_two_workers_and_started_again(tmp_path: Path, undisturbed: bytes) -> None:
     """Catches workers that outlive their parent, finished jobs that are made again, and
     half-written ones that count as done."""
     arguments = words(tmp_path, "--workers", "2")
@@ -263,7 +263,7 @@ def result(folder: Path) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_killed_and_told_again(name: str, run: Run, room: Path, tmp_path: Path) -> None:
+def test_killed_and_started_again(name: str, run: Run, room: Path, tmp_path: Path) -> None:
     """Catches half-written results that count, and runs that go on otherwise than they began."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):

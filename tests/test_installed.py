@@ -1,4 +1,4 @@
-"""Installed elsewhere: everything below the current folder, and missing extras told in a line."""
+"""Installed elsewhere: everything below the current folder, and missing extras in a line."""
 
 import importlib.util
 import shutil
@@ -30,7 +30,7 @@ def test_folders(elsewhere: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("missing", "arguments", "told"),
+    ("missing", "arguments", "message"),
     [
         ("distributed", ["tables", "--workers", "2"], "pip install 'nbtrack[cluster]'"),
         ("distributed", ["tables", "--dask", "tcp://h:1"], "pip install 'nbtrack[cluster]'"),
@@ -40,7 +40,7 @@ def test_folders(elsewhere: Path) -> None:
     ],
 )  # fmt: skip
 def test_a_missing_extra_is_told_before_any_work(
-    elsewhere: Path, missing: str, arguments: list[str], told: str,
+    elsewhere: Path, missing: str, arguments: list[str], message: str,
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture,
 ) -> None:  # fmt: skip
     """Catches minutes of work that end in a traceback of imports."""
@@ -50,7 +50,7 @@ def test_a_missing_extra_is_told_before_any_work(
     )
     assert main(arguments) == 2
     error = capsys.readouterr().err
-    assert told in error
+    assert message in error
     assert error.count("\n") == 1
     assert not list(elsewhere.iterdir())
 

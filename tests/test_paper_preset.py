@@ -67,8 +67,8 @@ def test_nine_columns_and_seven(
         (dataset / name).rename(dataset / f"away_{name}")
     capsys.readouterr()
     assert run(monkeypatch, dataset, tmp_path) == 0
-    told = capsys.readouterr().err
-    assert "missing, and left out: kitchen, staircase" in told
+    errors = capsys.readouterr().err
+    assert "missing, and left out: kitchen, staircase" in errors
     seven = pd.read_csv(tmp_path / "out" / "table_1.csv")
     assert seven["scene"].nunique() == 7
     pd.testing.assert_frame_equal(

@@ -1,4 +1,4 @@
-"""What is told while somebody waits, and nobody watches a bar."""
+"""What is printed while a command runs and no bar is shown."""
 
 import re
 import time

@@ -1,4 +1,4 @@
-"""Texts of every format with anything in them: what is wrong is told, nothing else is raised.
+"""Texts of every format with anything in them: what is wrong is reported, nothing else is raised.
 
 What can be read is also checked now and then: absurd numbers must not break the check either.
 

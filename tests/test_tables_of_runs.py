@@ -153,7 +153,8 @@ def test_every_method_is_made_again_from_its_command(
     """Catches a command that lacks a setting, a seed or a slice, or is refused; of the first method
     the map is made anew too."""
     monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 2000)
-    coarse = with_settings(preset, "tracking.lm.voxel=0.3")
+    few = [f"mapping.{field}.iterations=6" for field in ("volsdf", "occupancy")]
+    coarse = with_settings(preset, "tracking.lm.voxel=0.3", *few)
     for name, method in METHODS.items():
         settings = tuple(text.replace("voxel=0.04", "voxel=0.3") for text in method.settings)
         monkeypatch.setitem(METHODS, name, replace(method, settings=settings))
@@ -230,12 +231,12 @@ def test_wrong_scenes_are_told_before_anything_is_made(
 ) -> None:
     """Catches a misspelt column that is left out in silence, a column counted as two seeds, and an
     unhelpful error where the dataset was not downloaded."""
-    for names, told in (
+    for names, message in (
         ("['living_rom']", "unknown scene 'living_rom', and no such folder: did you mean"),
         ("['office', 'office']", "office, office: give at least one, and of one name only one"),
         ("[]", r"\(none\): give at least one"),
     ):
-        with pytest.raises(ConfigError, match=told):
+        with pytest.raises(ConfigError, match=message):
             open_scenes(with_settings(preset, f"scenes.names={names}"))
     monkeypatch.setenv("NBTRACK_DATA", str(tmp_path / "nothing"))
     with pytest.raises(MissingError, match=r"no folder .*breakfast_room.*data/README.md"):
@@ -248,9 +249,9 @@ def test_a_damaged_scene_leaves_the_others(
     """Catches one bad folder that stops the whole grid."""
     (own_scenes[0].folder / "images" / "img2.png").unlink()
     assert [s.name for s in open_scenes(preset)] == ["office"]
-    told = capsys.readouterr().err
-    assert "left out: living_room" in told
-    assert "1 without a partner: depth2.png" in told
+    errors = capsys.readouterr().err
+    assert "left out: living_room" in errors
+    assert "1 without a partner: depth2.png" in errors
 
 
 def test_a_failed_map_tells_why_in_every_cell(preset: Preset, own_scenes: list[Scene]) -> None:

@@ -162,8 +162,8 @@ def test_the_frame_is_copied_within_its_time() -> None:
     begin, frames = tracker.budget.frame, Frame.to
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Frame, "to", lambda *a: events.append("copied") or frames(*a))
-        told = lambda device: events.append(device) or begin(device)  # noqa: E731
-        patch.setattr(tracker.budget, "frame", told)
+        recorded = lambda device: events.append(device) or begin(device)  # noqa: E731
+        patch.setattr(tracker.budget, "frame", recorded)
         tracker.track(sequence[1])
     assert events == [tracker.device, "copied"]
 

@@ -126,7 +126,7 @@ def _print_metrics(metrics: dict[str, Any]) -> None:
     if "lost_frames" in metrics:
         print(f"  frames off by more than {LOST_THRESHOLD_M:g} m: {metrics['lost_frames']}")
     else:
-        print("  no true pose is known of the tracked frames: errors cannot be told")
+        print("  no true pose is known of the tracked frames: errors cannot be computed")
     if "flagged_frames" in metrics:
         print(f"  frames that the tracker itself calls lost: {metrics['flagged_frames']}")
     if 0 < metrics["frames_without_reference"] < metrics["frames"]:

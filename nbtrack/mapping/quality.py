@@ -53,7 +53,7 @@ def split_holdout(n_frames: int, every: int) -> tuple[Frames, Frames]:
 def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -> Scores:
     """`SCORES` of a map of a sequence; None where its field has no such answer, or without truth.
 
-    What has been seen is told by the mapped frames; the truth is known of synthetic rooms.
+    Only what the mapped frames have seen counts. The truth is known of synthetic rooms only.
     """
     field, scores = finished.field, dict.fromkeys(SCORES)
     mapped, held_out = split_holdout(len(sequence), finished.record["settings"]["holdout_every"])

@@ -85,7 +85,7 @@ def style_table_2(
     texts[is_whole] = _texts(wide[is_whole], "{:.0f}", _MISSING)
     texts += _texts(table_2(steps, "steps_std"), " ± {:.1f}")
     styler = TableStyler(texts)
-    # Notebooks show every row label in bold, so the others must be told not to be.
+    # Notebooks show every row label in bold, so the others are set to normal weight.
     weights = [_BOLD if default_pixels.get(row[0]) == row[1] else _PLAIN for row in wide.index]
     styler.format_index("{:g} ms", axis="columns")
     labels = ["<b>{} *</b>" if weight == _BOLD else "{}" for weight in weights]
