@@ -1,4 +1,4 @@
-"""The command line: a thin face over the functions that the notebooks call."""
+"""The command line: options for the functions that the notebooks call."""
 
 import argparse
 import importlib
@@ -121,7 +121,7 @@ class Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, with the nearest name, as every other user error does."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise a mistake in place of leaving the program."""
+        """Raise an error that the caller catches; argparse would exit."""
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
             choices = [choice.strip("' ") for choice in wrong[2].split(",")]
             message = f"unknown {wrong[1]!r}: {nearest_name(wrong[1], choices)}"

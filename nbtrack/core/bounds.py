@@ -1,4 +1,4 @@
-"""The axis-aligned box of a scene: where fields live and where rays end."""
+"""The axis-aligned box of a scene: where fields are defined and where rays end."""
 
 from dataclasses import dataclass
 

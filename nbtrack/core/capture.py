@@ -29,7 +29,7 @@ class Recorded:
         self._run, self._owner, self._calls = step, owner, 0
 
     def __call__(self) -> Scalar:
-        """What the step returns, in memory of its own."""
+        """Run the step. Its result is a copy that later calls do not change."""
         self._calls += 1
         if self._calls <= WARM_STEPS:
             return run_aside(self._run, self._owner.generator.device)

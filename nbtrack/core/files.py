@@ -96,9 +96,9 @@ def modules_of(kind: type) -> tuple[str, ...]:
 def foreign_source(kind: type) -> str:
     """What makes up a class that somebody wrote outside this package, in a file or a notebook.
 
-    It is told by what Python compiled, which worker processes hold as well, and which has neither
-    comments nor docstrings: the methods, of its own base classes too, and the constants, functions
-    and classes of the same module or notebook that they name.
+    Taken is what Python compiled, since worker processes have it as well, without comments and
+    docstrings: the methods, those of its own base classes too, and the constants, functions and
+    classes of the same module or notebook that they name.
     """
     own = [c for c in kind.__mro__ if c.__module__.partition(".")[0] not in _LIBRARIES]
     return "\n".join(str(_compiled(c, c.__module__, {}, [])) for c in own)

@@ -209,7 +209,7 @@ def _shares(folder: Path) -> dict[str, float]:
 
 
 def _declared(path: Path, defaults: Declaration) -> Declaration:
-    """The defaults with what a file changes, if it is there."""
+    """The defaults, changed by what a file declares where there is one."""
     try:
         return with_values(defaults, read_object(path)) if path.is_file() else defaults
     except ConfigError as error:

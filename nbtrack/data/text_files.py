@@ -208,7 +208,7 @@ def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     camera = {{"w": "width", "h": "height"}.get(key, key): camera[key] for key in camera}
 
     def numbers(key: str, *counts: int) -> list[float]:
-        """A single one needs no list."""
+        """The list of an entry; a single number counts as a list of one."""
         entry = camera.get(key)
         values = entry if isinstance(entry, list) else [entry]
         # NaN is not below anything, and True is no number here.

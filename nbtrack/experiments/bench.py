@@ -186,7 +186,7 @@ def default_pixels(preset: Preset, methods: Sequence[str | Method] = TABLE_1) ->
 
 
 def _note(preset: Preset, clock: bool) -> str:
-    """How the numbers came about, in a sentence. Which scenes there are the columns tell."""
+    """How the numbers were measured, in a sentence. The columns name the scenes."""
     changed = changed_settings(preset, PRESETS[preset.name])
     changed = [setting for setting in changed if not setting.startswith("scenes.names")]
     label = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name

@@ -301,7 +301,7 @@ def _checked_scene(options: Namespace, preset: Preset, *mapped: str) -> Scene:
 
 
 def _method_in(given: Map | None, options: Namespace) -> Method:
-    """What to track with: as named, or what suits a given map, which knows its own field."""
+    """What to track with: as named, or what suits the field of a given map."""
     name, field, tracker = options.method, options.field, options.tracker
     if given is None:
         return method_of(name, field, tracker)

@@ -149,7 +149,7 @@ def _outcome_there(
 ) -> Any:
     """Runs in a worker, which may have been started with other folders, or for another device.
 
-    It may also know fewer fields and trackers: somebody adds them in the process that asks.
+    Fields and trackers that were registered in the calling process may be missing in it.
     """
     from distributed import get_worker
 

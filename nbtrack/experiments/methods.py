@@ -109,7 +109,7 @@ def method_of(name: str | None, field: str | None, tracker: str | None) -> Metho
 
 
 def find_methods(methods: Sequence[str | Method]) -> list[Method]:
-    """Methods by their names; those that are one already stay.
+    """The methods of these names; a `Method` stands for itself.
 
     Raises ConfigError if a name is unknown, or its field and tracker do not go together.
     """

@@ -68,7 +68,7 @@ class Preset:
     tables: TablesConfig = TablesConfig()
 
     def __post_init__(self) -> None:
-        """Fields and trackers that somebody has added since then have settings too."""
+        """Add the settings of all registered fields and trackers."""
         object.__setattr__(self, "mapping", {name: self.mapping_of(name) for name in FIELDS})
         object.__setattr__(self, "tracking", {name: self.tracking_of(name) for name in TRACKERS})
 

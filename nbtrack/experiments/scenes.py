@@ -122,7 +122,7 @@ def _room(name: str, config: ScenesConfig) -> Scene:
     recipe += f"-{room_version(name)}"
     folder = runs_folder() / "rooms" / f"{name}-{recipe}" / name
     if not folder.is_dir():
-        # Another command may want the same room: it waits, and finds it made.
+        # Another command that needs the same room waits, and then reads it.
         with FileLock(folder.with_suffix(".lock")):
             for unfinished in folder.parent.glob(f".{name}.*.unfinished"):  # of a killed attempt
                 shutil.rmtree(unfinished, ignore_errors=True)

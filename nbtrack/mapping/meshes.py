@@ -26,8 +26,8 @@ def extract_mesh(
 ) -> Mesh:
     """Coloured mesh (m, world frame) of a field's surface, by marching cubes; points as they are.
 
-    A field says something everywhere, of which what no camera looked at is invention: with a
-    sequence only faces all of whose corners it, or some of its frames, have seen are kept.
+    A field has a value everywhere, also where no camera looked. With a sequence, a face is kept
+    only if all its corners were seen, in any frame of it or in one of `frames`.
 
     The grid's cells have an edge of `voxel` metres. Raises DataError where there is no surface.
     """

@@ -29,7 +29,7 @@ styled = matplotlib.style.context("nbtrack.plots.house")
 
 
 class NotebookFigure(Figure):
-    """A figure that shows itself once where a cell ends with it; pyplot knows nothing of it."""
+    """A figure that is shown once where a cell ends with it; it is not registered with pyplot."""
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()

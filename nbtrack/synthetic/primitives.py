@@ -74,7 +74,7 @@ class Solid:
         """Ray parameter at which a ray from outside enters the solid; inf for a miss.
 
         In units of the direction's length: with camera directions of z = 1 it is the z-depth.
-        Rays that start inside count as misses: cameras live in free space.
+        Rays that start inside count as misses, since cameras are in free space.
         """
         near, far = self._crossing(origins, directions)
         return np.where((near <= far) & (near > 0.0), near, np.inf)

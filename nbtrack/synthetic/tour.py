@@ -32,7 +32,7 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     rng = np.random.default_rng([seed, room.number])
     around = _closed_walk(room, rng)
     length = np.linalg.norm(np.diff(around, axis=0, append=around[:1]), axis=1)
-    # Three rounds, so that what is smoothed or interpolated knows no end.
+    # Three rounds, so that smoothing and interpolation meet no end in the middle one.
     covered = np.concatenate([[0.0], np.cumsum(np.tile(length, 3))[:-1]])
     curve = CubicSpline(covered, np.tile(around, (3, 1)))
     speed = relative_speed(n_frames, rng)

@@ -84,8 +84,9 @@ def table_1(results: pd.DataFrame, value: str = "ate_m") -> pd.DataFrame:
 def table_2(steps: pd.DataFrame, value: str = "steps") -> pd.DataFrame:
     """Table II as printed: mean steps, a row per tracker and n (pixels), a column per budget (ms).
 
-    Made of a row a cell with columns tracker, n_pixels, budget_ms, steps; for the std over
-    frames the value is "steps_std". Raises DataError as `average_over_seeds` does.
+    `steps` has a row for each cell, with columns tracker, n_pixels, budget_ms, steps. With the
+    value "steps_std" the table holds the std over frames. Raises DataError as `average_over_seeds`
+    does.
     """
     _check(steps, "steps", _CELL_2)
     return _wide(steps, _CELL_2, value).reindex(steps["tracker"].unique(), level="tracker")

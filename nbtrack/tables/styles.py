@@ -117,7 +117,7 @@ def latex_file(styler: TableStyler, path: Path, kind: str, note: str) -> str:
         clines="skip-last;data", multirow_align="c", convert_css=True,
         label=f"tab:{kind}-{path.resolve().parent.name}", caption=f"{caption} {escape_latex(note)}",
     )  # fmt: skip
-    # Pandas knows clines only, and has no head for row labels but in a line of its own.
+    # Pandas writes clines only, and puts the head of row labels into a line of its own.
     text = re.sub(r"\\cline\{[\d-]+\}\n(?=\\bottomrule)", "", text)
     text = re.sub(r"\\cline\{[\d-]+\}", r"\\midrule", text)
     if has_steps:

@@ -337,7 +337,7 @@ def retract(T, twist):
 @no_type_check
 @njit(**JIT)
 def damped_step(terms, scales, weight, T_start, T, damping):
-    """The twist of a step."""
+    """The twist (6,) that solves the damped normal equations of data and prior."""
     matrix, vector = normal_equations(terms, scales, weight)
     for k in range(3):
         i, j = (k + 2) % 3, (k + 1) % 3

@@ -52,7 +52,7 @@ class AdamTracker(Tracker):
                 losses = torch.stack([self.loss(T, *self._drawn()) for T in T_starts])
             T_start = T_starts[losses.argmin()]
         start = T_start[:3, 3].clone(), geometry.matrix_to_quaternion(T_start[:3, :3])
-        if self.recorded:  # it knows its tensors by their place
+        if self.recorded:  # the recorded step holds these very tensors
             with torch.no_grad():
                 self.position.copy_(start[0])
                 self.q_wxyz.copy_(start[1])

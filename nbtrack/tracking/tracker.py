@@ -140,8 +140,8 @@ class Tracker(abc.ABC):
 
         A number of steps replaces the budget for this frame.
 
-        Without any measured depth, and where the tracker does not cope with that, it is the one
-        that the motion model expects: the frames after it still can be found (our choice).
+        A tracker that needs depth returns the pose that the motion model predicts where none is
+        measured, so that later frames can still be found (our choice).
         """
         T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
         estimate = Estimate(T_starts[0], without_depth=True)
@@ -168,7 +168,7 @@ class Tracker(abc.ABC):
             setattr(self, name, getattr(type(self), name))
 
     def restart_anywhere(self) -> None:
-        """Go on although nobody knows where the camera is. ConfigError if it cannot be found."""
+        """Track from an unknown pose. ConfigError if this tracker cannot find the camera."""
         raise ConfigError(
             f"tracker {self.name!r} cannot find a camera whose first pose is not known: take lm in "
             "a corrected map (--method corrected), or begin with a frame that has a pose"
