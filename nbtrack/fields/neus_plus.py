@@ -1,4 +1,4 @@
-"""NeuS+: NeuS whose signed distance is also taught directly, from the measured depths."""
+"""NeuS+: NeuS whose signed distance is also supervised directly by the measured depths."""
 
 from dataclasses import dataclass
 
@@ -37,7 +37,7 @@ class NeusPlusMapping(NeusMapping):
     lambda_sdf: float = 10.0  # per metre
     n_surface_points: int = 4096  # measured points an iteration, besides the rays
     lambda_rendering: float = 1.0  # factor of rendered depth and colour; 0: none
-    behind_band: float = 0.1  # distances are taught so far behind surfaces, m
+    behind_band: float = 0.1  # distances are supervised so far behind surfaces, m
 
 
 class NeuSPlusField(NeuSField):
