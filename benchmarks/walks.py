@@ -53,7 +53,7 @@ def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
     made = MapJob(room, method.field, preset, MAPPED)
     job = TrackJob(made, room, method.tracker, steps, frames=frames, n_threads=1)
     found = run_jobs([job], f"{room.name}, {method.label}", Execution(workers=1))[0]
-    tracked = read_run(cell.folder.name).frames
+    tracked = read_run(job.folder.name).frames
     is_wrong = (tracked["translation_error_m"] > WRONG_M).to_numpy()
     is_lost = tracked["lost"].to_numpy(bool)
     width, _, depth = room.room.parts[0].solid.size
