@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from nbtrack.core.arrays import Points, Values
@@ -27,11 +27,6 @@ class SceneBounds:
     def metres_per_unit(self) -> float:
         """Half of the longest side: it maps the box into [-1, 1]^3 without changing its shape."""
         return float((np.array(self.maximum) - np.array(self.minimum)).max() / 2)
-
-    def contain(self, points_world: Points, margin: float = 0.0) -> Bool[Tensor, "n"]:
-        """Whether points (m) lie inside the box, or no farther than `margin` metres from it."""
-        low, high = self._corners(points_world)
-        return ((points_world >= low - margin) & (points_world <= high + margin)).all(dim=-1)
 
     def far_bound(self, origins_world: Points, directions_world: Points) -> Values:
         """Where rays from inside leave the box, in units of the direction (z-depth, m, for z = 1).

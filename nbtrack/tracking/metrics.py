@@ -22,9 +22,9 @@ a short path an error below `LOST_THRESHOLD_M` says nothing, since a camera that
 def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | int]:
     """All errors of one trajectory, from camera-to-world poses (m) of the tracked frames.
 
-    Frames whose true pose is not known (NaN) are in none of them; without any known one only their
-    number is told. Source: paper, evaluation protocol (`ate_rmse_m`); the others tell a map that
-    is offset from a tracker that drifts (our choice).
+    Frames whose true pose is not known (NaN) are in none of them. Without any known true pose only
+    the number of frames is returned. Source: paper, evaluation protocol (`ate_rmse_m`). The others
+    distinguish a map that is offset from a tracker that drifts (our choice).
     """
     is_known = np.isfinite(T_true).all(axis=(1, 2))
     counts = {"frames": len(T_true), "frames_without_reference": int((~is_known).sum())}
