@@ -11,6 +11,7 @@ nothing else.
 
 from itertools import product
 
+import numpy as np
 import pandas as pd
 import torch
 
@@ -55,7 +56,8 @@ def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
     found = run_jobs([job], f"{room.name}, {method.label}", Execution(workers=1))[0]
     tracked = read_run(job.folder.name).frames
     is_wrong = (tracked["translation_error_m"] > WRONG_M).to_numpy()
-    is_lost = tracked["lost"].to_numpy(bool)
+    # The paper's methods do not judge themselves.
+    is_lost = tracked["lost"].to_numpy(bool) if "lost" in tracked else np.zeros_like(is_wrong)
     width, _, depth = room.room.parts[0].solid.size
     field = made.map().field
     return {
