@@ -1,4 +1,4 @@
-"""The tables of benchmarks/README.md, made of the committed CSV files.
+"""The tables of benchmarks/README.md and docs/choices.md, made of the committed CSV files.
 
     python benchmarks/documents.py
 
@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pandas as pd
 
-from nbtrack.core.files import tables_folder
+from nbtrack.tables import over_rooms
 
-README = Path(__file__).parent / "README.md"
+PROJECT = Path(__file__).parents[1]
+DOCUMENTS = PROJECT / "benchmarks" / "README.md", PROJECT / "docs" / "choices.md"
+_RIGHT_TO = 0.02  # m, error of a map's distance near surfaces from which on it counts as right
 # Short heads of the methods' columns; LM is that in the corrected NeuS+ map.
 _HEADS = {
     "iMAP with VR": "VR",
@@ -74,6 +76,84 @@ def fast(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
+def steps(cells: pd.DataFrame) -> pd.DataFrame:
+    """Steps in half a second and milliseconds a step from these, by tracker and pixels."""
+    cells = cells.query("budget_ms == 500")
+    cells.index = cells["tracker"] + " " + cells["n_pixels"].astype(str)
+    table = pd.DataFrame({"steps in 500 ms": cells["steps"].map("{:.1f}".format)})
+    return table.assign(**{"ms a step": (500 / cells["steps"]).map("{:.0f}".format)}).T
+
+
+def mapping(times: pd.DataFrame) -> pd.DataFrame:
+    """Seconds of a mapping iteration by field, and by the eikonal term's share of the samples."""
+    share = times["eikonal_share"].map(", eikonal term on {:g} of the samples".format)
+    times.index = times["field"] + share.where(times["eikonal_share"].notna(), "")
+    seconds = (times["ms"] / 1000).map("{:.2f}".format)
+    return pd.DataFrame({"rays": times["n_rays"].astype(str), "s an iteration": seconds})
+
+
+def convergence(scores: pd.DataFrame) -> pd.DataFrame:
+    """When the distance near surfaces is first right to 2 cm."""
+    first = scores[scores["near_m"] < _RIGHT_TO].groupby("field", sort=False).first()
+    seconds = first["seconds"].map("{:.0f}".format)
+    return pd.DataFrame({"iterations": first["iterations"].astype(str), "s": seconds})
+
+
+def image_size(times: pd.DataFrame) -> pd.DataFrame:
+    """Milliseconds and error of a frame by the width of its picture."""
+    times = times.set_index(times["width"].map("{:g} px wide".format))
+    error_cm = (100 * times["error_m"]).map("{:.2f}".format)
+    return pd.DataFrame(
+        {"ms a frame": times["milliseconds"].map("{:.1f}".format), "cm": error_cm}
+    ).T
+
+
+def correction(runs: pd.DataFrame) -> pd.DataFrame:
+    """What a correction takes in every scene of the ablation."""
+    own = runs.query("changed == 'as it is'").groupby("scene", sort=False).first()
+    seconds, vertices = own["seconds"].map("{:.0f}".format), own["vertices"].map("{:,}".format)
+    return pd.DataFrame({"s of one core": seconds, "vertices": vertices})
+
+
+def choices(runs: pd.DataFrame) -> pd.DataFrame:
+    """Errors at 2 Hz with each other choice over those with ours, and VR's over SDF's, over rooms.
+
+    Geometric means with their 95 % intervals, as notebook A1 has them.
+    """
+    runs = runs.query("rate_hz == 2").replace({"iMAP with VR": "VR", "NeuS with SDF": "SDF"})
+    place = ["choice", "scene", "seed"]
+    by_method = runs.pivot(index=place, columns="method", values="ate_m")
+    ratios = by_method / by_method.loc["ours"].reindex(by_method.index.droplevel("choice")).values
+    ratios = ratios.add_suffix("'s error over ours")
+    ratios["VR's over SDF's"] = by_method["VR"] / by_method["SDF"]
+    rooms = ratios.groupby("choice", sort=False).size()
+    table = {name: _over_rooms(column.rename("ratio")) for name, column in ratios.items()}
+    table = pd.DataFrame(table).assign(rooms=rooms.astype(str)).loc[runs["choice"].unique()]
+    table.loc["ours", [name for name in ratios if name.endswith("ours")]] = ""
+    return table
+
+
+def _over_rooms(ratios: pd.Series) -> pd.Series:
+    """By choice, "mean (from to)"."""
+    means = over_rooms(ratios.reset_index(), ["choice"], "ratio").set_index("choice")
+    return means.apply("{ratio:.2f} ({from:.2f} to {to:.2f})".format_map, axis=1)
+
+
+TABLES = {
+    "steps": (steps, "benchmarks/cpu/table_2.csv"),
+    "mapping": (mapping, "benchmarks/cpu/mapping.csv"),
+    "convergence": (convergence, "paper_tables/beyond/convergence.csv"),
+    "tracking": (tracking, "paper_tables/corrected/tracking.csv"),
+    "times": (times, "paper_tables/corrected/times.csv"),
+    "searches": (searches, "paper_tables/corrected/searches.csv"),
+    "fast": (fast, "paper_tables/corrected/fast.csv"),
+    "image_size": (image_size, "paper_tables/corrected/image_size.csv"),
+    "correction": (correction, "paper_tables/corrected/ablation.csv"),
+    "choices": (choices, "paper_tables/evidence/choices.csv"),
+}
+"""By name: what makes a table, and of which file."""
+
+
 def written(text: str) -> str:
     """A document with its tables made anew."""
     return re.sub(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", _table, text, flags=re.DOTALL)
@@ -81,8 +161,8 @@ def written(text: str) -> str:
 
 def _table(match: re.Match) -> str:
     begin, name, end = match.groups()
-    rows = pd.read_csv(tables_folder() / "corrected" / f"{name}.csv")
-    return f"{begin}{_markdown(globals()[name](rows))}{end}"
+    make, path = TABLES[name]
+    return f"{begin}{_markdown(make(pd.read_csv(PROJECT / path)))}{end}"
 
 
 def _markdown(table: pd.DataFrame) -> str:
@@ -93,4 +173,5 @@ def _markdown(table: pd.DataFrame) -> str:
 
 
 if __name__ == "__main__":
-    README.write_text(written(README.read_text()))
+    for document in DOCUMENTS:
+        document.write_text(written(document.read_text()))
