@@ -115,6 +115,15 @@ def correction(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame({"s of one core": seconds, "vertices": vertices})
 
 
+def memory(peaks: pd.DataFrame) -> pd.DataFrame:
+    """Peak memory of mapping a long sequence, and what its images take of it."""
+    pixels = peaks["frames"] * peaks["width"] * peaks["height"]
+    images_gb = (5 * pixels / 1e9).map("{:.2f}".format)  # 3 bytes of colour and 2 of depth a pixel
+    peak_gb = peaks["peak_gb"].map("{:.2f}".format)
+    table = pd.DataFrame({"peak, GB": peak_gb, "images of it, GB": images_gb})
+    return table.set_axis(peaks["field"])
+
+
 def choices(runs: pd.DataFrame) -> pd.DataFrame:
     """Errors at 2 Hz with each other choice over those with ours, and VR's over SDF's, over rooms.
 
@@ -149,6 +158,7 @@ TABLES = {
     "fast": (fast, "paper_tables/corrected/fast.csv"),
     "image_size": (image_size, "paper_tables/corrected/image_size.csv"),
     "correction": (correction, "paper_tables/corrected/ablation.csv"),
+    "memory": (memory, "benchmarks/cpu/memory.csv"),
     "choices": (choices, "paper_tables/evidence/choices.csv"),
 }
 """By name: what makes a table, and of which file."""

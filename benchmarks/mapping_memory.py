@@ -1,9 +1,10 @@
 """Peak memory of mapping a sequence of 1,600 frames of 640x480, by `/usr/bin/time -v`.
 
-    python benchmarks/mapping_memory.py [neus|imap] [WORK_FOLDER]
+    python benchmarks/mapping_memory.py [WORK_FOLDER]
 
-The sequence has the size of the dataset's longest scenes. Its frames are those of a synthetic room,
-each standing there several times (as hard links): what the images show does not matter here.
+Writes cpu/memory.csv. The sequence has the size of the dataset's longest scenes. Its frames are
+those of a synthetic room, each standing there several times (as hard links): what the images show
+does not matter here.
 """
 
 import os
@@ -15,8 +16,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from nbtrack.synthetic import make_room
+from nbtrack.tables import write_csv
 
 N_FRAMES, N_RENDERED = 1600, 40
 ITERATIONS = 5  # memory has reached its peak after the first
@@ -54,14 +57,16 @@ def measure(field: str, sequence: Path, runs: Path) -> float:
 
 
 def main() -> None:
-    """Measure one field, or both."""
-    fields = sys.argv[1:2] or ["imap", "neus"]
+    """Measure both of the paper's fields."""
+    rows = []
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(sys.argv[2] if len(sys.argv) > 2 else temporary)
+        folder = Path(sys.argv[1] if len(sys.argv) > 1 else temporary)
         sequence = make_long_sequence(folder)
-        for field in fields:
-            peak = measure(field, sequence, Path(temporary) / "runs")
-            print(f"{field}: {peak:.2f} GB at the peak, {N_FRAMES} frames of 640x480")
+        for field in ("imap", "neus"):
+            rows.append({"field": field, "frames": N_FRAMES, "width": 640, "height": 480})
+            rows[-1]["peak_gb"] = measure(field, sequence, Path(temporary) / "runs")
+            print(rows[-1])
+    write_csv(Path(__file__).parent / "cpu" / "memory.csv", pd.DataFrame(rows))
 
 
 if __name__ == "__main__":
