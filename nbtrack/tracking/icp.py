@@ -60,6 +60,8 @@ class IcpTracker(Tracker):
             )
         self.small_gicp = importlib.import_module(self.package)
         points = self.field.points.double().numpy()
+        self.low = points.min(axis=0) - _MAX_CORRESPONDENCE_DISTANCES[0]
+        self.high = points.max(axis=0) + _MAX_CORRESPONDENCE_DISTANCES[0]
         self.target, self.target_tree = self._with_planes(self.small_gicp.PointCloud(points))
 
     @classmethod
@@ -85,6 +87,9 @@ class IcpTracker(Tracker):
         if self.source is None or self.source.size() < _MIN_POINTS:
             return float("nan")
         T_world_camera = self.T_world_camera.double().numpy()
+        points_world = (self.source.points() @ T_world_camera.T)[:, :3]
+        if not ((points_world > self.low) & (points_world < self.high)).all(axis=1).any():
+            return float("nan")  # of points so far away the tree finds no partner, in seconds
         map_and_frame = self.target, self.source, self.target_tree
         for distance in _MAX_CORRESPONDENCE_DISTANCES:
             options = {**_OPTIONS, "max_correspondence_distance": distance}
