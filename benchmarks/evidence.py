@@ -66,6 +66,7 @@ def main(experiment: str, seeds: int) -> None:
             rows = pd.concat([rows, made])
             write_atomic(path, rows.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     if experiment == "nine_rooms":
+        rows = pd.read_csv(path)  # as anybody has them, rounded
         note = f"Preset: {NINE.name}; budget: the paper's step counts; {machine}."
         write_table_1(path.parent, rows.query("path == 'mapped'"), note)
         judged = verdicts(rows).to_csv(index=False, float_format="%.4g", lineterminator="\n")

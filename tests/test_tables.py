@@ -240,8 +240,8 @@ def test_mean_and_deviation_over_seeds() -> None:
 
 
 def test_standing_still_is_a_row() -> None:
-    """Catches a table without the dullest alternative, one row of it for each method, or one in the
-    published table, where nobody knows it."""
+    """Catches a table without the dullest alternative, one row of it for each method, a std over
+    seeds of what no seed changes, or one in the published table, where nobody knows it."""
     still = SEEDS.assign(still_ate_m=SEEDS["method"].map({"A": 0.25, "B": 0.25}))
     wide = table_1(still)
     assert wide["x"].to_dict() == {
@@ -250,6 +250,7 @@ def test_standing_still_is_a_row() -> None:
         (10, STANDING_STILL): 0.25,
     }
     assert f" & {STANDING_STILL} & " in latex(style_table_1(still))
+    assert style_table_1(still).data["x"].tolist() == ["0.200 ± 0.100", "1.000 ± 0.000", "0.250"]
     assert STANDING_STILL not in table_1(published_table_1()).index.get_level_values("method")
 
 
