@@ -18,7 +18,7 @@ Config = TypeVar("Config")
 
 def may_be_zero(default: int) -> Any:
     """A dataclass field with a count that may also be 0."""
-    return dataclasses.field(default=default, metadata={"least": 0})
+    return dataclasses.field(default=default, metadata={"min": 0})
 
 
 def as_dict(config: Any) -> dict[str, Any]:
@@ -90,7 +90,7 @@ def _replaced(node: Any, path: list[str], key: str, value: Any, minimum: int = 1
     if isinstance(node, dict):
         return {**node, name: _replaced(node[name], rest, key, value)}
     metadata = next(f.metadata for f in dataclasses.fields(node) if f.name == name)
-    new = _replaced(getattr(node, name), rest, key, value, metadata.get("least", 1))
+    new = _replaced(getattr(node, name), rest, key, value, metadata.get("min", 1))
     return dataclasses.replace(node, **{name: new})
 
 
