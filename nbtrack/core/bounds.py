@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from nbtrack.core.arrays import Points, Values
 from nbtrack.core.device import constant
@@ -35,10 +34,7 @@ class SceneBounds:
         """
         # An axis that a ray runs along is left at infinity, never at 0/0.
         safe = torch.where(directions_world.abs() < 1e-9, 1e-9, directions_world)
-        low, high = self._corners(origins_world)
+        corners = self.minimum, self.maximum
+        low, high = (constant(c, origins_world.device, origins_world.dtype) for c in corners)
         to_minimum, to_maximum = (low - origins_world) / safe, (high - origins_world) / safe
         return torch.maximum(to_minimum, to_maximum).amin(dim=-1)
-
-    def _corners(self, like: Tensor) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        corners = self.minimum, self.maximum
-        return tuple(constant(corner, like.device, like.dtype) for corner in corners)
