@@ -87,10 +87,16 @@ def sources_fingerprint(*modules: str) -> str:
     return fingerprint(modules_read)
 
 
-def modules_of(kind: type) -> tuple[str, ...]:
-    """The modules of this package in which a class and its base classes stand."""
-    names = [base.__module__ for base in kind.__mro__]
-    return tuple(name.removeprefix("nbtrack.") for name in names if name.startswith("nbtrack."))
+def code_fingerprint(*parts: type | str) -> str:
+    """Twelve hexadecimal digits that change with the code of classes and of the package's modules.
+
+    Classes count with their base classes, whether they stand in this package or outside.
+    """
+    kinds = [part for part in parts if isinstance(part, type)]
+    names = [part for part in parts if isinstance(part, str)]
+    names += [base.__module__ for kind in kinds for base in kind.__mro__]
+    own = (name.removeprefix("nbtrack.") for name in names if name.startswith("nbtrack."))
+    return fingerprint(sources_fingerprint(*own), *map(foreign_source, kinds))
 
 
 def foreign_source(kind: type) -> str:

@@ -10,13 +10,7 @@ from filelock import FileLock
 
 from nbtrack.core.device import advise_on_memory, choose_device
 from nbtrack.core.errors import NbtrackError
-from nbtrack.core.files import (
-    fingerprint,
-    foreign_source,
-    modules_of,
-    runs_folder,
-    sources_fingerprint,
-)
+from nbtrack.core.files import code_fingerprint, fingerprint, runs_folder
 from nbtrack.core.settings import as_dict, with_settings
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
@@ -88,16 +82,12 @@ class MapJob(Job):
         """Of code, device, data, settings and seed."""
         if self.is_given:
             given = read_map(self.folder)
-            code = sources_fingerprint(*modules_of(type(given.field)))
-            return fingerprint(given.key, code, choose_device().type)
-        kind = field_class(self.field)
-        modules = [*modules_of(kind), "mapping.fit"]
-        if self.base:
-            modules.append("mapping.correct")
+            return fingerprint(given.key, code_fingerprint(type(given.field)), choose_device().type)
+        correction = ["nbtrack.mapping.correct"] if self.base else []
         return fingerprint(
-            sources_fingerprint(*modules), foreign_source(kind), choose_device().type,
-            self.scene.fingerprint, self.field, self.preset.network_of(self.field), self.settings,
-            self.frames, self.seed,
+            code_fingerprint(field_class(self.field), "nbtrack.mapping.fit", *correction),
+            choose_device().type, self.scene.fingerprint, self.field,
+            self.preset.network_of(self.field), self.settings, self.frames, self.seed,
         )  # fmt: skip
 
     @property
@@ -139,17 +129,13 @@ class MapJob(Job):
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Map and score, or resume; write the map's files."""
-        checkpoint, iterations = (
-            self.folder / CHECKPOINT_FILE,
-            getattr(self.settings, "iterations", 1),
-        )
+        iterations = getattr(self.settings, "iterations", 1)
+        checkpoint, base = self.folder / CHECKPOINT_FILE, self.base
 
         def tell(done: int, losses: dict[str, float | int]) -> None:
-            report(
-                done / iterations, " ".join(f"{name} {loss:.3f}" for name, loss in losses.items())
-            )
+            words = [f"{name} {loss:.3f}" for name, loss in losses.items()]
+            report(done / iterations, " ".join(words))
 
-        base = self.base
         if base and isinstance(failure := base.outcome(None, report), NbtrackError):
             raise failure
         sequence, network = self.scene.read(self.frames), self.preset.network_of(self.field)
@@ -165,12 +151,10 @@ class MapJob(Job):
             )  # fmt: skip
         quality = score_map(finished_map, sequence, self.scene.room)
         record = {"quality": quality, "frames": self.frames, "key": self.key}
-        finished = replace(
-            finished_map, record={**finished_map.record, **record, "config": as_dict(self.preset)}
-        )
-        write_map(self.folder / MAP_FILE, finished)
+        record = finished_map.record | record | {"config": as_dict(self.preset)}
+        write_map(self.folder / MAP_FILE, replace(finished_map, record=record))
         checkpoint.unlink(missing_ok=True)
-        return finished.record
+        return record
 
 
 @lru_cache(maxsize=4)

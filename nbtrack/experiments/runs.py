@@ -55,11 +55,10 @@ class TrackJob(Job):
     @cached_property
     def key(self) -> str:
         """Of code, map, tracker, budget, threads, frames and seed; by the clock, of the machine."""
-        kind, field = tracker_class(self.tracker), field_class(self.needs.field)
-        modules = (*files.modules_of(kind), *files.modules_of(field), "tracking.trajectories")
+        kinds = tracker_class(self.tracker), field_class(self.needs.field)
         clock = None if self.rate_hz is None else (self.rate_hz, device_name(choose_device()))
         return files.fingerprint(
-            files.sources_fingerprint(*modules), files.foreign_source(kind), self.needs.key,
+            files.code_fingerprint(*kinds, "nbtrack.tracking.trajectories"), self.needs.key,
             self.tracker, self.settings, self.steps, clock, self.n_threads, self.start, self.frames,
             self.seed, self.scene.fingerprint,
         )  # fmt: skip
