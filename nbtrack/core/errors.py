@@ -1,6 +1,10 @@
 """One exception family. A message says what was found, what is allowed and what to do next."""
 
 import difflib
+from collections.abc import Mapping
+from typing import TypeVar
+
+Entry = TypeVar("Entry")
 
 
 class NbtrackError(Exception):
@@ -25,6 +29,13 @@ class NumericalError(NbtrackError, ArithmeticError):
 
 class OutOfMemory(NbtrackError, MemoryError):
     """Host or device have too little memory; the message names the setting to lower."""
+
+
+def look_up(what: str, name: str, known: Mapping[str, Entry]) -> Entry:
+    """The entry of a name. Raises ConfigError, naming the nearest, for an unknown one."""
+    if name not in known:
+        raise ConfigError(f"unknown {what} {name[:40]!r}: {nearest_name(name, [*known])}")
+    return known[name]
 
 
 def nearest_name(text: str, allowed: list[str]) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nbtrack.core.arrays import Poses
-from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
+from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.core.settings import may_be_zero, with_values
 from nbtrack.data.text_files import Calibration, read_object
 
@@ -162,9 +162,7 @@ def declaration(folder: Path, format: str | None = None) -> Declaration:
         )
     path = folder / DECLARATION_FILE
     format = format or _declared(path, Declaration()).format or _told_by_files(folder)
-    if format not in FORMATS:
-        raise ConfigError(f"unknown format {format[:40]!r}: {nearest_name(format, list(FORMATS))}")
-    return replace(_declared(path, FORMATS[format].declared), format=format)
+    return replace(_declared(path, look_up("format", format, FORMATS).declared), format=format)
 
 
 def _told_by_files(folder: Path) -> str:

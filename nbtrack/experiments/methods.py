@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from nbtrack.core.errors import ConfigError, nearest_name
+from nbtrack.core.errors import ConfigError, look_up
 from nbtrack.fields import field_class
 from nbtrack.tracking import TRACKERS, check_pair, paper_steps, tracker_class
 
@@ -115,8 +115,6 @@ def find_methods(methods: Sequence[str | Method]) -> list[Method]:
     """
     chosen = []
     for method in dict.fromkeys(methods):
-        if isinstance(method, str) and method not in METHODS:
-            raise ConfigError(f"unknown method {method!r}: {nearest_name(method, [*METHODS])}")
-        chosen.append(METHODS[method] if isinstance(method, str) else method)
+        chosen.append(look_up("method", method, METHODS) if isinstance(method, str) else method)
         check_pair(chosen[-1].tracker, chosen[-1].field)
     return chosen

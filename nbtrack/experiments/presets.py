@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from nbtrack.core.errors import ConfigError, MissingError, nearest_name
+from nbtrack.core.errors import ConfigError, MissingError, look_up
 from nbtrack.core.settings import may_be_zero, with_settings, with_values
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, PointMapping, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
@@ -142,9 +142,7 @@ def load_preset(
     wrong type; MissingError if the file does not exist.
     """
     name = name or os.environ.get("NBTRACK_PRESET", "smoke")
-    if name not in PRESETS:
-        raise ConfigError(f"unknown preset {name!r}: {nearest_name(name, list(PRESETS))}")
-    preset = PRESETS[name]
+    preset = look_up("preset", name, PRESETS)
     file_name, text = config_file or os.environ.get("NBTRACK_CONFIG"), os.environ.get("NBTRACK_SET")
     if file_name:
         preset = with_values(preset, _read_toml(Path(file_name)))
