@@ -54,7 +54,7 @@ OPTIONS = {
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from MAP": _option("track in this map of the room: its folder or file", a_path),
     "--start": _option("given: the first frame's own pose (default where it has one), or unknown",
-                       choices=("given", "unknown")),
+                       choices=("given", "unknown"), default="given"),
     "--to FORMAT": _option("tum, kitti: trajectory; gif, mp4: movie of a run; ply, glb: "
                             "coloured mesh; map: one file"),
     "--budget BY": _option("steps, the paper's counts (default), or this machine's clock",

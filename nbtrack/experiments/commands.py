@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
-from nbtrack.core.files import naming_damaged, read_json, write_atomic
+from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
+from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import as_dict
 from nbtrack.data.check import check_recording, quick_warning
@@ -44,7 +44,6 @@ from nbtrack.tracking.trajectories import (
 )
 
 OVERVIEW_FILE = "overview.png"  # beside the files of a run
-_FORMATS = ["tum", "kitti", "ply", "glb", "map", "gif", "mp4"]
 _PRINTED = (
     "ate_rmse_m", "still_ate_m", "path_m", "ate_over_path", "ate_rmse_aligned_m",
     "rotation_rmse_deg", "max_error_m", "frames", "steps_per_frame",
@@ -71,10 +70,10 @@ def map_command(options: Namespace) -> None:
     scene = _checked_scene(options, preset, options.frames)
     job = MapJob(scene, method.field, preset, options.frames, options.seed, options.out)
     with output_folder(options.out, *_MAP_FILES):
-        _make_map(job, options.frames)
+        _make_map(job)
 
 
-def _make_map(job: MapJob, frames: str) -> None:
+def _make_map(job: MapJob) -> None:
     """Map and say how good the map is; draw the mesh of what was seen."""
     _map(job)
     finished, scene = job.map(), job.scene
@@ -83,7 +82,7 @@ def _make_map(job: MapJob, frames: str) -> None:
     _print_numbers({k: v for k, v in finished.record["quality"].items() if v is not None})
     try:
         # Every tenth frame says enough of what has been seen: neighbours see the same.
-        sequence = scene.read(frames)
+        sequence = scene.read(job.frames)
         mesh = extract_mesh(finished.field, sequence.select(slice(None, None, 10)))
     except DataError as error:
         print(f"  no mesh: {error}")
@@ -109,7 +108,7 @@ def track_command(options: Namespace) -> None:
     )
     run = TrackJob(
         job, scene, method.tracker, steps, options.rate, options.frames, options.seed,
-        options.out, options.threads, options.start or "given",
+        options.out, options.threads, options.start,
     )  # fmt: skip
     with output_folder(options.out, *RUN_FILES, OVERVIEW_FILE):
         if not given:
@@ -142,7 +141,7 @@ def _draw_overview(run: TrackJob) -> None:
     """A picture of a finished run, beside its files: the path in what was seen of the map."""
     from nbtrack.plots import cloud_of, plot_overview
 
-    tracked, metrics, field = read_trajectory(run.folder), run.result(), run.needs.map().field
+    tracked, field = read_trajectory(run.folder), run.needs.map().field
     ids, known = tracked.frames["frame_id"].to_numpy(), np.isfinite(tracked.T_true).all(axis=(1, 2))
     stride = max(1, len(ids) // _FRAMES_SHOWN)
     seen = read_frames(run.scene.recording, ids[::stride], needs_poses=False)
@@ -156,8 +155,9 @@ def _draw_overview(run: TrackJob) -> None:
     paths = {"true": tracked.T_true[known]} if known.any() else {}
     title = f"{run.scene.name}: {run.tracker} in {field.label}, {len(ids)} frames"
     if known.any():
-        still = 100 * metrics.get("still_ate_m", float("nan"))
-        title += f", ATE {100 * metrics['ate_rmse_m']:.2f} cm (standing still {still:.0f} cm)"
+        still = 100 * tracked.metrics.get("still_ate_m", float("nan"))
+        ate = 100 * tracked.metrics["ate_rmse_m"]
+        title += f", ATE {ate:.2f} cm (standing still {still:.0f} cm)"
     title = title.encode(errors="replace").decode()  # letters that the system's encoding lacks
     figure = plot_overview(cloud, paths | {"tracked": tracked.T_estimated}, tracked.frames, title)
     figure.savefig(run.folder / OVERVIEW_FILE, dpi=120)
@@ -166,8 +166,7 @@ def _draw_overview(run: TrackJob) -> None:
 
 def _cell_of(field: Any) -> float:
     """The edge (m) of a picture's cells: large places have larger ones."""
-    size = max(np.subtract(field.bounds.maximum, field.bounds.minimum))
-    return max(0.05, float(size) / _CELLS)
+    return max(0.05, 2 * field.bounds.metres_per_unit / _CELLS)
 
 
 def export_command(options: Namespace) -> None:
@@ -176,16 +175,9 @@ def export_command(options: Namespace) -> None:
     Raises ConfigError for an unknown format, or where a file would be replaced; MissingError and
     DataError where the result is not there, unfinished, damaged, or not what the format is for.
     """
-    source, name, out = options.source, options.to, options.out
-    if name not in _FORMATS:
-        raise ConfigError(f"unknown format {name!r}: {nearest_name(name, _FORMATS)}")
-    export = _export_map
-    if name in ("tum", "kitti"):
-        export = _export_trajectory
-    elif name in ("gif", "mp4"):
-        export = _export_movie
-    summary = export(source, name, new_file(out))
-    print(f"{out}: {summary}")
+    export = look_up("format", options.to, _EXPORTS)
+    summary = export(options.source, options.to, new_file(options.out))
+    print(f"{options.out}: {summary}")
 
 
 def _export_map(source: Path, format_name: str, out: Path) -> str:
@@ -193,9 +185,8 @@ def _export_map(source: Path, format_name: str, out: Path) -> str:
     if format_name == "map":
         content = (source / MAP_FILE if source.is_dir() else source).read_bytes()
         write_atomic(out, content)
-        return (
-            f"{finished.field.label} map of {finished.record['scene']}, {len(content) / 1e6:.2f} MB"
-        )
+        label, scene = finished.field.label, finished.record["scene"]
+        return f"{label} map of {scene}, {len(content) / 1e6:.2f} MB"
     is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
     with naming_damaged(seen, "mesh", "remove it and map again"):
         mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)
@@ -208,14 +199,14 @@ def _export_movie(source: Path, format_name: str, out: Path) -> str:
     """Of a run, whose recording and map must still be where they were."""
     from nbtrack.plots import movie_bytes, movie_pictures
 
-    tracked, metrics = read_trajectory(source), read_json(source / METRICS_FILE)
+    tracked = read_trajectory(source)
+    metrics = tracked.metrics
     if "map" not in metrics:
         raise MissingError(f"{source} is of an earlier version: track again")
     finished, recording = read_map(Path(metrics["map"])), Path(metrics["recording"])
     if not recording.is_dir():
         raise MissingError(f"the recording {recording} of this run is gone: track again")
-    shown = np.linspace(0, len(tracked.frames) - 1, _MOVIE_FRAMES).round().astype(int)
-    shown = np.unique(shown)
+    shown = np.unique(np.linspace(0, len(tracked.frames) - 1, _MOVIE_FRAMES).round().astype(int))
     rows, T_estimated = tracked.frames.iloc[shown], tracked.T_estimated[shown]
     opened = open_recording(recording, metrics["format"])
     origin = np.array(metrics.get("origin", [0, 0, 0]))
@@ -242,6 +233,13 @@ def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
     return f"{len(T_world_camera)} poses, TUM: timestamp (s), position (m), quaternion xyzw"
 
 
+_EXPORTS = {
+    **dict.fromkeys(("tum", "kitti"), _export_trajectory),
+    **dict.fromkeys(("ply", "glb", "map"), _export_map),
+    **dict.fromkeys(("gif", "mp4"), _export_movie),
+}
+
+
 def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
     chosen = "motion", "n_frames", "width", "seed"
@@ -264,10 +262,9 @@ def check_command(options: Namespace) -> None:
     path = new_file(options.out if is_picture else options.out / "check.png")
     path.parent.mkdir(parents=True, exist_ok=True)
     T_world_camera = shifted(recording.T_world_camera[recording.has_pose], -recording.origin)
-    apart = (
-        f"surfaces of two frames lie {1e3 * report.conventions[0].median_m:.1f} mm apart (median)"
-    )
-    plot_recording(report.cloud, T_world_camera, f"{recording.name}: {apart}").savefig(path)
+    apart = f"{1e3 * report.conventions[0].median_m:.1f} mm apart (median)"
+    title = f"{recording.name}: surfaces of two frames lie {apart}"
+    plot_recording(report.cloud, T_world_camera, title).savefig(path)
     print(f"  picture         {path}")
 
 
