@@ -92,35 +92,7 @@ def _shared(kind: type, other: Any) -> Any:
     return kind(**{f.name: getattr(other, f.name) for f in fields(kind) if hasattr(other, f.name)})
 
 
-# Pixel counts of `smoke` are the paper's divided by eight: the ratio of VR to SDF stays.
-_SMOKE = """
-network.imap.width = 96
-network.neus.width = 96
-network.occupancy.width = 96
-[scenes]
-names = ["living_room", "office"]
-n_frames = 240
-width = 96
-track_frames = "-120:"
-[mapping]
-imap = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
-neus = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
-volsdf = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
-occupancy = {iterations = 1200, n_rays = 96, learning_rate = 3e-3}
-[mapping.neus_plus]
-iterations = 1400
-n_rays = 96
-n_stratified = 8
-n_surface = 8
-n_surface_points = 1024
-learning_rate = 3e-3
-[tracking]
-vr.n_pixels = 64
-sdf.n_pixels = 512
-[tables.pixels]
-vr = [16, 64, 128]
-sdf = [256, 512, 2048]
-"""
+_SMOKE = Path(__file__).with_name("smoke.toml").read_text(encoding="utf-8")
 _SMALL = with_values(Preset("smoke"), tomllib.loads(_SMOKE))
 _NINE = replace(_SMALL.scenes, names=REPORTED_ROOMS, track_frames=":")
 _ALL = (
