@@ -65,7 +65,7 @@ NOTE = r"Preset: smoke; budget: the paper's step counts; device: CPU_1 & 50% #1 
 
 
 def latex(styler) -> str:
-    return latex_file(styler, Path("smoke/table_1.tex"), "ate", NOTE)
+    return latex_file(styler, Path("smoke/table_1.tex"), NOTE)
 
 
 def tabular_rows(source: str) -> list[list[str]]:
