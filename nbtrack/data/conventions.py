@@ -3,10 +3,9 @@
 Under the right convention the surfaces that two frames both see coincide.
 """
 
-import json
 import math
 import os
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,6 +16,7 @@ from torch.nn.functional import grid_sample
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.camera import Intrinsics, pixel_directions, project
+from nbtrack.core.settings import changed_settings
 from nbtrack.data.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA, Declaration
 from nbtrack.data.recording import Recording
 
@@ -34,7 +34,15 @@ ROTATED = (8000.0, 80_000.0)  # depth values a metre: millimetres, and tenths, t
 # Those that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1 mm; and metres
 # and micrometres, which 16 bits hold badly.
 _SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, *ROTATED, 256.0, 100.0, 1.0, 1e6)
-_ALONG = {"axis": "depth along the optical axis", "ray": "distances along the ray, not z-depth"}
+_DEPTHS = {f"{scale:g} depth values a metre": {"depth_scale": scale} for scale in _SCALES}
+_DEPTHS["depth along the optical axis"] = {"depth_along": "axis"}
+_DEPTHS["distances along the ray, not z-depth"] = {"depth_along": "ray"}
+_CALIBRATIONS = {  # factors of focal lengths
+    "one with its principal point in the middle of the image": 1.0,
+    "one for images twice as large": 0.5,
+    "one for images half as large": 2.0,
+}
+_UNITS = {"ones in millimetres": 1e-3, "ones in centimetres": 1e-2}
 _EDGES_ALIKE = 0.02  # by which a correlation of edges must be higher to decide (our choice)
 _FLIPPED = {(1,): "images upside down", (1, 2): "images turned by 180 degrees"}
 # The common camera axes first: where several fit alike, the first is named.
@@ -106,40 +114,32 @@ class Convention:
 
 def conventions(declared: Declaration, camera: Intrinsics) -> list[Convention]:
     """The declared convention first, then the usual mistakes, common ones first."""
-    own = _convention_name(declared.camera_axes, declared.poses)
-    declared = replace(declared, **CONVENTIONS.get(own, {}))  # `opencv` for `right down forward`
-    conventions = {own: {}} | CONVENTIONS
-    table = [("poses", *convention) for convention in conventions.items()]
+    name = _convention_name(declared.camera_axes, declared.poses)
+    declared = replace(declared, **CONVENTIONS.get(name, {}))  # `opencv` for `right down forward`
+    own = Convention("poses", name, declared, camera)
     order = "wxyz" if declared.quaternion == "xyzw" else "xyzw"
-    for name, keys in conventions.items():
-        if name == own or name.startswith("Open"):
-            in_order = f"quaternions in the order {order}"
-            name = in_order if name == own else f"{in_order}, and {name}"
-            table.append(("poses", name, keys | {"quaternion": order}))
-    table += [("depth", f"{n:g} depth values a metre", {"depth_scale": n}) for n in _SCALES]
-    table += [("depth", name, {"depth_along": along}) for along, name in _ALONG.items()]
-    candidates = [
-        Convention(what, name, replace(declared, **keys), camera) for what, name, keys in table
+    orders = {f"quaternions in the order {order}": {"quaternion": order}}
+    for other, keys in CONVENTIONS.items():
+        if other.startswith("Open") and other != name:
+            orders[f"quaternions in the order {order}, and {other}"] = {**keys, "quaternion": order}
+    table = [
+        (subject, name, {"declared": replace(declared, **keys)})
+        for subject, named in (("poses", CONVENTIONS | orders), ("depth", _DEPTHS))
+        for name, keys in named.items()
     ]
-    others = [
-        Convention("depth", n, declared, camera, flipped=axes) for axes, n in _FLIPPED.items()
-    ]
-    for unit, metres in (("millimetres", 1e-3), ("centimetres", 1e-2)):
-        others.append(Convention("poses", f"ones in {unit}", declared, camera, metres=metres))
-    factors = {"with its principal point in the middle of the image": 1.0}
-    factors |= {"for images twice as large": 0.5, "for images half as large": 2.0}
     lengths = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    for name, factor in factors.items():
+    for name, factor in _CALIBRATIONS.items():
         # The principal point scales with the rest, or is in the middle of any image.
         scaled = Intrinsics(camera.width, camera.height, *(factor * lengths).tolist())
         middle = replace(scaled, cx=camera.width / 2, cy=camera.height / 2)
-        candidates += [
-            Convention("calibration", f"one {name}", declared, c) for c in (scaled, middle)
-        ]
-    candidates = candidates[:1] + [
-        r for r in candidates if (r.declared, r.camera) != (declared, camera)
+        table += [("calibration", name, {"camera": c}) for c in (scaled, middle)]
+    table += [("depth", name, {"flipped": axes}) for axes, name in _FLIPPED.items()]
+    table += [("poses", name, {"metres": metres}) for name, metres in _UNITS.items()]
+    return [own] + [
+        replace(own, subject=subject, name=name, **changes)
+        for subject, name, changes in table
+        if any(getattr(own, key) != value for key, value in changes.items())
     ]
-    return candidates + others
 
 
 def fitted(
@@ -274,11 +274,10 @@ def _remedy(convention: Convention, own: Convention) -> str:
         return "turn the depth images as the colour images are"
     if convention.metres != 1:
         return f"multiply the positions in the pose file by {convention.metres:g}"
-    c, keys = convention.camera, asdict(convention.declared).items()
-    if c != own.camera:
+    if (c := convention.camera) != own.camera:
         numbers = f"{c.fx:.6g} {c.fy:.6g} {c.cx - 0.5:.6g} {c.cy - 0.5:.6g}"
         return f"set fx fy cx cy in the calibration to {numbers} (the first pixel's centre at 0)"
-    changes = {k: json.dumps(v) for k, v in keys if v != getattr(own.declared, k)}
-    said = [f"{key} = {value.removesuffix('.0')}" for key, value in changes.items()]
+    changes = changed_settings(convention.declared, own.declared)
+    said = " and ".join(text.replace("=", " = ", 1).removesuffix(".0") for text in changes)
     matrices = " if the pose file has quaternions, or make the matrices anew"
-    return f"set {' and '.join(said)} in sequence.toml{matrices * ('quaternion' in changes)}"
+    return f"set {said} in sequence.toml{matrices * ('quaternion' in said)}"
