@@ -1,13 +1,14 @@
 """From image files to arrays: one size, depth in mm along the optical axis, no distortion."""
 
+import io
 import os
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Int, Shaped, UInt8, UInt16
+from PIL import Image
 
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError, MissingError
@@ -16,8 +17,6 @@ from nbtrack.data.recording import Recording
 from nbtrack.data.text_files import camera_matrix
 
 _FARTHEST_MM = 65535  # what 16 bits hold
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_CHUNK_OVERHEAD = 12  # bytes of a PNG chunk beside its content: length, type, checksum
 
 
 def decode(
@@ -64,8 +63,9 @@ def _read_image(path: Path, flags: int) -> Shaped[np.ndarray, "height width *cha
     """Decoded PNG or JPEG file, checked before: of a damaged one OpenCV fills in anything."""
     if not os.path.isfile(path):
         raise MissingError(f"no file {path}: a frame needs it; add it or remove the frame")
-    content = np.fromfile(path, dtype=np.uint8)
-    image = cv2.imdecode(content, flags) if _is_complete(memoryview(content)) else None
+    content = path.read_bytes()
+    is_complete = _is_complete(content)
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if is_complete else None
     if image is None:
         raise DataError(
             f"{path} is damaged or not a complete PNG or JPEG ({len(content)} bytes): copy it "
@@ -74,19 +74,15 @@ def _read_image(path: Path, flags: int) -> Shaped[np.ndarray, "height width *cha
     return image
 
 
-def _is_complete(content: memoryview) -> bool:
+def _is_complete(content: bytes) -> bool:
     """A JPEG with its end marker, or a PNG with all chunks, whose checksums agree."""
-    if content[:8] != _PNG_SIGNATURE:
-        # Some cameras append notes. Compressed JPEG data never holds the marker's two bytes.
-        return b"\xff\xd9" in bytes(content[-1024:])
-    start, kind = len(_PNG_SIGNATURE), b""
-    while kind != b"IEND":
-        end = start + _CHUNK_OVERHEAD + int.from_bytes(content[start : start + 4], "big")
-        checksum = int.from_bytes(content[end - 4 : end], "big")
-        if end > len(content) or zlib.crc32(content[start + 4 : end - 4]) != checksum:
-            return False
-        start, kind = end, content[start + 4 : start + 8]
-    return True
+    try:
+        with Image.open(io.BytesIO(content)) as image:
+            image.verify()  # of a PNG the chunks, of a JPEG nothing
+    except (OSError, SyntaxError):
+        return False
+    # Some cameras append notes. Compressed JPEG data never holds the marker's two bytes.
+    return image.format == "PNG" or b"\xff\xd9" in content[-1024:]
 
 
 def _check(path: Path, image: np.ndarray, wanted: np.ndarray, first: Path) -> None:
