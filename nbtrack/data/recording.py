@@ -58,12 +58,6 @@ class Recording:
         center = np.median(self.T_world_camera[self.has_pose, :3, 3], axis=0)
         return np.round(center) if np.abs(center).max() > _FAR_FROM_ZERO else np.zeros(3)
 
-    @property
-    def rate_hz(self) -> float:
-        """Frames a second, in the median; as declared for a single one."""
-        steps = np.diff(self.times)
-        return float(1 / np.median(steps)) if len(steps) else self.declared.frame_rate
-
     def contents(self) -> tuple[list[tuple[str, str, int, int]], list[str], Declaration]:
         """What changes when a recording does: texts, the declaration, and of every image its name,
         size and time of change (ns)."""
@@ -182,9 +176,9 @@ def _poses(
     if patterns and not files:
         path, files = patterns[0], numbered_files(patterns, (".txt",))
         check_paired(colors, files)
+    elif not files and not pose_file:
+        return np.full((len(colors), 4, 4), np.nan), None, [], "no poses"
     else:
-        if not files and not pose_file:
-            return np.full((len(colors), 4, 4), np.nan), None, [], "no poses"
         path = _first_there(folder, names, "poses", layout)
         files = [path]
     tables = [read_poses(file, declared.quaternion) for file in files]
