@@ -192,18 +192,20 @@ def _told_by_files(folder: Path) -> str:
 
 def holds_recording(folder: Path) -> bool:
     """Whether a folder has both colour and depth of a known format."""
-    return any(
-        all(any(any(folder.glob(p)) for p in patterns) for patterns in (layout.color, layout.depth))
-        for layout in FORMATS.values()
-    )
+    needed = ((layout.color, layout.depth) for layout in FORMATS.values())
+    return any(_is_there(folder, color) and _is_there(folder, depth) for color, depth in needed)
 
 
 def _shares(folder: Path) -> dict[str, float]:
     """How much of what each format needs is in a folder."""
     return {
-        name: np.mean([any(any(folder.glob(p)) for p in patterns) for patterns in layout.needs])
+        name: np.mean([_is_there(folder, patterns) for patterns in layout.needs])
         for name, layout in FORMATS.items()
     }
+
+
+def _is_there(folder: Path, patterns: tuple[str, ...]) -> bool:
+    return any(any(folder.glob(pattern)) for pattern in patterns)
 
 
 def _declared(path: Path, defaults: Declaration) -> Declaration:

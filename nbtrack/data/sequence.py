@@ -38,9 +38,8 @@ class RgbdSequence:
     T_world_camera: Poses  # OpenCV camera axes; NaN where not known
     frame_ids: Int[np.ndarray, "frames"]  # position in the folder's natural order
     times: Float[np.ndarray, "frames"]  # s, the recording's own, or by its numbers and rate
-    origin: Position = field(
-        default_factory=lambda: np.zeros(3)
-    )  # of poses, in the recording's world
+    # Of poses, in the recording's world.
+    origin: Position = field(default_factory=lambda: np.zeros(3))
 
     def __len__(self) -> int:
         return len(self.frame_ids)
