@@ -9,15 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import DataError
-from nbtrack.data.conventions import (
-    ROTATED,
-    Convention,
-    best_convention,
-    conventions,
-    diagnosis,
-    fitted,
-    preferring_edges,
-)
+from nbtrack.data.conventions import ROTATED, Convention, best_convention, diagnosis, fit_all
 from nbtrack.data.recording import Recording
 from nbtrack.data.sequence import RgbdSequence, read_frames
 
@@ -47,6 +39,7 @@ class DataReport:
 
     recording: Recording
     frames: pd.DataFrame  # what `_by_frame` tells
+    T_world_camera: Poses  # of the frames that have one, as declared
     cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m), frame
     conventions: list[Convention]  # the declared one first
     best: Convention  # the declared one unless another is clearly better
@@ -142,10 +135,9 @@ def check_recording(recording: Recording, progress: bool = False) -> DataReport:
     if not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     pairs = _pairs(sequence.T_world_camera, _N_PAIRS)
-    results = _fitted_to(sequence, recording, pairs)
-    return DataReport(
-        recording, frames, _cloud(results[0], sequence), results, best_convention(results)
-    )
+    results = fit_all(sequence, recording, pairs)
+    cloud, best = _cloud(results[0], sequence), best_convention(results)
+    return DataReport(recording, frames, sequence.T_world_camera, cloud, results, best)
 
 
 def quick_warning(recording: Recording) -> str:
@@ -161,7 +153,7 @@ def quick_warning(recording: Recording) -> str:
     sequence = read_frames(_as_in_files(recording), ids[kept])
     if not sequence.depths_mm.any():
         return ""  # whoever needs depth says so
-    results = _fitted_to(sequence, recording, places.reshape(pairs.shape))
+    results = fit_all(sequence, recording, places.reshape(pairs.shape))
     best, depth = best_convention(results), _cloud(results[0], sequence).depth.median()
     if best is results[0] and not _DEPTH[0] <= depth <= _DEPTH[1]:
         return f"the median depth is {depth:.3g} m: set depth_scale or no_depth in sequence.toml"
@@ -170,9 +162,8 @@ def quick_warning(recording: Recording) -> str:
 
 def _as_in_files(recording: Recording) -> Recording:
     """With depth values as they stand in the files, so that any unit can be tried."""
-    return replace(
-        recording, declared=replace(recording.declared, depth_scale=1000.0, depth_along="axis")
-    )
+    declared = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
+    return replace(recording, declared=declared)
 
 
 def _pairs(T_world_camera: Poses, maximum: int) -> Int[np.ndarray, "2 pairs"]:
@@ -186,18 +177,6 @@ def _pairs(T_world_camera: Poses, maximum: int) -> Int[np.ndarray, "2 pairs"]:
     gaps = np.minimum(np.resize(_GAPS, maximum), max(1, min(n_frames - 1, int(_TURNED_DEG / turn))))
     first = np.rint(np.linspace(0, 1, maximum) * (n_frames - 1 - gaps)).astype(int)
     return np.unique([first, first + gaps], axis=1)[:, : maximum * (n_frames > 1)]
-
-
-def _fitted_to(
-    sequence: RgbdSequence, recording: Recording, pairs: Int[np.ndarray, "2 pairs"]
-) -> list[Convention]:
-    """All conventions, the declared one first, with how well pairs of frames agree under each."""
-    poses = recording.file_poses[sequence.frame_ids[pairs.ravel()]]
-    candidates = conventions(recording.declared, sequence.intrinsics)
-    some = np.unique(pairs)
-    candidates = preferring_edges(candidates, sequence.colors[some], sequence.depths_mm[some])
-    in_files = sequence.depths_mm[pairs], poses, recording.declared.quaternion
-    return [fitted(convention, *in_files) for convention in candidates]
 
 
 def _by_frame(sequence: RgbdSequence) -> pd.DataFrame:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Int, UInt8, UInt16
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -19,6 +19,7 @@ from nbtrack.core.camera import Intrinsics, pixel_directions, project
 from nbtrack.core.settings import changed_settings
 from nbtrack.data.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA, Declaration
 from nbtrack.data.recording import Recording
+from nbtrack.data.sequence import RgbdSequence
 
 _HIDDEN_BEHIND = 0.25  # m behind a surface points are hidden: several times a camera's noise
 _SAME_SURFACE = 0.025  # of the depth: where neighbours blend to more, they lie on two surfaces
@@ -112,7 +113,22 @@ class Convention:
         return self.declared.poses_to_opencv(T)
 
 
-def conventions(declared: Declaration, camera: Intrinsics) -> list[Convention]:
+def fit_all(
+    sequence: RgbdSequence, recording: Recording, pairs: Int[np.ndarray, "2 pairs"]
+) -> list[Convention]:
+    """All conventions, the declared one first, with how well pairs of frames agree under each.
+
+    The sequence has depth values as in the files; pairs are positions in it.
+    """
+    poses = recording.file_poses[sequence.frame_ids[pairs.ravel()]]
+    candidates = _candidates(recording.declared, sequence.intrinsics)
+    some = np.unique(pairs)
+    candidates = _preferring_edges(candidates, sequence.colors[some], sequence.depths_mm[some])
+    in_files = sequence.depths_mm[pairs], poses, recording.declared.quaternion
+    return [_fitted(convention, *in_files) for convention in candidates]
+
+
+def _candidates(declared: Declaration, camera: Intrinsics) -> list[Convention]:
     """The declared convention first, then the usual mistakes, common ones first."""
     name = _convention_name(declared.camera_axes, declared.poses)
     declared = replace(declared, **CONVENTIONS.get(name, {}))  # `opencv` for `right down forward`
@@ -142,7 +158,7 @@ def conventions(declared: Declaration, camera: Intrinsics) -> list[Convention]:
     ]
 
 
-def fitted(
+def _fitted(
     convention: Convention, values: UInt16[np.ndarray, "2 pairs h w"], file_poses: Poses, order: str
 ) -> Convention:
     """How far points that the first frames of pairs measured lie from the second ones' surfaces.
@@ -175,7 +191,7 @@ def fitted(
     return replace(convention, median_m=median_m, relative=relative, overlap=overlap)
 
 
-def preferring_edges(
+def _preferring_edges(
     results: list[Convention],
     colors: UInt8[np.ndarray, "frames h w 3"],
     values: UInt16[np.ndarray, "frames h w"],

@@ -19,31 +19,17 @@ from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.grid import run_jobs
 from nbtrack.experiments.jobs import MapJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, METHODS, Method, method_of
-from nbtrack.experiments.output import new_file, output_folder
+from nbtrack.experiments.output import MAP_FILES, OVERVIEW_FILE, RUN_FILES, new_file, output_folder
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
-from nbtrack.experiments.runs import OF_MAPS, RUN_FILES, TrackJob
+from nbtrack.experiments.runs import OF_MAPS, TrackJob
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.fields import NetworkSettings, PointCloud
-from nbtrack.mapping.files import (
-    CHECKPOINT_FILE,
-    HISTORY_FILE,
-    MAP_FILE,
-    MESH_FILE,
-    Map,
-    read_map,
-)
+from nbtrack.mapping.files import MAP_FILE, MESH_FILE, Map, read_map
 from nbtrack.mapping.meshes import extract_mesh
 from nbtrack.tracking import make_budget
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
-from nbtrack.tracking.trajectories import (
-    METRICS_FILE,
-    read_trajectory,
-    read_tum,
-    shifted,
-    write_kitti,
-)
+from nbtrack.tracking.trajectories import METRICS_FILE, read_trajectory, read_tum, write_kitti
 
-OVERVIEW_FILE = "overview.png"  # beside the files of a run
 _PRINTED = (
     "ate_rmse_m", "still_ate_m", "path_m", "ate_over_path", "ate_rmse_aligned_m",
     "rotation_rmse_deg", "max_error_m", "frames", "steps_per_frame",
@@ -51,7 +37,6 @@ _PRINTED = (
 )  # fmt: skip
 _FRAMES_SHOWN, _CELLS = 20, 120  # of an overview: frames that tell what was seen; cells across
 _MOVIE_FRAMES = 100
-_MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
 _UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": ("s", 0)}
 
 
@@ -69,7 +54,7 @@ def map_command(options: Namespace) -> None:
     preset = preset_of(options, method)
     scene = _checked_scene(options, preset, options.frames)
     job = MapJob(scene, method.field, preset, options.frames, options.seed, options.out)
-    with output_folder(options.out, *_MAP_FILES):
+    with output_folder(options.out, *MAP_FILES):
         _make_map(job)
 
 
@@ -110,7 +95,7 @@ def track_command(options: Namespace) -> None:
         job, scene, method.tracker, steps, options.rate, options.frames, options.seed,
         options.out, options.threads, options.start,
     )  # fmt: skip
-    with output_folder(options.out, *RUN_FILES, OVERVIEW_FILE):
+    with output_folder(options.out, *RUN_FILES):
         if not given:
             _map(job)
         run = replace(run, out=run.folder)  # made anew, whatever the cache holds
@@ -261,10 +246,9 @@ def check_command(options: Namespace) -> None:
     is_picture = options.out.suffix.lower() == ".png"
     path = new_file(options.out if is_picture else options.out / "check.png")
     path.parent.mkdir(parents=True, exist_ok=True)
-    T_world_camera = shifted(recording.T_world_camera[recording.has_pose], -recording.origin)
     apart = f"{1e3 * report.conventions[0].median_m:.1f} mm apart (median)"
     title = f"{recording.name}: surfaces of two frames lie {apart}"
-    plot_recording(report.cloud, T_world_camera, title).savefig(path)
+    plot_recording(report.cloud, report.T_world_camera, title).savefig(path)
     print(f"  picture         {path}")
 
 

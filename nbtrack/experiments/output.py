@@ -8,9 +8,12 @@ from filelock import FileLock, Timeout
 
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.formats import holds_recording
-from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE
+from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, MESH_FILE
 from nbtrack.tracking.trajectories import METRICS_FILE
 
+OVERVIEW_FILE = "overview.png"
+RUN_FILES = ("trajectory.txt", "groundtruth.txt", "frames.csv", METRICS_FILE, OVERVIEW_FILE)
+MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
 LOCK_FILE = ".nbtrack.lock"
 """It stays in every folder that was given with --out, and tells that nbtrack wrote there."""
 

@@ -25,7 +25,6 @@ from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_
 from nbtrack.tracking.trajectories import METRICS_FILE, shifted, tum_text
 
 RUN_FILE = "run.pt"
-RUN_FILES = ("trajectory.txt", "groundtruth.txt", "frames.csv", METRICS_FILE)
 OF_MAPS = ("network.", "mapping.")
 """How keys of settings begin that only matter where a map is made."""
 
