@@ -83,13 +83,14 @@ def open_recording(
     folder = Path(folder)
     declared = declaration(folder, format)
     layout = FORMATS[declared.format]
-    colors, depths, times, lists, left_out = _images(folder, declared, depth_folder)
+    colors, depths, times, left_out = _images(folder, declared, depth_folder)
     poses, path, pose_files, chosen = _poses(folder, declared, pose_file, colors, times)
     _check_together(declared.poses_to_opencv(poses)[:, :3, 3], path)
     camera, notes = _calibration(folder, layout), [left_out, chosen]
     if not camera.source.is_file():
         notes.append(f"{camera.source.name}, {camera.fx:g} px at 640x480: no {layout.cameras[0]}")
-    texts = [*lists, *pose_files, camera.source, folder / DECLARATION_FILE, folder / TIMES_FILE]
+    names = [*layout.color, *layout.depth, DECLARATION_FILE, TIMES_FILE]
+    texts = [*(folder / name for name in names), *pose_files, camera.source]
     return Recording(
         folder=folder,
         name=folder.resolve().name,
@@ -108,19 +109,17 @@ def open_recording(
 
 def _images(
     folder: Path, declared: Declaration, depth_folder: str | None
-) -> tuple[list[Path], list[Path], Times, list[Path], str]:
-    """Colours and depths in pairs, their times, the lists that name them, and who is left out."""
+) -> tuple[list[Path], list[Path], Times, str]:
+    """Colours and depths in pairs, their times, and a word on who is left out."""
     layout = FORMATS[declared.format]
     if layout.color[0].endswith(".txt"):
         names = (layout.color, layout.depth)
-        lists = [_first_there(folder, name, "images", layout) for name in names]
-        colors, depths, times, left_out = listed_pairs(*lists)
-        return colors, depths, times, lists, left_out
+        return listed_pairs(*(_first_there(folder, name, "images", layout) for name in names))
     places = [(depth_folder or Path(p).parent, Path(p).name) for p in layout.depth]
     colors = numbered_files([folder / pattern for pattern in layout.color])
     depths = numbered_files([folder / place / name for place, name in places])
     check_paired(colors, depths)
-    return colors, depths, _times(folder, colors, declared.frame_rate), [], ""
+    return colors, depths, _times(folder, colors, declared.frame_rate), ""
 
 
 def _times(folder: Path, colors: list[Path], rate_hz: float) -> Times:

@@ -36,7 +36,7 @@ _MIN_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 
 def read_object(path: Path) -> dict[str, Any]:
     """A JSON or TOML file, by its name, that holds an object. Raises DataError otherwise."""
-    kind = "TOML" if path.suffix == ".toml" else "JSON"
+    kind = "JSON" if path.suffix.lower() == ".json" else "TOML"
     try:
         text = path.read_text(**_TOLERANT)
         content = tomllib.loads(text) if kind == "TOML" else json.loads(text)

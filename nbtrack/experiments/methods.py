@@ -102,9 +102,7 @@ def method_of(name: str | None, field: str | None, tracker: str | None) -> Metho
         kind = field_class(field)
         tracker = next(t for t in ("lm", "icp", "vr") if TRACKERS[t].works_in(kind))
     if field is None:
-        tracker_class(tracker)
-        rows = [row.field for row in METHODS.values() if row.tracker == tracker]
-        field = rows[0] if rows else "neus"
+        field = next((row.field for row in METHODS.values() if row.tracker == tracker), "neus")
     return find_methods([Method(f"{field_class(field).label} with {tracker}", field, tracker)])[0]
 
 

@@ -28,7 +28,7 @@ def write_page(notebook: Any, source: Path, page: Path) -> None:
     for cell in shown.cells:
         if cell.cell_type == "markdown":
             cell.source = _for_a_page(cell.source, source.parent, page.parent)
-    title = title_of(notebook)
+    title = notebook.cells[0].source.splitlines()[0].lstrip("# ")
     exporter = HTMLExporter(mathjax_url="")
     text, _ = exporter.from_notebook_node(shown, {"metadata": {"name": title}})
     write_atomic(page, text.replace("</head>", f"{_STYLE}</head>", 1))
@@ -41,11 +41,6 @@ def write_page(notebook: Any, source: Path, page: Path) -> None:
         "<!doctype html><meta charset=utf-8><title>nbtrack</title><h1>nbtrack</h1><ol>"
         + "\n".join(entries) + "</ol>\n",
     )  # fmt: skip
-
-
-def title_of(notebook: Any) -> str:
-    """The first heading of a notebook."""
-    return notebook.cells[0].source.splitlines()[0].lstrip("# ")
 
 
 def _for_a_page(text: str, source_folder: Path, page_folder: Path) -> str:

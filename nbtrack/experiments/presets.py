@@ -5,7 +5,6 @@ Precedence: preset < TOML file (`NBTRACK_CONFIG` or `--config`) < `NBTRACK_SET` 
 
 import os
 import shlex
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 from nbtrack.core.errors import ConfigError, MissingError, look_up
 from nbtrack.core.settings import may_be_zero, with_settings, with_values
+from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, PointMapping, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.tables import PAPER_SCENE_LABELS
@@ -92,8 +92,7 @@ def _shared(kind: type, other: Any) -> Any:
     return kind(**{f.name: getattr(other, f.name) for f in fields(kind) if hasattr(other, f.name)})
 
 
-_SMOKE = Path(__file__).with_name("smoke.toml").read_text(encoding="utf-8")
-_SMALL = with_values(Preset("smoke"), tomllib.loads(_SMOKE))
+_SMALL = with_values(Preset("smoke"), read_object(Path(__file__).with_name("smoke.toml")))
 _NINE = replace(_SMALL.scenes, names=REPORTED_ROOMS, track_frames=":")
 _ALL = (
     _SMALL,
@@ -111,13 +110,15 @@ def load_preset(
 
     They are a TOML file, by default the one that `NBTRACK_CONFIG` names, and `key=value` texts,
     after those in `NBTRACK_SET`. Raises ConfigError for an unknown preset or key, or a value of the
-    wrong type; MissingError if the file does not exist.
+    wrong type; MissingError if the file does not exist, DataError if it is no TOML.
     """
     name = name or os.environ.get("NBTRACK_PRESET", "smoke")
     preset = look_up("preset", name, PRESETS)
     file_name, text = config_file or os.environ.get("NBTRACK_CONFIG"), os.environ.get("NBTRACK_SET")
+    if file_name and not Path(file_name).is_file():
+        raise MissingError(f"no config file {file_name}: give a TOML file of settings")
     if file_name:
-        preset = with_values(preset, _read_toml(Path(file_name)))
+        preset = with_values(preset, read_object(Path(file_name)))
     try:
         before = shlex.split(text or "")
     except ValueError as error:
@@ -125,12 +126,3 @@ def load_preset(
             f"NBTRACK_SET={text!r} cannot be split ({error}): quote each setting as in a shell"
         ) from None
     return with_settings(preset, *before, *settings)
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise MissingError(f"no config file {path}: give a TOML file of settings")
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is no TOML: {error}; write lines like 'width = 128'") from None
