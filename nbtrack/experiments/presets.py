@@ -58,12 +58,9 @@ class Preset:
             "occupancy": NetworkSettings(embedding_sigma=4.0),
         }
     )
-    mapping: dict[str, MappingSettings | PointMapping] = field(
-        default_factory=lambda: {name: known.Settings() for name, known in FIELDS.items()}
-    )
-    tracking: dict[str, TrackerSettings] = field(
-        default_factory=lambda: {name: known.Settings() for name, known in TRACKERS.items()}
-    )
+    # Of every field and tracker; of those that are not given, the defaults of their classes.
+    mapping: dict[str, MappingSettings | PointMapping] = field(default_factory=dict)
+    tracking: dict[str, TrackerSettings] = field(default_factory=dict)
     scenes: ScenesConfig = ScenesConfig()
     tables: TablesConfig = TablesConfig()
 
@@ -77,14 +74,14 @@ class Preset:
         return self.network.get(field_name, self.network["neus"])
 
     def mapping_of(self, field_name: str) -> MappingSettings | PointMapping:
-        """Mapping settings of a field; a field without its own takes what it shares with NeuS."""
-        own = self.mapping.get(field_name, self.mapping["neus"])
-        return _shared(field_class(field_name).Settings, own)
+        """Mapping settings of a field; one that is added later takes what it shares with NeuS."""
+        kind = field_class(field_name).Settings
+        return _shared(kind, self.mapping.get(field_name) or self.mapping.get("neus") or kind())
 
     def tracking_of(self, tracker_name: str) -> TrackerSettings:
-        """Settings of a tracker. Without settings of its own it takes those of SDF tracking."""
-        own = self.tracking.get(tracker_name, self.tracking["sdf"])
-        return _shared(tracker_class(tracker_name).Settings, own)
+        """Settings of a tracker; one that is added later takes what it shares with SDF tracking."""
+        kind = tracker_class(tracker_name).Settings
+        return _shared(kind, self.tracking.get(tracker_name) or self.tracking.get("sdf") or kind())
 
 
 def _shared(kind: type, other: Any) -> Any:

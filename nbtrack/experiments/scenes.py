@@ -18,6 +18,8 @@ from nbtrack.experiments.presets import Preset, ScenesConfig
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
 from nbtrack.tables import PAPER_SCENE_LABELS
 
+_KNOWN = [*ROOMS, *PAPER_SCENE_LABELS]
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -61,7 +63,7 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     format of a folder is by default told by its files.
     """
     text, folder = str(sequence), Path(sequence)
-    if text in (*ROOMS, *PAPER_SCENE_LABELS) and folder.is_dir() and not is_own_output(folder):
+    if text in _KNOWN and folder.is_dir() and not is_own_output(folder):
         tell(f"{text}: the folder {folder.resolve()} is read, not the room or scene of that name")
     elif text in ROOMS and (preset.scenes.synthetic or text not in PAPER_SCENE_LABELS):
         return _room(text, preset.scenes)
@@ -74,7 +76,7 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
         )
     if folder.is_dir():
         return Scene(folder.resolve().name, folder.resolve(), format)
-    advice = nearest_name(text, [*ROOMS, *PAPER_SCENE_LABELS])
+    advice = nearest_name(text, _KNOWN)
     raise MissingError(f"no sequence {text!r}: it is neither a folder nor a known scene; {advice}")
 
 
@@ -85,10 +87,10 @@ def open_scenes(preset: Preset) -> list[Scene]:
     returned. Raises ConfigError where no name is given, or one twice, or an unknown one; where no
     scene is whole, what is wrong with the first.
     """
-    names, known = preset.scenes.names, [*ROOMS, *PAPER_SCENE_LABELS]
+    names = preset.scenes.names
     for name in names:
-        if name not in known and not Path(name).is_dir():
-            advice = nearest_name(name, known)
+        if name not in _KNOWN and not Path(name).is_dir():
+            advice = nearest_name(name, _KNOWN)
             raise ConfigError(f"unknown scene {name!r}, and no such folder: {advice}")
     if not names or len({Path(name).resolve().name for name in names}) < len(names):
         raise ConfigError(
