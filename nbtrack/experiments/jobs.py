@@ -139,16 +139,13 @@ class MapJob(Job):
         if base and isinstance(failure := base.outcome(None, report), NbtrackError):
             raise failure
         sequence, network = self.scene.read(self.frames), self.preset.network_of(self.field)
+        parts = self.field, sequence, network, self.settings, self.seed
         if (self.folder / MAP_FILE).is_file():  # a folder of the user's, with another finished map
-            recipe = recipe_of(self.field, sequence, network, self.settings, self.seed)
-            check_recipe(self.folder / MAP_FILE, read_map(self.folder).record, recipe)
+            check_recipe(self.folder / MAP_FILE, read_map(self.folder).record, recipe_of(*parts))
         if base:
             finished_map = correct_map(base.map(), sequence, self.settings)
         else:
-            finished_map = map_sequence(
-                self.field, sequence, network, self.settings, self.seed, choose_device(),
-                checkpoint, tell,
-            )  # fmt: skip
+            finished_map = map_sequence(*parts, choose_device(), checkpoint, tell)
         quality = score_map(finished_map, sequence, self.scene.room)
         record = {"quality": quality, "frames": self.frames, "key": self.key}
         record = finished_map.record | record | {"config": as_dict(self.preset)}

@@ -118,7 +118,7 @@ class TrackJob(Job):
     def _tracked(self, report: Report) -> tuple[Trajectory, dict[str, Any]]:
         """The trajectory, and what is to be said of the run beside its errors."""
         finished_map = self.needs.map()
-        origin = np.array(finished_map.record["origin"])
+        field, origin = finished_map.field, np.array(finished_map.record["origin"])
         sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
         budget = make_budget(self.steps, self.rate_hz)
         notes = {"map_seconds": finished_map.record["seconds"], "budget": str(budget)}
@@ -132,9 +132,7 @@ class TrackJob(Job):
         if self.needs.is_given and is_start_known:  # another path may begin where no map reaches
             notes["map_warning"] = check_belongs(finished_map, sequence[0])
         start, T_start = time.perf_counter(), T_first if is_start_known else np.eye(4)
-        tracker = make_tracker(
-            self.tracker, finished_map.field, T_start, budget, self.settings, self.seed
-        )
+        tracker = make_tracker(self.tracker, field, T_start, budget, self.settings, self.seed)
         if isinstance(tracker.field, BakedField):
             notes["bake_seconds"] = time.perf_counter() - start
             notes["grid_bytes"] = tracker.field.n_bytes
