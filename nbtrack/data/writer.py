@@ -12,6 +12,7 @@ from jaxtyping import Float
 from nbtrack.core.arrays import ColorImage, DepthImage, Frames, Pose, Poses
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
+from nbtrack.core.files import write_atomic
 from nbtrack.core.progress import ProgressBar
 from nbtrack.data.formats import FORMATS
 from nbtrack.data.images import decode
@@ -68,13 +69,9 @@ def _write_images(
                 f"{path.name} is of shape {image.shape} but the camera {size}: write frames of one "
                 "size"
             )
-        path.parent.mkdir(exist_ok=True)
         # The fastest compression: rooms are made often and read from a local disk.
-        content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
-        try:
-            path.write_bytes(content)
-        except OSError as error:  # a full disk's has no name of its own
-            raise OSError(error.errno, error.strerror, str(folder)) from None
+        content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+        write_atomic(path, content.tobytes())
 
 
 def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
