@@ -12,6 +12,7 @@ from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, MESH_
 from nbtrack.tracking.trajectories import METRICS_FILE
 
 OVERVIEW_FILE = "overview.png"
+# What the folder of a run and that of a map may hold.
 RUN_FILES = ("trajectory.txt", "groundtruth.txt", "frames.csv", METRICS_FILE, OVERVIEW_FILE)
 MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
 LOCK_FILE = ".nbtrack.lock"
