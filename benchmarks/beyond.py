@@ -59,7 +59,7 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     results = track_scenes(scenes, TABLE_3, preset, RATES_3_HZ, frames=":")
     write("table_3_cells", results[_COLUMNS])
     device = device_name(choose_device())
-    note = f"Preset: smoke; budget: the paper's step counts; whole path; {device}."
+    note = f"Preset: smoke; budget: {preset.step_counts}; whole path; {device}."
     write_table_3(tables_folder() / "beyond", results, note)
     # Times count: one run after the other. The slice reads otherwise, so that none is cached.
     speed = track_scenes(scenes, TABLE_3, preset, [10], frames="0:", execution=Execution(1, 1))

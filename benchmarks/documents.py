@@ -132,13 +132,14 @@ def choices(runs: pd.DataFrame) -> pd.DataFrame:
     runs = runs.query("rate_hz == 2").replace({"iMAP with VR": "VR", "NeuS with SDF": "SDF"})
     place = ["choice", "scene", "seed"]
     by_method = runs.pivot(index=place, columns="method", values="ate_m")
-    ratios = by_method / by_method.loc["ours"].reindex(by_method.index.droplevel("choice")).values
-    ratios = ratios.add_suffix("'s error over ours")
+    ours = by_method.loc["ours"].reindex(by_method.index.droplevel("choice"))
+    ratios = (by_method / ours.values).add_suffix("'s error over ours")
     ratios["VR's over SDF's"] = by_method["VR"] / by_method["SDF"]
+    ratios["the same with ours, same rooms"] = (ours["VR"] / ours["SDF"]).values
     rooms = ratios.groupby("choice", sort=False).size()
     table = {name: _over_rooms(column.rename("ratio")) for name, column in ratios.items()}
     table = pd.DataFrame(table).assign(rooms=rooms.astype(str)).loc[runs["choice"].unique()]
-    table.loc["ours", [name for name in ratios if name.endswith("ours")]] = ""
+    table.loc["ours", [name for name in ratios if "ours" in name]] = ""
     return table
 
 

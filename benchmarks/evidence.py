@@ -67,7 +67,7 @@ def main(experiment: str, seeds: int) -> None:
             write_atomic(path, rows.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     if experiment == "nine_rooms":
         rows = pd.read_csv(path)  # as anybody has them, rounded
-        note = f"Preset: {NINE.name}; budget: the paper's step counts; {machine}."
+        note = f"Preset: {NINE.name}; budget: {NINE.step_counts}; {machine}."
         write_table_1(path.parent, rows.query("path == 'mapped'"), note)
         judged = verdicts(rows).to_csv(index=False, float_format="%.4g", lineterminator="\n")
         write_atomic(path.parent / "verdicts.csv", judged)

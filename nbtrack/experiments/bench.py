@@ -190,7 +190,7 @@ def _note(preset: Preset, clock: bool) -> str:
     changed = changed_settings(preset, PRESETS[preset.name])
     changed = [setting for setting in changed if not setting.startswith("scenes.names")]
     label = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name
-    budget = "wall clock" if clock else "the paper's step counts"
+    budget = "wall clock" if clock else preset.step_counts
     return f"Preset: {label}; budget: {budget}; device: {device_name(choose_device())}."
 
 

@@ -16,6 +16,7 @@ from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, PointMapping, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.tables import PAPER_SCENE_LABELS
+from nbtrack.tables.layout import PAPER_PIXELS
 from nbtrack.tracking import TRACKERS, TrackerSettings, tracker_class
 
 
@@ -68,6 +69,19 @@ class Preset:
         """Add the settings of all registered fields and trackers."""
         object.__setattr__(self, "mapping", {name: self.mapping_of(name) for name in FIELDS})
         object.__setattr__(self, "tracking", {name: self.tracking_of(name) for name in TRACKERS})
+
+    @property
+    def step_counts(self) -> str:
+        """For captions of tables with the paper's step counts: the sizes of the paper and ours."""
+        paper = " and ".join(f"{n} ({tracker})" for tracker, n in PAPER_PIXELS.items())
+        own = " and ".join(
+            f"{self.tracking_of(tracker.lower()).n_pixels} ({tracker})" for tracker in PAPER_PIXELS
+        )
+        return (
+            f"the paper's step counts, measured there with n = {paper} and "
+            f"{NetworkSettings().width} units a layer; here n = {own} and "
+            f"{self.network_of('neus').width} units"
+        )
 
     def network_of(self, field_name: str) -> NetworkSettings:
         """Network of a field; a field without its own takes that of NeuS."""
