@@ -162,6 +162,8 @@ def test_curves_of_methods_and_sweeps() -> None:
     assert [line.get_label() for line in figure.axes[0].lines] == ["A, b", "A, a"]
     spans = plots.plot_curves(SWEEP.assign(**{"from": 0.5, "to": 4.0}), *SWEEP)
     assert spans.axes[0].collections[0].get_segments()[0][:, 1].tolist() == [0.5, 4.0]
+    still = plots.plot_curves(SWEEP.assign(**{"standing still": [6.0] * len(SWEEP)}), *SWEEP)
+    assert still.axes[0].lines[-1].get_ydata() == [6.0, 6.0]
 
 
 def held(sequence: RgbdSequence, up: tuple[float, float, float]) -> RgbdSequence:

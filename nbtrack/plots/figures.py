@@ -161,7 +161,8 @@ def plot_curves(
     Columns x and y are named as the axes are to be labelled, "time a frame (ms)". Text on x keeps
     the order of its first appearance; its points stand side by side, without lines. Methods among
     the labels get their colours. Where there are columns `from` and `to`, thin lines span that
-    interval of y. Axes of `log` are logarithmic.
+    interval of y. The mean of a column `standing still`, in the unit of y, is the dotted line of a
+    camera that stands still. Axes of `log` are logarithmic.
     """
     axes = new_axes(title, 3.6)[0, 0]
     labels = table[[group] if isinstance(group, str) else group].agg(", ".join, axis=1)
@@ -178,10 +179,14 @@ def plot_curves(
         axes.plot(places, rows[y], linestyle="none" if is_text else "-", **look)
         if "from" in rows:
             axes.vlines(places, rows["from"], rows["to"], color=color, linewidth=0.8)
+    if STANDING_STILL in table:
+        axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **DOTTED)
     axes.set(xlabel=x, ylabel=y)
     log_axes(axes, log.replace("x", "") if is_text else log)
     if labels.is_unique and not is_text and len(labels) > 1:
         label_points(axes, at, table[y], colors)
+        if STANDING_STILL in table:
+            axes.legend(handles=axes.lines[-1:])
     else:
         axes.figure.legend(loc="outside right center")
     return axes.figure
