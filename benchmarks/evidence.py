@@ -2,10 +2,10 @@
 
     python benchmarks/evidence.py EXPERIMENT [SEEDS]
 
-EXPERIMENT is one of nine_rooms, scores, steps, oracle, choices, basin. Rows are
-added to a CSV under paper_tables/ as they are finished, the first seed first; those that are there
-are not made again, whatever has changed since: remove the file to begin anew. Maps and runs are
-kept with all others (`NBTRACK_RUNS`). Only nine_rooms uses all cores: run others side by side.
+EXPERIMENT is one of nine_rooms, scores, steps, factors, oracle, choices, basin. Rows are added to
+a CSV under paper_tables/ as they are finished, the first seed first; those that are there are not
+made again, whatever has changed since: remove the file to begin anew. Maps and runs are kept with
+all others (`NBTRACK_RUNS`). Only nine_rooms uses all cores: run others side by side.
 """
 
 import sys
@@ -131,6 +131,24 @@ def steps(seed: int) -> Iterator[Chunk]:
         yield place, partial(track, open_scenes(PRESET), TABLE_1, PRESET, **there)
 
 
+def factors(seed: int) -> Iterator[Chunk]:
+    """Steps x pixels x method: what is left between VR and SDF in one map is the loss.
+
+    The steps are those of the paper's VR and SDF at 10 Hz, the pixels those of `smoke`.
+    """
+    steps = {method: method.paper_steps(10) for method in (VR, SDF)}
+    pixels = {method: PRESET.tracking_of(method.tracker).n_pixels for method in (VR, SDF)}
+    for scene in open_scenes(PRESET):
+        for n_pixels, n_steps in product(pixels.values(), steps.values()):
+            methods = [
+                replace(m, settings=(*m.settings, f"tracking.{m.tracker}.n_pixels={n_pixels}"))
+                for m in (VR, METHODS["vr_neus"], SDF)
+            ]
+            there = {"steps": n_steps, "frames": ":", "seeds": [seed]}
+            place = {"scene": scene.name, "n_pixels": n_pixels, "steps": n_steps}
+            yield place, partial(track, [scene], methods, PRESET, **there)
+
+
 LEARNED = {"NeuS+ corrected": "corrected", "NeuS+": "baked", "NeuS": "sdf"}  # the methods' names
 ORACLES = ("exact distance", "NeuS+ corrected", "fused voxels", "NeuS+", "NeuS")
 DEPTHS = {"exact": "depth", "filtered": "depth_filtered", "noisy": "depth_with_noise"}
@@ -199,7 +217,7 @@ EXPERIMENTS = {
     "nine_rooms": (nine_rooms, "nine_rooms/table_1_cells.csv"),
     **{
         f.__name__: (f, f"evidence/{f.__name__}.csv")
-        for f in (scores, steps, oracle, choices, basin)
+        for f in (scores, steps, factors, oracle, choices, basin)
     },
 }
 

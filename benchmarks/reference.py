@@ -1,13 +1,16 @@
 """What errors against reference poses say where the reference itself is off.
 
-    python benchmarks/reference.py
+    python benchmarks/reference.py [RECORDING]
 
 Writes paper_tables/corrected/reference.csv, of rooms whose mapped poses were moved by smooth
-errors, so that the truth is known: how far paths are from the moved reference, from the truth, and,
-for frames a little apart, from the motion that generalised ICP finds between these two frames'
-points alone, which knows no map.
+errors, so that the truth is known, and of a recording, whose truth is not: how far paths are from
+the reference, from the truth, and, for frames a little apart, from the motion that generalised ICP
+finds between these two frames' points alone, which knows no map. Distances from pairs have 95 %
+intervals (blocks of frames drawn anew), and the share of these draws in which a path is nearer to
+the pairs than the reference is.
 """
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +20,7 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from nbtrack import METHODS, load_preset, make_tracker, open_scenes
+from nbtrack import METHODS, load_preset, make_tracker, open_scenes, read_sequence
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder
 from nbtrack.core.settings import with_settings
@@ -33,27 +36,43 @@ TRACKED = METHODS["corrected_dense"], METHODS["icp_dense"]
 OFF_M, OFF_DEG, AHEAD, SMOOTH = 0.006, 0.25, 1.5, 4
 # Frames between the two of a pair, points of each, and cells (m) and reach (m) of registering them.
 GAP, PAIR_POINTS, PAIR_VOXEL, PAIR_REACH = 5, 16_384, 0.02, 0.05
+BLOCK, DRAWS = 10, 1000  # frames that are drawn together, since neighbours err alike; draws
 
 
-def main() -> None:
-    """Two rooms, two seeds of errors."""
+def main(recordings: list[str]) -> None:
+    """Two rooms, two seeds of errors; then recordings as they are."""
     torch.set_num_threads(1)
-    preset, rows = load_preset("smoke"), []
+    preset, tables = load_preset("smoke"), []
     for scene in open_scenes(preset):
         truth = scene.read(":120")
         for seed in (0, 1):
             given = replace(truth, T_world_camera=moved_poses(truth.T_world_camera, seed))
-            paths = {"reference": given, "truth": truth}
-            paths |= {method.label: tracked_path(method, given, preset) for method in TRACKED}
-            pairs = registered_pairs(given)
-            for name, path in paths.items():
-                off = apart(path, given), apart(path, truth), from_pairs(path, pairs)
-                rows.append((scene.name, seed, name, *off))
-    columns = ["scene", "seed", "path", "from_reference_m", "from_truth_m", "from_pairs_m"]
-    table = pd.DataFrame(rows, columns=columns)
-    print(table.groupby("path")[columns[3:]].mean())
+            tables.append(compared(given, preset, truth).assign(scene=scene.name, seed=seed))
+    for recording in recordings:
+        given = read_sequence(recording)
+        tables.append(compared(given, preset).assign(scene=given.name, seed=0))
+    table = pd.concat(tables)
+    print(table.groupby(["scene", "path"], sort=False).mean(numeric_only=True).round(4))
     path = tables_folder() / "corrected" / "reference.csv"
     write_csv(path, table.assign(device=device_name(choose_device())))
+
+
+def compared(given, preset, truth=None) -> pd.DataFrame:
+    """A row a path: its distances (m) from the reference, from the truth if known, from pairs."""
+    paths = {"reference": given} | ({"truth": truth} if truth else {})
+    paths |= {method.label: tracked_path(method, given, preset) for method in TRACKED}
+    pairs = registered_pairs(given)
+    squares = {name: pair_errors(path, pairs) ** 2 for name, path in paths.items()}
+    means = {name: in_blocks(values) for name, values in squares.items()}
+    rows = []
+    for name, path in paths.items():
+        low, high = np.quantile(means[name] ** 0.5, [0.025, 0.975])
+        row = {"path": name, "from_reference_m": apart(path, given)}
+        row["from_truth_m"] = apart(path, truth) if truth else np.nan
+        row |= {"from_pairs_m": squares[name].mean() ** 0.5, "pairs_low_m": low}
+        row |= {"pairs_high_m": high, "nearer_share": (means[name] < means["reference"]).mean()}
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def moved_poses(poses: np.ndarray, seed: int) -> np.ndarray:
@@ -106,12 +125,19 @@ def registered_pairs(sequence) -> np.ndarray:
     return np.stack(pairs)
 
 
-def from_pairs(path, pairs: np.ndarray) -> float:
-    """RMS distance (m) of positions in the frame `GAP` before from those of registered pairs."""
+def pair_errors(path, pairs: np.ndarray) -> np.ndarray:
+    """Distances (m) of positions in the frame `GAP` before from those of registered pairs."""
     poses = path.T_world_camera
     off = (np.linalg.inv(poses[:-GAP]) @ poses[GAP:] - pairs)[:, :3, 3]
-    return float(np.sqrt((off**2).sum(axis=1).mean()))
+    return np.linalg.norm(off, axis=1)
+
+
+def in_blocks(values: np.ndarray) -> np.ndarray:
+    """Means of values whose blocks are drawn anew, with the same blocks for all paths."""
+    n_blocks = -(-len(values) // BLOCK)
+    first = np.random.default_rng(0).integers(len(values), size=(DRAWS, n_blocks, 1))
+    return values[(first + np.arange(BLOCK)) % len(values)].mean(axis=(1, 2))
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
