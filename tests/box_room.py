@@ -11,7 +11,7 @@ from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import LearnedField
-from nbtrack.fields.rendering import Rendering, composite, weights_from_density, weights_from_sdf
+from nbtrack.fields.rendering import weights_from_density, weights_from_sdf
 
 SHIFT = 0.03  # m behind the wall at which the density is half its largest
 
@@ -39,12 +39,10 @@ class Formula(LearnedField):
     def forward(self, points_world: Tensor) -> tuple[Tensor, Tensor]:
         return self.color(points_world), self.value(points_world)
 
-    def composite(self, colors: Tensor, values: Tensor, rays: Rays, depths: Tensor) -> Rendering:
+    def weights(self, values: Tensor, rays: Rays, depths: Tensor) -> Tensor:
         if self.as_density:
-            lengths = rays.directions_world.norm(dim=-1)
-            return composite(weights_from_density(values, depths, lengths), colors, depths)
-        weights = weights_from_sdf(values, torch.tensor(50.0))
-        return composite(weights, colors[:, 1:], (depths[:, 1:] + depths[:, :-1]) / 2)
+            return weights_from_density(values, depths, rays.directions_world.norm(dim=-1))
+        return weights_from_sdf(values, torch.tensor(50.0))
 
 
 class BoxRoom(Formula):

@@ -9,8 +9,7 @@ from torch import Tensor
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.pixels import Rays
 from nbtrack.fields import NetworkSettings, NeusMapping, make_field
-from nbtrack.fields.base import measured_mean, rendered_losses
-from nbtrack.fields.imap import MIN_STD, rendering_losses
+from nbtrack.fields.base import MIN_STD, measured_mean, rendered_losses
 from nbtrack.fields.rendering import Rendering
 
 ROOM = SceneBounds((-1.0, -1.2, 0.5), (3.0, 1.3, 3.7))  # 4 x 2.5 x 3.2 m
@@ -140,7 +139,7 @@ def test_rendered_losses_by_hand() -> None:
     )
     color = torch.tensor([[0.1, 0.3, 0.5], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     rays = replace(random_rays(3, 1.0), depth=torch.tensor([1.0, 1.9, 0.0]), color=color)
-    terms = rendering_losses(rendering, rays, 5.0)
+    terms = rendered_losses(rendering, rays, 5.0, over_std=True)
     assert MIN_STD == 0.02
     assert terms["depth"].item() == pytest.approx((1 + 5) / 2, rel=1e-4)
     assert terms["color"].item() == pytest.approx(5 * (0.2 + 0.4) / 2, rel=1e-4)

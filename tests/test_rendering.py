@@ -6,15 +6,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from nbtrack.fields.occupancy import weights_from_occupancy
 from nbtrack.fields.rendering import (
     composite,
+    density_from_sdf,
     importance_depths,
     stratified_depths,
     weights_from_density,
+    weights_from_occupancy,
     weights_from_sdf,
 )
-from nbtrack.fields.volsdf import density_from_sdf
 
 LN2, LN3 = math.log(2.0), math.log(3.0)
 

@@ -3,15 +3,13 @@
 import torch
 
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.errors import ConfigError, nearest_name
+from nbtrack.core.errors import look_up
 from nbtrack.fields.base import Field, LearnedField, MappingSettings
-from nbtrack.fields.imap import IMapField
+from nbtrack.fields.imap import IMapField, OccupancyField
 from nbtrack.fields.mlp import NetworkSettings
-from nbtrack.fields.neus import NeuSField, NeusMapping
+from nbtrack.fields.neus import NeuSField, NeusMapping, VolSdfField
 from nbtrack.fields.neus_plus import NeuSPlusField, NeusPlusMapping
-from nbtrack.fields.occupancy import OccupancyField
 from nbtrack.fields.points import PointCloud, PointMapping
-from nbtrack.fields.volsdf import VolSdfField
 
 FIELDS: dict[str, type[Field | PointCloud]] = {
     kind.name: kind
@@ -22,9 +20,7 @@ FIELDS: dict[str, type[Field | PointCloud]] = {
 
 def field_class(name: str) -> type[Field | PointCloud]:
     """The field of a name. Raises ConfigError, naming the nearest, for any other."""
-    if name not in FIELDS:
-        raise ConfigError(f"unknown field {name!r}: {nearest_name(name, sorted(FIELDS))}")
-    return FIELDS[name]
+    return look_up("field", name, FIELDS)
 
 
 def make_field(name: str, network: NetworkSettings, bounds: SceneBounds, seed: int) -> Field:

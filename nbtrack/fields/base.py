@@ -17,10 +17,14 @@ from nbtrack.core.device import constant
 from nbtrack.core.settings import may_be_zero
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.rendering import Rendering, importance_depths, stratified_depths
+from nbtrack.fields import rendering
+from nbtrack.fields.rendering import Rendering, Weights
 
 LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in the intensity that trackers compare (ITU-R BT.601)."""
+# Minimum standard deviation (m) that a depth error is divided by: a perfectly sharp ray would
+# otherwise outweigh all others (our choice; depth noise is of this size).
+MIN_STD = 0.02
 NEAR = 0.05  # m, z-depth before which nothing is looked for: closer than any depth camera measures
 
 # Samples a ray in pictures: twice those of mapping, and in fixed places, so that an image shows the
@@ -80,10 +84,8 @@ class LearnedField(Field):
     """A field that is fitted to posed frames by gradient descent, and can be rendered."""
 
     @abc.abstractmethod
-    def composite(
-        self, colors: RayColors, values: RaySamples, rays: Rays, depths: RaySamples
-    ) -> Rendering:
-        """Volume rendering from what the field answered at ascending z-depths (m)."""
+    def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
+        """Probabilities that rays end at samples at ascending z-depths (m), or between two."""
 
     @abc.abstractmethod
     def mapping_losses(self, draw: Draw, settings: MappingSettings, generator: Generator) -> Losses:
@@ -95,6 +97,19 @@ class LearnedField(Field):
     def diagnostics(self) -> dict[str, float]:
         """Scalars worth a curve over training, beside the losses."""
         return {}
+
+    def composite(
+        self, colors: RayColors, values: RaySamples, rays: Rays, depths: RaySamples
+    ) -> Rendering:
+        """Volume rendering from what the field answered at ascending z-depths (m).
+
+        A section between two samples has the mean of its ends. That is its mid-point (our choice;
+        NeuS evaluates the network there once more).
+        """
+        weights = self.weights(values, rays, depths)
+        if weights.shape != depths.shape:
+            colors, depths = ((ends[:, 1:] + ends[:, :-1]) / 2 for ends in (colors, depths))
+        return rendering.composite(weights, colors, depths)
 
     def query_along(self, rays: Rays, depths: RaySamples) -> tuple[RayColors, RaySamples]:
         """Colour and value at z-depths (m) along rays."""
@@ -151,13 +166,13 @@ class LearnedField(Field):
         """Z-depths (m) of the first pass, the field's answers there, and z-depths of the second."""
         with torch.no_grad():  # where samples lie is given: a pose does not move them along
             far = rays_end(rays, self.bounds)
-            coarse = stratified_depths(NEAR, far, n_stratified, generator)
+            coarse = rendering.stratified_depths(NEAR, far, n_stratified, generator)
         answers = self.query_along(rays, coarse)
         with torch.no_grad():
-            weights = self.composite(*answers, rays, coarse).weights
-            if weights.shape != coarse.shape:  # NeuS weighs sections: both ends of one get a share
+            weights = self.weights(answers[1], rays, coarse)
+            if weights.shape != coarse.shape:  # of sections: both ends of one get a share
                 weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
-            fine = importance_depths(coarse, weights, n_importance, generator)
+            fine = rendering.importance_depths(coarse, weights, n_importance, generator)
         return coarse, answers, fine
 
 
@@ -178,19 +193,24 @@ def measured_mean(error: Float[Tensor, "*some"], measured: Float[Tensor, "*some"
 
 
 def rendered_losses(
-    rendering: Rendering,
+    rendered: Rendering,
     rays: Rays,
     lambda_color: float,
     lambda_depth: float = 1.0,
-    std: Values | float = 1.0,
+    over_std: bool = False,
 ) -> Losses:
-    """Weighted L1 errors of rendered depth (m, over a std) and colour.
+    """Weighted L1 errors of rendered depth (m) and colour, for mapping and tracking.
 
-    Rays without a depth measurement take part in neither term.
+    Rays without a depth measurement take part in neither term. Over the standard deviation of a
+    ray's own depth they are iMAP's, of mean(|D - D_rendered| / sqrt(variance)): that std is
+    detached, as in NICE-SLAM, for its gradient would reward blurred surfaces.
+    Source: iMAP, Sec. 3.3.
     """
     measured = (rays.depth > 0).float()
-    depth_error = (rendering.depth - rays.depth).abs() / std
-    color_error = (rendering.color - rays.color).abs().mean(dim=-1)
+    depth_error = (rendered.depth - rays.depth).abs()
+    if over_std:
+        depth_error = depth_error / rendered.depth_variance.detach().sqrt().clamp_min(MIN_STD)
+    color_error = (rendered.color - rays.color).abs().mean(dim=-1)
     return {
         "depth": lambda_depth * measured_mean(depth_error, measured),
         "color": lambda_color * measured_mean(color_error, measured),

@@ -1,19 +1,16 @@
-"""iMAP: colour and volume density (Sucar et al. 2021)."""
+"""iMAP: colour and volume density (Sucar et al. 2021); and occupancy on the same network."""
 
 import torch
 from torch import Generator
 
-from nbtrack.core.arrays import Colors, Points, RayColors, RaySamples, Values
+from nbtrack.core.arrays import Colors, Points, RaySamples, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.pixels import Rays
 from nbtrack.fields.base import Draw, LearnedField, Losses, MappingSettings, rendered_losses
 from nbtrack.fields.mlp import FourierMlp, NetworkSettings
-from nbtrack.fields.rendering import Rendering, composite, weights_from_density
+from nbtrack.fields.rendering import Weights, weights_from_density, weights_from_occupancy
 
 DENSITY_PER_UNIT = 10.0  # 1/m of one unit of network output (vMAP's re-implementation of iMAP)
-# Minimum standard deviation (m) that a depth error is divided by: a perfectly sharp ray would
-# otherwise outweigh all others (our choice; depth noise is of this size).
-MIN_STD = 0.02
 
 
 class IMapField(LearnedField):
@@ -36,29 +33,35 @@ class IMapField(LearnedField):
         density = DENSITY_PER_UNIT * torch.nn.functional.softplus(raw_density)
         return torch.sigmoid(raw_color), density
 
-    def composite(
-        self, colors: RayColors, values: RaySamples, rays: Rays, depths: RaySamples
-    ) -> Rendering:
-        """Volume rendering from density. Source: iMAP, Sec. 3.2."""
-        weights = weights_from_density(values, depths, rays.directions_world.norm(dim=-1))
-        return composite(weights, colors, depths)
+    def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
+        """Of samples, from their densities. Source: iMAP, Sec. 3.2."""
+        return weights_from_density(values, depths, rays.directions_world.norm(dim=-1))
 
     def mapping_losses(self, draw: Draw, settings: MappingSettings, generator: Generator) -> Losses:
         """iMAP's geometric and photometric losses."""
         rays = draw(settings.n_rays)
         # Not guided by measured depths: tracking has no such help, and would see a thinner map.
         n_samples = settings.n_stratified, settings.n_surface
-        rendering = self.render(rays, self.hierarchical_depths(rays, *n_samples, generator))
-        return rendering_losses(rendering, rays, settings.lambda_color)
+        rendered = self.render(rays, self.hierarchical_depths(rays, *n_samples, generator))
+        return rendered_losses(rendered, rays, settings.lambda_color, over_std=True)
 
 
-def rendering_losses(rendering: Rendering, rays: Rays, lambda_color: float) -> Losses:
-    """Depth error over the rendered standard deviation, and colour L1, for mapping and tracking.
+class OccupancyField(IMapField):
+    """f: position -> (colour, occupancy in [0, 1]), as iMAP but for what a ray makes of it.
 
-    L = mean(|D - D_rendered| / sqrt(variance)) + lambda_color mean|I - I_rendered|.
-
-    The std is detached, as in NICE-SLAM: its gradient would reward blurred surfaces.
-    Source: iMAP, Sec. 3.3.
+    Occupancy is the probability that a place is taken (as in UNISURF and NICE-SLAM). Network,
+    samples and losses are iMAP's (our choice: the two maps differ in one equation alone).
     """
-    std = rendering.depth_variance.detach().sqrt().clamp_min(MIN_STD)
-    return rendered_losses(rendering, rays, lambda_color, std=std)
+
+    name = "occupancy"
+    label = "Occupancy"
+    surface_level = 0.5  # (UNISURF)
+
+    def forward(self, points_world: Points) -> tuple[Colors, Values]:
+        """Colour and occupancy, both in [0, 1]."""
+        raw_color, raw_occupancy = self.mlp(points_world)
+        return torch.sigmoid(raw_color), torch.sigmoid(raw_occupancy)
+
+    def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
+        """Of samples, from their occupancies."""
+        return weights_from_occupancy(values)

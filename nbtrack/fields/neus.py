@@ -1,17 +1,17 @@
-"""NeuS: colour and signed distance on iMAP's network (Wang et al. 2021)."""
+"""NeuS: colour and signed distance on iMAP's network (Wang et al. 2021); and VolSDF."""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Generator, Tensor
 
-from nbtrack.core.arrays import Colors, Points, RayColors, RaySamples, Scalar, Values
+from nbtrack.core.arrays import Colors, Points, RaySamples, Scalar, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.pixels import Rays
-from nbtrack.fields import base
+from nbtrack.fields import base, rendering
 from nbtrack.fields.base import Draw, LearnedField, Losses, rendered_losses
 from nbtrack.fields.mlp import FourierMlp, NetworkSettings
-from nbtrack.fields.rendering import Rendering, composite, stratified_depths, weights_from_sdf
+from nbtrack.fields.rendering import Weights
 
 
 @dataclass(frozen=True)
@@ -55,16 +55,9 @@ class NeuSField(LearnedField):
         raw_color, raw_sdf = self.mlp(points_world)
         return torch.sigmoid(raw_color), raw_sdf * self.mlp.metres_per_unit
 
-    def composite(
-        self, colors: RayColors, values: RaySamples, rays: Rays, depths: RaySamples
-    ) -> Rendering:
-        """Volume rendering of the sections between samples, each with the mean of its ends.
-
-        That is its mid-point (our choice; NeuS evaluates the network there once more).
-        """
-        weights = weights_from_sdf(values, self.inverse_std)
-        middles = ((ends[:, 1:] + ends[:, :-1]) / 2 for ends in (colors, depths))
-        return composite(weights, *middles)
+    def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
+        """Of the sections between samples."""
+        return rendering.weights_from_sdf(values, self.inverse_std)
 
     def mapping_losses(self, draw: Draw, settings: NeusMapping, generator: Generator) -> Losses:
         """Colour L1, depth L1 and the eikonal term (NeuS, Eq. 15, with RGB-D's depth added)."""
@@ -110,6 +103,25 @@ class NeuSField(LearnedField):
         self.mlp.head.weight[3], self.mlp.head.bias[3] = solution[:-1], solution[-1]
 
 
+class VolSdfField(NeuSField):
+    """f: position -> (colour, signed distance in m), as NeuS but for what a ray makes of it.
+
+    A signed distance, rendered through a density. Network, start, samples and losses are NeuS's,
+    and so is the one learnable scale, here beta = exp(-10 variance) in m: the two maps differ in
+    one equation alone (our choice; VolSDF places its samples by a bound on the error of the
+    integral). Source: Yariv et al. 2021.
+    """
+
+    name = "volsdf"
+    label = "VolSDF"
+
+    def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
+        """Of samples, from the density that belongs to the signed distance."""
+        density = rendering.density_from_sdf(values, self.inverse_std)
+        lengths = rays.directions_world.norm(dim=-1)
+        return rendering.weights_from_density(density, depths, lengths)
+
+
 def guided_depths(
     rays: Rays, bounds: SceneBounds, settings: NeusMapping, generator: Generator
 ) -> RaySamples:
@@ -120,8 +132,8 @@ def guided_depths(
     """
     far_bound, measured = base.rays_end(rays, bounds), rays.depth > 0
     far = torch.where(measured, rays.depth + settings.surface_band, far_bound)
-    coarse = stratified_depths(base.NEAR, far, settings.n_stratified, generator)
-    around = stratified_depths(-1.0, torch.ones_like(far), settings.n_surface, generator)
+    coarse = rendering.stratified_depths(base.NEAR, far, settings.n_stratified, generator)
+    around = rendering.stratified_depths(-1.0, torch.ones_like(far), settings.n_surface, generator)
     center = torch.where(measured, rays.depth, far_bound)
     around = (center[:, None] + settings.surface_band * around).clamp_min(base.NEAR)
     return torch.cat([coarse, around], dim=-1).sort(dim=-1).values

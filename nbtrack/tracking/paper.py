@@ -13,7 +13,7 @@ from nbtrack.core.camera import pixel_directions
 from nbtrack.core.settings import may_be_zero
 from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
-from nbtrack.fields.imap import rendering_losses
+from nbtrack.fields.base import rendered_losses
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 
@@ -135,9 +135,10 @@ class VrTracker(AdamTracker):
         directions_world = directions_camera @ rotation.T
         rays = Rays(position.T.expand_as(directions_world), directions_world, color, depth)
         n_samples = self.settings.n_stratified, self.settings.n_importance
-        rendering = self.field.render_hierarchically(rays, *n_samples, self.generator)
-        terms = rendering_losses(rendering, rays, self.settings.lambda_color)
-        return self.settings.lambda_depth * terms["depth"] + terms["color"]
+        rendered = self.field.render_hierarchically(rays, *n_samples, self.generator)
+        lambdas = self.settings.lambda_color, self.settings.lambda_depth
+        terms = rendered_losses(rendered, rays, *lambdas, over_std=True)
+        return terms["depth"] + terms["color"]
 
 
 @dataclass(frozen=True)
