@@ -56,8 +56,8 @@ class _Best(AdamTracker):
             self.least, self.best = float(loss), before.double().numpy()
         return loss
 
-    def _search(self, frame, T_starts, n_steps):
-        found = super()._search(frame, T_starts, n_steps)
+    def _search(self, frame, T_starts):
+        found = super()._search(frame, T_starts)
         return replace(found, T_world_camera=self.best)
 
 

@@ -149,4 +149,4 @@ def test_images_and_poses_that_are_none() -> None:
     *images, pose = found.stdout.splitlines()
     for kind, line in zip(("NoneType", "list", "Tensor"), images, strict=True):
         assert f"depth is of type {kind}: give a numpy array, uint16" in line, found
-    assert pose == "T_world_camera is of shape (3, 4): give a 4x4 rigid transform"
+    assert pose == "T_world_camera is no rigid transform: give 4 x 4 finite numbers"

@@ -74,7 +74,7 @@ def test_only_the_frames_asked_for_and_what_lies_inside_are_fused() -> None:
     sequence = two_pixels([[2000, 9000], [1000, 1000]], [[10, 10]] * 2)
     cloud = fuse_points(sequence, np.array([0]), BOX, voxel=0.02)
     np.testing.assert_allclose(cloud.points, [[-0.5, 0.0, 2.0]], atol=1e-6)
-    found = cloud.distance(torch.tensor([[-0.5, 0.3, 2.0], [-0.5, 0.0, 1.6]]))
+    found = cloud(torch.tensor([[-0.5, 0.3, 2.0], [-0.5, 0.0, 1.6]]))[1]
     torch.testing.assert_close(found, torch.tensor([0.3, 0.4]))
 
 

@@ -11,14 +11,14 @@ from nbtrack.fields.neus import NeuSField, NeusMapping, VolSdfField
 from nbtrack.fields.neus_plus import NeuSPlusField, NeusPlusMapping
 from nbtrack.fields.points import PointCloud, PointMapping
 
-FIELDS: dict[str, type[Field | PointCloud]] = {
+FIELDS: dict[str, type[Field]] = {
     kind.name: kind
     for kind in (IMapField, NeuSField, NeuSPlusField, VolSdfField, OccupancyField, PointCloud)
 }
 """What can be mapped, by name. A field of your own joins by `FIELDS["mine"] = MyField`."""
 
 
-def field_class(name: str) -> type[Field | PointCloud]:
+def field_class(name: str) -> type[Field]:
     """The field of a name. Raises ConfigError, naming the nearest, for any other."""
     return look_up("field", name, FIELDS)
 

@@ -63,7 +63,7 @@ class Field(nn.Module, abc.ABC):
     inlier_distance: float = 0.05  # m from its surface within which a point fits
     intensity_mad: float = np.inf  # median residual of luma at what was mapped, where known
     min_inliers: float = 0.6  # share of a frame's points that fit where the camera is not lost
-    Settings: type[MappingSettings] = MappingSettings  # of mapping
+    Settings: type = MappingSettings  # of mapping
 
     def __init__(self, bounds: SceneBounds) -> None:
         super().__init__()

@@ -43,12 +43,9 @@ class BakedField(Field):
         self.voxel, self.n_vertices = float(voxel), _checked_size(source, voxel)
         # The first vertex lies one cell below the bounds; they are listed with z fastest.
         low = torch.tensor([x - voxel for x in self.bounds.minimum]).to(source.device)
-        numbers = torch.arange(math.prod(self.n_vertices), device=source.device)
-        _, ny, nz = self.n_vertices  # `unravel_index` would import sympy, which takes a second
-        answers = [
-            source(low + voxel * torch.stack([i // (ny * nz), i // nz % ny, i % nz], dim=-1))
-            for i in numbers.split(_POINTS_AT_ONCE)
-        ]
+        axes = (torch.arange(n, dtype=torch.int32, device=low.device) for n in self.n_vertices)
+        numbers = torch.cartesian_prod(*axes).split(_POINTS_AT_ONCE)
+        answers = [source(low + voxel * number) for number in numbers]
         color, value = map(torch.cat, zip(*answers, strict=True))
         volume = torch.cat([color.T, value[None], torch.ones_like(value)[None]])
         self.register_buffer("low", low, persistent=False)
@@ -70,33 +67,38 @@ class BakedField(Field):
 
     def _at(self, points_world: Points) -> Float[Tensor, "5 points"]:
         """All channels at points (m)."""
-        n_vertices = constant(self.n_vertices, self.low.device, self.low.dtype)
-        last = self.voxel * (n_vertices - 1)
-        # grid_sample wants x, y, z of a volume indexed z, y, x, from -1 to 1.
-        normalized = (2 * (points_world - self.low) / last - 1).flip(-1)
-        normalized, volume = normalized[None, None, None], self.volume.view(1, 5, *self.n_vertices)
-        options = {"padding_mode": "border", "align_corners": True}
-        values = nn.functional.grid_sample(volume, normalized, **options)[0, :, 0, 0]
+        volume = self.volume.view(5, *self.n_vertices)
+        values = trilinear(volume, self.low, self.voxel, points_world)
         # A point that is not a number is taken for one at the border.
         return torch.where(points_world.isnan().any(dim=-1), torch.nan, values)
 
 
+def trilinear(
+    volume: Float[Tensor, "channels x y z"], low: Float[Tensor, "3"], voxel: float, points: Points
+) -> Float[Tensor, "channels n"]:
+    """Interpolation at points (m) between vertices, the first at `low`, in cells of `voxel` (m).
+
+    Differentiable; points outside are moved to the border.
+    """
+    extent = voxel * (constant(tuple(volume.shape[1:]), low.device, low.dtype) - 1)
+    # grid_sample takes x, y, z of a volume indexed z, y, x, from -1 to 1.
+    normalized = (2 * (points - low) / extent - 1).flip(-1)[None, None, None]
+    options = {"padding_mode": "border", "align_corners": True}
+    return nn.functional.grid_sample(volume[None], normalized, **options)[0, :, 0, 0]
+
+
 def _checked_size(field: Field, voxel: float | int) -> tuple[int, int, int]:
     """Vertices along x, y and z, if the grid is allowed. Raises ConfigError otherwise."""
-    if not 0 < voxel < math.inf:
-        raise ConfigError(
-            f"voxel is {voxel} m: a baked field needs a positive length; set for instance 0.04"
-        )
-    extent = np.array(field.bounds.maximum) - np.array(field.bounds.minimum)
+    extent = np.subtract(field.bounds.maximum, field.bounds.minimum)
     # Stays floating-point until it is known to be small: 1e-300 m is a positive length.
-    with np.errstate(over="ignore"):
+    with np.errstate(all="ignore"):
         n_vertices = np.ceil(extent / voxel) + 3
         n_bytes = float(np.prod(n_vertices)) * _BYTES_PER_VERTEX
-    if n_bytes > _MAX_BYTES:
+    if not (0 < voxel < math.inf and n_bytes <= _MAX_BYTES):
         # The smallest that fits, with 5 % for the cells to spare and for rounding.
         enough = 1.05 * (float(np.prod(extent)) * _BYTES_PER_VERTEX / _MAX_BYTES) ** (1 / 3)
         raise ConfigError(
-            f"voxel is {voxel} m: the baked grid would need {n_bytes / 1e9:.3g} GB, allowed is "
-            f"{_MAX_BYTES / 1e9:g} GB; set {enough:.2g} m or more, or choose smaller bounds"
+            f"voxel is {voxel} m: the grid of a baked field may take {_MAX_BYTES / 1e9:g} GB; set "
+            f"{enough:.2g} m or more, for instance 0.04, or choose smaller bounds"
         )
     return tuple(n_vertices.astype(int).tolist())

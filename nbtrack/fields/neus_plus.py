@@ -13,8 +13,9 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Draw, Losses, measured_mean, rendered_losses
+from nbtrack.fields.grid import trilinear
 from nbtrack.fields.neus import NeuSField, NeusMapping, guided_depths
-from nbtrack.fields.points import cells_of, fuse_points
+from nbtrack.fields.points import cells_of, fuse_points, least_behind
 
 # Distances are kept at corners so far apart (m), unless there would be more of them a side, and
 # measured from the mean points of cells half as wide, of three or more: single ones are noise.
@@ -23,7 +24,7 @@ _POINTS_PER_FRAME = 10_000  # about, on a regular grid of its pixels
 # How much the distances to a tangent plane and to the nearest point may differ for the plane to be
 # believed (m): by half a point voxel, and the cells' rounding of distances near the surface.
 _PLANE_TOLERANCE = 0.015
-_FREE_IN_FRONT, _ASKED_EVERY = 0.05, 5  # m in front of a measured depth; frames, for free space
+_FREE_IN_FRONT = 0.05  # m in front of a measured depth
 
 
 @dataclass(frozen=True)
@@ -132,20 +133,14 @@ class ObservedDistance:
         corners = np.stack(np.indices(shape)[:, ::2, ::2, ::2], -1) * fine + low + fine / 2
         distance = np.linalg.norm(corners - nearest, axis=-1)
         corners = torch.from_numpy(corners.reshape(-1, 3)).float()
-        is_free = torch.zeros(len(corners), dtype=torch.bool)
-        for index in frames[::_ASKED_EVERY].tolist():
-            is_free |= sequence[index].depth_behind(corners) < -_FREE_IN_FRONT
+        is_free = least_behind(corners, sequence, frames) < -_FREE_IN_FRONT
         values = torch.from_numpy(distance).float(), is_free.view(distance.shape).float()
-        self.values, self.low = torch.stack(values)[None].to(device), corners[0].to(device)
-        self.extent = (self.voxel * (torch.tensor(distance.shape) - 1)).to(device)
+        self.values, self.low = torch.stack(values).to(device), corners[0].to(device)
 
     def __call__(
         self, points_world: Float[Tensor, "rays samples 3"]
     ) -> tuple[RaySamples, Bool[Tensor, "rays samples"]]:
         """Distance (m) and whether it is free at points (m); outside those of the border."""
-        # grid_sample takes x, y, z of a volume indexed z, y, x, from -1 to 1.
-        normalized = (2 * (points_world - self.low) / self.extent - 1).flip(-1)
-        distance, free = torch.nn.functional.grid_sample(
-            self.values, normalized[None, None], padding_mode="border", align_corners=True
-        )[0, :, 0]
+        found = trilinear(self.values, self.low, self.voxel, points_world.flatten(0, 1))
+        distance, free = found.view(2, *points_world.shape[:2])
         return distance, free > 0.5

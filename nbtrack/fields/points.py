@@ -1,23 +1,23 @@
 """Points: the measured pixels of posed frames, averaged by voxel, for classical registration."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 import pandas as pd
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Frames, Points, Values, WorldPoints
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError
 from nbtrack.core.settings import may_be_zero
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.fields.base import Field
 
 _MAX_CELLS_A_SIDE = 2**20  # so that a cell's number fits into 64 bits
+_ASKED_EVERY = 5  # frames
 _FRAMES_AT_ONCE = 8  # frames whose voxels wait to be merged: what the memory is bounded by
 
 
@@ -29,35 +29,23 @@ class PointMapping:
     holdout_every: int = may_be_zero(10)  # every n-th frame is left out
 
 
-@dataclass(frozen=True, eq=False)
-class PointCloud:
+class PointCloud(Field):
     """Measured points with their colours, one a voxel. Made by `fuse_points`."""
 
-    name: ClassVar[str] = "points"  # this and what follows: as fields have it
-    label: ClassVar[str] = "Points"
-    Settings: ClassVar[type[PointMapping]] = PointMapping
+    name, label, is_distance = "points", "Points", False
+    Settings = PointMapping
 
-    points: Points  # m, world frame
-    colors: Colors  # in [0, 1]
-    voxel: float  # m
-    bounds: SceneBounds
+    def __init__(self, points: Points, colors: Colors, voxel: float, bounds: SceneBounds) -> None:
+        """Of points (m, world frame), colours in [0, 1], and the edge (m) of the points' cells."""
+        super().__init__(bounds)
+        self.register_buffer("points", points)
+        self.register_buffer("colors", colors)
+        self.voxel = voxel
 
-    @property
-    def device(self) -> torch.device:
-        """Where the points lie."""
-        return self.points.device
-
-    def to(self, device: torch.device | str) -> "PointCloud":
-        """The same points on a device."""
-        return replace(self, points=self.points.to(device), colors=self.colors.to(device))
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """What a map's file keeps, by name."""
-        return {"points": self.points, "colors": self.colors}
-
-    def distance(self, points_world: Points) -> Values:
-        """Distance (m, without sign) of points (m) from the nearest point."""
-        return torch.from_numpy(self._tree.query(points_world.cpu().numpy())[0]).to(points_world)
+    def forward(self, points_world: Points) -> tuple[Colors, Values]:
+        """Colour of the nearest point, and distance (m, without sign) from it."""
+        distance, nearest = self._tree.query(points_world.cpu().numpy())
+        return self.colors[nearest], torch.from_numpy(distance).to(points_world)
 
     @cached_property
     def _tree(self) -> cKDTree:
@@ -112,3 +100,14 @@ def cells_of(
     cells = np.floor((points - low) / voxel).astype(np.int64)
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
     return np.ravel_multi_index(tuple(cells[inside].T), tuple(shape)), inside
+
+
+def least_behind(points_world: Points, sequence: RgbdSequence, frames: Frames) -> Values:
+    """How far (z-depth, m) points (m) lie behind what was measured, in the frame that says least.
+
+    As `Frame.depth_behind` of every fifth of the frames: neighbours see the same.
+    """
+    least = torch.full_like(points_world[:, 0], torch.inf)
+    for index in frames[::_ASKED_EVERY].tolist():
+        least = torch.minimum(least, sequence[index].depth_behind(points_world))
+    return least

@@ -24,14 +24,13 @@ MESH_FILE = "mesh.ply"  # what a map's frames have seen
 CHECKPOINT_FILE = "mapping.pt"  # of a map in the making
 _FORMAT, _VERSION = "nbtrack map", 3
 _AGAIN = "map again, and give the folder or its map.safetensors; an earlier nbtrack's are none"
-AnyField = Field | PointCloud
 
 
 @dataclass(frozen=True)
 class Map:
     """A mapped scene, ready for tracking, with what is known of how it was made."""
 
-    field: AnyField
+    field: Field
     camera: Intrinsics  # of the frames it was made from
     # Plain values: scene, n_frames, seed, network, settings, misfit_m, device, versions, seconds
     # spent in iterations; and whatever its maker adds, as `quality`, scores by name.
@@ -115,7 +114,7 @@ def _read_file(file: Path) -> Map:
     return Map(mapped, Intrinsics(**header["camera"]), record)
 
 
-def _tensors(mapped: AnyField) -> dict[str, Tensor]:
+def _tensors(mapped: Field) -> dict[str, Tensor]:
     """All that was learnt, by name, on the CPU."""
     state = mapped.state_dict()
     return {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}

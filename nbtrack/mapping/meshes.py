@@ -10,16 +10,15 @@ from nbtrack.core.arrays import Frames, WorldPoints
 from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, PointCloud
-from nbtrack.mapping.files import AnyField
+from nbtrack.fields.points import least_behind
 
 _POINTS_AT_ONCE = 65_536
 _SEEN_BEHIND = 0.1  # m behind the measured depth that still count as seen
-_ASKED_EVERY = 5  # frames
 Mesh = trimesh.Trimesh | trimesh.PointCloud
 
 
 def extract_mesh(
-    field: AnyField,
+    field: Field,
     sequence: RgbdSequence | None = None,
     frames: Frames | None = None,
     voxel: float = 0.05,
@@ -71,8 +70,5 @@ def seen_by(
     Of the given frames, by default all, every fifth is asked: neighbours see the same.
     """
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32))
-    seen = torch.zeros(len(points), dtype=torch.bool)
     frames = np.arange(len(sequence)) if frames is None else frames
-    for index in frames[::_ASKED_EVERY].tolist():
-        seen |= sequence[index].depth_behind(points) < _SEEN_BEHIND
-    return seen.numpy()
+    return (least_behind(points, sequence, frames) < _SEEN_BEHIND).numpy()

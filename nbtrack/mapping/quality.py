@@ -12,7 +12,7 @@ from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField, PointCloud
-from nbtrack.mapping.files import AnyField, Map
+from nbtrack.mapping.files import Map
 from nbtrack.mapping.meshes import extract_mesh, query_field, seen_by
 from nbtrack.synthetic import Room, true_surface_points
 
@@ -60,7 +60,7 @@ def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -
     if len(held_out) and isinstance(field, LearnedField):
         scores |= _score_images(field, sequence, held_out, room)
     if room is not None:
-        if getattr(field, "is_distance", False):
+        if field.is_distance:
             scores |= _score_sdf(field, sequence, mapped, room)
         scores |= _score_surface(field, sequence, mapped, room)
     return scores
@@ -105,7 +105,7 @@ def _score_sdf(field: Field, sequence: RgbdSequence, mapped: Frames, room: Room)
     return {"sdf_near_m": float(error[is_near].mean()), "sdf_free_m": float(error[is_free].mean())}
 
 
-def _score_surface(field: AnyField, sequence, mapped: Frames, room: Room) -> Scores:
+def _score_surface(field: Field, sequence, mapped: Frames, room: Room) -> Scores:
     """Accuracy, completion (m) and F-score of the seen part of a map's surface, if it has one."""
     try:
         mesh = extract_mesh(field, sequence, mapped)
@@ -126,7 +126,7 @@ def _score_surface(field: AnyField, sequence, mapped: Frames, room: Room) -> Sco
     }
 
 
-def depth_residual_of(field: AnyField, frame: Frame) -> float:
+def depth_residual_of(field: Field, frame: Frame) -> float:
     """How far (m) a map is from what a frame measured, at the frame's given pose.
 
     The median over random pixels of |rendered depth - measured depth|; of points and grids, which
@@ -141,15 +141,13 @@ def depth_residual_of(field: AnyField, frame: Frame) -> float:
     T_world_camera = torch.from_numpy(frame.T_world_camera).float().to(rows.device)
     if not isinstance(field, LearnedField):
         points_world = transform_points(T_world_camera, frame.points(rows, columns)[0])
-        cloud = isinstance(field, PointCloud)
-        distance = field.distance(points_world) if cloud else field(points_world)[1].abs()
-        return float(distance.median())
+        return float(field(points_world)[1].abs().median())
     directions = pixel_directions(frame.camera, columns, rows) @ T_world_camera[:3, :3].T
     origins, measured = T_world_camera[:3, 3].expand_as(directions), frame.at(rows, columns)[1]
     return float((field.render_rays(origins, directions)[1] - measured).abs().median())
 
 
-def usual_depth_residual(field: AnyField, sequence: RgbdSequence, mapped: Frames) -> float:
+def usual_depth_residual(field: Field, sequence: RgbdSequence, mapped: Frames) -> float:
     """The median misfit (m) of some of the mapped frames, evenly spread; 0 if none has a depth."""
     spread = np.linspace(0, len(mapped) - 1, min(_MISFIT_FRAMES, len(mapped))).round().astype(int)
     frames = [sequence[index] for index in mapped[spread].tolist()]

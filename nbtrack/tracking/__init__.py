@@ -3,8 +3,8 @@
 import importlib.util
 
 from nbtrack.core.arrays import Pose
-from nbtrack.core.errors import ConfigError, MissingError, nearest_name
-from nbtrack.fields import FIELDS, Field, PointCloud, field_class
+from nbtrack.core.errors import ConfigError, MissingError, look_up
+from nbtrack.fields import FIELDS, Field, field_class
 from nbtrack.tracking.budget import Budget, ClockBudget, StepBudget, make_budget, paper_steps
 from nbtrack.tracking.icp import IcpSettings, IcpTracker
 from nbtrack.tracking.lm import LmSettings, LmTracker
@@ -18,9 +18,7 @@ TRACKERS = {"vr": VrTracker, "sdf": SdfTracker, "lm": LmTracker, "icp": IcpTrack
 
 def tracker_class(name: str) -> type[Tracker]:
     """The tracker of a name. Raises ConfigError, naming the nearest, for any other."""
-    if name not in TRACKERS:
-        raise ConfigError(f"unknown tracker {name!r}: {nearest_name(name, sorted(TRACKERS))}")
-    return TRACKERS[name]
+    return look_up("tracker", name, TRACKERS)
 
 
 def check_pair(tracker_name: str, field: str | type) -> None:
@@ -42,7 +40,7 @@ def check_pair(tracker_name: str, field: str | type) -> None:
 
 def make_tracker(
     name: str,
-    field: Field | PointCloud,
+    field: Field,
     T_world_camera: Pose,
     budget: Budget,
     settings: TrackerSettings | None = None,

@@ -1,6 +1,7 @@
 """ICP: each frame is aligned with a fused point cloud, without any network."""
 
 import importlib
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,22 +48,23 @@ class IcpTracker(Tracker):
     converges = True
     copes_without_depth = True
 
-    def __init__(self, field: PointCloud, *arguments: Any, **settings: Any) -> None:
-        """Prepare the map: planes of its points, and a search tree.
+    def prepare(self, field: PointCloud) -> PointCloud:
+        """The map on the host; planes of its points and a search tree are kept.
 
         Raises ConfigError where it has too few points for a plane.
         """
-        super().__init__(field.to("cpu"), *arguments, **settings)
         if len(field.points) < _NEIGHBOURS:
             raise ConfigError(
                 f"the map has {len(field.points)} points of {field.voxel:g} m cells; ICP needs "
                 f"{_NEIGHBOURS} or more: set a smaller mapping.points.voxel, or map more frames"
             )
         self.small_gicp = importlib.import_module(self.package)
-        points = self.field.points.double().numpy()
+        field = deepcopy(field).cpu()
+        points = field.points.double().numpy()
         self.low = points.min(axis=0) - _MAX_CORRESPONDENCE_DISTANCES[0]
         self.high = points.max(axis=0) + _MAX_CORRESPONDENCE_DISTANCES[0]
         self.target, self.target_tree = self._with_planes(self.small_gicp.PointCloud(points))
+        return field
 
     @classmethod
     def works_in(cls, field: type) -> bool:

@@ -15,7 +15,6 @@ from nbtrack.core.settings import may_be_zero
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
 from nbtrack.fields.grid import BakedField
-from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.lm_solver import Descent, Grid, retract
 from nbtrack.tracking.observed import draw_points, with_normals
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
@@ -79,20 +78,12 @@ class LmTracker(Tracker):
     was_lost: bool = False  # in the frame before
     usual_mad: float | None = None  # of intensities, in the latest frame beyond doubt
 
-    def __init__(
-        self,
-        field: Field,
-        T_world_camera: Pose,
-        budget: Budget,
-        settings: LmSettings | None = None,
-        seed: int = 0,
-    ) -> None:
-        """As `Tracker`; ConfigError where the grid would be too large."""
-        settings = settings or LmSettings()
-        grid = field if isinstance(field, BakedField) else BakedField(field, settings.voxel)
+    def prepare(self, field: Field) -> BakedField:
+        """The map as a grid on the host; ConfigError where it would be too large."""
+        grid = field if isinstance(field, BakedField) else BakedField(field, self.settings.voxel)
         grid = grid if grid.device.type == "cpu" else deepcopy(grid).cpu()
-        super().__init__(grid, T_world_camera, budget, settings, seed)
         self.grid = Grid(grid)
+        return grid
 
     def restart_anywhere(self) -> None:
         """Look for the camera near all poses that the map was made from; see `_hypotheses`."""

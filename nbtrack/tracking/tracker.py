@@ -14,15 +14,14 @@ from torch import Tensor
 from nbtrack.core import capture
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform
 from nbtrack.core.device import suitable_threads, synchronize
-from nbtrack.core.errors import ConfigError, DataError, NumericalError, nearest_name
+from nbtrack.core.errors import ConfigError, DataError, NumericalError, look_up
 from nbtrack.data.frame import Frame
 from nbtrack.data.text_files import checked_poses
-from nbtrack.fields import Field, LearnedField, PointCloud
+from nbtrack.fields import Field, LearnedField
 from nbtrack.fields.grid import BakedField
 from nbtrack.tracking.budget import Budget
 
 _MAX_PIXELS = 2**24
-MOTION_MODELS = ("previous_pose", "constant_velocity", "better_of_both")
 
 
 def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
@@ -33,14 +32,15 @@ def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
     T_k-1 (T_k-2^-1 T_k-1) (ORB-SLAM); or at both, for the tracker to choose: hands start and stop
     within a frame. Raises ConfigError, naming the nearest, for any other model.
     """
-    if motion_model not in MOTION_MODELS:
-        advice = nearest_name(motion_model, [*MOTION_MODELS])
-        raise ConfigError(f"unknown motion model {motion_model!r}: {advice}")
-    last = estimates[-1]
-    if len(estimates) < 2 or motion_model == "previous_pose":
-        return [last]
-    moved_on = last @ np.linalg.inv(estimates[-2]) @ last
-    return [moved_on] if motion_model == "constant_velocity" else [moved_on, last]
+    last = moved_on = estimates[-1]
+    if len(estimates) > 1:
+        moved_on = last @ np.linalg.inv(estimates[-2]) @ last
+    starts = {
+        "previous_pose": [last],
+        "constant_velocity": [moved_on],
+        "better_of_both": [moved_on, last],
+    }
+    return look_up("motion model", motion_model, starts)[: len(estimates)]
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class TrackerSettings:
     """What all trackers share."""
 
     n_pixels: int = 4096  # random pixels a step, or a frame where they are drawn once
-    motion_model: str = "previous_pose"  # one of MOTION_MODELS
+    motion_model: str = "previous_pose"  # see `expected_poses`
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Tracker(abc.ABC):
 
     def __init__(
         self,
-        field: Field | PointCloud,
+        field: Field,
         T_world_camera: Pose,
         budget: Budget,
         settings: TrackerSettings | None = None,
@@ -105,13 +105,11 @@ class Tracker(abc.ABC):
                 f"tracking.{self.name}.n_pixels = {self.settings.n_pixels}: allowed are 1 to "
                 f"{_MAX_PIXELS}, more than any depth image has; set for instance 4096"
             )
-        if isinstance(field, Field):
-            field.eval().requires_grad_(False)
+        self.field = self.prepare(field).eval().requires_grad_(False)
         # One thread serves a grid, even one that keeps the network it was made from, and points.
-        is_network = isinstance(field, Field) and not isinstance(field, BakedField)
-        weights = [*field.parameters()] if is_network else []
+        weights = [] if isinstance(self.field, BakedField) else self.field.parameters()
         self._width = max((len(weight) for weight in weights if weight.dim()), default=0)
-        self.field, self.device, self.budget = field, field.device, budget
+        self.device, self.budget = self.field.device, budget
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self._is_warm = False
         self.restart(T_world_camera)
@@ -121,7 +119,11 @@ class Tracker(abc.ABC):
         """Whether it can track in maps of this kind: rendering needs rays, others distances."""
         if cls.renders:
             return issubclass(field, LearnedField)
-        return getattr(field, "is_distance", False)
+        return field.is_distance
+
+    def prepare(self, field: Field) -> Field:
+        """A map in the form, and on the device, in which this tracker asks it."""
+        return field
 
     @abc.abstractmethod
     def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
@@ -135,10 +137,8 @@ class Tracker(abc.ABC):
         """What it says about its estimate, by column name; `lost`, where given, is its verdict."""
         return {}
 
-    def track(self, frame: Frame, steps: int | None = None) -> Estimate:
+    def track(self, frame: Frame) -> Estimate:
         """The camera's pose at the next frame; NumericalError if it is not finite.
-
-        A number of steps replaces the budget for this frame.
 
         A tracker that needs depth returns the pose that the motion model predicts where none is
         measured, so that later frames can still be found (our choice).
@@ -147,7 +147,7 @@ class Tracker(abc.ABC):
         estimate = Estimate(T_starts[0], without_depth=True)
         if self.copes_without_depth or frame.has_depth:
             with suitable_threads(self._width):
-                estimate = self._search(frame, T_starts, steps)
+                estimate = self._search(frame, T_starts)
         self.estimates.append(estimate.T_world_camera)
         return estimate
 
@@ -158,10 +158,8 @@ class Tracker(abc.ABC):
         Random numbers and the budget go on.
         """
         pose = np.array(T_world_camera, dtype=np.float64)
-        if pose.shape != (4, 4):
-            raise DataError(f"T_world_camera is of shape {pose.shape}: give a 4x4 rigid transform")
-        if not np.isfinite(pose).all():
-            raise DataError("T_world_camera is no rigid transform: its numbers must be finite")
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise DataError("T_world_camera is no rigid transform: give 4 x 4 finite numbers")
         self.estimates = [*checked_poses(pose[None], Path("T_world_camera"))]
         expected_poses(self.settings.motion_model, self.estimates)  # a wrong name is told now
         for name in self.remembers:
@@ -195,7 +193,7 @@ class Tracker(abc.ABC):
         starts = torch.from_numpy(T_starts).float()
         self.begin(frame.to(self.device), starts.to(self.device))
 
-    def _search(self, frame: Frame, T_starts: Poses, n_steps: int | None) -> Estimate:
+    def _search(self, frame: Frame, T_starts: Poses) -> Estimate:
         if not self._is_warm and frame.has_depth:
             # Steps that count nowhere: first calls load, allocate and record for a second or more.
             state, self._is_warm = self.state(), True
