@@ -139,11 +139,11 @@ def test_rendered_losses_by_hand() -> None:
     )
     color = torch.tensor([[0.1, 0.3, 0.5], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     rays = replace(random_rays(3, 1.0), depth=torch.tensor([1.0, 1.9, 0.0]), color=color)
-    terms = rendered_losses(rendering, rays, 5.0, over_std=True)
+    terms = rendered_losses(rendering, rays, 5.0, 1.0, over_std=True)
     assert MIN_STD == 0.02
     assert terms["depth"].item() == pytest.approx((1 + 5) / 2, rel=1e-4)
     assert terms["color"].item() == pytest.approx(5 * (0.2 + 0.4) / 2, rel=1e-4)
-    of_neus = rendered_losses(rendering, rays, 2.0)
+    of_neus = rendered_losses(rendering, rays, 2.0, 1.0)
     assert list(map(float, of_neus.values())) == pytest.approx([0.3, 0.6], rel=1e-4)
     assert not terms["depth"].requires_grad  # the deviation is a weight, not something to enlarge
     assert measured_mean(torch.ones(3), torch.zeros(3)).item() == 0

@@ -155,9 +155,10 @@ class LearnedField(Field):
     def render_rays(self, origins_world: Points, directions_world: Points) -> tuple[Colors, Values]:
         """Colour and z-depth (m) of rays, by two passes with fixed samples."""
         parts = []
-        for start in range(0, len(origins_world), _RAYS_AT_ONCE):
-            place = [x[start : start + _RAYS_AT_ONCE] for x in (origins_world, directions_world)]
-            rays = Rays(*place, torch.zeros_like(place[0]), place[0].new_zeros(len(place[0])))
+        both = (x.split(_RAYS_AT_ONCE) for x in (origins_world, directions_world))
+        for origins, directions in zip(*both, strict=True):
+            unknown = torch.zeros_like(origins)
+            rays = Rays(origins, directions, unknown, unknown[:, 0])
             parts.append(self.render_hierarchically(rays, _N_STRATIFIED, _N_IMPORTANCE))
         color = torch.cat([part.color.clamp(0, 1) for part in parts])
         return color, torch.cat([part.depth for part in parts])
@@ -193,11 +194,7 @@ def measured_mean(error: Float[Tensor, "*some"], measured: Float[Tensor, "*some"
 
 
 def rendered_losses(
-    rendered: Rendering,
-    rays: Rays,
-    lambda_color: float,
-    lambda_depth: float = 1.0,
-    over_std: bool = False,
+    seen: Rendering, rays: Rays, lambda_color: float, lambda_depth: float, over_std: bool = False
 ) -> Losses:
     """Weighted L1 errors of rendered depth (m) and colour, for mapping and tracking.
 
@@ -207,10 +204,10 @@ def rendered_losses(
     Source: iMAP, Sec. 3.3.
     """
     measured = (rays.depth > 0).float()
-    depth_error = (rendered.depth - rays.depth).abs()
+    depth_error = (seen.depth - rays.depth).abs()
     if over_std:
-        depth_error = depth_error / rendered.depth_variance.detach().sqrt().clamp_min(MIN_STD)
-    color_error = (rendered.color - rays.color).abs().mean(dim=-1)
+        depth_error = depth_error / seen.depth_variance.detach().sqrt().clamp_min(MIN_STD)
+    color_error = (seen.color - rays.color).abs().mean(dim=-1)
     return {
         "depth": lambda_depth * measured_mean(depth_error, measured),
         "color": lambda_color * measured_mean(color_error, measured),

@@ -39,40 +39,33 @@ _MEDIANS, _MIN_SCALES = np.array([5.5, 2.3]), np.array([0.01, 0.05])
 _UNMEASURED = 0.1  # confidence where nothing was measured: the word of the network is a guess
 _MAX_CAMERAS = 200  # poses kept, evenly spread: where a lost camera may be looked for
 CORRECTIONS = ("numbers", "corrections", "T_world_cameras", "residual_medians")
-"""What a file keeps of a correction: arguments of `CorrectedField`, in their order."""
+"""What a file keeps of a correction, besides the field: see `CorrectedField`."""
+Columns = Float[np.ndarray, "rows columns"]
 
 
 class CorrectedField(BakedField):
     """A grid of a learned field with corrections at vertices near surfaces. Our choice.
 
-    What a file keeps is the field itself, the corrections in half precision, mapped poses, and how
-    large residuals of distance (m) and luma are that the corrections leave at measured points: from
-    them follow the least scales of a tracker's residuals.
+    What a file keeps is the field itself and, by name: the `numbers` (n) of corrected vertices,
+    their `corrections` (n x 5) of colour, distance (m) and confidence in half precision, mapped
+    poses `T_world_cameras` (n x 4 x 4), and `residual_medians` (2), of distance (m) and luma, that
+    the corrections leave at measured points: from them follow the least scales of a tracker's
+    residuals.
     """
 
     inlier_distance, min_inliers = 0.025, 0.8
 
-    def __init__(
-        self,
-        source: Field,
-        voxel: float,
-        numbers: Int[Tensor, "corrected"],
-        corrections: Float[Tensor, "corrected 5"],
-        T_world_cameras: Float[Tensor, "cameras 4 4"],
-        residual_medians: Float[Tensor, "2"],
-    ) -> None:
-        """Add to colour, distance (m) and confidence at the numbered vertices of a baked field."""
+    def __init__(self, source: Field, voxel: float, correction: dict[str, Tensor]) -> None:
+        """Add to what a field gives at vertices; the correction's tensors are `CORRECTIONS`."""
         super().__init__(source, voxel)
         self.name, self.label, self.source = source.name, f"{source.label} corrected", source
-        self.register_buffer("numbers", numbers)
-        self.register_buffer("corrections", corrections.half())
-        self.register_buffer("T_world_cameras", T_world_cameras)
-        self.register_buffer("residual_medians", residual_medians)
-        medians = residual_medians.double().numpy()
+        for name in CORRECTIONS:
+            self.register_buffer(name, correction[name])
+        medians = self.residual_medians.double().numpy()
         self.residual_sigma = tuple(np.maximum(_MEDIANS * medians, _MIN_SCALES).tolist())
         self.intensity_mad = float(medians[1])
         self.volume[4] = _UNMEASURED
-        self.volume[:, numbers.long()] += self.corrections.float().T
+        self.volume[:, self.numbers.long()] += self.corrections.float().T
 
 
 def corrected(
@@ -106,14 +99,11 @@ def corrected(
 
     left = missing - at_surface @ distance[:, 0], (missing_color - at_surface @ colors) @ LUMA
     spread = np.linspace(0, len(frames) - 1, min(_MAX_CAMERAS, len(frames))).round().astype(int)
-    return CorrectedField(
-        source,
-        voxel,
-        numbers=torch.from_numpy(numbers).int(),
-        corrections=torch.from_numpy(np.column_stack([colors, distance, confidence])).float(),
-        T_world_cameras=torch.from_numpy(sequence.T_world_camera[frames[spread]]).float(),
-        residual_medians=torch.from_numpy(np.median(np.abs(left), axis=1)).float(),
-    )
+    corrections = torch.from_numpy(np.column_stack([colors, distance, confidence])).float().half()
+    poses = torch.from_numpy(sequence.T_world_camera[frames[spread]]).float()
+    medians = torch.from_numpy(np.median(np.abs(left), axis=1)).float()
+    parts = torch.from_numpy(numbers).int(), corrections, poses, medians
+    return CorrectedField(source, voxel, dict(zip(CORRECTIONS, parts, strict=True)))
 
 
 def _measured_planes(
@@ -163,25 +153,21 @@ def _unknowns(
     design = sparse.csr_array((weights.ravel(), column.flat[vertices].ravel(), rows), shape=size)
     stiffness = _PULL * sparse.eye_array(len(numbers), format="csr")
     for axis in range(3):
-        pair = (np.moveaxis(column, axis, 0)[part].ravel() for part in (slice(-1), slice(1, None)))
-        low, high = pair
-        low, high = low[(low >= 0) & (high >= 0)], high[(low >= 0) & (high >= 0)]
-        spring = sparse.coo_array((np.ones(len(low)), (low, high)), shape=2 * size[1:])
+        along = np.moveaxis(column, axis, 0)
+        pairs = np.stack([along[:-1].ravel(), along[1:].ravel()])
+        pairs = pairs[:, (pairs >= 0).all(axis=0)]
+        spring = sparse.coo_array((np.ones(pairs.shape[1]), pairs), shape=2 * size[1:])
         stiffness = stiffness - _SMOOTHNESS * (spring + spring.T)
     return numbers, design, stiffness + 6 * _SMOOTHNESS * sparse.eye_array(len(numbers))
 
 
 def _solve(
-    design: sparse.csr_array,
-    stiffness: sparse.csr_array,
-    wanted: Float[np.ndarray, "equations columns"],
-    reliability: Float[np.ndarray, "equations"],
-    huber: float,
-    rounds: int,
-) -> tuple[Float[np.ndarray, "unknowns columns"], Float[np.ndarray, "unknowns"]]:
+    design, stiffness, wanted: Columns, reliability: np.ndarray, huber: float, rounds: int
+) -> tuple[Columns, np.ndarray]:
     """Minimise |W^(1/2) (design x - wanted)|^2 + x' stiffness x; and the system's diagonal.
 
-    W holds the reliability, times huber / |residual| where the largest residual of an equation's
+    Of sparse matrices, and columns of `wanted` with an equation, and its reliability, a row. W
+    holds the reliability, times huber / |residual| where the largest residual of an equation's
     columns is above that; it is judged anew in every round.
     """
     solution = np.zeros((design.shape[1], wanted.shape[1]))

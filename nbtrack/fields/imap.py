@@ -43,7 +43,7 @@ class IMapField(LearnedField):
         # Not guided by measured depths: tracking has no such help, and would see a thinner map.
         n_samples = settings.n_stratified, settings.n_surface
         rendered = self.render(rays, self.hierarchical_depths(rays, *n_samples, generator))
-        return rendered_losses(rendered, rays, settings.lambda_color, over_std=True)
+        return rendered_losses(rendered, rays, settings.lambda_color, 1.0, over_std=True)
 
 
 class OccupancyField(IMapField):

@@ -63,12 +63,9 @@ class NeuSField(LearnedField):
         """Colour L1, depth L1 and the eikonal term (NeuS, Eq. 15, with RGB-D's depth added)."""
         rays = draw(settings.n_rays)
         depths = guided_depths(rays, self.bounds, settings, generator)
-        return {
-            **rendered_losses(
-                self.render(rays, depths), rays, settings.lambda_color, settings.lambda_depth
-            ),
-            "eikonal": self._eikonal(rays.points(depths), settings, generator),
-        }
+        lambdas = settings.lambda_color, settings.lambda_depth
+        losses = rendered_losses(self.render(rays, depths), rays, *lambdas)
+        return losses | {"eikonal": self._eikonal(rays.points(depths), settings, generator)}
 
     def _eikonal(self, points_world: Tensor, settings: NeusMapping, generator: Generator) -> Scalar:
         """Weighted mean (|grad f| - 1)^2 over a share of the ray samples, drawn anew every time."""

@@ -88,7 +88,7 @@ def _read_file(file: Path) -> Map:
     """The map of a file. Raises ValueError, KeyError and others if it is not sound."""
     with safetensors.safe_open(file, "pt") as opened:
         header = dict(json.loads((opened.metadata() or {})[_FORMAT]))
-        names = list(opened.keys())
+        names = opened.keys()
         tensors = {name: opened.get_tensor(name).clone() for name in names}
     if header.get("format_version") != _VERSION:
         raise ValueError(f"format {header.get('format_version')!r}; this nbtrack reads {_VERSION}")
@@ -105,12 +105,11 @@ def _read_file(file: Path) -> Map:
         mapped = PointCloud(**tensors, voxel=float(record["settings"]["voxel"]), bounds=bounds)
     else:
         mapped = make_field(name, NetworkSettings(**record["network"]), bounds, seed=0)
-        own = {key.removeprefix("source."): tensors[key] for key in names if key not in CORRECTIONS}
-        mapped.load_state_dict(own)
+        correction = {key: tensors.pop(key) for key in CORRECTIONS if key in tensors}
+        mapped.load_state_dict({key.removeprefix("source."): t for key, t in tensors.items()})
         mapped.eval().requires_grad_(False)
-        if correction := [tensors[key] for key in CORRECTIONS if key in tensors]:
-            voxel = float(record["settings"]["correct_voxel"])
-            mapped = CorrectedField(mapped, voxel, *correction)
+        if correction:
+            mapped = CorrectedField(mapped, float(record["settings"]["correct_voxel"]), correction)
     return Map(mapped, Intrinsics(**header["camera"]), record)
 
 
