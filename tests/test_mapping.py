@@ -76,10 +76,10 @@ def test_points_are_fused_at_once() -> None:
     assert mapped.record["misfit_m"] < 0.05
 
 
-def map_wall(field_name: str, checkpoint: Path | None, on_iteration=None) -> Map:
+def map_wall(field_name: str, checkpoint: Path | None, *on_iteration) -> Map:
     settings = settings_of(field_name)
     return map_sequence(
-        field_name, wall_sequence(), NETWORK, settings, 3, None, checkpoint, on_iteration
+        field_name, wall_sequence(), NETWORK, settings, 3, None, checkpoint, *on_iteration
     )
 
 

@@ -10,6 +10,7 @@ Position = Float[np.ndarray, "3"]  # m, in double precision
 ColorImage = UInt8[np.ndarray, "height width 3"]  # RGB
 DepthImage = UInt16[np.ndarray, "height width"]  # mm, 0 = no measurement
 Transform = Float[Tensor, "4 4"]  # a rigid transform, where gradients may flow
+Transforms = Float[Tensor, "_ 4 4"]
 Points = Float[Tensor, "n 3"]  # m
 Colors = Float[Tensor, "n 3"]  # red, green, blue in [0, 1]
 Values = Float[Tensor, "n"]

@@ -25,7 +25,8 @@ CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at
 _PENDING = 10  # iterations between two looks at the losses, which wait for the device
 _FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
 
-OnIteration = Callable[[int, dict[str, float]], None]
+Settings = MappingSettings | PointMapping
+OnIteration = Callable[[int, dict[str, float]], object]
 """Called with the iterations done and the last one's losses, a few times a second at most."""
 
 
@@ -40,11 +41,11 @@ def map_sequence(
     field_name: str,
     sequence: RgbdSequence,
     network: NetworkSettings,
-    settings: MappingSettings | PointMapping,
+    settings: Settings,
     seed: int = 0,
     device: torch.device | None = None,
     checkpoint: Path | None = None,
-    on_iteration: OnIteration | None = None,
+    on_iteration: OnIteration = lambda done, losses: None,
 ) -> Map:
     """Fit a field to a sequence with known poses; points, which learn nothing, are fused.
 
@@ -60,8 +61,7 @@ def map_sequence(
         field = fuse_points(sequence, mapped, bounds, settings.voxel).to(device)
         seconds = time.perf_counter() - start
         history = [{"points": len(field.points), "bytes": 2 * field.points.nbytes}]
-        if on_iteration:
-            on_iteration(1, history[0])
+        on_iteration(1, history[0])
     else:
         setting = f"mapping.{field_name}.n_rays={settings.n_rays}"
         with advise_on_memory(setting), suitable_threads(network.width):
@@ -79,11 +79,7 @@ def map_sequence(
 
 
 def recipe_of(
-    field_name: str,
-    sequence: RgbdSequence,
-    network: NetworkSettings,
-    settings: MappingSettings | PointMapping,
-    seed: int,
+    field_name: str, sequence: RgbdSequence, network: NetworkSettings, settings: Settings, seed: int
 ) -> dict[str, Any]:
     """What a map is made of, as plain values: two maps of one recipe are the same map."""
     ids = sequence.frame_ids
@@ -122,15 +118,14 @@ class _Fit:
         field.prepare(sequence, mapped)
         self.seconds, self.history = 0.0, []
 
-    def run(self, checkpoint: Path | None, on_iteration: OnIteration | None) -> None:
+    def run(self, checkpoint: Path | None, on_iteration: OnIteration) -> None:
         """From the checkpoint, where there is one, to the last iteration."""
         if checkpoint and checkpoint.exists():
             self._load(checkpoint)
         last_saved, end = time.perf_counter(), self.settings.iterations
         while (done := len(self.history)) < end:
             self._advance(range(done, min(end, done + _PENDING)))
-            if on_iteration:
-                on_iteration(len(self.history), self.history[-1])
+            on_iteration(len(self.history), self.history[-1])
             is_due = time.perf_counter() - last_saved > CHECKPOINT_SECONDS
             if checkpoint and (is_due or len(self.history) == end):
                 self._save(checkpoint)

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
+from nbtrack.core.arrays import Transforms
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
 from nbtrack.fields import PointCloud
@@ -71,7 +70,7 @@ class IcpTracker(Tracker):
         """Only in measured points."""
         return issubclass(field, PointCloud)
 
-    def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
+    def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Draw the frame's points and find their planes; the first pose is the start."""
         self.T_world_camera, self.source = T_starts[0], None
         self.is_converged, self.inlier_ratio = False, 0.0

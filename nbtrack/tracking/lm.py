@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
-from nbtrack.core.arrays import Pose, Poses, Transform
+from nbtrack.core.arrays import Pose, Poses, Transform, Transforms
 from nbtrack.core.settings import may_be_zero
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
@@ -93,7 +91,7 @@ class LmTracker(Tracker):
         self.restart(cameras[len(cameras) // 2].double().numpy())
         self.was_lost = True
 
-    def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
+    def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Draw the frame's points; take up the descent from the start that fits them best."""
         starts = T_starts.double().numpy()
         # A lost frame says little of where the next one starts.

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Poses
-from nbtrack.core.errors import DataError, NumericalError
+from nbtrack.core.errors import DataError
 
 Errors = Float[np.ndarray, "frames"]
 Flags = Bool[np.ndarray, "frames"]
@@ -32,7 +32,7 @@ def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | i
         return counts
     T_estimated, T_true = T_estimated[is_known], T_true[is_known]
     errors, angles = pose_errors(T_estimated, T_true)
-    estimated, true = (np.asarray(poses, np.float64)[:, :3, 3] for poses in (T_estimated, T_true))
+    estimated, true = T_estimated[:, :3, 3], T_true[:, :3, 3]
     aligned_errors = np.linalg.norm(align_rigidly(estimated, true) - true, axis=1)
     return {
         "ate_rmse_m": _root_mean_square(errors),  # unaligned: the paper's equation
@@ -75,22 +75,17 @@ def pose_errors(T_estimated: Poses, T_true: Poses) -> tuple[Errors, Errors]:
     """Distance (m) and angle (degrees, 0 to 180) between both cameras of every frame, row 0 too.
 
     Source: paper, evaluation protocol: the norm inside the sum. Raises DataError for different
-    numbers of poses, or none; NumericalError, naming the row, for one that is not finite.
+    numbers of poses, or none, and for one that is not finite.
     """
-    if len(T_estimated) != len(T_true) or len(T_true) == 0:
+    n_frames = len(T_true)
+    is_paired = len(T_estimated) == n_frames > 0
+    if not (is_paired and np.isfinite(T_estimated + T_true).all()):
         raise DataError(
-            f"{len(T_estimated)} estimated and {len(T_true)} true poses; allowed: equally many, "
-            "at least one; pass the poses of the same frames"
+            f"{len(T_estimated)} estimated and {n_frames} true poses: give equally many, at least "
+            "one, of frames whose poses are known and finite"
         )
-    estimated, true = (np.asarray(poses, dtype=np.float64) for poses in (T_estimated, T_true))
-    bad = np.flatnonzero(~np.isfinite(estimated + true).all(axis=(1, 2)))
-    if len(bad):
-        raise NumericalError(
-            f"the estimated or true pose of frame {bad[0]} is not finite ({len(bad)} such frames): "
-            "leave such frames out or check the tracking loss there"
-        )
-    turn = true[:, :3, :3].transpose(0, 2, 1) @ estimated[:, :3, :3]
-    distances = np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=1)
+    turn = T_true[:, :3, :3].mT @ T_estimated[:, :3, :3]
+    distances = np.linalg.norm(T_estimated[:, :3, 3] - T_true[:, :3, 3], axis=1)
     return distances, np.degrees(Rotation.from_matrix(turn).magnitude())
 
 

@@ -4,11 +4,10 @@ import abc
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from nbtrack.core import capture, geometry
-from nbtrack.core.arrays import Colors, Points, Scalar, Transform, Values
+from nbtrack.core.arrays import Colors, Points, Scalar, Transform, Transforms, Values
 from nbtrack.core.camera import pixel_directions
 from nbtrack.core.settings import may_be_zero
 from nbtrack.data.frame import Frame
@@ -33,7 +32,7 @@ class AdamTracker(Tracker):
     """
 
     Settings = AdamSettings
-    pixels: Float[Tensor, "most 7"] | None = None  # rays, colours and depths that may be drawn
+    pixels: Tensor | None = None  # n x 7: rays, colours and depths that may be drawn
     recorded: capture.Recorded | None = None  # the step, where its device can
 
     @abc.abstractmethod
@@ -42,7 +41,7 @@ class AdamTracker(Tracker):
     ) -> Scalar:
         """The loss of some pixels at a pose: rays (z = 1), colours in [0, 1] and z-depths (m)."""
 
-    def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
+    def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Take up a frame; of several starts, that with the lowest loss on the same pixels."""
         self._list_pixels(frame)
         T_start = T_starts[0]
@@ -86,8 +85,7 @@ class AdamTracker(Tracker):
         listed[:, 3:6], listed[:, 6] = frame.at(rows, columns)
 
     def _draw(self) -> None:
-        drawn, generator = self.drawn, self.generator
-        torch.randint(self.n_measured, drawn.shape, generator=generator, out=drawn)
+        torch.randint(self.n_measured, self.drawn.shape, generator=self.generator, out=self.drawn)
 
     def _drawn(self) -> tuple[Points, Colors, Values]:
         directions, color, depth = self.pixels[self.drawn].split([3, 3, 1], dim=1)

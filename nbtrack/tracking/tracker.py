@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from nbtrack.core import capture
-from nbtrack.core.arrays import Pose, Poses, Scalar, Transform
+from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
 from nbtrack.core.device import suitable_threads, synchronize
 from nbtrack.core.errors import ConfigError, DataError, NumericalError, look_up
 from nbtrack.data.frame import Frame
@@ -126,7 +124,7 @@ class Tracker(abc.ABC):
         return field
 
     @abc.abstractmethod
-    def begin(self, frame: Frame, T_starts: Float[Tensor, "starts 4 4"]) -> None:
+    def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Take up a frame; its search starts at the best of some poses."""
 
     @abc.abstractmethod

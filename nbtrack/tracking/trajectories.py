@@ -39,7 +39,7 @@ def track_sequence(
     tracker: Tracker,
     sequence: RgbdSequence,
     checkpoint: Path | None = None,
-    on_frame: Callable[[int, float], None] | None = None,
+    on_frame: Callable[[int, float], object] = lambda index, error_m: None,
     is_start_known: bool = True,
 ) -> Trajectory:
     """Estimate every frame's pose from the first frame's true one, wherever the tracker was.
@@ -64,8 +64,7 @@ def track_sequence(
                 rows = state["rows"]
         for index in range(first + len(rows), len(sequence)):
             rows.append(_row(sequence, index, tracker.track(sequence[index])))
-            if on_frame:
-                on_frame(index, rows[-1]["translation_error_m"])
+            on_frame(index, rows[-1]["translation_error_m"])
             if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
                 files.save_checkpoint(checkpoint, {"rows": rows, "tracker": tracker.state()})
                 last_saved = time.perf_counter()
@@ -102,10 +101,10 @@ def read_trajectory(folder: Path) -> Trajectory:
 
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
     translation_error, rotation_error = [np.nan], [np.nan]
-    T_true = sequence.T_world_camera[index : index + 1]
-    from_first = T_true[0, :3, 3] - sequence.T_world_camera[0, :3, 3]
+    T_true, T_first = sequence.T_world_camera[[index, 0]]
     if np.isfinite(T_true).all():
-        translation_error, rotation_error = pose_errors(estimate.T_world_camera[None], T_true)
+        both = estimate.T_world_camera[None], T_true[None]
+        translation_error, rotation_error = pose_errors(*both)
     return {
         "frame_id": int(sequence.frame_ids[index]),
         "time": float(sequence.times[index]),
@@ -114,7 +113,7 @@ def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, An
         "loss": estimate.loss,
         "translation_error_m": float(translation_error[0]),
         "rotation_error_deg": float(rotation_error[0]),
-        "still_error_m": float(np.linalg.norm(from_first)),  # of a camera that stands still
+        "still_error_m": float(np.linalg.norm((T_true - T_first)[:3, 3])),  # of no motion
         "without_depth": estimate.without_depth,
         **estimate.report,
     }
@@ -135,7 +134,6 @@ def tum_text(times: Float[np.ndarray, "n"], T_world_camera: Poses) -> str:
     """
     known = np.isfinite(T_world_camera).all(axis=(1, 2))
     times, T_world_camera = np.asarray(times)[known], T_world_camera[known]
-    T_world_camera = np.asarray(T_world_camera, dtype=np.float64)
     q_xyzw = Rotation.from_matrix(T_world_camera[:, :3, :3]).as_quat(canonical=True)
     return f"# {_COLUMNS}\n" + _lines(np.column_stack([times, T_world_camera[:, :3, 3], q_xyzw]))
 
@@ -145,8 +143,7 @@ def write_kitti(path: Path, T_world_camera: Poses) -> None:
 
     Source: KITTI odometry benchmark, whose files begin at the identity; ours keep the world frame.
     """
-    rows = np.asarray(T_world_camera, dtype=np.float64)[:, :3].reshape(-1, 12)
-    files.write_atomic(path, _lines(rows))
+    files.write_atomic(path, _lines(T_world_camera[:, :3].reshape(-1, 12)))
 
 
 def _lines(rows: Float[np.ndarray, "n numbers"]) -> str:
