@@ -25,6 +25,7 @@ _POINTS_PER_FRAME = 10_000  # about, on a regular grid of its pixels
 # believed (m): by half a point voxel, and the cells' rounding of distances near the surface.
 _PLANE_TOLERANCE = 0.015
 _FREE_IN_FRONT = 0.05  # m in front of a measured depth
+Flags = Bool[Tensor, "rays samples"]
 
 
 @dataclass(frozen=True)
@@ -77,11 +78,7 @@ class NeuSPlusField(NeuSField):
 
 
 def distance_targets(
-    rays: Rays,
-    depths: RaySamples,
-    nearest: RaySamples,
-    is_free: Bool[Tensor, "rays samples"],
-    settings: NeusPlusMapping,
+    rays: Rays, depths: RaySamples, nearest: RaySamples, is_free: Flags, settings: NeusPlusMapping
 ) -> tuple[RaySamples, RaySamples]:
     """Signed distances (m) to aim at, and a mask of 0 and 1: where one is known.
 
@@ -137,9 +134,7 @@ class ObservedDistance:
         values = torch.from_numpy(distance).float(), is_free.view(distance.shape).float()
         self.values, self.low = torch.stack(values).to(device), corners[0].to(device)
 
-    def __call__(
-        self, points_world: Float[Tensor, "rays samples 3"]
-    ) -> tuple[RaySamples, Bool[Tensor, "rays samples"]]:
+    def __call__(self, points_world: Float[Tensor, "rays samples 3"]) -> tuple[RaySamples, Flags]:
         """Distance (m) and whether it is free at points (m); outside those of the border."""
         found = trilinear(self.values, self.low, self.voxel, points_world.flatten(0, 1))
         distance, free = found.view(2, *points_world.shape[:2])

@@ -15,6 +15,7 @@ from nbtrack.core.device import synchronize
 from nbtrack.core.errors import ConfigError
 
 _HOST = torch.device("cpu")
+Number = float | int
 
 
 class ClockBudget:
@@ -31,9 +32,7 @@ class ClockBudget:
     evaluation protocol; for the first step of a frame, our choice.
     """
 
-    def __init__(
-        self, rate_hz: float | int, clock: Callable[[], float] = time.perf_counter
-    ) -> None:
+    def __init__(self, rate_hz: Number, clock: Callable[[], float] = time.perf_counter) -> None:
         """Of frames a second and a clock (s); ConfigError if the rate is not finite and above 0."""
         self.rate_hz, self._clock = _positive("rate_hz", rate_hz), clock
         self.memory: float | None = None  # mean seconds of a step in the last frame
@@ -70,7 +69,7 @@ class StepBudget:
     6, 7, 7, 7, 7, 6, ... Our choice, to repeat the paper's tables at its hardware's speed.
     """
 
-    def __init__(self, steps_per_frame: float | int) -> None:
+    def __init__(self, steps_per_frame: Number) -> None:
         """Raises ConfigError if the count is not a finite number above zero."""
         self.steps_per_frame = _positive("steps_per_frame", steps_per_frame)
         # The nearest short fraction: 6.8 becomes 34/5, so that ten frames take 68 steps, not 67.
@@ -90,7 +89,7 @@ class StepBudget:
 Budget = ClockBudget | StepBudget
 
 
-def make_budget(steps: float | int | None, rate_hz: float | int | None) -> Budget:
+def make_budget(steps: Number | None, rate_hz: Number | None) -> Budget:
     """A budget by the clock if there is a rate (Hz), else of so many steps a frame.
 
     Raises ConfigError if there are both or neither, or the number is not above zero.
@@ -106,7 +105,7 @@ _MEASURED_STEPS = {"vr": (6.8, 36.1), "sdf": (15.3, 79.3)}
 """Steps within 100 and 500 ms for the default n (VR 512, SDF 4096). Source: paper, Table II."""
 
 
-def paper_steps(tracker: str, rate_hz: float | int) -> float:
+def paper_steps(tracker: str, rate_hz: Number) -> float:
     """Steps a frame of "vr" or "sdf" on the paper's hardware, with its n; ConfigError as above.
 
     On the line through its 100 and 500 ms figures: time per step and fixed cost of a frame are then
@@ -117,7 +116,7 @@ def paper_steps(tracker: str, rate_hz: float | int) -> float:
     return round(at_100 + (at_500 - at_100) * (budget_ms - 100) / 400, 6)
 
 
-def _positive(name: str, value: float | int) -> float:
+def _positive(name: str, value: Number) -> float:
     if not (isfinite(value) and value > 0):
         raise ConfigError(
             f"{name} is {value:g}; allowed: a finite number above 0; take for example 10"

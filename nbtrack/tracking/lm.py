@@ -186,7 +186,13 @@ class LmTracker(Tracker):
         """Where else the camera may be, the likeliest first."""
         cameras = getattr(self.field, "T_world_cameras", None)
         if cameras is None:
-            return [_around(self.anchor, number) for number in range(self.settings.n_restarts)]
+            # The last good pose itself, then turned about x, y and z both ways, and wider.
+            turns = [way * axis for axis in np.eye(6)[:3] for way in (1, -1)]
+            wider = [
+                factor * turn for factor in range(1, self.settings.n_restarts) for turn in turns
+            ]
+            twists = [np.zeros(6), *(_RESTART_ANGLE * np.array(wider))]
+            return [retract(self.anchor, twist) for twist in twists]
         hypotheses = [self.anchor, *self._hypotheses(cameras.double().numpy())]
         tried = _by_cost([self._descent_from(T) for T in hypotheses])[:_TRIED]
         for descent in tried:
@@ -216,13 +222,3 @@ def _take_steps(descent: Descent, max_steps: int) -> None:
         if descent.is_ended:
             return
         descent.step()
-
-
-def _around(T_world_camera: Pose, number: int) -> Pose:
-    """The start of a restart: a pose itself, then turned about x, y and z both ways, and wider."""
-    twist = np.zeros(6)
-    if number > 0:
-        round_, which = divmod(number - 1, 6)
-        axis, way = divmod(which, 2)
-        twist[axis] = (1 + round_) * _RESTART_ANGLE * (1 - 2 * way)
-    return retract(T_world_camera, twist)

@@ -263,7 +263,6 @@ def residual_terms(observed, T, grid, is_fine):
     return terms
 
 
-@no_type_check
 def scales_of(terms, before, residual_sigma, mad_factor):
     """Robust scales of both residuals; numpy's own median, whose compilation would take seconds."""
     if (before <= residual_sigma).all():  # as in most steps: a median takes as long as many sums
