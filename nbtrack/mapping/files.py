@@ -71,14 +71,15 @@ def read_map(path: Path | str) -> Map:
     DataError where a file is damaged, of another format version, or no map at all.
     """
     path = Path(path)
-    file, history = (path / MAP_FILE, path / HISTORY_FILE) if path.is_dir() else (path, None)
+    file, history = path / MAP_FILE if path.is_dir() else path, path / HISTORY_FILE
     if not file.is_file():
-        if (path / CHECKPOINT_FILE).is_file():
-            raise MissingError(f"{path} holds an unfinished map: run its `map` command again")
-        raise MissingError(f"{path} holds no map of this nbtrack: give a folder or file it wrote")
+        advice = (
+            "give a folder or file that it wrote, or run the `map` command of that folder again"
+        )
+        raise MissingError(f"{path} holds no finished map of this nbtrack: {advice}")
     with naming_damaged(file, "map file", _AGAIN):
         stored = _read_file(file)
-    if history is None or not history.is_file():
+    if not history.is_file():
         return stored
     with naming_damaged(history, "history", "remove it, or map again"):
         return replace(stored, history=pd.read_csv(history, index_col="iteration"))
@@ -95,8 +96,6 @@ def _read_file(file: Path) -> Map:
     # A bit that flipped on a disk, or a number edited by hand, shows nowhere else.
     if header.pop("digest", None) != _digest(header, tensors):
         raise ValueError("its content is not what was written")
-    if not all(tensor.isfinite().all() for tensor in tensors.values()):
-        raise ValueError("its numbers are not finite")
     name, record = header["field"], header["made"]
     bounds = SceneBounds(*(tuple(map(float, corner)) for corner in header["bounds"]))
     if name not in FIELDS:

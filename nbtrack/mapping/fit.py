@@ -69,12 +69,9 @@ def map_sequence(
             fit = _Fit(recipe, settings, field, sequence, mapped)
             fit.run(checkpoint, on_iteration)
         history, seconds = fit.history, fit.seconds
-    record = {
-        **recipe,
-        "seconds": seconds,
-        "misfit_m": usual_depth_residual(field, sequence, mapped),
-    }
-    record |= {"mapped_frames": len(mapped), "device": device_name(device), "versions": versions()}
+    misfit_m = usual_depth_residual(field, sequence, mapped)
+    record = {**recipe, "seconds": seconds, "misfit_m": misfit_m, "mapped_frames": len(mapped)}
+    record |= {"device": device_name(device), "versions": versions()}
     return Map(field, sequence.intrinsics, record, pd.DataFrame(history).rename_axis("iteration"))
 
 
