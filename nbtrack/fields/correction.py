@@ -69,7 +69,7 @@ class CorrectedField(BakedField):
 
 
 def corrected(
-    source: Field, sequence: RgbdSequence, frames: Frames, voxel: float, seed: int = 0
+    source: Field, sequence: RgbdSequence, frames: Frames, voxel: float
 ) -> CorrectedField:
     """A map with a signed distance, corrected in cells of `voxel` (m) by its mapped frames.
 
@@ -81,7 +81,7 @@ def corrected(
     """
     source = copy.deepcopy(source).cpu()
     baked = BakedField(source, voxel)
-    points, normals, depth, color = _measured_planes(sequence, frames, seed)
+    points, normals, depth, color = _measured_planes(sequence, frames)
     asked = np.concatenate([points + offset * normals for offset in _OFFSETS])
     numbers, design, stiffness = _unknowns(*interpolation(asked, baked), baked.n_vertices)
     values = baked.volume[:4].T.double().numpy()[numbers]
@@ -106,12 +106,10 @@ def corrected(
     return CorrectedField(source, voxel, dict(zip(CORRECTIONS, parts, strict=True)))
 
 
-def _measured_planes(
-    sequence: RgbdSequence, frames: Frames, seed: int
-) -> tuple[WorldPoints, WorldPoints, np.ndarray, np.ndarray]:
-    """Random measured points (m) with a normal there, their z-depths (m) and colours in [0, 1]."""
+def _measured_planes(sequence: RgbdSequence, frames: Frames) -> tuple[np.ndarray, ...]:
+    """Random measured points (n x 3, m) with normals, their z-depths (n, m) and colours (n x 3)."""
     sampler = PixelSampler(sequence, torch.device("cpu"))
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     rays = sampler.draw(_N_POINTS, generator, torch.from_numpy(frames), tangent_planes=True)
     has_plane = rays.normals_world.any(dim=-1)
     if not has_plane.any():

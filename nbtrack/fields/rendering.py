@@ -133,8 +133,7 @@ def importance_depths(
     cdf = (share / share.sum(dim=-1, keepdim=True)).cumsum(dim=-1)
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], dim=-1)
     # Stratified in probability: fewer clumps than independent draws.
-    ones = torch.ones(len(depths), device=depths.device)
-    levels = stratified_depths(0.0, ones, n_samples, generator)
+    levels = stratified_depths(0.0, depths.new_ones(len(depths)), n_samples, generator)
     cell = torch.searchsorted(cdf, levels, right=True).clamp(1, cdf.shape[-1] - 1)
     cdf_low, cdf_high = cdf.gather(-1, cell - 1), cdf.gather(-1, cell)
     low, high = borders.gather(-1, cell - 1), borders.gather(-1, cell)

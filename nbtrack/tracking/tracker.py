@@ -188,8 +188,7 @@ class Tracker(abc.ABC):
             setattr(self, name, state[name])
 
     def _begin(self, frame: Frame, T_starts: Poses) -> None:
-        starts = torch.from_numpy(T_starts).float()
-        self.begin(frame.to(self.device), starts.to(self.device))
+        self.begin(frame.to(self.device), torch.from_numpy(T_starts).float().to(self.device))
 
     def _search(self, frame: Frame, T_starts: Poses) -> Estimate:
         if not self._is_warm and frame.has_depth:
