@@ -100,19 +100,18 @@ def read_trajectory(folder: Path) -> Trajectory:
 
 
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
-    translation_error, rotation_error = [np.nan], [np.nan]
+    distance, angle = [np.nan], [np.nan]
     T_true, T_first = sequence.T_world_camera[[index, 0]]
     if np.isfinite(T_true).all():
-        both = estimate.T_world_camera[None], T_true[None]
-        translation_error, rotation_error = pose_errors(*both)
+        distance, angle = pose_errors(estimate.T_world_camera[None], T_true[None])
     return {
         "frame_id": int(sequence.frame_ids[index]),
         "time": float(sequence.times[index]),
         "steps": estimate.steps,
         "seconds": estimate.seconds,
         "loss": estimate.loss,
-        "translation_error_m": float(translation_error[0]),
-        "rotation_error_deg": float(rotation_error[0]),
+        "translation_error_m": float(distance[0]),
+        "rotation_error_deg": float(angle[0]),
         "still_error_m": float(np.linalg.norm((T_true - T_first)[:3, 3])),  # of no motion
         "without_depth": estimate.without_depth,
         **estimate.report,
