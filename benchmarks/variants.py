@@ -56,8 +56,8 @@ class _Best(AdamTracker):
             self.least, self.best = float(loss), before.double().numpy()
         return loss
 
-    def _search(self, frame, T_starts):
-        found = super()._search(frame, T_starts)
+    def _search(self, frame, T_starts, budget):
+        found = super()._search(frame, T_starts, budget)
         return replace(found, T_world_camera=self.best)
 
 

@@ -117,6 +117,16 @@ def test_a_killed_run_goes_on_as_if_it_had_not_stopped(
     pd.testing.assert_frame_equal(resumed.frames[kept], whole.frames[kept])
 
 
+def test_an_unknown_start_is_searched_beyond_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a search for a camera somewhere in the map that ends with the budget of a frame."""
+    monkeypatch.setattr("nbtrack.tracking.trajectories.STEPS_TO_FIND", 9)
+    tracker = tracker_of("sdf", 2)
+    tracker.restart_anywhere = lambda: tracker.restart(np.eye(4))
+    tracker.report = lambda: {"lost": len(tracker.estimates) < 3}  # in the first two frames
+    found = track_sequence(tracker, walk(5), is_start_known=False)
+    assert found.frames["steps"].tolist() == [9, 9, 9, 2, 2]
+
+
 def test_the_warm_up_step_counts_nowhere() -> None:
     """Catches a first call that loads and allocates within the first frame's time, and a
     preparation that does not: with a quarter of a second for each, three steps fit in one."""

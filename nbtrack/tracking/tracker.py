@@ -135,17 +135,18 @@ class Tracker(abc.ABC):
         """What it says about its estimate, by column name; `lost`, where given, is its verdict."""
         return {}
 
-    def track(self, frame: Frame) -> Estimate:
+    def track(self, frame: Frame, budget: Budget | None = None) -> Estimate:
         """The camera's pose at the next frame; NumericalError if it is not finite.
 
-        A tracker that needs depth returns the pose that the motion model predicts where none is
-        measured, so that later frames can still be found (our choice).
+        A budget given here takes the place of the tracker's own for this frame. A tracker that
+        needs depth returns the pose that the motion model predicts where none is measured, so that
+        later frames can still be found (our choice).
         """
         T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
         estimate = Estimate(T_starts[0], without_depth=True)
         if self.copes_without_depth or frame.has_depth:
             with suitable_threads(self._width):
-                estimate = self._search(frame, T_starts)
+                estimate = self._search(frame, T_starts, budget or self.budget)
         self.estimates.append(estimate.T_world_camera)
         return estimate
 
@@ -190,7 +191,7 @@ class Tracker(abc.ABC):
     def _begin(self, frame: Frame, T_starts: Poses) -> None:
         self.begin(frame.to(self.device), torch.from_numpy(T_starts).float().to(self.device))
 
-    def _search(self, frame: Frame, T_starts: Poses) -> Estimate:
+    def _search(self, frame: Frame, T_starts: Poses, budget: Budget) -> Estimate:
         if not self._is_warm and frame.has_depth:
             # Steps that count nowhere: first calls load, allocate and record for a second or more.
             state, self._is_warm = self.state(), True
@@ -200,7 +201,7 @@ class Tracker(abc.ABC):
             self.report()
             self.restore(state)
             synchronize(self.device)
-        began, allowed = time.perf_counter(), self.budget.frame(self.device)
+        began, allowed = time.perf_counter(), budget.frame(self.device)
         self._begin(frame, T_starts)
         steps, loss = 0, float("nan")
         for step in allowed:

@@ -17,10 +17,12 @@ from nbtrack.core.device import advise_on_memory
 from nbtrack.core.errors import DataError, MissingError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.data.text_files import read_poses
+from nbtrack.tracking.budget import StepBudget
 from nbtrack.tracking.metrics import pose_errors
 from nbtrack.tracking.tracker import Estimate, Tracker
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
+STEPS_TO_FIND = 1000  # a few dozen descents
 METRICS_FILE = "metrics.json"  # written last: where it stands, a run is complete
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
@@ -45,7 +47,8 @@ def track_sequence(
     """Estimate every frame's pose from the first frame's true one, wherever the tracker was.
 
     Source: paper, Sec. I-A and the evaluation protocol: every frame is processed, none is dropped.
-    Where the start is not known, the first frame is tracked too.
+    Where the start is not known, the first frame is tracked too, and until one frame is not lost
+    each has `STEPS_TO_FIND` steps, whatever the budget (our choice).
     A checkpoint of this run is written every few seconds and resumed from; `on_frame` is told the
     index in the sequence and the translation error (m; NaN where no true pose is known). Raises
     DataError if there are fewer than two frames, or none of them has a measured depth.
@@ -63,7 +66,9 @@ def track_sequence(
                 tracker.restore(state["tracker"])
                 rows = state["rows"]
         for index in range(first + len(rows), len(sequence)):
-            rows.append(_row(sequence, index, tracker.track(sequence[index])))
+            is_found = is_start_known or not all(row["lost"] for row in rows)
+            budget = None if is_found else StepBudget(STEPS_TO_FIND)
+            rows.append(_row(sequence, index, tracker.track(sequence[index], budget)))
             on_frame(index, rows[-1]["translation_error_m"])
             if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
                 files.save_checkpoint(checkpoint, {"rows": rows, "tracker": tracker.state()})
