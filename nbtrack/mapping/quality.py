@@ -4,17 +4,17 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from nbtrack.core.arrays import Frames
+from nbtrack.core.arrays import Frames, Values
 from nbtrack.core.camera import pixel_directions
 from nbtrack.core.errors import DataError
 from nbtrack.core.geometry import transform_points
 from nbtrack.data.frame import Frame
-from nbtrack.data.pixels import PixelSampler
+from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField, PointCloud
 from nbtrack.mapping.files import Map
-from nbtrack.mapping.meshes import extract_mesh, query_field, seen_by
-from nbtrack.synthetic import Room, true_surface_points
+from nbtrack.mapping.meshes import extract_mesh, query_field
+from nbtrack.synthetic import Room
 
 Scores = dict[str, float | None]
 SCORES = (
@@ -60,9 +60,12 @@ def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -
     if len(held_out) and isinstance(field, LearnedField):
         scores |= _score_images(field, sequence, held_out, room)
     if room is not None:
+        generator = torch.Generator().manual_seed(0)
+        sampler = PixelSampler(sequence, torch.device("cpu"))
+        rays = sampler.draw(POINTS_SCORED, generator, torch.from_numpy(mapped))
         if field.is_distance:
-            scores |= _score_sdf(field, sequence, mapped, room)
-        scores |= _score_surface(field, sequence, mapped, room)
+            scores |= _score_sdf(field, rays, generator, room)
+        scores |= _score_surface(field, sequence, mapped, rays, room)
     return scores
 
 
@@ -79,21 +82,21 @@ def _score_images(
     origins, directions = rays.origins_world[hit], rays.directions_world[hit]
     color, depth = field.render_rays(origins, directions)
     psnr_db = -10 * float(np.log10((color - rays.color[hit]).square().mean().item()))
-    reference = rays.depth[hit].cpu()
-    if room is not None:
-        exact = (rays.cpu().double().numpy() for rays in (origins, directions))
-        reference = torch.from_numpy(room.first_hit(*exact)[0]).float()
-    return {"psnr_db": psnr_db, "depth_l1_m": (depth.cpu() - reference).abs().mean().item()}
+    reference = (rays.depth if room is None else _exact_depths(rays, room))[hit]
+    return {"psnr_db": psnr_db, "depth_l1_m": (depth - reference).cpu().abs().mean().item()}
 
 
-def _score_sdf(field: Field, sequence: RgbdSequence, mapped: Frames, room: Room) -> Scores:
+def _exact_depths(rays: Rays, room: Room) -> Values:
+    """The z-depth (m) at which each ray meets the room's surface."""
+    exact = (part.cpu().double().numpy() for part in (rays.origins_world, rays.directions_world))
+    return torch.from_numpy(room.first_hit(*exact)[0]).to(rays.depth)
+
+
+def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room) -> Scores:
     """Mean |error| (m) of the signed distance near surfaces and in free space that was seen.
 
     Points lie on rays of mapped frames: half between camera and surface, half near the surface.
     """
-    generator = torch.Generator().manual_seed(0)
-    sampler = PixelSampler(sequence, torch.device("cpu"))
-    rays = sampler.draw(POINTS_SCORED, generator, torch.from_numpy(mapped))
     offsets = torch.rand(len(rays.depth), generator=generator)
     is_in_front = torch.arange(len(rays.depth)) % 2 == 0
     around = rays.depth + NEAR * (2 * offsets - 1)
@@ -105,8 +108,12 @@ def _score_sdf(field: Field, sequence: RgbdSequence, mapped: Frames, room: Room)
     return {"sdf_near_m": float(error[is_near].mean()), "sdf_free_m": float(error[is_free].mean())}
 
 
-def _score_surface(field: Field, sequence, mapped: Frames, room: Room) -> Scores:
-    """Accuracy, completion (m) and F-score of the seen part of a map's surface, if it has one."""
+def _score_surface(field: Field, sequence, mapped: Frames, rays: Rays, room: Room) -> Scores:
+    """Accuracy, completion (m) and F-score of the seen part of a map's surface, if it has one.
+
+    The true surface is where rays of mapped frames meet the room, one point a cell of 5 cm: what is
+    near the camera counts no more than what is far.
+    """
     try:
         mesh = extract_mesh(field, sequence, mapped)
     except DataError:
@@ -115,8 +122,9 @@ def _score_surface(field: Field, sequence, mapped: Frames, room: Room) -> Scores
         points = np.random.default_rng(0).permutation(mesh.vertices)[:POINTS_SCORED]
     else:
         points = mesh.sample(POINTS_SCORED, seed=0)
-    true_points = true_surface_points(room, POINTS_SCORED, seed=0)
-    true_points = true_points[seen_by(true_points, sequence, mapped)]
+    true_points = rays.points(_exact_depths(rays, room)[:, None])[rays.depth > 0, 0].numpy()
+    cells = np.floor(true_points / NEAR).astype(int)
+    true_points = true_points[np.unique(cells, axis=0, return_index=True)[1]]
     to_truth, to_map = np.abs(room.sdf(points)), cKDTree(points).query(true_points)[0]
     precision, recall = float((to_truth < NEAR).mean()), float((to_map < NEAR).mean())
     return {

@@ -3,4 +3,4 @@
 from nbtrack.synthetic.make import make_room, room_frames, room_intrinsics, room_of, room_version
 from nbtrack.synthetic.motion import handheld_trajectory
 from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame
-from nbtrack.synthetic.room import REPORTED_ROOMS, ROOMS, Room, build_room, true_surface_points
+from nbtrack.synthetic.room import REPORTED_ROOMS, ROOMS, Room, build_room

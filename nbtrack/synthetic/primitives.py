@@ -53,10 +53,9 @@ def _round_interval(offsets: Origins, directions: Points, radius: float) -> Inte
 class Solid:
     """A closed convex body that is a box in its own coordinates.
 
-    A subclass has a `center` (world frame, m) and an `area` of its surface (m²). `_coordinates`
-    maps points to coordinates (m, not negative), which are inside up to `_half`. `_crossing` gives
-    the interval in which a line is inside. `normals` gives unit outward normals at points on the
-    surface, and `sample_surface` draws uniform points there.
+    A subclass has a `center` (world frame, m). `_coordinates` maps points to coordinates (m, not
+    negative), which are inside up to `_half`. `_crossing` gives the interval in which a line is
+    inside. `normals` gives unit outward normals at points on the surface.
     """
 
     @cached_property
@@ -111,20 +110,6 @@ class Box(Solid):
         axis = (np.abs(local) - self._half).argmax(axis=1)
         return np.eye(3)[axis] * np.where(local < 0, -1.0, 1.0) @ self._axes.T
 
-    def area(self) -> float:
-        """Surface area (m²)."""
-        x, y, z = self.size
-        return 2 * (x * y + y * z + z * x)
-
-    def sample_surface(self, n: int, rng: np.random.Generator) -> Points:
-        """Uniform points on the six faces."""
-        x, y, z = half = self._half
-        face_areas = np.array([y * z, x * z, x * y])
-        axes = rng.choice(3, size=n, p=face_areas / face_areas.sum())
-        local = rng.uniform(-1.0, 1.0, (n, 3)) * half
-        local[np.arange(n), axes] = rng.choice([-1.0, 1.0], n) * half[axes]
-        return local @ self._axes.T + self.center
-
 
 class RoomShell(Box):
     """Walls, floor and ceiling: the solid is everything outside a cuboid, normals point inwards."""
@@ -166,16 +151,6 @@ class Sphere(Solid):
     def normals(self, points: Points) -> Points:
         """Unit radial directions."""
         return (points - self.center) / self.radius
-
-    def area(self) -> float:
-        """Surface area (m²)."""
-        return 4 * np.pi * self.radius**2
-
-    def sample_surface(self, n: int, rng: np.random.Generator) -> Points:
-        """Uniform points, as normalised Gaussian vectors."""
-        vectors = rng.normal(size=(n, 3))
-        scale = self.radius / np.linalg.norm(vectors, axis=1, keepdims=True)
-        return vectors * scale + self.center
 
 
 @dataclass(frozen=True)
@@ -226,21 +201,3 @@ class Cylinder(Solid):
         lengths = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
         cap = np.where(along < 0, -1.0, 1.0)[:, None] * self._axis
         return np.where(from_cap > from_side, cap, across / lengths)
-
-    def area(self) -> float:
-        """Surface area (m²), caps included."""
-        return 2 * np.pi * self.radius * (2 * self._half[1] + self.radius)
-
-    def sample_surface(self, n: int, rng: np.random.Generator) -> Points:
-        """Uniform points on side and caps."""
-        axis, (radius, half) = self._axis, self._half
-        # The coordinate axis least aligned with the cylinder spans the plane of its caps.
-        first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-        first /= np.linalg.norm(first)
-        second = np.cross(axis, first)
-        angles = rng.uniform(0.0, 2 * np.pi, n)
-        on_side = rng.uniform(size=n) < 2 * half / (2 * half + radius)
-        radii = radius * np.where(on_side, 1.0, np.sqrt(rng.uniform(size=n)))
-        heights = half * np.where(on_side, rng.uniform(-1.0, 1.0, n), rng.choice([-1.0, 1.0], n))
-        rings = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
-        return self.center + radii[:, None] * rings + heights[:, None] * axis

@@ -1,15 +1,15 @@
-"""The furnished rooms of `rooms.toml`: exact distance, ray casting, colors, surface points."""
+"""The furnished rooms of `rooms.toml`: exact distance, ray casting, colors."""
 
 import tomllib
 import zlib
 from dataclasses import dataclass
-from functools import cache, partial, reduce
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nbtrack.core.errors import MissingError, NumericalError, nearest_name
+from nbtrack.core.errors import MissingError, nearest_name
 from nbtrack.synthetic import materials, primitives
 from nbtrack.synthetic.materials import Light, Material, Pair, Part
 from nbtrack.synthetic.primitives import Array3, Indices, Origins, Points, Values, row_dot
@@ -48,25 +48,19 @@ class Room:
         """A number made of the name, so that one seed means another path in every room."""
         return zlib.crc32(self.name.encode())
 
-    def sdf(self, points: Points) -> Values:
+    def sdf(self, points: Points, limit: float = np.inf) -> Values:
         """Signed distance (m) to the nearest surface, positive in free space and exact there.
 
         Within matter it is exact for a body that stands alone; where bodies touch or overlap (a
-        leg let into its table top) the true depth below the surface is at least as large.
+        leg let into its table top) the true depth below the surface is at least as large. Larger
+        distances than the limit are given as the limit. A small one is fast: solids whose bounding
+        sphere is farther away are left out.
         """
-        return reduce(np.minimum, (part.solid.sdf(points) for part in self.parts))
-
-    def sdf_up_to(self, points: Points, limit: float) -> Values:
-        """`min(sdf, limit)`, fast for small limits: far solids are skipped by bounding spheres."""
         distance = np.full(len(points), limit)
-        centers = np.array([part.solid.center for part in self.parts])
-        reach = np.array([part.solid.reach for part in self.parts]) + limit
-        # |p - c|² < reach² for all pairs by one product; the slack covers its rounding.
-        squared = row_dot(points, points)[:, None] - 2 * points @ centers.T
-        near = squared < reach**2 - row_dot(centers, centers) + 1e-6
-        for part, chosen in zip(self.parts, near.T, strict=True):
-            rows = np.flatnonzero(chosen)
-            distance[rows] = np.minimum(distance[rows], part.solid.sdf(points[rows]))
+        for part in self.parts:
+            offsets = points - part.solid.center
+            near = np.flatnonzero(row_dot(offsets, offsets) < (part.solid.reach + limit) ** 2)
+            distance[near] = np.minimum(distance[near], part.solid.sdf(points[near]))
         return distance
 
     def first_hit(self, origins: Origins, directions: Points) -> tuple[Values, Indices]:
@@ -101,7 +95,7 @@ class Room:
             normals[chosen] = part.solid.normals(points[chosen])
             albedo[chosen] = part.material(points[chosen])
         lifted = points + _OPENNESS_RADIUS * normals
-        openness = np.maximum(self.sdf_up_to(lifted, _OPENNESS_RADIUS), 0.0) / _OPENNESS_RADIUS
+        openness = np.maximum(self.sdf(lifted, _OPENNESS_RADIUS), 0.0) / _OPENNESS_RADIUS
         return t, self.light.shade(albedo, points, normals, openness), index
 
 
@@ -139,31 +133,3 @@ def _resolved(value: Any, named: dict[str, Material]) -> Any:
     if isinstance(value, list):
         return tuple(_resolved(item, named) for item in value)
     return named[value] if isinstance(value, str) else value
-
-
-def true_surface_points(room: Room, n: int, seed: int) -> Points:
-    """`n` world points (m), uniform over the surface that borders free space.
-
-    Points are drawn on every solid in proportion to its area and kept where a step of a
-    millimetre along the normal leads into free space: no camera could see the others.
-    Raises `NumericalError` where nearly no surface borders free space.
-    """
-    rng, step = np.random.default_rng(seed), 1e-3
-    solids = [part.solid for part in room.parts]
-    areas = np.array([solid.area() for solid in solids])
-    kept = np.empty((0, 3))
-    for _ in range(20):
-        counts = rng.multinomial(n, areas / areas.sum()).tolist()
-        drawn = [solid.sample_surface(k, rng) for solid, k in zip(solids, counts, strict=True)]
-        normals = [solid.normals(points) for solid, points in zip(solids, drawn, strict=True)]
-        points = np.concatenate(drawn)
-        # Where two surfaces meet at an angle the step may pass nearer to the other one.
-        exposed = room.sdf(points + step * np.concatenate(normals)) > step / 4
-        exposed &= np.abs(room.sdf(points)) < 1e-6
-        kept = np.concatenate([kept, rng.permutation(points[exposed])])
-        if len(kept) >= n:
-            return kept[:n]
-    raise NumericalError(
-        f"room '{room.name}': only {len(kept)} of {n} surface points border free space; "
-        "solids must not fill the shell; check their places"
-    )
