@@ -11,11 +11,10 @@ from scipy.spatial import cKDTree
 from nbtrack.core.errors import ConfigError, DataError, MissingError
 from nbtrack.data.sequence import read_sequence
 from nbtrack.synthetic import make_room, room_frames, room_intrinsics, room_of
-from nbtrack.synthetic.motion import handheld_trajectory, motion_statistics
+from nbtrack.synthetic.motion import handheld_trajectory, steps_between, tour
 from nbtrack.synthetic.primitives import Box, Cylinder, RoomShell, Sphere
 from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame
 from nbtrack.synthetic.room import REPORTED_ROOMS, ROOMS, Room, build_room
-from nbtrack.synthetic.tour import tour
 
 SOLIDS = {
     "box": Box((0.1, -0.2, 0.3), (0.8, 0.5, 1.1)),
@@ -212,9 +211,9 @@ def test_camera_passes_the_doorway(seed):
 def test_motion_is_hand_held(room, n_frames, seed, turn):
     """Catches paths too fast, too jerky, too near to furniture, or that stare at one spot."""
     T_world_camera = path_of(room, n_frames, seed)
-    mean_mm, max_mm, mean_deg, max_deg = motion_statistics(T_world_camera)
-    assert 5 <= mean_mm <= 7 < max_mm <= 18
-    assert 0.5 <= mean_deg <= 0.8 < max_deg <= 1.95
+    mm, degrees = steps_between(T_world_camera)
+    assert 5 <= mm.mean() <= 7 < mm.max() <= 18
+    assert 0.5 <= degrees.mean() <= 0.8 < degrees.max() <= 1.95
     positions, rotation = T_world_camera[:, :3, 3], T_world_camera[:, :3, :3]
     assert room.sdf(positions).min() >= 0.35
     assert np.abs(positions[:, 1] - 1.4).max() <= 0.3
@@ -242,10 +241,10 @@ def test_a_tour_passes_all_of_the_room(room):
     jerks, or turns faster than a hand-held camera does."""
     poses = tour(room, 1200, 0)
     positions = poses[:, :3, 3]
-    _, max_mm, _, max_deg = motion_statistics(poses)
+    mm, degrees = steps_between(poses)
     assert room.sdf(positions).min() >= 0.35
-    assert max_deg < 3
-    assert np.linalg.norm((positions[-1] - positions[0])[::2]) < 2 * max_mm / 1e3
+    assert degrees.max() < 3
+    assert np.linalg.norm((positions[-1] - positions[0])[::2]) < 2 * mm.max() / 1e3
     # A place at eye level with half a metre around it is at most 2 m of walking away.
     rng, size = np.random.default_rng(0), np.array(room.parts[0].solid.size)
     places = (rng.random((500, 3)) - 0.5) * size * [1, 0, 1] + [0, 1.4, 0]

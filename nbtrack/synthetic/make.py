@@ -4,20 +4,17 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from nbtrack.core.arrays import Pose
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import ConfigError, DataError, nearest_name
+from nbtrack.core.errors import ConfigError, DataError, look_up
 from nbtrack.core.files import fingerprint, json_text, naming_damaged, sources_fingerprint
 from nbtrack.data.writer import WrittenFrame, write_sequence
-from nbtrack.synthetic.motion import handheld_trajectory
+from nbtrack.synthetic.motion import handheld_trajectory, tour
 from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame
 from nbtrack.synthetic.room import Room, build_room, description
-from nbtrack.synthetic.tour import tour
 
 ROOM_FILE = "room.json"
 ROOM_VERSION = 2  # raise it when a room, the motion or the sensor model changes
@@ -45,24 +42,21 @@ def room_frames(
     for label, value, minimum in asked:
         if value < minimum:
             raise ConfigError(f"{label} = {value}; {minimum} or more are allowed; raise it")
-    if motion not in MOTIONS:
-        raise ConfigError(f"unknown motion {motion!r}: {nearest_name(motion, [*MOTIONS])}")
-    poses = MOTIONS[motion](room, n_frames, seed)
-    make = partial(_make_frame, room, room_intrinsics(width, height), seed)
+    camera = room_intrinsics(width, height)
+    poses = look_up("motion", motion, MOTIONS)(room, n_frames, seed)
+
+    def make_frame(number: int) -> WrittenFrame:
+        color, depth, _ = render_frame(room, camera, poses[number])
+        rng = np.random.default_rng([seed, number, room.number])
+        noisy = add_kinect_noise(depth, camera.fx, rng)
+        maps = {"depth": depth, "depth_with_noise": noisy, "depth_filtered": filter_depth(noisy)}
+        depths_mm = {name: np.rint(1e3 * values).astype(np.uint16) for name, values in maps.items()}
+        return color, depths_mm, poses[number]
+
     # NumPy releases the interpreter lock, so threads suffice.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for start in range(0, n_frames, _FRAMES_AT_ONCE):
-            block = poses[start : start + _FRAMES_AT_ONCE]
-            yield from pool.map(make, range(start, n_frames), block)
-
-
-def _make_frame(room: Room, camera: Intrinsics, seed: int, number: int, pose: Pose) -> WrittenFrame:
-    color, depth, _ = render_frame(room, camera, pose)
-    rng = np.random.default_rng([seed, number, room.number])
-    noisy = add_kinect_noise(depth, camera.fx, rng)
-    maps = {"depth": depth, "depth_with_noise": noisy, "depth_filtered": filter_depth(noisy)}
-    depths_mm = {name: np.rint(1e3 * values).astype(np.uint16) for name, values in maps.items()}
-    return color, depths_mm, pose
+            yield from pool.map(make_frame, range(n_frames)[start : start + _FRAMES_AT_ONCE])
 
 
 def make_room(

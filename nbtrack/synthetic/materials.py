@@ -125,13 +125,9 @@ def lining(
     points: Points, shell: Box, floor: Material, ceiling: Material, sides: Material, ends: Material
 ) -> Points:
     """Of a room's shell; `sides` are the walls perpendicular to x, `ends` those to z."""
-    colors, normals = np.empty_like(points), shell.normals(points)
-    for chosen, material in (
-        (normals[:, 1] > 0.5, floor),
-        (normals[:, 1] < -0.5, ceiling),
-        (np.abs(normals[:, 0]) > 0.5, sides),
-        (np.abs(normals[:, 2]) > 0.5, ends),
-    ):
+    colors, (side, up, end) = np.empty_like(points), shell.normals(points).T
+    walls = (np.abs(side) > 0.5, sides), (np.abs(end) > 0.5, ends)
+    for chosen, material in ((up > 0.5, floor), (up < -0.5, ceiling), *walls):
         colors[chosen] = material(points[chosen])
     return colors
 

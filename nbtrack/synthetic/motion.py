@@ -1,34 +1,36 @@
-"""Smooth trajectories like those of a hand-held 30 Hz camera carried through a room."""
+"""Paths of a hand-held 30 Hz camera: a glance around in a room, and a walk around the whole of it.
+
+Both have height, tilt and roll that wander, bursts of speed, and a tremor. Source: our choice.
+"""
 
 import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
 from scipy.interpolate import CubicSpline
+from skimage.graph import MCP_Geometric, route_through_array
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import NumericalError
 from nbtrack.synthetic.primitives import Points, Values
 from nbtrack.synthetic.room import Room, Walk
 
-MEAN_STEP_MM = 6.0  # translation a frame; hand-held recordings at 30 Hz move 5 to 7
-MEAN_STEP_DEG = 0.65  # rotation a frame; hand-held recordings turn 0.5 to 0.8
+# Translation (mm) and rotation (degrees) a frame; hand-held recordings at 30 Hz have 5 to 7 and 0.5
+# to 0.8.
+MEAN_STEP = np.array([6.0, 0.65])
 HEIGHTS = (1.1, 1.7)  # m above the floor
 CLEARANCE = 0.35  # m, least distance of the camera to any surface (our choice)
-_KNOT_SPACING = 0.35  # rad of turning between knots of the path, about 35 frames
-_BURST_FRAMES = 14  # frames between knots of the speed
+_KNOT_SPACING = 0.35  # rad of turning between knots of a glance around, about 35 frames
 _CALIBRATION_FRAMES = 120  # shorter trajectories are the beginning of one of this length
 # How far a seed moves the center of a path (m, along x and z) and turns its start (rad): paths of
 # two seeds cross each other and see the same side of the room.
 _CENTER_REACH, _HEADING_REACH = 0.3, 0.25
 _FLATTENING = 0.25  # width of the path's ellipse over its length
 _ATTEMPTS = 400
-
-
-def motion_statistics(T_world_camera: Poses) -> tuple[float, float, float, float]:
-    """Mean and largest translation (mm), mean and largest rotation (degrees) between frames."""
-    step_mm = 1e3 * np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
-    chord = np.linalg.norm(np.diff(T_world_camera[:, :3, :3], axis=0), axis=(1, 2))
-    # |R1 - R0| (Frobenius) = 2 sqrt(2) sin(angle / 2): accurate for the small angles here.
-    step_deg = np.degrees(2 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0)))
-    return tuple(float(f(steps)) for steps in (step_mm, step_deg) for f in (np.mean, np.max))
+_CELL = 0.1  # m, of a tour's plan of free space
+_MARGIN = 0.1  # m that the plan keeps in addition to the clearance, since the path is smoothed
+_COVERED = 2.0  # m: the tour passes so near to every free place
+_SMOOTHED = 0.4  # m, std of the tour's smoothing along itself
+_AHEAD = 45.0  # frames, std of the smoothing of the direction of view: 180 degrees in about 120
 
 
 def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
@@ -40,7 +42,7 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     ellipse a little, so that two seeds give two paths past the same things. Reach, height (1.1 to
     1.7 m), direction, tilt and roll wander as cubic splines (twice continuously differentiable),
     the speed varies up to threefold, and a hand's tremor of 1.5 to 5 Hz lies on top. Mean speeds
-    over the trajectory, or 120 frames if it is shorter, are `MEAN_STEP_MM` and `MEAN_STEP_DEG`.
+    over the trajectory, or 120 frames if it is shorter, are `MEAN_STEP`.
 
     Raises `NumericalError` where no path keeps `CLEARANCE`: the room is too full.
     Source: our choice; the statistics are those of hand-held RGB-D recordings.
@@ -49,13 +51,11 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([seed, attempt, room.number])
         poses = _calibrated_path(room.walk, length, rng)
-        mean_mm, max_mm, mean_deg, max_deg = motion_statistics(poses)
-        calm = max_mm < 3 * MEAN_STEP_MM and max_deg < 3 * MEAN_STEP_DEG
-        calm &= abs(mean_mm / MEAN_STEP_MM - 1) < 0.05
-        calm &= abs(mean_deg / MEAN_STEP_DEG - 1) < 0.05
-        positions = poses[:, :3, 3]
-        upright = positions[:, 1].min() >= HEIGHTS[0] and positions[:, 1].max() <= HEIGHTS[1]
-        if calm and upright and room.sdf(positions).min() >= CLEARANCE:
+        steps, height = steps_between(poses), poses[:, 1, 3]
+        calm = (steps.max(axis=1) < 3 * MEAN_STEP).all()
+        calm &= (np.abs(steps.mean(axis=1) / MEAN_STEP - 1) < 0.05).all()
+        upright = height.min() >= HEIGHTS[0] and height.max() <= HEIGHTS[1]
+        if calm and upright and room.sdf(poses[:, :3, 3]).min() >= CLEARANCE:
             return poses[:n_frames]
     raise NumericalError(
         f"room '{room.name}': none of {_ATTEMPTS} paths keeps {CLEARANCE} m from every surface; "
@@ -64,65 +64,142 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
 
 
 def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
-    """Draw a path and its speed; adjust turning rate and radius until mean speeds are as wanted."""
-    knots = np.arange(-2.0, 1.6 * length * np.radians(MEAN_STEP_DEG) / _KNOT_SPACING + 4.0)
+    """Draw a path and its speed; adjust radius and turning rate until mean speeds are as wanted."""
+    knots = np.arange(-2.0, 1.6 * length * np.radians(MEAN_STEP[1]) / _KNOT_SPACING + 4.0)
     # Radius (relative), side (rad), yaw (rad), pitch (rad), roll (rad), height (m).
     spread = np.array([0.04, 0.05, 0.07, 0.09, 0.025, 0.05])
     values = spread * np.clip(rng.normal(size=(len(knots), 6)), -2.0, 2.0)
     values[:, 3] += walk.pitch
     values[:, 5] = np.clip(values[:, 5] + rng.uniform(1.3, 1.5), 1.15, 1.65)
     path = CubicSpline(knots * _KNOT_SPACING, values)  # over the angle turned
-    speed = relative_speed(length, rng)
-    trembling = tremor(length, rng)
+    speed, trembling = _relative_speed(length, rng), _tremor(length, rng)
     center = np.asarray(walk.center) + rng.uniform(-_CENTER_REACH, _CENTER_REACH, 2)
     heading = walk.start_yaw + rng.uniform(-_HEADING_REACH, _HEADING_REACH)
-    rate, radius = np.radians(0.5), 0.7
+    axes = -np.array([[np.sin(heading), np.cos(heading)], [np.cos(heading), -np.sin(heading)]])
+    radius, rate = 0.7, np.radians(0.5)
     for _ in range(12):
-        turned = rate * np.concatenate([[0.0], np.cumsum(speed)[:-1]])
-        poses = _poses(center, heading, walk.turn * turned, path(turned), radius, trembling)
-        mean_mm, _, mean_deg, _ = motion_statistics(poses)
-        rate *= np.clip(MEAN_STEP_DEG / mean_deg, 0.7, 1.4)
-        radius *= np.clip(MEAN_STEP_MM / mean_mm, 0.7, 1.4)
+        angle = rate * np.concatenate([[0.0], np.cumsum(speed)[:-1]])
+        relative_radius, side, yaw_offset, pitch, roll, height = path(angle).T
+        turned = walk.turn * angle
+        # Opposite to the direction of view, so that the room lies before the camera.
+        along, across = -np.cos(turned + side), -_FLATTENING * np.sin(turned + side)
+        reach = radius * (1.0 + relative_radius[:, None])
+        x, z = (center + reach * (np.stack([along, across], axis=1) @ axes)).T
+        yaw = heading + turned + yaw_offset
+        poses = _camera_poses((x, height, z), yaw, pitch, roll, trembling)
+        slower = np.clip(MEAN_STEP / steps_between(poses).mean(axis=1), 0.7, 1.4)
+        radius, rate = radius * slower[0], rate * slower[1]
     return poses
 
 
-def relative_speed(length: int, rng: np.random.Generator) -> Values:
+def steps_between(T_world_camera: Poses) -> Float[np.ndarray, "2 n"]:
+    """Translations (mm) and rotations (degrees) from frame to frame."""
+    step_mm = 1e3 * np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
+    chord = np.linalg.norm(np.diff(T_world_camera[:, :3, :3], axis=0), axis=(1, 2))
+    # |R1 - R0| (Frobenius) = 2 sqrt(2) sin(angle / 2): accurate for the small angles here.
+    step_deg = np.degrees(2 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0)))
+    return np.stack([step_mm, step_deg])
+
+
+def tour(room: Room, n_frames: int, seed: int) -> Poses:
+    """Camera-to-world poses (OpenCV axes) of a closed walk around a room's free space.
+
+    The walk passes within 1.2 m of every place where a camera has room, by the nearest one that it
+    has not passed, and returns to its start. The camera looks ahead and turns slowly. Its mean
+    speed is the length of the walk over the frames. A seed chooses where the walk begins, and what
+    wanders.
+
+    Raises `NumericalError` where the walk comes nearer than `CLEARANCE` to a surface.
+    Source: our choice.
+    """
+    rng = np.random.default_rng([seed, room.number])
+    around = _closed_walk(room, rng)
+    length = np.linalg.norm(np.diff(around, axis=0, append=around[:1]), axis=1)
+    # Three rounds, so that smoothing and interpolation meet no end in the middle one.
+    covered = np.concatenate([[0.0], np.cumsum(np.tile(length, 3))[:-1]])
+    curve = CubicSpline(covered, np.tile(around, (3, 1)))
+    speed = _relative_speed(n_frames, rng)
+    share = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) / speed.sum()
+    at = length.sum() * (1 + share)
+    x, z = curve(at).T
+    forward = curve(np.concatenate([at - length.sum(), at, at + length.sum()]), 1)
+    yaw = np.unwrap(np.arctan2(-forward[:, 0], -forward[:, 1]))
+    yaw = ndimage.gaussian_filter1d(yaw, _AHEAD)[n_frames : 2 * n_frames]
+    height = rng.uniform(1.3, 1.5) + _wander(n_frames, rng, 0.05)
+    pitch = room.walk.pitch + _wander(n_frames, rng, 0.09)
+    roll, trembling = _wander(n_frames, rng, 0.025), _tremor(n_frames, rng)
+    poses = _camera_poses((x, height, z), yaw, pitch, roll, trembling)
+    nearest = room.sdf(poses[:, :3, 3]).min()
+    if nearest < CLEARANCE:
+        raise NumericalError(
+            f"room '{room.name}': the tour comes within {nearest:.2f} m of a surface; "
+            f"{CLEARANCE} m or more are allowed; move the furniture"
+        )
+    return poses
+
+
+def _closed_walk(room: Room, rng: np.random.Generator) -> Points:
+    """Places (n x 2: x and z, m) of a smooth closed walk past all of a room's free space."""
+    shell = room.parts[0].solid
+    x, z = (np.arange(_CELL - side / 2, side / 2, _CELL) for side in shell.size[::2])
+    heights = np.linspace(*HEIGHTS, 5)
+    points = np.stack(np.meshgrid(x, heights, z, indexing="ij"), axis=-1)
+    clearance = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:3]).min(axis=1)
+    labels, _ = ndimage.label(clearance >= CLEARANCE + _MARGIN)
+    free = labels == 1 + np.bincount(labels.ravel())[1:].argmax()  # the largest connected part
+    cells = [tuple(cell) for cell in np.argwhere(free)]
+    # Begin as far from a random place as one can walk, then go where one has not been.
+    somewhere = cells[rng.integers(len(cells))]
+    passed = [cells[_walked(free, [somewhere])[free].argmax()]]
+    while (lengths := _walked(free, passed)[free]).max() > _COVERED:
+        passed.append(cells[lengths.argmax()])
+    ordered = [passed.pop(0)]
+    while passed:
+        nearest = min(passed, key=_walked(free, ordered[-1:]).__getitem__)
+        passed.remove(nearest)
+        ordered.append(nearest)
+    costs = np.where(free, 1.0 / np.maximum(clearance - CLEARANCE, 0.01), -1.0)  # the middle
+    route = []
+    for start, end in zip(ordered, ordered[1:] + ordered[:1], strict=True):
+        route += route_through_array(costs, start, end, geometric=True)[0][:-1]
+    rows, columns = np.array(route).T
+    places = np.stack([x[rows], z[columns]], axis=1)
+    return ndimage.gaussian_filter1d(places, _SMOOTHED / _CELL, axis=0, mode="wrap")
+
+
+def _walked(free: np.ndarray, starts: list) -> np.ndarray:
+    """Length (m) of the shortest walk from any start to every free cell of a plan."""
+    return MCP_Geometric(np.where(free, _CELL, -1.0)).find_costs(starts)[0]
+
+
+def _wander(
+    n_frames: int, rng: np.random.Generator, std: float, spacing: int = 40, limit: float = 2.0
+) -> Values:
+    """A smooth random curve with knots every `spacing` frames, up to `limit` times the std."""
+    knots = np.arange(-1.0, n_frames / spacing + 3.0)
+    values = std * np.clip(rng.normal(size=len(knots)), -limit, limit)
+    return CubicSpline(knots, values)(np.arange(n_frames) / spacing)
+
+
+def _relative_speed(n_frames: int, rng: np.random.Generator) -> Values:
     """A smooth speed of each frame, up to threefold from slow to fast, of mean 1."""
-    bursts = np.arange(-1.0, length / _BURST_FRAMES + 3.0)
-    values = 0.4 * np.clip(rng.normal(size=len(bursts)), -1.6, 1.6)
-    speed = np.exp(CubicSpline(bursts, values)(np.arange(length) / _BURST_FRAMES))
+    speed = np.exp(_wander(n_frames, rng, 0.4, spacing=14, limit=1.6))
     return speed / speed.mean()
 
 
-def tremor(length: int, rng: np.random.Generator) -> Points:
-    """A hand's tremor, (length, 6): translation (m) and rotation (pitch, yaw, roll; rad).
+def _tremor(n_frames: int, rng: np.random.Generator) -> Float[np.ndarray, "n 6"]:
+    """A hand's tremor: translation (m) and rotation (pitch, yaw, roll; rad).
 
     Four sines of 1.5 to 5 Hz each.
     """
     cycles_per_frame, phases = rng.uniform(1.5, 5.0, (4, 6)) / 30, rng.uniform(0, 2 * np.pi, (4, 6))
     amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / 2.0
-    waves = np.sin(2 * np.pi * cycles_per_frame * np.arange(length)[:, None, None] + phases)
+    waves = np.sin(2 * np.pi * cycles_per_frame * np.arange(n_frames)[:, None, None] + phases)
     return amplitude * waves.sum(axis=1)
 
 
-def _poses(center, heading: float, turned: Values, wander, radius: float, trembling) -> Poses:
-    """Poses (OpenCV axes) along an ellipse by the angle turned (rad), wandering and trembling.
-
-    `center` (m) is x and z of the ellipse, `heading` (rad) the yaw from its first end to the other,
-    `radius` (m) half its length.
-    """
-    relative_radius, side, yaw_offset, pitch, roll, height = wander.T
-    # Opposite to the direction of view, so that the room lies before the camera.
-    along, across = -np.cos(turned + side), -_FLATTENING * np.sin(turned + side)
-    axes = -np.array([[np.sin(heading), np.cos(heading)], [np.cos(heading), -np.sin(heading)]])
-    reach = radius * (1.0 + relative_radius[:, None])
-    x, z = (center + reach * (np.stack([along, across], axis=1) @ axes)).T
-    positions = np.stack([x, height, z], axis=1)
-    return camera_poses(positions, heading + turned + yaw_offset, pitch, roll, trembling)
-
-
-def camera_poses(positions: Points, yaw: Values, pitch: Values, roll: Values, trembling) -> Poses:
-    """Poses (OpenCV axes) at positions (n x 3, m) with angles (rad), and a tremor on top.
+def _camera_poses(places, yaw: Values, pitch: Values, roll: Values, trembling) -> Poses:
+    """Poses (OpenCV axes) at places (x, y and z, m) with angles (rad), and a tremor on top.
 
     Yaw 0 looks along -z and positive turns left; positive pitch looks up.
     """
@@ -132,8 +209,8 @@ def camera_poses(positions: Points, yaw: Values, pitch: Values, roll: Values, tr
     forward = np.stack(forward, axis=-1)
     right = np.stack([np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)], axis=-1)
     down, cosine, sine = np.cross(forward, right), np.cos(roll), np.sin(roll)
-    poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, :3, 3] = positions + trembling[:, :3]
+    poses = np.tile(np.eye(4), (len(yaw), 1, 1))
+    poses[:, :3, 3] = np.stack(places, axis=1) + trembling[:, :3]
     axes = [cosine * right + sine * down, cosine * down - sine * right, forward]
     poses[:, :3, :3] = np.stack(axes, axis=-1)
     return poses
