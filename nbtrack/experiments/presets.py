@@ -15,8 +15,7 @@ from nbtrack.core.settings import may_be_zero, with_settings, with_values
 from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, PointMapping, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
-from nbtrack.tables import PAPER_SCENE_LABELS
-from nbtrack.tables.layout import PAPER_PIXELS
+from nbtrack.tables import PAPER_PIXELS, PAPER_SCENE_LABELS
 from nbtrack.tracking import TRACKERS, TrackerSettings, tracker_class
 
 
