@@ -49,6 +49,8 @@ FRAMES = pd.DataFrame({
     "frame_id": [33, 36], "time": [1.1, 1.2], "translation_error_m": [0.01, 0.3],
     "rotation_error_deg": [0.1, 0.2], "still_error_m": [0.02, 0.04],
 })  # fmt: skip
+CLOUD = pd.DataFrame(np.random.default_rng(0).uniform(0, 1, (50, 6)))
+CLOUD.columns = ["x", "y", "z", "red", "green", "blue"]
 
 
 @pytest.fixture(scope="module")
@@ -88,15 +90,12 @@ FIGURES = {
     "points": lambda s: plots.plot_points({"before": cloud(0.05), "after": cloud(0.02)}, "closer"),
     "mesh": lambda s: plots.plot_mesh(room_mesh(), {"SDF": s.T_world_camera}, "room"),
     "paths": lambda s: plots.plot_trajectories(s.T_world_camera, {"SDF": s.T_world_camera}, "near"),
-    "recording": lambda s: plots.plot_recording(
-        pd.DataFrame(np.random.default_rng(0).uniform(0, 1, (50, 6)), columns=[*"xyz", *COLORS]),
-        s.T_world_camera, "thin",
-    ),
+    "recording": lambda s: plots.plot_overview(CLOUD, {"true": s.T_world_camera}, None, "thin"),
+    "overview": lambda s: plots.plot_overview(CLOUD, {"SDF": s.T_world_camera}, FRAMES, "near"),
     "errors": lambda s: plots.plot_errors({"VR": FRAMES, "SDF": FRAMES}, "lost"),
     "curves": lambda s: plots.plot_curves(SWEEP, *SWEEP, "fast"),
     "ate": lambda s: plots.plot_ate(published_table_1(), "rates matter"),
 }  # fmt: skip
-COLORS = ["red", "green", "blue"]
 
 
 def is_labelled(axis: Axis) -> bool:
@@ -334,7 +333,7 @@ def test_a_movie_shows_every_frame(sequence) -> None:
     wall.visual.vertex_colors = (200, 0, 0, 255)
     frames = FRAMES.iloc[:2].assign(frame_id=[3, 8], translation_error_m=[0.01, np.nan])
     poses = np.stack([np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])])  # ahead, and turned about y
-    seen = [view_of(wall, sequence.intrinsics, pose) for pose in poses]
+    seen = [view_of(wall, sequence.intrinsics, pose, 16) for pose in poses]
     assert (seen[0] == (200, 0, 0)).all()
     assert (seen[1] == 255).all()
     pictures = plots.movie_pictures(wall, sequence, frames, poses, "A wall")

@@ -241,14 +241,14 @@ def check_command(options: Namespace) -> None:
     print(report)
     if options.out is None:
         return
-    from nbtrack.plots import plot_recording
+    from nbtrack.plots import plot_overview
 
     is_picture = options.out.suffix.lower() == ".png"
     path = new_file(options.out if is_picture else options.out / "check.png")
     path.parent.mkdir(parents=True, exist_ok=True)
     apart = f"{1e3 * report.conventions[0].median_m:.1f} mm apart (median)"
     title = f"{recording.name}: surfaces of two frames lie {apart}"
-    plot_recording(report.cloud, report.T_world_camera, title).savefig(path)
+    plot_overview(report.cloud, {"true": report.T_world_camera}, None, title).savefig(path)
     print(f"  picture         {path}")
 
 

@@ -19,7 +19,6 @@ from nbtrack.plots.rooms import (
     plot_mesh,
     plot_overview,
     plot_points,
-    plot_recording,
     plot_slice,
     plot_trajectories,
 )

@@ -4,6 +4,7 @@ Up is the axis of the world that the cameras' own up is nearest to: they are mos
 """
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,6 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from nbtrack.core.arrays import Points, Poses, Transform, Values
-from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.mapping.meshes import query_field, seen_by
@@ -25,7 +25,7 @@ from nbtrack.tables import STANDING_STILL
 _POINTS_ALONG = 240  # grid points along the longer side of a slice
 _DIMMED = 0.72  # how white the unseen becomes
 _CUT = 0.01  # share of a recording's points cut off at either end: wild depths hide the room
-_MAX_FACES, _MAX_FACES_TO_TURN = 120_000, 10_000  # more are merged first
+_MAX_FACES_TO_TURN = 10_000  # more are merged for the viewer
 _MAX_TUBES = 80  # straight pieces of a path in the viewer
 _ELEVATION = np.radians(45)  # of the viewer of a mesh
 _AMBIENT = 0.55  # share of the light on a mesh that comes from everywhere
@@ -43,9 +43,14 @@ def plot_slice(
     exact scene, if it is a synthetic one.
     """
     axes = new_axes(title, 5.4)[0, 0]
-    up = _draw_from_above(axes, {"camera path": sequence.T_world_camera})
-    right, ahead, points = _plane(field.bounds, up, height)
+    up, page = _draw_from_above(axes, {"camera path": sequence.T_world_camera})
+    # A regular grid, with coordinates to the right and ahead.
+    low, high = np.array(field.bounds.minimum)[page], np.array(field.bounds.maximum)[page]
+    step = (high - low).max() / _POINTS_ALONG
+    right, ahead = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))
     shape, level = (len(ahead), len(right)), field.surface_level
+    points = np.tile(height * up, (len(ahead) * len(right), 1))
+    points[:, page] = np.stack(np.meshgrid(right, ahead), axis=-1).reshape(-1, 2)
     values, seen = query_field(field, points)[1].reshape(shape), seen_by(points, sequence)
     norm, colors, label = LogNorm(0.1, 1000.0, clip=True), "YlOrBr", "density (1/m)"
     if level == 0:
@@ -62,8 +67,7 @@ def plot_slice(
         if zero_there.min() < 0 < zero_there.max():  # matplotlib warns where there is no line
             look = {"colors": color, "linestyles": style, "zorder": zorder}
             axes.contour(right, ahead, zero_there, [0.0], **look)
-    veil = np.ones((*shape, 4))
-    veil[..., 3] = _DIMMED * ~seen.reshape(shape)
+    veil = np.dstack([np.ones((*shape, 3)), _DIMMED * ~seen.reshape(shape)])
     axes.pcolormesh(right, ahead, veil, gid="unseen", zorder=2.5, **grid)
     axes.set_title(f"{field.label} at height {height:.2f} m; pale: never seen")
     axes.figure.legend_below()
@@ -84,7 +88,7 @@ def plot_points(points: Mapping[str, tuple[Points, Values, Transform]], title: s
     look = {"cmap": "RdBu", "s": 6, "edgecolors": "0.6", "linewidths": 0.15}
     for axes, (label, parts) in zip(panels, points.items(), strict=True):
         places, sdf, T_world_camera = (part.cpu().numpy() for part in parts)
-        page = page_axes(_draw_from_above(axes, {"camera": T_world_camera[None]}))
+        _, page = _draw_from_above(axes, {"camera": T_world_camera[None]})
         image = axes.scatter(*places[:, page].T, c=100 * sdf, vmin=-limit, vmax=limit, **look)
         axes.set_title(f"{label}: mean |distance| {100 * np.abs(sdf).mean():.2f} cm")
         axes.set_facecolor("0.93")
@@ -99,36 +103,25 @@ def plot_trajectories(T_true: Poses, estimates: Mapping[str, Poses], title: str 
 
     The world axis along which the true path is longer lies across the page.
     """
-    axes, up = new_axes(title, 4.7)[0, 0], up_of(T_true, *estimates.values())
-    page = sorted(page_axes(up), key=lambda axis: -np.ptp(T_true[:, axis, 3]))
-    _draw_from_above(axes, {"true": T_true, **estimates}, page)
+    axes = new_axes(title, 4.7)[0, 0]
+    _draw_from_above(axes, {"true": T_true, **estimates}, longer_across=True)
     axes.figure.legend_below()
     return axes.figure
 
 
 @styled
-def plot_recording(cloud: pd.DataFrame, T_world_camera: Poses, title: str) -> Figure:
-    """A recording's coloured points (m) and the camera's path, without what is higher than it.
-
-    Walls should be thin and straight: doubled or fanned ones mean that something is read wrongly.
-    The cloud's columns are x, y, z (m, world frame), red, green, blue (0 to 255).
-    """
-    axes = new_axes(title, 6.0)[0, 0]
-    draw_cloud(axes, cloud, {"true": T_world_camera})
-    return axes.figure
-
-
-@styled
 def plot_overview(
-    cloud: pd.DataFrame, T_paths: Mapping[str, Poses], frames: pd.DataFrame, title: str
+    cloud: pd.DataFrame, T_paths: Mapping[str, Poses], frames: pd.DataFrame | None, title: str
 ) -> Figure:
-    """A tracked run: paths over the map's coloured points from above, and errors over time.
+    """Coloured points (m) and paths from above, and the errors of a tracked run over time.
 
-    The cloud is as in `plot_recording`, `frames` are the run's; without a known true pose the
-    errors are left out.
+    The cloud's columns are x, y, z (m, world frame), red, green, blue (0 to 255); what is higher
+    than all cameras is left out. Walls should be thin and straight: doubled or fanned ones mean
+    that a recording is read wrongly. `frames` are those of the run that is called "tracked";
+    without them, or without a known true pose, there are no errors.
     """
-    has_errors = frames["translation_error_m"].notna().any()
-    left, *right = new_axes(title, 4.2, 1, 2 if has_errors else 1)[0]
+    has_errors = frames is not None and frames["translation_error_m"].notna().any()
+    left, *right = new_axes(title, 4.2 if has_errors else 6.0, 1, 1 + has_errors)[0]
     draw_cloud(left, cloud, T_paths)
     left.figure.legend_below()
     for axes in right:
@@ -147,15 +140,14 @@ def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) ->
 
     Returns the indices of the world's axes to the right and ahead.
     """
-    up, places = _draw_from_above(axes, T_paths), cloud[["x", "y", "z"]]
+    (up, page), places = _draw_from_above(axes, T_paths), cloud[["x", "y", "z"]]
     inside = (places >= places.quantile(_CUT)) & (places <= places.quantile(1 - _CUT))
     heights = (places @ up)[inside.all(axis=1)].sort_values()  # drawn from the floor up
     highest = max((path[:, :3, 3] @ up).max() for path in T_paths.values())
     shown = cloud.loc[heights.index[heights <= highest + 0.1]]
-    page = shown[["x", "y", "z"]].to_numpy()[:, page_axes(up)]
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
-    axes.scatter(*page.T, c=colors, s=4, linewidths=0)
-    return page_axes(up)
+    axes.scatter(*shown[["x", "y", "z"]].to_numpy()[:, page].T, c=colors, s=4, linewidths=0)
+    return page
 
 
 @styled
@@ -166,8 +158,7 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
     where most surface shows. Parallel projection; lengths across the picture are true (m). The
     camera-to-world poses by label are drawn on top; "true" is green, "tracked" red.
     """
-    mesh, up = _simplified(mesh, _MAX_FACES), up_of(*T_paths.values())
-    side = _inward_side(mesh)
+    up, side = up_of(*T_paths.values()), _inward_side(mesh)
     # None of the azimuths looks along the walls of a room aligned to the axes.
     screens = np.stack([screen_axes(up, azimuth) for azimuth in np.arange(15.0, 360.0, 30.0)])
     fronts = side * mesh.face_normals @ screens[:, 2].T
@@ -191,15 +182,8 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
     return axes.figure
 
 
-class _UnlitScene(trimesh.Scene):
-    """A scene whose colours are shown as they are: the viewer's one light leaves sides black."""
-
-    def export(self, *args, **options) -> bytes:
-        """As its parent, with one unlit material for all meshes (glTF's KHR_materials_unlit)."""
-        return super().export(*args, tree_postprocessor=_make_unlit, **options)
-
-
 def _make_unlit(tree: dict) -> None:
+    """One material for all meshes of a scene that shows their colours as they are."""
     tree["materials"] = [{"extensions": {"KHR_materials_unlit": {}}}]
     tree["extensionsUsed"] = ["KHR_materials_unlit"]
     for mesh in tree["meshes"]:
@@ -213,10 +197,18 @@ def mesh_viewer(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses]) -> trimesh.
     Each path is a tube that ends in a pyramid, which opens where the last camera looks. The mesh is
     made coarser: the viewer adds 1.2 MB to the notebook, 0.7 MB of it the viewer's own.
     """
-    room, up = _simplified(mesh, _MAX_FACES_TO_TURN).copy(), up_of(*T_paths.values())
+    room, up = mesh.copy(), up_of(*T_paths.values())
+    if len(room.faces) > _MAX_FACES_TO_TURN:  # vertices of a grid cell merge
+        cell = np.sqrt(2.2 * room.area / _MAX_FACES_TO_TURN)
+        room.apply_scale(1 / cell)
+        room.merge_vertices(digits_vertex=0, merge_tex=True, merge_norm=True)
+        room.update_faces(room.nondegenerate_faces() & room.unique_faces())
+        room.apply_scale(cell)
     if _inward_side(room) < 0:
         room.faces = room.faces[:, ::-1]  # the viewer leaves out faces that show their back
-    scene = _UnlitScene({"mesh": room})
+    scene = trimesh.Scene({"mesh": room})
+    # The viewer's one light leaves sides black: it is switched off (glTF's KHR_materials_unlit).
+    scene.export = partial(scene.export, tree_postprocessor=_make_unlit)
     for label, color in method_colors(T_paths).items():
         path = _path_mesh(T_paths[label], 0.004 * mesh.scale)
         path.visual.face_colors = trimesh.visual.color.hex_to_rgba(color)
@@ -258,25 +250,24 @@ def up_of(*T_paths: Poses) -> np.ndarray:
     return np.sign(above[axis]) * np.eye(3)[axis]
 
 
-def page_axes(up: np.ndarray) -> list[int]:
-    """Indices of the world's axes to the right and ahead, seen from above."""
-    return [axis for axis in range(3) if up[axis] == 0]
-
-
 def _draw_from_above(
-    axes: Axes, T_paths: Mapping[str, Poses], page: list[int] | None = None
-) -> np.ndarray:
-    """Paths, and axes in metres, equal, and turned so that nothing is mirrored; returns up.
+    axes: Axes, T_paths: Mapping[str, Poses], longer_across: bool = False
+) -> tuple[np.ndarray, list[int]]:
+    """Paths, and axes in metres, equal, and turned so that nothing is mirrored.
 
-    `page` has the world's axes across and along the page, by default those of `page_axes`.
+    Returns up, and the indices of the world's axes across and along the page; the one along which
+    the first path is longer may be asked for across.
     """
     up = up_of(*T_paths.values())
-    right, ahead = page or page_axes(up)
-    _draw_paths(axes, T_paths, np.eye(3)[[right, ahead]])
+    page = [axis for axis in range(3) if up[axis] == 0]
+    if longer_across:
+        page.sort(key=lambda axis: -np.ptp(next(iter(T_paths.values()))[:, axis, 3]))
+    right, ahead = page
+    _draw_paths(axes, T_paths, np.eye(3)[page])
     axes.set(xlabel=f"{'xyz'[right]} (m)", ylabel=f"{'xyz'[ahead]} (m)", aspect="equal")
     # Right, page-up and up must be right-handed.
     axes.yaxis.set_inverted(np.cross(np.eye(3)[right], np.eye(3)[ahead]) @ up < 0)
-    return up
+    return up, page
 
 
 def _draw_paths(axes: Axes, T_paths: Mapping[str, Poses], to_page: np.ndarray) -> None:
@@ -290,19 +281,6 @@ def _draw_paths(axes: Axes, T_paths: Mapping[str, Poses], to_page: np.ndarray) -
     axes.plot(*np.transpose(starts), "o", color="black", markersize=5, zorder=4, label="start")
 
 
-def _plane(
-    bounds: SceneBounds, up: np.ndarray, height: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A regular grid `height` metres up: its coordinates to the right and ahead, and its points."""
-    page = page_axes(up)
-    low, high = np.array(bounds.minimum)[page], np.array(bounds.maximum)[page]
-    step = (high - low).max() / _POINTS_ALONG
-    right, ahead = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))
-    points = np.tile(height * up, (len(ahead) * len(right), 1))
-    points[:, page] = np.stack(np.meshgrid(right, ahead), axis=-1).reshape(-1, 2)
-    return right, ahead, points
-
-
 def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
     """Rows: the picture's right, its upward direction, and the way to the viewer (world frame)."""
     side, azimuth = np.roll(up, 1), np.radians(azimuth_deg)  # any horizontal axis is azimuth 0
@@ -310,14 +288,3 @@ def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
     viewer = np.cos(_ELEVATION) * level + np.sin(_ELEVATION) * up
     right = np.cross(up, level)
     return np.stack([right, np.cross(viewer, right), viewer])
-
-
-def _simplified(mesh: trimesh.Trimesh, n_faces: int) -> trimesh.Trimesh:
-    """The mesh, or where it has too many faces a coarser one: vertices of a grid cell merge."""
-    if len(mesh.faces) <= n_faces:
-        return mesh
-    cell = np.sqrt(2.2 * mesh.area / n_faces)
-    coarse = mesh.copy().apply_scale(1 / cell)
-    coarse.merge_vertices(digits_vertex=0, merge_tex=True, merge_norm=True)
-    coarse.update_faces(coarse.nondegenerate_faces() & coarse.unique_faces())
-    return coarse.apply_scale(cell)
