@@ -1,6 +1,6 @@
 """What a camera saw beside what a field renders; numbers as curves and bars."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import matplotlib
 import numpy as np
@@ -166,25 +166,23 @@ def plot_curves(
     """
     axes = new_axes(title, 3.6)[0, 0]
     labels = table[[group] if isinstance(group, str) else group].agg(", ".join, axis=1)
-    colors, at = method_colors(labels), table[x]
-    is_text = not pd.api.types.is_numeric_dtype(at)
+    is_text = not pd.api.types.is_numeric_dtype(table[x])
     if is_text:
-        names = at.unique()
-        at = at.map({name: place for place, name in enumerate(names)}) + _beside(labels)
+        names = list(table[x].unique())
         turned = {"rotation": 20, "ha": "right"} if sum(map(len, names)) > 90 else {}
         axes.set_xticks(range(len(names)), names, **turned)
-    for index, (label, color) in enumerate(colors.items()):
-        rows, places = table[labels == label], at[labels == label]
-        look = {"marker": "os^Dv"[index % 5], "color": color, "label": label}
+    for label, look, offset in _looks(labels):
+        rows = table[labels == label]
+        places = rows[x].map(names.index) + offset if is_text else rows[x]
         axes.plot(places, rows[y], linestyle="none" if is_text else "-", **look)
         if "from" in rows:
-            axes.vlines(places, rows["from"], rows["to"], color=color, linewidth=0.8)
+            axes.vlines(places, rows["from"], rows["to"], color=look["color"], linewidth=0.8)
     if STANDING_STILL in table:
         axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **DOTTED)
     axes.set(xlabel=x, ylabel=y)
     log_axes(axes, log.replace("x", "") if is_text else log)
     if labels.is_unique and not is_text and len(labels) > 1:
-        label_points(axes, at, table[y], colors)
+        label_points(axes, table[x], table[y], method_colors(labels))
         if STANDING_STILL in table:
             axes.legend(handles=axes.lines[-1:])
     else:
@@ -192,10 +190,14 @@ def plot_curves(
     return axes.figure
 
 
-def _beside(labels: pd.Series) -> pd.Series:
-    """For every row a small offset of its label, so that points of one category stand apart."""
-    order = {label: number for number, label in enumerate(labels.unique())}
-    return labels.map(order).sub((len(order) - 1) / 2) * 0.5 / max(len(order), 4)
+def _looks(labels: Iterable[str]) -> list[tuple[str, dict[str, str], float]]:
+    """Every label with its colour and marker, and an offset by which its points stand apart."""
+    colors = method_colors(labels)
+    offsets = (np.arange(len(colors)) - (len(colors) - 1) / 2) * 0.5 / max(len(colors), 4)
+    return [
+        (label, {"label": label, "color": color, "marker": "os^Dv"[index % 5]}, offsets[index])
+        for index, (label, color) in enumerate(colors.items())
+    ]
 
 
 @styled
@@ -207,21 +209,16 @@ def plot_ate(results: pd.DataFrame, title: str = "") -> Figure:
     std over seeds either way; the dotted line is a camera that stands still.
     """
     means, stds = table_1(results), table_1(results, "ate_std_m")
-    is_still = means.index.get_level_values("method") == STANDING_STILL
-    still, means, stds = means[is_still], means[~is_still], stds[~is_still]
-    rates = means.index.get_level_values("rate_hz").unique()
-    labels = means.index.get_level_values("method").to_series(index=means.index)
-    at = means.index.get_level_values("rate_hz").map(list(rates).index) + _beside(labels)
+    rates, methods = (means.index.unique(level) for level in means.index.names)
     rows = -(-len(means.columns) // 5)
     panels = new_axes(title, 0.9 + 2.1 * rows, rows, min(5, len(means.columns)), sharey=True).flat
     for axes, scene in zip(panels, means, strict=False):
-        for index, (label, color) in enumerate(method_colors(labels).items()):
-            of_method = (labels == label).to_numpy()
-            look = {"marker": "os^Dv"[index % 5], "color": color, "linestyle": "none"}
-            spread = stds[scene][of_method]
-            axes.errorbar(at[of_method], means[scene][of_method], spread, label=label, **look)
-        for ate_m in still[scene][:1]:
-            axes.axhline(ate_m, label=STANDING_STILL, **DOTTED)
+        for label, look, offset in _looks(methods.drop(STANDING_STILL, errors="ignore")):
+            ate, spread = (table.xs(label, level="method")[scene] for table in (means, stds))
+            axes.errorbar(np.arange(len(rates)) + offset, ate, spread, linestyle="none", **look)
+        if STANDING_STILL in methods:
+            still_m = means[scene][rates[0], STANDING_STILL]
+            axes.axhline(still_m, label=STANDING_STILL, **DOTTED)
         axes.axhline(LOST_THRESHOLD_M, label="lost above 0.2 m", **DASHED)
         axes.set(title=scene.replace("_", " "), xlabel="rate (Hz)", ylabel="ATE (m)")
         axes.set_xticks(range(len(rates)), [f"{rate:g}" for rate in rates])
@@ -229,6 +226,7 @@ def plot_ate(results: pd.DataFrame, title: str = "") -> Figure:
         log_axes(axes, "y")
     for axes in panels[len(means.columns) :]:
         axes.remove()
-    panels[0].set_ylim(bottom=min(0.002, 0.7 * means.min(axis=None)))
+    tracked = means.drop(STANDING_STILL, level="method", errors="ignore")
+    panels[0].set_ylim(bottom=min(0.002, 0.7 * tracked.min(axis=None)))
     panels[0].figure.legend_below()
     return panels[0].figure

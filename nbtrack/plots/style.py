@@ -86,7 +86,5 @@ def log_axes(axes: Axes, names: str) -> None:
     """Make "x", "y" or "xy" logarithmic, with plain numbers at 1, 2 and 5."""
     for name in names:
         axes.set(**{f"{name}scale": "log"})
-        axis = getattr(axes, f"{name}axis")
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter("")
+        plain = {"major_formatter": "{x:g}", "minor_formatter": ""}
+        getattr(axes, f"{name}axis").set(major_locator=LogLocator(subs=(1, 2, 5)), **plain)

@@ -58,8 +58,7 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
         if calm and upright and room.sdf(poses[:, :3, 3]).min() >= CLEARANCE:
             return poses[:n_frames]
     raise NumericalError(
-        f"room '{room.name}': none of {_ATTEMPTS} paths keeps {CLEARANCE} m from every surface; "
-        "the middle of its walk must be free; move the walk's center or the furniture"
+        f"room '{room.name}': no path keeps {CLEARANCE} m from surfaces; move its walk or furniture"
     )
 
 
@@ -129,8 +128,7 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     pitch = room.walk.pitch + _wander(n_frames, rng, 0.09)
     roll, trembling = _wander(n_frames, rng, 0.025), _tremor(n_frames, rng)
     poses = _camera_poses((x, height, z), yaw, pitch, roll, trembling)
-    nearest = room.sdf(poses[:, :3, 3]).min()
-    if nearest < CLEARANCE:
+    if (nearest := room.sdf(poses[:, :3, 3]).min()) < CLEARANCE:
         raise NumericalError(
             f"room '{room.name}': the tour comes within {nearest:.2f} m of a surface; "
             f"{CLEARANCE} m or more are allowed; move the furniture"

@@ -70,11 +70,10 @@ class Room:
         lengths = np.sqrt(row_dot(directions, directions))
         for number, part in enumerate(self.parts):
             towards = part.solid.center - origins
-            # Only rays in the cone around the solid may meet it; from within the sphere, all. The
-            # tangent is taken slightly short, so that rounding never drops a ray that grazes.
-            squared = row_dot(towards, towards) - (part.solid.reach * 1.001) ** 2
-            minimum = np.where(squared > 0.0, lengths * np.sqrt(np.maximum(squared, 0.0)), -np.inf)
-            rays = np.flatnonzero(row_dot(directions, towards) >= minimum)
+            # Only lines through the bounding sphere may meet the solid. It is slightly enlarged, so
+            # that rounding never drops a ray that grazes.
+            passing = row_dot(towards, towards) - (row_dot(directions, towards) / lengths) ** 2
+            rays = np.flatnonzero(passing < (part.solid.reach * 1.001) ** 2)
             starts = origins if origins.ndim == 1 else origins[rays]
             candidate = part.solid.hit(starts, directions[rays])
             closer = candidate < t[rays]
