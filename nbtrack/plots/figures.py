@@ -13,21 +13,12 @@ from nbtrack.core.arrays import Values
 from nbtrack.data.frame import MILLIMETRE
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import View
-from nbtrack.plots.style import (
-    DASHED,
-    DOTTED,
-    WIDTH,
-    label_points,
-    log_axes,
-    method_colors,
-    new_axes,
-    styled,
-)
+from nbtrack.plots import style
 from nbtrack.tables import STANDING_STILL, table_1
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 
-@styled
+@style.styled
 def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figure:
     """Colour and depth (m) of the frame at a position of a sequence; unmeasured pixels are grey.
 
@@ -35,8 +26,8 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     sequence=fixed(sequence), index=(0, len(sequence) - 1), title=fixed("A room"))`.
     """
     some = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
-    height = WIDTH * sequence.intrinsics.height / sequence.intrinsics.width  # inches
-    left, right = new_axes(title, 0.4 + 0.5 * height, 1, 2)[0]
+    height = style.WIDTH * sequence.intrinsics.height / sequence.intrinsics.width  # inches
+    left, right = style.new_axes(title, 0.4 + 0.5 * height, 1, 2)[0]
     _show(left, sequence.color(index), f"frame {sequence.frame_ids[index]}: colour")
     depth = np.ma.masked_equal(sequence.depth(index), 0)
     image = _show(right, depth, "depth", MILLIMETRE * _upper_limit(some))
@@ -44,7 +35,7 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     return right.figure
 
 
-@styled
+@style.styled
 def plot_views(
     sequence: RgbdSequence, indices: Sequence[int], views: Sequence[View], title: str = ""
 ) -> Figure:
@@ -58,8 +49,8 @@ def plot_views(
     errors = 100 * np.abs(np.stack([depth for _, depth in views]) - depths)
     far, worst = _upper_limit(depths), _upper_limit(errors)
     aspect = sequence.intrinsics.height / sequence.intrinsics.width
-    height = 0.9 + len(views) * (0.2 + 0.2 * WIDTH * aspect)
-    grid = new_axes(title, height, len(views), 5)
+    height = 0.9 + len(views) * (0.2 + 0.2 * style.WIDTH * aspect)
+    grid = style.new_axes(title, height, len(views), 5)
     parts = zip(grid, indices, views, depths, errors, strict=True)
     for row, index, (color, rendered), depth, error in parts:
         _show(row[0], sequence.color(index), f"frame {sequence.frame_ids[index]}")
@@ -88,7 +79,7 @@ def _upper_limit(images: np.ndarray) -> float:
     return float(np.quantile(values, 0.98)) if len(values) else 1.0
 
 
-@styled
+@style.styled
 def plot_along_ray(
     depths: Values, curves: Mapping[str, Values], measured_depth: float, title: str = ""
 ) -> Figure:
@@ -96,18 +87,18 @@ def plot_along_ray(
 
     The last samples may be left out, as by the weights of sections between samples.
     """
-    panels = new_axes(title, 0.9 + 1.3 * len(curves), len(curves), sharex=True)[:, 0]
-    for axes, (label, color) in zip(panels, method_colors(curves).items(), strict=True):
+    panels = style.new_axes(title, 0.9 + 1.3 * len(curves), len(curves), sharex=True)[:, 0]
+    for axes, (label, color) in zip(panels, style.method_colors(curves).items(), strict=True):
         values = curves[label].detach().cpu()
         axes.plot(depths.cpu()[: len(values)], values, ".-", markersize=4, color=color)
-        axes.axvline(measured_depth, label="measured depth", **DASHED)
+        axes.axvline(measured_depth, label="measured depth", **style.DASHED)
         axes.set_ylabel(label)
     panels[0].legend()
     panels[-1].set_xlabel("depth (m)")
     return panels[0].figure
 
 
-@styled
+@style.styled
 def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """Every loss term over mapping: each iteration pale, the running median on top.
 
@@ -117,9 +108,9 @@ def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figur
     # Loss terms are the columns before their total; what is behind it are diagnostics.
     terms = {label: history.loc[:, :"total"].iloc[:, :-1] for label, history in histories.items()}
     names = dict.fromkeys(name for losses in terms.values() for name in losses)
-    panels = new_axes(title, 3.0, 1, len(names), sharex=True)[0]
+    panels = style.new_axes(title, 3.0, 1, len(names), sharex=True)[0]
     for axes, name in zip(panels, names, strict=True):
-        for label, color in method_colors(terms).items():
+        for label, color in style.method_colors(terms).items():
             values = terms[label].get(name, pd.Series(dtype=float))
             # A twentieth of the series, centred, cut short at the ends.
             window = values.rolling(max(5, len(values) // 20), center=True, min_periods=1)
@@ -130,29 +121,29 @@ def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figur
     return panels[0].figure
 
 
-@styled
+@style.styled
 def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """Errors of every frame over time: position (cm, logarithmic) and orientation (degrees).
 
     `frames` are those of runs by method on the same frames, as in frames.csv. Above the dashed
     line, 0.2 m, the paper calls the camera lost; the dotted one is a camera that stands still.
     """
-    above, below = new_axes(title, 4.9, 2, sharex=True)[:, 0]
-    for label, color in method_colors(frames).items():
+    above, below = style.new_axes(title, 4.9, 2, sharex=True)[:, 0]
+    for label, color in style.method_colors(frames).items():
         tracked = frames[label]
         seconds = tracked["time"] - tracked["time"].iloc[0]
         above.plot(seconds, 100 * tracked["translation_error_m"], color=color, label=label)
         below.plot(seconds, tracked["rotation_error_deg"], color=color)
-    above.plot(seconds, 100 * tracked["still_error_m"], label=STANDING_STILL, **DOTTED)
-    above.axhline(100 * LOST_THRESHOLD_M, label="lost above 0.2 m", **DASHED)
+    above.plot(seconds, 100 * tracked["still_error_m"], label=STANDING_STILL, **style.DOTTED)
+    above.axhline(100 * LOST_THRESHOLD_M, label="lost above 0.2 m", **style.DASHED)
     above.set_ylabel("translation error (cm)")
     below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
-    log_axes(above, "y")
+    style.log_axes(above, "y")
     above.figure.legend_below()
     return above.figure
 
 
-@styled
+@style.styled
 def plot_curves(
     table: pd.DataFrame, x: str, y: str, group: str | list[str], title: str = "", log: str = "xy"
 ) -> Figure:
@@ -164,7 +155,7 @@ def plot_curves(
     interval of y. The mean of a column `standing still`, in the unit of y, is the dotted line of a
     camera that stands still. Axes of `log` are logarithmic.
     """
-    axes = new_axes(title, 3.6)[0, 0]
+    axes = style.new_axes(title, 3.6)[0, 0]
     labels = table[[group] if isinstance(group, str) else group].agg(", ".join, axis=1)
     is_text = not pd.api.types.is_numeric_dtype(table[x])
     if is_text:
@@ -178,11 +169,11 @@ def plot_curves(
         if "from" in rows:
             axes.vlines(places, rows["from"], rows["to"], color=look["color"], linewidth=0.8)
     if STANDING_STILL in table:
-        axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **DOTTED)
+        axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **style.DOTTED)
     axes.set(xlabel=x, ylabel=y)
-    log_axes(axes, log.replace("x", "") if is_text else log)
+    style.log_axes(axes, log.replace("x", "") if is_text else log)
     if labels.is_unique and not is_text and len(labels) > 1:
-        label_points(axes, table[x], table[y], method_colors(labels))
+        style.label_points(axes, table[x], table[y], style.method_colors(labels))
         if STANDING_STILL in table:
             axes.legend(handles=axes.lines[-1:])
     else:
@@ -192,7 +183,7 @@ def plot_curves(
 
 def _looks(labels: Iterable[str]) -> list[tuple[str, dict[str, str], float]]:
     """Every label with its colour and marker, and an offset by which its points stand apart."""
-    colors = method_colors(labels)
+    colors = style.method_colors(labels)
     offsets = (np.arange(len(colors)) - (len(colors) - 1) / 2) * 0.5 / max(len(colors), 4)
     return [
         (label, {"label": label, "color": color, "marker": "os^Dv"[index % 5]}, offsets[index])
@@ -200,7 +191,7 @@ def _looks(labels: Iterable[str]) -> list[tuple[str, dict[str, str], float]]:
     ]
 
 
-@styled
+@style.styled
 def plot_ate(results: pd.DataFrame, title: str = "") -> Figure:
     """Table I as points: mean ATE (m, logarithmic) by rate and method, a panel a scene.
 
@@ -210,20 +201,20 @@ def plot_ate(results: pd.DataFrame, title: str = "") -> Figure:
     """
     means, stds = table_1(results), table_1(results, "ate_std_m")
     rates, methods = (means.index.unique(level) for level in means.index.names)
-    rows = -(-len(means.columns) // 5)
-    panels = new_axes(title, 0.9 + 2.1 * rows, rows, min(5, len(means.columns)), sharey=True).flat
+    columns, rows = min(5, len(means.columns)), -(-len(means.columns) // 5)
+    panels = style.new_axes(title, 0.9 + 2.1 * rows, rows, columns, sharey=True).flat
     for axes, scene in zip(panels, means, strict=False):
         for label, look, offset in _looks(methods.drop(STANDING_STILL, errors="ignore")):
             ate, spread = (table.xs(label, level="method")[scene] for table in (means, stds))
             axes.errorbar(np.arange(len(rates)) + offset, ate, spread, linestyle="none", **look)
         if STANDING_STILL in methods:
             still_m = means[scene][rates[0], STANDING_STILL]
-            axes.axhline(still_m, label=STANDING_STILL, **DOTTED)
-        axes.axhline(LOST_THRESHOLD_M, label="lost above 0.2 m", **DASHED)
+            axes.axhline(still_m, label=STANDING_STILL, **style.DOTTED)
+        axes.axhline(LOST_THRESHOLD_M, label="lost above 0.2 m", **style.DASHED)
         axes.set(title=scene.replace("_", " "), xlabel="rate (Hz)", ylabel="ATE (m)")
         axes.set_xticks(range(len(rates)), [f"{rate:g}" for rate in rates])
         axes.set_xlim(-0.5, len(rates) - 0.5)
-        log_axes(axes, "y")
+        style.log_axes(axes, "y")
     for axes in panels[len(means.columns) :]:
         axes.remove()
     tracked = means.drop(STANDING_STILL, level="method", errors="ignore")

@@ -82,10 +82,8 @@ def view_of(
     scale = width / camera.width
     rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
     points = (np.asarray(surface.vertices) - position) @ rotation
-    depth = np.maximum(points[:, 2], 1e-6)
-    columns = scale * (camera.fx * points[:, 0] / depth + camera.cx)
-    rows = scale * (camera.fy * points[:, 1] / depth + camera.cy)
-    pixels = np.stack([columns, rows], axis=1)
+    depth = np.maximum(points[:, 2:], _NEAR)
+    pixels = scale * (points[:, :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
     if isinstance(surface, trimesh.Trimesh):
         parts = np.asarray(surface.faces)
         corners = pixels[parts]
@@ -93,13 +91,13 @@ def view_of(
         parts = np.arange(len(points))[:, None]
         square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         half = np.maximum(1, scale * camera.fx * _POINT_SIZE / depth).astype(int)
-        corners = pixels[parts] + half[:, None, None] * square
+        corners = pixels[parts] + half[:, None] * square
     size = round(scale * camera.width), round(scale * camera.height)
     is_seen = (points[parts, 2] > _NEAR).all(axis=1)
     is_seen &= ((corners.max(axis=1) > 0) & (corners.min(axis=1) < size)).all(axis=1)
     seen = np.flatnonzero(is_seen)
     seen = seen[np.argsort(-points[parts[seen], 2].mean(axis=1))]
-    colors = cloud_of(surface)[["red", "green", "blue"]].to_numpy()[parts[seen]].mean(axis=1)
+    colors = surface.visual.vertex_colors[parts[seen], :3].mean(axis=1)
     image = np.full((*size[::-1], 3), 255, np.uint8)
     for polygon, color in zip(corners[seen].round().astype(np.int32), colors.tolist(), strict=True):
         cv2.fillConvexPoly(image, polygon, color)

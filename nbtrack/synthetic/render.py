@@ -2,14 +2,13 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import map_coordinates
 
-from nbtrack.core.arrays import Pose
+from nbtrack.core.arrays import ColorImage, Pose
 from nbtrack.core.camera import Intrinsics
 from nbtrack.synthetic.room import Room
 
-Color = UInt8[np.ndarray, "h w 3"]
 Depth = Float[np.ndarray, "h w"]
 Surfaces = Int[np.ndarray, "h w"]
 # Samples of a refined pixel, as offsets from its center in pixels: a 2x2 grid.
@@ -27,7 +26,7 @@ EDGE_DROPOUT = 0.6  # probability that a pixel at an edge is lost (our choice)
 
 def render_frame(
     room: Room, intrinsics: Intrinsics, T_world_camera: Pose
-) -> tuple[Color, Depth, Surfaces]:
+) -> tuple[ColorImage, Depth, Surfaces]:
     """Color (RGB), z-depth (m, float64, at pixel centers) and surface index of each pixel.
 
     Pixels at the outline of a surface or in a steep pattern get four color samples instead of
