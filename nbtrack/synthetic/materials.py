@@ -38,10 +38,9 @@ def _smooth_noise(points: Points, wavelength: float, seed: int) -> Values:
     return np.sin(waves + rng.uniform(0, 2 * np.pi, 5)).sum(axis=1) / 2.5
 
 
-def _square_wave(phase: Values) -> Values:
-    """A square wave in [0, 1] with rounded edges: a hard edge would ring in any smooth field."""
-    sine = np.sin(phase)
-    return 0.5 + 0.5 * sine / np.sqrt(sine * sine + 0.04)
+def _squared(wave: Values, softness: float = 0.04) -> Values:
+    """A wave in [0, 1], square with rounded edges: a hard edge would ring in any smooth field."""
+    return 0.5 + 0.5 * wave / np.sqrt(wave * wave + softness)
 
 
 def _mix(first: Color, second: Color, amount: Values) -> Points:
@@ -62,7 +61,7 @@ def checker(
     """Two colors in rounded squares over two world axes; a period is two squares."""
     across, along = (2 * np.pi / period * points[:, axis] for axis in axes)
     product = np.sin(across + 0.7) * np.sin(along + 0.4)
-    return _mix(first, second, 0.5 + 0.5 * product / np.sqrt(product**2 + 0.02))
+    return _mix(first, second, _squared(product, 0.02))
 
 
 def stripes(
@@ -70,7 +69,7 @@ def stripes(
 ) -> Points:
     """Two colors in rounded stripes."""
     phase = 2 * np.pi / period * (points @ np.asarray(direction))
-    return _mix(first, second, _square_wave(phase))
+    return _mix(first, second, _squared(np.sin(phase)))
 
 
 def wood(
@@ -117,7 +116,7 @@ def framed(
     """A picture across `axis`: a frame of the first color, 5 cm wide, around soft shapes in two."""
     offset = np.abs(points - np.asarray(center))
     inset = np.minimum(size[0] / 2 - offset[:, 2 - axis], size[1] / 2 - offset[:, 1])
-    shapes = _mix(*colors[1:], _square_wave(2.5 * _smooth_noise(points, 0.25, seed)))
+    shapes = _mix(*colors[1:], _squared(np.sin(2.5 * _smooth_noise(points, 0.25, seed))))
     return np.where((inset < 0.05)[:, None], np.asarray(colors[0]), shapes)
 
 
