@@ -9,9 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import DataError
-from nbtrack.data.conventions import ROTATED, Convention, best_convention, diagnosis, fit_all
+from nbtrack.data.conventions import (
+    Convention,
+    best_convention,
+    diagnosis,
+    fit_all,
+    want_of_proof,
+)
 from nbtrack.data.recording import Recording
-from nbtrack.data.sequence import RgbdSequence, read_frames
+from nbtrack.data.sequence import RgbdSequence, read_frames, select_frames
 
 _CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
@@ -24,7 +30,6 @@ _JUMP = 0.3  # m between consecutive frames, and five times what is usual; a han
 _DEPTH = (0.2, 20.0)  # m, plausible median of a depth camera's measurements
 _FLICKER = 0.35  # share by which brightness may change between frames (our choice)
 _SAME_VIEW_DEG = 10  # where they are turned by no more
-_ROTATED_SHARE = 0.9  # of the values there are: multiples of 8 (our choice; by chance an eighth)
 _MIN_MEASURED = 0.3  # share of pixels with a depth, below which maps have holes (our choice)
 # What the second-order tracker still followed, of a real recording thinned to every third frame.
 _FOLLOWED_MM, _FOLLOWED_DEG = 70, 3.6
@@ -43,6 +48,7 @@ class DataReport:
     cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m), frame
     conventions: list[Convention]  # the declared one first
     best: Convention  # the declared one unless another is clearly better
+    is_whole: bool  # every frame was looked at
 
     @property
     def warnings(self) -> list[str]:
@@ -51,24 +57,18 @@ class DataReport:
         jumps = moved[moved > max(_JUMP, 5 * moved.median())]
         first = "".join(self.recording.color_files[i].name for i in jumps.index[:1])
         flicker = self.frames.flicker[self.frames.turned_deg < _SAME_VIEW_DEG].max()
-        measured, scale = self.frames.measured.mean(), self.recording.declared.depth_scale
-        values = (self.cloud.depth * scale).round().unique()
-        eights = np.mean(values % 8 == 0) * (len(values) > 8)  # of a few it may be so by chance
-        is_right = self.best is self.conventions[0]  # else motion and depth tell nothing
+        measured, misread = self.frames.measured.mean(), self.best is not self.conventions[0]
+        wrong = diagnosis(self.conventions, self.best, self.recording)
         rules = [
-            (True, diagnosis(self.conventions, self.best, self.recording)),
+            (wrong, wrong),
+            (not wrong and self.is_whole, want_of_proof(self.conventions, self.recording)),
             (
-                scale not in ROTATED and eights > _ROTATED_SHARE,
-                f"{eights:.0%} of the depth values are multiples of 8, as where they are rotated "
-                "by three bits (SUN3D): set depth_scale = 8000 in sequence.toml, or 80000",
-            ),
-            (
-                is_right and len(jumps),
+                len(jumps) and not misread,
                 f"{len(jumps)} of {moved.count()} steps are longer than {_JUMP} m, first to {first}"
                 ": check the poses there, or leave frames out with --frames of map and track",
             ),
             (
-                is_right and not _DEPTH[0] <= depth <= _DEPTH[1],
+                not misread and not _DEPTH[0] <= depth <= _DEPTH[1],
                 f"the median depth is {depth:.3g} m, outside {_DEPTH[0]:g} to {_DEPTH[1]:g} m: set "
                 "depth_scale, the depth values a metre, in sequence.toml",
             ),
@@ -125,39 +125,34 @@ class DataReport:
         return "\n".join(lines)
 
 
-def check_recording(recording: Recording, progress: bool = False) -> DataReport:
+def check_recording(
+    recording: Recording, progress: bool = False, is_whole: bool = True
+) -> DataReport:
     """Read every frame of a recording and report what is there and whether it fits together.
 
-    All images are kept meanwhile. Raises what `read_frames` does, or DataError without any depth.
+    All images are kept meanwhile. Unless the whole is asked for, only a few pairs of frames are
+    read, which takes about a second. Raises what `read_frames` does, and DataError where the whole
+    has no depth.
     """
-    sequence = read_frames(_as_in_files(recording), progress=progress)
+    ids = select_frames(recording, slice(None))
+    ids = ids[recording.has_pose[ids]]
+    pairs = ids[_pairs(recording.T_world_camera[ids], _N_PAIRS if is_whole else _QUICK_PAIRS)]
+    looked_at = ids if is_whole else np.unique(pairs)
+    sequence = read_frames(_as_in_files(recording), looked_at, progress)
     frames = _by_frame(sequence)
-    if not frames.measured.any():
+    if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
-    pairs = _pairs(sequence.T_world_camera, _N_PAIRS)
-    results = fit_all(sequence, recording, pairs)
+    results = fit_all(sequence, recording, np.searchsorted(looked_at, pairs))
     cloud, best = _cloud(results[0], sequence), best_convention(results)
-    return DataReport(recording, frames, sequence.T_world_camera, cloud, results, best)
+    poses = sequence.T_world_camera
+    return DataReport(recording, frames, poses, cloud, results, best, is_whole)
 
 
 def quick_warning(recording: Recording) -> str:
-    """What a look at a few pairs of frames finds wrong, in a sentence; empty where nothing is.
-
-    As `check_recording`, but that only these frames are read, which takes about a second.
-    """
-    ids = np.flatnonzero(recording.has_pose)
-    if len(ids) < 2:
+    """The first thing that a look at a few pairs of frames finds wrong; empty where nothing is."""
+    if recording.has_pose.sum() < 2:
         return ""
-    pairs = _pairs(recording.T_world_camera[ids], _QUICK_PAIRS)
-    kept, places = np.unique(pairs, return_inverse=True)
-    sequence = read_frames(_as_in_files(recording), ids[kept])
-    if not sequence.depths_mm.any():
-        return ""  # whoever needs depth says so
-    results = fit_all(sequence, recording, places.reshape(pairs.shape))
-    best, depth = best_convention(results), _cloud(results[0], sequence).depth.median()
-    if best is results[0] and not _DEPTH[0] <= depth <= _DEPTH[1]:
-        return f"the median depth is {depth:.3g} m: set depth_scale or no_depth in sequence.toml"
-    return diagnosis(results, best, recording, needs_proof=False)
+    return next(iter(check_recording(recording, is_whole=False).warnings), "")
 
 
 def _as_in_files(recording: Recording) -> Recording:

@@ -4,12 +4,11 @@ Under the right convention the surfaces that two frames both see coincide.
 """
 
 import math
-import os
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Int, UInt8, UInt16
+from jaxtyping import Int, UInt16
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -31,10 +30,9 @@ _FAR_APART_OF_FEW = 0.15  # the same where less than the first share overlaps (o
 # Shares of points below which a median tells nothing, and below which not even a large one does: of
 # a right recording hardly a point lies in front of what another frame sees there (our choice).
 _MIN_OVERLAP, _MIN_CONTRADICTION = 0.15, 0.02
-ROTATED = (8000.0, 80_000.0)  # depth values a metre: millimetres, and tenths, times 8 (SUN3D)
-# Those that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1 mm; and metres
-# and micrometres, which 16 bits hold badly.
-_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, *ROTATED, 256.0, 100.0, 1.0, 1e6)
+# Those that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1 mm, SUN3D's
+# millimetres and tenths times 8; and metres and micrometres, which 16 bits hold badly.
+_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 8000.0, 80_000.0, 256.0, 100.0, 1.0, 1e6)
 _DEPTHS = {f"{scale:g} depth values a metre": {"depth_scale": scale} for scale in _SCALES}
 _DEPTHS["depth along the optical axis"] = {"depth_along": "axis"}
 _DEPTHS["distances along the ray, not z-depth"] = {"depth_along": "ray"}
@@ -44,7 +42,6 @@ _CALIBRATIONS = {  # factors of focal lengths
     "one for images half as large": 2.0,
 }
 _UNITS = {"ones in millimetres": 1e-3, "ones in centimetres": 1e-2}
-_EDGES_ALIKE = 0.02  # by which a correlation of edges must be higher to decide (our choice)
 _FLIPPED = {(1,): "images upside down", (1, 2): "images turned by 180 degrees"}
 # The common camera axes first: where several fit alike, the first is named.
 _USUAL = {
@@ -120,12 +117,9 @@ def fit_all(
 
     The sequence has depth values as in the files; pairs are positions in it.
     """
-    poses = recording.file_poses[sequence.frame_ids[pairs.ravel()]]
-    candidates = _candidates(recording.declared, sequence.intrinsics)
-    some = np.unique(pairs)
-    candidates = _preferring_edges(candidates, sequence.colors[some], sequence.depths_mm[some])
-    in_files = sequence.depths_mm[pairs], poses, recording.declared.quaternion
-    return [_fitted(convention, *in_files) for convention in candidates]
+    declared, poses = recording.declared, recording.file_poses[sequence.frame_ids[pairs.ravel()]]
+    in_files = sequence.depths_mm[pairs], poses, declared.quaternion
+    return [_fitted(c, *in_files) for c in _candidates(declared, sequence.intrinsics)]
 
 
 def _candidates(declared: Declaration, camera: Intrinsics) -> list[Convention]:
@@ -191,37 +185,6 @@ def _fitted(
     return replace(convention, median_m=median_m, relative=relative, overlap=overlap)
 
 
-def _preferring_edges(
-    results: list[Convention],
-    colors: UInt8[np.ndarray, "frames h w 3"],
-    values: UInt16[np.ndarray, "frames h w"],
-) -> list[Convention]:
-    """Conventions in an order in which flipped depth comes second where it fits the colours better.
-
-    Depth upside down fits other frames as well as mirrored camera axes do. But its edges are then
-    not where the edges of the colour images are.
-    """
-    if not len(colors):
-        return results
-    luma = colors.mean(axis=-1)
-    # A middle pixel's differences from its neighbours on both sides, so that flips stay in place.
-    strength = [
-        np.abs(image[:, 2:, 1:-1] - image[:, :-2, 1:-1])
-        + np.abs(image[:, 1:-1, 2:] - image[:, 1:-1, :-2])
-        for image in (luma, np.log1p(values))
-    ]
-    edges = [(image > np.quantile(image, 0.9)).astype(float) for image in strength]
-    with np.errstate(invalid="ignore"):  # images without any edge
-        alike = {
-            axes: np.nan_to_num(np.corrcoef(edges[0].flat, np.flip(edges[1], axes).flat)[0, 1])
-            for axes in ((), *_FLIPPED)
-        }
-    best = max(alike, key=alike.__getitem__)
-    if best and alike[best] > alike[()] + _EDGES_ALIKE:
-        return [results[0], *sorted(results[1:], key=lambda convention: convention.flipped != best)]
-    return results
-
-
 def best_convention(results: list[Convention]) -> Convention:
     """The declared convention (the first), unless another fits clearly better.
 
@@ -243,45 +206,44 @@ def _is_clearly_less(relative: float, other: float) -> bool:
     return relative <= min(_CLEARLY_BETTER * other, other - _MIN_GAIN)
 
 
-def diagnosis(
-    results: list[Convention], best: Convention, recording: Recording, needs_proof: bool = True
-) -> str:
-    """What is wrong with how the numbers are read, in a sentence; empty where nothing is.
-
-    Where proof is needed, a camera that moves too little to tell conventions apart is wrong too.
-    """
-    own, file = results[0], os.path.relpath(recording.pose_file, recording.folder)
+def diagnosis(results: list[Convention], best: Convention, recording: Recording) -> str:
+    """What is wrong with how the numbers are read, in a sentence; empty where nothing is."""
+    own, file = results[0], recording.pose_file.name
     apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
     if best is not own:
         look = "look" if best.subject == "poses" else "looks"
-        note = (
+        # Mirrored or turned axes and flipped images fit alike; the common axes come first.
+        alike = [r for r in results if r.flipped and r.relative < best.relative / _CLEARLY_BETTER]
+        or_depth = f"; so would depth {alike[0].name}" if alike and not best.flipped else ""
+        return (
             f"your {best.subject} {look} like {best.name}; {_remedy(best, own)} (surfaces that two "
             f"frames see then lie {1e3 * best.median_m:.0f} mm apart; as declared they {apart})"
+            f"{or_depth}"
         )
-        # Mirrored or turned axes and flipped images may fit alike, and colours not tell.
-        alike = [r for r in results if r.flipped and r.relative < best.relative / _CLEARLY_BETTER]
-        return note if best.flipped or not alike else f"{note}; so would depth {alike[0].name}"
-    if recording.has_pose.sum() < 2:
-        return f"{file} is not proved: that takes two frames with a pose"
     # Of few points, such as key frames share, not even a right convention's lie close.
     few = own.overlap < _MIN_OVERLAP
     is_far = own.median_m > (_FAR_APART_OF_FEW if few else _FAR_APART)
     if own.overlap < (_MIN_CONTRADICTION if is_far else _MIN_OVERLAP):
-        little = f"{file} is not proved: two frames see too little of the same"
-        where = f"{own.overlap:.0%} of the points, whose surfaces {apart}"
-        return f"{little} ({where}): check it, and a piece with smaller steps"
-    if is_far:
         return (
-            f"surfaces that two frames see {apart} (median, {own.overlap:.0%} of the points "
-            f"overlap) and no other convention fits: check {recording.calibration.source.name}, "
-            f"the depth unit and {file}, and that image, depth and pose belong to one moment"
+            f"{file} is not proved: two frames see too little of the same ({own.overlap:.0%} of "
+            f"the points, whose surfaces {apart}): check it, and a piece with smaller steps"
         )
-    if not needs_proof:
+    if not is_far:
         return ""
-    poses = [r for r in results[1:] if r.subject == "poses" and r.overlap >= own.overlap / 2]
+    return (
+        f"surfaces that two frames see {apart} (median, {own.overlap:.0%} of the points overlap) "
+        f"and no other convention fits: check {recording.calibration.source.name}, the depth unit "
+        f"and {file}, and that image, depth and pose belong to one moment"
+    )
+
+
+def want_of_proof(results: list[Convention], recording: Recording) -> str:
+    """That a camera moves too little to tell conventions apart, in a sentence; empty if it does."""
+    own, *others = results
+    poses = [r for r in others if r.subject == "poses" and r.overlap >= own.overlap / 2]
     alike = [r.name for r in poses if not _is_clearly_less(own.relative, r.relative)]
-    little = f"{file} is not proved: the camera moves too little to tell {len(alike)} other "
-    return f"{little}conventions apart, such as {alike[0]}" if alike else ""
+    little = f"{recording.pose_file.name} is not proved: the camera moves too little to tell "
+    return f"{little}{len(alike)} other conventions apart, such as {alike[0]}" if alike else ""
 
 
 def _remedy(convention: Convention, own: Convention) -> str:
