@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from scipy.spatial import cKDTree
 
-from nbtrack.core.errors import ConfigError, DataError, MissingError
+from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.data.sequence import read_sequence
 from nbtrack.synthetic import make_room, room_frames, room_intrinsics, room_of
 from nbtrack.synthetic.motion import handheld_trajectory, steps_between, tour
@@ -338,7 +338,7 @@ def test_rooms_are_bit_identical_for_a_seed(tmp_path, monkeypatch):
 
 def test_user_errors(tmp_path):
     """Catches tracebacks of the wrong kind, and half a folder left by a call that failed."""
-    with pytest.raises(MissingError, match="did you mean 'kitchen_nook'"):
+    with pytest.raises(ConfigError, match="did you mean 'kitchen_nook'"):
         make_room("kitchen", tmp_path / "a", 4, 32, 24)
     with pytest.raises(ConfigError, match="frames = 1"):
         make_room("office", tmp_path / "a", 1, 32, 24)

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
-from nbtrack.core.errors import ConfigError, nearest_name
+from nbtrack.core.errors import ConfigError, look_up
 
 Config = TypeVar("Config")
 
@@ -54,10 +54,9 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     Raises ConfigError for an unknown key, or a value of the wrong type or range.
     """
     config = dataclasses.replace(config)  # a class may take up what was added since it was made
-    valid = [key for key, _ in _leaves(config)]
+    valid = dict(_leaves(config))
     for key, value in _leaves(dict(values)):
-        if key not in valid:
-            raise ConfigError(f"unknown config key {key!r}: {nearest_name(key, valid)}")
+        look_up("config key", key, valid)
         config = _replaced(config, key.split("."), key, value)
     return config
 

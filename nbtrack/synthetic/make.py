@@ -86,7 +86,7 @@ def make_room(
 def room_version(name: str) -> str:
     """Twelve hexadecimal digits that change with the room's description and the generator's code.
 
-    Raises MissingError for an unknown room.
+    Raises ConfigError for an unknown room.
     """
     return fingerprint(description(name), sources_fingerprint("synthetic.make"))
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nbtrack.core.errors import MissingError, nearest_name
+from nbtrack.core.errors import look_up
 from nbtrack.synthetic import materials, primitives
 from nbtrack.synthetic.materials import Light, Material, Pair, Part
 from nbtrack.synthetic.primitives import Array3, Indices, Origins, Points, Values, row_dot
@@ -99,16 +99,14 @@ class Room:
 
 
 def description(name: str) -> dict[str, Any]:
-    """What `rooms.toml` says of a room. Raises MissingError with the nearest of all names."""
-    if name not in ROOMS:
-        raise MissingError(f"no synthetic room '{name}'; {nearest_name(name, list(ROOMS))}")
-    table = _TABLES[name]
+    """What `rooms.toml` says of a room. Raises ConfigError, naming the nearest, for any other."""
+    table = look_up("synthetic room", name, _TABLES)
     return {**table, "materials": _PALETTE | table["materials"]}
 
 
 @cache
 def build_room(name: str) -> Room:
-    """The synthetic room of that name. Raises MissingError as `description` does."""
+    """The synthetic room of that name. Raises ConfigError as `description` does."""
     table = description(name)
     named: dict[str, Material] = {}
     for label, material in table["materials"].items():
