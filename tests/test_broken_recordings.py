@@ -96,7 +96,7 @@ MIDDLE_CUT_OUT = changed("images/img1.png", lambda c: c[: len(c) // 2] + c[-12:]
 # What the message must say; None where the recording can be read all the same.
 BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
     "tum": {
-        "no list": (without("rgb.txt"), "no images in .*TUM RGB-D needs rgb.txt"),
+        "no list": (without("rgb.txt"), "no colour images .*TUM RGB-D needs rgb.txt"),
         "empty list": (text("depth.txt", "# nothing\n"), "depth.txt is empty: every line holds"),
         "no timestamp": (line("rgb.txt", 1, "rgb/a.png"), "rgb.txt line 2 is 'rgb/a.png': every"),
         "timestamp NaN": (line("rgb.txt", 1, "nan rgb/a.png"), "line 2 is 'nan rgb/a.png'"),
@@ -128,7 +128,7 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
     "7scenes": {
         "pose missing": (without("frame-000002.pose.txt"), "6 .* 5 .txt .*: frame-000002.color"),
         "no rotation": (text("frame-000003.pose.txt", SKEWED), "frame-000003.pose.txt is no rigid"),
-        "no poses": (without("*.pose.txt"), r"no file .*pose.txt \(.txt\): "),
+        "no poses": (without("*.pose.txt"), r"no poses in .*needs \*.pose.txt"),
         "3 rows": (line("frame-000001.pose.txt", 3), None),  # 3x4: as good as 4x4
         "2 rows": (text("frame-000001.pose.txt", "1 0 0 0\n0 1 0 0\n"), "has 2 rows: it needs"),
         "small depth": (image("frame-000004.depth.png", SMALL), r"depth.png is .*\(18, 24\): it"),
@@ -185,11 +185,11 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "tiny focal": (text("focal.txt", "1e-300"), r"focal.txt gives .* matrix \[\[1e-300"),
         "binary poses": (text("poses.txt", BINARY), "poses.txt line 1 is"),
         "folder missing": (shutil.rmtree, "no folder .*recording"),
-        "no images": (without("images/*"), "no file .*recording/images"),
-        "no depth folder": (renamed("depth_filtered", "depths"), "no file .*filtered/. or .*/dep"),
+        "no images": (without("images/*"), "no colour images .*recording: .*needs images/"),
+        "no depth folder": (renamed("depth_filtered", "depths"), "no depth maps .*red/. or dep"),
         "3 images, 2 depths": (without("depth_filtered/depth2.png"), "6 images but .* has 5 .png"),
         "other frame numbers": (renamed(DEPTH_1, "depth_filtered/depth7.png"), "img1.png, depth7"),
-        "PGM": (suffix("depth_filtered/*", ".pgm"), r"convert \.pgm, which is not read"),
+        "PGM": (suffix("depth_filtered/*", ".pgm"), r"no depth maps \(PNG of 16 bits\) in"),
         "format: one level too high": (in_a_folder, "level too high, above inner: give .*inner"),
         "depth of another size": (image(DEPTH_1, SMALL), r"depth1.png is .* of shape \(18, 24\)"),
         "8-bit depth": (image(DEPTH_1, EIGHT_BIT), "depth1.png is uint8"),
@@ -272,5 +272,5 @@ def test_files_of_the_system_and_images_too_many(tmp_path: Path) -> None:
     assert len(open_recording(folder)) == N_FRAMES
     rows = (folder / "traj.txt").read_text().splitlines()
     (folder / "traj.txt").write_text("\n".join(rows[:-1]) + "\n")
-    with pytest.raises(DataError, match=r"5 poses but there are 6 images.*, or remove its images"):
+    with pytest.raises(DataError, match=r"5 poses but there are 6 images.*; remove what is odd"):
         open_recording(folder)

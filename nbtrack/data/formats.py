@@ -4,6 +4,8 @@ A format of one's own is one more entry. What a recording does otherwise than it
 in `sequence.toml`: any field of `Declaration`.
 """
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from nbtrack.core.settings import may_be_zero, with_values
 from nbtrack.data.text_files import Calibration, read_object
 
 DECLARATION_FILE = "sequence.toml"
+_IMAGES = (".png", ".jpg", ".jpeg")
 CAMERA_TO_WORLD, WORLD_TO_CAMERA = "camera-to-world", "world-to-camera"
 SPELLED_AXES = {"opencv": "right down forward", "opengl": "right up backward"}
 # Where an axis may point, seen from behind the camera, in OpenCV's x, y and z.
@@ -94,6 +97,34 @@ class Format:
         """Of each of these patterns one must be there."""
         cameras = () if self.known_cameras else (self.cameras,)
         return self.color, self.depth, self.poses, *cameras
+
+    def files(self, folder: Path, patterns: Sequence[str], what: str) -> list[Path]:
+        """Files of the first pattern that has any, or raises MissingError."""
+        for pattern in patterns:
+            if files := files_of(folder, pattern):
+                return files
+        raise MissingError(
+            f"no {what} in {folder}: {self.label} needs {' or '.join(patterns)}; add it, or name "
+            "another format with --format"
+        )
+
+
+def files_of(folder: Path, pattern: str) -> list[Path]:
+    """Files that a pattern names, texts or images as it says, `img2` before `img10`."""
+    if (folder / pattern).is_file():
+        return [folder / pattern]
+    suffixes = (".txt",) if pattern.endswith(".txt") else _IMAGES
+    paths = (folder / pattern).parent.glob(Path(pattern).name)
+    # Hidden files are the system's.
+    files = [p for p in paths if p.suffix.lower() in suffixes and p.name[0] != "." and p.is_file()]
+    # The name decides between img1 and img01.
+    return sorted(files, key=lambda path: (numbers_in(path), path.name))
+
+
+def numbers_in(path: Path) -> list[int]:
+    """The numbers in a file's name."""
+    # A dot ends the stem: frame-000001.color.png counts as 1. Of more digits no camera is capable.
+    return [int(digits[-18:]) for digits in re.findall(r"[0-9]+", path.stem)]
 
 
 _VGA = (640, 480)

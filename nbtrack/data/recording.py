@@ -1,19 +1,25 @@
-"""A recording whose files are found and whose texts are read, before any pixel is decoded."""
+"""A recording: its files found and paired, its texts read, before any pixel is decoded.
+
+Images, depth maps and poses belong together by numbers in their names, or by times in lists.
+"""
 
 import hashlib
+import os
+from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.errors import DataError, MissingError
-from nbtrack.data.formats import DECLARATION_FILE, FORMATS, Declaration, Format, declaration
-from nbtrack.data.pairs import check_paired, listed_pairs, numbered_files, numbers_of, posed_by_time
+from nbtrack.data.formats import FORMATS, Declaration, Format, declaration, files_of, numbers_in
 from nbtrack.data.text_files import Calibration, Times, read_calibration, read_poses, read_rows
 
+_TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 _ALONE = 1000.0  # m from the middle, and so many times as far as nine in ten: no camera went there
 TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
@@ -33,7 +39,6 @@ class Recording:
     file_poses: Poses  # as `declared` says; NaN without a pose
     pose_file: Path | None  # named in messages; with `*` where every frame has a file
     calibration: Calibration  # of the depth images, and of the colour that lies on them
-    text_files: list[Path]  # everything read beside the images
     notes: list[str]  # what was assumed, and left out
 
     def __len__(self) -> int:
@@ -58,15 +63,16 @@ class Recording:
         center = np.median(self.T_world_camera[self.has_pose, :3, 3], axis=0)
         return np.round(center) if np.abs(center).max() > _FAR_FROM_ZERO else np.zeros(3)
 
-    def contents(self) -> tuple[list[tuple[str, str, int, int]], list[str], Declaration]:
-        """What changes when a recording does: texts, the declaration, and of every image its name,
-        size and time of change (ns)."""
+    def contents(self) -> tuple[list[tuple[str, str, int, int]], str, Declaration]:
+        """What changes when a recording does: of every image its name, size and time of change
+        (ns), a digest of times, poses and camera, and the declaration."""
         images = []
         for file in self.color_files + self.depth_files:
             status = file.stat()
             images.append((file.parent.name, file.name, status.st_size, status.st_mtime_ns))
-        texts = [hashlib.sha256(path.read_bytes()).hexdigest() for path in self.text_files]
-        return images, texts, self.declared
+        digest = hashlib.sha256(repr(replace(self.calibration, source=Path())).encode())
+        digest.update(self.times.tobytes() + self.file_poses.tobytes())
+        return images, digest.hexdigest(), self.declared
 
 
 def open_recording(
@@ -80,17 +86,15 @@ def open_recording(
     The format is told by the files, unless named; a depth folder or a pose file replaces its own.
     Raises MissingError, DataError or ConfigError if something is not there, wrong or unknown.
     """
-    folder = Path(folder)
+    folder, notes = Path(folder), []
     declared = declaration(folder, format)
     layout = FORMATS[declared.format]
-    colors, depths, times, left_out = _images(folder, declared, depth_folder)
-    poses, path, pose_files, chosen = _poses(folder, declared, pose_file, colors, times)
+    colors, depths, times = _images(folder, declared, depth_folder, notes)
+    poses, path = _poses(folder, declared, pose_file, colors, times, notes)
     _check_together(declared.poses_to_opencv(poses)[:, :3, 3], path)
-    camera, notes = _calibration(folder, layout), [left_out, chosen]
+    camera = _calibration(folder, layout)
     if not camera.source.is_file():
         notes.append(f"{camera.source.name}, {camera.fx:g} px at 640x480: no {layout.cameras[0]}")
-    names = [*layout.color, *layout.depth, DECLARATION_FILE, TIMES_FILE]
-    texts = [*(folder / name for name in names), *pose_files, camera.source]
     return Recording(
         folder=folder,
         name=folder.resolve().name,
@@ -102,29 +106,27 @@ def open_recording(
         file_poses=poses,
         pose_file=path,
         calibration=camera,
-        text_files=[text for text in texts if text.is_file()],
-        notes=[note for note in notes if note],
+        notes=notes,
     )
 
 
 def _images(
-    folder: Path, declared: Declaration, depth_folder: str | None
-) -> tuple[list[Path], list[Path], Times, str]:
-    """Colours and depths in pairs, their times, and a word on who is left out."""
+    folder: Path, declared: Declaration, depth_folder: str | None, notes: list[str]
+) -> tuple[list[Path], list[Path], Times]:
+    """Colours and depths in pairs, and their times; notes are added on what is left out."""
     layout = FORMATS[declared.format]
-    if layout.color[0].endswith(".txt"):
-        names = (layout.color, layout.depth)
-        return listed_pairs(*(_first_there(folder, name, "images", layout) for name in names))
-    places = [(depth_folder or Path(p).parent, Path(p).name) for p in layout.depth]
-    colors = numbered_files([folder / pattern for pattern in layout.color])
-    depths = numbered_files([folder / place / name for place, name in places])
-    check_paired(colors, depths)
-    return colors, depths, _times(folder, colors, declared.frame_rate), ""
+    depth = [f"{depth_folder}/{Path(p).name}" if depth_folder else p for p in layout.depth]
+    colors = layout.files(folder, layout.color, "colour images (PNG or JPEG)")
+    depths = layout.files(folder, depth, "depth maps (PNG of 16 bits)")
+    if colors[0].suffix == ".txt":
+        return _listed_pairs(colors[0], depths[0], notes)
+    _check_paired(colors, depths)
+    return colors, depths, _times(folder, colors, declared.frame_rate)
 
 
 def _times(folder: Path, colors: list[Path], rate_hz: float) -> Times:
     """Of frames that no list of files times: from a file, else by the numbers in their names."""
-    path, numbers = folder / TIMES_FILE, numbers_of(colors)
+    path, numbers = folder / TIMES_FILE, _numbers_of(colors)
     if not path.is_file():
         is_counted = (np.diff(numbers) > 0).all()
         return (numbers - numbers[0] if is_counted else np.arange(len(colors))) / rate_hz
@@ -138,65 +140,55 @@ def _times(folder: Path, colors: list[Path], rate_hz: float) -> Times:
     return times
 
 
-def _first_there(folder: Path, names: tuple[str, ...], what: str, layout: Format) -> Path:
-    for name in names:
-        if (folder / name).is_file():
-            return folder / name
-    needed = f"{layout.label} needs {' or '.join(names)}"
-    raise MissingError(
-        f"no {what} in {folder}: {needed}; add it, or name another format with --format"
-    )
-
-
 def _calibration(folder: Path, layout: Format) -> Calibration:
     """From the folder's own file, else assumed, by the folder's name."""
     known = [c for c in layout.known_cameras if c.source.name in folder.resolve().name]
     if known and not any((folder / name).is_file() for name in layout.cameras):
         return replace(known[0], source=folder / f"the camera assumed for {layout.label}")
     named = tuple(f"{c.source} in the folder's name" for c in layout.known_cameras)
-    return read_calibration(_first_there(folder, layout.cameras + named, "calibration", layout))
+    return read_calibration(layout.files(folder, layout.cameras + named, "calibration")[0])
 
 
 def _poses(
-    folder: Path, declared: Declaration, pose_file: str | None, colors: list[Path], times: Times
-) -> tuple[Poses, Path | None, list[Path], str]:
-    """A pose a frame, the files that they were read from, by one name and all, and how chosen.
+    folder: Path,
+    declared: Declaration,
+    pose_file: str | None,
+    colors: list[Path],
+    times: Times,
+    notes: list[str],
+) -> tuple[Poses, Path | None]:
+    """A pose a frame, and the name of the files that they were read from.
 
-    Without a file all poses are NaN.
+    Without a file all poses are NaN. Notes are added on that, and on poses without an image.
     """
     layout = FORMATS[declared.format]
     names = (pose_file,) if pose_file else layout.poses
-    files = [folder / name for name in names if (folder / name).is_file()]
-    if len(files) > 1:
-        both = " and ".join(file.name for file in files)
+    there = [name for name in names if files_of(folder, name)]
+    if len(there) > 1:
+        both = " and ".join(there)
         raise DataError(f"{folder} has {both}: keep one, or choose by `data convert --poses FILE`")
-    patterns = [folder / (f"{n}/*.txt" if (folder / n).is_dir() else n) for n in names]
-    patterns = [p for p in patterns if "*" in p.name and p.parent.is_dir()]
-    if patterns and not files:
-        path, files = patterns[0], numbered_files(patterns, (".txt",))
-        check_paired(colors, files)
-    elif not files and not pose_file:
-        return np.full((len(colors), 4, 4), np.nan), None, [], "no poses"
-    else:
-        path = _first_there(folder, names, "poses", layout)
-        files = [path]
+    if not there and not pose_file:
+        notes.append("no poses")
+        return np.full((len(colors), 4, 4), np.nan), None
+    files = layout.files(folder, names, "poses")
+    path = folder / there[0]
+    if "*" in path.name:
+        _check_paired(colors, files)
     tables = [read_poses(file, declared.quaternion) for file in files]
-    poses, chosen = np.concatenate([T for T, _ in tables]), ""
-    if (pose_times := tables[0][1]) is not None:
+    poses, pose_times = np.concatenate([T for T, _ in tables]), tables[0][1]
+    if pose_times is not None:
         poses = _placed(poses, pose_times, times, path, layout.color[0].endswith(".txt"))
-    numbers = numbers_of(colors)
+    numbers = _numbers_of(colors)
     if len(poses) > len(colors) and 0 <= numbers.min() <= numbers.max() < len(poses):
-        chosen = f"of {len(poses)} poses in {path.name} those of the {len(colors)} images' numbers"
+        of = f"of {len(poses)} poses in {path.name}"
+        notes.append(f"{of} those of the {len(colors)} images' numbers")
         poses = poses[numbers]
     if len(poses) != len(colors):
-        advice = "write 'nan' for each number of a frame without a pose, or remove its images"
-        if len(poses) > len(colors):
-            advice = "remove those without an image, or number the images as the poses"
         raise DataError(
-            f"{path} has {len(poses)} poses but there are {len(colors)} images: every frame needs "
-            f"one; {advice}"
+            f"{path} has {len(poses)} poses but there are {len(colors)} images: every image needs "
+            "one, 'nan' where it has none, and every pose an image; remove what is odd"
         )
-    return poses, path, files, chosen
+    return poses, path
 
 
 def _check_together(positions: Float[np.ndarray, "frames 3"], path: Path | None) -> None:
@@ -214,14 +206,94 @@ def _check_together(positions: Float[np.ndarray, "frames 3"], path: Path | None)
 
 
 def _placed(poses: Poses, pose_times: Times, times: Times, path: Path, is_by_time: bool) -> Poses:
-    """The pose of every frame, in formats by time; else as they stand, one a frame.
+    """The pose nearest to every frame in time; NaN where none is near.
 
-    nbtrack's own trajectories leave frames out, and are placed by time in any format.
+    In formats by number they are taken as they stand, but for nbtrack's own trajectories, which
+    leave frames out.
     """
-    if is_by_time:
-        return posed_by_time(times, poses, pose_times, path)
-    if len(poses) == len(times):
+    if len(poses) == len(times) and not is_by_time:
         return poses
-    placed = posed_by_time(times, poses, pose_times, path, tolerance=1e-3)
+    tolerance, closest = _TOLERANCE if is_by_time else 1e-3, _nearest(times, pose_times)
+    has_pose = np.abs(pose_times[closest] - times) <= tolerance
+    if not (has_pose.any() and np.isfinite(pose_times).all()):
+        raise DataError(
+            f"{path} ({_span(pose_times)}) has no pose within {tolerance:g} s of an image "
+            f"({_span(times)}): it needs finite timestamps of the same clock, one a frame"
+        )
+    placed = np.where(has_pose[:, None, None], poses[closest], np.nan)
     # Unless all poses find a frame the times are something else.
-    return placed if np.isfinite(placed).sum() == np.isfinite(poses).sum() else poses
+    is_whole = np.isfinite(placed).sum() == np.isfinite(poses).sum()
+    return placed if is_by_time or is_whole else poses
+
+
+def _numbers_of(files: list[Path]) -> Int[np.ndarray, "_"]:
+    """Frame numbers: the last in each file's name; -1 if it has none."""
+    return np.array([[-1, *numbers_in(path)][-1] for path in files])
+
+
+def _check_paired(colors: list[Path], others: list[Path]) -> None:
+    """Raises DataError unless every image has its depth map or pose, with the same frame number."""
+    numbers, other_numbers = _numbers_of(colors), _numbers_of(others)
+    if not np.array_equal(numbers, other_numbers):
+        count = Counter([*numbers, *other_numbers])
+        odd = [path.name for path in (*colors, *others) if count[_numbers_of([path])[0]] != 2]
+        more = " ..." if len(odd) > 4 else ""
+        raise DataError(
+            f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
+            f"{len(others)} {others[0].suffix} files, with other frame numbers in the names "
+            f"({len(odd)} without a partner: {', '.join(odd[:4])}{more}): every "
+            "image needs one; rename or remove the odd files"
+        )
+
+
+def _listed_pairs(
+    color_list: Path, depth_list: Path, notes: list[str]
+) -> tuple[list[Path], list[Path], Times]:
+    """Images and depth maps of two lists that are each other's nearest in time, and the times."""
+    (color_times, colors), (depth_times, depths) = map(_read_list, (color_list, depth_list))
+    closest = _nearest(color_times, depth_times)
+    kept = _nearest(depth_times, color_times)[closest] == np.arange(len(colors))
+    kept &= np.abs(depth_times[closest] - color_times) <= _TOLERANCE
+    if not kept.any():
+        raise DataError(
+            f"{color_list} ({_span(color_times)}) and {depth_list} ({_span(depth_times)}) have no "
+            f"times within {_TOLERANCE} s of each other: both need timestamps of one clock"
+        )
+    if not kept.all():
+        left_out = f"{(~kept).sum()} of the {len(kept)} images in {color_list.name} are left out"
+        notes.append(f"{left_out}: no depth map of {depth_list.name} is within {_TOLERANCE} s")
+    return (
+        [colors[i] for i in np.flatnonzero(kept)],
+        [depths[i] for i in closest[kept]],
+        color_times[kept],
+    )
+
+
+def _read_list(path: Path) -> tuple[Times, list[Path]]:
+    """Times and files of a list with `timestamp file` a line, in the order of time."""
+    meaning = "'timestamp file', as in '1305031102.175 rgb/1305031102.175.png'"
+    rows = sorted(read_rows(path, _entry, (2,), meaning), key=lambda row: row[0])
+    files = [path.parent / name for _, name in rows]
+    # Unlike pathlib's, it takes names that no file can have.
+    if absent := [file for file in files if not os.path.isfile(file)]:
+        raise MissingError(
+            f"{len(absent)} of {len(files)} files named in {path} are not there, the first of them "
+            f"{str(absent[0])[:200]!r}: add them, or take their lines out"
+        )
+    return np.array([time for time, _ in rows]), files
+
+
+def _entry(line: str) -> tuple[float, str]:
+    time, name = line.split(maxsplit=1)
+    if not np.isfinite(float(time)):
+        raise ValueError
+    return float(time), name.strip()
+
+
+def _nearest(times: Times, others: Times) -> Int[np.ndarray, "_"]:
+    """For every time the index of the nearest other one (m > 0)."""
+    return cKDTree(np.nan_to_num(others)[:, None]).query(times[:, None], p=1)[1]
+
+
+def _span(times: Times) -> str:
+    return f"{times.min():.13g} to {times.max():.13g} s"
