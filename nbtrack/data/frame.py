@@ -13,6 +13,7 @@ from nbtrack.core.errors import DataError
 
 MILLIMETRE = 1e-3
 _MAX_MILLIMETRES = np.iinfo(np.uint16).max
+_MAX_METRES = 100.0  # beyond it in most of an image they are in another unit (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,24 +31,20 @@ class Frame:
         """A camera's images. Raises DataError if one has another size, type or unit.
 
         Args:
-            color: RGB, (height, width, 3): uint8, or floating point in [0, 1].
+            color: RGB, (height, width, 3), uint8.
             depth: z-depth along the optical axis, (height, width): uint16 in millimetres, or
                 floating point in metres, kept to the millimetre. 0, NaN, infinite and negative ones
-                are none; nor are those whose colour is not finite.
+                are none.
         """
-        size = (camera.height, camera.width)
-        # Metres beyond 100 in most of an image are none (our choice).
-        _check("color", color, (*size, 3), "uint8, or floating point in [0, 1]", 1.0, 1.5)
-        _check("depth", depth, size, "uint16 in mm, or floating point in metres", 0.5, 100.0)
+        size, metres = (camera.height, camera.width), "uint16 in mm, or floating point in metres"
+        _check("color", color, (*size, 3), np.uint8, asked="uint8")
+        _check("depth", depth, size, np.uint16, np.floating, asked=metres)
         if depth.dtype != np.uint16:
-            metres = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float64)
-            depth = (metres / MILLIMETRE).round()
+            depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float64)
+            if depth.any() and (median := np.median(depth[depth > 0])) > _MAX_METRES:
+                raise DataError(f"depth is {median:.4g} m in the median: give {metres}")
+            depth = (depth / MILLIMETRE).round()
             depth = np.where(depth > _MAX_MILLIMETRES, 0, depth)
-        if color.dtype != np.uint8:
-            is_known = np.isfinite(color).all(axis=-1)
-            color = np.where(is_known[..., None], color, 0)
-            color = (255 * color.clip(0, 1)).round().astype(np.uint8)
-            depth = np.where(is_known, depth, 0)
         # Read-only memory is copied: torch does not take it.
         color = torch.from_numpy(np.require(color, requirements="CW"))
         return cls(camera, color, torch.from_numpy(depth.astype(np.int32)))
@@ -92,19 +89,13 @@ class Frame:
         return behind
 
 
-def _check(
-    what: str, image: np.ndarray, shape: tuple[int, ...], kinds: str, quantile: float, limit: float
-) -> None:
-    """Raises DataError for another shape or type, or where so many positive values are larger."""
-    if not isinstance(image, np.ndarray):
-        kind = type(image).__name__
-        raise DataError(f"{what} is of type {kind}: give a numpy array, {kinds}, of shape {shape}")
-    if image.shape == shape and str(image.dtype) == kinds.split()[0].strip(","):
-        return
-    values = image[np.isfinite(image) & (image > 0)]
-    large = np.quantile(values, quantile) if values.size else 0.0
-    if image.shape != shape or not np.issubdtype(image.dtype, np.floating) or large > limit:
-        raise DataError(
-            f"{what} is {image.dtype} of shape {image.shape} with values like {large:.4g}: give "
-            f"{kinds}, of the camera's shape {shape}"
+def _check(what: str, image: np.ndarray, shape: tuple[int, ...], *kinds: type, asked: str) -> None:
+    """Raises DataError for another shape or type."""
+    is_array = isinstance(image, np.ndarray)
+    if not (is_array and image.shape == shape and issubclass(image.dtype.type, kinds)):
+        shown = (
+            f"{image.dtype} of shape {image.shape}"
+            if is_array
+            else f"of type {type(image).__name__}"
         )
+        raise DataError(f"{what} is {shown}: give a numpy array, {asked}, of shape {shape}")
