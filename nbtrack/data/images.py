@@ -1,7 +1,6 @@
 """From image files to arrays: one size, depth in mm along the optical axis, no distortion."""
 
 import io
-import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from jaxtyping import Int, Shaped, UInt8, UInt16
 from PIL import Image
 
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError, MissingError
+from nbtrack.core.errors import DataError
 from nbtrack.core.progress import ProgressBar
 from nbtrack.data.recording import Recording
 from nbtrack.data.text_files import camera_matrix
@@ -61,8 +60,6 @@ def decode(
 
 def _read_image(path: Path, flags: int) -> Shaped[np.ndarray, "height width *channels"]:
     """Decoded PNG or JPEG file, checked before: of a damaged one OpenCV fills in anything."""
-    if not os.path.isfile(path):
-        raise MissingError(f"no file {path}: a frame needs it; add it or remove the frame")
     content = path.read_bytes()
     is_complete = _is_complete(content)
     image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if is_complete else None

@@ -168,8 +168,7 @@ def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
     points_world = np.concatenate(clouds)
     if len(points_world) == 0:
         raise DataError(
-            f"no pixel of {sequence.name} has a depth, of one in {stride**2} in {len(sequence)} "
-            f"frames ({(sequence.depths_mm > 0).mean():.2%} of all have one): check the depth "
+            f"no pixel of {sequence.name} has a depth, of one in {stride**2}: check the depth "
             "folder and its unit (uint16 millimetres)"
         )
     positions = sequence.T_world_camera[:, :3, 3]

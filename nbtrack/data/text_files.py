@@ -98,18 +98,17 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
 
 def _from_quaternions(numbers: np.ndarray, order: str, path: Path) -> Poses:
     """Poses of rows with a position and a quaternion; NaN for a position if a number is none."""
-    is_known = np.isfinite(numbers).all(axis=1, keepdims=True)
-    positions, quaternions = np.split(np.where(is_known, numbers, 3 * [np.nan] + 4 * [0.5]), [3], 1)
+    numbers = np.where(np.isfinite(numbers).all(axis=1, keepdims=True), numbers, np.nan)
     # Clipped, so that absurd numbers are refused below and overflow nothing here.
-    norms = np.linalg.norm(quaternions.clip(-1e6, 1e6), axis=1)
+    norms = np.linalg.norm(numbers[:, 3:].clip(-1e6, 1e6), axis=1)
     for i in np.flatnonzero(np.abs(norms - 1) > _RIGID):
         raise DataError(
             f"{path} pose {i} has a quaternion of norm {norms[i]:.3g}: columns must be "
             f"tx ty tz and a unit quaternion ({' '.join('q' + axis for axis in order)})"
         )
-    q_xyzw = quaternions[:, [order.index(axis) for axis in "xyzw"]]
+    q_xyzw = numbers[:, [3 + order.index(axis) for axis in "xyzw"]]
     poses = np.tile(np.eye(4), (len(numbers), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_quat(q_xyzw).as_matrix(), positions
+    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_quat(q_xyzw).as_matrix(), numbers[:, :3]
     return checked_poses(poses, path)
 
 

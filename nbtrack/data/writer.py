@@ -36,8 +36,8 @@ def write_sequence(
     """Write frames, and notes (texts of further files, by name), as a scene in the layout.
 
     It is put in place when it is complete: a run that is killed leaves no half-written scene.
-    `progress` is called after each frame with how many are written. Raises DataError if the folder
-    exists, a frame has another size than the camera, or there is none.
+    `progress` is called after each frame with how many are written; one is needed. Raises DataError
+    if the folder exists.
     """
     if folder.exists():
         raise DataError(f"{folder} exists: choose another folder or remove it first")
@@ -48,30 +48,22 @@ def write_sequence(
         unfinished.mkdir()
         poses = []
         for color, depths_mm, T_world_camera in frames:
-            _write_images(unfinished, len(poses), camera, color, depths_mm)
+            _write_images(unfinished, len(poses), color, depths_mm)
             poses.append(T_world_camera)
             progress(len(poses))
-        if not poses:
-            raise DataError(f"no frame was added to {folder}: a scene needs at least one")
         for name, text in (_texts(camera, np.stack(poses)) | dict(notes or {})).items():
             (unfinished / name).write_text(text, encoding="utf-8")
         unfinished.rename(folder)  # fails if another command has finished it meanwhile
 
 
 def _write_images(
-    folder: Path, number: int, camera: Intrinsics, color: ColorImage, depths: dict[str, DepthImage]
+    folder: Path, number: int, color: ColorImage, depths: dict[str, DepthImage]
 ) -> None:
     images = {"images/img": cv2.cvtColor(color, cv2.COLOR_RGB2BGR)}
     for prefix, image in (images | {f"{name}/depth": depths[name] for name in depths}).items():
-        path, size = folder / f"{prefix}{number}.png", (camera.height, camera.width)
-        if image.shape[:2] != size:
-            raise DataError(
-                f"{path.name} is of shape {image.shape} but the camera {size}: write frames of one "
-                "size"
-            )
         # The fastest compression: rooms are made often and read from a local disk.
         content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-        write_atomic(path, content.tobytes())
+        write_atomic(folder / f"{prefix}{number}.png", content.tobytes())
 
 
 def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
@@ -110,13 +102,10 @@ def convert_sequence(
     lost = f" ({n_lost} without a pose)" if n_lost else ""
     said = f"{out}: {len(numbers)} frames{lost} of {camera.width}x{camera.height}"
     said = "\n  ".join([f"{said}, read as {recording.format.label}", *recording.notes])
-    if (out / "focal.txt").is_file():
-        return said
-    return (
-        f"{said}\n  the camera (fx {camera.fx:.2f}, fy {camera.fy:.2f}, principal point "
-        f"({camera.cx:.2f}, {camera.cy:.2f})) is more than focal.txt can say: it is in "
-        "intrinsics.txt, which nbtrack reads and other programs do not know"
-    )
+    if not (out / "focal.txt").is_file():
+        said += "\n  the camera is more than focal.txt can say: it is in intrinsics.txt, which "
+        said += "nbtrack reads and other programs do not know"
+    return said
 
 
 def _frames(recording: Recording, numbers: Frames) -> Iterator[WrittenFrame]:
