@@ -189,7 +189,7 @@ def declaration(folder: Path, format: str | None = None) -> Declaration:
     """
     if not folder.is_dir():
         raise MissingError(
-            f"no folder {folder}: give a folder with a recording, or the name of a synthetic room"
+            f"no folder {folder}: give that of a recording, or a synthetic room's name"
         )
     path = folder / DECLARATION_FILE
     format = format or _declared(path, Declaration()).format or _told_by_files(folder)
@@ -201,17 +201,16 @@ def _told_by_files(folder: Path) -> str:
     shares = _shares(folder)
     maximum = max(shares.values())
     best = [name for name, share in shares.items() if share == maximum]
-    folders = sorted(path for path in folder.iterdir() if path.is_dir()) if maximum < 1 else []
-    if inner := [path for path in folders if 1 in _shares(path).values()]:
-        names = ", ".join(path.name for path in inner[:4])
-        if len(inner) > 4:
-            names += " ..."
-        raise MissingError(f"{folder} is one level too high, above {names}: give {inner[0]}")
+    if maximum < 1:
+        folders = sorted(path for path in folder.iterdir() if path.is_dir())
+        if inner := [path for path in folders if 1 in _shares(path).values()]:
+            raise MissingError(
+                f"{folder} is one level too high: give a folder below, as {inner[0]}"
+            )
     if maximum == 0:
         files = (f"{name} ({', '.join(map(' or '.join, FORMATS[name].needs))})" for name in best)
         raise MissingError(
-            f"{folder} is no known recording: it needs the files of {'; '.join(files)}; of a scene "
-            "in parts, give one part's folder"
+            f"{folder} is no known recording: it needs the files of {'; '.join(files)}"
         )
     if len(best) > 1 and maximum == 1:
         raise DataError(
@@ -223,8 +222,8 @@ def _told_by_files(folder: Path) -> str:
 
 def holds_recording(folder: Path) -> bool:
     """Whether a folder has both colour and depth of a known format."""
-    needed = ((layout.color, layout.depth) for layout in FORMATS.values())
-    return any(_is_there(folder, color) and _is_there(folder, depth) for color, depth in needed)
+    layouts = FORMATS.values()
+    return any(_is_there(folder, f.color) and _is_there(folder, f.depth) for f in layouts)
 
 
 def _shares(folder: Path) -> dict[str, float]:

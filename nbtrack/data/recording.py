@@ -134,8 +134,7 @@ def _times(folder: Path, colors: list[Path], rate_hz: float) -> Times:
     times = np.array(rows).ravel()
     if len(times) != len(colors) or not (np.diff(times) > 0).all():
         raise DataError(
-            f"{path} has {len(times)} times for {len(colors)} images: write one a line (s), in "
-            "rising order, or remove it"
+            f"{path} has {len(times)} times for {len(colors)} images: write one each (s), rising"
         )
     return times
 
@@ -237,12 +236,10 @@ def _check_paired(colors: list[Path], others: list[Path]) -> None:
     if not np.array_equal(numbers, other_numbers):
         count = Counter([*numbers, *other_numbers])
         odd = [path.name for path in (*colors, *others) if count[_numbers_of([path])[0]] != 2]
-        more = " ..." if len(odd) > 4 else ""
         raise DataError(
             f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
-            f"{len(others)} {others[0].suffix} files, with other frame numbers in the names "
-            f"({len(odd)} without a partner: {', '.join(odd[:4])}{more}): every "
-            "image needs one; rename or remove the odd files"
+            f"{len(others)} {others[0].suffix} files ({len(odd)} without a partner of its number: "
+            f"{', '.join(odd[:4])}): every image needs one; rename or remove the odd files"
         )
 
 

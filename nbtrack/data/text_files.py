@@ -64,8 +64,7 @@ def read_rows(
         except ValueError:
             row = ()
         if len(row) not in (columns if not rows else (len(rows[0]),)):
-            line_shown = f"{path} line {number} is {line[:60]!r}"
-            raise DataError(f"{line_shown}: every line holds {meaning}; correct it")
+            raise DataError(f"{path} line {number} is {line[:60]!r}: every line holds {meaning}")
         rows.append(row)
     if not rows:
         raise DataError(f"{path} is empty: every line holds {meaning}; write it anew")
@@ -208,14 +207,12 @@ def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
 
     def numbers(key: str, *counts: int) -> list[float]:
         """The list of an entry; a single number counts as a list of one."""
-        entry = camera.get(key)
-        values = entry if isinstance(entry, list) else [entry]
+        values = camera[key] if isinstance(camera.get(key), list) else [camera.get(key)]
         # NaN is not below anything, and True is no number here.
         are_numbers = all(type(v) in (int, float) and abs(v) < _LARGEST for v in values)
         if not (are_numbers and len(values) in counts):
-            allowed = " or ".join(map(str, counts))
-            text = f"{path}: {key} is {str(entry)[:40]!r}: write {allowed} finite number(s)"
-            raise DataError(f"{text}, as in {_CAMERA}")
+            text = f"{path}: {key} is {str(camera.get(key))[:40]!r}: write"
+            raise DataError(f"{text} {' or '.join(map(str, counts))} finite number(s)")
         return [float(value) for value in values]
 
     others: dict[str, Any] = {}
