@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from scipy.spatial import cKDTree
 
 from nbtrack.core.arrays import Poses, Position
@@ -36,10 +36,10 @@ class Recording:
     color_files: list[Path]  # in the order of the recording, frame by frame
     depth_files: list[Path]
     times: Times  # of the frames, as recorded, or by their numbers and the rate declared
-    file_poses: Poses  # as `declared` says; NaN without a pose
-    pose_file: Path | None  # named in messages; with `*` where every frame has a file
     calibration: Calibration  # of the depth images, and of the colour that lies on them
     notes: list[str]  # what was assumed, and left out
+    file_poses: Poses  # as `declared` says; NaN without a pose
+    pose_file: Path | None = None  # named in messages; with `*` where every frame has a file
 
     def __len__(self) -> int:
         return len(self.color_files)
@@ -89,25 +89,13 @@ def open_recording(
     folder, notes = Path(folder), []
     declared = declaration(folder, format)
     layout = FORMATS[declared.format]
-    colors, depths, times = _images(folder, declared, depth_folder, notes)
-    poses, path = _poses(folder, declared, pose_file, colors, times, notes)
-    _check_together(declared.poses_to_opencv(poses)[:, :3, 3], path)
-    camera = _calibration(folder, layout)
+    images = _images(folder, declared, depth_folder, notes)
+    camera, no_poses = _calibration(folder, layout), np.full((len(images[0]), 4, 4), np.nan)
     if not camera.source.is_file():
         notes.append(f"{camera.source.name}, {camera.fx:g} px at 640x480: no {layout.cameras[0]}")
-    return Recording(
-        folder=folder,
-        name=folder.resolve().name,
-        format=layout,
-        declared=declared,
-        color_files=colors,
-        depth_files=depths,
-        times=times,
-        file_poses=poses,
-        pose_file=path,
-        calibration=camera,
-        notes=notes,
-    )
+    name = folder.resolve().name
+    recording = Recording(folder, name, layout, declared, *images, camera, notes, no_poses)
+    return _with_poses(recording, pose_file)
 
 
 def _images(
@@ -148,59 +136,53 @@ def _calibration(folder: Path, layout: Format) -> Calibration:
     return read_calibration(layout.files(folder, layout.cameras + named, "calibration")[0])
 
 
-def _poses(
-    folder: Path,
-    declared: Declaration,
-    pose_file: str | None,
-    colors: list[Path],
-    times: Times,
-    notes: list[str],
-) -> tuple[Poses, Path | None]:
-    """A pose a frame, and the name of the files that they were read from.
-
-    Without a file all poses are NaN. Notes are added on that, and on poses without an image.
-    """
-    layout = FORMATS[declared.format]
+def _with_poses(recording: Recording, pose_file: str | None) -> Recording:
+    """The recording with a pose a frame, where there is a file of poses."""
+    folder, layout, colors = recording.folder, recording.format, recording.color_files
     names = (pose_file,) if pose_file else layout.poses
     there = [name for name in names if files_of(folder, name)]
     if len(there) > 1:
         both = " and ".join(there)
         raise DataError(f"{folder} has {both}: keep one, or choose by `data convert --poses FILE`")
     if not there and not pose_file:
-        notes.append("no poses")
-        return np.full((len(colors), 4, 4), np.nan), None
+        recording.notes.append("no poses")
+        return recording
     files = layout.files(folder, names, "poses")
     path = folder / there[0]
     if "*" in path.name:
         _check_paired(colors, files)
-    tables = [read_poses(file, declared.quaternion) for file in files]
+    tables = [read_poses(file, recording.declared.quaternion) for file in files]
     poses, pose_times = np.concatenate([T for T, _ in tables]), tables[0][1]
     if pose_times is not None:
-        poses = _placed(poses, pose_times, times, path, layout.color[0].endswith(".txt"))
+        is_by_time = layout.color[0].endswith(".txt")
+        poses = _placed(poses, pose_times, recording.times, path, is_by_time)
     numbers = _numbers_of(colors)
     if len(poses) > len(colors) and 0 <= numbers.min() <= numbers.max() < len(poses):
-        of = f"of {len(poses)} poses in {path.name}"
-        notes.append(f"{of} those of the {len(colors)} images' numbers")
+        chosen = f"those of the {len(colors)} images' numbers"
+        recording.notes.append(f"of {len(poses)} poses in {path.name} {chosen}")
         poses = poses[numbers]
     if len(poses) != len(colors):
         raise DataError(
             f"{path} has {len(poses)} poses but there are {len(colors)} images: every image needs "
             "one, 'nan' where it has none, and every pose an image; remove what is odd"
         )
-    return poses, path
+    recording = replace(recording, file_poses=poses, pose_file=path)
+    _check_together(recording)
+    return recording
 
 
-def _check_together(positions: Float[np.ndarray, "frames 3"], path: Path | None) -> None:
+def _check_together(recording: Recording) -> None:
     """Raises DataError for a pose that lies far from all others."""
-    known = np.isfinite(positions).all(axis=1)
-    if not known.any():
+    ids = np.flatnonzero(recording.has_pose)
+    positions = recording.T_world_camera[ids, :3, 3]
+    if not len(ids):
         return
-    away = np.linalg.norm(positions - np.median(positions[known], axis=0), axis=1)
-    usual = np.quantile(away[known], 0.9, method="lower")
+    away = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    usual = np.quantile(away, 0.9, method="lower")
     for i in np.flatnonzero((away > _ALONE) & (away > _ALONE * usual)):
         raise DataError(
-            f"{path} frame {i} lies {away[i]:.3g} m from the others, which keep within {usual:.3g} "
-            "m: correct its pose, or write nan for it"
+            f"{recording.pose_file} frame {ids[i]} lies {away[i]:.3g} m from the others, which "
+            f"keep within {usual:.3g} m: correct its pose, or write nan for it"
         )
 
 
