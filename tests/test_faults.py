@@ -95,7 +95,7 @@ ENVIRONMENT = {
     "preset": ("PRESET", "smok", "did you mean 'smoke'"),
     "no config": ("CONFIG", "none.toml", "no config file none.toml"),
     "config folder": ("CONFIG", "map", "no config file map"),
-    "device": ("DEVICE", "gpu7", "device 'gpu7' is not there"),
+    "device": ("DEVICE", "gpu7", "no device 'gpu7': this machine"),
     "runs in a file": ("RUNS", "room", "room"),
 }
 
@@ -227,7 +227,7 @@ ARGUMENTS = {
     "giant seed": ([*OWN, "--seed", "9" * 30], "is 0 or more"),
     "no threads": ([*OWN, "--threads", "0"], "from 1 to 1024"),
     "too many threads": ([*OWN, "--threads", "100000"], "from 1 to 1024"),
-    "unknown device": ([*OWN, "--device", "tpu"], "is not there"),
+    "unknown device": ([*OWN, "--device", "tpu"], "no device 'tpu'"),
     "no slice": ([*OWN, "--frames", "3"], "is no slice"),
     "no step": ([*OWN, "--frames", "::0"], "with S above 0"),
     "one frame": ([*OWN, "--frames", "2:3"], "too short to track"),

@@ -36,9 +36,7 @@ def named_device(name: str) -> torch.device:
     except (RuntimeError, AssertionError, NotImplementedError):
         kind = torch.accelerator.current_accelerator(check_available=True)
         there = ["cpu", *(f"{kind}:{i}" for i in range(torch.accelerator.device_count()))]
-        raise ConfigError(
-            f"device {name!r} is not there: this machine has {', '.join(there)}"
-        ) from None
+        raise ConfigError(f"no device {name!r}: this machine has {', '.join(there)}") from None
     return device
 
 
@@ -107,8 +105,7 @@ def advise_on_memory(setting: str) -> Iterator[None]:
         if not (is_told or isinstance(error, MemoryError | torch.OutOfMemoryError)):
             raise
         raise OutOfMemory(
-            f"out of memory with {setting}: lower it with --set, or use a device with more; what "
-            "was finished is kept"
+            f"out of memory with {setting}: lower it with --set; what was finished is kept"
         ) from None
 
 

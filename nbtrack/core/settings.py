@@ -39,10 +39,7 @@ def with_settings(config: Config, *settings: str) -> Config:
             value = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
             if text.startswith(("[", "{", '"', "'")):
-                raise ConfigError(
-                    f"value {text!r} is no TOML: write ['a', 'b'] or [1, 2], and quote the whole "
-                    "setting, so that the shell leaves the inner quotes"
-                ) from None
+                raise ConfigError(f"{text!r} is no TOML: write \"{key}=['a', 'b']\"") from None
             value = text  # a bare word is a string
         config = with_values(config, {key: value})
     return config
@@ -102,13 +99,8 @@ def _converted(key: str, old: Any, value: Any, minimum: int) -> Any:
     if wanted is float and type(value) is int and abs(value) < 1e300:
         value = float(value)
     if type(value) is not wanted:
-        raise ConfigError(
-            f"{key} = {value!r} is of type {type(value).__name__}: it must be {wanted.__name__}, "
-            f"for example {old!r}"
-        )
+        raise ConfigError(f"{key} = {value!r}: it must be {wanted.__name__}, for example {old!r}")
     minimum = minimum if wanted is int else 0
     if wanted in (int, float) and not minimum <= value < math.inf:
-        raise ConfigError(
-            f"{key} = {value!r}: it must be {minimum} or more; the preset has {old!r}"
-        )
+        raise ConfigError(f"{key} = {value!r}: it must be {minimum} or more, for example {old!r}")
     return value

@@ -91,11 +91,10 @@ class Frame:
 
 def _check(what: str, image: np.ndarray, shape: tuple[int, ...], *kinds: type, asked: str) -> None:
     """Raises DataError for another shape or type."""
-    is_array = isinstance(image, np.ndarray)
-    if not (is_array and image.shape == shape and issubclass(image.dtype.type, kinds)):
-        shown = (
-            f"{image.dtype} of shape {image.shape}"
-            if is_array
-            else f"of type {type(image).__name__}"
-        )
-        raise DataError(f"{what} is {shown}: give a numpy array, {asked}, of shape {shape}")
+    if not isinstance(image, np.ndarray):
+        found = f"of type {type(image).__name__}"
+    elif image.shape == shape and issubclass(image.dtype.type, kinds):
+        return
+    else:
+        found = f"{image.dtype} of shape {image.shape}"
+    raise DataError(f"{what} is {found}: give a numpy array, {asked}, of shape {shape}")

@@ -131,9 +131,7 @@ def read_frames(
     return RgbdSequence(recording.name, *images, poses, frame_ids, times, origin)
 
 
-def select_frames(
-    recording: Recording, frames: slice, needs_poses: bool = True
-) -> Int[np.ndarray, "n"]:
+def select_frames(recording: Recording, frames: slice, needs_poses: bool = True) -> Frames:
     """Numbers of the selected frames. Raises DataError if there is none, or none with a pose."""
     frame_ids = np.arange(len(recording))[frames]
     if not (recording.has_pose[frame_ids].any() if needs_poses else len(frame_ids)):

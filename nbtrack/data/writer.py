@@ -48,22 +48,17 @@ def write_sequence(
         unfinished.mkdir()
         poses = []
         for color, depths_mm, T_world_camera in frames:
-            _write_images(unfinished, len(poses), color, depths_mm)
+            images = {f"{name}/depth": image for name, image in depths_mm.items()}
+            images["images/img"] = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
+            for prefix, image in images.items():
+                # The fastest compression: rooms are made often and read from a local disk.
+                content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+                write_atomic(unfinished / f"{prefix}{len(poses)}.png", content.tobytes())
             poses.append(T_world_camera)
             progress(len(poses))
         for name, text in (_texts(camera, np.stack(poses)) | dict(notes or {})).items():
             (unfinished / name).write_text(text, encoding="utf-8")
         unfinished.rename(folder)  # fails if another command has finished it meanwhile
-
-
-def _write_images(
-    folder: Path, number: int, color: ColorImage, depths: dict[str, DepthImage]
-) -> None:
-    images = {"images/img": cv2.cvtColor(color, cv2.COLOR_RGB2BGR)}
-    for prefix, image in (images | {f"{name}/depth": depths[name] for name in depths}).items():
-        # The fastest compression: rooms are made often and read from a local disk.
-        content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-        write_atomic(folder / f"{prefix}{number}.png", content.tobytes())
 
 
 def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
