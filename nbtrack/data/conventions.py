@@ -129,9 +129,6 @@ def _candidates(declared: Declaration, camera: Intrinsics) -> list[Convention]:
     own = Convention("poses", name, declared, camera)
     order = "wxyz" if declared.quaternion == "xyzw" else "xyzw"
     orders = {f"quaternions in the order {order}": {"quaternion": order}}
-    for other, keys in CONVENTIONS.items():
-        if other.startswith("Open") and other != name:
-            orders[f"quaternions in the order {order}, and {other}"] = {**keys, "quaternion": order}
     table = [
         (subject, name, {"declared": replace(declared, **keys)})
         for subject, named in (("poses", CONVENTIONS | orders), ("depth", _DEPTHS))

@@ -188,9 +188,7 @@ def declaration(folder: Path, format: str | None = None) -> Declaration:
     Raises MissingError, ConfigError or DataError for what it cannot tell.
     """
     if not folder.is_dir():
-        raise MissingError(
-            f"no folder {folder}: give that of a recording, or a synthetic room's name"
-        )
+        raise MissingError(f"no folder {folder}: give a recording's, or a synthetic room's name")
     path = folder / DECLARATION_FILE
     format = format or _declared(path, Declaration()).format or _told_by_files(folder)
     return replace(_declared(path, look_up("format", format, FORMATS).declared), format=format)
@@ -204,18 +202,14 @@ def _told_by_files(folder: Path) -> str:
     if maximum < 1:
         folders = sorted(path for path in folder.iterdir() if path.is_dir())
         if inner := [path for path in folders if 1 in _shares(path).values()]:
-            raise MissingError(
-                f"{folder} is one level too high: give a folder below, as {inner[0]}"
-            )
+            raise MissingError(f"{folder} is one level too high: give {inner[0]}, say")
     if maximum == 0:
         files = (f"{name} ({', '.join(map(' or '.join, FORMATS[name].needs))})" for name in best)
-        raise MissingError(
-            f"{folder} is no known recording: it needs the files of {'; '.join(files)}"
-        )
+        raise MissingError(f"{folder} is no recording: it needs the files of {'; '.join(files)}")
     if len(best) > 1 and maximum == 1:
         raise DataError(
-            f"{folder} can be read as {' or '.join(best)}: choose with --format, or format = "
-            f'"{best[0]}" in {DECLARATION_FILE}'
+            f"{folder} can be read as {' or '.join(best)}: choose with --format, or by "
+            f'format = "{best[0]}" in {DECLARATION_FILE}'
         )
     return best[0]
 
@@ -228,10 +222,7 @@ def holds_recording(folder: Path) -> bool:
 
 def _shares(folder: Path) -> dict[str, float]:
     """How much of what each format needs is in a folder."""
-    return {
-        name: np.mean([_is_there(folder, patterns) for patterns in layout.needs])
-        for name, layout in FORMATS.items()
-    }
+    return {name: np.mean([_is_there(folder, p) for p in FORMATS[name].needs]) for name in FORMATS}
 
 
 def _is_there(folder: Path, patterns: tuple[str, ...]) -> bool:
