@@ -9,13 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import DataError
-from nbtrack.data.conventions import (
-    Convention,
-    best_convention,
-    diagnosis,
-    fit_all,
-    want_of_proof,
-)
+from nbtrack.data.conventions import Convention, best_convention, diagnosis, fit_all
 from nbtrack.data.recording import Recording
 from nbtrack.data.sequence import RgbdSequence, read_frames, select_frames
 
@@ -58,10 +52,8 @@ class DataReport:
         first = "".join(self.recording.color_files[i].name for i in jumps.index[:1])
         flicker = self.frames.flicker[self.frames.turned_deg < _SAME_VIEW_DEG].max()
         measured, misread = self.frames.measured.mean(), self.best is not self.conventions[0]
-        wrong = diagnosis(self.conventions, self.best, self.recording)
         rules = [
-            (wrong, wrong),
-            (not wrong and self.is_whole, want_of_proof(self.conventions, self.recording)),
+            (True, diagnosis(self.conventions, self.recording, needs_proof=self.is_whole)),
             (
                 len(jumps) and not misread,
                 f"{len(jumps)} of {moved.count()} steps are longer than {_JUMP} m, first to {first}"

@@ -203,9 +203,12 @@ def _is_clearly_less(relative: float, other: float) -> bool:
     return relative <= min(_CLEARLY_BETTER * other, other - _MIN_GAIN)
 
 
-def diagnosis(results: list[Convention], best: Convention, recording: Recording) -> str:
-    """What is wrong with how the numbers are read, in a sentence; empty where nothing is."""
-    own, file = results[0], recording.pose_file.name
+def diagnosis(results: list[Convention], recording: Recording, needs_proof: bool) -> str:
+    """What is wrong with how the numbers are read, in a sentence; empty where nothing is.
+
+    Where proof is needed, a camera that moves too little to tell conventions apart is wrong too.
+    """
+    own, best, file = results[0], best_convention(results), recording.pose_file.name
     apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
     if best is not own:
         look = "look" if best.subject == "poses" else "looks"
@@ -225,22 +228,18 @@ def diagnosis(results: list[Convention], best: Convention, recording: Recording)
             f"{file} is not proved: two frames see too little of the same ({own.overlap:.0%} of "
             f"the points, whose surfaces {apart}): check it, and a piece with smaller steps"
         )
-    if not is_far:
-        return ""
-    return (
-        f"surfaces that two frames see {apart} (median, {own.overlap:.0%} of the points overlap) "
-        f"and no other convention fits: check {recording.calibration.source.name}, the depth unit "
-        f"and {file}, and that image, depth and pose belong to one moment"
-    )
-
-
-def want_of_proof(results: list[Convention], recording: Recording) -> str:
-    """That a camera moves too little to tell conventions apart, in a sentence; empty if it does."""
-    own, *others = results
-    poses = [r for r in others if r.subject == "poses" and r.overlap >= own.overlap / 2]
+    if is_far:
+        return (
+            f"surfaces that two frames see {apart} (median, {own.overlap:.0%} of the points "
+            f"overlap) and no other convention fits: check {recording.calibration.source.name}, "
+            f"the depth unit and {file}, and that image, depth and pose belong to one moment"
+        )
+    poses = [r for r in results[1:] if r.subject == "poses" and r.overlap >= own.overlap / 2]
     alike = [r.name for r in poses if not _is_clearly_less(own.relative, r.relative)]
-    little = f"{recording.pose_file.name} is not proved: the camera moves too little to tell "
-    return f"{little}{len(alike)} other conventions apart, such as {alike[0]}" if alike else ""
+    if not (needs_proof and alike):
+        return ""
+    little = f"{file} is not proved: the camera moves too little to tell {len(alike)} other"
+    return f"{little} conventions apart, such as {alike[0]}"
 
 
 def _remedy(convention: Convention, own: Convention) -> str:
