@@ -284,8 +284,8 @@ MISTAKES = [
     Case("one for images half as large; set", change=camera(0.5, 0.5)),
     Case("ones in millimetres; multiply .* by 0.001 ", change=moved(1000.0)),
     Case("ones in centimetres; multiply .* by 0.01 ", change=moved(100.0)),
-    Case(".*images upside down", change=turned(1)),
-    Case(".*images turned by 180 degrees", change=turned(1, 2)),
+    Case(".*; or the depth images are turned against", change=turned(1)),
+    Case(".*; or the depth images are turned against", change=turned(1, 2)),
 ]
 RIGHT = [
     Case("", f'camera_axes = "{axes}"\nposes = "{direction}"', poses(axes, direction))

@@ -99,10 +99,9 @@ def advise_on_memory(setting: str) -> Iterator[None]:
     except OutOfMemory:
         raise  # somebody nearer has named the setting
     except (RuntimeError, MemoryError) as error:
-        # Only CUDA has a class of its own for it; the CPU's allocator and MPS say it in words.
+        # CUDA, the CPU's allocator and MPS say it in words.
         words = ("can't allocate memory", "not enough memory", "out of memory")
-        is_told = any(word in str(error) for word in words)
-        if not (is_told or isinstance(error, MemoryError | torch.OutOfMemoryError)):
+        if not (isinstance(error, MemoryError) or any(word in str(error) for word in words)):
             raise
         raise OutOfMemory(
             f"out of memory with {setting}: lower it with --set; what was finished is kept"

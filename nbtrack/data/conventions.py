@@ -42,7 +42,6 @@ _CALIBRATIONS = {  # factors of focal lengths
     "one for images half as large": 2.0,
 }
 _UNITS = {"ones in millimetres": 1e-3, "ones in centimetres": 1e-2}
-_FLIPPED = {(1,): "images upside down", (1, 2): "images turned by 180 degrees"}
 # The common camera axes first: where several fit alike, the first is named.
 _USUAL = {
     "right up backward": "OpenGL axes",
@@ -83,7 +82,6 @@ class Convention:
     relative: float = math.nan  # the same as a share of the depth, which no unit makes small
     overlap: float = 0.0  # share of all points that fall onto a measured, not nearer, surface
     metres: float = 1.0  # of one unit of the poses' positions
-    flipped: tuple[int, ...] = ()  # axes of (frames, rows, columns) that depth has in reverse order
 
     def points(self, columns: Tensor, rows: Tensor, values: Tensor) -> Tensor:
         """Points (..., 3; m, camera frame) of pixels with depth values as in the files."""
@@ -94,7 +92,6 @@ class Convention:
 
     def grid_points(self, values: UInt16[np.ndarray, "frames h w"], stride: int) -> Tensor:
         """Points (frames, n, 3) of every `stride`-th row and column; 0 if unmeasured."""
-        values = np.flip(values, self.flipped)
         values = torch.from_numpy(values[:, ::stride, ::stride].astype(np.float32))
         rows, columns = (stride * torch.from_numpy(np.indices(values.shape[1:]))).flatten(1)
         return self.points(columns, rows, values.flatten(1))
@@ -140,7 +137,6 @@ def _candidates(declared: Declaration, camera: Intrinsics) -> list[Convention]:
         scaled = Intrinsics(camera.width, camera.height, *(factor * lengths).tolist())
         middle = replace(scaled, cx=camera.width / 2, cy=camera.height / 2)
         table += [("calibration", name, {"camera": c}) for c in (scaled, middle)]
-    table += [("depth", name, {"flipped": axes}) for axes, name in _FLIPPED.items()]
     table += [("poses", name, {"metres": metres}) for name, metres in _UNITS.items()]
     return [own] + [
         replace(own, subject=subject, name=name, **changes)
@@ -167,8 +163,7 @@ def _fitted(
     columns, rows, depth = project(convention.camera, points_b)
     # From -1 at the first pixel to 1 at the last.
     at = 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1)[:, None] - 1
-    seen_by_b = np.flip(values[1], convention.flipped).astype(np.float32)
-    inverse = 1 / torch.from_numpy(seen_by_b[:, None])
+    inverse = 1 / torch.from_numpy(values[1, :, None].astype(np.float32))
     blended = 1 / grid_sample(inverse, at, "bilinear", align_corners=True)[:, 0, 0]
     nearest = 1 / grid_sample(inverse, at, "nearest", align_corners=True)[:, 0, 0]
     measured = convention.points(columns, rows, blended)[..., 2]
@@ -212,9 +207,9 @@ def diagnosis(results: list[Convention], recording: Recording, needs_proof: bool
     apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
     if best is not own:
         look = "look" if best.subject == "poses" else "looks"
-        # Mirrored or turned axes and flipped images fit alike; the common axes come first.
-        alike = [r for r in results if r.flipped and r.relative < best.relative / _CLEARLY_BETTER]
-        or_depth = f"; so would depth {alike[0].name}" if alike and not best.flipped else ""
+        # Depth upside down, or turned by 180 degrees, fits like mirrored or turned axes.
+        is_rare = "axes" in best.name and not best.name.startswith("Open")
+        or_depth = "; or the depth images are turned against the colour images" * is_rare
         return (
             f"your {best.subject} {look} like {best.name}; {_remedy(best, own)} (surfaces that two "
             f"frames see then lie {1e3 * best.median_m:.0f} mm apart; as declared they {apart})"
@@ -244,8 +239,6 @@ def diagnosis(results: list[Convention], recording: Recording, needs_proof: bool
 
 def _remedy(convention: Convention, own: Convention) -> str:
     """What to change, so that a convention is the declared one."""
-    if convention.flipped:
-        return "turn the depth images as the colour images are"
     if convention.metres != 1:
         return f"multiply the positions in the pose file by {convention.metres:g}"
     if (c := convention.camera) != own.camera:
