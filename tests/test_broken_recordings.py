@@ -102,8 +102,8 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "timestamp NaN": (line("rgb.txt", 1, "nan rgb/a.png"), "line 2 is 'nan rgb/a.png'"),
         "file not there": (line("depth.txt", 2, "1.0 depth/no.png"), "1 of 7 .* in .*no.png.: add"),
         "part of the files": (without("depth/*86*"), "6 of 7 files named in .*depth.txt are not"),
-        "other clock": (text("depth.txt", "1.0 depth/odd.png\n"), "no times within 0.02 s"),
-        "poses of another clock": (text("groundtruth.txt", "5 0 0 0 0 0 0 1"), "no pose within"),
+        "other clock": (text("depth.txt", "1.0 depth/odd.png\n"), "no time within 0.02 s"),
+        "poses of another clock": (text("groundtruth.txt", "5 0 0 0 0 0 0 1"), "no time within"),
         "7 columns": (line("groundtruth.txt", 3, ROW), "line 4 is '1305031102.675 0"),
         "zero quaternion": (line("groundtruth.txt", 3, ROW + " 0"), "pose 1 .* norm 0:"),
         "NaN timestamp": (line("groundtruth.txt", 3, "nan 0 0 0 0 0 0 1"), "needs finite timest"),
@@ -173,7 +173,7 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "no poses": (without("trajectory.txt"), "no poses in .*trajectory.txt or poses.txt"),
         "two pose files": (text("poses.txt", "1 2 3"), "keep one, or choose by `data convert"),
         "9 columns": (text("trajectory.txt", "1 2 3 4 5 6 7 8 9\n"), "trajectory.txt line 1 is"),
-        "a line less": (text("trajectory.txt", "0.5001 0 0 0 0 0 0 1\n"), "no pose within 0.001"),
+        "a line less": (text("trajectory.txt", "0.5001 0 0 0 0 0 0 1\n"), "no time within 0.001"),
         "order of columns": (text("trajectory.txt", "0 0 0 0 1 2 3 4\n" * 6), "norm 5.48: columns"),
         "rows of two kinds": (
             text("trajectory.txt", "0 0 0 0 0 0 0 1\n" * 5 + "0 0 0 0 0 0 1\n"), "line 6 is '0 0"

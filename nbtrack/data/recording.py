@@ -194,13 +194,7 @@ def _placed(poses: Poses, pose_times: Times, times: Times, path: Path, is_by_tim
     """
     if len(poses) == len(times) and not is_by_time:
         return poses
-    tolerance, closest = _TOLERANCE if is_by_time else 1e-3, _nearest(times, pose_times)
-    has_pose = np.abs(pose_times[closest] - times) <= tolerance
-    if not (has_pose.any() and np.isfinite(pose_times).all()):
-        raise DataError(
-            f"{path} ({_span(pose_times)}) has no pose within {tolerance:g} s of an image "
-            f"({_span(times)}): it needs finite timestamps of the same clock, one a frame"
-        )
+    closest, has_pose = _nearest(times, pose_times, _TOLERANCE if is_by_time else 1e-3, path)
     placed = np.where(has_pose[:, None, None], poses[closest], np.nan)
     # Unless all poses find a frame the times are something else.
     is_whole = np.isfinite(placed).sum() == np.isfinite(poses).sum()
@@ -230,14 +224,9 @@ def _listed_pairs(
 ) -> tuple[list[Path], list[Path], Times]:
     """Images and depth maps of two lists that are each other's nearest in time, and the times."""
     (color_times, colors), (depth_times, depths) = map(_read_list, (color_list, depth_list))
-    closest = _nearest(color_times, depth_times)
-    kept = _nearest(depth_times, color_times)[closest] == np.arange(len(colors))
-    kept &= np.abs(depth_times[closest] - color_times) <= _TOLERANCE
-    if not kept.any():
-        raise DataError(
-            f"{color_list} ({_span(color_times)}) and {depth_list} ({_span(depth_times)}) have no "
-            f"times within {_TOLERANCE} s of each other: both need timestamps of one clock"
-        )
+    closest, kept = _nearest(color_times, depth_times, _TOLERANCE, depth_list)
+    back, _ = _nearest(depth_times, color_times, _TOLERANCE, color_list)
+    kept &= back[closest] == np.arange(len(colors))
     if not kept.all():
         left_out = f"{(~kept).sum()} of the {len(kept)} images in {color_list.name} are left out"
         notes.append(f"{left_out}: no depth map of {depth_list.name} is within {_TOLERANCE} s")
@@ -269,9 +258,21 @@ def _entry(line: str) -> tuple[float, str]:
     return float(time), name.strip()
 
 
-def _nearest(times: Times, others: Times) -> Int[np.ndarray, "_"]:
-    """For every time the index of the nearest other one (m > 0)."""
-    return cKDTree(np.nan_to_num(others)[:, None]).query(times[:, None], p=1)[1]
+def _nearest(
+    times: Times, others: Times, tolerance: float, path: Path
+) -> tuple[Int[np.ndarray, "_"], Bool[np.ndarray, "_"]]:
+    """For every time the index of the nearest other one, and whether it is within a tolerance (s).
+
+    Raises DataError, which names the file of the others, if none is, or one is not finite.
+    """
+    closest = cKDTree(np.nan_to_num(others)[:, None]).query(times[:, None], p=1)[1]
+    is_near = np.abs(others[closest] - times) <= tolerance
+    if not (is_near.any() and np.isfinite(others).all()):
+        raise DataError(
+            f"{path} ({_span(others)}) has no time within {tolerance:g} s of the images' "
+            f"({_span(times)}): it needs finite timestamps of the same clock"
+        )
+    return closest, is_near
 
 
 def _span(times: Times) -> str:
