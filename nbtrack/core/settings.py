@@ -1,7 +1,7 @@
 """Settings: trees of frozen dataclasses and dictionaries of them, changed by checked `key=value`.
 
 Keys are dotted paths such as `mapping.neus.iterations`; an unknown one is an error. Counts are at
-least one, unless their field says `may_be_zero`.
+least one, and other numbers at least zero, unless their field says otherwise.
 """
 
 import dataclasses
@@ -18,7 +18,17 @@ Config = TypeVar("Config")
 
 def may_be_zero(default: int) -> Any:
     """A dataclass field with a count that may also be 0."""
-    return dataclasses.field(default=default, metadata={"min": 0})
+    return limited(default, 0)
+
+
+def limited(default: float, minimum: float, maximum: float = math.inf) -> Any:
+    """A dataclass field with a number that a user may set within limits."""
+    return dataclasses.field(default=default, metadata={"limits": (minimum, maximum)})
+
+
+def one_of(*choices: str) -> Any:
+    """A dataclass field with one of some words, by default the first."""
+    return dataclasses.field(default=choices[0], metadata={"choices": choices})
 
 
 def as_dict(config: Any) -> dict[str, Any]:
@@ -54,7 +64,7 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     valid = dict(_leaves(config))
     for key, value in _leaves(dict(values)):
         look_up("config key", key, valid)
-        config = _replaced(config, key.split("."), key, value)
+        config = _replaced(config, key.split("."), key, value, {})
     return config
 
 
@@ -78,29 +88,32 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield from _leaves(value, f"{prefix}.{name}" if prefix else name)
 
 
-def _replaced(node: Any, path: list[str], key: str, value: Any, minimum: int = 1) -> Any:
+def _replaced(node: Any, path: list[str], key: str, value: Any, allowed: Mapping) -> Any:
     """The tree with one key set. Nested parts are rebuilt, never changed in place."""
     if not path:
-        return _converted(key, node, value, minimum)
+        return _converted(key, node, value, allowed)
     name, *rest = path
     if isinstance(node, dict):
-        return {**node, name: _replaced(node[name], rest, key, value)}
-    metadata = next(f.metadata for f in dataclasses.fields(node) if f.name == name)
-    new = _replaced(getattr(node, name), rest, key, value, metadata.get("min", 1))
+        return {**node, name: _replaced(node[name], rest, key, value, {})}
+    allowed = next(f.metadata for f in dataclasses.fields(node) if f.name == name)
+    new = _replaced(getattr(node, name), rest, key, value, allowed)
     return dataclasses.replace(node, **{name: new})
 
 
-def _converted(key: str, old: Any, value: Any, minimum: int) -> Any:
+def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
     wanted = type(old)
     if wanted is tuple and isinstance(value, list | str | int | float):
         values = value if isinstance(value, list) else [value]
-        return tuple(_converted(key, old[0], v, minimum) if old else v for v in values)
+        return tuple(_converted(key, old[0], v, allowed) if old else v for v in values)
     # Integers of TOML may be too large for a float.
     if wanted is float and type(value) is int and abs(value) < 1e300:
         value = float(value)
     if type(value) is not wanted:
         raise ConfigError(f"{key} = {value!r}: it must be {wanted.__name__}, for example {old!r}")
-    minimum = minimum if wanted is int else 0
-    if wanted in (int, float) and not minimum <= value < math.inf:
-        raise ConfigError(f"{key} = {value!r}: it must be {minimum} or more, for example {old!r}")
+    minimum, maximum = allowed.get("limits", (int(wanted is int), math.inf))
+    if wanted in (int, float) and not (minimum <= value <= maximum and value < math.inf):
+        up_to = "or more" if maximum == math.inf else f"to {maximum:g}"
+        raise ConfigError(f"{key} = {value!r}: it must be {minimum:g} {up_to}, such as {old!r}")
+    if value not in allowed.get("choices", [value]):
+        raise ConfigError(f"{key} = {value!r}: write {' or '.join(map(repr, allowed['choices']))}")
     return value

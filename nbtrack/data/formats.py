@@ -8,13 +8,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
-from nbtrack.core.settings import may_be_zero, with_values
+from nbtrack.core.settings import limited, one_of, with_values
 from nbtrack.data.text_files import Calibration, read_object
 
 DECLARATION_FILE = "sequence.toml"
@@ -28,24 +27,18 @@ _DIRECTIONS |= dict(zip(("left", "up", "backward"), 0 - np.eye(3), strict=True))
 
 @dataclass(frozen=True)
 class Declaration:
-    """How the numbers of a recording are meant. Raises ConfigError for what cannot be."""
+    """How the numbers of a recording are meant; limits are far beyond any camera's."""
 
     format: str = ""  # empty: told by the files
-    depth_scale: float = 1000.0  # depth values a metre
-    no_depth: int = may_be_zero(0)  # a value that means "not measured", besides 0
-    depth_along: str = "axis"  # the optical axis (z-depth), or "ray" (distance)
+    depth_scale: float = limited(1000.0, 1e-8, 1e8)  # depth values a metre
+    no_depth: int = limited(0, 0, 65535)  # a value that means "not measured", besides 0
+    depth_along: str = one_of("axis", "ray")  # the optical axis (z-depth), or the ray (distance)
     camera_axes: str = "opencv"  # or "opengl", or where x, y, z point: "right up forward"
-    poses: str = CAMERA_TO_WORLD  # or "world-to-camera"
-    quaternion: str = "xyzw"  # or "wxyz": the order in pose files with quaternions
-    frame_rate: float = 30.0  # Hz
+    poses: str = one_of(CAMERA_TO_WORLD, WORLD_TO_CAMERA)
+    quaternion: str = one_of("xyzw", "wxyz")  # the order in pose files with quaternions
+    frame_rate: float = limited(30.0, 1e-8, 1e8)  # Hz
 
     def __post_init__(self) -> None:
-        for key, (first, last) in _ALLOWED.items():
-            value = getattr(self, key)
-            is_text = isinstance(value, str)
-            if not (value in (first, last) if is_text else first <= value <= last):
-                allowed = f"{first!r} {'or' if is_text else 'to'} {last!r}"
-                raise ConfigError(f"{key} = {value!r}: write {allowed}")
         if len(self._axes) != 3 or not np.linalg.det(self._axes):
             raise ConfigError(
                 f"camera_axes = {self.camera_axes!r}: write 'opencv', 'opengl', or where x, y and "
@@ -68,14 +61,6 @@ class Declaration:
         T[:, :3, :3] = T[:, :3, :3] @ axes
         T[:, 2] *= np.linalg.det(axes)  # left-handed cameras come with a mirrored world
         return T
-
-
-# Two choices, or limits: far beyond any camera's, and what 16 bits hold.
-_ALLOWED: dict[str, tuple[Any, Any]] = {
-    "depth_scale": (1e-8, 1e8), "no_depth": (0, 65535), "frame_rate": (1e-8, 1e8),
-    "depth_along": ("axis", "ray"), "quaternion": ("xyzw", "wxyz"),
-    "poses": (CAMERA_TO_WORLD, WORLD_TO_CAMERA),
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
