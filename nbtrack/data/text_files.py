@@ -97,7 +97,8 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
 
 def _from_quaternions(numbers: np.ndarray, order: str, path: Path) -> Poses:
     """Poses of rows with a position and a quaternion; NaN for a position if a number is none."""
-    numbers = np.where(np.isfinite(numbers).all(axis=1, keepdims=True), numbers, np.nan)
+    is_known = np.isfinite(numbers).all(axis=1, keepdims=True)
+    numbers = np.where(is_known, numbers, 3 * [np.nan] + 4 * [0.5])
     # Clipped, so that absurd numbers are refused below and overflow nothing here.
     norms = np.linalg.norm(numbers[:, 3:].clip(-1e6, 1e6), axis=1)
     for i in np.flatnonzero(np.abs(norms - 1) > _RIGID):
