@@ -77,7 +77,7 @@ def test_tracking_command_reads_any_format(tmp_path: Path, capsys: pytest.Captur
     folder = write_recording("tum", tmp_path / "r")
     assert main(track(folder, "--format", "tum")) == 0
     assert main(track(folder, "--format", "plain")) == 2
-    assert "nbtrack: no file " in capsys.readouterr().err
+    assert "nbtrack: no colour images " in capsys.readouterr().err
 
 
 def test_only_the_first_pose_is_known(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

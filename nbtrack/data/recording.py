@@ -11,10 +11,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 from scipy.spatial import cKDTree
 
-from nbtrack.core.arrays import Poses, Position
+from nbtrack.core.arrays import Frames, Poses, Position
 from nbtrack.core.errors import DataError, MissingError
 from nbtrack.data.formats import FORMATS, Declaration, Format, declaration, files_of, numbers_in
 from nbtrack.data.text_files import Calibration, Times, read_calibration, read_poses, read_rows
@@ -194,14 +194,14 @@ def _placed(poses: Poses, pose_times: Times, times: Times, path: Path, is_by_tim
     """
     if len(poses) == len(times) and not is_by_time:
         return poses
-    closest, has_pose = _nearest(times, pose_times, _TOLERANCE if is_by_time else 1e-3, path)
-    placed = np.where(has_pose[:, None, None], poses[closest], np.nan)
+    closest = _nearest(times, pose_times, _TOLERANCE if is_by_time else 1e-3, path)
+    placed = np.where(closest[:, None, None] >= 0, poses[closest], np.nan)
     # Unless all poses find a frame the times are something else.
     is_whole = np.isfinite(placed).sum() == np.isfinite(poses).sum()
     return placed if is_by_time or is_whole else poses
 
 
-def _numbers_of(files: list[Path]) -> Int[np.ndarray, "_"]:
+def _numbers_of(files: list[Path]) -> Frames:
     """Frame numbers: the last in each file's name; -1 if it has none."""
     return np.array([[-1, *numbers_in(path)][-1] for path in files])
 
@@ -224,17 +224,14 @@ def _listed_pairs(
 ) -> tuple[list[Path], list[Path], Times]:
     """Images and depth maps of two lists that are each other's nearest in time, and the times."""
     (color_times, colors), (depth_times, depths) = map(_read_list, (color_list, depth_list))
-    closest, kept = _nearest(color_times, depth_times, _TOLERANCE, depth_list)
-    back, _ = _nearest(depth_times, color_times, _TOLERANCE, color_list)
-    kept &= back[closest] == np.arange(len(colors))
+    closest = _nearest(color_times, depth_times, _TOLERANCE, depth_list)
+    back = _nearest(depth_times, color_times, _TOLERANCE, color_list)
+    kept = (closest >= 0) & (back[closest] == np.arange(len(colors)))
     if not kept.all():
         left_out = f"{(~kept).sum()} of the {len(kept)} images in {color_list.name} are left out"
         notes.append(f"{left_out}: no depth map of {depth_list.name} is within {_TOLERANCE} s")
-    return (
-        [colors[i] for i in np.flatnonzero(kept)],
-        [depths[i] for i in closest[kept]],
-        color_times[kept],
-    )
+    colors = [colors[i] for i in np.flatnonzero(kept)]
+    return colors, [depths[i] for i in closest[kept]], color_times[kept]
 
 
 def _read_list(path: Path) -> tuple[Times, list[Path]]:
@@ -258,12 +255,11 @@ def _entry(line: str) -> tuple[float, str]:
     return float(time), name.strip()
 
 
-def _nearest(
-    times: Times, others: Times, tolerance: float, path: Path
-) -> tuple[Int[np.ndarray, "_"], Bool[np.ndarray, "_"]]:
-    """For every time the index of the nearest other one, and whether it is within a tolerance (s).
+def _nearest(times: Times, others: Times, tolerance: float, path: Path) -> Frames:
+    """For every time the index of the nearest other one; -1 if none is within the tolerance (s).
 
-    Raises DataError, which names the file of the others, if none is, or one is not finite.
+    Raises DataError, which names the file of the others, if that is so everywhere, or one of them
+    is not finite.
     """
     closest = cKDTree(np.nan_to_num(others)[:, None]).query(times[:, None], p=1)[1]
     is_near = np.abs(others[closest] - times) <= tolerance
@@ -272,7 +268,7 @@ def _nearest(
             f"{path} ({_span(others)}) has no time within {tolerance:g} s of the images' "
             f"({_span(times)}): it needs finite timestamps of the same clock"
         )
-    return closest, is_near
+    return np.where(is_near, closest, -1)
 
 
 def _span(times: Times) -> str:

@@ -95,12 +95,12 @@ def convert_sequence(
         write_sequence(out, camera, _frames(recording, numbers), times, bar.move_to)
     n_lost = int((~recording.has_pose[numbers]).sum())
     lost = f" ({n_lost} without a pose)" if n_lost else ""
-    said = f"{out}: {len(numbers)} frames{lost} of {camera.width}x{camera.height}"
-    said = "\n  ".join([f"{said}, read as {recording.format.label}", *recording.notes])
+    said = f"{out}: {len(numbers)} frames{lost} of {camera.width}x{camera.height}, read as "
+    lines = [said + recording.format.label, *recording.notes]
     if not (out / "focal.txt").is_file():
-        said += "\n  the camera is more than focal.txt can say: it is in intrinsics.txt, which "
-        said += "nbtrack reads and other programs do not know"
-    return said
+        what = "the camera is more than focal.txt can say: it is in intrinsics.txt"
+        lines.append(f"{what}, which nbtrack reads and other programs do not know")
+    return "\n  ".join(lines)
 
 
 def _frames(recording: Recording, numbers: Frames) -> Iterator[WrittenFrame]:
