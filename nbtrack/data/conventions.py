@@ -208,7 +208,7 @@ def diagnosis(results: list[Convention], recording: Recording, needs_proof: bool
     if best is not own:
         look = "look" if best.subject == "poses" else "looks"
         # Depth upside down, or turned by 180 degrees, fits like mirrored or turned axes.
-        is_rare = "axes" in best.name and not best.name.startswith("Open")
+        is_rare = "axes" in best.name and not best.name.startswith(("Open", "robot"))
         or_depth = "; or the depth images are turned against the colour images" * is_rare
         return (
             f"your {best.subject} {look} like {best.name}; {_remedy(best, own)} (surfaces that two "

@@ -86,9 +86,7 @@ def parse_frames(text: str) -> slice:
     """
     match = re.fullmatch(_SLICE, text.replace(" ", ""))
     if not match:
-        raise DataError(
-            f"frames {text!r} is no slice: write A:B or A:B:S, for example 0:100:2, with S above 0"
-        )
+        raise DataError(f"frames {text!r} is no slice: write A:B, or A:B:S with S above 0")
     return slice(*(int(part) if part else None for part in match.groups()))
 
 
@@ -166,8 +164,7 @@ def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
     points_world = np.concatenate(clouds)
     if len(points_world) == 0:
         raise DataError(
-            f"no pixel of {sequence.name} has a depth, of one in {stride**2}: check the depth "
-            "folder and its unit (uint16 millimetres)"
+            f"no pixel of {sequence.name} has a depth, of one in {stride**2}: check its files"
         )
     positions = sequence.T_world_camera[:, :3, 3]
     low, high = np.quantile(points_world, [_CUT_OFF, 1 - _CUT_OFF], axis=0)

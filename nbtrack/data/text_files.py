@@ -27,7 +27,6 @@ _NO_ROW = r"\s*(#|$)"
 _HEAD = r"|\s*-?\d+\s+-?\d+\s+-?\d+\s*$"  # of each matrix in Open3D's .log: three whole numbers
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
 _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
-_CAMERA = '{"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5}'
 _FARTHEST = 1e7  # m from the origin: beyond map coordinates, within what floats can square
 _RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 _LARGEST = 1e6  # pixels: no image is so wide
@@ -44,7 +43,7 @@ def read_object(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is no {kind} ({error}): correct it or write it anew") from None
     if not isinstance(content, dict):
-        raise DataError(f"{path} holds {content!r:.40}: it must be an object, as in {_CAMERA}")
+        raise DataError(f"{path} holds {content!r:.40}: it must be an object of names and values")
     return content
 
 
