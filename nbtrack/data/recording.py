@@ -214,8 +214,8 @@ def _check_paired(colors: list[Path], others: list[Path]) -> None:
         odd = [path.name for path in (*colors, *others) if count[_numbers_of([path])[0]] != 2]
         raise DataError(
             f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
-            f"{len(others)} {others[0].suffix} files ({len(odd)} without a partner of its number: "
-            f"{', '.join(odd[:4])}): every image needs one; rename or remove the odd files"
+            f"{len(others)} {others[0].suffix} files ({len(odd)} without a partner: "
+            f"{', '.join(odd[:4])}): every image needs one of its number; rename or remove them"
         )
 
 
