@@ -36,9 +36,8 @@ from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.grid import Execution
-from nbtrack.experiments.jobs import MapJob
+from nbtrack.experiments.jobs import MapJob, TrackJob
 from nbtrack.experiments.methods import TABLE_1
-from nbtrack.experiments.runs import TrackJob
 from nbtrack.fields import correction
 from nbtrack.mapping.correct import correct_map
 from nbtrack.tracking import StepBudget, track_sequence

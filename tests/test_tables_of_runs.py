@@ -76,8 +76,8 @@ def test_table_1_is_complete_cached_and_repeatable(
     assert run.T_estimated.shape == run.T_true.shape == (4, 4, 4)
     assert len(run.frames) == 4
     with monkeypatch.context() as patch:
-        for name in ("jobs.map_sequence", "runs.track_sequence"):
-            patch.delattr(f"nbtrack.experiments.{name}")
+        for name in ("map_sequence", "track_sequence"):
+            patch.delattr(f"nbtrack.experiments.jobs.{name}")
         again = track_scenes(open_scenes(preset), TABLE_1, preset)
     pd.testing.assert_frame_equal(again, cells)
     monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path))

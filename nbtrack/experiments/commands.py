@@ -17,11 +17,10 @@ from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import parse_frames, read_frames
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.grid import run_jobs
-from nbtrack.experiments.jobs import MapJob
+from nbtrack.experiments.jobs import OF_MAPS, MapJob, TrackJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, METHODS, Method, method_of
 from nbtrack.experiments.output import MAP_FILES, OVERVIEW_FILE, RUN_FILES, new_file, output_folder
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
-from nbtrack.experiments.runs import OF_MAPS, TrackJob
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.fields import NetworkSettings, PointCloud
 from nbtrack.mapping.files import MAP_FILE, MESH_FILE, Map, read_map

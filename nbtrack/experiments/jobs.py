@@ -1,25 +1,35 @@
-"""Jobs, each named by all that it depends on and made once; and maps as jobs."""
+"""Jobs, each named by all that it depends on and made once: maps, and runs tracked in them."""
 
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from math import isnan
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from filelock import FileLock
 
-from nbtrack.core.device import advise_on_memory, choose_device
+from nbtrack.core import files
+from nbtrack.core.device import advise_on_memory, choose_device, device_name, threads
 from nbtrack.core.errors import NbtrackError
-from nbtrack.core.files import code_fingerprint, fingerprint, runs_folder
-from nbtrack.core.settings import as_dict, with_settings
-from nbtrack.experiments.presets import Preset
+from nbtrack.core.settings import as_dict, changed_settings, with_settings
+from nbtrack.experiments.presets import PRESETS, Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
 from nbtrack.mapping.correct import correct_map
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
-from nbtrack.mapping.quality import score_map
+from nbtrack.mapping.quality import check_belongs, score_map
+from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
+from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
+from nbtrack.tracking.trajectories import METRICS_FILE, shifted, tum_text
 
+RUN_FILE = "run.pt"
+OF_MAPS = ("network.", "mapping.")
+"""How keys of settings begin that only matter where a map is made."""
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""
 
@@ -39,7 +49,7 @@ class Job:
     @property
     def cache(self) -> Path:
         """Its folder in the cache."""
-        return runs_folder() / self.kind / f"{self.name}-{self.key}"
+        return files.runs_folder() / self.kind / f"{self.name}-{self.key}"
 
     @property
     def folder(self) -> Path:
@@ -54,7 +64,7 @@ class Job:
         """
         if isinstance(needed, NbtrackError):
             return NbtrackError(f"not run, because {self.needs.name} failed: {needed}")
-        path = runs_folder() / "locks" / f"{self.cache.name}.lock"
+        path = files.runs_folder() / "locks" / f"{self.cache.name}.lock"
         report(0.0, "begins, or waits for another process that makes the same")
         try:
             with FileLock(path), advise_on_memory(f"the frames and settings of {self.name}"):
@@ -80,15 +90,15 @@ class MapJob(Job):
     @cached_property
     def key(self) -> str:
         """Of code, device, data, settings and seed."""
+        device = choose_device().type
         if self.is_given:
             given = read_map(self.folder)
-            return fingerprint(given.key, code_fingerprint(type(given.field)), choose_device().type)
+            return files.fingerprint(given.key, files.code_fingerprint(type(given.field)), device)
         correction = ["nbtrack.mapping.correct"] if self.base else []
-        return fingerprint(
-            code_fingerprint(field_class(self.field), "nbtrack.mapping.fit", *correction),
-            choose_device().type, self.scene.fingerprint, self.field,
-            self.preset.network_of(self.field), self.settings, self.frames, self.seed,
-        )  # fmt: skip
+        code = field_class(self.field), "nbtrack.mapping.fit", *correction
+        network = self.preset.network_of(self.field)
+        parts = self.scene.fingerprint, self.field, network, self.settings, self.frames, self.seed
+        return files.fingerprint(files.code_fingerprint(*code), device, *parts)
 
     @property
     def settings(self) -> Any:
@@ -98,10 +108,11 @@ class MapJob(Job):
     @property
     def name(self) -> str:
         """Scene and field, and the seed if it is not the first."""
-        name = f"{self.scene.name}-{self.field}"
-        if self.base is not None:
-            name += "-corrected"
-        return f"{name}-seed{self.seed}" if self.seed else name
+        corrected, seed = (
+            "-corrected" if self.base else "",
+            f"-seed{self.seed}" if self.seed else "",
+        )
+        return f"{self.scene.name}-{self.field}{corrected}{seed}"
 
     @property
     def base(self) -> "MapJob | None":
@@ -130,7 +141,7 @@ class MapJob(Job):
     def compute(self, report: Report) -> dict[str, Any]:
         """Map and score, or resume; write the map's files."""
         iterations = getattr(self.settings, "iterations", 1)
-        checkpoint, base = self.folder / CHECKPOINT_FILE, self.base
+        path, checkpoint, base = self.folder / MAP_FILE, self.folder / CHECKPOINT_FILE, self.base
 
         def tell(done: int, losses: dict[str, float | int]) -> None:
             words = [f"{name} {loss:.3f}" for name, loss in losses.items()]
@@ -140,21 +151,193 @@ class MapJob(Job):
             raise failure
         sequence, network = self.scene.read(self.frames), self.preset.network_of(self.field)
         parts = self.field, sequence, network, self.settings, self.seed
-        if (self.folder / MAP_FILE).is_file():  # a folder of the user's, with another finished map
-            check_recipe(self.folder / MAP_FILE, read_map(self.folder).record, recipe_of(*parts))
+        if path.is_file():  # a folder of the user's, with another finished map
+            check_recipe(path, read_map(self.folder).record, recipe_of(*parts))
         if base:
-            finished_map = correct_map(base.map(), sequence, self.settings)
+            finished = correct_map(base.map(), sequence, self.settings)
         else:
-            finished_map = map_sequence(*parts, choose_device(), checkpoint, tell)
-        quality = score_map(finished_map, sequence, self.scene.room)
-        record = {"quality": quality, "frames": self.frames, "key": self.key}
-        record = finished_map.record | record | {"config": as_dict(self.preset)}
-        write_map(self.folder / MAP_FILE, replace(finished_map, record=record))
+            finished = map_sequence(*parts, choose_device(), checkpoint, tell)
+        record = {"quality": score_map(finished, sequence, self.scene.room)}
+        record |= {"frames": self.frames, "key": self.key, "config": as_dict(self.preset)}
+        finished = replace(finished, record=finished.record | record)
+        write_map(path, finished)
         checkpoint.unlink(missing_ok=True)
-        return record
+        return finished.record
 
 
 @lru_cache(maxsize=4)
 def _read(folder: Path, key: str) -> Map:
     """Read once for all runs in a map."""
     return read_map(folder)
+
+
+@dataclass(frozen=True)
+class TrackJob(Job):
+    """One tracked run in a map, under one budget: so many steps a frame, or a rate by the clock."""
+
+    needs: MapJob
+    scene: Scene  # the mapped one, or another recording of the same room
+    tracker: str
+    steps: float | int | None = None
+    rate_hz: float | int | None = None
+    frames: str = ":"
+    seed: int = 0
+    out: Path | None = None
+    n_threads: int | None = None  # CPU threads to track with; by default the process's
+    start: str = "given"  # the first frame's true pose, where known; or "unknown"
+
+    kind = "tracks"
+
+    @property
+    def settings(self) -> Any:
+        """Settings of the tracker."""
+        return self.needs.preset.tracking_of(self.tracker)
+
+    @cached_property
+    def key(self) -> str:
+        """Of code, map, tracker, budget, threads, frames and seed; by the clock, of the machine."""
+        kinds = tracker_class(self.tracker), field_class(self.needs.field)
+        code = files.code_fingerprint(*kinds, "nbtrack.tracking.trajectories")
+        clock = None if self.rate_hz is None else (self.rate_hz, device_name(choose_device()))
+        how = self.tracker, self.settings, self.steps, clock, self.n_threads, self.start
+        what = self.frames, self.seed, self.scene.fingerprint
+        return files.fingerprint(code, self.needs.key, *how, *what)
+
+    @property
+    def name(self) -> str:
+        """Scene, method and budget, and the seed if it is not the first."""
+        budget = f"{self.rate_hz:g}hz" if self.rate_hz else f"{self.steps:g}steps"
+        elsewhere = "-unmapped" if self.is_elsewhere else ""
+        name = f"{self.scene.name}-{self.needs.field}-{self.tracker}{elsewhere}-{budget}"
+        return f"{name}-seed{self.seed}" if self.seed else name
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether the map was made from another recording."""
+        return self.needs.is_given or self.scene.folder != self.needs.scene.folder
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the run is finished; in a folder of the user's it is always made anew."""
+        return self.out is None and (self.folder / METRICS_FILE).is_file()
+
+    def result(self) -> dict[str, Any]:
+        """What a finished run keeps: errors, speed, device, versions, settings."""
+        return files.read_json(self.folder / METRICS_FILE)
+
+    def compute(self, report: Report) -> dict[str, Any]:
+        """Track, or take a killed run up where its last checkpoint stands; write the files.
+
+        `trajectory.txt` and `groundtruth.txt` (TUM) hold the tracked frames, without the first
+        one, whose pose was given: so public tools report the error of the paper's formula. Where no
+        true pose is known there is no `groundtruth.txt`. Raises DataError where a given map does
+        not fit the first frame at its given pose.
+        """
+        n_threads = self.n_threads or torch.get_num_threads()
+        with threads(n_threads):
+            tracked, notes = self._tracked(report)
+        metrics = _scores(tracked) | self._provenance(n_threads) | notes
+        if metrics.get("path_m") and "ate_rmse_m" in metrics:
+            metrics["ate_over_path"] = metrics["ate_rmse_m"] / metrics["path_m"]
+        times, origin = tracked.frames["time"].to_numpy(), np.array(notes.get("origin", [0, 0, 0]))
+        texts = {
+            "trajectory.txt": tum_text(times, shifted(tracked.T_estimated, origin)),
+            "groundtruth.txt": tum_text(times, shifted(tracked.T_true, origin)),
+            "frames.csv": tracked.frames.to_csv(index=False),
+            METRICS_FILE: files.json_text(metrics),
+        }
+        if "ate_rmse_m" not in metrics:
+            del texts["groundtruth.txt"]
+            (self.folder / "groundtruth.txt").unlink(missing_ok=True)
+        files.write_together(self.folder, texts)
+        (self.cache / RUN_FILE).unlink(missing_ok=True)
+        return metrics
+
+    def _tracked(self, report: Report) -> tuple[Trajectory, dict[str, Any]]:
+        """The trajectory, and what is to be said of the run beside its errors."""
+        finished_map, budget = self.needs.map(), make_budget(self.steps, self.rate_hz)
+        origin = np.array(finished_map.record["origin"])
+        sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
+        notes = {"map_seconds": finished_map.record["seconds"], "budget": str(budget)}
+        if origin.any():
+            notes["origin"] = origin.tolist()
+        notes |= still_metrics(sequence.T_world_camera)
+        if self.is_elsewhere:
+            notes["map_from"] = finished_map.record
+        T_first = sequence.T_world_camera[0]
+        is_start_known = self.start == "given" and bool(np.isfinite(T_first).all())
+        if self.needs.is_given and is_start_known:  # another path may begin where no map reaches
+            notes["map_warning"] = check_belongs(finished_map, sequence[0])
+        notes["start"] = "given" if is_start_known else "unknown"
+        T_start = T_first if is_start_known else np.eye(4)
+        how = T_start, budget, self.settings, self.seed
+        tracker = make_tracker(self.tracker, finished_map.field, *how)
+
+        def tell(done: int, error_m: float) -> None:
+            status = f"frame {done}" if isnan(error_m) else f"off by {100 * error_m:.1f} cm"
+            report(done / len(sequence), status)
+
+        checkpoint = self.cache / RUN_FILE  # a folder of the user's holds results alone
+        return track_sequence(tracker, sequence, checkpoint, tell, is_start_known), notes
+
+    def _provenance(self, n_threads: int) -> dict[str, Any]:
+        """Where a run comes from: data, map, method, settings, machine; how to make it again."""
+        return {
+            "device": device_name(choose_device()),
+            "threads": n_threads,
+            "scene": self.scene.name,
+            "field": self.needs.field,
+            "tracker": self.tracker,
+            "seed": self.seed,
+            "key": self.key,
+            "versions": files.versions(),
+            "command": self._command(),
+            "recording": str(self.scene.folder),
+            "format": self.scene.format,
+            "map": str(self.needs.folder),
+            "config": {
+                "preset": as_dict(self.needs.preset),
+                "map_frames": self.needs.frames,
+                "map_seed": self.needs.seed,
+                "frames": self.frames,
+                "steps": self.steps,
+                "rate_hz": self.rate_hz,
+            },
+        }
+
+    def _command(self) -> str:
+        """What makes this run anew, and its map where that is of all frames and not given."""
+        preset, sequence = self.needs.preset, str(self.scene.folder)
+        settings = changed_settings(preset, PRESETS[preset.name])
+        options = {"format": self.scene.format, "field": self.needs.field}
+        if self.is_elsewhere or self.needs.frames != ":":
+            options = {"format": self.scene.format, "map-from": self.needs.folder}
+            settings = [text for text in settings if not text.startswith(OF_MAPS)]
+        elif self.scene.made_by:
+            sequence = self.scene.name
+        options |= {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
+        options |= {"start": self.start, "frames": self.frames, "seed": self.seed}
+        options |= {"device": choose_device().type, "threads": self.n_threads}
+        given = [f"--{name}={value}" for name, value in options.items() if value is not None]
+        words = ["python", "-m", "nbtrack", "track", sequence, f"--preset={preset.name}"]
+        words += [f"--set={text}" for text in settings]
+        return shlex.join([*words, *given, "--out", f"again_{self.name}"])
+
+
+def _scores(tracked: Trajectory) -> dict[str, Any]:
+    """Errors of a run, the tracker's own verdicts against them, and its speed."""
+    rows = tracked.frames
+    metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
+    if "lost" in rows:
+        rated = rows.dropna(subset="translation_error_m")
+        errors_m = rated["translation_error_m"].to_numpy()
+        metrics["flagged_frames"] = int(rows["lost"].sum())
+        metrics |= score_detection(rated["lost"].to_numpy(dtype=bool), errors_m)
+    steps, seconds = int(rows["steps"].sum()), rows["seconds"]
+    return {
+        **metrics,
+        "frames_without_depth": int(rows["without_depth"].sum()),
+        "steps_per_frame": steps / len(rows),
+        "seconds_per_step": float(seconds.sum()) / max(steps, 1),
+        "seconds_per_frame": float(seconds.mean()),
+    }

@@ -14,10 +14,9 @@ from nbtrack.core.files import runs_folder
 from nbtrack.core.progress import tell
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.grid import Execution, run_jobs
-from nbtrack.experiments.jobs import MapJob
+from nbtrack.experiments.jobs import MapJob, TrackJob
 from nbtrack.experiments.methods import Method, find_methods
 from nbtrack.experiments.presets import Preset
-from nbtrack.experiments.runs import TrackJob
 from nbtrack.experiments.scenes import Scene
 from nbtrack.mapping.files import Map
 from nbtrack.tracking.trajectories import Trajectory, read_trajectory
