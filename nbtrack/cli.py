@@ -34,86 +34,66 @@ def _option(help: str, type: Any = str, **more: Any) -> dict[str, Any]:
 
 
 _MAX_THREADS = 1024  # OpenMP ends the process where it cannot start them
-# By name, and a word for its value where the name says too little.
+a_seed, some_threads = partial(a_count, minimum=0), partial(a_count, maximum=_MAX_THREADS)
+_STARTS = {"choices": ("given", "unknown"), "default": "given"}
+_BUDGETS = {"choices": ("steps", "clock"), "default": "steps"}
+_SETTINGS = {"action": "append", "default": [], "dest": "settings", "metavar": "KEY=VALUE"}
+# By name; with ! where it must be given.
 OPTIONS = {
     "sequence": _option("a folder, or the name of a room or dataset scene"),
     "folder": _option("a recording", a_path),
     "room": _option("its name"),
     "source": _option("folder of a run or a map, or a map file", a_path),
     "out": _option("file or folder to write", a_path),
-    "--format NAME": _option("neural_rgbd, tum, replica, 7scenes, scannet, plain (default: found)"),
-    "--method NAME": _option("one of `nbtrack methods` (default: corrected); tables take several, "
-                             "as vr,sdf"),
+    "--format": _option("neural_rgbd, tum, replica, 7scenes, scannet, plain (default: found)"),
+    "--method": _option("of `nbtrack methods` (default: corrected); for tables several: vr,sdf"),
     "--field": _option("in place of a method: imap, neus, neus_plus or another field"),
     "--tracker": _option("in place of a method: vr, sdf, lm or another tracker"),
-    "--rate HZ": _option("frames a second, by the clock", float),
-    "--steps N": _option("steps a frame (default: until converged; vr, sdf: the paper's at 2 Hz)",
-                         float),
-    "--pixels N": _option("pixels a step", int),
+    "--rate": _option("frames a second, by the clock", float, metavar="HZ"),
+    "--steps": _option("a frame (default: to convergence; vr, sdf: the paper's at 2 Hz)", float),
     "--frames": _option("Python slice of frames, A:B:S", default=":"),
-    "--map-frames": _option("Python slice of frames to map (default: all)"),
-    "--map-from MAP": _option("track in this map of the room: its folder or file", a_path),
-    "--start": _option("given: the first frame's own pose (default where it has one), or unknown",
-                       choices=("given", "unknown"), default="given"),
-    "--to FORMAT": _option("tum, kitti: trajectory; gif, mp4: movie of a run; ply, glb: "
-                            "coloured mesh; map: one file"),
-    "--budget BY": _option("steps, the paper's counts (default), or this machine's clock",
-                           choices=("steps", "clock"), default="steps"),
-    "--scenes A,B": _option("only these scenes of the preset's kind"),
-    "--seeds K": _option("K maps and runs a cell: mean ± std", a_count, default=1),
-    "--workers N": _option("jobs side by side (default: one a core, or one on a GPU)", a_count),
-    "--dask ADDRESS": _option("run on a Dask cluster, as tcp://HOST:8786"),
-    "--beyond": {"help": "Table III instead: the paper's methods and ours, 30 Hz too",
-                 "action": "store_true"},
+    "--map-from": _option("track in this map of the room: its folder or file", a_path),
+    "--start": _option("given: the first frame's own pose, if any (default); unknown", **_STARTS),
+    "--to!": _option("tum, kitti: trajectory; gif, mp4: movie; ply, glb: mesh; map", required=True),
+    "--budget": _option("steps: the paper's counts (default); clock: this machine's", **_BUDGETS),
+    "--scenes": _option("only these scenes of the preset's kind", metavar="A,B"),
+    "--seeds": _option("so many maps and runs a cell: mean ± std", a_count, default=1),
+    "--workers": _option("jobs side by side (default: one a core, or one on a GPU)", a_count),
+    "--dask": _option("run on a Dask cluster, as tcp://HOST:8786", metavar="ADDRESS"),
+    "--beyond": {"help": "Table III: our methods too, and 30 Hz", "action": "store_true"},
     "--n-frames": _option("how many (default: 300)", int, default=300),
     "--width": _option("pixels; the height is 3/4 of it", int, default=640),
-    "--motion": _option("handheld: a glance around (default); tour: around the whole room",
-                        choices=("handheld", "tour"), default="handheld"),
+    "--motion": _option("handheld: a glance (default); tour: the whole room", default="handheld"),
     "--depth-folder": _option("default: the format's; filtered before raw depth"),
-    "--poses FILE": _option("pose file (default: the format's)"),
-    "--seed": _option("of all random numbers (default: 0)", partial(a_count, minimum=0), default=0),
+    "--poses": _option("pose file (default: the format's)", metavar="FILE"),
+    "--seed": _option("of all random numbers (default: 0)", a_seed, default=0),
     "--out": _option("where to write (default: in runs/)", a_path),
+    "--out!": _option("where to write", a_path, required=True),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
-    "--threads N": _option(
-        "CPU threads (default: all cores)", partial(a_count, maximum=_MAX_THREADS)
-    ),
+    "--threads": _option("CPU threads (default: all cores)", some_threads),
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
     "--config": _option("TOML file of settings", a_path),
-    "--set KEY=VALUE": _option("one setting, as mapping.neus.iterations=500; may be repeated",
-                               action="append", default=[], dest="settings"),
-}  # fmt: skip
+    "--set": _option("one setting, as mapping.neus.iterations=500; may be repeated", **_SETTINGS),
+}
 _PRESET = " --preset --config --set"
 _RUN = " --device --threads" + _PRESET
-_MADE = "--frames --seed --out" + _RUN
+_MADE = " --method --field --format --frames --seed --out" + _RUN
 _PARTS = " --format --depth-folder --poses"
-# By name: what it does, and its options; ! marks those that must be. `map` is done by the function
-# `map_command`, `data make` by `make_command`.
+_TRACKED = " --tracker --rate --steps --map-from --start"
+_CELLS = "--budget --scenes --method --beyond --seeds --workers --dask --out"
+# By name: what it does, and its options. `map` is done by the function `map_command`, `data make`
+# by `make_command`.
 COMMANDS = {
-    "map": ("fit a field to a sequence with known poses",
-            "sequence --method --field --format " + _MADE),
-    "track": ("track a camera; maps first where no map fits",
-              "sequence --method --field --tracker --format --rate --steps --pixels "
-              "--map-frames --map-from --start " + _MADE),
+    "map": ("fit a field to a sequence with known poses", "sequence" + _MADE),
+    "track": ("track a camera; maps first where no map fits", "sequence" + _MADE + _TRACKED),
     "methods": ("list what --method takes", ""),
     "export": ("a run's trajectory or a map elsewhere", "source out --to!"),
-    "tables": ("the paper's tables, and one beyond, CSV and LaTeX",
-               "--budget --scenes --method --beyond --seeds --workers --dask --out" + _RUN),
+    "tables": ("the paper's tables, and one beyond, CSV and LaTeX", _CELLS + _RUN),
     "notebooks": ("run all notebooks headless, with HTML copies", _PRESET),
-    "data make": ("write a synthetic room in the dataset's layout",
-                  "room --out! --motion --n-frames --width --seed"),
+    "data make": ("write a synthetic room", "room --out! --motion --n-frames --width --seed"),
     "data check": ("what is wrong with a recording", "folder --out" + _PARTS),
-    "data convert": ("write a recording in the Neural RGB-D layout",
-                     "folder out --frames" + _PARTS),
+    "data convert": ("write a recording as the dataset is", "folder out --frames" + _PARTS),
     "bench": ("Table II on this machine, full-size networks", "--out" + _RUN),
-}  # fmt: skip
-
-
-# Options of earlier versions: what to write now.
-_EARLIER = {
-    "--supervision": "write --field neus_plus for rendering+sdf",
-    "--correct": "write --method corrected, or --set mapping.neus_plus.correct_voxel=METRES",
-    "--bake": "lm always works in a grid: write --set tracking.lm.voxel=METRES",
-    "--trackers": "write --method A,B",
 }
 
 
@@ -125,8 +105,6 @@ class Parser(argparse.ArgumentParser):
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
             choices = [choice.strip("' ") for choice in wrong[2].split(",")]
             message = f"unknown {wrong[1]!r}: {nearest_name(wrong[1], choices)}"
-        dashed = [word for word in sys.argv[1:] if word.startswith("-") and Path(word).exists()]
-        message += "".join(f"; write ./{word} for the file or folder {word}" for word in dashed)
         raise ConfigError(f"{message}; see {self.prog} --help")
 
 
@@ -135,7 +113,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _open_streams()
     try:
         options = _parsed(arguments)
-        _set_device(options)
+        if options.device:
+            os.environ["NBTRACK_DEVICE"] = options.device
+        if options.threads:
+            import torch
+
+            torch.set_num_threads(options.threads)
         module = "bench" if options.command in ("tables", "bench", "notebooks") else "commands"
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)
@@ -166,7 +149,6 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
     parser.add_argument("--version", action="version", version=f"nbtrack {__version__}")
     groups = {"": parser.add_subparsers(required=True, metavar="COMMAND")}
-    known = {name.split()[0]: (name.split(), option) for name, option in OPTIONS.items()}
     for name, (about, options) in COMMANDS.items():
         *group, last = name.split()
         if group and group[0] not in groups:
@@ -174,28 +156,11 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
             groups[group[0]] = part.add_subparsers(required=True, metavar="ACTION")
         command = groups["".join(group)].add_parser(last, help=about, description=about)
         for word in options.split():
-            (option, *metavar), keywords = known[word.rstrip("!")]
-            keywords = keywords | {"metavar": metavar[0]} if metavar else keywords
-            keywords = keywords | {"required": True} if word.endswith("!") else keywords
-            command.add_argument(option, **keywords)
-        command.set_defaults(command=last, parser=command)
+            command.add_argument(word.rstrip("!"), **OPTIONS[word])
+        command.set_defaults(command=last, parser=command, device=None, threads=None)
     namespace, unknown = parser.parse_known_args(arguments)
     if unknown:
         known = [option for option in namespace.parser._option_string_actions if option[:2] == "--"]
         name = unknown[0].partition("=")[0]
-        advice = _EARLIER.get(name) or nearest_name(name, known)
-        namespace.parser.error(f"unknown argument {unknown[0]!r}: {advice}")
+        namespace.parser.error(f"unknown argument {unknown[0]!r}: {nearest_name(name, known)}")
     return namespace
-
-
-def _set_device(options: argparse.Namespace) -> None:
-    """Where and with how many threads this process and its workers compute."""
-    if getattr(options, "device", None):
-        from nbtrack.core.device import named_device
-
-        named_device(options.device)
-        os.environ["NBTRACK_DEVICE"] = options.device
-    if getattr(options, "threads", None):
-        import torch
-
-        torch.set_num_threads(options.threads)

@@ -202,8 +202,6 @@ ARGUMENTS = {
     "a method and a field": ([*OWN, "--method", "sdf"], "leave --field and --tracker out"),
     "unknown method": (["track", "living_room", "--method", "corected"], "mean 'corrected'"),
     "a method in another map": ([*GIVEN[:2], "--method", "vr", "--map-from", "map"], "not 'imap'"),
-    "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames out"),
-    "an earlier option": ([*GIVEN, "map", "--correct", "0.1"], "write --method corrected"),
     "field not the map's": (
         [*GIVEN, "map", "--field", "imap", "--tracker", "vr"],
         "is a map of field 'neus'",
@@ -217,12 +215,10 @@ ARGUMENTS = {
     "steps that are none": ([*OWN, "--steps", "nan"], "steps_per_frame is nan"),
     "steps in words": ([*OWN, "--steps", "few"], "invalid float value: 'few'"),
     "endless steps": ([*OWN, "--steps", "inf"], "steps_per_frame is inf"),
-    "no grid": ([*OWN, "--bake", "nan"], "lm always works in a grid"),
     "no grid size": (
         [*OWN, "--tracker", "lm", "--set", "tracking.lm.voxel=nan"],
         "must be 0 or more",
     ),
-    "negative pixels": ([*OWN, "--pixels", "-5"], "must be 1 or more"),
     "negative seed": ([*OWN, "--seed", "-1"], "is 0 or more"),
     "giant seed": ([*OWN, "--seed", "9" * 30], "is 0 or more"),
     "no threads": ([*OWN, "--threads", "0"], "from 1 to 1024"),
@@ -254,7 +250,7 @@ ARGUMENTS = {
     "endless rate": ([*NO_STEPS, "--rate", "inf"], "rate_hz is inf"),
     "no steps": ([*OWN, "--steps", "0"], "steps_per_frame is 0"),
     "negative steps": ([*OWN, "--steps", "-1"], "steps_per_frame is -1"),
-    "no frames to map": ([*OWN, "--map-frames", "10:20"], "select 0 of"),
+    "no frames to map": ([*MAP, "--frames", "10:20"], "select 0 of"),
     "room onto a folder": (["data", "make", "office", "--out", "run"], "exists"),
 }
 

@@ -15,15 +15,14 @@ import torch
 
 from nbtrack import tables
 from nbtrack.core.device import advise_on_memory, choose_device, device_name
-from nbtrack.core.errors import ConfigError, MissingError, NbtrackError
+from nbtrack.core.errors import MissingError, NbtrackError
 from nbtrack.core.files import project_folder, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings, with_settings
-from nbtrack.experiments.commands import preset_of
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Method, find_methods
 from nbtrack.experiments.output import output_folder
-from nbtrack.experiments.presets import PRESETS, Preset
+from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.results import map_scene, track_scenes
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.tracking import ClockBudget, StepBudget, make_tracker
@@ -42,48 +41,43 @@ def tables_command(options: Namespace) -> None:
 
     Raises NbtrackError at the end where cells failed, and left gaps.
     """
-    names = [f"scenes.names={_words(options.scenes)}"] if options.scenes else []
-    preset = preset_of(options, None, *names)
-    if options.beyond and options.method:
-        raise ConfigError("--beyond has rows of its own: leave --method out")
-    methods = _words(options.method) or (TABLE_3 if options.beyond else TABLE_1)
+    names = [f"scenes.names={options.scenes.split(',')}"] if options.scenes else []
+    preset = load_preset(options.preset, options.config, [*options.settings, *names])
+    usual = TABLE_3 if options.beyond else TABLE_1
+    methods = options.method.split(",") if options.method else usual
     find_methods(methods)  # a bad name is told before a room is made
+    with output_folder(options.out):
+        _fill_tables(options, preset, methods)
+
+
+def _fill_tables(options: Namespace, preset: Preset, methods: Sequence[str]) -> None:
     execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
-    with output_folder(options.out, "table_1.csv", "table_2.csv", "table_3.csv"):
-        _fill_tables(options, preset, methods, execution)
-
-
-def _fill_tables(
-    options: Namespace, preset: Preset, methods: Sequence[str], execution: Execution
-) -> None:
     scenes, clock = open_scenes(preset), options.budget == "clock"
-    results = track_scenes(
-        scenes, methods, preset, RATES_3_HZ if options.beyond else None, clock=clock,
-        seeds=options.seeds, execution=execution,
-    )  # fmt: skip
+    rates_hz = RATES_3_HZ if options.beyond else None
+    how = {"clock": clock, "seeds": options.seeds, "execution": execution}
+    results = track_scenes(scenes, methods, preset, rates_hz, **how)
     name = f"{preset.name}_clock" if clock else preset.name
-    folder = options.out or runs_folder() / "tables" / name
-    number, note = "III" if options.beyond else "I", _note(preset, clock)
-    print(f"Table {number}: ATE (m), {note}")
-    print(tables.style_table_1(tables.naming_points(results) if options.beyond else results))
+    folder, note = options.out or runs_folder() / "tables" / name, _note(preset, clock)
+    print(f"Table {'III' if options.beyond else 'I'}: ATE (m), {note}")
     if options.beyond:
+        print(tables.style_table_1(tables.naming_points(results)))
         paths = tables.write_table_3(folder, results, note)
     else:
+        print(tables.style_table_1(results))
         print("Table I beside the paper's")
         print(tables.beside_published(results).to_string(float_format="%.3f", na_rep="–"))
         steps, pixels = _table_2(preset, scenes[0], methods)
         by_clock = _note(preset, clock=True)
         paths = tables.write_tables(folder, results, steps, note, pixels, steps_note=by_clock)
-    cells = results[[name for name in _CELL_COLUMNS if name in results]]
-    cells_file = folder / f"table_{3 if options.beyond else 1}_cells.csv"
-    paths.append(tables.write_csv(cells_file, cells, float_format=None))
-    print("\n".join(str(path) for path in paths))
+    cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
+    paths.append(tables.write_csv(cells, results.filter(_CELL_COLUMNS), float_format=None))
+    print("\n".join(map(str, paths)))
     failed = results[results["failure"] != ""]
     if len(failed):
+        first, why = failed.iloc[0][["run", "failure"]]
         raise NbtrackError(
-            f"{len(failed)} cells of the table failed and are empty, the first of them "
-            f"{failed['run'].iloc[0]}: {failed['failure'].iloc[0]}; mend the cause and run the "
-            "same command again, the rest is kept"
+            f"{len(failed)} cells of the table failed and are empty, the first of them {first}: "
+            f"{why}; mend the cause and run the same command again, the rest is kept"
         )
 
 
@@ -94,8 +88,8 @@ def bench_command(options: Namespace) -> None:
         options.preset = options.preset or "synthetic"
     # One image is enough, and hardly a map: a step costs the same whatever the weights are.
     quick = ("scenes.n_frames=2", "mapping.imap.iterations=1", "mapping.neus.iterations=1")
-    preset = preset_of(options, None, *quick)
-    with output_folder(options.out, "table_2.csv"):
+    preset = load_preset(options.preset, options.config, [*options.settings, *quick])
+    with output_folder(options.out):
         steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset))
         folder = options.out or runs_folder() / "bench" / preset.name
         print(tables.write_csv(folder / "table_2.csv", steps))
@@ -108,7 +102,8 @@ def notebooks_command(options: Namespace) -> None:
     the environment, where each notebook's settings cell finds them. Raises MissingError without
     notebooks or Jupyter, NbtrackError if a cell failed; the copy up to there is kept.
     """
-    preset = preset_of(options).name  # a wrong setting is refused before the first kernel starts
+    # A wrong setting is refused before the first kernel starts.
+    preset = load_preset(options.preset, options.config, options.settings).name
     wanted = ("nbconvert", "ipykernel", "latex2mathml")
     if any(importlib.util.find_spec(name) is None for name in wanted):
         raise MissingError("notebooks need Jupyter: pip install 'nbtrack[notebooks]'")
@@ -188,15 +183,10 @@ def default_pixels(preset: Preset, methods: Sequence[str | Method] = TABLE_1) ->
 def _note(preset: Preset, clock: bool) -> str:
     """How the numbers were measured, in a sentence. The columns name the scenes."""
     changed = changed_settings(preset, PRESETS[preset.name])
-    changed = [setting for setting in changed if not setting.startswith("scenes.names")]
-    label = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name
+    changed = ", ".join(text for text in changed if not text.startswith("scenes.names"))
+    label = f"{preset.name}, with {changed}" if changed else preset.name
     budget = "wall clock" if clock else preset.step_counts
     return f"Preset: {label}; budget: {budget}; device: {device_name(choose_device())}."
-
-
-def _words(text: str | None) -> list[str]:
-    """The parts of a list with commas."""
-    return [word.strip() for word in (text or "").split(",") if word.strip()]
 
 
 def _run_notebook(path: Path, folder: Path) -> None:

@@ -13,30 +13,32 @@ from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import as_dict
 from nbtrack.data.check import check_recording, quick_warning
-from nbtrack.data.recording import open_recording
-from nbtrack.data.sequence import parse_frames, read_frames
+from nbtrack.data.recording import Recording, open_recording
+from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.grid import run_jobs
 from nbtrack.experiments.jobs import OF_MAPS, MapJob, TrackJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, METHODS, Method, method_of
-from nbtrack.experiments.output import MAP_FILES, OVERVIEW_FILE, RUN_FILES, new_file, output_folder
+from nbtrack.experiments.output import OVERVIEW_FILE, new_file, output_folder
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
-from nbtrack.fields import NetworkSettings, PointCloud
+from nbtrack.fields import PointCloud
 from nbtrack.mapping.files import MAP_FILE, MESH_FILE, Map, read_map
 from nbtrack.mapping.meshes import extract_mesh
-from nbtrack.tracking import make_budget
+from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
+from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 from nbtrack.tracking.trajectories import METRICS_FILE, read_trajectory, read_tum, write_kitti
 
-_PRINTED = (
-    "ate_rmse_m", "still_ate_m", "path_m", "ate_over_path", "ate_rmse_aligned_m",
-    "rotation_rmse_deg", "max_error_m", "frames", "steps_per_frame",
-    "seconds_per_step", "seconds_per_frame", "map_seconds",
-)  # fmt: skip
+# What is printed in place of names in metrics.json that say too little.
+_MEANINGS = {
+    "lost_frames": f"frames off by more than {LOST_THRESHOLD_M:g} m",
+    "flagged_frames": "frames that the tracker itself calls lost",
+    "frames_without_reference": "frames without a true pose, in no error",
+    "frames_without_depth": "frames without any depth, not searched",
+}
 _FRAMES_SHOWN, _CELLS = 20, 120  # of an overview: frames that tell what was seen; cells across
 _MOVIE_FRAMES = 100
-_UNITS = {"_m": ("m", 4), "_deg": ("degrees", 3), "_db": ("dB", 1), "_seconds": ("s", 0)}
 
 
 def methods_command(options: Namespace) -> None:
@@ -50,102 +52,150 @@ def methods_command(options: Namespace) -> None:
 def map_command(options: Namespace) -> None:
     """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
     method = method_of(options.method, options.field, None)
-    preset = preset_of(options, method)
-    scene = _checked_scene(options, preset, options.frames)
+    preset = _preset_of(options, method)
+    scene = _opened(options, preset)
+    scene.count(options.frames)
     job = MapJob(scene, method.field, preset, options.frames, options.seed, options.out)
-    with output_folder(options.out, *MAP_FILES):
-        _make_map(job)
+    with output_folder(options.out):
+        _map(job)
+        finished = job.map()
+        print(f"{job.folder}: {finished.field.label} map of {scene.name}")
+        print(f"  mapped in {finished.record['seconds']:.0f} s on {finished.record['device']}")
+        _print_numbers(finished.record["quality"])
+        _write_mesh(job, finished)
 
 
-def _make_map(job: MapJob) -> None:
-    """Map and say how good the map is; draw the mesh of what was seen."""
-    _map(job)
-    finished, scene = job.map(), job.scene
-    print(f"{job.folder}: {finished.field.label} map of {scene.name}")
-    print(f"  mapped in {finished.record['seconds']:.0f} s on {finished.record['device']}")
-    _print_numbers({k: v for k, v in finished.record["quality"].items() if v is not None})
+def _write_mesh(job: MapJob, finished: Map) -> None:
+    """The mesh of what was seen, beside a map."""
     try:
         # Every tenth frame says enough of what has been seen: neighbours see the same.
-        sequence = scene.read(job.frames)
+        sequence = job.scene.read(job.frames)
         mesh = extract_mesh(finished.field, sequence.select(slice(None, None, 10)))
     except DataError as error:
         print(f"  no mesh: {error}")
-    else:
-        write_atomic(job.folder / MESH_FILE, mesh.export(file_type="ply"))
-        origin = finished.record["origin"]
-        where = f", relative to {origin} m" if any(origin) else ""
-        print(f"  mesh of what was seen: {job.folder / MESH_FILE}{where}")
+        return
+    write_atomic(job.folder / MESH_FILE, mesh.export(file_type="ply"))
+    origin = finished.record["origin"]
+    where = f", relative to {origin} m" if any(origin) else ""
+    print(f"  mesh of what was seen: {job.folder / MESH_FILE}{where}")
 
 
 def track_command(options: Namespace) -> None:
     """Track a sequence in its map, made first where none fits, or in a given one."""
     given = read_map(options.map_from) if options.map_from else None
     method = _method_in(given, options)
-    preset, map_frames = preset_of(options, method), options.map_frames or ":"
+    preset = _preset_of(options, method)
     if given:
-        preset = _with_network_of(given, preset, options)
+        _check_settings(given, preset, options)
     steps = method.usual_steps if options.steps is options.rate is None else options.steps
     budget = make_budget(steps, options.rate)  # told before a room is made
-    scene = _checked_scene(options, preset, *([] if given else [map_frames]))
-    job = MapJob(
-        scene, method.field, preset, map_frames, options.seed, options.map_from, given is not None
-    )
-    run = TrackJob(
-        job, scene, method.tracker, steps, options.rate, options.frames, options.seed,
-        options.out, options.threads, options.start,
-    )  # fmt: skip
-    with output_folder(options.out, *RUN_FILES):
+    scene = _opened(options, preset)
+    scene.count(options.frames, needs_poses=False)
+    if not given:
+        scene.count(":")
+    job = MapJob(scene, method.field, preset, ":", options.seed, options.map_from, bool(given))
+    how = options.frames, options.seed, options.out, options.threads, options.start
+    run = TrackJob(job, scene, method.tracker, steps, options.rate, *how)
+    with output_folder(options.out):
         if not given:
             _map(job)
         run = replace(run, out=run.folder)  # made anew, whatever the cache holds
         (metrics,) = run_jobs([run], f"tracking {scene.name}")
         _draw_overview(run)
     print(f"{run.folder}: {method.tracker} in {job.map().field.label}, {budget}")
-    _print_metrics(metrics)
-
-
-def _print_metrics(metrics: dict[str, Any]) -> None:
-    _print_numbers({name: metrics[name] for name in _PRINTED if name in metrics})
-    if "lost_frames" in metrics:
-        print(f"  frames off by more than {LOST_THRESHOLD_M:g} m: {metrics['lost_frames']}")
-    else:
+    _print_numbers(metrics)
+    if "ate_rmse_m" not in metrics:
         print("  no true pose is known of the tracked frames: errors cannot be computed")
-    if "flagged_frames" in metrics:
-        print(f"  frames that the tracker itself calls lost: {metrics['flagged_frames']}")
-    if 0 < metrics["frames_without_reference"] < metrics["frames"]:
-        print(f"  frames without a true pose, in no error: {metrics['frames_without_reference']}")
-    if metrics["frames_without_depth"]:
-        print(f"  frames without any depth, not searched: {metrics['frames_without_depth']}")
     print(f"  on {metrics['device']}")
     if metrics.get("map_warning"):
         tell(f"nbtrack: warning: {metrics['map_warning']}")
 
 
+def _preset_of(options: Namespace, method: Method) -> Preset:
+    """The preset with what a method changes, and then the user."""
+    return load_preset(options.preset, options.config, [*method.settings, *options.settings])
+
+
+def _opened(options: Namespace, preset: Preset) -> Scene:
+    """The scene that is named, and a warning where it is likely read wrongly."""
+    scene = open_scene(options.sequence, preset, options.format)
+    # A room of the cache is as it should be.
+    if not scene.made_by and (said := quick_warning(scene.recording)):
+        tell(f"nbtrack: warning: {said}; `data check` tells more")
+    return scene
+
+
+def _method_in(given: Map | None, options: Namespace) -> Method:
+    """What to track with: as named, or what suits the field of a given map."""
+    name, field, tracker = options.method, options.field, options.tracker
+    if given is None:
+        return method_of(name, field, tracker)
+    own = given.field.name
+    method = method_of(name, field or (None if name else own), tracker)
+    if method.field != own:
+        raise ConfigError(
+            f"{options.map_from} is a map of field {own!r}, not {method.field!r}: "
+            f"leave --{'method' if name else 'field'} out"
+        )
+    return method
+
+
+def _check_settings(given: Map, preset: Preset, options: Namespace) -> None:
+    """Raises ConfigError where --set names settings that a given map was not made with."""
+    name, record = given.field.name, given.record
+    asked = as_dict(preset.network_of(name)), as_dict(preset.mapping_of(name))
+    of_maps = [text for text in options.settings if text.startswith(OF_MAPS)]
+    if of_maps and asked != (record["network"], record["settings"]):
+        raise ConfigError(
+            f"{options.map_from} was made with other settings than --set {of_maps[0]}: leave out "
+            f"what begins with {' or '.join(OF_MAPS)}, or map anew"
+        )
+
+
+def _map(job: MapJob) -> None:
+    """Map, unless the map is there, and say so."""
+    print(f"{'map found' if job.is_done else 'no finished map'} in {job.folder}")
+    has_pose = job.scene.recording.has_pose[parse_frames(job.frames)]
+    if not has_pose.all():
+        tell(f"nbtrack: {(~has_pose).sum()} of {len(has_pose)} frames have no pose: not mapped")
+    run_jobs([job], f"mapping {job.scene.name}")
+
+
+def _print_numbers(results: dict[str, Any]) -> None:
+    """All numbers among some results, by name."""
+    for name, value in results.items():
+        if isinstance(value, int | float):
+            print(f"  {_MEANINGS.get(name, name)}: {value:.5g}")
+
+
 def _draw_overview(run: TrackJob) -> None:
     """A picture of a finished run, beside its files: the path in what was seen of the map."""
-    from nbtrack.plots import cloud_of, plot_overview
-
     tracked, field = read_trajectory(run.folder), run.needs.map().field
-    ids, known = tracked.frames["frame_id"].to_numpy(), np.isfinite(tracked.T_true).all(axis=(1, 2))
-    stride = max(1, len(ids) // _FRAMES_SHOWN)
-    seen = read_frames(run.scene.recording, ids[::stride], needs_poses=False)
-    seen = replace(seen, T_world_camera=tracked.T_estimated[::stride])
+    n_frames, metrics = len(tracked.frames), tracked.metrics
+    shown = np.arange(0, n_frames, max(1, n_frames // _FRAMES_SHOWN))
     try:
+        seen = _seen(tracked, shown, run.scene.recording)
         surface = extract_mesh(field, seen, voxel=_cell_of(field))
     except DataError as error:
         print(f"  no picture: {error}")
         return
-    cloud = cloud_of(surface)
-    paths = {"true": tracked.T_true[known]} if known.any() else {}
-    title = f"{run.scene.name}: {run.tracker} in {field.label}, {len(ids)} frames"
-    if known.any():
-        still = 100 * tracked.metrics.get("still_ate_m", float("nan"))
-        ate = 100 * tracked.metrics["ate_rmse_m"]
+    title, paths = f"{run.scene.name}: {run.tracker} in {field.label}, {n_frames} frames", {}
+    if "ate_rmse_m" in metrics:
+        ate, still = (100 * metrics.get(n, np.nan) for n in ("ate_rmse_m", "still_ate_m"))
         title += f", ATE {ate:.2f} cm (standing still {still:.0f} cm)"
+        paths["true"] = tracked.T_true[np.isfinite(tracked.T_true).all(axis=(1, 2))]
     title = title.encode(errors="replace").decode()  # letters that the system's encoding lacks
-    figure = plot_overview(cloud, paths | {"tracked": tracked.T_estimated}, tracked.frames, title)
+    paths["tracked"] = tracked.T_estimated
+    figure = plot_overview(cloud_of(surface), paths, tracked.frames, title)
     figure.savefig(run.folder / OVERVIEW_FILE, dpi=120)
     print(f"  picture: {run.folder / OVERVIEW_FILE}")
+
+
+def _seen(tracked: Trajectory, rows: np.ndarray, recording: Recording) -> RgbdSequence:
+    """What was observed in some rows of a run, from where its camera was estimated to be."""
+    frame_ids = tracked.frames["frame_id"].to_numpy()[rows]
+    sequence = read_frames(recording, frame_ids, needs_poses=False)
+    return replace(sequence, T_world_camera=tracked.T_estimated[rows])
 
 
 def _cell_of(field: Any) -> float:
@@ -181,34 +231,25 @@ def _export_map(source: Path, format_name: str, out: Path) -> str:
 
 def _export_movie(source: Path, format_name: str, out: Path) -> str:
     """Of a run, whose recording and map must still be where they were."""
-    from nbtrack.plots import movie_bytes, movie_pictures
-
     tracked = read_trajectory(source)
-    metrics = tracked.metrics
-    if "map" not in metrics:
-        raise MissingError(f"{source} is of an earlier version: track again")
-    finished, recording = read_map(Path(metrics["map"])), Path(metrics["recording"])
-    if not recording.is_dir():
-        raise MissingError(f"the recording {recording} of this run is gone: track again")
-    shown = np.unique(np.linspace(0, len(tracked.frames) - 1, _MOVIE_FRAMES).round().astype(int))
-    rows, T_estimated = tracked.frames.iloc[shown], tracked.T_estimated[shown]
-    opened = open_recording(recording, metrics["format"])
-    origin = np.array(metrics.get("origin", [0, 0, 0]))
-    sequence = read_frames(opened, rows["frame_id"].to_numpy(), needs_poses=False, origin=origin)
-    seen = replace(sequence, T_world_camera=T_estimated)
-    surface = extract_mesh(finished.field, seen, voxel=_cell_of(finished.field) / 2)
-    title = f"{metrics['scene']}: {metrics['tracker']} in {finished.field.label}"
+    metrics, last = tracked.metrics, len(tracked.frames) - 1
+    field = read_map(metrics["map"]).field
+    shown = np.unique(np.linspace(0, last, _MOVIE_FRAMES).round().astype(int))
+    seen = _seen(tracked, shown, open_recording(metrics["recording"], metrics["format"]))
+    surface = extract_mesh(field, seen, voxel=_cell_of(field) / 2)
+    title = f"{metrics['scene']}: {metrics['tracker']} in {field.label}"
     with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
-        of_run = surface, sequence, rows, T_estimated, title
-        content = movie_bytes(movie_pictures(*of_run, bar.move_to), format_name)
+        of_run = tracked.frames.iloc[shown], seen.T_world_camera, title
+        pictures = movie_pictures(surface, seen, *of_run, bar.move_to)
+        content = movie_bytes(pictures, format_name)
     write_atomic(out, content)
-    return f"{len(shown)} of {len(tracked.frames)} frames, {len(content) / 1e6:.1f} MB"
+    return f"{len(shown)} of {last + 1} frames, {len(content) / 1e6:.1f} MB"
 
 
 def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
-    if source.is_dir() and not (source / METRICS_FILE).is_file():
+    if not (source / METRICS_FILE).is_file():
         raise MissingError(f"{source} holds no finished run: give a folder of `track --out`")
-    path = source / "trajectory.txt" if source.is_dir() else source
+    path = source / "trajectory.txt"
     T_world_camera = read_tum(path)[1]
     if format_name == "kitti":
         write_kitti(out, T_world_camera)
@@ -238,17 +279,13 @@ def check_command(options: Namespace) -> None:
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     report = check_recording(recording, progress=True)
     print(report)
-    if options.out is None:
-        return
-    from nbtrack.plots import plot_overview
-
-    is_picture = options.out.suffix.lower() == ".png"
-    path = new_file(options.out if is_picture else options.out / "check.png")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    apart = f"{1e3 * report.conventions[0].median_m:.1f} mm apart (median)"
-    title = f"{recording.name}: surfaces of two frames lie {apart}"
-    plot_overview(report.cloud, {"true": report.T_world_camera}, None, title).savefig(path)
-    print(f"  picture         {path}")
+    if options.out is not None:
+        path = new_file(options.out / "check.png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        apart = f"{1e3 * report.conventions[0].median_m:.1f} mm apart (median)"
+        title = f"{recording.name}: surfaces of two frames lie {apart}"
+        plot_overview(report.cloud, {"true": report.T_world_camera}, None, title).savefig(path)
+        print(f"  picture         {path}")
 
 
 def convert_command(options: Namespace) -> None:
@@ -256,75 +293,3 @@ def convert_command(options: Namespace) -> None:
     frames = parse_frames(options.frames)
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     print(convert_sequence(recording, options.out, frames, progress=True))
-
-
-def preset_of(options: Namespace, method: Method | None = None, *settings: str) -> Preset:
-    """The preset with what a method changes, and then the user."""
-    changed = [*(method.settings if method else ()), *options.settings, *settings]
-    if getattr(options, "pixels", None) is not None:
-        changed.append(f"tracking.{method.tracker}.n_pixels={options.pixels}")
-    return load_preset(options.preset, options.config, changed)
-
-
-def _checked_scene(options: Namespace, preset: Preset, *mapped: str) -> Scene:
-    """The scene, of which slices to map have poses; a bad slice is told before a room is made."""
-    for frames in (options.frames, *mapped):
-        parse_frames(frames)
-    scene = open_scene(options.sequence, preset, options.format)
-    scene.count(options.frames, needs_poses=False)
-    for frames in mapped:
-        scene.count(frames)
-    # A room of the cache is as it should be.
-    if not scene.made_by and (said := quick_warning(scene.recording)):
-        tell(f"nbtrack: warning: {said}; `data check` tells more")
-    return scene
-
-
-def _method_in(given: Map | None, options: Namespace) -> Method:
-    """What to track with: as named, or what suits the field of a given map."""
-    name, field, tracker = options.method, options.field, options.tracker
-    if given is None:
-        return method_of(name, field, tracker)
-    if options.map_frames is not None:
-        raise ConfigError("--map-from names a map that is made: leave --map-frames out")
-    own = given.field.name
-    method = method_of(name, field or (None if name else own), tracker)
-    if method.field != own:
-        raise ConfigError(
-            f"{options.map_from} is a map of field {own!r}, not {method.field!r}: "
-            f"leave --{'method' if name else 'field'} out"
-        )
-    return method
-
-
-def _with_network_of(given: Map, preset: Preset, options: Namespace) -> Preset:
-    """The preset with a map's own network. Raises ConfigError for --set of a map made otherwise."""
-    name, record = given.field.name, given.record
-    asked = as_dict(preset.network_of(name)), as_dict(preset.mapping_of(name))
-    of_maps = [text for text in options.settings if text.startswith(OF_MAPS)]
-    if of_maps and asked != (record["network"], record["settings"]):
-        raise ConfigError(
-            f"{options.map_from} was made with other settings than --set {of_maps[0]}: leave out "
-            f"what begins with {' or '.join(OF_MAPS)}, or map anew"
-        )
-    network = NetworkSettings(**record["network"])
-    return replace(preset, network={**preset.network, name: network})
-
-
-def _map(job: MapJob) -> None:
-    if job.is_done:
-        print(f"map found in {job.folder}")
-        return
-    print(f"no finished map in {job.folder}: mapping")
-    has_pose = job.scene.recording.has_pose[parse_frames(job.frames)]
-    if not has_pose.all():
-        tell(f"nbtrack: {(~has_pose).sum()} of {len(has_pose)} frames have no pose: not mapped")
-    run_jobs([job], f"mapping {job.scene.name}")
-
-
-def _print_numbers(numbers: dict[str, float | int]) -> None:
-    for name, value in numbers.items():
-        suffix = next((s for s in _UNITS if name.endswith(s)), "")
-        unit, digits = _UNITS.get(suffix, ("", 0))
-        text = f"{value:.{digits}f} {unit}" if unit else f"{value:.4g}"
-        print(f"  {name.removesuffix(suffix).replace('_', ' ')}: {text}")

@@ -12,9 +12,10 @@ from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, MESH_
 from nbtrack.tracking.trajectories import METRICS_FILE
 
 OVERVIEW_FILE = "overview.png"
-# What the folder of a run and that of a map may hold.
-RUN_FILES = ("trajectory.txt", "groundtruth.txt", "frames.csv", METRICS_FILE, OVERVIEW_FILE)
-MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
+# What the folders of runs, maps and tables may hold.
+_RUN_FILES = ("trajectory.txt", "groundtruth.txt", "frames.csv", METRICS_FILE, OVERVIEW_FILE)
+_MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
+_TABLE_FILES = ("table_1.csv", "table_2.csv", "table_3.csv")
 LOCK_FILE = ".nbtrack.lock"
 """It stays in every folder that was given with --out, and tells that nbtrack wrote there."""
 
@@ -33,20 +34,19 @@ def new_file(path: Path) -> Path:
 
 
 @contextlib.contextmanager
-def output_folder(folder: Path | None, *names: str) -> Iterator[None]:
-    """Keep a folder for this process alone while files of these names are written there.
+def output_folder(folder: Path | None) -> Iterator[None]:
+    """Keep a folder for this process alone while results are written there.
 
     None stands for the cache, whose jobs are kept apart already.
 
-    Raises ConfigError where it is no folder, holds a recording or such files of somebody else, or
-    where another process writes; OSError where nothing can be written.
+    Raises ConfigError where it holds a recording, or files of somebody else that are named like
+    results, or where another process writes; OSError where nothing can be written.
     """
     if folder is None:
         yield
         return
-    if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"{folder} is a file: --out takes a folder; choose another")
     _check_no_recording(folder)
+    names = _RUN_FILES + _MAP_FILES + _TABLE_FILES
     foreign = [name for name in names if (folder / name).exists()]
     if foreign and not is_own_output(folder):
         raise ConfigError(
