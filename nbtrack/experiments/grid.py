@@ -119,13 +119,11 @@ def _on_workers(
         client.subscribe_topic(topic, lambda event: news.append(event[1]))
         settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
         settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
+        how = topic, settings, n_threads, (FIELDS, TRACKERS)
         waiting: dict[Path, Any] = {}
-        for priority, (folder, job) in enumerate(jobs.items()):
+        for folder, job in jobs.items():
             needed = waiting.get(job.needs.folder) if job.needs else None
-            waiting[folder] = client.submit(
-                _outcome_there, job, needed, topic, settings, n_threads, (FIELDS, TRACKERS),
-                key=f"{topic}-{folder.name}", pure=False, priority=-priority,
-            )  # fmt: skip
+            waiting[folder] = client.submit(_outcome_there, job, needed, *how, pure=False)
         while waiting:
             with contextlib.suppress(TimeoutError):
                 wait([*waiting.values()], timeout=_REPORT_SECONDS, return_when="FIRST_COMPLETED")

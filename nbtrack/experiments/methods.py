@@ -33,11 +33,11 @@ class Method:
 _COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
 _VR_VELOCITY = ("tracking.vr.motion_model=constant_velocity",)
 _SDF_VELOCITY = ("tracking.sdf.motion_model=constant_velocity",)
-_SPARSE, _MIDDLE, _DENSE = ((f"tracking.lm.n_pixels={n}",) for n in (512, 2048, 4096))
-_GEOMETRY = (*_MIDDLE, "tracking.lm.lambda_intensity=0")
 _CORRECTED = ("mapping.neus.correct_voxel=0.04",)
 # As good as from 1400 iterations, in half the time (benchmarks/README.md; rooms for tuning).
-_PLUS_CORRECTED = ("mapping.neus_plus.correct_voxel=0.04", "mapping.neus_plus.iterations=600")
+_PLUS = ("mapping.neus_plus.correct_voxel=0.04", "mapping.neus_plus.iterations=600")
+_SPARSE, _MIDDLE, _DENSE = ((*_PLUS, f"tracking.lm.n_pixels={n}") for n in (512, 2048, 4096))
+_GEOMETRY = (*_MIDDLE, "tracking.lm.lambda_intensity=0")
 METHODS = {
     "vr": Method("iMAP with VR", "imap", "vr"),
     "sdf": Method("NeuS with SDF", "neus", "sdf"),
@@ -55,15 +55,11 @@ METHODS = {
     "color_occupancy": Method("Occupancy with VR, colour only", "occupancy", "vr", _COLOR_ONLY),
     "sdf_plus": Method("NeuS+ with SDF (Adam)", "neus_plus", "sdf"),
     "baked": Method("NeuS+ baked (LM)", "neus_plus", "lm"),
-    "corrected": Method("NeuS+ corrected (LM)", "neus_plus", "lm", _PLUS_CORRECTED + _MIDDLE),
-    "corrected_sparse": Method(
-        "NeuS+ corrected (LM), sparse", "neus_plus", "lm", _PLUS_CORRECTED + _SPARSE
-    ),
-    "corrected_dense": Method(
-        "NeuS+ corrected (LM), dense", "neus_plus", "lm", _PLUS_CORRECTED + _DENSE
-    ),
+    "corrected": Method("NeuS+ corrected (LM)", "neus_plus", "lm", _MIDDLE),
+    "corrected_sparse": Method("NeuS+ corrected (LM), sparse", "neus_plus", "lm", _SPARSE),
+    "corrected_dense": Method("NeuS+ corrected (LM), dense", "neus_plus", "lm", _DENSE),
     "corrected_geometry": Method(
-        "NeuS+ corrected (LM), without colour", "neus_plus", "lm", _PLUS_CORRECTED + _GEOMETRY
+        "NeuS+ corrected (LM), without colour", "neus_plus", "lm", _GEOMETRY
     ),
     "neus_corrected": Method("NeuS corrected (LM)", "neus", "lm", _CORRECTED),
     "sdf_corrected": Method("NeuS corrected with SDF (Adam)", "neus", "sdf", _CORRECTED),

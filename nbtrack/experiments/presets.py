@@ -73,14 +73,10 @@ class Preset:
     def step_counts(self) -> str:
         """For captions of tables with the paper's step counts: the sizes of the paper and ours."""
         paper = " and ".join(f"{n} ({tracker})" for tracker, n in PAPER_PIXELS.items())
-        own = " and ".join(
-            f"{self.tracking_of(tracker.lower()).n_pixels} ({tracker})" for tracker in PAPER_PIXELS
-        )
-        return (
-            f"the paper's step counts, measured there with n = {paper} and "
-            f"{NetworkSettings().width} units a layer; here n = {own} and "
-            f"{self.network_of('neus').width} units"
-        )
+        own = " and ".join(f"{self.tracking_of(t.lower()).n_pixels} ({t})" for t in PAPER_PIXELS)
+        width, own_width = NetworkSettings().width, self.network_of("neus").width
+        there = f"measured there with n = {paper} and {width} units a layer"
+        return f"the paper's step counts, {there}; here n = {own} and {own_width} units"
 
     def network_of(self, field_name: str) -> NetworkSettings:
         """Network of a field; a field without its own takes that of NeuS."""
@@ -88,29 +84,28 @@ class Preset:
 
     def mapping_of(self, field_name: str) -> MappingSettings | PointMapping:
         """Mapping settings of a field; one that is added later takes what it shares with NeuS."""
-        kind = field_class(field_name).Settings
-        return _shared(kind, self.mapping.get(field_name) or self.mapping.get("neus") or kind())
+        return _own_or_like("neus", self.mapping, field_name, field_class(field_name).Settings)
 
     def tracking_of(self, tracker_name: str) -> TrackerSettings:
         """Settings of a tracker; one that is added later takes what it shares with SDF tracking."""
         kind = tracker_class(tracker_name).Settings
-        return _shared(kind, self.tracking.get(tracker_name) or self.tracking.get("sdf") or kind())
+        return _own_or_like("sdf", self.tracking, tracker_name, kind)
 
 
-def _shared(kind: type, other: Any) -> Any:
-    """Settings of a class, with those that the others have too; of the same class, the same."""
+def _own_or_like(usual: str, known: dict[str, Any], name: str, kind: type) -> Any:
+    """Settings of a class with what is known of a name, or shared with the usual one."""
+    other = known.get(name) or known.get(usual) or kind()
     return kind(**{f.name: getattr(other, f.name) for f in fields(kind) if hasattr(other, f.name)})
 
 
 _SMALL = with_values(Preset("smoke"), read_object(Path(__file__).with_name("smoke.toml")))
 _NINE = replace(_SMALL.scenes, names=REPORTED_ROOMS, track_frames=":")
-_ALL = (
-    _SMALL,
-    replace(_SMALL, name="nine_rooms", scenes=_NINE),
-    Preset("synthetic", scenes=ScenesConfig(REPORTED_ROOMS)),
-    Preset("paper", scenes=ScenesConfig(tuple(PAPER_SCENE_LABELS), synthetic=False)),
-)
-PRESETS = {preset.name: preset for preset in _ALL}
+PRESETS = {
+    "smoke": _SMALL,
+    "nine_rooms": replace(_SMALL, name="nine_rooms", scenes=_NINE),
+    "synthetic": Preset("synthetic", scenes=ScenesConfig(REPORTED_ROOMS)),
+    "paper": Preset("paper", scenes=ScenesConfig(tuple(PAPER_SCENE_LABELS), synthetic=False)),
+}
 
 
 def load_preset(
@@ -122,17 +117,14 @@ def load_preset(
     after those in `NBTRACK_SET`. Raises ConfigError for an unknown preset or key, or a value of the
     wrong type; MissingError if the file does not exist, DataError if it is no TOML.
     """
-    name = name or os.environ.get("NBTRACK_PRESET", "smoke")
-    preset = look_up("preset", name, PRESETS)
-    file_name, text = config_file or os.environ.get("NBTRACK_CONFIG"), os.environ.get("NBTRACK_SET")
-    if file_name and not Path(file_name).is_file():
-        raise MissingError(f"no config file {file_name}: give a TOML file of settings")
-    if file_name:
-        preset = with_values(preset, read_object(Path(file_name)))
+    preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
+    if config_file := config_file or os.environ.get("NBTRACK_CONFIG"):
+        if not Path(config_file).is_file():
+            raise MissingError(f"no config file {config_file}: give a TOML file of settings")
+        preset = with_values(preset, read_object(Path(config_file)))
     try:
-        before = shlex.split(text or "")
+        before = shlex.split(os.environ.get("NBTRACK_SET", ""))
     except ValueError as error:
-        raise ConfigError(
-            f"NBTRACK_SET={text!r} cannot be split ({error}): quote each setting as in a shell"
-        ) from None
+        advice = "quote each setting as in a shell"
+        raise ConfigError(f"NBTRACK_SET cannot be split ({error}): {advice}") from None
     return with_settings(preset, *before, *settings)

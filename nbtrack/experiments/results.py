@@ -22,9 +22,9 @@ from nbtrack.mapping.files import Map
 from nbtrack.tracking.trajectories import Trajectory, read_trajectory
 
 
-def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0, frames: str = ":") -> Map:
+def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
     """The map of a scene, from the cache or made now."""
-    job = MapJob(scene, field, preset, frames, seed)
+    job = MapJob(scene, field, preset, seed=seed)
     run_jobs([job], f"mapping {job.name}")
     return job.map()
 
@@ -76,9 +76,9 @@ def track_scenes(
     """
     execution, rates = execution or Execution(), [None] if steps else rates_hz
     seeds = range(seeds) if isinstance(seeds, int) else seeds
-    options = {"frames": frames or preset.scenes.track_frames, "n_threads": execution.threads}
-    if clock:  # how far a run comes depends on its threads
-        options["n_threads"] = execution.threads or torch.get_num_threads()
+    # By the clock, how far a run comes depends on its threads.
+    n_threads = execution.threads or (torch.get_num_threads() if clock else None)
+    options = {"frames": frames or preset.scenes.track_frames, "n_threads": n_threads}
     pairs, jobs, rows = list(zip(scenes, tracked or scenes, strict=True)), [], []
     grid = product(find_methods(methods), seeds, rates or preset.tables.rates_hz, pairs)
     for method, seed, rate_hz, (scene, seen) in grid:
