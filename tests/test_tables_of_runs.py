@@ -232,7 +232,7 @@ def test_wrong_scenes_are_told_before_anything_is_made(
     """Catches a misspelt column that is left out in silence, a column counted as two seeds, and an
     unhelpful error where the dataset was not downloaded."""
     for names, message in (
-        ("['living_rom']", "unknown scene 'living_rom', and no such folder: did you mean"),
+        ("['living_rom']", "no sequence 'living_rom': it is neither a folder nor .*did you mean"),
         ("['office', 'office']", "office, office: give at least one, and of one name only one"),
         ("[]", r"\(none\): give at least one"),
     ):

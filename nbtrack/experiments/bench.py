@@ -5,7 +5,6 @@ import os
 import shlex
 import time
 from argparse import Namespace
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from nbtrack.core.files import project_folder, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings, with_settings
 from nbtrack.experiments.grid import Execution
-from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Method, find_methods
+from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Methods, find_methods
 from nbtrack.experiments.output import output_folder
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.results import map_scene, track_scenes
@@ -50,7 +49,7 @@ def tables_command(options: Namespace) -> None:
         _fill_tables(options, preset, methods)
 
 
-def _fill_tables(options: Namespace, preset: Preset, methods: Sequence[str]) -> None:
+def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
     execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
     scenes, clock = open_scenes(preset), options.budget == "clock"
     rates_hz = RATES_3_HZ if options.beyond else None
@@ -66,7 +65,7 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Sequence[str]) -> 
         print(tables.style_table_1(results))
         print("Table I beside the paper's")
         print(tables.beside_published(results).to_string(float_format="%.3f", na_rep="–"))
-        steps, pixels = _table_2(preset, scenes[0], methods)
+        steps, pixels = _table_2(preset, scenes[0], methods), default_pixels(preset, methods)
         by_clock = _note(preset, clock=True)
         paths = tables.write_tables(folder, results, steps, note, pixels, steps_note=by_clock)
     cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
@@ -90,7 +89,7 @@ def bench_command(options: Namespace) -> None:
     quick = ("scenes.n_frames=2", "mapping.imap.iterations=1", "mapping.neus.iterations=1")
     preset = load_preset(options.preset, options.config, [*options.settings, *quick])
     with output_folder(options.out):
-        steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset))
+        steps = _table_2(preset, open_scene(preset.scenes.names[0], preset))
         folder = options.out or runs_folder() / "bench" / preset.name
         print(tables.write_csv(folder / "table_2.csv", steps))
 
@@ -104,18 +103,15 @@ def notebooks_command(options: Namespace) -> None:
     """
     # A wrong setting is refused before the first kernel starts.
     preset = load_preset(options.preset, options.config, options.settings).name
-    wanted = ("nbconvert", "ipykernel", "latex2mathml")
-    if any(importlib.util.find_spec(name) is None for name in wanted):
+    if not all(map(importlib.util.find_spec, ("nbconvert", "ipykernel", "latex2mathml"))):
         raise MissingError("notebooks need Jupyter: pip install 'nbtrack[notebooks]'")
     paths = sorted((project_folder() / "notebooks").glob("[0-9A]*_*.ipynb"))
     if not paths:
         raise MissingError(f"no notebooks in {project_folder()}: run the command in a checkout")
-    before = os.environ.get("NBTRACK_SET", "")
-    os.environ |= {
-        "NBTRACK_PRESET": preset,
-        "NBTRACK_SET": f"{before} {shlex.join(options.settings)}".strip(),
-        **({"NBTRACK_CONFIG": str(options.config.resolve())} if options.config else {}),
-    }
+    settings = f"{os.environ.get('NBTRACK_SET', '')} {shlex.join(options.settings)}"
+    os.environ |= {"NBTRACK_PRESET": preset, "NBTRACK_SET": settings.strip()}
+    if options.config:
+        os.environ["NBTRACK_CONFIG"] = str(options.config.resolve())
     with ProgressBar("notebooks", len(paths)) as bar:
         for done, path in enumerate(paths):
             bar.move_to(done, path.stem)
@@ -123,20 +119,16 @@ def notebooks_command(options: Namespace) -> None:
         bar.move_to(len(paths))
 
 
-def _table_2(
-    preset: Preset, scene: Scene, methods: Sequence[str | Method] = TABLE_1
-) -> tuple[pd.DataFrame, dict[str, int]]:
-    """Measure and print it; the n of Table I besides."""
+def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
+    """Measure and print it."""
     steps, pixels = measure_steps(preset, scene, methods), default_pixels(preset, methods)
     machine = f"{device_name(choose_device())}, {torch.get_num_threads()} threads"
     print(f"Table II: steps, {preset.name} networks, on {machine}")
     print(tables.style_table_2(steps, default_pixels=pixels))
-    return steps, pixels
+    return steps
 
 
-def measure_steps(
-    preset: Preset, scene: Scene, methods: Sequence[str | Method] = TABLE_1
-) -> pd.DataFrame:
+def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
     """Steps within each budget for every tracker, in its first method's field, and its n (pixels).
 
     A tracker first spends one frame that is not counted, so that allocations and compilations are
@@ -145,7 +137,7 @@ def measure_steps(
     A row is a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames) and
     steps_std (over frames). Source: paper, Table II and evaluation protocol.
     """
-    firsts: dict[str, Method] = {}
+    firsts = {}
     for method in find_methods(methods):
         firsts.setdefault(method.tracker, method)
     pixels, rows = preset.tables.pixels, []
@@ -172,7 +164,7 @@ def measure_steps(
     return pd.DataFrame(rows, columns=columns)
 
 
-def default_pixels(preset: Preset, methods: Sequence[str | Method] = TABLE_1) -> dict[str, int]:
+def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]:
     """The n that each tracker's first method uses for Table I, by its label in Table II."""
     return {
         m.tracker.upper(): with_settings(preset, *m.settings).tracking_of(m.tracker).n_pixels

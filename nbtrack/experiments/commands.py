@@ -76,17 +76,17 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
         return
     write_atomic(job.folder / MESH_FILE, mesh.export(file_type="ply"))
     origin = finished.record["origin"]
-    where = f", relative to {origin} m" if any(origin) else ""
-    print(f"  mesh of what was seen: {job.folder / MESH_FILE}{where}")
+    print(f"  mesh of what was seen: {job.folder / MESH_FILE}, relative to {origin} m")
 
 
 def track_command(options: Namespace) -> None:
     """Track a sequence in its map, made first where none fits, or in a given one."""
     given = read_map(options.map_from) if options.map_from else None
-    method = _method_in(given, options)
+    own = given.field.name if given and not options.method else None
+    method = method_of(options.method, options.field or own, options.tracker)
     preset = _preset_of(options, method)
     if given:
-        _check_settings(given, preset, options)
+        _check_fits(given, method, preset, options)
     steps = method.usual_steps if options.steps is options.rate is None else options.steps
     budget = make_budget(steps, options.rate)  # told before a room is made
     scene = _opened(options, preset)
@@ -125,24 +125,14 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
     return scene
 
 
-def _method_in(given: Map | None, options: Namespace) -> Method:
-    """What to track with: as named, or what suits the field of a given map."""
-    name, field, tracker = options.method, options.field, options.tracker
-    if given is None:
-        return method_of(name, field, tracker)
-    own = given.field.name
-    method = method_of(name, field or (None if name else own), tracker)
-    if method.field != own:
-        raise ConfigError(
-            f"{options.map_from} is a map of field {own!r}, not {method.field!r}: "
-            f"leave --{'method' if name else 'field'} out"
-        )
-    return method
-
-
-def _check_settings(given: Map, preset: Preset, options: Namespace) -> None:
-    """Raises ConfigError where --set names settings that a given map was not made with."""
+def _check_fits(given: Map, method: Method, preset: Preset, options: Namespace) -> None:
+    """Raises ConfigError where a given map is of another field or other settings than asked for."""
     name, record = given.field.name, given.record
+    if method.field != name:
+        raise ConfigError(
+            f"{options.map_from} is a map of field {name!r}, not {method.field!r}: leave --method "
+            "and --field out"
+        )
     asked = as_dict(preset.network_of(name)), as_dict(preset.mapping_of(name))
     of_maps = [text for text in options.settings if text.startswith(OF_MAPS)]
     if of_maps and asked != (record["network"], record["settings"]):

@@ -61,8 +61,7 @@ def run_jobs(jobs: Sequence[Job], title: str, execution: Execution | None = None
     Unless it is to keep going, it raises what the first failing job raised, and drops the others.
     """
     execution, results = execution or Execution(), {}
-    wanted = [part for job in jobs if not job.is_done for part in (job.needs, job) if part]
-    missing = {job.folder: job for job in wanted if not job.is_done}
+    missing = {part.folder: part for job in jobs for part in _missing(job)}
     done = dict.fromkeys(missing, 0.0)  # shares: each job counts as one, however long it takes
 
     def show(folder: Path, share: float, status: str) -> None:
@@ -80,6 +79,11 @@ def run_jobs(jobs: Sequence[Job], title: str, execution: Execution | None = None
             results[folder] = outcome
             show(folder, 1.0, "done")
     return [results[job.folder] if job.folder in results else job.result() for job in jobs]
+
+
+def _missing(job: Job | None) -> list[Job]:
+    """What is not done of a job and what it needs, in the order in which it can be done."""
+    return [] if job is None or job.is_done else [*_missing(job.needs), job]
 
 
 def _outcomes(

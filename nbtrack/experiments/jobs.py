@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -85,7 +85,7 @@ class MapJob(Job):
     out: Path | None = None
     is_given: bool = False  # made elsewhere, and only read: `out` is its folder, or its file
 
-    kind, needs = "maps", None
+    kind = "maps"
 
     @cached_property
     def key(self) -> str:
@@ -94,7 +94,7 @@ class MapJob(Job):
         if self.is_given:
             given = read_map(self.folder)
             return files.fingerprint(given.key, files.code_fingerprint(type(given.field)), device)
-        correction = ["nbtrack.mapping.correct"] if self.base else []
+        correction = ["nbtrack.mapping.correct"] if self.needs else []
         code = field_class(self.field), "nbtrack.mapping.fit", *correction
         network = self.preset.network_of(self.field)
         parts = self.scene.fingerprint, self.field, network, self.settings, self.frames, self.seed
@@ -109,13 +109,13 @@ class MapJob(Job):
     def name(self) -> str:
         """Scene and field, and the seed if it is not the first."""
         corrected, seed = (
-            "-corrected" if self.base else "",
+            "-corrected" if self.needs else "",
             f"-seed{self.seed}" if self.seed else "",
         )
         return f"{self.scene.name}-{self.field}{corrected}{seed}"
 
     @property
-    def base(self) -> "MapJob | None":
+    def needs(self) -> "MapJob | None":
         """The map that this one corrects, if it is a corrected one."""
         if not getattr(self.settings, "correct_voxel", 0.0):
             return None
@@ -131,30 +131,28 @@ class MapJob(Job):
 
     def result(self) -> dict[str, Any]:
         """How the finished map was made, and its scores."""
-        return self.map().record
+        return read_map(self.folder).record
 
     def map(self) -> Map:
         """The finished map, ready for tracking."""
-        finished = _read(self.folder, self.key)
+        finished = read_map(self.folder)
         return replace(finished, field=finished.field.to(choose_device()))
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Map and score, or resume; write the map's files."""
         iterations = getattr(self.settings, "iterations", 1)
-        path, checkpoint, base = self.folder / MAP_FILE, self.folder / CHECKPOINT_FILE, self.base
+        path, checkpoint = self.folder / MAP_FILE, self.folder / CHECKPOINT_FILE
 
         def tell(done: int, losses: dict[str, float | int]) -> None:
             words = [f"{name} {loss:.3f}" for name, loss in losses.items()]
             report(done / iterations, " ".join(words))
 
-        if base and isinstance(failure := base.outcome(None, report), NbtrackError):
-            raise failure
         sequence, network = self.scene.read(self.frames), self.preset.network_of(self.field)
         parts = self.field, sequence, network, self.settings, self.seed
         if path.is_file():  # a folder of the user's, with another finished map
             check_recipe(path, read_map(self.folder).record, recipe_of(*parts))
-        if base:
-            finished = correct_map(base.map(), sequence, self.settings)
+        if self.needs:
+            finished = correct_map(self.needs.map(), sequence, self.settings)
         else:
             finished = map_sequence(*parts, choose_device(), checkpoint, tell)
         record = {"quality": score_map(finished, sequence, self.scene.room)}
@@ -163,12 +161,6 @@ class MapJob(Job):
         write_map(path, finished)
         checkpoint.unlink(missing_ok=True)
         return finished.record
-
-
-@lru_cache(maxsize=4)
-def _read(folder: Path, key: str) -> Map:
-    """Read once for all runs in a map."""
-    return read_map(folder)
 
 
 @dataclass(frozen=True)
@@ -237,8 +229,6 @@ class TrackJob(Job):
         with threads(n_threads):
             tracked, notes = self._tracked(report)
         metrics = _scores(tracked) | self._provenance(n_threads) | notes
-        if metrics.get("path_m") and "ate_rmse_m" in metrics:
-            metrics["ate_over_path"] = metrics["ate_rmse_m"] / metrics["path_m"]
         times, origin = tracked.frames["time"].to_numpy(), np.array(notes.get("origin", [0, 0, 0]))
         texts = {
             "trajectory.txt": tum_text(times, shifted(tracked.T_estimated, origin)),

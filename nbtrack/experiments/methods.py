@@ -30,6 +30,9 @@ class Method:
         return 30 if tracker_class(self.tracker).converges else self.paper_steps(2)
 
 
+Methods = Sequence[str | Method]
+"""By name, or as they are."""
+
 _COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
 _VR_VELOCITY = ("tracking.vr.motion_model=constant_velocity",)
 _SDF_VELOCITY = ("tracking.sdf.motion_model=constant_velocity",)
@@ -102,7 +105,7 @@ def method_of(name: str | None, field: str | None, tracker: str | None) -> Metho
     return find_methods([Method(f"{field_class(field).label} with {tracker}", field, tracker)])[0]
 
 
-def find_methods(methods: Sequence[str | Method]) -> list[Method]:
+def find_methods(methods: Methods) -> list[Method]:
     """The methods of these names; a `Method` stands for itself.
 
     Raises ConfigError if a name is unknown, or its field and tracker do not go together.

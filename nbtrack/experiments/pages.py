@@ -19,7 +19,7 @@ _LINK = re.compile(r"\]\(([\w./-]+)\)")
 
 
 def write_page(notebook: Any, source: Path, page: Path) -> None:
-    """Write a notebook as HTML, and the index of all pages of that folder.
+    """Write a notebook as HTML.
 
     Formulas become MathML. Links to notebooks lead to their pages, those to other files to where
     these lie beside the notebook's `source`. The page has the notebook's heading as its title.
@@ -32,15 +32,6 @@ def write_page(notebook: Any, source: Path, page: Path) -> None:
     exporter = HTMLExporter(mathjax_url="")
     text, _ = exporter.from_notebook_node(shown, {"metadata": {"name": title}})
     write_atomic(page, text.replace("</head>", f"{_STYLE}</head>", 1))
-    entries = []
-    for other in sorted(page.parent.glob("[0-9A]*.html")):
-        heading = re.search(r"<title>(.*?)</title>", other.read_text(encoding="utf-8"))
-        entries.append(f'<li><a href="{other.name}">{heading[1] if heading else other.stem}</a>')
-    write_atomic(
-        page.parent / "index.html",
-        "<!doctype html><meta charset=utf-8><title>nbtrack</title><h1>nbtrack</h1><ol>"
-        + "\n".join(entries) + "</ol>\n",
-    )  # fmt: skip
 
 
 def _for_a_page(text: str, source_folder: Path, page_folder: Path) -> str:

@@ -15,7 +15,7 @@ from nbtrack.core.progress import tell
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.grid import Execution, run_jobs
 from nbtrack.experiments.jobs import MapJob, TrackJob
-from nbtrack.experiments.methods import Method, find_methods
+from nbtrack.experiments.methods import Methods, find_methods
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.mapping.files import Map
@@ -52,7 +52,7 @@ def map_scenes(
 
 def track_scenes(
     scenes: Sequence[Scene],
-    methods: Sequence[str | Method],
+    methods: Methods,
     preset: Preset,
     rates_hz: Sequence[float | int] | None = None,
     steps: float | int | None = None,

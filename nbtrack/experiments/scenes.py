@@ -55,12 +55,13 @@ class Scene:
 
 
 def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) -> Scene:
-    """The scene that a user means. Raises MissingError if there is no such folder, room or scene.
+    """The scene that a user means.
 
     It is a folder in a supported layout, the name of a synthetic room (made here at the size that
     the preset gives, unless it is there already), or of a scene of the Neural RGB-D dataset below
     the data folder. A folder of that name comes first, unless nbtrack wrote its results there. The
-    format of a folder is by default told by its files.
+    format of a folder is by default told by its files. Raises ConfigError where there is no such
+    folder, room or scene; MissingError where the scene of the dataset was not downloaded.
     """
     text, folder = str(sequence), Path(sequence)
     if text in _KNOWN and folder.is_dir() and not is_own_output(folder):
@@ -77,7 +78,7 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     if folder.is_dir():
         return Scene(folder.resolve().name, folder.resolve(), format)
     advice = nearest_name(text, _KNOWN)
-    raise MissingError(f"no sequence {text!r}: it is neither a folder nor a known scene; {advice}")
+    raise ConfigError(f"no sequence {text!r}: it is neither a folder nor a known scene; {advice}")
 
 
 def open_scenes(preset: Preset) -> list[Scene]:
@@ -87,16 +88,10 @@ def open_scenes(preset: Preset) -> list[Scene]:
     returned. Raises ConfigError where no name is given, or one twice, or an unknown one; where no
     scene is whole, what is wrong with the first.
     """
-    names = preset.scenes.names
-    for name in names:
-        if name not in _KNOWN and not Path(name).is_dir():
-            advice = nearest_name(name, _KNOWN)
-            raise ConfigError(f"unknown scene {name!r}, and no such folder: {advice}")
+    names, scenes, missing = preset.scenes.names, [], {}
     if not names or len({Path(name).resolve().name for name in names}) < len(names):
-        raise ConfigError(
-            f"scenes {', '.join(names) or '(none)'}: give at least one, and of one name only one"
-        )
-    scenes, missing = [], {}
+        given = ", ".join(names) or "(none)"
+        raise ConfigError(f"scenes {given}: give at least one, and of one name only one")
     for name in names:
         try:
             scene = open_scene(name, preset)
