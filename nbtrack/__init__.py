@@ -6,21 +6,17 @@ from typing import Any
 __version__ = "0.1.0"
 
 # Loaded when they are first used, so that `--help` needs no torch.
-_FACE = {
-    "Frame": "data.frame",
-    "METHODS": "experiments.methods",
-    "Method": "experiments.methods",
-    "load_preset": "experiments.presets",
-    "make_tracker": "tracking",
-    "map_scene": "experiments.results",
-    "map_scenes": "experiments.results",
-    "open_scene": "experiments.scenes",
-    "open_scenes": "experiments.scenes",
-    "read_map": "mapping.files",
-    "read_run": "experiments.results",
-    "read_sequence": "data.sequence",
-    "track_scenes": "experiments.results",
+_MODULES = {
+    "data.frame": ["Frame"],
+    "data.sequence": ["read_sequence"],
+    "experiments.methods": ["METHODS", "Method"],
+    "experiments.presets": ["load_preset"],
+    "experiments.results": ["map_scene", "map_scenes", "read_run", "track_scenes"],
+    "experiments.scenes": ["open_scene", "open_scenes"],
+    "mapping.files": ["read_map"],
+    "tracking": ["make_tracker"],
 }
+_FACE = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = [*_FACE]
 
 

@@ -3,7 +3,6 @@
 import argparse
 import importlib
 import os
-import re
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -11,7 +10,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from nbtrack import __version__
-from nbtrack.core.errors import ConfigError, NbtrackError, nearest_name
+from nbtrack.core.errors import ConfigError, NbtrackError
+
+_MAX_COUNT = 2**31 - 1
 
 
 def a_path(text: str) -> Path:
@@ -21,10 +22,10 @@ def a_path(text: str) -> Path:
     return Path(text)
 
 
-def a_count(text: str, minimum: int = 1, maximum: int = 2**63 - 1) -> int:
+def a_count(text: str, minimum: int = 1) -> int:
     """A number of things, of which there is at least one, that every random generator takes."""
-    if not (text.lstrip("-").isdecimal() and minimum <= int(text) <= maximum):
-        limits = f"from {minimum} to {maximum}" if maximum < 2**31 else f"that is {minimum} or more"
+    if not (text.lstrip("-").isdecimal() and minimum <= int(text) <= _MAX_COUNT):
+        limits = f"from {minimum} to {_MAX_COUNT}"
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number {limits}")
     return int(text)
 
@@ -33,8 +34,6 @@ def _option(help: str, type: Any = str, **more: Any) -> dict[str, Any]:
     return {"help": help, "type": type, **more}
 
 
-_MAX_THREADS = 1024  # OpenMP ends the process where it cannot start them
-a_seed, some_threads = partial(a_count, minimum=0), partial(a_count, maximum=_MAX_THREADS)
 _STARTS = {"choices": ("given", "unknown"), "default": "given"}
 _BUDGETS = {"choices": ("steps", "clock"), "default": "steps"}
 _SETTINGS = {"action": "append", "default": [], "dest": "settings", "metavar": "KEY=VALUE"}
@@ -66,11 +65,11 @@ OPTIONS = {
     "--motion": _option("handheld: a glance (default); tour: the whole room", default="handheld"),
     "--depth-folder": _option("default: the format's; filtered before raw depth"),
     "--poses": _option("pose file (default: the format's)", metavar="FILE"),
-    "--seed": _option("of all random numbers (default: 0)", a_seed, default=0),
+    "--seed": _option("of all random numbers (default: 0)", partial(a_count, minimum=0), default=0),
     "--out": _option("where to write (default: in runs/)", a_path),
     "--out!": _option("where to write", a_path, required=True),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
-    "--threads": _option("CPU threads (default: all cores)", some_threads),
+    "--threads": _option("CPU threads (default: all cores)", a_count),
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
     "--config": _option("TOML file of settings", a_path),
     "--set": _option("one setting, as mapping.neus.iterations=500; may be repeated", **_SETTINGS),
@@ -98,13 +97,10 @@ COMMANDS = {
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, with the nearest name, as every other user error does."""
+    """Says what is wrong in one line, as every other user error does."""
 
     def error(self, message: str) -> NoReturn:
         """Raise an error that the caller catches; argparse would exit."""
-        if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
-            choices = [choice.strip("' ") for choice in wrong[2].split(",")]
-            message = f"unknown {wrong[1]!r}: {nearest_name(wrong[1], choices)}"
         raise ConfigError(f"{message}; see {self.prog} --help")
 
 
@@ -127,8 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         message, status = " ".join(str(error).split()), 2
     except OSError as error:  # a disk that is full or read-only, a file where a folder should be
         where = error.filename2 or error.filename or "the output"
-        message, status = f"{where}: {error.strerror or error}; what was finished is kept: ", 2
-        message += "make room or choose another place, and run the same command again"
+        message, status = f"{where}: {error.strerror or error}; mend it and run again", 2
     except KeyboardInterrupt:
         message, status = "interrupted; run the same command again to go on", 130
     print(f"nbtrack: {message}", file=sys.stderr)
@@ -157,10 +152,5 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
         command = groups["".join(group)].add_parser(last, help=about, description=about)
         for word in options.split():
             command.add_argument(word.rstrip("!"), **OPTIONS[word])
-        command.set_defaults(command=last, parser=command, device=None, threads=None)
-    namespace, unknown = parser.parse_known_args(arguments)
-    if unknown:
-        known = [option for option in namespace.parser._option_string_actions if option[:2] == "--"]
-        name = unknown[0].partition("=")[0]
-        namespace.parser.error(f"unknown argument {unknown[0]!r}: {nearest_name(name, known)}")
-    return namespace
+        command.set_defaults(command=last, device=None, threads=None)
+    return parser.parse_args(arguments)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import nbformat
 
-from nbtrack.experiments.pages import write_page
+from nbtrack.experiments.bench import write_page
 
 
 def test_a_page_needs_no_network(tmp_path: Path) -> None:

@@ -1,12 +1,14 @@
 """The commands that compute the paper anew: `tables`, `bench` (Table II alone), `notebooks`."""
 
+import html
 import importlib.util
 import os
+import re
 import shlex
-import time
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -33,6 +35,11 @@ _CELL_COLUMNS = (
     "rotation_rmse_deg", "max_error_m", "frames", "lost_frames", "steps_per_frame", "run",
     "failure",
 )  # fmt: skip
+# Of notebooks as pages: long lines of code; formulas, code and links in Markdown.
+_STYLE = "<style>.jp-InputArea pre { white-space: pre-wrap; }</style>"
+_FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$\n]+?)\$", re.DOTALL)
+_CODE = re.compile(r"(`[^`]*`)")
+_LINK = re.compile(r"\]\(([\w./-]+)\)")
 
 
 def tables_command(options: Namespace) -> None:
@@ -74,20 +81,17 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
     failed = results[results["failure"] != ""]
     if len(failed):
         first, why = failed.iloc[0][["run", "failure"]]
-        raise NbtrackError(
-            f"{len(failed)} cells of the table failed and are empty, the first of them {first}: "
-            f"{why}; mend the cause and run the same command again, the rest is kept"
-        )
+        cells = f"{len(failed)} cells of the table failed and are empty, the first of them {first}"
+        raise NbtrackError(f"{cells}: {why}; mend the cause and run again, the rest is kept")
 
 
 def bench_command(options: Namespace) -> None:
     """Measure and print Table II; write it as CSV."""
     # The paper's sizes unless something else is asked for: small networks measure bookkeeping.
-    if "NBTRACK_PRESET" not in os.environ:
-        options.preset = options.preset or "synthetic"
+    name = options.preset or os.environ.get("NBTRACK_PRESET", "synthetic")
     # One image is enough, and hardly a map: a step costs the same whatever the weights are.
     quick = ("scenes.n_frames=2", "mapping.imap.iterations=1", "mapping.neus.iterations=1")
-    preset = load_preset(options.preset, options.config, [*options.settings, *quick])
+    preset = load_preset(name, options.config, [*options.settings, *quick])
     with output_folder(options.out):
         steps = _table_2(preset, open_scene(preset.scenes.names[0], preset))
         folder = options.out or runs_folder() / "bench" / preset.name
@@ -186,19 +190,51 @@ def _run_notebook(path: Path, folder: Path) -> None:
     import nbformat
     from nbconvert.preprocessors import CellExecutionError, ExecutePreprocessor
 
-    from nbtrack.experiments.pages import write_page
-
-    notebook, page, start = nbformat.read(path, 4), folder / f"{path.stem}.html", time.monotonic()
+    notebook, page = nbformat.read(path, 4), folder / f"{path.stem}.html"
     options = {"record_timing": False, "extra_arguments": ["--log-level=ERROR"]}  # no talk of ports
     run = ExecutePreprocessor(timeout=None, kernel_name="python3", **options)
     try:
         run.preprocess(notebook, {"metadata": {"path": str(path.parent)}})
     except CellExecutionError as error:
-        raise NbtrackError(
-            f"{path.name} failed with {error.ename}: {error.evalue}; see the last cell of "
-            f"{folder / path.name}, mend what it names and run again"
-        ) from None
+        failed = f"{path.name} failed with {error.ename}: {error.evalue}"
+        raise NbtrackError(f"{failed}; see the last cell of {folder / path.name}") from None
     finally:
         write_atomic(folder / path.name, nbformat.writes(notebook) + "\n")
     write_page(notebook, path, page)
-    print(f"{page}: {time.monotonic() - start:.0f} s")
+    print(page)
+
+
+def write_page(notebook: Any, source: Path, page: Path) -> None:
+    """Write a notebook as a page for a browser that needs no network for its formulas.
+
+    Formulas become MathML. Links to notebooks lead to their pages, those to other files to where
+    these lie beside the notebook's `source`. The page has the notebook's heading as its title.
+    """
+    from nbconvert import HTMLExporter
+
+    title = notebook.cells[0].source.splitlines()[0].lstrip("# ")
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            cell.source = _for_a_page(cell.source, source.parent, page.parent)
+    exporter = HTMLExporter(mathjax_url="")
+    text, _ = exporter.from_notebook_node(notebook, {"metadata": {"name": title}})
+    write_atomic(page, text.replace("</head>", f"{_STYLE}</head>", 1))
+
+
+def _for_a_page(text: str, source_folder: Path, page_folder: Path) -> str:
+    """Markdown with formulas as MathML and links that lead somewhere; code stays as it is."""
+    from latex2mathml.converter import convert
+
+    def formula(match: re.Match) -> str:
+        kind = "block" if match[1] else "inline"
+        return convert(match[1] or match[2], display=kind)
+
+    def link(match: re.Match) -> str:
+        target = match[1]
+        if target.endswith(".ipynb"):
+            return f"]({Path(target).with_suffix('.html')})"
+        path = os.path.relpath((source_folder / target).resolve(), page_folder.resolve())
+        return f"]({html.escape(path)})"
+
+    parts = _CODE.split(_LINK.sub(link, text))
+    return "".join(p if p.startswith("`") else _FORMULA.sub(formula, p) for p in parts)

@@ -43,10 +43,8 @@ _MOVIE_FRAMES = 100
 
 def methods_command(options: Namespace) -> None:
     """List every method that --method takes."""
-    width = max(map(len, METHODS))
     for name, method in METHODS.items():
-        usual = "  (default)" if name == DEFAULT_METHOD else ""
-        print(f"  {name:<{width}}  {method.label}{usual}")
+        print(f"  {name:<20}{method.label}{'  (default)' if name == DEFAULT_METHOD else ''}")
 
 
 def map_command(options: Namespace) -> None:
@@ -127,19 +125,15 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
 
 def _check_fits(given: Map, method: Method, preset: Preset, options: Namespace) -> None:
     """Raises ConfigError where a given map is of another field or other settings than asked for."""
-    name, record = given.field.name, given.record
+    name, record, path = given.field.name, given.record, options.map_from
     if method.field != name:
-        raise ConfigError(
-            f"{options.map_from} is a map of field {name!r}, not {method.field!r}: leave --method "
-            "and --field out"
-        )
+        advice = "leave --method and --field out"
+        raise ConfigError(f"{path} is a map of field {name!r}, not {method.field!r}: {advice}")
     asked = as_dict(preset.network_of(name)), as_dict(preset.mapping_of(name))
     of_maps = [text for text in options.settings if text.startswith(OF_MAPS)]
     if of_maps and asked != (record["network"], record["settings"]):
-        raise ConfigError(
-            f"{options.map_from} was made with other settings than --set {of_maps[0]}: leave out "
-            f"what begins with {' or '.join(OF_MAPS)}, or map anew"
-        )
+        advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
+        raise ConfigError(f"{path} was made with other settings than --set {of_maps[0]}: {advice}")
 
 
 def _map(job: MapJob) -> None:
@@ -260,8 +254,7 @@ def make_command(options: Namespace) -> None:
     chosen = "motion", "n_frames", "width", "seed"
     config = ScenesConfig(**{name: getattr(options, name) for name in chosen})
     write_room(options.room, options.out, config)
-    size = f"{options.n_frames} frames of {options.width}x{options.width * 3 // 4}"
-    print(f"{options.out}: {options.room}, {size}, seed {options.seed}")
+    print(f"{options.out}: {options.room}, {options.n_frames} frames, seed {options.seed}")
 
 
 def check_command(options: Namespace) -> None:
@@ -272,8 +265,8 @@ def check_command(options: Namespace) -> None:
     if options.out is not None:
         path = new_file(options.out / "check.png")
         path.parent.mkdir(parents=True, exist_ok=True)
-        apart = f"{1e3 * report.conventions[0].median_m:.1f} mm apart (median)"
-        title = f"{recording.name}: surfaces of two frames lie {apart}"
+        apart_mm = 1e3 * report.conventions[0].median_m
+        title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart (median)"
         plot_overview(report.cloud, {"true": report.T_world_camera}, None, title).savefig(path)
         print(f"  picture         {path}")
 

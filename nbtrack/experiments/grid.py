@@ -50,9 +50,7 @@ class Execution:
     def __post_init__(self) -> None:
         """Raises MissingError, before any work, if Dask is needed and not there."""
         if (self.dask is not None or (self.workers or 1) > 1) and not _has_dask():
-            raise MissingError(
-                "several workers need Dask: pip install 'nbtrack[cluster]', or give --workers 1"
-            )
+            raise MissingError("workers need Dask: pip install 'nbtrack[cluster]', or --workers 1")
 
 
 def run_jobs(jobs: Sequence[Job], title: str, execution: Execution | None = None) -> list[Any]:
@@ -139,10 +137,9 @@ def _on_workers(
                 try:
                     outcome = waiting.pop(folder).result()
                 except KilledWorker:
-                    outcome = NbtrackError(
-                        f"a worker process died at {folder.name}, perhaps for lack of memory: what "
-                        "is done is kept; run it again, with fewer --workers or smaller settings"
-                    )
+                    died = f"a worker process died at {folder.name}, perhaps for lack of memory"
+                    advice = "run it again, with fewer --workers or smaller settings"
+                    outcome = NbtrackError(f"{died}: {advice}")
                 yield folder, outcome
 
 
@@ -183,8 +180,6 @@ def _client(address: str | None, workers: int) -> Any:
         client = Client(address, timeout=_SECONDS_TO_CONNECT)
         client.wait_for_workers(1, timeout=_SECONDS_TO_CONNECT)
         return client
-    except (OSError, ValueError) as error:
-        raise MissingError(
-            f"no Dask scheduler at {address!r} with a worker ({type(error).__name__}): start one "
-            "with 'dask scheduler', and workers with 'dask worker ADDRESS --nthreads 1'"
-        ) from None
+    except (OSError, ValueError):
+        advice = "start 'dask scheduler', and 'dask worker ADDRESS --nthreads 1'"
+        raise MissingError(f"no Dask scheduler at {address!r} with a worker: {advice}") from None

@@ -108,11 +108,8 @@ class MapJob(Job):
     @property
     def name(self) -> str:
         """Scene and field, and the seed if it is not the first."""
-        corrected, seed = (
-            "-corrected" if self.needs else "",
-            f"-seed{self.seed}" if self.seed else "",
-        )
-        return f"{self.scene.name}-{self.field}{corrected}{seed}"
+        name = f"{self.scene.name}-{self.field}{'-corrected' if self.needs else ''}"
+        return f"{name}-seed{self.seed}" if self.seed else name
 
     @property
     def needs(self) -> "MapJob | None":
@@ -285,14 +282,7 @@ class TrackJob(Job):
             "recording": str(self.scene.folder),
             "format": self.scene.format,
             "map": str(self.needs.folder),
-            "config": {
-                "preset": as_dict(self.needs.preset),
-                "map_frames": self.needs.frames,
-                "map_seed": self.needs.seed,
-                "frames": self.frames,
-                "steps": self.steps,
-                "rate_hz": self.rate_hz,
-            },
+            "config": as_dict(self.needs.preset),
         }
 
     def _command(self) -> str:

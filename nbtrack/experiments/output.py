@@ -49,22 +49,15 @@ def output_folder(folder: Path | None) -> Iterator[None]:
     names = _RUN_FILES + _MAP_FILES + _TABLE_FILES
     foreign = [name for name in names if (folder / name).exists()]
     if foreign and not is_own_output(folder):
-        raise ConfigError(
-            f"{folder} has a {foreign[0]} that nbtrack did not write: choose another --out, or "
-            "move the file away"
-        )
+        raise ConfigError(f"{folder} has a {foreign[0]} that nbtrack did not write: move it away")
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(folder / LOCK_FILE, timeout=0):
             yield
     except Timeout:
-        raise ConfigError(
-            f"another nbtrack command is writing to {folder}: choose another --out, or wait for it"
-        ) from None
+        raise ConfigError(f"another nbtrack command is writing to {folder}: wait for it") from None
 
 
 def _check_no_recording(folder: Path) -> None:
     if holds_recording(folder):
-        raise ConfigError(
-            f"{folder} holds a recording, where nothing is written: choose another place"
-        )
+        raise ConfigError(f"{folder} holds a recording, where nothing is written: choose another")

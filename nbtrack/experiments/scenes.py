@@ -71,10 +71,8 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     elif text in PAPER_SCENE_LABELS:
         if (folder := data_folder() / text).is_dir():
             return Scene(text, folder, format)
-        raise MissingError(
-            f"no folder {folder}: download the Neural RGB-D dataset there (see data/README.md), "
-            f"or use a synthetic room, which needs no download: {', '.join(ROOMS)}"
-        )
+        advice = f"see data/README.md, or use a room, which needs no download: {', '.join(ROOMS)}"
+        raise MissingError(f"no folder {folder} of the Neural RGB-D dataset: {advice}")
     if folder.is_dir():
         return Scene(folder.resolve().name, folder.resolve(), format)
     advice = nearest_name(text, _KNOWN)
