@@ -11,7 +11,7 @@ _MODULES = {
     "data.sequence": ["read_sequence"],
     "experiments.methods": ["METHODS", "Method"],
     "experiments.presets": ["load_preset"],
-    "experiments.results": ["map_scene", "map_scenes", "read_run", "track_scenes"],
+    "experiments.grid": ["map_scene", "map_scenes", "read_run", "track_scenes"],
     "experiments.scenes": ["open_scene", "open_scenes"],
     "mapping.files": ["read_map"],
     "tracking": ["make_tracker"],

@@ -22,11 +22,10 @@ from tiny import tiny_words
 from nbtrack.cli import main
 from nbtrack.core import files
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.grid import Execution, track_scenes
 from nbtrack.experiments.jobs import MapJob, TrackJob
 from nbtrack.experiments.output import LOCK_FILE
 from nbtrack.experiments.presets import load_preset
-from nbtrack.experiments.results import track_scenes
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.synthetic import make, room
 from nbtrack.tracking.trajectories import read_tum

@@ -21,11 +21,10 @@ from nbtrack.cli import main
 from nbtrack.core.errors import ConfigError, MissingError, NbtrackError
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.bench import default_pixels, measure_steps
-from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.grid import Execution, map_scene, map_scenes, read_run, track_scenes
 from nbtrack.experiments.jobs import MapJob
 from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, Method
 from nbtrack.experiments.presets import Preset, load_preset
-from nbtrack.experiments.results import map_scene, map_scenes, read_run, track_scenes
 from nbtrack.experiments.scenes import Scene, open_scenes
 from nbtrack.fields import FIELDS, PointCloud
 from nbtrack.fields.correction import CorrectedField

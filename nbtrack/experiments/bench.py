@@ -20,11 +20,10 @@ from nbtrack.core.errors import MissingError, NbtrackError
 from nbtrack.core.files import project_folder, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings, with_settings
-from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.grid import Execution, map_scene, track_scenes
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Methods, find_methods
 from nbtrack.experiments.output import output_folder
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
-from nbtrack.experiments.results import map_scene, track_scenes
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.tracking import ClockBudget, StepBudget, make_tracker
 

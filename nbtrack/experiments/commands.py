@@ -203,8 +203,8 @@ def _export_map(source: Path, format_name: str, out: Path) -> str:
     if format_name == "map":
         content = (source / MAP_FILE if source.is_dir() else source).read_bytes()
         write_atomic(out, content)
-        label, scene = finished.field.label, finished.record["scene"]
-        return f"{label} map of {scene}, {len(content) / 1e6:.2f} MB"
+        megabytes = len(content) / 1e6
+        return f"{finished.field.label} map of {finished.record['scene']}, {megabytes:.2f} MB"
     is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
     with naming_damaged(seen, "mesh", "remove it and map again"):
         mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)

@@ -4,7 +4,6 @@ import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -261,7 +260,7 @@ class TrackJob(Job):
         tracker = make_tracker(self.tracker, finished_map.field, *how)
 
         def tell(done: int, error_m: float) -> None:
-            status = f"frame {done}" if isnan(error_m) else f"off by {100 * error_m:.1f} cm"
+            status = f"frame {done}" if np.isnan(error_m) else f"off by {100 * error_m:.1f} cm"
             report(done / len(sequence), status)
 
         checkpoint = self.cache / RUN_FILE  # a folder of the user's holds results alone
