@@ -35,7 +35,7 @@ from nbtrack import (
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments.grid import Execution
+from nbtrack.experiments.grid import Execution, run_jobs
 from nbtrack.experiments.jobs import MapJob, TrackJob
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.fields import correction
@@ -174,8 +174,8 @@ def ablation(recordings) -> pd.DataFrame:
 def _corrected_now(scene, field, preset):
     """A field corrected by the constants of this moment, which no cache knows; and its seconds."""
     made = MapJob(scene, field, preset)
-    made.base.outcome(None, lambda share, told: None)
-    base, sequence, began = made.base.map(), scene.read(), time.perf_counter()
+    run_jobs([made.needs], f"mapping {scene.name}", ALONE)
+    base, sequence, began = made.needs.map(), scene.read(), time.perf_counter()
     return correct_map(base, sequence, made.settings).field, time.perf_counter() - began
 
 
@@ -234,8 +234,7 @@ def _held_out(scene, preset, seed: int) -> pd.DataFrame:
         changed = with_settings(preset, *method.settings)
         made = MapJob(scene, method.field, changed, "::2", seed)
         job = TrackJob(made, scene, method.tracker, 30, frames="1::2", seed=seed)
-        made.outcome(None, print)
-        found = job.outcome(None, lambda share, told: None)
+        (found,) = run_jobs([job], f"tracking {scene.name}", ALONE)
         row = {name: found[name] for name in COLUMNS if name in found}
         n_pixels = changed.tracking_of(method.tracker).n_pixels
         row |= {"ate_m": found["ate_rmse_m"], "method": method.label, "n_pixels": n_pixels}

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 from nbtrack import __version__
 from nbtrack.core.errors import ConfigError, NbtrackError
 
-_MAX_COUNT = 2**31 - 1
+_MAX_COUNT = 2**31 - 1  # what every random generator takes
 
 
 def a_path(text: str) -> Path:
@@ -23,7 +23,7 @@ def a_path(text: str) -> Path:
 
 
 def a_count(text: str, minimum: int = 1) -> int:
-    """A number of things, of which there is at least one, that every random generator takes."""
+    """A number of things, of which there is at least one, or of a seed."""
     if not (text.lstrip("-").isdecimal() and minimum <= int(text) <= _MAX_COUNT):
         limits = f"from {minimum} to {_MAX_COUNT}"
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number {limits}")
@@ -143,13 +143,12 @@ def _open_streams() -> None:
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
     parser.add_argument("--version", action="version", version=f"nbtrack {__version__}")
-    groups = {"": parser.add_subparsers(required=True, metavar="COMMAND")}
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    data = commands.add_parser("data", help="make rooms; check or convert a recording")
+    actions = data.add_subparsers(required=True, metavar="ACTION")
     for name, (about, options) in COMMANDS.items():
-        *group, last = name.split()
-        if group and group[0] not in groups:
-            part = groups[""].add_parser(group[0], help="make rooms; check or convert a recording")
-            groups[group[0]] = part.add_subparsers(required=True, metavar="ACTION")
-        command = groups["".join(group)].add_parser(last, help=about, description=about)
+        group, last = actions if name.startswith("data ") else commands, name.split()[-1]
+        command = group.add_parser(last, help=about, description=about)
         for word in options.split():
             command.add_argument(word.rstrip("!"), **OPTIONS[word])
         command.set_defaults(command=last, device=None, threads=None)

@@ -98,8 +98,7 @@ def method_of(name: str | None, field: str | None, tracker: str | None) -> Metho
     if field is None and tracker is None:
         return find_methods([name or DEFAULT_METHOD])[0]
     if tracker is None:
-        kind = field_class(field)
-        tracker = next(t for t in ("lm", "icp", "vr") if TRACKERS[t].works_in(kind))
+        tracker = next(t for t in ("lm", "icp", "vr") if TRACKERS[t].works_in(field_class(field)))
     if field is None:
         field = next((row.field for row in METHODS.values() if row.tracker == tracker), "neus")
     return find_methods([Method(f"{field_class(field).label} with {tracker}", field, tracker)])[0]

@@ -50,7 +50,6 @@ def output_folder(folder: Path | None) -> Iterator[None]:
     foreign = [name for name in names if (folder / name).exists()]
     if foreign and not is_own_output(folder):
         raise ConfigError(f"{folder} has a {foreign[0]} that nbtrack did not write: move it away")
-    folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(folder / LOCK_FILE, timeout=0):
             yield
