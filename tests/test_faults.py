@@ -184,9 +184,9 @@ FILES = {
     "no rotation": (_write(TRAJECTORY, ROW[:-1] + "0"), KITTI, "norm 0"),
     "another order": (_write(TRAJECTORY, "0.5 0 0 1 1 2 3 4"), KITTI, "of norm 5.48"),
     "second line": (_write(TRAJECTORY, f"{ROW}\n{ROW[:-2]}"), KITTI, "line 2 is"),
-    "a map for a run": (_nothing, ["export", "map", "--to", "tum", "p"], "map holds no finished"),
+    "a map for a run": (_nothing, ["export", "map", "--to", "tum", "p"], "no finished run in map"),
     "a run for a mesh": (_nothing, ["export", "run", "--to", "glb", "m.glb"], "run holds no"),
-    "unfinished run": (lambda: Path("run/metrics.json").unlink(), KITTI, "run holds no finished"),
+    "unfinished run": (lambda: Path("run/metrics.json").unlink(), KITTI, "no finished run in run"),
     "mesh cut": (_cut("map/mesh.ply"), MESH, "not a readable mesh"),
     "mesh is text": (_write("map/mesh.ply", "ply"), MESH, "not a readable mesh"),
 }  # fmt: skip

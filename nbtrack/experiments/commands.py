@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
+from nbtrack.core.errors import ConfigError, DataError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import as_dict
@@ -28,7 +28,7 @@ from nbtrack.mapping.meshes import extract_mesh
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
-from nbtrack.tracking.trajectories import METRICS_FILE, read_trajectory, read_tum, write_kitti
+from nbtrack.tracking.trajectories import read_trajectory, read_tum, write_kitti
 
 # What is printed in place of names in metrics.json that say too little.
 _MEANINGS = {
@@ -231,15 +231,12 @@ def _export_movie(source: Path, format_name: str, out: Path) -> str:
 
 
 def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
-    if not (source / METRICS_FILE).is_file():
-        raise MissingError(f"{source} holds no finished run: give a folder of `track --out`")
-    path = source / "trajectory.txt"
-    T_world_camera = read_tum(path)[1]
+    n_poses, path = len(read_trajectory(source).frames), source / "trajectory.txt"
     if format_name == "kitti":
-        write_kitti(out, T_world_camera)
-        return f"{len(T_world_camera)} poses, KITTI: three rows of the matrix (m), no time stamps"
+        write_kitti(out, read_tum(path)[1])
+        return f"{n_poses} poses, KITTI: three rows of the matrix (m), no time stamps"
     write_atomic(out, path.read_bytes())
-    return f"{len(T_world_camera)} poses, TUM: timestamp (s), position (m), quaternion xyzw"
+    return f"{n_poses} poses, TUM: timestamp (s), position (m), quaternion xyzw"
 
 
 _EXPORTS = {
