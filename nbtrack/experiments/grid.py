@@ -127,9 +127,8 @@ def track_scenes(
         budget = n_steps, rate_hz if clock else None
         job = TrackJob(map_job, seen, method.tracker, *budget, seed=seed, **options)
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
-        row |= {"seed": seed, "run": job.folder.name, "n_pixels": job.settings.n_pixels}
         jobs.append(job)
-        rows.append(row)
+        rows.append(row | {"seed": seed, "run": job.folder.name, "n_pixels": job.settings.n_pixels})
     return pd.DataFrame(map(_row_of, rows, _run(jobs, clock, execution)))
 
 
