@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import os
+import re
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -10,9 +11,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from nbtrack import __version__
-from nbtrack.core.errors import ConfigError, NbtrackError
+from nbtrack.core.errors import ConfigError, NbtrackError, nearest_name
 
 _MAX_COUNT = 2**31 - 1  # what every random generator takes
+_MAX_THREADS = 1024  # OpenMP ends the process where it cannot start them
 
 
 def a_path(text: str) -> Path:
@@ -22,10 +24,10 @@ def a_path(text: str) -> Path:
     return Path(text)
 
 
-def a_count(text: str, minimum: int = 1) -> int:
+def a_count(text: str, minimum: int = 1, maximum: int = _MAX_COUNT) -> int:
     """A number of things, of which there is at least one, or of a seed."""
-    if not (text.lstrip("-").isdecimal() and minimum <= int(text) <= _MAX_COUNT):
-        limits = f"from {minimum} to {_MAX_COUNT}"
+    if not (text.lstrip("-").isdecimal() and minimum <= int(text) <= maximum):
+        limits = f"from {minimum} to {maximum}"
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number {limits}")
     return int(text)
 
@@ -34,6 +36,7 @@ def _option(help: str, type: Any = str, **more: Any) -> dict[str, Any]:
     return {"help": help, "type": type, **more}
 
 
+some_threads = partial(a_count, maximum=_MAX_THREADS)
 _STARTS = {"choices": ("given", "unknown"), "default": "given"}
 _BUDGETS = {"choices": ("steps", "clock"), "default": "steps"}
 _SETTINGS = {"action": "append", "default": [], "dest": "settings", "metavar": "KEY=VALUE"}
@@ -50,7 +53,9 @@ OPTIONS = {
     "--tracker": _option("in place of a method: vr, sdf, lm or another tracker"),
     "--rate": _option("frames a second, by the clock", float, metavar="HZ"),
     "--steps": _option("a frame (default: to convergence; vr, sdf: the paper's at 2 Hz)", float),
+    "--pixels": _option("pixels or points a frame, or a step of vr and sdf", int),
     "--frames": _option("Python slice of frames, A:B:S", default=":"),
+    "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from": _option("track in this map of the room: its folder or file", a_path),
     "--start": _option("given: the first frame's own pose, if any (default); unknown", **_STARTS),
     "--to!": _option("tum, kitti: trajectory; gif, mp4: movie; ply, glb: mesh; map", required=True),
@@ -69,7 +74,7 @@ OPTIONS = {
     "--out": _option("where to write (default: in runs/)", a_path),
     "--out!": _option("where to write", a_path, required=True),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
-    "--threads": _option("CPU threads (default: all cores)", a_count),
+    "--threads": _option("CPU threads (default: all cores)", some_threads),
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
     "--config": _option("TOML file of settings", a_path),
     "--set": _option("one setting, as mapping.neus.iterations=500; may be repeated", **_SETTINGS),
@@ -78,7 +83,7 @@ _PRESET = " --preset --config --set"
 _RUN = " --device --threads" + _PRESET
 _MADE = " --method --field --format --frames --seed --out" + _RUN
 _PARTS = " --format --depth-folder --poses"
-_TRACKED = " --tracker --rate --steps --map-from --start"
+_TRACKED = " --tracker --rate --steps --pixels --map-frames --map-from --start"
 _CELLS = "--budget --scenes --method --beyond --seeds --workers --dask --out"
 # By name: what it does, and its options. `map` is done by the function `map_command`, `data make`
 # by `make_command`.
@@ -96,11 +101,24 @@ COMMANDS = {
 }
 
 
+# Options of earlier versions: what to write now.
+_EARLIER = {
+    "--supervision": "write --field neus_plus for rendering+sdf",
+    "--correct": "write --method corrected, or --set mapping.neus_plus.correct_voxel=METRES",
+    "--bake": "lm always works in a grid: write --set tracking.lm.voxel=METRES",
+}
+
+
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, as every other user error does."""
+    """Says what is wrong in one line, with the nearest name, as every other user error does."""
 
     def error(self, message: str) -> NoReturn:
         """Raise an error that the caller catches; argparse would exit."""
+        if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
+            choices = [choice.strip("' ") for choice in wrong[2].split(",")]
+            message = f"unknown {wrong[1]!r}: {nearest_name(wrong[1], choices)}"
+        dashed = [word for word in sys.argv[1:] if word.startswith("-") and Path(word).exists()]
+        message += "".join(f"; write ./{word} for the file or folder {word}" for word in dashed)
         raise ConfigError(f"{message}; see {self.prog} --help")
 
 
@@ -151,5 +169,10 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
         command = group.add_parser(last, help=about, description=about)
         for word in options.split():
             command.add_argument(word.rstrip("!"), **OPTIONS[word])
-        command.set_defaults(command=last, device=None, threads=None)
-    return parser.parse_args(arguments)
+        command.set_defaults(command=last, parser=command, device=None, threads=None)
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        name, known = unknown[0].partition("=")[0], [*options.parser._option_string_actions]
+        advice = _EARLIER.get(name) or nearest_name(name, [o for o in known if o[:2] == "--"])
+        options.parser.error(f"unknown argument {unknown[0]!r}: {advice}")
+    return options

@@ -25,3 +25,4 @@ def test_a_page_needs_no_network(tmp_path: Path) -> None:
     assert 'href="04_next.html"' in found
     assert 'href="../../docs/choices.md"' in found
     assert "<title>3. A title</title>" in found
+    assert '<a href="03_title.html">03 title</a>' in (page.parent / "index.html").read_text()

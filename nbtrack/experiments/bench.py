@@ -204,7 +204,7 @@ def _run_notebook(path: Path, folder: Path) -> None:
 
 
 def write_page(notebook: Any, source: Path, page: Path) -> None:
-    """Write a notebook as a page for a browser that needs no network for its formulas.
+    """Write a notebook as a page that needs no network for its formulas, and the pages' index.
 
     Formulas become MathML. Links to notebooks lead to their pages, those to other files to where
     these lie beside the notebook's `source`. The page has the notebook's heading as its title.
@@ -218,6 +218,10 @@ def write_page(notebook: Any, source: Path, page: Path) -> None:
     exporter = HTMLExporter(mathjax_url="")
     text, _ = exporter.from_notebook_node(notebook, {"metadata": {"name": title}})
     write_atomic(page, text.replace("</head>", f"{_STYLE}</head>", 1))
+    pages = sorted(page.parent.glob("[0-9A]*.html"))
+    entries = [f'<li><a href="{p.name}">{p.stem.replace("_", " ")}</a></li>' for p in pages]
+    index = "<!doctype html><meta charset=utf-8><title>nbtrack</title><h1>nbtrack</h1><ul>"
+    write_atomic(page.parent / "index.html", index + "".join(entries) + "</ul>\n")
 
 
 def _for_a_page(text: str, source_folder: Path, page_folder: Path) -> str:

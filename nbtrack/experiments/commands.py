@@ -74,7 +74,8 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
         return
     write_atomic(job.folder / MESH_FILE, mesh.export(file_type="ply"))
     origin = finished.record["origin"]
-    print(f"  mesh of what was seen: {job.folder / MESH_FILE}, relative to {origin} m")
+    where = f", relative to {origin} m" if any(origin) else ""
+    print(f"  mesh of what was seen: {job.folder / MESH_FILE}{where}")
 
 
 def track_command(options: Namespace) -> None:
@@ -82,7 +83,7 @@ def track_command(options: Namespace) -> None:
     given = read_map(options.map_from) if options.map_from else None
     own = given.field.name if given and not options.method else None
     method = method_of(options.method, options.field or own, options.tracker)
-    preset = _preset_of(options, method)
+    preset, map_frames = _preset_of(options, method), options.map_frames or ":"
     if given:
         _check_fits(given, method, preset, options)
     steps = method.usual_steps if options.steps is options.rate is None else options.steps
@@ -90,8 +91,9 @@ def track_command(options: Namespace) -> None:
     scene = _opened(options, preset)
     scene.count(options.frames, needs_poses=False)
     if not given:
-        scene.count(":")
-    job = MapJob(scene, method.field, preset, ":", options.seed, options.map_from, bool(given))
+        scene.count(map_frames)
+    of_map = map_frames, options.seed, options.map_from, bool(given)
+    job = MapJob(scene, method.field, preset, *of_map)
     how = options.frames, options.seed, options.out, options.threads, options.start
     run = TrackJob(job, scene, method.tracker, steps, options.rate, *how)
     with output_folder(options.out):
@@ -111,7 +113,10 @@ def track_command(options: Namespace) -> None:
 
 def _preset_of(options: Namespace, method: Method) -> Preset:
     """The preset with what a method changes, and then the user."""
-    return load_preset(options.preset, options.config, [*method.settings, *options.settings])
+    settings = [*method.settings, *options.settings]
+    if getattr(options, "pixels", None) is not None:
+        settings.append(f"tracking.{method.tracker}.n_pixels={options.pixels}")
+    return load_preset(options.preset, options.config, settings)
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:
@@ -126,6 +131,8 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
 def _check_fits(given: Map, method: Method, preset: Preset, options: Namespace) -> None:
     """Raises ConfigError where a given map is of another field or other settings than asked for."""
     name, record, path = given.field.name, given.record, options.map_from
+    if options.map_frames is not None:
+        raise ConfigError("--map-from names a map that is made: leave --map-frames out")
     if method.field != name:
         advice = "leave --method and --field out"
         raise ConfigError(f"{path} is a map of field {name!r}, not {method.field!r}: {advice}")
@@ -138,7 +145,9 @@ def _check_fits(given: Map, method: Method, preset: Preset, options: Namespace) 
 
 def _map(job: MapJob) -> None:
     """Map, unless the map is there, and say so."""
-    print(f"{'map found' if job.is_done else 'no finished map'} in {job.folder}")
+    print(
+        f"map found in {job.folder}" if job.is_done else f"no finished map in {job.folder}: mapping"
+    )
     has_pose = job.scene.recording.has_pose[parse_frames(job.frames)]
     if not has_pose.all():
         tell(f"nbtrack: {(~has_pose).sum()} of {len(has_pose)} frames have no pose: not mapped")

@@ -225,6 +225,8 @@ class TrackJob(Job):
         with threads(n_threads):
             tracked, notes = self._tracked(report)
         metrics = _scores(tracked) | self._provenance(n_threads) | notes
+        if metrics.get("path_m") and "ate_rmse_m" in metrics:
+            metrics["ate_over_path"] = metrics["ate_rmse_m"] / metrics["path_m"]
         times, origin = tracked.frames["time"].to_numpy(), np.array(notes.get("origin", [0, 0, 0]))
         texts = {
             "trajectory.txt": tum_text(times, shifted(tracked.T_estimated, origin)),
@@ -285,11 +287,12 @@ class TrackJob(Job):
         }
 
     def _command(self) -> str:
-        """What makes this run anew, and its map where that is of all frames and not given."""
+        """What makes this run anew, and its map where that is not cached."""
         preset, sequence = self.needs.preset, str(self.scene.folder)
         settings = changed_settings(preset, PRESETS[preset.name])
-        options = {"format": self.scene.format, "field": self.needs.field}
-        if self.is_elsewhere or self.needs.frames != ":":
+        of_map = {"field": self.needs.field, "map-frames": self.needs.frames}
+        options = {"format": self.scene.format, **of_map}
+        if self.is_elsewhere:
             options = {"format": self.scene.format, "map-from": self.needs.folder}
             settings = [text for text in settings if not text.startswith(OF_MAPS)]
         elif self.scene.made_by:
