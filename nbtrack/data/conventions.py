@@ -209,11 +209,11 @@ def diagnosis(results: list[Convention], recording: Recording, needs_proof: bool
         look = "look" if best.subject == "poses" else "looks"
         # Depth upside down, or turned by 180 degrees, fits like mirrored or turned axes.
         is_rare = "axes" in best.name and not best.name.startswith(("Open", "robot"))
-        or_depth = "; or the depth images are turned against the colour images" * is_rare
+        turned = "; or the depth images are turned against the colour images" if is_rare else ""
         return (
             f"your {best.subject} {look} like {best.name}; {_remedy(best, own)} (surfaces that two "
             f"frames see then lie {1e3 * best.median_m:.0f} mm apart; as declared they {apart})"
-            f"{or_depth}"
+            f"{turned}"
         )
     # Of few points, such as key frames share, not even a right convention's lie close.
     few = own.overlap < _MIN_OVERLAP
@@ -246,5 +246,7 @@ def _remedy(convention: Convention, own: Convention) -> str:
         return f"set fx fy cx cy in the calibration to {numbers} (the first pixel's centre at 0)"
     changes = changed_settings(convention.declared, own.declared)
     said = " and ".join(text.replace("=", " = ", 1).removesuffix(".0") for text in changes)
-    matrices = " if the pose file has quaternions, or make the matrices anew"
-    return f"set {said} in sequence.toml{matrices * ('quaternion' in said)}"
+    advice = f"set {said} in sequence.toml"
+    if "quaternion" in said:
+        advice += " if the pose file has quaternions, or make the matrices anew"
+    return advice
