@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -127,11 +127,11 @@ class MapJob(Job):
 
     def result(self) -> dict[str, Any]:
         """How the finished map was made, and its scores."""
-        return read_map(self.folder).record
+        return self.map().record
 
     def map(self) -> Map:
         """The finished map, ready for tracking."""
-        finished = read_map(self.folder)
+        finished = _read(self.folder, self.key)
         return replace(finished, field=finished.field.to(choose_device()))
 
     def compute(self, report: Report) -> dict[str, Any]:
@@ -157,6 +157,12 @@ class MapJob(Job):
         write_map(path, finished)
         checkpoint.unlink(missing_ok=True)
         return finished.record
+
+
+@lru_cache(maxsize=4)
+def _read(folder: Path, key: str) -> Map:
+    """Read once for all runs in a map: a corrected one samples its network, which takes seconds."""
+    return read_map(folder)
 
 
 @dataclass(frozen=True)
