@@ -17,15 +17,9 @@ from scipy.special import stdtrit
 
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import fingerprint, write_atomic
+from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
-PAPER_SCENE_LABELS = {
-    "breakfast_room": "Breakfast", "complete_kitchen": "Compl. Kitchen",
-    "green_room": "Green Room", "grey_white_room": "Grey-white", "kitchen": "Kitchen",
-    "morning_apartment": "Morning Apart.", "staircase": "Staircase", "thin_geometry": "Thin Geo.",
-    "whiteroom": "Whiteroom",
-}  # fmt: skip
-"""Folders of the Neural RGB-D dataset and the names that the paper's Table I gives them."""
 PAPER_PIXELS = {"VR": 512, "SDF": 4096}
 """The n that the paper's Table II prints in bold: the one used for Table I."""
 STANDING_STILL = "standing still"
@@ -90,7 +84,7 @@ def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
         still = results.dropna(subset="still_ate_m").assign(method=STANDING_STILL)
         still = still.assign(ate_m=still["still_ate_m"]).drop_duplicates(keys)
         results = pd.concat([results, still], ignore_index=True)
-    results = results.replace({"scene": PAPER_SCENE_LABELS})
+    results = results.replace({"scene": DATASET_SCENES})
     groups = results.groupby(_CELL_1, sort=False)["ate_m"]
     averaged = groups.mean(skipna=False).reset_index()
     if groups.size().max() > 1:

@@ -8,10 +8,11 @@ import pytest
 from tiny import TINY
 
 from nbtrack.cli import main
+from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.text_files import read_poses
 from nbtrack.data.writer import write_sequence
 from nbtrack.synthetic import build_room, room_frames, room_intrinsics
-from nbtrack.tables import PAPER_SCENE_LABELS, STANDING_STILL
+from nbtrack.tables import STANDING_STILL
 
 N_FRAMES = 13  # so that img10 would come before img2 if sorted as text
 WIDTH, HEIGHT = 32, 24
@@ -22,7 +23,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine folders in the dataset's layout, under its names; what they show is one room of ours."""
     folder = tmp_path_factory.mktemp("neural_rgbd")
     frames = list(room_frames(build_room("living_room"), N_FRAMES, WIDTH, HEIGHT, seed=0))
-    for name in PAPER_SCENE_LABELS:
+    for name in DATASET_SCENES:
         write_sequence(folder / name, room_intrinsics(WIDTH, HEIGHT), frames)
         poses = read_poses(folder / name / "poses.txt")[0]
         poses[3:5] = np.nan  # as where BundleFusion lost the camera
@@ -49,7 +50,7 @@ def test_nine_columns_and_seven(
     """Catches a preset that stops at a missing scene, or leaves a gap without a word."""
     assert run(monkeypatch, dataset, tmp_path) == 0
     cells = pd.read_csv(tmp_path / "out" / "table_1.csv")
-    assert set(cells["scene"]) == set(PAPER_SCENE_LABELS.values())
+    assert set(cells["scene"]) == set(DATASET_SCENES.values())
     assert cells["ate_m"].notna().all()
     still = cells["method"] == STANDING_STILL
     assert still.sum() == (~still).sum() == 9

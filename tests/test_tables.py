@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from nbtrack.core.errors import DataError
+from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.tables import (
-    PAPER_SCENE_LABELS,
     STANDING_STILL,
     average_over_seeds,
     beside,
@@ -40,7 +40,7 @@ PAPER_TABLE_1 = {
     (2, "iMAP with VR"): "0.021b 0.020b 0.015b 0.077 0.077b 0.007b 3.987r 0.012b 0.022",
     (2, "NeuS with SDF"): "0.038 0.038 0.067 0.043b 1.148r 0.067 0.044b 0.014 0.015b",
 }
-PAPER_SCENES = list(PAPER_SCENE_LABELS.values())
+PAPER_SCENES = list(DATASET_SCENES.values())
 # Table II of the paper: the bold n carry a "b".
 PAPER_TABLE_2 = {
     "VR": ["128 3.2 6.6 36.2", "512b 3.2 6.8 36.1", "1024 2.2 5.0 27.0"],

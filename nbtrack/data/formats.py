@@ -164,6 +164,13 @@ FORMATS: dict[str, Format] = {
                  "intrinsic.json", "camera_intrinsic.json", "camera_primesense.json"),
     ),
 }  # fmt: skip
+DATASET_SCENES = {
+    "breakfast_room": "Breakfast", "complete_kitchen": "Compl. Kitchen",
+    "green_room": "Green Room", "grey_white_room": "Grey-white", "kitchen": "Kitchen",
+    "morning_apartment": "Morning Apart.", "staircase": "Staircase", "thin_geometry": "Thin Geo.",
+    "whiteroom": "Whiteroom",
+}  # fmt: skip
+"""Folders of the Neural RGB-D dataset, and the names that the paper's Table I gives them."""
 
 
 def declaration(folder: Path, format: str | None = None) -> Declaration:

@@ -12,10 +12,11 @@ from typing import Any
 
 from nbtrack.core.errors import ConfigError, MissingError, look_up
 from nbtrack.core.settings import may_be_zero, with_settings, with_values
+from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, PointMapping, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
-from nbtrack.tables import PAPER_PIXELS, PAPER_SCENE_LABELS
+from nbtrack.tables import PAPER_PIXELS
 from nbtrack.tracking import TRACKERS, TrackerSettings, tracker_class
 
 
@@ -104,7 +105,7 @@ PRESETS = {
     "smoke": _SMALL,
     "nine_rooms": replace(_SMALL, name="nine_rooms", scenes=_NINE),
     "synthetic": Preset("synthetic", scenes=ScenesConfig(REPORTED_ROOMS)),
-    "paper": Preset("paper", scenes=ScenesConfig(tuple(PAPER_SCENE_LABELS), synthetic=False)),
+    "paper": Preset("paper", scenes=ScenesConfig(tuple(DATASET_SCENES), synthetic=False)),
 }
 
 

@@ -11,14 +11,14 @@ from filelock import FileLock
 from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
 from nbtrack.core.files import data_folder, fingerprint, runs_folder
 from nbtrack.core.progress import ProgressBar, tell
+from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames, select_frames
 from nbtrack.experiments.output import is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
-from nbtrack.tables import PAPER_SCENE_LABELS
 
-_KNOWN = [*ROOMS, *PAPER_SCENE_LABELS]
+_KNOWN = [*ROOMS, *DATASET_SCENES]
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,9 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     text, folder = str(sequence), Path(sequence)
     if text in _KNOWN and folder.is_dir() and not is_own_output(folder):
         tell(f"{text}: the folder {folder.resolve()} is read, not the room or scene of that name")
-    elif text in ROOMS and (preset.scenes.synthetic or text not in PAPER_SCENE_LABELS):
+    elif text in ROOMS and (preset.scenes.synthetic or text not in DATASET_SCENES):
         return _room(text, preset.scenes)
-    elif text in PAPER_SCENE_LABELS:
+    elif text in DATASET_SCENES:
         if (folder := data_folder() / text).is_dir():
             return Scene(text, folder, format)
         advice = f"see data/README.md, or use a room, which needs no download: {', '.join(ROOMS)}"
