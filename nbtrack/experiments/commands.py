@@ -155,9 +155,9 @@ def _map(job: MapJob) -> None:
 
 
 def _print_numbers(results: dict[str, Any]) -> None:
-    """All numbers among some results, by name."""
+    """The numbers among some results, by name; zeros are said of lost frames alone."""
     for name, value in results.items():
-        if isinstance(value, int | float):
+        if isinstance(value, int | float) and (value or name in ("lost_frames", "flagged_frames")):
             print(f"  {_MEANINGS.get(name, name)}: {value:.5g}")
 
 
