@@ -94,7 +94,7 @@ class Preset:
 
 
 def _own_or_like(usual: str, known: dict[str, Any], name: str, kind: type) -> Any:
-    """Settings of a class with what is known of a name, or shared with the usual one."""
+    """Settings of a class: those of a name, else what they share with those of the usual one."""
     other = known.get(name) or known.get(usual) or kind()
     return kind(**{f.name: getattr(other, f.name) for f in fields(kind) if hasattr(other, f.name)})
 

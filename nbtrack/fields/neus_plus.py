@@ -15,7 +15,7 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Draw, Losses, measured_mean, rendered_losses
 from nbtrack.fields.grid import trilinear
 from nbtrack.fields.neus import NeuSField, NeusMapping, guided_depths
-from nbtrack.fields.points import cells_of, fuse_points, least_behind
+from nbtrack.fields.points import cells_of, fuse_points, min_depth_behind
 
 # Distances are kept at corners so far apart (m), unless there would be more of them a side, and
 # measured from the mean points of cells half as wide, of three or more: single ones are noise.
@@ -130,7 +130,7 @@ class ObservedDistance:
         corners = np.stack(np.indices(shape)[:, ::2, ::2, ::2], -1) * fine + low + fine / 2
         distance = np.linalg.norm(corners - nearest, axis=-1)
         corners = torch.from_numpy(corners.reshape(-1, 3)).float()
-        is_free = least_behind(corners, sequence, frames) < -_FREE_IN_FRONT
+        is_free = min_depth_behind(corners, sequence, frames) < -_FREE_IN_FRONT
         values = torch.from_numpy(distance).float(), is_free.view(distance.shape).float()
         self.values, self.low = torch.stack(values).to(device), corners[0].to(device)
 

@@ -102,12 +102,12 @@ def cells_of(
     return np.ravel_multi_index(tuple(cells[inside].T), tuple(shape)), inside
 
 
-def least_behind(points_world: Points, sequence: RgbdSequence, frames: Frames) -> Values:
-    """How far (z-depth, m) points (m) lie behind what was measured, in the frame that says least.
+def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frames) -> Values:
+    """The minimum over frames of how far (z-depth, m) points (m) lie behind what was measured.
 
-    As `Frame.depth_behind` of every fifth of the frames: neighbours see the same.
+    The minimum of `Frame.depth_behind`, of every fifth of the frames: neighbours see the same.
     """
-    least = torch.full_like(points_world[:, 0], torch.inf)
+    minimum = torch.full_like(points_world[:, 0], torch.inf)
     for index in frames[::_ASKED_EVERY].tolist():
-        least = torch.minimum(least, sequence[index].depth_behind(points_world))
-    return least
+        minimum = torch.minimum(minimum, sequence[index].depth_behind(points_world))
+    return minimum

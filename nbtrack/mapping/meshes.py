@@ -10,7 +10,7 @@ from nbtrack.core.arrays import Frames, WorldPoints
 from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, PointCloud
-from nbtrack.fields.points import least_behind
+from nbtrack.fields.points import min_depth_behind
 
 _POINTS_AT_ONCE = 65_536
 _SEEN_BEHIND = 0.1  # m behind the measured depth that still count as seen
@@ -71,4 +71,4 @@ def seen_by(
     """
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32))
     frames = np.arange(len(sequence)) if frames is None else frames
-    return (least_behind(points, sequence, frames) < _SEEN_BEHIND).numpy()
+    return (min_depth_behind(points, sequence, frames) < _SEEN_BEHIND).numpy()
