@@ -32,12 +32,12 @@ from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.settings import with_settings
-from nbtrack.data.check import DataReport, check_recording, quick_warning
-from nbtrack.data.conventions import CONVENTIONS
 from nbtrack.data.formats import WORLD_TO_CAMERA
 from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import read_sequence
 from nbtrack.experiments.presets import load_preset
+from nbtrack.recordings.check import DataReport, check_recording, quick_warning
+from nbtrack.recordings.conventions import CONVENTIONS
 
 REAL_ROOM = Path(__file__).resolve().parents[2] / "shared/data/real_room"
 NEEDS_REAL = pytest.mark.skipif(not REAL_ROOM.is_dir(), reason="no real recording here")

@@ -32,7 +32,7 @@ def key() -> str:
         ("core/errors.py", "did you mean", "perhaps", False),
         ("tracking/budget.py", "yield", "return", False),
         ("data/images.py", "INTER_NEAREST", "INTER_LINEAR", True),
-        ("data/check.py", "a metre, in sequence.toml", "a metre", False),
+        ("recordings/check.py", "a metre, in sequence.toml", "a metre", False),
         ("fields/neus_plus.py", "class", "clas", False),
         ("fields/__init__.py", "NeuSField, ", "", False),
         ("fields/correction.py", "300_000", "30", False),

@@ -7,7 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "nbtrack"
 ORDER = [
-    "core", "data", "synthetic", "fields", "mapping", "tracking", "tables", "plots",
+    "core", "data", "synthetic", "fields", "mapping", "tracking", "recordings", "tables", "plots",
     "experiments", "cli", "__main__",
 ]  # fmt: skip
 MODULES = {

@@ -26,7 +26,7 @@ from nbtrack.tracking import (
     make_tracker,
     track_sequence,
 )
-from nbtrack.tracking.tracker import expected_poses
+from nbtrack.tracking.starts import expected_poses
 
 SETTINGS = {"vr": VrSettings(n_pixels=128), "sdf": SdfSettings(n_pixels=256, lambda_color=0.1)}
 
@@ -60,7 +60,8 @@ def test_one_step_of_adam_moves_by_the_learning_rates() -> None:
     tracker = tracker_of("sdf", 1)
     tracker.begin(box_sequence([[0.05, 0.04, 0.03]])[0], torch.eye(4)[None])
     tracker.step()
-    assert tracker.position.detach().abs().tolist() == pytest.approx([5e-4] * 3, rel=1e-3)
+    rate = 5e-4 * tracker.field.bounds.metres_per_unit
+    assert tracker.position.detach().abs().tolist() == pytest.approx([rate] * 3, rel=1e-3)
     assert tracker.q_wxyz.detach()[1:].abs().tolist() == pytest.approx([1e-3] * 3, rel=1e-2)
     assert tracker.q_wxyz.norm().item() == pytest.approx(1.0, abs=1e-6)
 

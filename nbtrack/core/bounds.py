@@ -16,6 +16,7 @@ class SceneBounds:
 
     minimum: tuple[float, float, float]
     maximum: tuple[float, float, float]
+    declared_unit: float | None = None  # m, where the authors of a recording give it
 
     @property
     def center(self) -> Float[np.ndarray, "3"]:
@@ -23,9 +24,18 @@ class SceneBounds:
         return (np.array(self.minimum) + np.array(self.maximum)) / 2
 
     @property
-    def metres_per_unit(self) -> float:
-        """Half of the longest side: it maps the box into [-1, 1]^3 without changing its shape."""
+    def half_longest_side(self) -> float:
+        """As a unit (m) it maps the box into [-1, 1]^3 without changing its shape."""
         return float((np.array(self.maximum) - np.array(self.minimum)).max() / 2)
+
+    @property
+    def metres_per_unit(self) -> float:
+        """The unit of the map: networks see coordinates in it, and Adam moves a camera by it.
+
+        It is the declared one, else half of the longest side, as NeuS and the Neural RGB-D dataset
+        normalise their scenes to about [-1, 1]^3.
+        """
+        return self.declared_unit or self.half_longest_side
 
     def far_bound(self, origins_world: Points, directions_world: Points) -> Values:
         """Where rays from inside leave the box, in units of the direction (z-depth, m, for z = 1).

@@ -37,6 +37,7 @@ class Declaration:
     poses: str = one_of(CAMERA_TO_WORLD, WORLD_TO_CAMERA)
     quaternion: str = one_of("xyzw", "wxyz")  # the order in pose files with quaternions
     frame_rate: float = limited(30.0, 1e-8, 1e8)  # Hz
+    metres_per_unit: float = limited(0.0, 0.0, 1e8)  # of the map; 0: half its longest side
 
     def __post_init__(self) -> None:
         if len(self._axes) != 3 or not np.linalg.det(self._axes):
@@ -171,6 +172,12 @@ DATASET_SCENES = {
     "whiteroom": "Whiteroom",
 }  # fmt: skip
 """Folders of the Neural RGB-D dataset, and the names that the paper's Table I gives them."""
+DATASET_UNITS = {
+    "breakfast_room": 2.5, "complete_kitchen": 5.0, "green_room": 4.0, "grey_white_room": 4.0,
+    "kitchen": 4.0, "morning_apartment": 2.0, "staircase": 4.0, "whiteroom": 4.0,
+}  # fmt: skip
+"""Metres a unit of its scenes: 1 / `sc_factor` in the `configs/` of the dataset's own code, which
+scales each scene to about [-1, 1]^3 (Azinović et al. 2022). It has none for `thin_geometry`."""
 
 
 def declaration(folder: Path, format: str | None = None) -> Declaration:
@@ -183,7 +190,11 @@ def declaration(folder: Path, format: str | None = None) -> Declaration:
         raise MissingError(f"no folder {folder}: give a recording's, or a synthetic room's name")
     path = folder / DECLARATION_FILE
     format = format or _declared(path, Declaration()).format or _told_by_files(folder)
-    return replace(_declared(path, look_up("format", format, FORMATS).declared), format=format)
+    usual = look_up("format", format, FORMATS).declared
+    if format == "neural_rgbd":
+        unit = DATASET_UNITS.get(folder.resolve().name, usual.metres_per_unit)
+        usual = replace(usual, metres_per_unit=unit)
+    return replace(_declared(path, usual), format=format)
 
 
 def _told_by_files(folder: Path) -> str:

@@ -40,6 +40,7 @@ class RgbdSequence:
     times: Float[np.ndarray, "frames"]  # s, the recording's own, or by its numbers and rate
     # Of poses, in the recording's world.
     origin: Position = field(default_factory=lambda: np.zeros(3))
+    declared_unit: float | None = None  # m, see `SceneBounds`
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -66,8 +67,9 @@ class RgbdSequence:
 
     @cached_property
     def digest(self) -> str:
-        """A hash over pixels, poses, frame numbers and camera, as sixteen hexadecimal digits."""
-        digest = hashlib.blake2b(repr(self.intrinsics).encode(), digest_size=8)
+        """A hash over pixels, poses, frame numbers, camera and unit: sixteen hexadecimal digits."""
+        digest = hashlib.blake2b(digest_size=8)
+        digest.update(repr((self.intrinsics, self.declared_unit)).encode())
         for array in (self.frame_ids, self.T_world_camera, self.colors, self.depths_mm):
             digest.update(np.ascontiguousarray(array).data)
         return digest.hexdigest()
@@ -126,7 +128,8 @@ def read_frames(
     poses, times = recording.T_world_camera[frame_ids], recording.times[frame_ids]
     origin = recording.origin if origin is None else origin
     poses[:, :3, 3] -= origin
-    return RgbdSequence(recording.name, *images, poses, frame_ids, times, origin)
+    unit = recording.declared.metres_per_unit or None
+    return RgbdSequence(recording.name, *images, poses, frame_ids, times, origin, unit)
 
 
 def select_frames(recording: Recording, frames: slice, needs_poses: bool = True) -> Frames:
@@ -170,4 +173,4 @@ def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
     low, high = np.quantile(points_world, [_CUT_OFF, 1 - _CUT_OFF], axis=0)
     low = np.minimum(low, positions.min(axis=0)) - margin
     high = np.maximum(high, positions.max(axis=0)) + margin
-    return SceneBounds(tuple(low.tolist()), tuple(high.tolist()))
+    return SceneBounds(tuple(low.tolist()), tuple(high.tolist()), sequence.declared_unit)

@@ -55,6 +55,7 @@ def write_map(path: Path, finished: Map) -> None:
         "format_version": _VERSION,
         "field": finished.field.name,
         "bounds": [list(bounds.minimum), list(bounds.maximum)],
+        "declared_unit": bounds.declared_unit,
         "camera": asdict(finished.camera),
         "made": finished.record,
     }
@@ -97,7 +98,8 @@ def _read_file(file: Path) -> Map:
     if header.pop("digest", None) != _digest(header, tensors):
         raise ValueError("its content is not what was written")
     name, record = header["field"], header["made"]
-    bounds = SceneBounds(*(tuple(map(float, corner)) for corner in header["bounds"]))
+    corners = (tuple(map(float, corner)) for corner in header["bounds"])
+    bounds = SceneBounds(*corners, header.get("declared_unit"))
     if name not in FIELDS:
         raise ValueError(f"this nbtrack has no field {name!r}")
     if FIELDS[name] is PointCloud:

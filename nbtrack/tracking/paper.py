@@ -9,19 +9,34 @@ from torch import Tensor
 from nbtrack.core import capture, geometry
 from nbtrack.core.arrays import Colors, Points, Scalar, Transform, Transforms, Values
 from nbtrack.core.camera import pixel_directions
-from nbtrack.core.settings import may_be_zero
+from nbtrack.core.settings import may_be_zero, one_of
 from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
 from nbtrack.fields.base import rendered_losses
+from nbtrack.tracking.reach import Reach, reach
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 
 @dataclass(frozen=True)
 class AdamSettings(TrackerSettings):
-    """Adam's learning rates (paper, implementation details)."""
+    """Adam's learning rates (paper, implementation details).
 
-    position_rate: float = 5e-4  # of the position, m
+    The paper does not say what its position is measured in. In metres two cells of its Table I
+    could not be reached (see `reach`), so that it is the unit of the map (notebook 5).
+    """
+
+    position_rate: float = 5e-4  # of the position, in units of the map, or in metres
+    position_unit: str = one_of("map", "metre")
     orientation_rate: float = 1e-3  # of the unit quaternion
+
+    def position_rate_m(self, metres_per_unit: float) -> float:
+        """The learning rate of the position in metres, in a map of some unit."""
+        return self.position_rate * (metres_per_unit if self.position_unit == "map" else 1.0)
+
+    def reach(self, steps: float, metres_per_unit: float) -> Reach:
+        """How far a frame's search comes; a turn by an angle moves the quaternion by half of it."""
+        position = reach(steps, self.position_rate_m(metres_per_unit))
+        return Reach(position, 2 * reach(steps, self.orientation_rate))
 
 
 class AdamTracker(Tracker):
@@ -59,7 +74,8 @@ class AdamTracker(Tracker):
                 torch._foreach_zero_([*moments.values()])
             return
         self.position, self.q_wxyz = (part.requires_grad_() for part in start)
-        position = {"params": [self.position], "lr": self.settings.position_rate}
+        position_rate = self.settings.position_rate_m(self.field.bounds.metres_per_unit)
+        position = {"params": [self.position], "lr": position_rate}
         orientation = {"params": [self.q_wxyz], "lr": self.settings.orientation_rate}
         can, groups = capture.can_record(self.device), [position, orientation]
         self.optimizer = torch.optim.Adam(groups, fused=can or None, capturable=can)

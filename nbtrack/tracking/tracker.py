@@ -12,33 +12,16 @@ import torch
 from nbtrack.core import capture
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
 from nbtrack.core.device import suitable_threads, synchronize
-from nbtrack.core.errors import ConfigError, DataError, NumericalError, look_up
+from nbtrack.core.errors import ConfigError, DataError, NumericalError
 from nbtrack.data.frame import Frame
 from nbtrack.data.text_files import checked_poses
 from nbtrack.fields import Field, LearnedField
 from nbtrack.fields.grid import BakedField
 from nbtrack.tracking.budget import Budget
+from nbtrack.tracking.reach import Reach
+from nbtrack.tracking.starts import expected_poses
 
 _MAX_PIXELS = 2**24
-
-
-def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
-    """Where a frame's search may start, given the poses found so far.
-
-    At the previous pose (most likely the paper's: Sec. II-B.1 renders "at the previous estimate",
-    Sec. II-B.2 uses "the previous pose estimate"); at constant velocity as the camera sees it,
-    T_k-1 (T_k-2^-1 T_k-1) (ORB-SLAM); or at both, for the tracker to choose: hands start and stop
-    within a frame. Raises ConfigError, naming the nearest, for any other model.
-    """
-    last = moved_on = estimates[-1]
-    if len(estimates) > 1:
-        moved_on = last @ np.linalg.inv(estimates[-2]) @ last
-    starts = {
-        "previous_pose": [last],
-        "constant_velocity": [moved_on],
-        "better_of_both": [moved_on, last],
-    }
-    return look_up("motion model", motion_model, starts)[: len(estimates)]
 
 
 @dataclass(frozen=True)
@@ -47,6 +30,10 @@ class TrackerSettings:
 
     n_pixels: int = 4096  # random pixels a step, or a frame where they are drawn once
     motion_model: str = "previous_pose"  # see `expected_poses`
+
+    def reach(self, steps: float, metres_per_unit: float) -> Reach | None:
+        """How far so many steps can move the camera; None where no step is bounded."""
+        return None
 
 
 @dataclass(frozen=True)

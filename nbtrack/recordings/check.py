@@ -1,5 +1,6 @@
 """Validate a recording, and find from its own depth maps whether its numbers are read rightly."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import DataError
-from nbtrack.data.conventions import Convention, best_convention, diagnosis, fit_all
 from nbtrack.data.recording import Recording
 from nbtrack.data.sequence import RgbdSequence, read_frames, select_frames
+from nbtrack.recordings.conventions import Convention, best_convention, diagnosis, fit_all
+from nbtrack.tracking import SdfSettings
 
 _CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
@@ -27,8 +29,6 @@ _SAME_VIEW_DEG = 10  # where they are turned by no more
 _MIN_MEASURED = 0.3  # share of pixels with a depth, below which maps have holes (our choice)
 # What the second-order tracker still followed, of a real recording thinned to every third frame.
 _FOLLOWED_MM, _FOLLOWED_DEG = 70, 3.6
-# A step of the paper's trackers moves at most so far: the learning rates of their optimiser.
-_STEP_MM, _STEP_DEG = 0.5, 0.1
 _XYZ, _RGB = ["x", "y", "z"], ["red", "green", "blue"]
 
 
@@ -82,7 +82,11 @@ class DataReport:
     def suggestion(self) -> str:
         """What to do first, by how the camera moved."""
         mm, deg = self.frames[["moved_mm", "turned_deg"]].quantile(0.95).fillna(0)  # not jumps
-        n_steps = max(10, round(max(mm / _STEP_MM, deg / _STEP_DEG)))
+        size = np.ptp(self.cloud[_XYZ].quantile(_CUT), axis=0).max()
+        unit = self.recording.declared.metres_per_unit or size / 2
+        one = SdfSettings().reach(1, unit)  # of the paper's trackers
+        n_steps = max(mm / 1e3 / one.position, np.radians(deg) / one.orientation)
+        n_steps = max(10, math.ceil(n_steps))
         advice = f"track {self.recording.folder}; the paper's way: --method sdf --steps {n_steps}"
         if mm > _FOLLOWED_MM or deg > _FOLLOWED_DEG:
             apart = f"frames are up to {mm / 10:.0f} cm and {deg:.1f} deg apart"
