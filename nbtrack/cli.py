@@ -67,7 +67,7 @@ OPTIONS = {
     "--beyond": {"help": "Table III: our methods too, and 30 Hz", "action": "store_true"},
     "--n-frames": _option("how many (default: 300)", int, default=300),
     "--width": _option("pixels; the height is 3/4 of it", int, default=640),
-    "--motion": _option("handheld: a glance (default); tour: the whole room", default="handheld"),
+    "--motion": _option("handheld (default), keyframes: the dataset's, tour", default="handheld"),
     "--depth-folder": _option("default: the format's; filtered before raw depth"),
     "--poses": _option("pose file (default: the format's)", metavar="FILE"),
     "--seed": _option("of all random numbers (default: 0)", partial(a_count, minimum=0), default=0),

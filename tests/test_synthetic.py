@@ -11,10 +11,12 @@ from scipy.spatial import cKDTree
 from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.data.sequence import read_sequence
 from nbtrack.synthetic import make_room, room_frames, room_intrinsics, room_of
+from nbtrack.synthetic.keyframes import keyframe_trajectory
 from nbtrack.synthetic.motion import handheld_trajectory, steps_between, tour
 from nbtrack.synthetic.primitives import Box, Cylinder, RoomShell, Sphere
 from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame
 from nbtrack.synthetic.room import REPORTED_ROOMS, ROOMS, Room, build_room
+from nbtrack.tracking.metrics import still_metrics
 
 SOLIDS = {
     "box": Box((0.1, -0.2, 0.3), (0.8, 0.5, 1.1)),
@@ -27,7 +29,7 @@ SOLIDS = {
 FOCAL = 554.2562584220407  # 640 / (2 tan 30°)
 each_solid = pytest.mark.parametrize("solid", [*SOLIDS.values()], ids=SOLIDS)
 EACH_ROOM = {name: build_room(name) for name in ROOMS}
-path_of = cache(handheld_trajectory)
+path_of, keyframes_of = cache(handheld_trajectory), cache(keyframe_trajectory)
 each_room = pytest.mark.parametrize("room", [*EACH_ROOM.values()], ids=ROOMS)
 
 
@@ -233,6 +235,55 @@ def test_two_paths_cross_the_room(room):
     assert np.linalg.norm(position[:, -1] - position[:, 0], axis=-1).min() > 0.8
     assert np.linalg.norm(position[0] - position[1], axis=1).max() > 0.15
     assert np.degrees(np.arccos((forward[0] * forward[1]).sum(axis=1).mean())) < 40
+
+
+@pytest.mark.parametrize(("n_frames", "seed"), [(240, 0), (300, 1)])
+@each_room
+def test_key_frames_move_as_the_dataset_does(room, n_frames, seed):
+    """Catches paths that are not like those of the paper's data. `breakfast_room` moves by 14.2 mm
+    a frame (90 %: 17.8, all: 19.4) in a unit of 2.5 m, and by 0.45 degrees (0.60, 0.86). Its
+    velocity changes by 0.15 mm from frame to frame (median), and by more at joins."""
+    poses = keyframes_of(room, n_frames, seed)
+    mm, degrees = steps_between(poses)
+    seen = np.concatenate([_seen_points(room, poses), poses[:, :3, 3]])
+    unit = np.ptp(seen, axis=0).max() / 2 + 0.1  # with the margin of `observed_bounds`
+    share = mm / 1e3 / unit
+    assert share.mean() == pytest.approx(14.2e-3 / 2.5, rel=0.06)
+    assert np.quantile(share, 0.9) == pytest.approx(17.8e-3 / 2.5, rel=0.2)
+    assert share.max() < 1.15 * 19.4e-3 / 2.5
+    assert degrees.mean() == pytest.approx(0.45, rel=0.04)
+    assert degrees.max() < 0.96
+    n_pieces = round(n_frames / 83)
+    assert len(np.unique(degrees.round(4))) <= n_pieces + (n_pieces - 1)  # and one over each join
+    jerk = np.linalg.norm(np.diff(poses[:, :3, 3], n=2, axis=0), axis=1) / unit
+    assert np.median(jerk) < 2 * 0.15e-3 / 2.5  # smooth: no tremor
+    assert (jerk > 3 * 0.38e-3 / 2.5).sum() <= 4 * n_pieces
+    assert room.sdf(poses[:, :3, 3]).min() >= 0.35
+    assert still_metrics(poses)["still_ate_m"] > 1.0
+
+
+@each_room
+def test_two_paths_of_key_frames_see_the_same(room):
+    """Catches seeds that give one path, and a second path that looks where no map of the first
+    knows anything: nine in ten of its points were seen from the first."""
+    first, second = (keyframes_of(room, 240, seed) for seed in (0, 1))
+    assert np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max() > 0.1
+    points = _seen_points(room, second)
+    known = cKDTree(_seen_points(room, first)).query(points)[0] < 0.15
+    assert known.mean() > 0.85
+
+
+def _seen_points(room, poses):
+    """Points (m, world) along rays through some frames."""
+    rays = np.stack(
+        np.meshgrid(np.linspace(-0.55, 0.55, 24), np.linspace(-0.4, 0.4, 18), [1.0]), -1
+    )
+    points = []
+    for pose in poses[::8]:
+        directions = rays.reshape(-1, 3) @ pose[:3, :3].T
+        depths = room.first_hit(pose[:3, 3], directions)[0]
+        points.append(pose[:3, 3] + depths[:, None] * directions)
+    return np.concatenate(points)
 
 
 @each_room

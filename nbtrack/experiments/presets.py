@@ -26,7 +26,7 @@ class ScenesConfig:
 
     names: tuple[str, ...] = ()  # synthetic rooms, or folders below the data folder
     synthetic: bool = True  # made by this package; otherwise read from the data folder
-    motion: str = "handheld"  # of the camera in a synthetic room: handheld, or a tour around it
+    motion: str = "keyframes"  # in a synthetic room: as the dataset's; or handheld, or a tour
     n_frames: int = 300
     width: int = 640  # pixels; the height is three quarters of it
     track_frames: str = ":"  # the Python slice of frames that is tracked

@@ -12,6 +12,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError, DataError, look_up
 from nbtrack.core.files import fingerprint, json_text, naming_damaged, sources_fingerprint
 from nbtrack.data.writer import WrittenFrame, write_sequence
+from nbtrack.synthetic.keyframes import keyframe_trajectory
 from nbtrack.synthetic.motion import handheld_trajectory, tour
 from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame
 from nbtrack.synthetic.room import Room, build_room, description
@@ -20,7 +21,7 @@ ROOM_FILE = "room.json"
 ROOM_VERSION = 2  # raise it when a room, the motion or the sensor model changes
 _AGAIN = "remove the folder and make the room again"
 _FRAMES_AT_ONCE = 32  # in flight, so that memory is bounded where writing is slower
-MOTIONS = {"handheld": handheld_trajectory, "tour": tour}
+MOTIONS = {"keyframes": keyframe_trajectory, "handheld": handheld_trajectory, "tour": tour}
 FIELD_OF_VIEW = np.radians(60.0)  # horizontal, as in the Neural RGB-D dataset
 
 

@@ -85,7 +85,7 @@ def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses
         reach = radius * (1.0 + relative_radius[:, None])
         x, z = (center + reach * (np.stack([along, across], axis=1) @ axes)).T
         yaw = heading + turned + yaw_offset
-        poses = _camera_poses((x, height, z), yaw, pitch, roll, trembling)
+        poses = camera_poses((x, height, z), yaw, pitch, roll, trembling)
         slower = np.clip(MEAN_STEP / steps_between(poses).mean(axis=1), 0.7, 1.4)
         radius, rate = radius * slower[0], rate * slower[1]
     return poses
@@ -127,7 +127,7 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     height = rng.uniform(1.3, 1.5) + _wander(n_frames, rng, 0.05)
     pitch = room.walk.pitch + _wander(n_frames, rng, 0.09)
     roll, trembling = _wander(n_frames, rng, 0.025), _tremor(n_frames, rng)
-    poses = _camera_poses((x, height, z), yaw, pitch, roll, trembling)
+    poses = camera_poses((x, height, z), yaw, pitch, roll, trembling)
     if (nearest := room.sdf(poses[:, :3, 3]).min()) < CLEARANCE:
         raise NumericalError(
             f"room '{room.name}': the tour comes within {nearest:.2f} m of a surface; "
@@ -196,11 +196,12 @@ def _tremor(n_frames: int, rng: np.random.Generator) -> Float[np.ndarray, "n 6"]
     return amplitude * waves.sum(axis=1)
 
 
-def _camera_poses(places, yaw: Values, pitch: Values, roll: Values, trembling) -> Poses:
+def camera_poses(places, yaw: Values, pitch: Values, roll: Values, trembling=None) -> Poses:
     """Poses (OpenCV axes) at places (x, y and z, m) with angles (rad), and a tremor on top.
 
     Yaw 0 looks along -z and positive turns left; positive pitch looks up.
     """
+    trembling = np.zeros((len(yaw), 6)) if trembling is None else trembling
     yaw, pitch = yaw + trembling[:, 4], pitch + trembling[:, 3]
     roll = (roll + trembling[:, 5])[:, None]
     forward = [-np.sin(yaw) * np.cos(pitch), np.sin(pitch), -np.cos(yaw) * np.cos(pitch)]
