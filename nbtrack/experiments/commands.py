@@ -12,13 +12,13 @@ from nbtrack.core.errors import ConfigError, DataError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import as_dict
-from nbtrack.data.check import check_recording, quick_warning
 from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.grid import run_jobs
 from nbtrack.experiments.jobs import OF_MAPS, MapJob, TrackJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, METHODS, Method, method_of
+from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.output import OVERVIEW_FILE, new_file, output_folder
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
@@ -26,6 +26,7 @@ from nbtrack.fields import PointCloud
 from nbtrack.mapping.files import MAP_FILE, MESH_FILE, Map, read_map
 from nbtrack.mapping.meshes import extract_mesh
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
+from nbtrack.recordings.check import check_recording, quick_warning
 from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 from nbtrack.tracking.trajectories import read_trajectory, read_tum, write_kitti
@@ -96,6 +97,8 @@ def track_command(options: Namespace) -> None:
     job = MapJob(scene, method.field, preset, *of_map)
     how = options.frames, options.seed, options.out, options.threads, options.start
     run = TrackJob(job, scene, method.tracker, steps, options.rate, *how)
+    for warning in reach_warnings([run]):
+        tell(f"nbtrack: warning: {warning}")
     with output_folder(options.out):
         if not given:
             _map(job)

@@ -25,6 +25,7 @@ from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.jobs import Job, MapJob, TrackJob
 from nbtrack.experiments.methods import Methods, find_methods
+from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import FIELDS
@@ -134,11 +135,13 @@ def track_scenes(
 
 def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:
     """Side by side; by the clock one after the other, here: a neighbour would slow a clock down."""
-    n_done = sum(job.is_done for job in jobs)
-    if 0 < n_done < len(jobs):
-        tell(f"{n_done} of {len(jobs)} runs are cached")
+    missing = [job for job in jobs if not job.is_done]
+    if 0 < len(missing) < len(jobs):
+        tell(f"{len(jobs) - len(missing)} of {len(jobs)} runs are cached")
+    for warning in reach_warnings(missing):
+        tell(f"nbtrack: warning: {warning}")
     if clock:
-        run_jobs([job.needs for job in jobs if not job.is_done], "mapping", execution)
+        run_jobs([job.needs for job in missing], "mapping", execution)
         execution = replace(execution, workers=1, dask=None)
     return run_jobs(jobs, "by the clock" if clock else "tracking", execution)
 

@@ -24,6 +24,7 @@ from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
 from nbtrack.mapping.quality import check_belongs, score_map
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
+from nbtrack.tracking.reach import reach_metrics
 from nbtrack.tracking.trajectories import METRICS_FILE, shifted, tum_text
 
 RUN_FILE = "run.pt"
@@ -256,6 +257,9 @@ class TrackJob(Job):
         if origin.any():
             notes["origin"] = origin.tolist()
         notes |= still_metrics(sequence.T_world_camera)
+        bounds = finished_map.field.bounds
+        notes["metres_per_unit"] = bounds.metres_per_unit
+        notes["half_longest_side_m"] = bounds.half_longest_side
         if self.is_elsewhere:
             notes["map_from"] = finished_map.record
         T_first = sequence.T_world_camera[0]
@@ -272,7 +276,10 @@ class TrackJob(Job):
             report(done / len(sequence), status)
 
         checkpoint = self.cache / RUN_FILE  # a folder of the user's holds results alone
-        return track_sequence(tracker, sequence, checkpoint, tell, is_start_known), notes
+        tracked = track_sequence(tracker, sequence, checkpoint, tell, is_start_known)
+        reach = self.settings.reach(tracked.frames["steps"].mean(), bounds.metres_per_unit)
+        how = sequence.T_world_camera, self.settings.motion_model
+        return tracked, notes | reach_metrics(reach, *how)
 
     def _provenance(self, n_threads: int) -> dict[str, Any]:
         """Where a run comes from: data, map, method, settings, machine; how to make it again."""

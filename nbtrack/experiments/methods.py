@@ -36,6 +36,8 @@ Methods = Sequence[str | Method]
 _COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
 _VR_VELOCITY = ("tracking.vr.motion_model=constant_velocity",)
 _SDF_VELOCITY = ("tracking.sdf.motion_model=constant_velocity",)
+_VR_METRES = ("tracking.vr.position_unit=metre",)
+_SDF_METRES = ("tracking.sdf.position_unit=metre",)
 _CORRECTED = ("mapping.neus.correct_voxel=0.04",)
 # As good as from 1400 iterations, in half the time (benchmarks/README.md; rooms for tuning).
 _PLUS = ("mapping.neus_plus.correct_voxel=0.04", "mapping.neus_plus.iterations=600")
@@ -46,6 +48,8 @@ METHODS = {
     "sdf": Method("NeuS with SDF", "neus", "sdf"),
     "vr_velocity": Method("iMAP with VR, constant velocity", "imap", "vr", _VR_VELOCITY),
     "sdf_velocity": Method("NeuS with SDF, constant velocity", "neus", "sdf", _SDF_VELOCITY),
+    "vr_metres": Method("iMAP with VR, rates in metres", "imap", "vr", _VR_METRES),
+    "sdf_metres": Method("NeuS with SDF, rates in metres", "neus", "sdf", _SDF_METRES),
     "vr_neus": Method("NeuS with VR", "neus", "vr"),
     "vr_plus": Method("NeuS+ with VR", "neus_plus", "vr"),
     "vr_volsdf": Method("VolSDF with VR", "volsdf", "vr"),

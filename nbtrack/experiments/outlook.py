@@ -1,0 +1,68 @@
+"""What can be said of runs before they are made: whether the camera outruns their search."""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from nbtrack.core.errors import NbtrackError
+from nbtrack.data.sequence import observed_bounds, parse_frames, read_frames, select_frames
+from nbtrack.experiments.jobs import MapJob, TrackJob
+from nbtrack.experiments.scenes import Scene
+from nbtrack.tracking.reach import reach_metrics
+
+_FRAMES_LOOKED_AT = 20  # that tell a map's unit before there is a map
+# Share of the frames in which the camera may move farther than the search reaches, before a user is
+# told: a hand starts and stops, and the search catches up (our choice).
+_TOLERATED = 0.1
+
+
+def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
+    """A line for each kind of run whose search falls behind its camera, whatever the map is."""
+    kinds: dict[tuple, list[TrackJob]] = {}
+    for run in runs:
+        kinds.setdefault((run.tracker, run.settings, run.steps), []).append(run)
+    for (tracker, settings, steps), alike in kinds.items():
+        seen = {run.scene.name: expected_reach(run) for run in alike}
+        short = {n: r for n, r in seen.items() if r.get("beyond_reach_share", 0) > _TOLERATED}
+        if not short:
+            continue
+        scene, worst = max(short.items(), key=lambda pair: pair[1]["least_ate_m"])
+        others = f" (of {len(short)} scenes)" if len(short) > 1 else ""
+        velocity = f"--set tracking.{tracker}.motion_model=constant_velocity, "
+        yield (
+            f"{steps:g} steps of {tracker} move the camera by at most {1e3 * worst['reach_m']:.1f} "
+            f"mm along an axis and {worst['reach_deg']:.2f} deg about it; it moves farther in "
+            f"{worst['beyond_reach_share']:.0%} of the frames of {scene}{others}, and no search "
+            f"can have an ATE below {worst['least_ate_m']:.3f} m there: take more steps, a lower "
+            f"rate, {velocity if settings.motion_model == 'previous_pose' else ''}"
+            "or --method corrected"
+        )
+
+
+def expected_reach(run: TrackJob) -> dict[str, float]:
+    """What `reach_metrics` will say of a run; nothing where its steps are not known before."""
+    if run.steps is None:
+        return {}
+    with contextlib.suppress(NbtrackError):  # the run itself will say what is wrong
+        recording = run.scene.recording
+        frame_ids = select_frames(recording, parse_frames(run.frames), needs_poses=False)
+        reach = run.settings.reach(run.steps, _unit_of(run.needs))
+        path = recording.T_world_camera[frame_ids]
+        return reach_metrics(reach, path, run.settings.motion_model)
+    return {}
+
+
+def _unit_of(job: MapJob) -> float:
+    """Metres a unit of a map; about those of one that is still to be made."""
+    if job.is_done:
+        return job.map().field.bounds.metres_per_unit
+    return _rough_unit(job.scene, job.frames)
+
+
+@lru_cache
+def _rough_unit(scene: Scene, frames: str) -> float:
+    ids = select_frames(scene.recording, parse_frames(frames))
+    some = ids[np.linspace(0, len(ids) - 1, min(len(ids), _FRAMES_LOOKED_AT)).astype(int)]
+    return observed_bounds(read_frames(scene.recording, some)).metres_per_unit
