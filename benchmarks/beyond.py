@@ -11,6 +11,7 @@ from itertools import product
 
 import pandas as pd
 from basin import find_from_afar
+from motions import HAND_HELD
 from turns import in_turns
 from variants import FusedDistance
 
@@ -130,5 +131,5 @@ def _maps(scene: Scene, preset: Preset) -> Iterator[tuple[str, tuple[int, Field,
 
 
 if __name__ == "__main__":
-    smoke = load_preset("smoke")
+    smoke = load_preset("smoke", settings=HAND_HELD)
     beyond(open_scenes(smoke), smoke)

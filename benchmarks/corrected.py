@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import torch
 from basin import find_from_afar
+from motions import HAND_HELD
 from scipy.spatial.transform import Rotation
 from turns import in_turns
 
@@ -85,7 +86,8 @@ def main() -> None:
     if sys.argv[1:] == ["fast"]:
         _write("fast.csv", fast())
         return
-    preset, second = load_preset("smoke"), load_preset("smoke", settings=["scenes.seed=1"])
+    preset = load_preset("smoke", settings=HAND_HELD)
+    second = with_settings(preset, "scenes.seed=1")
     rooms, elsewhere = open_scenes(preset), open_scenes(second)
     recordings = [open_scene(folder, preset) for folder in sys.argv[1:]]
     runs = []
@@ -151,7 +153,9 @@ def ablation(recordings) -> pd.DataFrame:
     """Errors with 2,048 points, in the two rooms for tuning on the mapped and on another path, and
     on recordings on the mapped one. One thing of `ABLATION` is changed at a time."""
     names, rows = "scenes.names=['bedroom', 'kitchen_nook']", []
-    preset, second = (load_preset("smoke", settings=[names, f"scenes.seed={n}"]) for n in (0, 1))
+    preset, second = (
+        load_preset("smoke", settings=[names, *HAND_HELD, f"scenes.seed={n}"]) for n in (0, 1)
+    )
     places = [
         (room, {"mapped": room, "second": other})
         for room, other in zip(open_scenes(preset), open_scenes(second), strict=True)
@@ -194,7 +198,9 @@ def fast() -> pd.DataFrame:
 
     `wrong_frames` are off by more than 5 cm, `missed_frames` are wrong and not called lost.
     """
-    preset, second = (load_preset("nine_rooms", settings=[f"scenes.seed={n}"]) for n in (0, 1))
+    preset, second = (
+        load_preset("nine_rooms", settings=[*HAND_HELD, f"scenes.seed={n}"]) for n in (0, 1)
+    )
     rooms, elsewhere, rows = open_scenes(preset), open_scenes(second), []
     methods = [method for method in ON_RECORDINGS if method != METHODS["baked"]]
     for frames in ("::4", "::8"):

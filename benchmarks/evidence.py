@@ -20,14 +20,16 @@ import numpy as np
 import pandas as pd
 from basin import OFFSETS, find_from_afar
 from choices import CHOICES, FASTER, SDF, SEARCHES, VR
+from motions import HAND_HELD, paced, placed
 from scipy.stats import binomtest, bootstrap
-from variants import ExactDistance, FusedDistance, OtherDepth, paced, placed, with_variants
+from variants import ExactDistance, FusedDistance, OtherDepth, with_variants
 
 from nbtrack import METHODS, load_preset, make_tracker, map_scene, open_scenes, track_scenes
 from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
 from nbtrack.data.sequence import observed_bounds
+from nbtrack.experiments.bench import camera_motion
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.scenes import Scene
@@ -43,16 +45,8 @@ Chunk = tuple[dict[str, str | int], Callable[[], pd.DataFrame]]
 NINE = load_preset("nine_rooms")
 THREE_ROOMS = [*NINE.scenes.names[:3]]  # the first of the nine, whatever was found in them
 THREE = with_settings(NINE, f"scenes.names={THREE_ROOMS}")
-# The rates were taken for metres where a camera is hand-held: so these rows stay comparable.
-PRESET = with_variants(
-    load_preset(
-        "smoke",
-        settings=[
-            f"scenes.names={THREE_ROOMS}", "scenes.motion=handheld",
-            "tracking.vr.position_unit=metre", "tracking.sdf.position_unit=metre",
-        ],
-    )
-)  # fmt: skip
+HELD = with_settings(NINE, *HAND_HELD)
+PRESET = with_variants(load_preset("smoke", settings=[f"scenes.names={THREE_ROOMS}", *HAND_HELD]))
 KEPT = [
     "rate_hz", "method", "scene", "frames", "steps_per_frame", "path_m", "still_ate_m", "ate_m",
     "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "lost_frames", "metres_per_unit",
@@ -80,7 +74,8 @@ def main(experiment: str, seeds: int) -> None:
             write_atomic(path, rows.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     if experiment == "nine_rooms":
         rows = pd.read_csv(path)  # as anybody has them, rounded
-        note = f"Preset: {NINE.name}; budget: {NINE.step_counts}; {machine}."
+        motion = camera_motion(NINE, rows.query("path == 'mapped'"))
+        note = f"{motion}; preset: {NINE.name}; budget: {NINE.step_counts}; {machine}."
         write_table_1(path.parent, rows.query("path == 'mapped'"), note)
         judged = verdicts(rows).to_csv(index=False, float_format="%.4g", lineterminator="\n")
         write_atomic(path.parent / "verdicts.csv", judged)
@@ -102,6 +97,9 @@ def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
         row = {"path": path, "rate_hz": rate_hz, "rooms": len(ratio), "sequences": len(ate_m)}
         row |= {"vr_over_sdf": mean, "from": low, "to": high, "vr_ahead": (ratio < 0).sum()}
         for method in (VR, SDF):
+            own = cells[cells["method"] == method.label]
+            motion_m = own["path_m"] / own["frames"]
+            row[f"{method.tracker}_reach_over_motion"] = (own["reach_m"] / motion_m).mean()
             lost = binomtest(int((ate_m[method.label] > LOST_THRESHOLD_M).sum()), len(ate_m))
             low, high = lost.proportion_ci(method="wilson")
             name = f"{method.tracker}_lost"
@@ -137,11 +135,11 @@ def dataset_path(seed: int) -> Iterator[Chunk]:
         yield place, partial(track, [scene], TABLE_1, preset, **there)
 
 
-READINGS = ("vr_metres", "sdf_metres", "vr_velocity", "sdf_velocity")
+READINGS = ("vr_metres", "sdf_metres", "vr_velocity", "sdf_velocity", "vr_neus")
 
 
 def readings(seed: int) -> Iterator[Chunk]:
-    """Other readings of the paper: rates in metres; the start at constant velocity."""
+    """Other readings of the paper: rates in metres, constant velocity; and VR in SDF's map."""
     for scene, name in product(open_scenes(THREE), READINGS):
         there = {"seeds": [seed], "workers": None}
         yield (
@@ -246,7 +244,7 @@ def _on_each_depth(scene: Scene, name: str, seed: int) -> pd.DataFrame:
 
 def choices(seed: int) -> Iterator[Chunk]:
     """Table I with each of `CHOICES`; those that need new maps come last."""
-    filtered = open_scenes(NINE)
+    filtered = open_scenes(HELD)
     noisy = [OtherDepth(s.name, s.folder, depth_folder=DEPTHS["noisy"]) for s in filtered]
     # The rates matter with few steps; all else is asked at 2 Hz, where the paper has VR ahead.
     places = [*product(("ours", FASTER), (10,)), *product(CHOICES, (2,))]

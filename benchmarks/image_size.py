@@ -7,6 +7,7 @@ the reading of files, in the corrected map of one room. Times count: run nothing
 """
 
 import torch
+from motions import HAND_HELD
 from turns import in_turns
 
 from nbtrack import METHODS, load_preset, make_tracker, map_scene, open_scene
@@ -23,7 +24,7 @@ def main() -> None:
     """One tracker a size; frame after frame, each in its turn."""
     torch.set_num_threads(1)
     settings = *METHODS["corrected"].settings, f"tracking.lm.n_pixels={POINTS}"
-    preset = with_settings(load_preset("smoke"), *settings)
+    preset = load_preset("smoke", settings=[*HAND_HELD, *settings])
     field = map_scene(open_scene(ROOM, preset), "neus_plus", preset).field
     walks = {}
     for width in WIDTHS:

@@ -17,6 +17,7 @@ from pathlib import Path
 import pandas as pd
 import torch
 from basin import OFFSETS, find_from_afar
+from motions import HAND_HELD
 
 from nbtrack import load_preset, map_scene, open_scenes, track_scenes
 from nbtrack.core.files import tables_folder, write_atomic
@@ -39,7 +40,7 @@ COLUMNS = [
 
 def starts(path: Path) -> None:
     """VR with and without depth, from starts that are off by up to 4 cm and 4 degrees."""
-    preset = load_preset("smoke")
+    preset = load_preset("smoke", settings=HAND_HELD)
     methods = dict.fromkeys(["vr", "color", "vr_neus", "color_neus"], 100)
     found = find_from_afar(open_scenes(preset)[0], methods, preset, OFFSETS[:3], 8)
     write_atomic(path, found.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
@@ -51,7 +52,7 @@ def opacity(seeds: int) -> pd.DataFrame:
 
     A row a map, with the mean over pixels of all frames, and the map's own scale (m).
     """
-    preset, rows = load_preset("smoke"), []
+    preset, rows = load_preset("smoke", settings=HAND_HELD), []
     vr = preset.tracking_of("vr")
     for scene, name, seed in product(open_scenes(preset), ("neus", "volsdf"), range(seeds)):
         field = map_scene(scene, name, preset, seed).field
@@ -67,7 +68,7 @@ def opacity(seeds: int) -> pd.DataFrame:
 
 def main(seeds: int) -> None:
     """Make the rows that are missing, method by method, over whole paths."""
-    preset, folder = load_preset("smoke"), tables_folder() / "other_fields"
+    preset, folder = load_preset("smoke", settings=HAND_HELD), tables_folder() / "other_fields"
     path, seen = folder / "table_1_cells.csv", folder / "starts.csv"
     rows = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=COLUMNS)
     for seed, scene, name in product(range(seeds), open_scenes(preset), ROWS):

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 import small_gicp
 import torch
+from motions import HAND_HELD
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -42,7 +43,7 @@ BLOCK, DRAWS = 10, 1000  # frames that are drawn together, since neighbours err 
 def main(recordings: list[str]) -> None:
     """Two rooms, two seeds of errors; then recordings as they are."""
     torch.set_num_threads(1)
-    preset, tables = load_preset("smoke"), []
+    preset, tables = load_preset("smoke", settings=HAND_HELD), []
     for scene in open_scenes(preset):
         truth = scene.read(":120")
         for seed in (0, 1):

@@ -8,30 +8,21 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import inf
 
-import numpy as np
 import torch
-from scipy.interpolate import interp1d
-from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 from torch.nn.functional import grid_sample, silu
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
-from nbtrack.core.arrays import Poses
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.errors import NumericalError
-from nbtrack.core.files import data_folder
-from nbtrack.data.formats import DATASET_UNITS, Declaration
 from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import FIELDS, Field, IMapField
 from nbtrack.synthetic import Room
-from nbtrack.synthetic.make import MOTIONS
 from nbtrack.tracking import TRACKERS, AdamTracker, SdfTracker, VrTracker
 
 FALLING_STEPS = 100
-_PLACED_CLEARANCE = 0.4  # m
 
 
 class _Kept(AdamTracker):
@@ -127,53 +118,6 @@ class SmoothImap(IMapField):
     def __init__(self, *args) -> None:
         super().__init__(*args)
         self.mlp.activation = silu
-
-
-def placed(scene: str) -> str:
-    """The name of a motion: the true path of a scene of the dataset, placed in a room.
-
-    It is scaled by half the room's longest edge over the scene's unit, moved level and turned about
-    the vertical. The first placement with `_PLACED_CLEARANCE` is taken, whatever is found there.
-    """
-    poses_gl = np.loadtxt(data_folder() / scene / "poses.txt").reshape(-1, 4, 4)
-    poses = Declaration(camera_axes="opengl").poses_to_opencv(poses_gl)
-
-    def motion(room: Room, n_frames: int, seed: int) -> Poses:
-        path = poses[:n_frames].copy()
-        size = np.array(room.parts[0].solid.size)
-        path[:, :3, 3] *= size.max() / 2 / DATASET_UNITS[scene]
-        rng = np.random.default_rng([seed, room.number])
-        for _ in range(10_000):
-            turn = np.eye(4)
-            turn[:3, :3] = Rotation.from_euler("y", rng.uniform(-np.pi, np.pi)).as_matrix()
-            moved = turn @ path
-            middle = (moved[:, :3, 3].min(axis=0) + moved[:, :3, 3].max(axis=0)) / 2
-            moved[:, [0, 2], 3] += rng.uniform(-0.5, 0.5, 2) * size[[0, 2]] - middle[[0, 2]]
-            if room.sdf(moved[:, :3, 3]).min() >= _PLACED_CLEARANCE:
-                return moved
-        raise NumericalError(
-            f"the path of {scene} finds no place in {room.name}: take another room"
-        )
-
-    MOTIONS[scene] = motion
-    return scene
-
-
-def paced(speed: float) -> str:
-    """The name of a motion: the path of key poses at so many times its speed."""
-
-    def motion(room: Room, n_frames: int, seed: int) -> Poses:
-        poses = MOTIONS["keyframes"](room, round(n_frames * speed), seed)
-        at = np.minimum(speed * np.arange(n_frames), len(poses) - 1)
-        known, between = np.arange(len(poses)), np.tile(np.eye(4), (n_frames, 1, 1))
-        turned = Rotation.from_matrix(poses[:, :3, :3])
-        between[:, :3, :3] = Slerp(known, turned)(at).as_matrix()
-        between[:, :3, 3] = interp1d(known, poses[:, :3, 3], axis=0)(at)
-        return between
-
-    name = f"keyframes_at_{speed:g}"
-    MOTIONS[name] = motion
-    return name
 
 
 _TRACKERS = (VrKept, SdfKept, VrBest, SdfBest, VrFalling, SdfFalling)

@@ -14,6 +14,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import torch
+from motions import HAND_HELD
 
 from nbtrack import METHODS, Method, load_preset, open_scenes, read_run
 from nbtrack.core.device import choose_device, device_name
@@ -25,7 +26,9 @@ from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.scenes import Scene
 from nbtrack.tables import write_csv
 
-PRESET = load_preset("nine_rooms", settings=["scenes.motion=tour", "scenes.n_frames=1200"])
+PRESET = load_preset(
+    "nine_rooms", settings=[*HAND_HELD, "scenes.motion=tour", "scenes.n_frames=1200"]
+)
 MAPPED, STEPS, RATE_HZ = "::4", 30, 2
 METHODS_OF_WALKS = [METHODS[name] for name in ("corrected", "baked", "icp_middle")]
 WRONG_M = 0.05

@@ -62,7 +62,8 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
     how = {"clock": clock, "seeds": options.seeds, "execution": execution}
     results = track_scenes(scenes, methods, preset, rates_hz, **how)
     name = f"{preset.name}_clock" if clock else preset.name
-    folder, note = options.out or runs_folder() / "tables" / name, _note(preset, clock)
+    folder = options.out or runs_folder() / "tables" / name
+    note = f"{camera_motion(preset, results)}; {_note(preset, clock)}"
     print(f"Table {'III' if options.beyond else 'I'}: ATE (m), {note}")
     if options.beyond:
         print(tables.style_table_1(tables.naming_points(results)))
@@ -173,6 +174,14 @@ def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]
         m.tracker.upper(): with_settings(preset, *m.settings).tracking_of(m.tracker).n_pixels
         for m in reversed(find_methods(methods))
     }
+
+
+def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
+    """For captions: how the camera of some runs moves, and how far a frame in the mean."""
+    kind = f"{preset.scenes.motion} motion" if preset.scenes.synthetic else "recorded motion"
+    if "path_m" not in results:
+        return f"Camera: {kind}"
+    return f"Camera: {kind}, {1e3 * (results['path_m'] / results['frames']).mean():.1f} mm a frame"
 
 
 def _note(preset: Preset, clock: bool) -> str:
