@@ -2,6 +2,7 @@
 
 import copy
 import json
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from nbtrack.core.errors import ConfigError
 from nbtrack.core.files import fingerprint
 from nbtrack.core.settings import as_dict, changed_settings, with_settings
 from nbtrack.data.sequence import parse_frames
+from nbtrack.experiments.commands import _preset_of
 from nbtrack.experiments.methods import METHODS, TABLE_1
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.fields import NetworkSettings
@@ -86,6 +88,27 @@ def test_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "other.toml").write_text(f"{KEY} = 6")
     assert iterations(load_preset(config_file=tmp_path / "other.toml")) == 6
     assert before == PRESETS
+
+
+@pytest.mark.parametrize("source", ["file", "environment", "set"])
+def test_a_method_gives_way_to_the_user(
+    source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a method's settings that are applied last, so that a run has another n than the one
+    that was asked for and that its caption names: preset < method < file < environment < --set."""
+    method, key = METHODS["corrected"], "tracking.lm.n_pixels"
+    assert load_preset().with_method(method.settings).tracking["lm"].n_pixels == 2048
+    (tmp_path / "own.toml").write_text(f"{key} = 64")
+    given = {"config_file": tmp_path / "own.toml"} if source == "file" else {}
+    if source == "environment":
+        monkeypatch.setenv("NBTRACK_SET", f"{key}=64")
+    preset = load_preset(**given, settings=[f"{key}=64"] if source == "set" else [])
+    own = preset.with_method(method.settings)
+    assert own.tracking["lm"].n_pixels == 64
+    assert own.mapping["neus_plus"].correct_voxel == 0.04  # what the user left to the method
+    options = Namespace(preset=None, config=given.get("config_file"), settings=[f"{key}=32"])
+    assert _preset_of(options, method).tracking["lm"].n_pixels == 32  # as `track` does
+    assert load_preset(settings=[f"{key}=512"]).with_method(method.settings) != own
 
 
 def test_values_take_the_type_of_the_preset(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,9 +71,12 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
 def changed_settings(config: Config, original: Config) -> list[str]:
     """The `key=value` texts that turn the original into this config."""
     before = dict(_leaves(original)).items()
-    return [
-        f"{key}={json.dumps(value)}" for key, value in _leaves(config) if (key, value) not in before
-    ]
+    return setting_texts({k: v for k, v in _leaves(config) if (k, v) not in before})
+
+
+def setting_texts(values: Mapping[str, Any]) -> list[str]:
+    """Values of dotted keys, or of trees of keys, as `key=value` texts."""
+    return [f"{key}={json.dumps(value)}" for key, value in _leaves(dict(values))]
 
 
 def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

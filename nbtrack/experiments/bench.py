@@ -19,7 +19,7 @@ from nbtrack.core.device import advise_on_memory, choose_device, device_name
 from nbtrack.core.errors import MissingError, NbtrackError
 from nbtrack.core.files import project_folder, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
-from nbtrack.core.settings import changed_settings, with_settings
+from nbtrack.core.settings import changed_settings
 from nbtrack.experiments.grid import Execution, map_scene, track_scenes
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Methods, find_methods
 from nbtrack.experiments.output import output_folder
@@ -150,7 +150,7 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     T_first = sequence.T_world_camera[0]
     with ProgressBar("Table II", len(plan)) as bar:
         for done, (method, n_pixels) in enumerate(plan):
-            name, own = method.tracker, with_settings(preset, *method.settings)
+            name, own = method.tracker, preset.with_method(method.settings)
             bar.move_to(done, f"{name}={n_pixels}")
             settings = replace(own.tracking_of(name), n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
@@ -171,7 +171,7 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
 def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]:
     """The n that each tracker's first method uses for Table I, by its label in Table II."""
     return {
-        m.tracker.upper(): with_settings(preset, *m.settings).tracking_of(m.tracker).n_pixels
+        m.tracker.upper(): preset.with_method(m.settings).tracking_of(m.tracker).n_pixels
         for m in reversed(find_methods(methods))
     }
 

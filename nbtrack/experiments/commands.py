@@ -116,10 +116,10 @@ def track_command(options: Namespace) -> None:
 
 def _preset_of(options: Namespace, method: Method) -> Preset:
     """The preset with what a method changes, and then the user."""
-    settings = [*method.settings, *options.settings]
+    settings = [*options.settings]
     if getattr(options, "pixels", None) is not None:
         settings.append(f"tracking.{method.tracker}.n_pixels={options.pixels}")
-    return load_preset(options.preset, options.config, settings)
+    return load_preset(options.preset, options.config, settings).with_method(method.settings)
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:

@@ -22,7 +22,6 @@ from nbtrack.core.device import choose_device, threads
 from nbtrack.core.errors import MissingError, NbtrackError
 from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.progress import ProgressBar, tell
-from nbtrack.core.settings import with_settings
 from nbtrack.experiments.jobs import Job, MapJob, TrackJob
 from nbtrack.experiments.methods import Methods, find_methods
 from nbtrack.experiments.outlook import reach_warnings
@@ -123,7 +122,7 @@ def track_scenes(
     pairs, jobs, rows = list(zip(scenes, tracked or scenes, strict=True)), [], []
     grid = product(find_methods(methods), seeds, rates or preset.tables.rates_hz, pairs)
     for method, seed, rate_hz, (scene, seen) in grid:
-        map_job = MapJob(scene, method.field, with_settings(preset, *method.settings), seed=seed)
+        map_job = MapJob(scene, method.field, preset.with_method(method.settings), seed=seed)
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
         budget = n_steps, rate_hz if clock else None
         job = TrackJob(map_job, seen, method.tracker, *budget, seed=seed, **options)

@@ -15,7 +15,7 @@ class Method:
     label: str
     field: str
     tracker: str
-    settings: tuple[str, ...] = ()  # key=value, over those of the preset
+    settings: tuple[str, ...] = ()  # key=value, over the preset's and under the user's own
 
     def paper_steps(self, rate_hz: float | int) -> float:
         """Steps a frame on the paper's hardware: of VR for what renders, else of SDF."""

@@ -1,6 +1,7 @@
 """Presets: everything that a run depends on, apart from the data and the seed.
 
-Precedence: preset < TOML file (`NBTRACK_CONFIG` or `--config`) < `NBTRACK_SET` < `--set key=value`.
+Precedence, in every command: class defaults < preset < method < TOML file (`NBTRACK_CONFIG` or
+`--config`) < `NBTRACK_SET` < `--set key=value`.
 """
 
 import os
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from nbtrack.core.errors import ConfigError, MissingError, look_up
-from nbtrack.core.settings import may_be_zero, with_settings, with_values
+from nbtrack.core.settings import may_be_zero, setting_texts, with_settings, with_values
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, PointMapping, field_class
@@ -64,6 +65,8 @@ class Preset:
     tracking: dict[str, TrackerSettings] = field(default_factory=dict)
     scenes: ScenesConfig = ScenesConfig()
     tables: TablesConfig = TablesConfig()
+    # The `key=value` texts of the user's own, which come after those of a method.
+    chosen: tuple[str, ...] = field(default=(), metadata={"is_setting": False})
 
     def __post_init__(self) -> None:
         """Add the settings of all registered fields and trackers."""
@@ -78,6 +81,10 @@ class Preset:
         width, own_width = NetworkSettings().width, self.network_of("neus").width
         there = f"measured there with n = {paper} and {width} units a layer"
         return f"the paper's step counts, {there}; here n = {own} and {own_width} units"
+
+    def with_method(self, settings: Sequence[str]) -> "Preset":
+        """The preset with the `key=value` texts of a method, and then those that a user chose."""
+        return with_settings(self, *settings, *self.chosen)
 
     def network_of(self, field_name: str) -> NetworkSettings:
         """Network of a field; a field without its own takes that of NeuS."""
@@ -119,13 +126,16 @@ def load_preset(
     wrong type; MissingError if the file does not exist, DataError if it is no TOML.
     """
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
+    in_file: list[str] = []
     if config_file := config_file or os.environ.get("NBTRACK_CONFIG"):
         if not Path(config_file).is_file():
             raise MissingError(f"no config file {config_file}: give a TOML file of settings")
-        preset = with_values(preset, read_object(Path(config_file)))
+        values = read_object(Path(config_file))
+        preset, in_file = with_values(preset, values), setting_texts(values)
     try:
         before = shlex.split(os.environ.get("NBTRACK_SET", ""))
     except ValueError as error:
         advice = "quote each setting as in a shell"
         raise ConfigError(f"NBTRACK_SET cannot be split ({error}): {advice}") from None
-    return with_settings(preset, *before, *settings)
+    chosen = *in_file, *before, *settings
+    return replace(with_settings(preset, *before, *settings), chosen=chosen)
