@@ -167,7 +167,7 @@ def speeds(seed: int) -> Iterator[Chunk]:
 
 def more_steps(seed: int) -> Iterator[Chunk]:
     """Both trackers with equal steps a frame, more than the paper's VR has at any rate."""
-    for n_steps, scene in product((8, 32, 128), open_scenes(THREE)):
+    for n_steps, scene in product((128, 32, 8), open_scenes(THREE)):
         place = {"steps": n_steps, "scene": scene.name}
         there = {"steps": n_steps, "seeds": [seed], "workers": None}
         yield place, partial(track, [scene], TABLE_1, THREE, **there)

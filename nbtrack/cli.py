@@ -5,6 +5,7 @@ import importlib
 import os
 import re
 import sys
+import traceback
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -101,14 +102,6 @@ COMMANDS = {
 }
 
 
-# Options of earlier versions: what to write now.
-_EARLIER = {
-    "--supervision": "write --field neus_plus for rendering+sdf",
-    "--correct": "write --method corrected, or --set mapping.neus_plus.correct_voxel=METRES",
-    "--bake": "lm always works in a grid: write --set tracking.lm.voxel=METRES",
-}
-
-
 class Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, with the nearest name, as every other user error does."""
 
@@ -123,7 +116,10 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit status: 0, or 2 after a user's mistake."""
+    """Run a command; returns the exit status: 0, or 2 after a user's mistake.
+
+    With `NBTRACK_DEBUG` set, the traceback of whatever ended it is printed too.
+    """
     _open_streams()
     try:
         options = _parsed(arguments)
@@ -138,12 +134,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         getattr(commands, f"{options.command}_command")(options)
         return 0
     except NbtrackError as error:
-        message, status = " ".join(str(error).split()), 2
+        cause, message, status = error, " ".join(str(error).split()), 2
     except OSError as error:  # a disk that is full or read-only, a file where a folder should be
+        cause = error
         where = error.filename2 or error.filename or "the output"
         message, status = f"{where}: {error.strerror or error}; mend it and run again", 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interruption:
+        cause = interruption
         message, status = "interrupted; run the same command again to go on", 130
+    if os.environ.get("NBTRACK_DEBUG"):
+        traceback.print_exception(cause)
     print(f"nbtrack: {message}", file=sys.stderr)
     return status
 
@@ -173,6 +173,6 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         name, known = unknown[0].partition("=")[0], [*options.parser._option_string_actions]
-        advice = _EARLIER.get(name) or nearest_name(name, [o for o in known if o[:2] == "--"])
+        advice = nearest_name(name, [option for option in known if option[:2] == "--"])
         options.parser.error(f"unknown argument {unknown[0]!r}: {advice}")
     return options

@@ -14,6 +14,7 @@ from tiny import tiny_words
 import nbtrack
 from nbtrack.cli import main
 from nbtrack.core.errors import DataError
+from nbtrack.core.files import naming_damaged
 from nbtrack.data.recording import open_recording
 from nbtrack.tracking.trajectories import read_tum
 
@@ -78,6 +79,40 @@ def test_tracking_command_reads_any_format(tmp_path: Path, capsys: pytest.Captur
     assert main(track(folder, "--format", "tum")) == 0
     assert main(track(folder, "--format", "plain")) == 2
     assert "nbtrack: no colour images " in capsys.readouterr().err
+
+
+def test_a_traceback_for_who_asks(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a mistake of the program that looks like one of a file, and tracebacks unasked."""
+    wrong = ["data", "check", str(tmp_path / "nothing")]
+    assert main(wrong) == 2
+    assert "Traceback" not in capsys.readouterr().err
+    monkeypatch.setenv("NBTRACK_DEBUG", "1")
+    assert main(wrong) == 2
+    said = capsys.readouterr().err
+    assert "Traceback" in said
+    assert said.splitlines()[-1].startswith("nbtrack: no folder")
+    with pytest.raises(AttributeError), naming_damaged(tmp_path):
+        tmp_path.no_such_method()
+    with pytest.raises(DataError), naming_damaged(tmp_path):
+        int("no number")
+
+
+def test_a_map_is_taken_with_the_settings_that_made_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Catches a refusal of the very settings that a map was made with, because a method set others
+    beside them; and settings that the map does not have, which no run could follow."""
+    folder, out = write_recording("plain", tmp_path / "r"), str(tmp_path / "m")
+    made = ["map", str(folder), "--field", "neus", *TINY, "--set", "mapping.neus.correct_voxel=0.3"]
+    assert main([*made, "--out", out]) == 0
+    given = ["track", str(folder), "--map-from", out, "--tracker", "lm", "--steps", "2", *TINY]
+    assert main([*given, "--out", str(tmp_path / "run")]) == 0
+    assert main([*given, "--set", "mapping.neus.n_rays=77"]) == 2
+    said = capsys.readouterr().err
+    assert "was made with other settings than --set mapping.neus.n_rays=77" in said
+    assert main([*given, "--set", "mapping.imap.n_rays=77", "--out", str(tmp_path / "run")]) == 0
 
 
 def test_only_the_first_pose_is_known(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from box_room import BoxRoom, box_sequence
+from PIL import Image
 from recordings import (
     CAMERA,
     Source,
@@ -380,6 +381,11 @@ def test_command_prints_the_sentence_and_draws(tmp_path: Path, capsys) -> None:
     assert "start with: track " in printed
     assert (tmp_path / "out/check.png").stat().st_size > 5000
     assert sorted(folder.rglob("*")) == before
+    again = ["data", "check", str(folder), "--out", str(tmp_path / "out")]
+    assert main(again) == 0  # its own picture is drawn anew, somebody else's is kept
+    Image.new("L", (8, 8)).save(tmp_path / "out/check.png")
+    assert main(again) == 2
+    assert "check.png exists" in capsys.readouterr().err
 
 
 def test_images_that_change(tmp_path: Path) -> None:

@@ -172,3 +172,12 @@ def test_a_lost_camera_is_looked_for_at_its_last_good_pose_too() -> None:
     assert not run(tracker, T_TRUE, 20)
     assert not run(tracker, retract(T_TRUE, FAR), 60)
     assert errors(tracker)[0] < 0.01
+
+
+def test_poses_keep_their_digits() -> None:
+    """Catches double poses that pass through single precision at every frame."""
+    T_start = np.eye(4)
+    T_start[:3, 3] = [1 / 3, 1 / 7, -1 / 9]
+    tracker = LmTracker(ROOM, T_start, StepBudget(1))
+    blank = replace(FRAME, depth_mm=0 * FRAME.depth_mm)  # where nothing is seen the start stays
+    np.testing.assert_allclose(tracker.track(blank).T_world_camera, T_start, rtol=0, atol=1e-15)

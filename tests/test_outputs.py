@@ -44,7 +44,7 @@ def test_a_map_is_read_once(work: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["tum", "plain", "neural_rgbd"])
 def test_a_recording_is_never_written_to(
-    kind: str, work: Path, capsys: pytest.CaptureFixture
+    kind: str, work: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches `track REC --out REC`, which replaced the recording's own poses by the estimate."""
     write_recording(kind, work / "rec")
@@ -55,8 +55,17 @@ def test_a_recording_is_never_written_to(
         ["data", "check", "rec", "--out", "rec"],
         ["tables", *SET, "--out", "rec"],
         ["bench", *SET, "--out", "rec"],
+        # A picture among the images, and a folder of poses, end the next reading.
+        ["track", "rec", *OWN[2:], "--out", "rec/images"],
+        ["data", "check", "rec", "--out", "rec/depth"],
+        ["data", "convert", "rec", "rec/color/again"],
+        ["data", "make", "office", "--out", "rec/office"],
+        ["export", "run", "--to", "tum", "rec/poses/new/poses.txt"],
     ]
     for command in commands:
+        assert_refused(work, capsys, command, "rec holds a recording, where nothing is written")
+    monkeypatch.setenv("NBTRACK_RUNS", str(work / "rec" / "runs"))
+    for command in (["track", "rec", *OWN[2:]], ["map", "office", *MAP[2:]]):
         assert_refused(work, capsys, command, "rec holds a recording, where nothing is written")
 
 

@@ -22,6 +22,7 @@ from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.plots.movie import view_of
 from nbtrack.plots.rooms import screen_axes
 from nbtrack.plots.style import PALETTE, method_colors
@@ -186,6 +187,15 @@ def test_the_zero_level_lies_on_the_sphere(sequence, field, height, up) -> None:
     along = Formula(lambda points: points @ torch.tensor(up, dtype=torch.float32), CUBE)
     values = plots.plot_slice(along, held(sequence, up), height).axes[0].collections[0].get_array()
     assert values.mean() == pytest.approx(height, abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["imap", "neus", "occupancy"])
+def test_a_slice_names_its_value(kind: str, sequence) -> None:
+    """Catches an occupancy that is labelled as a density, in 1/m."""
+    field = make_field(kind, NetworkSettings(width=8), CUBE, seed=0)
+    labels = {"imap": "density (1/m)", "neus": "signed distance (m)", "occupancy": "occupancy"}
+    shown = plots.plot_slice(field, sequence, 0.0)
+    assert labels[kind] in [axes.get_ylabel() for axes in shown.axes]
 
 
 def test_the_true_surface_is_drawn_too(sequence) -> None:

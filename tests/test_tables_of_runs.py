@@ -28,6 +28,7 @@ from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scenes
 from nbtrack.fields import FIELDS, PointCloud
 from nbtrack.fields.correction import CorrectedField
+from nbtrack.tables import table_1
 from nbtrack.tracking import TRACKERS, make_tracker
 
 
@@ -188,6 +189,20 @@ def test_a_second_path_is_tracked_in_the_map_of_the_first(
     assert main(arguments) == 0
     metrics = json.loads((tmp_path / arguments[-1] / "metrics.json").read_text())
     assert metrics["ate_rmse_m"] == found["ate_m"][0]
+
+
+def test_a_recording_without_reference(preset: Preset, scenes: list[Scene], tmp_path: Path) -> None:
+    """Catches a table that ends, and loses its other cells, because one recording has no poses."""
+    unknown = tmp_path / "unknown"
+    shutil.copytree(scenes[1].folder, unknown)
+    poses = np.loadtxt(unknown / "poses.txt")
+    poses[4:] = np.nan  # but for the first frame
+    np.savetxt(unknown / "poses.txt", poses)
+    tracked = [scenes[0], Scene("unknown", unknown)]
+    results = track_scenes(scenes, ["sdf"], preset, [10], tracked=tracked)
+    assert results["ate_m"].isna().tolist() == [False, True]
+    assert (results["failure"] == "").all()
+    assert table_1(results).isna().sum(axis=None) == 2  # of the method, and of standing still
 
 
 def test_table_2_of_this_machine(preset: Preset, scenes: list[Scene]) -> None:

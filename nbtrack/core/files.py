@@ -12,8 +12,12 @@ import hashlib
 import io
 import json
 import os
+import pickle
 import platform
 import re
+import struct
+import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -21,6 +25,7 @@ from types import CodeType, FunctionType
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 
 import nbtrack
 from nbtrack.core.errors import DataError, NbtrackError
@@ -32,6 +37,12 @@ _WITHOUT_EFFECT = {
     "mapping.files",
 }  # fmt: skip
 """Modules that change no digit of a result."""
+# What readers raise for bytes of another kind: numbers and texts (ValueError, which those of JSON,
+# TOML, CSV and Unicode are), missing keys, wrong types and sizes, torch and compressed archives.
+_MADE_BY_CONTENT = (
+    OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, RuntimeError,
+    pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile, SafetensorError,
+)  # fmt: skip
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _LIBRARIES = ("nbtrack", "torch", "abc", "typing", "builtins")  # what own classes are built on
 
@@ -220,12 +231,13 @@ def naming_damaged(
 ) -> Iterator[None]:
     """Turn what goes wrong in reading a file and taking up its content into a DataError in a line.
 
-    Bytes of any other kind make readers stumble in many ways; an interruption is none of them.
+    These are the errors that content makes readers raise. Others, as of a name that is not there,
+    are mistakes of a program and pass.
     """
     try:
         yield
     except (NbtrackError, MemoryError, torch.OutOfMemoryError, torch.AcceleratorError):
         raise  # a device that fails says nothing about the file
-    except Exception as error:
+    except _MADE_BY_CONTENT as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:120]
-        raise DataError(f"{path} is not a readable {kind} ({reason}): {advice}") from None
+        raise DataError(f"{path} is not a readable {kind} ({reason}): {advice}") from error

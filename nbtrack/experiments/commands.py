@@ -19,7 +19,13 @@ from nbtrack.experiments.grid import run_jobs
 from nbtrack.experiments.jobs import OF_MAPS, MapJob, TrackJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, METHODS, Method, method_of
 from nbtrack.experiments.outlook import reach_warnings
-from nbtrack.experiments.output import OVERVIEW_FILE, new_file, output_folder
+from nbtrack.experiments.output import (
+    OVERVIEW_FILE,
+    check_no_recording,
+    new_file,
+    output_folder,
+    save_picture,
+)
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.fields import PointCloud
@@ -139,11 +145,18 @@ def _check_fits(given: Map, method: Method, preset: Preset, options: Namespace) 
     if method.field != name:
         advice = "leave --method and --field out"
         raise ConfigError(f"{path} is a map of field {name!r}, not {method.field!r}: {advice}")
-    asked = as_dict(preset.network_of(name)), as_dict(preset.mapping_of(name))
-    of_maps = [text for text in options.settings if text.startswith(OF_MAPS)]
-    if of_maps and asked != (record["network"], record["settings"]):
-        advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
-        raise ConfigError(f"{path} was made with other settings than --set {of_maps[0]}: {advice}")
+    made = {"network": record["network"], "mapping": record["settings"]}
+    parts = {"network": preset.network_of(name), "mapping": preset.mapping_of(name)}
+    asked = {part: as_dict(settings) for part, settings in parts.items()}
+    of_network = name if name in preset.network else "neus"
+    texts = {text.partition("=")[0].strip(): text for text in options.settings}
+    for part, kind in (("network", of_network), ("mapping", name)):
+        for key in asked[part]:
+            text = texts.get(f"{part}.{kind}.{key}")
+            if text and asked[part][key] != made[part].get(key):
+                advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
+                found = f"{path} was made with other settings than --set {text}"
+                raise ConfigError(f"{found}: {advice}")
 
 
 def _map(job: MapJob) -> None:
@@ -183,7 +196,7 @@ def _draw_overview(run: TrackJob) -> None:
     title = title.encode(errors="replace").decode()  # letters that the system's encoding lacks
     paths["tracked"] = tracked.T_estimated
     figure = plot_overview(cloud_of(surface), paths, tracked.frames, title)
-    figure.savefig(run.folder / OVERVIEW_FILE, dpi=120)
+    save_picture(figure, run.folder / OVERVIEW_FILE, dpi=120)
     print(f"  picture: {run.folder / OVERVIEW_FILE}")
 
 
@@ -262,6 +275,7 @@ def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
     chosen = "motion", "n_frames", "width", "seed"
     config = ScenesConfig(**{name: getattr(options, name) for name in chosen})
+    check_no_recording(options.out)
     write_room(options.room, options.out, config)
     print(f"{options.out}: {options.room}, {options.n_frames} frames, seed {options.seed}")
 
@@ -273,15 +287,16 @@ def check_command(options: Namespace) -> None:
     print(report)
     if options.out is not None:
         path = new_file(options.out / "check.png")
-        path.parent.mkdir(parents=True, exist_ok=True)
         apart_mm = 1e3 * report.conventions[0].median_m
         title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart (median)"
-        plot_overview(report.cloud, {"true": report.T_world_camera}, None, title).savefig(path)
+        figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)
+        save_picture(figure, path)
         print(f"  picture         {path}")
 
 
 def convert_command(options: Namespace) -> None:
     """Write a recording in the Neural RGB-D layout; print what became of it."""
     frames = parse_frames(options.frames)
+    check_no_recording(options.out)
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     print(convert_sequence(recording, options.out, frames, progress=True))

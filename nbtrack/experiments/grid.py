@@ -112,7 +112,7 @@ def track_scenes(
         tracked: other recordings of the same rooms, in the same order, which no map has seen.
 
     Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), ate_m (NaN
-    where it failed), failure (why) and the other metrics.
+    where it failed, or no true pose is known), failure (why) and the other metrics.
     """
     execution, rates = execution or Execution(), [None] if steps else rates_hz
     seeds = range(seeds) if isinstance(seeds, int) else seeds
@@ -150,7 +150,7 @@ def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[
     if isinstance(result, NbtrackError):
         return {**row, "failure": str(result), "ate_m": float("nan")}
     metrics = {k: v for k, v in result.items() if k not in ("config", "versions")}
-    return {**metrics, **row, "failure": "", "ate_m": result["ate_rmse_m"]}
+    return {**metrics, **row, "failure": "", "ate_m": result.get("ate_rmse_m", float("nan"))}
 
 
 def read_run(name: str | Path) -> Trajectory:

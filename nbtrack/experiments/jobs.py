@@ -15,6 +15,7 @@ from nbtrack.core import files
 from nbtrack.core.device import advise_on_memory, choose_device, device_name, threads
 from nbtrack.core.errors import NbtrackError
 from nbtrack.core.settings import as_dict, changed_settings, with_settings
+from nbtrack.experiments.output import check_no_recording
 from nbtrack.experiments.presets import PRESETS, Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
@@ -67,6 +68,7 @@ class Job:
         path = files.runs_folder() / "locks" / f"{self.cache.name}.lock"
         report(0.0, "begins, or waits for another process that makes the same")
         try:
+            check_no_recording(path)
             with FileLock(path), advise_on_memory(f"the frames and settings of {self.name}"):
                 return self.result() if self.is_done else self.compute(report)
         except NbtrackError as error:
@@ -270,6 +272,7 @@ class TrackJob(Job):
         T_start = T_first if is_start_known else np.eye(4)
         how = T_start, budget, self.settings, self.seed
         tracker = make_tracker(self.tracker, finished_map.field, *how)
+        notes["device"] = device_name(tracker.device)  # LM and ICP run on the host
 
         def tell(done: int, error_m: float) -> None:
             status = f"frame {done}" if np.isnan(error_m) else f"off by {100 * error_m:.1f} cm"
@@ -284,7 +287,6 @@ class TrackJob(Job):
     def _provenance(self, n_threads: int) -> dict[str, Any]:
         """Where a run comes from: data, map, method, settings, machine; how to make it again."""
         return {
-            "device": device_name(choose_device()),
             "threads": n_threads,
             "scene": self.scene.name,
             "field": self.needs.field,

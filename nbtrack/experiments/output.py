@@ -1,12 +1,16 @@
 """Where commands write: never into a recording, and never over files that nbtrack did not write."""
 
 import contextlib
+import io
 from collections.abc import Iterator
 from pathlib import Path
 
 from filelock import FileLock, Timeout
+from matplotlib.figure import Figure
+from PIL import Image
 
 from nbtrack.core.errors import ConfigError
+from nbtrack.core.files import write_atomic
 from nbtrack.data.formats import holds_recording
 from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, MESH_FILE
 from nbtrack.tracking.trajectories import METRICS_FILE
@@ -16,6 +20,7 @@ OVERVIEW_FILE = "overview.png"
 _RUN_FILES = ("trajectory.txt", "groundtruth.txt", "frames.csv", METRICS_FILE, OVERVIEW_FILE)
 _MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
 _TABLE_FILES = ("table_1.csv", "table_2.csv", "table_3.csv")
+_SOFTWARE = "nbtrack"
 LOCK_FILE = ".nbtrack.lock"
 """It stays in every folder that was given with --out, and tells that nbtrack wrote there."""
 
@@ -26,11 +31,27 @@ def is_own_output(folder: Path) -> bool:
 
 
 def new_file(path: Path) -> Path:
-    """The path of a file to be written. Raises ConfigError if it exists or lies in a recording."""
-    if path.exists():
+    """The path of a file to be written, in a folder that is made where it is missing.
+
+    Raises ConfigError if it lies in a recording, or exists and is no picture that nbtrack drew.
+    """
+    check_no_recording(path)
+    if path.exists() and not _is_own_picture(path):
         raise ConfigError(f"{path} exists: choose another file to write, or remove it first")
-    _check_no_recording(path.parent)
     return path
+
+
+def save_picture(figure: Figure, path: Path, dpi: float | None = None) -> None:
+    """Writes a figure as a PNG that says that nbtrack drew it, and may replace it."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=dpi or "figure", metadata={"Software": _SOFTWARE})
+    write_atomic(path, content.getvalue())
+
+
+def _is_own_picture(path: Path) -> bool:
+    with contextlib.suppress(OSError), Image.open(path) as picture:
+        return picture.info.get("Software") == _SOFTWARE
+    return False
 
 
 @contextlib.contextmanager
@@ -45,7 +66,7 @@ def output_folder(folder: Path | None) -> Iterator[None]:
     if folder is None:
         yield
         return
-    _check_no_recording(folder)
+    check_no_recording(folder)
     names = _RUN_FILES + _MAP_FILES + _TABLE_FILES
     foreign = [name for name in names if (folder / name).exists()]
     if foreign and not is_own_output(folder):
@@ -57,6 +78,10 @@ def output_folder(folder: Path | None) -> Iterator[None]:
         raise ConfigError(f"another nbtrack command is writing to {folder}: wait for it") from None
 
 
-def _check_no_recording(folder: Path) -> None:
-    if holds_recording(folder):
-        raise ConfigError(f"{folder} holds a recording, where nothing is written: choose another")
+def check_no_recording(path: Path) -> None:
+    """Raises ConfigError if a path that is to be written is a recording, or lies within one."""
+    for folder in (path, *path.resolve().parents):
+        if folder.is_dir() and holds_recording(folder):
+            raise ConfigError(
+                f"{folder} holds a recording, where nothing is written: choose another"
+            )

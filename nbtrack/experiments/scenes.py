@@ -14,7 +14,7 @@ from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames, select_frames
-from nbtrack.experiments.output import is_own_output
+from nbtrack.experiments.output import check_no_recording, is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
 
@@ -117,6 +117,7 @@ def _room(name: str, config: ScenesConfig) -> Scene:
     recipe += f"-{room_version(name)}"
     folder = runs_folder() / "rooms" / f"{name}-{recipe}" / name
     if not folder.is_dir():
+        check_no_recording(folder)
         # Another command that needs the same room waits, and then reads it.
         with FileLock(folder.with_suffix(".lock")):
             for unfinished in folder.parent.glob(f".{name}.*.unfinished"):  # of a killed attempt

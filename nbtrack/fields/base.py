@@ -55,7 +55,8 @@ class Field(nn.Module, abc.ABC):
 
     name: str  # on the command line and in file names
     label: str  # in tables and figures
-    is_distance: bool = True  # whether its value is a signed distance (m), else a density
+    is_distance: bool = True  # whether its value is a signed distance (m)
+    value_label: str = "signed distance (m)"  # on axes
     surface_level: float  # the value whose isosurface is drawn as the scene's surface
     # By how much its distance (m) and intensity are off at surfaces, together with depth cameras:
     # larger residuals lose their say in second-order tracking. Our choice, for small networks.

@@ -19,6 +19,7 @@ class IMapField(LearnedField):
     name = "imap"
     label = "iMAP"
     is_distance = False
+    value_label = "density (1/m)"
     # Density (1/m): it has no surface, but light is halved over ln 2 / 20 = 3.5 cm (our choice).
     surface_level = 20.0
 
@@ -55,6 +56,7 @@ class OccupancyField(IMapField):
 
     name = "occupancy"
     label = "Occupancy"
+    value_label = "occupancy"
     surface_level = 0.5  # (UNISURF)
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:

@@ -37,10 +37,10 @@ def plot_slice(
 ) -> Figure:
     """A field's values on the horizontal plane `height` metres up.
 
-    A signed distance is blue in free space and red in matter, a density logarithmic. Black is the
-    surface (the field's `surface_level`), dashed green the true one. What no frame has seen is
-    pale: there the field invents. `sequence` are the frames that the map was made of, `room` is the
-    exact scene, if it is a synthetic one.
+    A signed distance is blue in free space and red in matter; a density or an occupancy has a
+    logarithmic scale. Black is the surface (the field's `surface_level`), dashed green the true
+    one. What no frame has seen is pale: there the field invents. `sequence` are the frames that the
+    map was made of, `room` is the exact scene, if it is a synthetic one.
     """
     axes = new_axes(title, 5.4)[0, 0]
     up, page = _draw_from_above(axes, {"camera path": sequence.T_world_camera})
@@ -52,13 +52,16 @@ def plot_slice(
     points = np.tile(height * up, (len(ahead) * len(right), 1))
     points[:, page] = np.stack(np.meshgrid(right, ahead), axis=-1).reshape(-1, 2)
     values, seen = query_field(field, points)[1].reshape(shape), seen_by(points, sequence)
-    norm, colors, label = LogNorm(0.1, 1000.0, clip=True), "YlOrBr", "density (1/m)"
-    if level == 0:
+    if field.is_distance:
         limit = np.clip(np.quantile(np.abs(values), 0.98), 0.2, 1.5)
-        norm, colors, label = Normalize(-limit, limit), "RdBu", "signed distance (m)"
+        norm, colors = Normalize(-limit, limit), "RdBu"
+    else:
+        norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
     grid = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
     image = axes.pcolormesh(right, ahead, values, cmap=colors, norm=norm, **grid)
-    axes.figure.colorbar(image, ax=axes, label=label, extend="both", aspect=25, pad=0.015)
+    axes.figure.colorbar(
+        image, ax=axes, label=field.value_label, extend="both", aspect=25, pad=0.015
+    )
     lines = {"surface": (values - level, 2, "black", "-")}  # below what makes the unseen pale
     if room is not None:
         lines["true surface"] = (room.sdf(points).reshape(shape), 3, "#1a9641", "--")

@@ -103,10 +103,10 @@ def steps_between(T_world_camera: Poses) -> Float[np.ndarray, "2 n"]:
 def tour(room: Room, n_frames: int, seed: int) -> Poses:
     """Camera-to-world poses (OpenCV axes) of a closed walk around a room's free space.
 
-    The walk passes within 1.2 m of every place where a camera has room, by the nearest one that it
-    has not passed, and returns to its start. The camera looks ahead and turns slowly. Its mean
-    speed is the length of the walk over the frames. A seed chooses where the walk begins, and what
-    wanders.
+    The walk passes within `_COVERED` (2 m) of every place where a camera has room, by the nearest
+    one that it has not passed, and returns to its start. The camera looks ahead and turns slowly.
+    Its mean speed is the length of the walk over the frames. A seed chooses where the walk begins,
+    and what wanders.
 
     Raises `NumericalError` where the walk comes nearer than `CLEARANCE` to a surface.
     Source: our choice.

@@ -98,7 +98,7 @@ class IcpTracker(Tracker):
             if not result.num_inliers or not np.isfinite(result.T_target_source).all():
                 return float("nan")
             T_world_camera = result.T_target_source
-        self.T_world_camera = torch.from_numpy(T_world_camera.copy()).float()
+        self.T_world_camera = torch.from_numpy(T_world_camera.copy())
         self.inlier_ratio = result.num_inliers / self.source.size()
         return result.error / result.num_inliers
 

@@ -59,6 +59,7 @@ class AdamTracker(Tracker):
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Take up a frame; of several starts, that with the lowest loss on the same pixels."""
         self._list_pixels(frame)
+        T_starts = T_starts.to(self.device, torch.float32)
         T_start = T_starts[0]
         if len(T_starts) > 1:
             self._draw()

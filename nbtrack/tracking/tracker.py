@@ -112,7 +112,7 @@ class Tracker(abc.ABC):
 
     @abc.abstractmethod
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
-        """Take up a frame; its search starts at the best of some poses."""
+        """Take up a frame; its search starts at the best of some poses (double, on the host)."""
 
     @abc.abstractmethod
     def step(self) -> Scalar | float:
@@ -176,7 +176,7 @@ class Tracker(abc.ABC):
             setattr(self, name, state[name])
 
     def _begin(self, frame: Frame, T_starts: Poses) -> None:
-        self.begin(frame.to(self.device), torch.from_numpy(T_starts).float().to(self.device))
+        self.begin(frame.to(self.device), torch.from_numpy(T_starts))
 
     def _search(self, frame: Frame, T_starts: Poses, budget: Budget) -> Estimate:
         if not self._is_warm and frame.has_depth:
