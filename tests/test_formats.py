@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from recordings import (
     CAMERA,
     N_FRAMES,
@@ -29,7 +30,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError, DataError, MissingError
 from nbtrack.data.formats import FORMATS
 from nbtrack.data.recording import open_recording
-from nbtrack.data.sequence import RgbdSequence, parse_frames, read_sequence
+from nbtrack.data.sequence import RgbdSequence, observed_bounds, parse_frames, read_sequence
 from nbtrack.data.writer import convert_sequence
 
 LOSSY = ("replica", "scannet")  # colour is JPEG
@@ -336,3 +337,74 @@ def test_a_new_format_is_one_entry(plain: Path, monkeypatch: pytest.MonkeyPatch)
     (plain / "color").rename(plain / "rgb")
     check_equal(read_sequence(plain), source())
     assert open_recording(plain).declared.format == "own"
+
+
+def test_what_a_camera_file_says_counts(plain: Path) -> None:
+    """Catches a lens, or the unit of depth, that a camera file gives under another name and that is
+    ignored in silence; what is not used is named; and a file of one's own is stronger."""
+    path, as_written = plain / "intrinsics.json", read_sequence(plain)
+    words = json.loads(path.read_text())
+    lenses = {"distortion": [-0.28, 0.08, 0, 0]}, {"k1": -0.28, "k2": 0.08, "p1": 0.0, "p2": 0.0}
+    lenses += ({"coeffs": [-0.28, 0.08, 0, 0, 0]},)
+    seen = []
+    for lens in lenses:
+        path.write_text(json.dumps({**words, **lens}))
+        seen.append(read_sequence(plain).depths_mm)
+    assert (seen[0] != as_written.depths_mm).any()
+    assert all((depths == seen[0]).all() for depths in seen)
+    for scale in ({"depth_scale": 4000}, {"scale": 4000.0}, {"depth_scale": 0.00025}):
+        path.write_text(json.dumps({**words, **scale, "serial": "17"}))
+        np.testing.assert_allclose(read_sequence(plain).depths_mm, as_written.depths_mm / 4, atol=1)
+    assert "not used of intrinsics.json: serial" in open_recording(plain).notes
+    (plain / "sequence.toml").write_text("depth_scale = 2000")
+    np.testing.assert_allclose(read_sequence(plain).depths_mm, as_written.depths_mm / 2, atol=1)
+    path.write_text(json.dumps({**words, "fy": -words["fy"]}))
+    with pytest.raises(DataError, match="as ICL-NUIM does"):
+        open_recording(plain)
+
+
+def test_images_as_cameras_write_them(plain: Path) -> None:
+    """Catches colours that a viewer's mark turns against their depth, a JPEG that is called damaged
+    for what a camera has appended, and saturated depth that is taken for a wall 65 m away."""
+    before = read_sequence(plain)
+    for path in sorted((plain / "color").iterdir()):
+        mark = Image.Exif()
+        mark[0x0112] = 3  # "turn by 180 degrees"
+        jpeg = path.with_suffix(".jpg")
+        Image.open(path).save(jpeg, exif=mark, quality=100, subsampling=0)
+        jpeg.write_bytes(jpeg.read_bytes() + bytes(4096))
+        path.unlink()
+    after = read_sequence(plain)
+    assert np.abs(after.colors.astype(int) - before.colors).mean() < 3
+    whole = jpeg.read_bytes()
+    jpeg.write_bytes(whole[: len(whole) // 2 - 2048])
+    with pytest.raises(DataError, match="damaged"):
+        read_sequence(plain)
+    jpeg.write_bytes(whole)
+    for path in (plain / "depth").iterdir():
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        depth[:9] = 65535
+        cv2.imwrite(str(path), depth)
+    after = read_sequence(plain)
+    assert (after.depths_mm[:, :9] == 0).all()
+    assert (after.depths_mm[:, 9:] == before.depths_mm[:, 9:]).all()
+    size = np.subtract(observed_bounds(after).maximum, observed_bounds(after).minimum)
+    assert size.max() < 8
+
+
+@pytest.mark.parametrize("lost", ["0 0 0 0 0 0 0", "1.5 1 2 0 0 0 0", "nan 1 2 0 0 0 1"])
+def test_a_lost_frame_among_poses(plain: Path, lost: str) -> None:
+    """Catches a whole file that is refused for one frame that a tool has lost."""
+    path = plain / "trajectory.txt"
+    lines = path.read_text().splitlines()
+    lines[2] = f"{lines[2].split()[0]} {lost}"
+    path.write_text("\n".join(lines))
+    assert np.flatnonzero(~open_recording(plain).has_pose).tolist() == [2]
+
+
+def test_decimal_commas_are_named(plain: Path) -> None:
+    """Catches numbers with decimal commas that are read as twice as many."""
+    path = plain / "trajectory.txt"
+    path.write_text(path.read_text().replace(".", ","))
+    with pytest.raises(DataError, match="write decimal points, not commas"):
+        open_recording(plain)

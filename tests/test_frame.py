@@ -9,14 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from box_room import BoxRoom, narrow_room, walk
+from box_room import BoxRoom, box_sequence, narrow_room, walk
 
+from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.tracking import LmSettings, StepBudget, make_tracker
 
 SETTINGS = LmSettings(n_restarts=2)
+CAMERA_OF_BUFFERS = Intrinsics.from_focal(16, 12, 14.0)
 Images = tuple[np.ndarray, np.ndarray]
 
 
@@ -147,3 +149,37 @@ def test_images_and_poses_that_are_none() -> None:
     for kind, line in zip(("NoneType", "list", "Tensor"), images, strict=True):
         assert f"depth is of type {kind}: give a numpy array, uint16" in line, found
     assert pose == "T_world_camera is no rigid transform: give 4 x 4 finite numbers"
+
+
+def test_memory_may_be_used_again() -> None:
+    """Catches frames that change with a driver's buffer, a sequence that changes with a frame that
+    it handed out, and a tracker whose memory a user changes."""
+    camera, color = CAMERA_OF_BUFFERS, np.full((12, 16, 3), 7, np.uint8)
+    depth = np.full((12, 16), 1500, np.uint16)
+    frame = Frame.of_images(camera, color, depth)
+    color[:], depth[:] = 0, 0
+    assert (frame.color == 7).all()
+    assert (frame.depth_mm == 1500).all()
+    sequence = box_sequence([[0.0, 0.0, 0.0]] * 2)
+    given = sequence[0]
+    before = sequence.colors.copy()
+    given.color[:], given.T_world_camera[:] = 0, 0
+    assert (sequence.colors == before).all()
+    assert np.isfinite(sequence.T_world_camera).all()
+    assert (sequence.T_world_camera[0] == np.eye(4)).all()
+    tracker = make_tracker("sdf", BoxRoom(), np.eye(4), StepBudget(1))
+    tracker.track(sequence[1]).T_world_camera[:] = np.nan
+    assert np.isfinite(tracker.track(sequence[1]).T_world_camera).all()
+
+
+def test_masks_and_byte_orders() -> None:
+    """Catches masked depth that is taken for measured, and big-endian millimetres for metres."""
+    color, depth = np.zeros((12, 16, 3), np.uint8), np.full((12, 16), 1500, np.uint16)
+    swapped = Frame.of_images(CAMERA_OF_BUFFERS, color, depth.astype(">u2"))
+    assert (swapped.depth_mm == 1500).all()
+    masked = np.ma.masked_array(depth, np.arange(192).reshape(12, 16) < 16)
+    frame = Frame.of_images(CAMERA_OF_BUFFERS, color, masked)
+    assert (frame.depth_mm[0] == 0).all()
+    assert (frame.depth_mm[1:] == 1500).all()
+    with pytest.raises(DataError, match="masked"):
+        Frame.of_images(CAMERA_OF_BUFFERS, np.ma.masked_equal(color, 0), depth)

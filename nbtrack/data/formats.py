@@ -197,6 +197,12 @@ def declaration(folder: Path, format: str | None = None) -> Declaration:
     return replace(_declared(path, usual), format=format)
 
 
+def is_declared(folder: Path, key: str) -> bool:
+    """Whether the folder's own file declares something."""
+    path = folder / DECLARATION_FILE
+    return path.is_file() and key in read_object(path)
+
+
 def _told_by_files(folder: Path) -> str:
     """The format with the largest share of what it needs."""
     shares = _shares(folder)

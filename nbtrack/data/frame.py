@@ -28,25 +28,29 @@ class Frame:
 
     @classmethod
     def of_images(cls, camera: Intrinsics, color: np.ndarray, depth: np.ndarray) -> "Frame":
-        """A camera's images. Raises DataError if one has another size, type or unit.
+        """A camera's images, copied: the memory may be used again for the next ones.
+
+        Raises DataError if one has another size, type or unit.
 
         Args:
             color: RGB, (height, width, 3), uint8.
             depth: z-depth along the optical axis, (height, width): uint16 in millimetres, or
                 floating point in metres, kept to the millimetre. 0, NaN, infinite and negative ones
-                are none.
+                are none, and so are masked ones.
         """
         size, metres = (camera.height, camera.width), "uint16 in mm, or floating point in metres"
         _check("color", color, (*size, 3), np.uint8, asked="uint8")
         _check("depth", depth, size, np.uint16, np.floating, asked=metres)
-        if depth.dtype != np.uint16:
+        if np.ma.is_masked(color):
+            raise DataError("color has masked pixels: fill them; only depth may lack some")
+        color, depth = np.ma.getdata(color), np.ma.filled(depth, 0)
+        if depth.dtype.type != np.uint16:  # of any byte order
             depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float64)
             if depth.any() and (median := np.median(depth[depth > 0])) > _MAX_METRES:
                 raise DataError(f"depth is {median:.4g} m in the median: give {metres}")
             depth = (depth / MILLIMETRE).round()
             depth = np.where(depth > _MAX_MILLIMETRES, 0, depth)
-        # Read-only memory is copied: torch does not take it.
-        color = torch.from_numpy(np.require(color, requirements="CW"))
+        color = torch.from_numpy(np.array(color, order="C"))
         return cls(camera, color, torch.from_numpy(depth.astype(np.int32)))
 
     @property

@@ -15,7 +15,9 @@ from nbtrack.core.progress import ProgressBar
 from nbtrack.data.recording import Recording
 from nbtrack.data.text_files import camera_matrix
 
-_FARTHEST_MM = 65535  # what 16 bits hold
+_FARTHEST_MM = _SATURATED = 65535  # what 16 bits hold; a camera's "farther than I can say"
+# Pixels as they are stored: depth images know no orientation that a viewer should turn them by.
+_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def decode(
@@ -28,7 +30,7 @@ def decode(
     files = [(recording.color_files[i], recording.depth_files[i]) for i in frame_ids]
     resize = recording.format.resize_color
     first = files[0][1 if resize else 0]  # the size is its
-    height, width = _read_image(first, cv2.IMREAD_COLOR).shape[:2]
+    height, width = _read_image(first, _AS_STORED).shape[:2]
     camera = recording.calibration.for_size(width, height, first)
     maps = _undistortion(camera, recording.calibration.distortion)
     colors = np.empty((len(files), height, width, 3), np.uint8)
@@ -36,7 +38,7 @@ def decode(
 
     def read(index: int) -> None:
         color_file, depth_file = files[index]
-        color = _read_image(color_file, cv2.IMREAD_COLOR)
+        color = _read_image(color_file, _AS_STORED)
         depth = _read_image(depth_file, cv2.IMREAD_UNCHANGED)
         if resize:
             color = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
@@ -46,7 +48,7 @@ def decode(
             color = cv2.remap(color, *maps, cv2.INTER_LINEAR)
             # Interpolation would invent points between a table and the wall behind.
             depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
-        depth[depth == recording.declared.no_depth] = 0
+        depth[(depth == recording.declared.no_depth) | (depth == _SATURATED)] = 0
         depths[index] = _in_millimetres(depth, recording, camera, depth_file)
         colors[index] = cv2.cvtColor(color, cv2.COLOR_BGR2RGB)
 
@@ -72,14 +74,17 @@ def _read_image(path: Path, flags: int) -> Shaped[np.ndarray, "height width *cha
 
 
 def _is_complete(content: bytes) -> bool:
-    """A JPEG with its end marker, or a PNG with all chunks, whose checksums agree."""
+    """A JPEG with its end marker, or a PNG with all chunks, whose checksums agree.
+
+    Compressed JPEG data holds neither the marker of its beginning nor that of its end, so that the
+    end of the last picture comes after its beginning, whatever a camera has appended.
+    """
     try:
         with Image.open(io.BytesIO(content)) as image:
             image.verify()  # of a PNG the chunks, of a JPEG nothing
     except (OSError, SyntaxError):
         return False
-    # Some cameras append notes. Compressed JPEG data never holds the marker's two bytes.
-    return image.format == "PNG" or b"\xff\xd9" in content[-1024:]
+    return image.format == "PNG" or content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
 
 
 def _check(path: Path, image: np.ndarray, wanted: np.ndarray, first: Path) -> None:

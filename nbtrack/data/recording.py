@@ -16,7 +16,15 @@ from scipy.spatial import cKDTree
 
 from nbtrack.core.arrays import Frames, Poses, Position
 from nbtrack.core.errors import DataError, MissingError
-from nbtrack.data.formats import FORMATS, Declaration, Format, declaration, files_of, numbers_in
+from nbtrack.data.formats import (
+    FORMATS,
+    Declaration,
+    Format,
+    declaration,
+    files_of,
+    is_declared,
+    numbers_in,
+)
 from nbtrack.data.text_files import Calibration, Times, read_calibration, read_poses, read_rows
 
 _TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
@@ -93,6 +101,10 @@ def open_recording(
     camera, no_poses = _calibration(folder, layout), np.full((len(images[0]), 4, 4), np.nan)
     if not camera.source.is_file():
         notes.append(f"{camera.source.name}, {camera.fx:g} px at 640x480: no {layout.cameras[0]}")
+    if camera.unused:
+        notes.append(f"not used of {camera.source.name}: {', '.join(camera.unused)}")
+    if camera.depth_scale and not is_declared(folder, "depth_scale"):
+        declared = replace(declared, depth_scale=camera.depth_scale)
     name = folder.resolve().name
     recording = Recording(folder, name, layout, declared, *images, camera, notes, no_poses)
     return _with_poses(recording, pose_file)

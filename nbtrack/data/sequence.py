@@ -50,10 +50,11 @@ class RgbdSequence:
         return f"RgbdSequence({self.name!r}, {len(self)} frames of {size})"
 
     def __getitem__(self, index: int) -> Frame:
-        """One frame, with the pose that it was recorded with."""
-        color = torch.from_numpy(self.colors[index])
+        """One frame, copied, with the pose that it was recorded with."""
+        color = torch.from_numpy(self.colors[index].copy())
         depth_mm = torch.from_numpy(self.depths_mm[index].astype(np.int32))
-        name, pose = f"frame {self.frame_ids[index]} of {self.name}", self.T_world_camera[index]
+        name = f"frame {self.frame_ids[index]} of {self.name}"
+        pose = self.T_world_camera[index].copy()
         known = pose if np.isfinite(pose).all() else None
         return Frame(self.intrinsics, color, depth_mm, known, name)
 

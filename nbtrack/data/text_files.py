@@ -30,6 +30,11 @@ _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length
 _FARTHEST = 1e7  # m from the origin: beyond map coordinates, within what floats can square
 _RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 _LARGEST = 1e6  # pixels: no image is so wide
+_LENS = ("k1", "k2", "p1", "p2", "k3")  # in OpenCV's order
+_CAMERA_KEYS = {
+    "fx", "fy", "cx", "cy", "width", "height", "intrinsic_matrix", "distortion", "coeffs",
+    "depth_scale", "scale", *_LENS,
+}  # fmt: skip
 _MIN_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 
 
@@ -63,15 +68,25 @@ def read_rows(
         except ValueError:
             row = ()
         if len(row) not in (columns if not rows else (len(rows[0]),)):
-            raise DataError(f"{path} line {number} is {line[:60]!r}: every line holds {meaning}")
+            advice = "; write decimal points, not commas" * _has_decimal_commas(line)
+            found = f"{path} line {number} is {line[:60]!r}"
+            raise DataError(f"{found}: every line holds {meaning}{advice}")
         rows.append(row)
     if not rows:
         raise DataError(f"{path} is empty: every line holds {meaning}; write it anew")
     return rows
 
 
+def _has_decimal_commas(line: str) -> bool:
+    """Whether its words are numbers with a comma in place of the point."""
+    words = line.split()
+    return len(words) > 1 and any(re.fullmatch(r"[-+]?\d+,\d+(e[-+]?\d+)?", w) for w in words)
+
+
 def _numbers(line: str) -> list[float]:
     """Separated by blanks or commas; NaN and infinity are kept."""
+    if _has_decimal_commas(line):
+        raise ValueError
     return [float(word) for word in line.replace(",", " ").split()]
 
 
@@ -95,8 +110,12 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
 
 
 def _from_quaternions(numbers: np.ndarray, order: str, path: Path) -> Poses:
-    """Poses of rows with a position and a quaternion; NaN for a position if a number is none."""
+    """Poses of rows with a position and a quaternion.
+
+    NaN for a frame if a number is none, or its quaternion is zero, as tools write a lost frame.
+    """
     is_known = np.isfinite(numbers).all(axis=1, keepdims=True)
+    is_known &= (numbers[:, 3:] != 0).any(axis=1, keepdims=True)
     numbers = np.where(is_known, numbers, 3 * [np.nan] + 4 * [0.5])
     # Clipped, so that absurd numbers are refused below and overflow nothing here.
     norms = np.linalg.norm(numbers[:, 3:].clip(-1e6, 1e6), axis=1)
@@ -112,11 +131,12 @@ def _from_quaternions(numbers: np.ndarray, order: str, path: Path) -> Poses:
 
 
 def checked_poses(poses: Poses, path: Path) -> Poses:
-    """The poses, all NaN where one number is not finite: those frames have no pose.
+    """The poses, all NaN where a number is not finite or all are 0: those frames have no pose.
 
     Raises DataError if a pose is no rigid transform, or absurdly far from the origin.
     """
     is_known = np.isfinite(poses).all(axis=(1, 2))[:, None, None]
+    is_known &= (poses[:, :3] != 0).any(axis=(1, 2))[:, None, None]  # of zeros: a lost frame
     # Clipped, so that absurd numbers are refused and overflow nothing.
     T = np.where(is_known, poses, np.eye(4)).clip(-1e8, 1e8)
     R, bottom, far = T[:, :3, :3], T[:, 3] - [0, 0, 0, 1], np.abs(T[:, :3, 3]) > _FARTHEST
@@ -143,6 +163,8 @@ class Calibration:
     principal_point: tuple[float, float] | None = None  # None: the middle of the image
     size: tuple[int, int] | None = None  # width, height that the numbers hold for; None: any
     distortion: tuple[float, ...] = ()  # OpenCV's coefficients k1 k2 p1 p2 k3 ...; empty: none
+    depth_scale: float | None = None  # depth values a metre, where the file says it
+    unused: tuple[str, ...] = ()  # what else the file says
 
     def for_size(self, width: int, height: int, image: Path) -> Intrinsics:
         """The camera of images of a size: scaled where the calibration is for another one.
@@ -165,15 +187,22 @@ def read_calibration(path: Path) -> Calibration:
 
     Text holds `fx fy cx cy` in a line, OpenCV's 3x3 camera matrix, that within a 4x4 matrix, or
     one focal length. JSON holds an object with fx, fy, cx, cy or Open3D's `intrinsic_matrix` (nine
-    numbers column by column) and, if known, width and height (or w and h) and `distortion`; it may
-    be the value of `camera`, as in Replica's files. Raises DataError if something is missing, no
-    number, or impossible.
+    numbers column by column) and, if known, width and height (or w and h), a lens as `distortion`,
+    `coeffs` or k1, k2, p1, p2, k3, and `depth_scale` or `scale`: depth values a metre, or, below 1,
+    metres a value. It may be the value of `camera`, as in Replica's files. Raises DataError if
+    something is missing, no number, or impossible.
     """
     K, others = _from_json(path) if path.suffix.lower() == ".json" else _from_text(path)
     fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     is_matrix = np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6)
     # NaN fails both: numpy's minimum keeps it, unlike Python's.
     is_camera = np.min([fx, fy]) >= _MIN_FOCAL and np.abs([fx, fy, cx, cy]).max() < _LARGEST
+    if fx >= _MIN_FOCAL and -_LARGEST < fy <= -_MIN_FOCAL:
+        raise DataError(
+            f"{path} gives fy = {fy:g}, as ICL-NUIM does, whose camera has its y axis up: write "
+            f'{-fy:g} and, where the poses are of that camera, camera_axes = "right up forward" in '
+            "sequence.toml"
+        )
     if not (is_matrix and is_camera):
         raise DataError(
             f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
@@ -215,9 +244,16 @@ def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
             raise DataError(f"{text} {' or '.join(map(str, counts))} finite number(s)")
         return [float(value) for value in values]
 
-    others: dict[str, Any] = {}
-    if "distortion" in camera:
-        others["distortion"] = tuple(numbers("distortion", 0, 4, 5, 8))
+    others: dict[str, Any] = {"unused": tuple(sorted(camera.keys() - _CAMERA_KEYS))}
+    if lens := camera.keys() & _LENS:
+        others["distortion"] = tuple(numbers(key, 1)[0] if key in lens else 0.0 for key in _LENS)
+    for key in camera.keys() & {"distortion", "coeffs"}:
+        others["distortion"] = tuple(numbers(key, 0, 4, 5, 8))
+    for key in camera.keys() & {"depth_scale", "scale"}:
+        (value,) = numbers(key, 1)
+        if value <= 0:
+            raise DataError(f"{path}: {key} is {value:g}: write how many depth values make a metre")
+        others["depth_scale"] = value if value >= 1 else 1 / value
     if camera.keys() & {"width", "height"}:
         width, height = *numbers("width", 1), *numbers("height", 1)
         if not (width % 1 == height % 1 == 0 and min(width, height) > 0):

@@ -134,7 +134,7 @@ class Tracker(abc.ABC):
         if self.copes_without_depth or frame.has_depth:
             with suitable_threads(self._width):
                 estimate = self._search(frame, T_starts, budget or self.budget)
-        self.estimates.append(estimate.T_world_camera)
+        self.estimates.append(estimate.T_world_camera.copy())  # the other one is the user's
         return estimate
 
     def restart(self, T_world_camera: Pose) -> None:
@@ -197,7 +197,7 @@ class Tracker(abc.ABC):
                 break
         synchronize(self.device)
         seconds = time.perf_counter() - began
-        pose = self.T_world_camera.detach().cpu().double().numpy()
+        pose = self.T_world_camera.detach().cpu().double().numpy().copy()
         if not np.isfinite(pose).all():
             advice = "lower the learning rates or map for longer"
             raise NumericalError(f"the pose of {frame.name} is not finite any more: {advice}")
