@@ -2,6 +2,7 @@
 a user's is overwritten, mixed or confused."""
 
 import json
+import os
 import shlex
 import shutil
 from dataclasses import replace
@@ -181,14 +182,24 @@ def test_a_folder_comes_before_a_room_of_its_name(
     assert open_scene("office", preset).made_by
 
 
-def test_an_image_mended_in_place_counts(tmp_path: Path) -> None:
-    """Catches a map made of images that are no longer there: same name, same size, other pixels."""
+@pytest.mark.parametrize("kind", ["color", "depth"])
+def test_an_image_mended_in_place_counts(tmp_path: Path, kind: str) -> None:
+    """Catches a map made of images that are no longer there: same name, size and time of change,
+    another pixel, as `rsync -t` leaves it; and a recording that is another one after a copy."""
     write_recording("plain", tmp_path / "rec")
-    before, image = Scene("rec", tmp_path / "rec").fingerprint, tmp_path / "rec/depth"
-    image = sorted(image.iterdir())[0]
-    content = image.read_bytes()
-    image.write_bytes(content[:-1] + content[-1:])
+    image = sorted((tmp_path / "rec" / kind).iterdir())[0]
+    pixels, uncompressed = cv2.imread(str(image), cv2.IMREAD_UNCHANGED), [16, 0]
+    cv2.imwrite(str(image), pixels, uncompressed)
+    before, status = Scene("rec", tmp_path / "rec").fingerprint, image.stat()
+    pixels[3, 4] += 1
+    cv2.imwrite(str(image), pixels, uncompressed)
+    os.utime(image, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert image.stat().st_size == status.st_size
     assert Scene("rec", tmp_path / "rec").fingerprint != before
+    pixels[3, 4] -= 1
+    cv2.imwrite(str(image), pixels, uncompressed)
+    shutil.copytree(tmp_path / "rec", tmp_path / "copy")
+    assert Scene("rec", tmp_path / "copy").fingerprint == before
 
 
 def test_a_room_is_made_anew_where_its_maker_changes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,12 @@ from pathlib import Path
 import pytest
 
 from nbtrack.core import files
+from nbtrack.core.settings import with_settings
+from nbtrack.experiments import jobs
+from nbtrack.experiments.jobs import MapJob, TrackJob
+from nbtrack.experiments.presets import Preset, load_preset
+from nbtrack.experiments.scenes import Scene
+from nbtrack.synthetic import make_room
 
 
 @pytest.fixture
@@ -52,7 +58,40 @@ def test_what_else_counts() -> None:
     results that do not tell the torch they were made with."""
     assert files.foreign_source(files.DataError) == ""
     assert "speed" in files.foreign_source(Mine)
-    assert set(files.versions()) == {"nbtrack", "torch", "python"}
+    assert {"nbtrack", "torch", "python", "numba", "scipy"} <= set(files.versions())
+
+
+def test_numbers_count_by_their_value() -> None:
+    """Catches results that are made twice because a step count was written 30 and 30.0."""
+    assert files.fingerprint(30, {"a": [1]}) == files.fingerprint(30.0, {"a": [1.0]})
+    assert files.fingerprint(30) != files.fingerprint(31)
+
+
+def test_keys_hold_all_that_makes_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches keys that miss what chooses the seed of a field, gives settings to a tracker or
+    judges a run, and versions; and points fused anew because a network has another width."""
+    scene = Scene("office", make_room("office", tmp_path / "office", 2, 16, 12))
+    preset = load_preset("smoke")
+
+    def keys(preset: Preset = preset) -> tuple[str, str, str]:
+        made = MapJob(scene, "neus", preset)
+        points = MapJob(scene, "points", preset)
+        return made.key, TrackJob(made, scene, "sdf", 2).key, points.key
+
+    before = keys()
+    assert keys() == before
+    assert keys(with_settings(preset, "network.neus.width=7"))[2] == before[2]
+    changed = {"make_field": 0, "make_tracker": 1, "_scores": 1}
+    for name, place in changed.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(jobs, name, _other)
+            assert keys()[place] != before[place], name
+    monkeypatch.setattr(files, "versions", lambda: {"torch": "another"})
+    assert all(a != b for a, b in zip(keys(), before, strict=True))
+
+
+def _other() -> None:
+    """Stands for a function that was edited."""
 
 
 class Mine:

@@ -9,6 +9,9 @@ import contextlib
 import dataclasses
 import dis
 import hashlib
+import importlib.metadata
+import importlib.util
+import inspect
 import io
 import json
 import os
@@ -16,9 +19,10 @@ import pickle
 import platform
 import re
 import struct
+import textwrap
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from types import CodeType, FunctionType
@@ -44,6 +48,7 @@ _MADE_BY_CONTENT = (
     pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile, SafetensorError,
 )  # fmt: skip
 _DIGEST_BYTES = hashlib.sha256().digest_size
+_PACKAGES = ("numpy", "scipy", "numba", "small_gicp")  # that compute results beside torch
 _LIBRARIES = ("nbtrack", "torch", "abc", "typing", "builtins")  # what own classes are built on
 
 
@@ -69,9 +74,13 @@ def tables_folder() -> Path:
 
 
 def fingerprint(*parts: Any) -> str:
-    """Twelve hexadecimal digits that change with any of the parts (plain values or configs)."""
-    plain = [as_dict(p) if dataclasses.is_dataclass(p) else p for p in parts]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
+    """Twelve hexadecimal digits that change with any of the parts (plain values or configs).
+
+    Numbers count by their value: 30 is 30.0.
+    """
+    plain = json.dumps([as_dict(p) if dataclasses.is_dataclass(p) else p for p in parts])
+    plain = json.dumps(json.loads(plain, parse_int=float), sort_keys=True)
+    return hashlib.sha256(plain.encode()).hexdigest()[:12]
 
 
 @cache
@@ -98,16 +107,20 @@ def sources_fingerprint(*modules: str) -> str:
     return fingerprint(modules_read)
 
 
-def code_fingerprint(*parts: type | str) -> str:
-    """Twelve hexadecimal digits that change with the code of classes and of the package's modules.
+def code_fingerprint(*parts: type | str | Callable) -> str:
+    """Twelve hexadecimal digits that change with the code of classes, modules and functions.
 
-    Classes count with their base classes, whether they stand in this package or outside.
+    Classes count with their base classes, whether they stand in this package or outside; modules of
+    the package with all that they import; functions alone, which serves those that choose among
+    classes: a cached result does not depend on those that were not chosen.
     """
+    functions = [part for part in parts if isinstance(part, FunctionType)]
+    texts = [_code(ast.parse(textwrap.dedent(inspect.getsource(f)))) for f in functions]
     kinds = [part for part in parts if isinstance(part, type)]
     names = [part for part in parts if isinstance(part, str)]
     names += [base.__module__ for kind in kinds for base in kind.__mro__]
     own = (name.removeprefix("nbtrack.") for name in names if name.startswith("nbtrack."))
-    return fingerprint(sources_fingerprint(*own), *map(foreign_source, kinds))
+    return fingerprint(sources_fingerprint(*own), *map(foreign_source, kinds), *texts)
 
 
 def foreign_source(kind: type) -> str:
@@ -153,9 +166,11 @@ def _code(tree: ast.Module) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions that a result depends on, to be kept beside it."""
-    of_packages = {module.__name__: module.__version__ for module in (nbtrack, torch)}
-    return of_packages | {"python": platform.python_version()}
+    """Versions that a result depends on, to be kept beside it and in its key."""
+    there = [name for name in _PACKAGES if importlib.util.find_spec(name)]
+    of_packages = {name: importlib.metadata.version(name) for name in there}
+    own = {"nbtrack": nbtrack.__version__, "python": platform.python_version()}
+    return {**own, "torch": str(torch.__version__), **of_packages}
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:

@@ -27,6 +27,7 @@ from nbtrack.data.formats import (
 )
 from nbtrack.data.text_files import Calibration, Times, read_calibration, read_poses, read_rows
 
+_END_OF_PNG = 64  # bytes: the checksum of all pixels, and the marker of the end
 _TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 _ALONE = 1000.0  # m from the middle, and so many times as far as nine in ten: no camera went there
@@ -71,16 +72,26 @@ class Recording:
         center = np.median(self.T_world_camera[self.has_pose, :3, 3], axis=0)
         return np.round(center) if np.abs(center).max() > _FAR_FROM_ZERO else np.zeros(3)
 
-    def contents(self) -> tuple[list[tuple[str, str, int, int]], str, Declaration]:
-        """What changes when a recording does: of every image its name, size and time of change
-        (ns), a digest of times, poses and camera, and the declaration."""
-        images = []
-        for file in self.color_files + self.depth_files:
-            status = file.stat()
-            images.append((file.parent.name, file.name, status.st_size, status.st_mtime_ns))
+    def contents(self) -> tuple[list[tuple[str, str, str]], str, Declaration]:
+        """What changes when a recording does: of every image its name and a digest, one of times,
+        poses and camera, and the declaration."""
+        files = self.color_files + self.depth_files
+        images = [(file.parent.name, file.name, image_digest(file)) for file in files]
         digest = hashlib.sha256(repr(replace(self.calibration, source=Path())).encode())
         digest.update(self.times.tobytes() + self.file_poses.tobytes())
         return images, digest.hexdigest(), self.declared
+
+
+def image_digest(file: Path) -> str:
+    """A digest of an image file that is cheap for long recordings.
+
+    A PNG ends with checksums of all its pixels, so that its size and its end tell; other files are
+    read whole.
+    """
+    with file.open("rb") as opened:
+        size = opened.seek(0, os.SEEK_END)
+        opened.seek(max(0, size - _END_OF_PNG) if file.suffix.lower() == ".png" else 0)
+        return hashlib.blake2b(opened.read() + str(size).encode(), digest_size=8).hexdigest()
 
 
 def open_recording(

@@ -18,7 +18,7 @@ from nbtrack.core.settings import as_dict, changed_settings, with_settings
 from nbtrack.experiments.output import check_no_recording
 from nbtrack.experiments.presets import PRESETS, Preset
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import field_class
+from nbtrack.fields import LearnedField, field_class, make_field
 from nbtrack.mapping.correct import correct_map
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
@@ -97,10 +97,12 @@ class MapJob(Job):
             given = read_map(self.folder)
             return files.fingerprint(given.key, files.code_fingerprint(type(given.field)), device)
         correction = ["nbtrack.mapping.correct"] if self.needs else []
-        code = field_class(self.field), "nbtrack.mapping.fit", *correction
-        network = self.preset.network_of(self.field)
+        kind = field_class(self.field)
+        code = kind, "nbtrack.mapping.fit", make_field, type(self).compute, *correction
+        network = self.preset.network_of(self.field) if issubclass(kind, LearnedField) else None
         parts = self.scene.fingerprint, self.field, network, self.settings, self.frames, self.seed
-        return files.fingerprint(files.code_fingerprint(*code), device, *parts)
+        how = files.code_fingerprint(*code), files.versions(), device
+        return files.fingerprint(*how, *parts)
 
     @property
     def settings(self) -> Any:
@@ -194,11 +196,12 @@ class TrackJob(Job):
     def key(self) -> str:
         """Of code, map, tracker, budget, threads, frames and seed; by the clock, of the machine."""
         kinds = tracker_class(self.tracker), field_class(self.needs.field)
-        code = files.code_fingerprint(*kinds, "nbtrack.tracking.trajectories")
+        own = type(self).compute, type(self)._tracked, _scores, make_tracker
+        code = files.code_fingerprint(*kinds, "nbtrack.tracking.trajectories", *own)
         clock = None if self.rate_hz is None else (self.rate_hz, device_name(choose_device()))
         how = self.tracker, self.settings, self.steps, clock, self.n_threads, self.start
         what = self.frames, self.seed, self.scene.fingerprint
-        return files.fingerprint(code, self.needs.key, *how, *what)
+        return files.fingerprint(code, files.versions(), self.needs.key, *how, *what)
 
     @property
     def name(self) -> str:

@@ -13,7 +13,7 @@ import torch
 
 from nbtrack.core.device import advise_on_memory, device_name, suitable_threads
 from nbtrack.core.errors import DataError, NumericalError
-from nbtrack.core.files import loaded_checkpoint, save_checkpoint, versions
+from nbtrack.core.files import code_fingerprint, loaded_checkpoint, save_checkpoint, versions
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import LearnedField, MappingSettings, NetworkSettings, PointMapping, make_field
@@ -106,7 +106,9 @@ class _Fit:
     """All that changes while a field is fitted, and what its batches are drawn from."""
 
     def __init__(self, recipe: dict, settings, field: LearnedField, sequence, mapped) -> None:
-        self.recipe = {**recipe, "device": field.device.type}  # each draws other numbers
+        # Each device draws other numbers, and batches go on only under the code they began with.
+        code = code_fingerprint(type(field), "nbtrack.mapping.fit", make_field)
+        self.recipe = {**recipe, "device": field.device.type, "code": code}
         self.settings, self.field = settings, field
         self.optimizer = torch.optim.Adam(field.parameters(), lr=settings.learning_rate)
         self.generator = torch.Generator(field.device).manual_seed(recipe["seed"])

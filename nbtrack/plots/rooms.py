@@ -52,11 +52,7 @@ def plot_slice(
     points = np.tile(height * up, (len(ahead) * len(right), 1))
     points[:, page] = np.stack(np.meshgrid(right, ahead), axis=-1).reshape(-1, 2)
     values, seen = query_field(field, points)[1].reshape(shape), seen_by(points, sequence)
-    if field.is_distance:
-        limit = np.clip(np.quantile(np.abs(values), 0.98), 0.2, 1.5)
-        norm, colors = Normalize(-limit, limit), "RdBu"
-    else:
-        norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
+    norm, colors = _scale_of(field, values)
     grid = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
     image = axes.pcolormesh(right, ahead, values, cmap=colors, norm=norm, **grid)
     axes.figure.colorbar(
@@ -75,6 +71,14 @@ def plot_slice(
     axes.set_title(f"{field.label} at height {height:.2f} m; pale: never seen")
     axes.figure.legend_below()
     return axes.figure
+
+
+def _scale_of(field: Field, values: np.ndarray) -> tuple[Normalize, str]:
+    """How a field's values are coloured; see `plot_slice`."""
+    if field.is_distance:
+        limit = np.clip(np.quantile(np.abs(values), 0.98), 0.2, 1.5)
+        return Normalize(-limit, limit), "RdBu"
+    return LogNorm(field.surface_level / 200, 50 * field.surface_level, clip=True), "YlOrBr"
 
 
 @styled
