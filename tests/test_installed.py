@@ -1,15 +1,18 @@
 """Installed elsewhere: everything below the current folder, and missing extras in a line."""
 
 import importlib.util
+import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from tiny import TINY
 
 from nbtrack.cli import main
 from nbtrack.core import files
+from nbtrack.tracking import observed
 
 
 @pytest.fixture
@@ -62,3 +65,35 @@ def test_help_is_quick_and_needs_no_torch(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "nbtrack", "track", "--help"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert "--map-from" in done.stdout
+
+
+def test_without_a_place_for_compiled_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches commands that end because numba can write its cache nowhere."""
+    real = observed.njit
+
+    def without_cache(cache: bool = False, **options: object):
+        if cache:
+            raise RuntimeError("cannot cache function 'add': no locator available")
+        return real(**options)
+
+    monkeypatch.setattr(observed, "njit", without_cache)
+    assert observed.compiled(lambda a, b: a + b)(2, 3) == 5
+
+
+SCRIPT = f"""
+from nbtrack import load_preset, open_scenes, track_scenes
+from nbtrack.experiments.grid import Execution
+preset = load_preset(settings={[*TINY, "scenes.names=['office','bedroom']"]!r})
+runs = track_scenes(open_scenes(preset), ["sdf"], preset, [10], execution=Execution(workers=2))
+print(runs["ate_m"].notna().sum(), "runs")
+"""
+
+
+def test_a_script_without_a_guard(tmp_path: Path) -> None:
+    """Catches workers that run the user's script once more, and end in hundreds of lines."""
+    (tmp_path / "script.py").write_text(SCRIPT)
+    environment = {**os.environ, "NBTRACK_RUNS": str(tmp_path / "runs")}
+    command = [sys.executable, "script.py"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.stdout == "2 runs\n", done.stderr
+    assert "Traceback" not in done.stderr

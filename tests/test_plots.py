@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import replace
+from pathlib import Path
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -22,6 +23,7 @@ from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.experiments.output import save_picture
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.plots.movie import view_of
 from nbtrack.plots.rooms import screen_axes
@@ -187,6 +189,16 @@ def test_the_zero_level_lies_on_the_sphere(sequence, field, height, up) -> None:
     along = Formula(lambda points: points @ torch.tensor(up, dtype=torch.float32), CUBE)
     values = plots.plot_slice(along, held(sequence, up), height).axes[0].collections[0].get_array()
     assert values.mean() == pytest.approx(height, abs=1e-4)
+
+
+def test_names_that_are_no_formulas(tmp_path: Path) -> None:
+    """Catches a picture that fails, after all the work, for a dollar sign in a recording's name or
+    a user's wish for TeX, and warnings of letters that a font lacks."""
+    for settings in ({}, {"text.usetex": True}):
+        with matplotlib.rc_context(settings):
+            figure = plots.plot_curves(SWEEP, *SWEEP, "a$^$b 録画: 3 frames")
+            save_picture(figure, tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").stat().st_size > 1000
 
 
 @pytest.mark.parametrize("kind", ["imap", "neus", "occupancy"])

@@ -7,6 +7,7 @@ nothing from a second thread, so scenes and methods share the cores instead.
 import contextlib
 import importlib.util
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -221,7 +222,7 @@ def _on_workers(
     from distributed import wait
     from distributed.scheduler import KilledWorker
 
-    with dask.config.set(_LOCAL), _client(address, workers) as client:
+    with dask.config.set(_LOCAL), _main_kept_back(), _client(address, workers) as client:
         topic, news = f"nbtrack-{os.getpid()}-{time.time_ns()}", []
         client.subscribe_topic(topic, lambda event: news.append(event[1]))
         settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
@@ -270,6 +271,23 @@ def _outcome_there(
 
     with threads(n_threads):
         return job.outcome(needed, report)
+
+
+@contextlib.contextmanager
+def _main_kept_back() -> Iterator[None]:
+    """Start processes that do not run the main script once more, as those of Python do.
+
+    A script without a `__main__` guard would start processes from within them. They need nothing of
+    it: what a script defines travels with the jobs.
+    """
+    main = sys.modules["__main__"]
+    kept = {name: value for name, value in vars(main).items() if name in ("__file__", "__spec__")}
+    main.__dict__.pop("__file__", None)
+    main.__spec__ = None
+    try:
+        yield
+    finally:
+        vars(main).update(kept)
 
 
 def _client(address: str | None, workers: int) -> Any:

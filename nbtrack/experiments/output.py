@@ -13,6 +13,7 @@ from nbtrack.core.errors import ConfigError
 from nbtrack.core.files import write_atomic
 from nbtrack.data.formats import holds_recording
 from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, MESH_FILE
+from nbtrack.plots.style import in_house_style
 from nbtrack.tracking.trajectories import METRICS_FILE
 
 OVERVIEW_FILE = "overview.png"
@@ -44,7 +45,8 @@ def new_file(path: Path) -> Path:
 def save_picture(figure: Figure, path: Path, dpi: float | None = None) -> None:
     """Writes a figure as a PNG that says that nbtrack drew it, and may replace it."""
     content = io.BytesIO()
-    figure.savefig(content, dpi=dpi or "figure", metadata={"Software": _SOFTWARE})
+    with in_house_style():
+        figure.savefig(content, dpi=dpi or "figure", metadata={"Software": _SOFTWARE})
     write_atomic(path, content.getvalue())
 
 

@@ -1,8 +1,10 @@
 """One look for all figures: colours by label, axes, figures without global state."""
 
+import contextlib
 import io
 import textwrap
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
 from itertools import cycle, product
 
 import matplotlib.style
@@ -24,8 +26,21 @@ _FIXED = {
 WIDTH = 9.0  # inches of every figure: a notebook's text width
 DASHED = {"color": "0.3", "linestyle": "--", "linewidth": 1}
 DOTTED = {"color": "0.3", "linestyle": ":", "linewidth": 1.5}
-styled = matplotlib.style.context("nbtrack.plots.house")
-"""Decorator: draw in the house style and leave matplotlib's own settings as they were."""
+
+
+@contextlib.contextmanager
+def in_house_style() -> Iterator[None]:
+    """Draw in the house style and leave matplotlib's own settings as they were.
+
+    Letters that the font lacks, as in the name of a recording, become boxes without a warning.
+    """
+    with matplotlib.style.context("nbtrack.plots.house"), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing")
+        yield
+
+
+styled = in_house_style()
+"""The same as a decorator."""
 
 
 class NotebookFigure(Figure):
@@ -44,10 +59,13 @@ class NotebookFigure(Figure):
 
 
 def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **share) -> np.ndarray:
-    """A grid of axes in a new figure of a height (inches), with its finding as title."""
+    """A grid of axes in a new figure of a height (inches), with its finding as title.
+
+    A dollar sign of the title, as in the name of a recording, begins no formula.
+    """
     figure = NotebookFigure(figsize=(WIDTH, height), layout="compressed")
     if title:
-        figure.suptitle(textwrap.fill(title, 100), x=0.01, ha="left")
+        figure.suptitle(textwrap.fill(title, 100).replace("$", r"\$"), x=0.01, ha="left")
     return figure.subplots(rows, columns, squeeze=False, **share)
 
 

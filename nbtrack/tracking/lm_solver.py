@@ -42,12 +42,11 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit
 
 from nbtrack.core.arrays import Pose
 from nbtrack.fields.base import intensity_of
 from nbtrack.fields.grid import BakedField
-from nbtrack.tracking.observed import JIT, Observed
+from nbtrack.tracking.observed import Observed, compiled
 
 G_MIN, G_MAX, G_SCALE = 0.3, 2.0, 0.5
 MARGIN = 0.3  # m beyond a field's bounds, where walls lie if the pose is off
@@ -188,7 +187,7 @@ def _median(values: Float[np.ndarray, "n"]) -> float:
 
 
 @no_type_check
-@njit(**JIT)
+@compiled
 def _weigh(terms, normals, T):
     """Reliability by the gradient norm and the angle to normals, and division by the norm."""
     for i in range(terms.shape[1]):
@@ -208,7 +207,7 @@ def _weigh(terms, normals, T):
 
 
 @no_type_check
-@njit(**JIT)
+@compiled
 def _locate(terms, points, T, shape, place):
     """Lever arms, and whether points are usable; their cells, where in them, and 1 / voxel."""
     inverse, numbers = 1 / place[3], np.zeros(len(points), np.int64)
@@ -231,7 +230,7 @@ def _locate(terms, points, T, shape, place):
 
 
 @no_type_check
-@njit(**JIT)
+@compiled
 def residual_terms(observed, T, grid, is_fine):
     """Of every point a column of twelve: r_d, r_i, w, a (3), q_d (3), q_i (3), at a pose.
 
@@ -273,7 +272,7 @@ def scales_of(terms, before, residual_sigma, mad_factor):
 
 
 @no_type_check
-@njit(**JIT)
+@compiled
 def robust_cost(terms, scales, weight):
     """The mean cost of the points; `weight` is that of intensity."""
     total, weight = 0.0, np.float32(weight)
@@ -286,7 +285,7 @@ def robust_cost(terms, scales, weight):
 
 
 @no_type_check
-@njit(**JIT)
+@compiled
 def normal_equations(terms, scales, weight):
     """H (6 x 6) and b (6), in double precision."""
     n_points = terms.shape[1]
@@ -315,7 +314,7 @@ def normal_equations(terms, scales, weight):
 
 
 @no_type_check
-@njit(**JIT)
+@compiled
 def retract(T, twist):
     """The pose after a twist (omega in rad, v in m), by Rodrigues' formula; finite at zero."""
     x, y, z = twist[0], twist[1], twist[2]
@@ -334,7 +333,7 @@ def retract(T, twist):
 
 
 @no_type_check
-@njit(**JIT)
+@compiled
 def damped_step(terms, scales, weight, T_start, T, damping):
     """The twist (6,) that solves the damped normal equations of data and prior."""
     matrix, vector = normal_equations(terms, scales, weight)
@@ -361,7 +360,7 @@ def damped_step(terms, scales, weight, T_start, T, damping):
 
 
 @no_type_check
-@njit(**JIT)
+@compiled
 def _try_step(observed, grid, is_fine, weight, T_start, T, terms, scales, damping):
     """A step: whether it is better, pose and terms after it, cost before, and its length.
 

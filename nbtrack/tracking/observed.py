@@ -1,5 +1,6 @@
 """Points that a frame observed, as LM and ICP take them: evenly spread, and away from edges."""
 
+from collections.abc import Callable
 from typing import no_type_check
 
 import numpy as np
@@ -18,10 +19,18 @@ _EDGE_JUMP, _DRAWN_PER_POINT = 0.05, 4
 _EVEN_STEPS, _MODULUS = (0xC13FA9A9, 0x91E10DA5), 2**32
 _RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
 # Sums may be reordered, so that they fill vector registers; NaN stays NaN.
-JIT = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
+_JIT = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 
 # Points (n x 3, m, camera frame), their intensities, and normals (n x 3) or none (0 x 3).
 Observed = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def compiled(function: Callable) -> Callable:
+    """A function compiled by numba, and kept on disk where numba finds a place to write."""
+    try:
+        return njit(cache=True, **_JIT)(function)
+    except RuntimeError:  # a read-only package, and no home that can be written
+        return njit(**_JIT)(function)
 
 
 def draw_points(frame: Frame, n_points: int, generator: torch.Generator) -> Observed:
@@ -48,7 +57,7 @@ def _pinhole(frame: Frame) -> tuple[float, float, float, float]:
 
 
 @no_type_check
-@njit(**JIT)
+@compiled
 def _drawn_points(depth_mm, color, pinhole, n_points, starts):
     (height, width), (fx, fy, cx, cy), n_drawn = depth_mm.shape, pinhole, 0
     points, luma = np.empty((n_points, 3)), np.empty(n_points)
@@ -73,7 +82,7 @@ def _drawn_points(depth_mm, color, pinhole, n_points, starts):
 
 
 @no_type_check
-@njit(**JIT)
+@compiled
 def _normals(depth_mm, pinhole, points):
     """`PixelSampler.normals_camera` at observed points (m, camera frame)."""
     (height, width), (fx, fy, cx, cy) = depth_mm.shape, pinhole
