@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 from finished import GIVEN
 from recordings import write_recording
+from scipy.spatial.transform import Rotation
 from tiny import tiny_words
 
 import nbtrack
@@ -196,6 +197,16 @@ def test_a_recording_without_poses_is_tracked_in_a_map(
     capsys.readouterr()
     assert main(["track", str(recording), "--map-from", "corrected", "--out", "known"]) == 0
     assert "still_ate_m" in capsys.readouterr().out
+    # A session whose world is its own: refused at its pose, and right where it is found.
+    poses = np.loadtxt(recording / "poses.txt").reshape(-1, 4, 4)
+    own = Rotation.from_euler("y", 2).as_matrix() @ poses[:, :3] + [[0, 0, 0, 1.5]] * 3
+    np.savetxt(recording / "poses.txt", np.insert(own, 3, [0, 0, 0, 1], axis=1).reshape(-1, 4))
+    elsewhere = ["track", str(recording), "--map-from", "corrected", "--out", "elsewhere"]
+    assert main(elsewhere) == 2
+    assert "--start unknown" in capsys.readouterr().err
+    assert main([*elsewhere, "--start", "unknown"]) == 0
+    assert "in another world than the map" in capsys.readouterr().err
+    assert json.loads((work / "elsewhere/metrics.json").read_text())["median_error_m"] < 0.05
     for name in ("poses.txt", "trainval_poses.txt"):
         (recording / name).unlink()
     assert main(["track", str(recording), "--map-from", "corrected", "--out", "found"]) == 0

@@ -11,6 +11,7 @@ from nbtrack.core.errors import DataError
 from nbtrack.core.files import json_text, write_atomic
 from nbtrack.tracking.metrics import (
     align_rigidly,
+    other_world,
     pose_errors,
     score_detection,
     still_metrics,
@@ -91,6 +92,22 @@ def test_aligned_error_ignores_rigid_motion_alone() -> None:
     doubled = align_rigidly(2 * points, points)
     np.testing.assert_allclose(doubled, 2 * points - points.mean(axis=0), atol=1e-12)
     assert np.abs(align_rigidly(points * [1, 1, -1], points) - points).max() > 0.1
+
+
+def test_another_world_is_told_from_errors() -> None:
+    """Catches a recording in a world of its own whose frames all count as wrong; and errors that
+    are explained away: of a camera that drifts, or of one that is right."""
+    true, moved = wandering(40), wandering(1, seed=3)[0]
+    noise = np.random.default_rng(5).normal(scale=0.01, size=(40, 3))
+    estimated = moved @ true
+    estimated[:, :3, 3] += noise
+    estimated[7] = wandering(1, seed=9)[0]  # one lost frame does not change the world
+    np.testing.assert_allclose(other_world(estimated, true), moved, atol=0.02)
+    drifting = true.copy()
+    drifting[:, 0, 3] += np.linspace(0, 3, 40)
+    assert other_world(drifting, true) is None
+    assert other_world(true, true) is None
+    assert other_world(estimated, np.full_like(true, np.nan)) is None
 
 
 @pytest.mark.parametrize("position", [0, 1])

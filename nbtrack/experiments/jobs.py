@@ -13,8 +13,9 @@ from filelock import FileLock
 
 from nbtrack.core import files
 from nbtrack.core.device import advise_on_memory, choose_device, device_name, threads
-from nbtrack.core.errors import NbtrackError
+from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.settings import as_dict, changed_settings, with_settings
+from nbtrack.data.frame import Frame
 from nbtrack.experiments.output import check_no_recording
 from nbtrack.experiments.presets import PRESETS, Preset
 from nbtrack.experiments.scenes import Scene
@@ -26,9 +27,13 @@ from nbtrack.mapping.quality import check_belongs, score_map
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
 from nbtrack.tracking.reach import reach_metrics
-from nbtrack.tracking.trajectories import METRICS_FILE, shifted, tum_text
+from nbtrack.tracking.trajectories import METRICS_FILE, in_world_of_map, shifted, tum_text
 
 RUN_FILE = "run.pt"
+_OTHER_WORLD = (
+    "the recording's poses are in another world than the map: they were moved into it by the one "
+    "rigid motion that explains the difference, and errors are those that remain"
+)
 OF_MAPS = ("network.", "mapping.")
 """How keys of settings begin that only matter where a map is made."""
 Report = Callable[[float, str], None]
@@ -236,6 +241,9 @@ class TrackJob(Job):
         n_threads = self.n_threads or torch.get_num_threads()
         with threads(n_threads):
             tracked, notes = self._tracked(report)
+        if notes["map_warning"] == _OTHER_WORLD:
+            tracked, is_explained = in_world_of_map(tracked)
+            notes["map_warning"] = _OTHER_WORLD if is_explained else None
         metrics = _scores(tracked) | self._provenance(n_threads) | notes
         if metrics.get("path_m") and "ate_rmse_m" in metrics:
             metrics["ate_over_path"] = metrics["ate_rmse_m"] / metrics["path_m"]
@@ -269,8 +277,7 @@ class TrackJob(Job):
             notes["map_from"] = finished_map.record
         T_first = sequence.T_world_camera[0]
         is_start_known = self.start == "given" and bool(np.isfinite(T_first).all())
-        if self.needs.is_given and is_start_known:  # another path may begin where no map reaches
-            notes["map_warning"] = check_belongs(finished_map, sequence[0])
+        notes["map_warning"] = self._map_warning(finished_map, sequence[0], is_start_known)
         notes["start"] = "given" if is_start_known else "unknown"
         T_start = T_first if is_start_known else np.eye(4)
         how = T_start, budget, self.settings, self.seed
@@ -286,6 +293,20 @@ class TrackJob(Job):
         reach = self.settings.reach(tracked.frames["steps"].mean(), bounds.metres_per_unit)
         how = sequence.T_world_camera, self.settings.motion_model
         return tracked, notes | reach_metrics(reach, *how)
+
+    def _map_warning(self, finished_map: Map, first: Frame, is_start_known: bool) -> str | None:
+        """What to say of a given map; DataError where it does not fit the pose to start from.
+
+        Where that is not used, and the map does not fit it, the recording has a world of its own.
+        """
+        if not self.needs.is_given or first.T_world_camera is None:
+            return None  # another path of a room may begin where no map reaches
+        try:
+            return check_belongs(finished_map, first)
+        except DataError:
+            if is_start_known:
+                raise
+            return _OTHER_WORLD
 
     def _provenance(self, n_threads: int) -> dict[str, Any]:
         """Where a run comes from: data, map, method, settings, machine; how to make it again."""

@@ -177,6 +177,6 @@ def check_belongs(finished: Map, frame: Frame) -> str | None:
         raise DataError(
             f"at its given pose {frame.name} is off {name} by {misfit_m:.3f} m (usual in this map "
             f"{usual:.3f} m, allowed {allowed:.3f} m): give the room's own map, poses in the map's "
-            "world frame, or begin where it was mapped"
+            "world frame, begin where it was mapped, or let the camera be found: --start unknown"
         )
     return None

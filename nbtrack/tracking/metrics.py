@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from nbtrack.core.arrays import Poses
+from nbtrack.core.arrays import Pose, Poses
 from nbtrack.core.errors import DataError
 
 Errors = Float[np.ndarray, "frames"]
@@ -90,7 +90,13 @@ def pose_errors(T_estimated: Poses, T_true: Poses) -> tuple[Errors, Errors]:
 
 
 def align_rigidly(points: Positions, targets: Positions) -> Positions:
-    """Points (m) after the rotation and translation that bring them closest to their targets.
+    """Points (m) after `rigid_motion` to their targets."""
+    T_target_points = rigid_motion(points, targets)
+    return points @ T_target_points[:3, :3].T + T_target_points[:3, 3]
+
+
+def rigid_motion(points: Positions, targets: Positions) -> Pose:
+    """The rotation and translation (m) that bring points closest to their targets.
 
     Least squares, without scale. Where points lie on a line the best rotation is not unique, but
     the distances that remain are. Source: Horn 1987 and Umeyama 1991, by SVD.
@@ -98,8 +104,34 @@ def align_rigidly(points: Positions, targets: Positions) -> Positions:
     center, target_center = points.mean(axis=0), targets.mean(axis=0)
     u, _, vt = np.linalg.svd((targets - target_center).T @ (points - center))
     # The best orthogonal matrix may be a mirror; flipping the weakest axis makes it a rotation.
+    T_target_points = np.eye(4)
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return (points - center) @ rotation.T + target_center
+    T_target_points[:3, :3] = rotation
+    T_target_points[:3, 3] = target_center - rotation @ center
+    return T_target_points
+
+
+def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
+    """The one rigid motion (m) from true to estimated poses that explains the errors of a run.
+
+    After it those of most frames are below `LOST_THRESHOLD_M` and a tenth of what they were (our
+    choice); None where no motion does that, or too little is known to tell.
+    """
+    is_known = np.isfinite(T_true).all(axis=(1, 2))
+    if is_known.sum() < 3:
+        return None
+    T_estimated, T_true = T_estimated[is_known], T_true[is_known]
+    # From orientations too, which tell it where the camera moves along a line.
+    turns = Rotation.from_matrix(T_estimated[:, :3, :3] @ T_true[:, :3, :3].mT)
+    T_map_world = np.eye(4)
+    is_usual = (turns.mean().inv() * turns).magnitude()
+    is_usual = is_usual <= np.median(is_usual)  # lost frames say nothing of it
+    T_map_world[:3, :3] = turns[is_usual].mean().as_matrix()
+    moved = T_true[:, :3, 3] @ T_map_world[:3, :3].T
+    T_map_world[:3, 3] = np.median(T_estimated[:, :3, 3] - moved, axis=0)
+    before, after = (pose_errors(T_estimated, T)[0] for T in (T_true, T_map_world @ T_true))
+    explained = np.median(after) < min(LOST_THRESHOLD_M, np.median(before) / 10)
+    return T_map_world if explained and np.median(before) > LOST_THRESHOLD_M else None
 
 
 def _root_mean_square(values: Errors) -> float:
