@@ -9,10 +9,10 @@ from typing import Any
 from filelock import FileLock
 
 from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
-from nbtrack.core.files import data_folder, fingerprint, runs_folder
+from nbtrack.core.files import data_folder, fingerprint, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.formats import DATASET_SCENES
-from nbtrack.data.recording import Recording, open_recording
+from nbtrack.data.recording import Recording, image_digest, open_recording
 from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames, select_frames
 from nbtrack.experiments.output import check_no_recording, is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
@@ -116,12 +116,27 @@ def _room(name: str, config: ScenesConfig) -> Scene:
     recipe = f"{config.motion}-{config.n_frames}x{config.width}-seed{config.seed}"
     recipe += f"-{room_version(name)}"
     folder = runs_folder() / "rooms" / f"{name}-{recipe}" / name
-    if not folder.is_dir():
-        check_no_recording(folder)
+    if not _is_whole(folder):
+        check_no_recording(runs_folder())
         # Another command that needs the same room waits, and then reads it.
         with FileLock(folder.with_suffix(".lock")):
             for unfinished in folder.parent.glob(f".{name}.*.unfinished"):  # of a killed attempt
                 shutil.rmtree(unfinished, ignore_errors=True)
-            if not folder.is_dir():
+            if not _is_whole(folder):
+                if folder.exists():
+                    tell(f"{folder} is not as it was made: the room is made anew")
+                    shutil.rmtree(folder)
                 write_room(name, folder, config)
+                write_atomic(folder.with_suffix(".digest"), _digest_of(folder))
     return Scene(name, folder, made_by=f"{name}-{recipe}")
+
+
+def _is_whole(folder: Path) -> bool:
+    """Whether a room of the cache is there, every file of it as it was written."""
+    digest = folder.with_suffix(".digest")
+    return folder.is_dir() and digest.is_file() and digest.read_text() == _digest_of(folder)
+
+
+def _digest_of(folder: Path) -> str:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return fingerprint([(str(path.relative_to(folder)), image_digest(path)) for path in files])
