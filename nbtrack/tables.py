@@ -5,6 +5,7 @@ table. Rows follow the data: a new tracker is a new row and nothing here names a
 """
 
 import copy
+import html
 import re
 from importlib.resources import files
 from pathlib import Path
@@ -190,6 +191,7 @@ def style_table_1(results: pd.DataFrame, caption: str | None = None) -> TableSty
     texts += _texts(table_1(results, "ate_std_m"), " ± {:.3f}")
     styler = TableStyler(texts)
     styler.format_index("{:g} Hz", level="rate_hz")
+    styler.format_index(escape="html", level="method").format_index(escape="html", axis="columns")
     forms = {"<b>{}</b>": best & ~lost, "{} †": lost & ~best, "<b>{} †</b>": best & lost}
     for form, cells in forms.items():
         for column in cells:
@@ -228,7 +230,7 @@ def _labelled(styler: TableStyler, caption: str | None, legend: str) -> TableSty
 
     A page's style sheets go by ids: tables that share one would colour each other.
     """
-    styler.set_caption(f"{caption}; {legend}" if caption else legend)
+    styler.set_caption(html.escape(f"{caption}; {legend}" if caption else legend))
     return styler.set_uuid(fingerprint(styler.set_uuid("table").to_html()))
 
 
@@ -250,11 +252,12 @@ def latex_file(styler: TableStyler, path: Path, note: str) -> str:
             styler.format_index(_LATEX_LABELS.get(level, _escape), axis=axis, level=level)
         styler.hide(axis=axis, names=True)
     styler.set_table_styles([{"selector": s, "props": ":;"} for s in ("smallskip", "scriptsize")])
+    label = f"tab:{kind}-{_label_of(path.resolve().parent.name)}"
     text = styler.to_latex(
         column_format=f"@{{}}l{'c' if has_steps else 'l'}{'r' * len(table.columns)}@{{}}",
         environment="table" if has_steps else "table*", position_float="centering", hrules=True,
         clines="skip-last;data", multirow_align="c", convert_css=True,
-        label=f"tab:{kind}-{path.resolve().parent.name}", caption=f"{caption} {_escape(note)}",
+        label=label, caption=f"{caption} {_escape(note)}",
     )  # fmt: skip
     # Pandas writes clines only, and puts the head of row labels into a line of its own.
     text = re.sub(r"\\cline\{[\d-]+\}\n(?=\\bottomrule)", "", text)
@@ -264,6 +267,11 @@ def latex_file(styler: TableStyler, path: Path, note: str) -> str:
     if has_std and len(table.columns) > _MANY_COLUMNS:  # else they run off the page
         text = text.replace("\\scriptsize\n", "\\scriptsize\n\\setlength{\\tabcolsep}{2.2pt}\n", 1)
     return _PREAMBLE.format(note=note, name=path.stem) + text
+
+
+def _label_of(folder: str) -> str:
+    """A folder's name as part of a label, which holds no special character."""
+    return re.sub(r"[^\w.-]", "_", folder)
 
 
 def _escape(text: object) -> str:

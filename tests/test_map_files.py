@@ -101,12 +101,22 @@ MAP_CONTENT: dict[str, tuple[str, Any, str]] = {
     "empty bounds": ("bounds", [[0.0] * 3, [0.0] * 3], CHANGED),
     "NaN bounds": ("bounds", [[NAN] * 3, [1.0] * 3], CHANGED),
     "infinite bounds": ("bounds", [[0.0] * 3, [INFINITE] * 3], CHANGED),
-    "no camera": ("camera", {}, "TypeError"),
+    "no camera": ("camera", {}, "KeyError"),
     "camera without size": ("camera/width", 0, CHANGED),
     "NaN camera": ("camera/fx", NAN, CHANGED),
     "misfit in words": ("made/misfit_m", "little", CHANGED),
     "no provenance": ("made", {}, "KeyError"),
     "no digest": ("digest", GONE, CHANGED),
+    # With a digest that is right.
+    "no origin": ("made/origin", GONE, "KeyError"),
+    "origin of two": ("made/origin", [0.0, 0.0], "a number of its header"),
+    "origin in words": ("made/origin", ["a", "b", "c"], "a number of its header"),
+    "seconds of NaN": ("made/seconds", NAN, "a number of its header"),
+    "no seconds": ("made/seconds", GONE, "KeyError"),
+    "a scene of control characters": ("made/scene", "a\x1b[2Jb", "can be printed"),
+    "a corner of NaN": ("bounds", [[NAN, 0.0, 0.0], [1.0] * 3], "a number of its header"),
+    "a camera of NaN": ("camera/fx", NAN, "a number of its header"),
+    "weights of NaN": (WEIGHT, lambda w: w * NAN, "is not finite"),
 }
 
 

@@ -295,3 +295,21 @@ def test_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixture) -> N
     assert main(["map", str(folder), "--field", "points", *SET]) == 2
     said = capsys.readouterr().err
     assert "frame 2 lies 1.05e+06 m from the others, which keep within" in said
+
+
+def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
+    """Catches a file of the user's that is overwritten through a link with a name to be guessed."""
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    for name in (f".result.txt.{os.getpid()}.tmp", "result.txt"):
+        (tmp_path / name).symlink_to(victim)
+    files.write_atomic(tmp_path / "result.txt", "new")
+    assert victim.read_text() == "precious"
+    assert (tmp_path / "result.txt").read_text() == "new"
+    assert not (tmp_path / "result.txt").is_symlink()
+
+
+def test_a_motion_names_no_folder(work: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches folders that are made outside of the cache before a wrong name is refused."""
+    command = [*MAP, "--set", "scenes.motion=tour/../../../x"]
+    assert_refused(work, capsys, command, "unknown motion 'tour/../../../x'")

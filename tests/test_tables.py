@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from nbtrack import tables
 from nbtrack.core.errors import DataError
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.tables import (
@@ -356,3 +357,15 @@ def test_tables_compile(tmp_path: Path) -> None:
         output = done.stdout.decode(errors="replace")
         assert done.returncode == 0, output[-2000:]
         assert "Overfull" not in output
+
+
+def test_names_are_text_on_a_page_and_in_latex(tmp_path: Path) -> None:
+    """Catches markup in the name of a recording that a page runs, and a folder's name that ends a
+    label of LaTeX."""
+    cells = [{"rate_hz": 10, "method": "<b>m</b>", "scene": "<script>x</script>", "ate_m": 0.1}]
+    page = tables.style_table_1(pd.DataFrame(cells), caption="<i>caption</i>").to_html()
+    assert not [tag for tag in ("<script>", "<b>m", "<i>") if tag in page]
+    (tmp_path / "a%b").mkdir()
+    paths = tables.write_table_1(tmp_path / "a%b", pd.DataFrame(cells), "a note")
+    (latex,) = [path.read_text() for path in paths if path.suffix == ".tex"]
+    assert r"\label{tab:ate-a_b}" in latex

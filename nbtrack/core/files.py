@@ -18,6 +18,7 @@ import os
 import pickle
 import platform
 import re
+import secrets
 import struct
 import textwrap
 import zipfile
@@ -208,15 +209,16 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
     earlier ones as they were. Whoever is killed between two moves leaves a folder without the last.
     Missing folders are made. Raises OSError, which names the last file, where that is not possible.
     """
-    # The process id keeps two writers of one path from moving each other's half-written file.
-    asides = {folder / name: folder / f".{name}.{os.getpid()}.tmp" for name in contents}
+    # A random name, which must be new: nobody else writes there, or has put a link in its place.
+    asides = {folder / name: folder / f".{name}.{secrets.token_hex(6)}.tmp" for name in contents}
     *_, last = asides
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for aside, content in zip(asides.values(), contents.values(), strict=True):
             # Paths whose letters the system's encoding lacks come as surrogates.
             is_text = isinstance(content, str)
-            aside.write_bytes(content.encode(errors="surrogateescape") if is_text else content)
+            with aside.open("xb") as opened:
+                opened.write(content.encode(errors="surrogateescape") if is_text else content)
         if len(contents) > 1:
             last.unlink(missing_ok=True)
         for path, aside in asides.items():

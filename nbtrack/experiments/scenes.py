@@ -8,7 +8,7 @@ from typing import Any
 
 from filelock import FileLock
 
-from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
+from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up, nearest_name
 from nbtrack.core.files import data_folder, fingerprint, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.formats import DATASET_SCENES
@@ -17,6 +17,7 @@ from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames, selec
 from nbtrack.experiments.output import check_no_recording, is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
+from nbtrack.synthetic.make import MOTIONS
 
 _KNOWN = [*ROOMS, *DATASET_SCENES]
 
@@ -113,6 +114,7 @@ def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
 
 def _room(name: str, config: ScenesConfig) -> Scene:
     """A room of this size, length and seed in the cache, made if it is not there."""
+    look_up("motion", config.motion, MOTIONS)  # told before it names a folder
     recipe = f"{config.motion}-{config.n_frames}x{config.width}-seed{config.seed}"
     recipe += f"-{room_version(name)}"
     folder = runs_folder() / "rooms" / f"{name}-{recipe}" / name

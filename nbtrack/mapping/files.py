@@ -2,8 +2,10 @@
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +100,7 @@ def _read_file(file: Path) -> Map:
     if header.pop("digest", None) != _digest(header, tensors):
         raise ValueError("its content is not what was written")
     name, record = header["field"], header["made"]
+    _check_content(header, tensors)
     corners = (tuple(map(float, corner)) for corner in header["bounds"])
     bounds = SceneBounds(*corners, header.get("declared_unit"))
     if name not in FIELDS:
@@ -112,6 +115,28 @@ def _read_file(file: Path) -> Map:
         if correction:
             mapped = CorrectedField(mapped, float(record["settings"]["correct_voxel"]), correction)
     return Map(mapped, Intrinsics(**header["camera"]), record)
+
+
+def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    """Raises ValueError or KeyError for what a digest of its own makes no better.
+
+    Names may hold what moves a terminal's cursor, and one NaN among weights spreads to every pose.
+    """
+    made, camera = header["made"], header["camera"]
+    numbers = [made["seconds"], made["misfit_m"], made["seed"], made["n_frames"], *made["origin"]]
+    numbers += [*chain(*header["bounds"]), *camera.values()]
+    are_numbers = all(type(n) in (int, float) and math.isfinite(n) for n in numbers)
+    sizes = [camera[name] for name in ("width", "height", "fx", "fy")]
+    if not (are_numbers and len(made["origin"]) == 3 and min(sizes) > 0):
+        raise ValueError("a number of its header is missing, not finite, or none")
+    if not (isinstance(made["scene"], str) and made["scene"].isprintable()):
+        raise ValueError("its scene has no name that can be printed")
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            raise ValueError(f"{name} is not finite")
+    of_points = [tensors[name].shape for name in ("points", "colors") if name in tensors]
+    if len(set(of_points)) > 1:
+        raise ValueError("points and colours are not equally many")
 
 
 def _tensors(mapped: Field) -> dict[str, Tensor]:
