@@ -1,6 +1,7 @@
 """The command line: what commands print and write. What they refuse: `test_faults.py`."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -223,6 +224,10 @@ def test_a_recording_without_poses_is_tracked_in_a_map(
     assert main(["export", "found", "--to", "gif", "found.gif"]) == 0
     assert "12 of 12 frames" in capsys.readouterr().out
     (work / "corrected").rename(work / "moved")
+    shutil.copytree(work / "map", work / "corrected")
+    assert main(["export", "found", "--to", "gif", "again.gif"]) == 2
+    assert "is not the map of this run any more" in capsys.readouterr().err
+    shutil.rmtree(work / "corrected")
     assert main(["export", "found", "--to", "gif", "again.gif"]) == 2
     assert "corrected" in capsys.readouterr().err
     (work / "moved").rename(work / "corrected")

@@ -185,6 +185,16 @@ FILES = {
     "another order": (_write(TRAJECTORY, "0.5 0 0 1 1 2 3 4"), KITTI, "of norm 5.48"),
     "second line": (_write(TRAJECTORY, f"{ROW}\n{ROW[:-2]}"), KITTI, "line 2 is"),
     "a map for a run": (_nothing, ["export", "map", "--to", "tum", "p"], "no finished run in map"),
+    "no frames": (
+        _write("run/frames.csv", ""),
+        ["export", "run", "--to", "tum", "t.txt"],
+        "run/frames.csv is not a readable table of frames",
+    ),
+    "bytes for frames": (
+        _write("run/frames.csv", b"\x00\xff\xfe\n" * 9),
+        ["export", "run", "--to", "tum", "t.txt"],
+        "run/frames.csv is not a readable table of frames",
+    ),
     "a run for a mesh": (_nothing, ["export", "run", "--to", "glb", "m.glb"], "run holds no"),
     "unfinished run": (lambda: Path("run/metrics.json").unlink(), KITTI, "no finished run in run"),
     "mesh cut": (_cut("map/mesh.ply"), MESH, "not a readable mesh"),

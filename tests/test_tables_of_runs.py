@@ -18,7 +18,8 @@ import pytest
 from tiny import TINY, tiny_words
 
 from nbtrack.cli import main
-from nbtrack.core.errors import ConfigError, MissingError, NbtrackError
+from nbtrack.core.errors import ConfigError, DataError, MissingError, NbtrackError
+from nbtrack.core.files import runs_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.bench import default_pixels, measure_steps
 from nbtrack.experiments.grid import Execution, map_scene, map_scenes, read_run, track_scenes
@@ -125,7 +126,7 @@ def test_budgets(preset: Preset, scenes: list[Scene]) -> None:
 
 def test_methods_carry_their_settings(preset: Preset, own_scenes: list[Scene]) -> None:
     """Catches settings of a method that reach neither the run nor the map, or reach both."""
-    more = Method("more pixels", "neus", "sdf", ("tracking.sdf.n_pixels=32",))
+    more = Method("more colour", "neus", "sdf", ("tracking.sdf.lambda_color=0.6",))
     runs = track_scenes(own_scenes[1:], ["sdf", more], preset, [10])
     assert runs["run"].nunique() == 2
     assert len(list(own_scenes[1].folder.parents[2].glob("maps/*/map.safetensors"))) == 1
@@ -205,6 +206,18 @@ def test_a_recording_without_reference(preset: Preset, scenes: list[Scene], tmp_
     assert table_1(results).isna().sum(axis=None) == 2  # of the method, and of standing still
 
 
+def test_a_cached_run_is_checked(preset: Preset, scenes: list[Scene]) -> None:
+    """Catches a table that ends in a traceback, or holds a hole, for a spoilt file of the cache."""
+    (run,) = track_scenes(scenes[:1], ["sdf"], preset, [10])["run"]
+    path = runs_folder() / "tracks" / run / "metrics.json"
+    sound = path.read_text()
+    for spoilt in ("{}", sound.replace('"key": "', '"key": "0')):
+        path.write_text(spoilt)
+        with pytest.raises(DataError, match="is not what this run has written"):
+            track_scenes(scenes[:1], ["sdf"], preset, [10])
+    path.write_text(sound)
+
+
 def test_table_2_of_this_machine(preset: Preset, scenes: list[Scene]) -> None:
     """Catches empty cells: even a slow machine fits a step of 16 points into 20 ms sometimes; and
     rows that stand there twice, where two methods share a tracker."""
@@ -227,10 +240,10 @@ def test_table_2_measures_what_a_method_uses(
 
     monkeypatch.setattr("nbtrack.experiments.bench.make_tracker", seen)
     monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 2000)
-    settings = ("mapping.neus_plus.correct_voxel=0.3", "tracking.lm.n_pixels=8")
+    settings = ("mapping.neus_plus.correct_voxel=0.3", "tracking.lm.n_pixels=64")
     monkeypatch.setitem(METHODS, "corrected", replace(METHODS["corrected"], settings=settings))
     words = tiny_words("scenes.names=office", "tables.rates_hz=[10]", "scenes.track_frames=:2")
-    words += ["--workers", "1", "--out", str(tmp_path)]
+    words += ["--set", "tracking.lm.n_pixels=8", "--workers", "1", "--out", str(tmp_path)]
     assert main(["tables", "--method", "icp,corrected", *words]) == 0
     assert isinstance(fields["icp"], PointCloud)
     assert isinstance(fields["lm"], CorrectedField)
@@ -261,10 +274,12 @@ def test_a_damaged_scene_leaves_the_others(
     preset: Preset, own_scenes: list[Scene], capsys: pytest.CaptureFixture
 ) -> None:
     """Catches one bad folder that stops the whole grid."""
-    (own_scenes[0].folder / "images" / "img2.png").unlink()
-    assert [s.name for s in open_scenes(preset)] == ["office"]
+    broken = own_scenes[0].folder.rename(own_scenes[0].folder.with_name("broken"))
+    (broken / "images" / "img2.png").unlink()
+    names = f"scenes.names=['{broken}', 'office']"
+    assert [s.name for s in open_scenes(with_settings(preset, names))] == ["office"]
     errors = capsys.readouterr().err
-    assert "left out: living_room" in errors
+    assert f"left out: {broken}" in errors
     assert "1 without a partner: depth2.png" in errors
 
 

@@ -242,7 +242,10 @@ def _export_movie(source: Path, format_name: str, out: Path) -> str:
     """Of a run, whose recording and map must still be where they were."""
     tracked = read_trajectory(source)
     metrics, last = tracked.metrics, len(tracked.frames) - 1
-    field = read_map(metrics["map"]).field
+    stored = read_map(metrics["map"])
+    if metrics.get("map_key") != stored.key:
+        raise DataError(f"{metrics['map']} is not the map of this run any more: track again")
+    field = stored.field
     shown = np.unique(np.linspace(0, last, _MOVIE_FRAMES).round().astype(int))
     seen = _seen(tracked, shown, open_recording(metrics["recording"], metrics["format"]))
     surface = extract_mesh(field, seen, voxel=_cell_of(field) / 2)

@@ -228,7 +228,11 @@ class TrackJob(Job):
 
     def result(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""
-        return files.read_json(self.folder / METRICS_FILE)
+        path = self.folder / METRICS_FILE
+        metrics = files.read_json(path)
+        if metrics.get("key") != self.key:
+            raise DataError(f"{path} is not what this run has written: remove {self.folder}")
+        return metrics
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Track, or take a killed run up where its last checkpoint stands; write the files.
@@ -319,9 +323,10 @@ class TrackJob(Job):
             "key": self.key,
             "versions": files.versions(),
             "command": self._command(),
-            "recording": str(self.scene.folder),
+            "recording": str(self.scene.folder.resolve()),
             "format": self.scene.format,
-            "map": str(self.needs.folder),
+            "map": str(self.needs.folder.resolve()),
+            "map_key": self.needs.map().key,
             "config": as_dict(self.needs.preset),
         }
 

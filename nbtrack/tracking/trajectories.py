@@ -113,7 +113,11 @@ def read_trajectory(folder: Path) -> Trajectory:
     if truth.is_file():
         known, poses = read_tum(truth)
         T_true[np.searchsorted(times, known)] = poses
-    frames, metrics = pd.read_csv(folder / "frames.csv"), files.read_json(folder / METRICS_FILE)
+    metrics = files.read_json(folder / METRICS_FILE)
+    with files.naming_damaged(folder / "frames.csv", "table of frames", "track again"):
+        frames = pd.read_csv(folder / "frames.csv")
+        if len(frames) != len(T_estimated):
+            raise ValueError(f"{len(frames)} rows for {len(T_estimated)} poses")
     back = -np.array(metrics.get("origin", [0, 0, 0]))
     return Trajectory(shifted(T_estimated, back), shifted(T_true, back), frames, metrics)
 
