@@ -13,9 +13,10 @@ from nbtrack.experiments.scenes import Scene
 from nbtrack.tracking.reach import reach_metrics
 
 _FRAMES_LOOKED_AT = 20  # that tell a map's unit before there is a map
-# Share of the frames in which the camera may move farther than the search reaches, before a user is
-# told: a hand starts and stops, and the search catches up (our choice).
-_TOLERATED = 0.1
+# A user is told where no search could have a lower error (m), or the camera moves farther than a
+# search reaches in a larger share of the frames: hands start and stop, and the search catches up
+# (our choice).
+_LEAST_ATE, _SHARE = 0.01, 0.5
 
 
 def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
@@ -25,20 +26,25 @@ def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
         kinds.setdefault((run.tracker, run.settings, run.steps), []).append(run)
     for (tracker, settings, steps), alike in kinds.items():
         seen = {run.scene.name: expected_reach(run) for run in alike}
-        short = {n: r for n, r in seen.items() if r.get("beyond_reach_share", 0) > _TOLERATED}
+        short = {name: r for name, r in seen.items() if _is_short(r)}
         if not short:
             continue
         scene, worst = max(short.items(), key=lambda pair: pair[1]["least_ate_m"])
         others = f" (of {len(short)} scenes)" if len(short) > 1 else ""
+        bound = f", and no search can have an ATE below {worst['least_ate_m']:.3f} m there"
         velocity = f"--set tracking.{tracker}.motion_model=constant_velocity, "
         yield (
             f"{steps:g} steps of {tracker} move the camera by at most {1e3 * worst['reach_m']:.1f} "
             f"mm along an axis and {worst['reach_deg']:.2f} deg about it; it moves farther in "
-            f"{worst['beyond_reach_share']:.0%} of the frames of {scene}{others}, and no search "
-            f"can have an ATE below {worst['least_ate_m']:.3f} m there: take more steps, a lower "
-            f"rate, {velocity if settings.motion_model == 'previous_pose' else ''}"
-            "or --method corrected"
+            f"{worst['beyond_reach_share']:.0%} of the frames of {scene}{others}"
+            f"{bound if worst['least_ate_m'] > _LEAST_ATE else ''}: take more steps, a lower rate, "
+            f"{velocity if settings.motion_model == 'previous_pose' else ''}or --method corrected"
         )
+
+
+def _is_short(reach: dict[str, float]) -> bool:
+    least_m, share = reach.get("least_ate_m", 0.0), reach.get("beyond_reach_share", 0.0)
+    return least_m > _LEAST_ATE or share > _SHARE
 
 
 def expected_reach(run: TrackJob) -> dict[str, float]:

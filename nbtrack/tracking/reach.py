@@ -19,24 +19,24 @@ from nbtrack.tracking.starts import expected_poses
 
 
 @dataclass(frozen=True)
+class Motion:
+    """What is left for the search of every frame but the first, from where it starts."""
+
+    position: Float[np.ndarray, "frames 3"]  # m, along the axes of the world
+    orientation: Float[np.ndarray, "frames 3"]  # rad, a rotation vector
+
+
+@dataclass(frozen=True)
 class Reach:
     """How far a frame's search can move the camera along, and turn it about, one axis."""
 
     position: float  # m, along an axis of the world
     orientation: float  # rad
 
-    def is_exceeded(self, motion: "Motion") -> Float[np.ndarray, "frames"]:
+    def is_exceeded(self, motion: Motion) -> Float[np.ndarray, "frames"]:
         """In which frames the camera moves or turns farther than that."""
         too_far = np.abs(motion.position).max(axis=1) > self.position
         return too_far | (np.abs(motion.orientation).max(axis=1) > self.orientation)
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What is left for the search of every frame but the first, from where it starts."""
-
-    position: Float[np.ndarray, "frames 3"]  # m, along the axes of the world
-    orientation: Float[np.ndarray, "frames 3"]  # rad, a rotation vector
 
 
 def reach(steps: float, rate: float) -> float:
