@@ -408,3 +408,27 @@ def test_decimal_commas_are_named(plain: Path) -> None:
     path.write_text(path.read_text().replace(".", ","))
     with pytest.raises(DataError, match="write decimal points, not commas"):
         open_recording(plain)
+
+
+def _renamed(folder: Path, name: Callable[[int], str]) -> None:
+    for kind in ("color", "depth"):
+        for i, path in enumerate(sorted((folder / kind).iterdir())):
+            path.rename(path.with_name(name(i) + path.suffix))
+
+
+def test_times_are_those_of_names_and_stamps(plain: Path) -> None:
+    """Catches frame numbers in place of a recording's own times, which evaluation tools need: of
+    stamped poses, and of images that are named after their time."""
+    path, data = plain / "trajectory.txt", source()
+    times = START + np.arange(N_FRAMES) / 15
+    path.write_text(tum_lines(times, data.poses))
+    assert open_recording(plain).times == pytest.approx(times, abs=1e-6)
+    for name in (lambda i: f"{times[i]:.6f}", lambda i: str(int(times[i] * 1e9))):
+        _renamed(plain, name)
+        opened = open_recording(plain)
+        assert opened.times == pytest.approx(times, abs=1e-5)
+        np.testing.assert_allclose(opened.T_world_camera, data.poses, atol=1e-9)
+    # Poses are found by time, though one frame has none and one is in another place.
+    lines = tum_lines(times, data.poses).splitlines()
+    path.write_text("\n".join(lines[:3] + lines[4:]))
+    assert np.flatnonzero(~open_recording(plain).has_pose).tolist() == [3]

@@ -107,6 +107,21 @@ def files_of(folder: Path, pattern: str) -> list[Path]:
     return sorted(files, key=lambda path: (numbers_in(path), path.name))
 
 
+def stamp_in(path: Path) -> float | None:
+    """The time (s) that a file is named after, as 1305031102.175304.png or in nanoseconds.
+
+    >>> stamp_in(Path("1305031102.5.png")), stamp_in(Path("1305031102500000000.png"))
+    (1305031102.5, 1305031102.5)
+    >>> stamp_in(Path("000017.png")) is stamp_in(Path("img17.5.png")) is None
+    True
+    """
+    if re.fullmatch(r"\d{9,10}\.\d+", path.stem):
+        return float(path.stem)
+    # Micro- and nanoseconds since 1970 have so many digits.
+    is_whole = re.fullmatch(r"\d{16}|\d{19}", path.stem)
+    return int(path.stem) / 10 ** (len(path.stem) - 10) if is_whole else None
+
+
 def numbers_in(path: Path) -> list[int]:
     """The numbers in a file's name."""
     # A dot ends the stem: frame-000001.color.png counts as 1. Of more digits no camera is capable.

@@ -24,11 +24,13 @@ from nbtrack.data.formats import (
     files_of,
     is_declared,
     numbers_in,
+    stamp_in,
 )
 from nbtrack.data.text_files import Calibration, Times, read_calibration, read_poses, read_rows
 
 _END_OF_PNG = 64  # bytes: the checksum of all pixels, and the marker of the end
 _TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
+_SINCE_1970 = 1e8  # s: times of a clock, and not of a recording's beginning
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 _ALONE = 1000.0  # m from the middle, and so many times as far as nine in ten: no camera went there
 TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
@@ -136,9 +138,11 @@ def _images(
 
 
 def _times(folder: Path, colors: list[Path], rate_hz: float) -> Times:
-    """Of frames that no list of files times: from a file, else by the numbers in their names."""
-    path, numbers = folder / TIMES_FILE, _numbers_of(colors)
+    """Of frames that no list of files times: from a file, their names, or the numbers in these."""
+    path, numbers, stamps = folder / TIMES_FILE, _numbers_of(colors), _stamps_of(colors)
     if not path.is_file():
+        if stamps is not None and (np.diff(stamps) > 0).all():
+            return stamps
         is_counted = (np.diff(numbers) > 0).all()
         return (numbers - numbers[0] if is_counted else np.arange(len(colors))) / rate_hz
     rows = read_rows(path, lambda line: [float(line)], (1,), "the time (s) of a frame")
@@ -178,7 +182,11 @@ def _with_poses(recording: Recording, pose_file: str | None) -> Recording:
     poses, pose_times = np.concatenate([T for T, _ in tables]), tables[0][1]
     if pose_times is not None:
         is_by_time = layout.color[0].endswith(".txt")
+        is_by_time |= _stamps_of(colors) is not None and pose_times.max() > _SINCE_1970
         poses = _placed(poses, pose_times, recording.times, path, is_by_time)
+        is_untimed = not is_by_time and not (folder / TIMES_FILE).is_file()
+        if is_untimed and len(pose_times) == len(colors) and (np.diff(pose_times) > 0).all():
+            recording = replace(recording, times=pose_times)  # what they are stamped with
     numbers = _numbers_of(colors)
     if len(poses) > len(colors) and 0 <= numbers.min() <= numbers.max() < len(poses):
         chosen = f"those of the {len(colors)} images' numbers"
@@ -224,8 +232,16 @@ def _placed(poses: Poses, pose_times: Times, times: Times, path: Path, is_by_tim
     return placed if is_by_time or is_whole else poses
 
 
+def _stamps_of(files: list[Path]) -> Times | None:
+    """The times (s) that all files are named after, if they are."""
+    stamps = [stamp_in(path) for path in files]
+    return None if None in stamps else np.array(stamps)
+
+
 def _numbers_of(files: list[Path]) -> Frames:
-    """Frame numbers: the last in each file's name; -1 if it has none."""
+    """Frame numbers: the last in each file's name; -1 if it has none. Of times: microseconds."""
+    if (stamps := _stamps_of(files)) is not None:
+        return np.rint(1e6 * stamps).astype(np.int64)
     return np.array([[-1, *numbers_in(path)][-1] for path in files])
 
 
