@@ -104,7 +104,8 @@ def test_a_file_keeps_it_whole(
     monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 10_000)
     network, settings = NetworkSettings(width=16), NeusMapping(correct_voxel=0.2)
     field = make_field("neus", network, ROOM.bounds, seed=0).eval().requires_grad_(False)
-    made = {"field": "neus", "network": vars(network), "seconds": 0.0}
+    made = {"field": "neus", "network": vars(network), "seconds": 0.0, "seed": 0}
+    made |= {"scene": "box", "n_frames": len(sequence), "origin": [0.0, 0.0, 0.0]}
     finished = correct_map(Map(field, sequence.intrinsics, made), sequence, settings)
     write_map(tmp_path / "map.safetensors", finished)
     stored, points = read_map(tmp_path), torch.rand(100, 3)

@@ -181,7 +181,7 @@ FILES = {
     "a column more": (_write(TRAJECTORY, f"{ROW} 1"), KITTI, "line 1 is"),
     "a word": (_write(TRAJECTORY, ROW.replace("3", "x")), KITTI, "line 1 is"),
     "a NaN": (_write(TRAJECTORY, ROW.replace("3", "nan")), KITTI, "not a finite pose"),
-    "no rotation": (_write(TRAJECTORY, ROW[:-1] + "0"), KITTI, "norm 0"),
+    "no rotation": (_write(TRAJECTORY, ROW[:-1] + "0"), KITTI, "not a finite pose"),
     "another order": (_write(TRAJECTORY, "0.5 0 0 1 1 2 3 4"), KITTI, "of norm 5.48"),
     "second line": (_write(TRAJECTORY, f"{ROW}\n{ROW[:-2]}"), KITTI, "line 2 is"),
     "a map for a run": (_nothing, ["export", "map", "--to", "tum", "p"], "no finished run in map"),

@@ -237,7 +237,7 @@ def test_two_paths_cross_the_room(room):
     assert np.degrees(np.arccos((forward[0] * forward[1]).sum(axis=1).mean())) < 40
 
 
-@pytest.mark.parametrize(("n_frames", "seed"), [(240, 0), (300, 1)])
+@pytest.mark.parametrize(("n_frames", "seed"), [(240, 0), (240, 1)])
 @each_room
 def test_key_frames_move_as_the_dataset_does(room, n_frames, seed):
     """Catches paths that are not like those of the paper's data. `breakfast_room` moves by 14.2 mm

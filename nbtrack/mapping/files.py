@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import re
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import chain
@@ -129,7 +130,7 @@ def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
     sizes = [camera[name] for name in ("width", "height", "fx", "fy")]
     if not (are_numbers and len(made["origin"]) == 3 and min(sizes) > 0):
         raise ValueError("a number of its header is missing, not finite, or none")
-    if not (isinstance(made["scene"], str) and made["scene"].isprintable()):
+    if not isinstance(made["scene"], str) or re.search(r"[\x00-\x1f\x7f-\x9f]", made["scene"]):
         raise ValueError("its scene has no name that can be printed")
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():

@@ -53,6 +53,11 @@ class DataReport:
         flicker = self.frames.flicker[self.frames.turned_deg < _SAME_VIEW_DEG].max()
         measured, misread = self.frames.measured.mean(), self.best is not self.conventions[0]
         rules = [
+            (
+                not self.frames.measured.any(),
+                "no pixel that was looked at has a depth: all are 0, or saturated (65535); check "
+                "the depth folder, and no_depth in sequence.toml",
+            ),
             (True, diagnosis(self.conventions, self.recording, needs_proof=self.is_whole)),
             (
                 len(jumps) and not misread,
