@@ -13,9 +13,9 @@ from nbtrack.experiments.scenes import Scene
 from nbtrack.tracking.reach import reach_metrics
 
 _FRAMES_LOOKED_AT = 20  # that tell a map's unit before there is a map
-# A user is told where no search could have a lower error (m), or the camera moves farther than a
-# search reaches in a larger share of the frames: hands start and stop, and the search catches up
-# (our choice).
+# A user is told where even the best follower has a larger error (m), or the camera moves farther
+# than a search reaches in a larger share of the frames: hands start and stop, and the search
+# catches up (our choice).
 _LEAST_ATE, _SHARE = 0.01, 0.5
 
 
@@ -31,7 +31,7 @@ def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
             continue
         scene, worst = max(short.items(), key=lambda pair: pair[1]["least_ate_m"])
         others = f" (of {len(short)} scenes)" if len(short) > 1 else ""
-        bound = f", and no search can have an ATE below {worst['least_ate_m']:.3f} m there"
+        bound = f", and the best that follows it has an ATE of {worst['least_ate_m']:.3f} m there"
         velocity = f"--set tracking.{tracker}.motion_model=constant_velocity, "
         yield (
             f"{steps:g} steps of {tracker} move the camera by at most {1e3 * worst['reach_m']:.1f} "
