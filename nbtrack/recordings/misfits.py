@@ -36,33 +36,6 @@ _MIN_CONTRAST = 0.02  # standard deviation of intensities in [0, 1], below which
 _RESAMPLED, _INTERVAL = 200, [0.025, 0.975]
 
 
-@dataclass(frozen=True)
-class Misfit:
-    """An estimated misfit; 0 is as declared."""
-
-    name: str  # "depth comes after the poses by", say
-    form: str  # how its estimate is written, and in which unit; empty for yes or no
-    unit: str
-    advice: str
-    estimate: float
-    low: float  # of the interval of 95 %
-    high: float
-    gain: float  # the cost at the estimate, as a share of that as declared
-    negligible: float  # as large as it may be
-
-    @property
-    def is_told(self) -> bool:
-        """Whether all of the interval is more than negligible, and frames agree better there."""
-        is_off = self.low > self.negligible or self.high < -self.negligible
-        return is_off and self.gain < _GAIN
-
-    def __str__(self) -> str:
-        if not self.form:
-            return f"{self.name}: {'yes' if self.is_told else 'no'}"
-        estimate, low, high = (self.form.format(x) for x in (self.estimate, self.low, self.high))
-        return f"{self.name} {estimate} ({low} to {high}) {self.unit}".rstrip()
-
-
 class Reading(NamedTuple):
     """How the frames of a recording are read."""
 
@@ -76,15 +49,39 @@ class Reading(NamedTuple):
 
 
 class Parameter(NamedTuple):
-    """A number that is varied."""
+    """A number that is varied; 0 is as declared."""
 
     name: str
-    form: str
+    form: str  # how its estimate is written, and in which unit; empty for yes or no
     unit: str
     advice: str  # with {factor}, 1 + estimate
     values: Float[np.ndarray, "values"]
     negligible: float  # our choice: more than right recordings show
     reading: Callable[[Reading, float], Reading]
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """The estimate of a parameter, with its interval of 95 %."""
+
+    parameter: Parameter
+    estimate: float
+    low: float
+    high: float
+    gain: float  # the cost at the estimate, as a share of that as declared
+
+    @property
+    def is_told(self) -> bool:
+        """Whether all of the interval is more than negligible, and frames agree better there."""
+        negligible = self.parameter.negligible
+        return (self.low > negligible or self.high < -negligible) and self.gain < _GAIN
+
+    def __str__(self) -> str:
+        name, form, unit, *_ = self.parameter
+        if not form:
+            return f"{name}: {'yes' if self.is_told else 'no'}"
+        estimate, low, high = (form.format(x) for x in (self.estimate, self.low, self.high))
+        return f"{name} {estimate} ({low} to {high}) {unit}".rstrip()
 
 
 def _with_scale(reading: Reading, share: float) -> Reading:
@@ -189,7 +186,8 @@ def told_misfit(misfits: list[Misfit]) -> str:
     told = min((m for m in misfits if m.is_told), key=lambda m: m.gain, default=None)
     if not told:
         return ""
-    return f"{told}; without it frames differ {told.gain:.0%} as much: {told.advice}"
+    advice = told.parameter.advice.format(factor=1 + told.estimate)
+    return f"{told}; without it frames differ {told.gain:.0%} as much: {advice}"
 
 
 class _PairedFrames:
@@ -280,9 +278,7 @@ def _estimate(
     mean = costs.mean(axis=0)
     estimate = float(_lowest(values, mean))
     gain = float(mean.min() / mean[np.abs(values).argmin()])
-    advice = parameter.advice.format(factor=1 + estimate)
-    how = parameter.name, parameter.form, parameter.unit, advice
-    return Misfit(*how, estimate, low, high, gain, parameter.negligible)
+    return Misfit(parameter, estimate, low, high, gain)
 
 
 def _lowest(
