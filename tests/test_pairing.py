@@ -188,6 +188,11 @@ def test_times_in_names(plain: Path) -> None:
     assert recording.times == pytest.approx(list(map(float, names)))
     assert np.array_equal(sequence.colors, source().colors)
     np.testing.assert_allclose(recording.T_world_camera, source().poses, atol=1e-9)
+    # A tool has lost a frame, and its time.
+    lines = tum_lines(recording.times + 0.001, source().poses).splitlines()
+    (plain / "trajectory.txt").write_text("\n".join([*lines[:2], "nan " * 8, *lines[3:]]))
+    assert np.flatnonzero(~open_recording(plain).has_pose).tolist() == [2]
+    (plain / "trajectory.txt").write_text("\n".join(lines))
     milliseconds = [str(1305031102175 + 33 * i) for i in RUN]
     for kind in ("color", "depth"):
         rename(plain / kind, milliseconds)

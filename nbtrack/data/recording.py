@@ -224,7 +224,8 @@ def _check_together(recording: Recording) -> None:
 def _share_clock(recording: Recording, stamps: Times) -> bool:
     """Whether stamps lie near frames' times, and are not all theirs to the last digit."""
     is_near = _nearest(recording.times, stamps, _TOLERANCE) >= 0
-    return is_near.any() and not np.isin(stamps, recording.times).all()
+    is_own = np.isin(stamps, recording.times).all()
+    return is_near.any() and np.isfinite(stamps).all() and not is_own
 
 
 def _by_time(recording: Recording, poses: Poses, stamps: Times, path: Path) -> Poses:
@@ -243,8 +244,8 @@ def _by_time(recording: Recording, poses: Poses, stamps: Times, path: Path) -> P
     kept &= np.isfinite(poses[first] + poses[second]).all(axis=(1, 2))
     if kept.any():
         flip = inverse if recording.declared.poses == WORLD_TO_CAMERA else np.copy
-        pair, share = (flip(poses[i[kept]]) for i in (first, second)), (late / (late + early))[kept]
-        placed[kept] = flip(_between(*pair, share))
+        share = late[kept] / (late + early)[kept]
+        placed[kept] = flip(_between(flip(poses[first[kept]]), flip(poses[second[kept]]), share))
         recording.notes.append(
             f"{kept.sum()} of {len(times)} poses are interpolated, the nearest in {path.name} "
             f"{1e3 * np.median(apart[kept]):.1f} ms away (at most {1e3 * apart[kept].max():.1f} ms)"
@@ -277,7 +278,8 @@ def _by_number(
     colors, rate = recording.color_files, recording.declared.frame_rate
     n_images, n_poses, numbers = len(colors), len(poses), frame_numbers(colors)
     is_stamped = stamps is not None and (np.abs(stamps) < _ABSURD).all()
-    clock, near = stamps if is_stamped else np.arange(n_poses) / rate, min(_ON_TIME, 0.25 / rate)
+    clock = stamps if is_stamped else np.arange(n_poses) / rate
+    near = min(_ON_TIME, 0.25 / rate)
     ways = [_nearest(times, clock, near) for times in _clocks(recording, numbers, clock)]
     whole = {tuple(way) for way in ways if (way >= 0).sum() == min(n_images, n_poses)}
     if len(whole) == 1 and (is_stamped or n_poses > n_images):
@@ -290,9 +292,9 @@ def _by_number(
             _nearest(recording.times, clock, _ON_TIME, path)
         return None
     if is_stamped and any((way >= 0).mean() > 0.75 for way in ways):
-        steps = np.diff(clock) * rate
-        # Where stamps leave out other frames than the images do. Equal steps only count the lines.
-        if np.ptp(steps) > 0.1 and not np.array_equal(np.rint(steps), np.diff(numbers)):
+        steps, image_steps = rate * np.diff(clock), rate * np.diff(recording.times)
+        # Stamps leave out other frames than the images do. Equal steps only count the lines.
+        if np.ptp(steps) > 0.1 and (np.rint(steps) != np.rint(image_steps)).any():
             return None
     if not np.array_equal(numbers, np.arange(n_images)):
         named = f"images {colors[0].name} to {colors[-1].name}"
