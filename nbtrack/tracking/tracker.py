@@ -21,8 +21,6 @@ from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.reach import Reach
 from nbtrack.tracking.starts import expected_poses
 
-_MAX_PIXELS = 2**24
-
 
 @dataclass(frozen=True)
 class TrackerSettings:
@@ -66,6 +64,7 @@ class Tracker(abc.ABC):
     package: str | None = None  # what it needs beside this project's own requirements
     converges: bool = False  # whether it ends a frame by itself, before its budget is spent
     copes_without_depth: bool = False  # whether it is shown frames without any measured depth
+    finds_cameras: bool = False  # whether a corrected map lets it start at an unknown pose
     # Attributes that one frame leaves to the next; their class has their values before the first.
     remembers: tuple[str, ...] = ()
     is_converged: bool = False  # whether further steps would change nothing: the rest is spared
@@ -81,15 +80,9 @@ class Tracker(abc.ABC):
     ) -> None:
         """In a map, from a pose before the first frame (m), with a budget of its own.
 
-        Raises ConfigError for an unknown motion model or too many pixels, DataError for a pose that
-        is not rigid.
+        Raises ConfigError for an unknown motion model, DataError for a pose that is not rigid.
         """
         self.settings = settings or self.Settings()
-        if self.settings.n_pixels > _MAX_PIXELS:
-            raise ConfigError(
-                f"tracking.{self.name}.n_pixels = {self.settings.n_pixels}: allowed are 1 to "
-                f"{_MAX_PIXELS}, more than any depth image has; set for instance 4096"
-            )
         self.field = self.prepare(field).eval().requires_grad_(False)
         # One thread serves a grid, even one that keeps the network it was made from, and points.
         weights = [] if isinstance(self.field, BakedField) else self.field.parameters()
@@ -153,10 +146,16 @@ class Tracker(abc.ABC):
 
     def restart_anywhere(self) -> None:
         """Track from an unknown pose. ConfigError if this tracker cannot find the camera."""
-        raise ConfigError(
-            f"tracker {self.name!r} cannot find a camera whose first pose is not known: take lm in "
-            "a corrected map (--method corrected), or begin with a frame that has a pose"
-        )
+        self.check_finds(in_corrected=False)
+
+    @classmethod
+    def check_finds(cls, in_corrected: bool) -> None:
+        """Raises ConfigError if it cannot find a camera, in a corrected map or in another."""
+        if not (cls.finds_cameras and in_corrected):
+            raise ConfigError(
+                f"tracker {cls.name!r} cannot find a camera whose first pose is not known: take lm "
+                "in a corrected map (--method corrected), or begin with a frame that has a pose"
+            )
 
     def state(self) -> dict[str, Any]:
         """What the tracker remembers from past frames: tensors and plain values."""
