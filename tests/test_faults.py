@@ -78,7 +78,7 @@ TOML = {
     "empty list": (b"[tables.pixels]\nsdf = []", "give at least one"),
     "deep list": (b"tables.rates_hz = " + b"[" * 5000, "is no TOML"),
     "deep table": (b".".join(5000 * [b"a"]) + b" = 1", "unknown config key 'a.a.a.a"),
-    "no name": (b"[scenes]\nnames = ['a\\u0000b']", "must be str"),
+    "no name": (b'[scenes]\nnames = ["a\\u0000b"]', "must be str"),
 }
 
 
@@ -274,7 +274,7 @@ ARGUMENTS = {
     ),
     "too many pixels": ([*OTHER, "--pixels", "16777216"], "must be 1 to"),
     "steps without end": ([*OTHER, "--steps", "1e12"], "steps_per_frame is 1e+12"),
-    "frames without end": ([*OTHER, "--rate", "1e-308"], "rate_hz is 1e-308"),
+    "frames without end": ([*NO_STEPS, "--rate", "1e-308"], "rate_hz is 1e-308"),
     "too many frames": ([*MAKE, "--n-frames", "1000000000"], "must be 2 to"),
     "too wide": ([*MAKE, "--width", "1000000"], "must be 11 to"),
     "too many seeds": (["tables", "--seeds", "1000000000"], "from 1 to 1000"),
