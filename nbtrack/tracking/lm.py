@@ -71,7 +71,6 @@ class LmTracker(Tracker):
     Settings = LmSettings
     converges = True
     copes_without_depth = True
-    finds_cameras = True
     remembers = ("last_good", "was_lost", "usual_mad")
     last_good: Transform | None = None  # of the latest frame not taken for lost
     was_lost: bool = False  # in the frame before

@@ -13,6 +13,7 @@ from nbtrack.core import capture
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
 from nbtrack.core.device import suitable_threads, synchronize
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
+from nbtrack.core.settings import with_values
 from nbtrack.data.frame import Frame
 from nbtrack.data.text_files import checked_poses
 from nbtrack.fields import Field, LearnedField
@@ -64,7 +65,6 @@ class Tracker(abc.ABC):
     package: str | None = None  # what it needs beside this project's own requirements
     converges: bool = False  # whether it ends a frame by itself, before its budget is spent
     copes_without_depth: bool = False  # whether it is shown frames without any measured depth
-    finds_cameras: bool = False  # whether a corrected map lets it start at an unknown pose
     # Attributes that one frame leaves to the next; their class has their values before the first.
     remembers: tuple[str, ...] = ()
     is_converged: bool = False  # whether further steps would change nothing: the rest is spared
@@ -80,9 +80,11 @@ class Tracker(abc.ABC):
     ) -> None:
         """In a map, from a pose before the first frame (m), with a budget of its own.
 
-        Raises ConfigError for an unknown motion model, DataError for a pose that is not rigid.
+        Raises ConfigError for an unknown motion model or too many pixels, DataError for a pose that
+        is not rigid.
         """
         self.settings = settings or self.Settings()
+        with_values(self.settings, {"n_pixels": int(self.settings.n_pixels)})  # within its limits
         self.field = self.prepare(field).eval().requires_grad_(False)
         # One thread serves a grid, even one that keeps the network it was made from, and points.
         weights = [] if isinstance(self.field, BakedField) else self.field.parameters()
@@ -151,7 +153,7 @@ class Tracker(abc.ABC):
     @classmethod
     def check_finds(cls, in_corrected: bool) -> None:
         """Raises ConfigError if it cannot find a camera, in a corrected map or in another."""
-        if not (cls.finds_cameras and in_corrected):
+        if cls.restart_anywhere is Tracker.restart_anywhere or not in_corrected:
             raise ConfigError(
                 f"tracker {cls.name!r} cannot find a camera whose first pose is not known: take lm "
                 "in a corrected map (--method corrected), or begin with a frame that has a pose"
