@@ -9,7 +9,7 @@ from typing import Any
 from filelock import FileLock
 
 from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up, nearest_name
-from nbtrack.core.files import data_folder, fingerprint, runs_folder, write_atomic
+from nbtrack.core.files import data_folder, fingerprint, resolved, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.recording import Recording, image_digest, open_recording
@@ -88,7 +88,7 @@ def open_scenes(preset: Preset) -> list[Scene]:
     scene is whole, what is wrong with the first.
     """
     names, scenes, missing = preset.scenes.names, [], {}
-    if not names or len({Path(name).resolve().name for name in names}) < len(names):
+    if not names or len({resolved(name).name for name in names}) < len(names):
         given = ", ".join(names) or "(none)"
         raise ConfigError(f"scenes {given}: give at least one, and of one name only one")
     for name in names:
