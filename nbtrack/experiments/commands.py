@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from nbtrack.beyond import PointCloud
 from nbtrack.core.errors import ConfigError, DataError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
@@ -28,10 +29,9 @@ from nbtrack.experiments.output import (
 )
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
-from nbtrack.fields import PointCloud
 from nbtrack.mapping.files import MAP_FILE, MESH_FILE, Map, read_map
-from nbtrack.mapping.meshes import extract_mesh
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
+from nbtrack.plots.meshes import extract_mesh
 from nbtrack.recordings.check import check_recording, quick_warning
 from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M

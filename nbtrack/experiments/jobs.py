@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from filelock import FileLock
 
+from nbtrack.beyond.correct import correct_map
 from nbtrack.core import files
 from nbtrack.core.device import advise_on_memory, choose_device, device_name, threads
 from nbtrack.core.errors import DataError, NbtrackError
@@ -19,12 +20,12 @@ from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import parse_frames, select_frames
 from nbtrack.experiments.output import check_no_recording
 from nbtrack.experiments.presets import PRESETS, Preset
+from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import LearnedField, field_class, make_field
-from nbtrack.mapping.correct import correct_map
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
-from nbtrack.mapping.quality import check_belongs, score_map
+from nbtrack.mapping.holdout import check_belongs
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
 from nbtrack.tracking.reach import reach_metrics
@@ -103,7 +104,7 @@ class MapJob(Job):
         if self.is_given:
             given = read_map(self.folder)
             return files.fingerprint(given.key, files.code_fingerprint(type(given.field)), device)
-        correction = ["nbtrack.mapping.correct"] if self.needs else []
+        correction = ["nbtrack.beyond.correct"] if self.needs else []
         kind = field_class(self.field)
         code = kind, "nbtrack.mapping.fit", make_field, type(self).compute, *correction
         network = self.preset.network_of(self.field) if issubclass(kind, LearnedField) else None

@@ -15,7 +15,7 @@ from nbtrack.core.errors import ConfigError, MissingError, look_up
 from nbtrack.core.settings import limited, setting_texts, with_settings, with_values
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.text_files import read_object
-from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, PointMapping, field_class
+from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.tables import PAPER_PIXELS
 from nbtrack.tracking import TRACKERS, TrackerSettings, tracker_class
@@ -53,7 +53,7 @@ class Preset:
     name: str = field(metadata={"is_setting": False})  # no `key=value` reaches it
     # A density gains from finer detail; a distance must start smooth, or ripples satisfy the
     # eikonal term: at 4 rad/m in place of 2.5 it was off by 19 cm in free space, not by 5.
-    network: dict[str, NetworkSettings] = field(
+    network: dict[str, Any] = field(
         default_factory=lambda: {
             "imap": NetworkSettings(embedding_sigma=4.0),
             "neus": NetworkSettings(),
@@ -61,7 +61,7 @@ class Preset:
         }
     )
     # Of every field and tracker; of those that are not given, the defaults of their classes.
-    mapping: dict[str, MappingSettings | PointMapping] = field(default_factory=dict)
+    mapping: dict[str, Any] = field(default_factory=dict)
     tracking: dict[str, TrackerSettings] = field(default_factory=dict)
     scenes: ScenesConfig = ScenesConfig()
     tables: TablesConfig = TablesConfig()
@@ -69,7 +69,13 @@ class Preset:
     chosen: tuple[str, ...] = field(default=(), metadata={"is_setting": False})
 
     def __post_init__(self) -> None:
-        """Add the settings of all registered fields and trackers."""
+        """Add settings of all registered fields and trackers, and of networks of other kinds."""
+        others = {
+            name: self.network_of(name)
+            for name, kind in FIELDS.items()
+            if issubclass(kind, LearnedField) and kind.Network is not NetworkSettings
+        }
+        object.__setattr__(self, "network", self.network | others)
         object.__setattr__(self, "mapping", {name: self.mapping_of(name) for name in FIELDS})
         object.__setattr__(self, "tracking", {name: self.tracking_of(name) for name in TRACKERS})
 
@@ -86,11 +92,13 @@ class Preset:
         """The preset with the `key=value` texts of a method, and then those that a user chose."""
         return with_settings(self, *settings, *self.chosen)
 
-    def network_of(self, field_name: str) -> NetworkSettings:
-        """Network of a field; a field without its own takes that of NeuS."""
-        return self.network.get(field_name, self.network["neus"])
+    def network_of(self, field_name: str) -> Any:
+        """Network of a field; one without its own takes what it shares with that of NeuS."""
+        kind = field_class(field_name)
+        network = kind.Network if issubclass(kind, LearnedField) else NetworkSettings
+        return _own_or_like("neus", self.network, field_name, network)
 
-    def mapping_of(self, field_name: str) -> MappingSettings | PointMapping:
+    def mapping_of(self, field_name: str) -> Any:
         """Mapping settings of a field; one that is added later takes what it shares with NeuS."""
         return _own_or_like("neus", self.mapping, field_name, field_class(field_name).Settings)
 

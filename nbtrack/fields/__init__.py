@@ -5,16 +5,11 @@ import torch
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import look_up
 from nbtrack.fields.base import Field, LearnedField, MappingSettings
-from nbtrack.fields.imap import IMapField, OccupancyField
+from nbtrack.fields.imap import IMapField
 from nbtrack.fields.mlp import NetworkSettings
-from nbtrack.fields.neus import NeuSField, NeusMapping, VolSdfField
-from nbtrack.fields.neus_plus import NeuSPlusField, NeusPlusMapping
-from nbtrack.fields.points import PointCloud, PointMapping
+from nbtrack.fields.neus import NeuSField, NeusMapping
 
-FIELDS: dict[str, type[Field]] = {
-    kind.name: kind
-    for kind in (IMapField, NeuSField, NeuSPlusField, VolSdfField, OccupancyField, PointCloud)
-}
+FIELDS: dict[str, type[Field]] = {kind.name: kind for kind in (IMapField, NeuSField)}
 """What can be mapped, by name. A field of your own joins by `FIELDS["mine"] = MyField`."""
 
 

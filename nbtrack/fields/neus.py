@@ -1,4 +1,4 @@
-"""NeuS: colour and signed distance on iMAP's network (Wang et al. 2021); and VolSDF."""
+"""NeuS: colour and signed distance on iMAP's network (Wang et al. 2021)."""
 
 from dataclasses import dataclass
 
@@ -99,25 +99,6 @@ class NeuSField(LearnedField):
         moments = design.T @ (target / self.mlp.metres_per_unit).double()
         solution = torch.linalg.solve(normal, moments).float()
         self.mlp.head.weight[3], self.mlp.head.bias[3] = solution[:-1], solution[-1]
-
-
-class VolSdfField(NeuSField):
-    """f: position -> (colour, signed distance in m), as NeuS but for what a ray makes of it.
-
-    A signed distance, rendered through a density. Network, start, samples and losses are NeuS's,
-    and so is the one learnable scale, here beta = exp(-10 variance) in m: the two maps differ in
-    one equation alone (our choice; VolSDF places its samples by a bound on the error of the
-    integral). Source: Yariv et al. 2021.
-    """
-
-    name = "volsdf"
-    label = "VolSDF"
-
-    def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
-        """Of samples, from the density that belongs to the signed distance."""
-        density = rendering.density_from_sdf(values, self.inverse_std)
-        lengths = rays.directions_world.norm(dim=-1)
-        return rendering.weights_from_density(density, depths, lengths)
 
 
 def guided_depths(

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from nbtrack.core.arrays import Points, Poses, Transform, Values
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
-from nbtrack.mapping.meshes import query_field, seen_by
+from nbtrack.plots.meshes import query_field, seen_by
 from nbtrack.plots.style import DOTTED, log_axes, method_colors, new_axes, styled
 from nbtrack.synthetic import Room
 from nbtrack.tables import STANDING_STILL

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from nbtrack.beyond.observed import draw_points
+from nbtrack.beyond.points import PointCloud
 from nbtrack.core.arrays import Transforms
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
-from nbtrack.fields import PointCloud
-from nbtrack.tracking.observed import draw_points
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 # How far from the map a point may be to have a partner there, m: first wide, to get home from

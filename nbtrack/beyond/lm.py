@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.lm_solver import Descent, Grid, retract
+from nbtrack.beyond.observed import draw_points, with_normals
 from nbtrack.core.arrays import Pose, Poses, Transform, Transforms
 from nbtrack.core.settings import limited
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
-from nbtrack.fields.grid import BakedField
-from nbtrack.tracking.lm_solver import Descent, Grid, retract
-from nbtrack.tracking.observed import draw_points, with_normals
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 _MIN_POINTS = 20  # below, a frame says too little for six unknowns
@@ -85,7 +85,7 @@ class LmTracker(Tracker):
 
     def restart_anywhere(self) -> None:
         """Look for the camera near all poses that the map was made from; see `_hypotheses`."""
-        cameras = getattr(self.field, "T_world_cameras", None)
+        cameras = self.field.T_world_cameras
         self.check_finds(in_corrected=cameras is not None)
         self.restart(cameras[len(cameras) // 2].double().numpy())
         self.was_lost = True
@@ -183,7 +183,7 @@ class LmTracker(Tracker):
 
     def _other_starts(self) -> list[Pose]:
         """Where else the camera may be, the likeliest first."""
-        cameras = getattr(self.field, "T_world_cameras", None)
+        cameras = self.field.T_world_cameras
         if cameras is None:
             # The last good pose itself, then turned about x, y and z both ways, and wider.
             turns = [way * axis for axis in np.eye(6)[:3] for way in (1, -1)]

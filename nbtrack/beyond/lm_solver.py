@@ -43,10 +43,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.observed import Observed, compiled
 from nbtrack.core.arrays import Pose
 from nbtrack.fields.base import intensity_of
-from nbtrack.fields.grid import BakedField
-from nbtrack.tracking.observed import Observed, compiled
 
 G_MIN, G_MAX, G_SCALE = 0.3, 2.0, 0.5
 MARGIN = 0.3  # m beyond a field's bounds, where walls lie if the pose is off
