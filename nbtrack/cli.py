@@ -1,7 +1,9 @@
 """The command line: options for the functions that the notebooks call."""
 
 import argparse
+import contextlib
 import importlib
+import io
 import os
 import re
 import sys
@@ -39,6 +41,7 @@ def _option(help: str, type: Any = str, **more: Any) -> dict[str, Any]:
 
 
 some_threads = partial(a_count, maximum=_MAX_THREADS)
+some_seeds = partial(a_count, maximum=1000)
 _STARTS = {"choices": ("given", "unknown"), "default": "given"}
 _BUDGETS = {"choices": ("steps", "clock"), "default": "steps"}
 _SETTINGS = {"action": "append", "default": [], "dest": "settings", "metavar": "KEY=VALUE"}
@@ -63,7 +66,7 @@ OPTIONS = {
     "--to!": _option("tum, kitti: trajectory; gif, mp4: movie; ply, glb: mesh; map", required=True),
     "--budget": _option("steps: the paper's counts (default); clock: this machine's", **_BUDGETS),
     "--scenes": _option("only these scenes of the preset's kind", metavar="A,B"),
-    "--seeds": _option("so many maps and runs a cell: mean ± std", a_count, default=1),
+    "--seeds": _option("so many maps and runs a cell: mean ± std", some_seeds, default=1),
     "--workers": _option("jobs side by side (default: one a core, or one on a GPU)", a_count),
     "--dask": _option("run on a Dask cluster, as tcp://HOST:8786", metavar="ADDRESS"),
     "--beyond": {"help": "Table III: our methods too, and 30 Hz", "action": "store_true"},
@@ -149,13 +152,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return status
 
 
+class _Pipe(io.FileIO):
+    """A stream whose reader may leave, as `head` does: what nobody reads is dropped."""
+
+    def write(self, content: Any) -> int:
+        with contextlib.suppress(BrokenPipeError):
+            return super().write(content)
+        return len(content)
+
+
 def _open_streams() -> None:
-    """Let nothing that is printed end a command: a daemon's streams are closed, and a terminal's
-    encoding may lack letters of a path."""
+    """Let nothing that is printed end a command: a daemon's streams are closed, a pipe's reader may
+    be gone, and a terminal's encoding may lack letters of a path."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
-        if hasattr(stream := getattr(sys, name), "reconfigure"):
+        stream = getattr(sys, name)
+        if stream is getattr(sys, f"__{name}__") and not stream.isatty():
+            pipe = io.BufferedWriter(_Pipe(stream.fileno(), "w", closefd=False))
+            in_lines = stream.line_buffering or stream.write_through
+            stream = io.TextIOWrapper(pipe, stream.encoding, line_buffering=in_lines)
+            setattr(sys, name, stream)
+        if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
 
 

@@ -14,7 +14,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.camera import Intrinsics
-from nbtrack.synthetic import build_room, handheld_trajectory, render_frame
+from nbtrack.synthetic import (
+    add_kinect_noise,
+    build_room,
+    filter_depth,
+    handheld_trajectory,
+    render_frame,
+)
 
 # The focal length of 7-Scenes at this width; pixel centres at integer + 0.5.
 CAMERA = Intrinsics.from_focal(48, 36, 585.0 * 48 / 640)
@@ -40,6 +46,15 @@ def source(room: str = "living_room", n_frames: int = N_FRAMES, stride: int = 3)
     depths = np.stack([np.rint(1000 * depth).astype(np.uint16) for _, depth, _ in rendered])
     depths[:, :2, :3] = 0  # a corner without measurement
     return Source(colors, depths, poses)
+
+
+def with_noise(data: Source) -> Source:
+    """With a Kinect's noise, filtered as datasets have it."""
+    depths, rng = [], np.random.default_rng(0)
+    for clean in data.depths_mm / 1000:
+        noisy = add_kinect_noise(clean, data.camera.fx, rng)
+        depths.append(np.rint(1000 * filter_depth(noisy)).astype(np.uint16))
+    return data._replace(depths_mm=np.stack(depths))
 
 
 def write_image(path: Path, image: np.ndarray) -> None:

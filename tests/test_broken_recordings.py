@@ -2,8 +2,11 @@
 
 import json
 import shutil
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
+from zlib import crc32
 
 import cv2
 import numpy as np
@@ -81,7 +84,15 @@ def toml(content: str) -> Damage:
     return text("sequence.toml", content)
 
 
+def png(header: bytes) -> bytes:
+    """A PNG of a header and too few pixels, whose checksums are right."""
+    parts = (b"IHDR", header), (b"IDAT", zlib.compress(bytes(99))), (b"IEND", b"")
+    chunks = (struct.pack(">I", len(c)) + k + c + struct.pack(">I", crc32(k + c)) for k, c in parts)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
 BINARY = bytes(range(256))
+GIANT = png(struct.pack(">IIBBBBB", 60_000, 60_000, 16, 0, 0, 0, 0))
 EIGHT_BIT, SMALL = np.ones((36, 48), np.uint8), np.ones((18, 24), np.uint16)
 THREE_CHANNELS = np.ones((36, 48, 3), np.uint16)
 SKEWED = "1 0.5 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
@@ -197,6 +208,9 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "colour cut in half": (cut("images/img1.png"), "img1.png is damaged"),
         "middle cut out": (MIDDLE_CUT_OUT, "img1.png is damaged"),
         "one bit flipped": (FLIPPED, "depth1.png is damaged"),
+        "giant depth": (text(DEPTH_1, GIANT), "depth1.png is damaged"),
+        "giant colour": (text("images/img0.png", GIANT), "img0.png is damaged"),
+        "short header": (text("depth_filtered/depth0.png", png(bytes(4))), "depth0.png is damaged"),
         "empty image": (text("images/img1.png", b""), r"img1.png .* PNG or JPEG \(0 bytes"),
         "text instead of an image": (text("images/img0.png", "version 1"), "img0.png is damaged"),
         "JPEG cut short": (changed("images/img1.png", lambda _: JPEG[:-20]), "img1.png is damaged"),

@@ -1,7 +1,10 @@
 """The command line: what commands print and write. What they refuse: `test_faults.py`."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -235,3 +238,32 @@ def test_a_recording_without_poses_is_tracked_in_a_map(
     assert "or track in a map of the same place with --map-from" in capsys.readouterr().err
     assert main([*GIVEN, "map", "--start", "unknown"]) == 2
     assert "cannot find a camera whose first pose is not known" in capsys.readouterr().err
+
+
+def test_a_pipe_that_nobody_reads(tmp_path: Path) -> None:
+    """Catches `map ... | true` that ends by the broken pipe, with nothing mapped."""
+    write_recording("plain", tmp_path / "r")
+    words = ["map", "r", "--field", "points", "--out", "m"]
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "nbtrack", *words]
+    found = subprocess.run(command, cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert (found.returncode, "nbtrack: " in found.stderr) == (0, False)
+    assert (tmp_path / "m/map.safetensors").is_file()
+
+
+def test_names_that_are_no_text(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Catches a recording or result whose name is not UTF-8 and that can be made but not read."""
+    monkeypatch.chdir(tmp_path)
+    folder, out, run = (os.fsdecode(name + b"\xff") for name in (b"r", b"m", b"t"))
+    write_recording("plain", tmp_path / "r").rename(folder)
+    assert main(["map", folder, "--field", "neus", *TINY, "--out", out]) == 0
+    given = ["track", folder, "--map-from", out, "--tracker", "sdf", "--steps", "2", *TINY]
+    assert main([*given, "--out", run]) == 0
+    assert main(["export", out, "--to", "ply", f"{out}.ply"]) == 0
+    assert main(["export", run, "--to", "gif", f"{run}.gif"]) == 0
+    assert main(["data", "check", folder, "--out", run]) == 0
+    assert (tmp_path / run / "check.png").is_file()

@@ -15,12 +15,12 @@ import pytest
 from box_room import BoxRoom, box_sequence
 from PIL import Image
 from recordings import (
-    CAMERA,
     Source,
     along_rays,
     camera_matrix,
     matrix_text,
     source,
+    with_noise,
     write_images,
     write_neural_rgbd,
     write_recording,
@@ -28,7 +28,6 @@ from recordings import (
 from scipy.spatial.transform import Rotation
 from tiny import TINY
 
-from nbtrack import synthetic
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
@@ -194,11 +193,7 @@ def seen(name: str) -> Source:
         quarter = (slice(None), slice(2, None, 4), slice(2, None, 4))
         colors, depths = sequence.colors[quarter], sequence.depths_mm[quarter]
         return Source(colors, depths, sequence.T_world_camera, camera)
-    depths, rng = [], np.random.default_rng(0)
-    for clean in source(name, 18, 5).depths_mm / 1000:
-        noisy = synthetic.add_kinect_noise(clean, CAMERA.fx, rng)
-        depths.append(np.rint(1000 * synthetic.filter_depth(noisy)).astype(np.uint16))
-    return source(name, 18, 5)._replace(depths_mm=np.stack(depths))
+    return with_noise(source(name, 18, 5))
 
 
 class Case(NamedTuple):

@@ -71,10 +71,14 @@ TOML = {
     "fraction": (b"[mapping.neus]\niterations = 1.5", "must be int"),
     "truth": (b"[mapping.neus]\niterations = true", "must be int"),
     "date": (b"[mapping.neus]\niterations = 2020-01-01", "must be int"),
-    "zero": (b"[mapping.neus]\nn_rays = 0", "must be 1 or more"),
-    "not a number": (b"[mapping.neus]\nlearning_rate = nan", "must be 0 or more"),
-    "infinite": (b"[mapping.neus]\nlearning_rate = inf", "must be 0 or more"),
+    "zero": (b"[mapping.neus]\nn_rays = 0", "must be 1 to"),
+    "not a number": (b"[mapping.neus]\nlearning_rate = nan", "must be 0 to"),
+    "infinite": (b"[mapping.neus]\nlearning_rate = inf", "must be 0 to"),
     "list of words": (b"[tables]\nrates_hz = ['fast']", "must be float"),
+    "empty list": (b"[tables.pixels]\nsdf = []", "give at least one"),
+    "deep list": (b"tables.rates_hz = " + b"[" * 5000, "is no TOML"),
+    "deep table": (b".".join(5000 * [b"a"]) + b" = 1", "unknown config key 'a.a.a.a"),
+    "no name": (b'[scenes]\nnames = ["a\\u0000b"]', "must be str"),
 }
 
 
@@ -84,8 +88,12 @@ SET_TEXTS = {
     "no key": ("=3", "unknown config key"),
     "unknown": ("mapping.neus.iteration=3", "did you mean"),
     "part of a tree": ("mapping.neus=3", "unknown config key 'mapping.neus'"),
-    "negative": ("mapping.neus.iterations=-5", "must be 1 or more"),
+    "negative": ("mapping.neus.iterations=-5", "must be 1 to"),
     "broken list": ("tables.rates_hz=[1,", "is no TOML"),
+    "deep list": ("tables.rates_hz=" + 5000 * "[", "is no TOML"),
+    "empty list": ("tables.rates_hz=[]", "give at least one"),
+    "no budget": ("tables.budgets_ms=[0]", "must be 0.1 to"),
+    "giant": ("scenes.width=1000000000", "must be 11 to 4096"),
     "blank inside": ("mapping.neus .iterations=5", "unknown config key"),
 }
 
@@ -96,6 +104,8 @@ ENVIRONMENT = {
     "no config": ("CONFIG", "none.toml", "no config file none.toml"),
     "config folder": ("CONFIG", "map", "no config file map"),
     "device": ("DEVICE", "gpu7", "no device 'gpu7': this machine"),
+    "no memory": ("DEVICE", "meta", "no device 'meta': this machine"),
+    "no module": ("DEVICE", "hpu", "no device 'hpu': this machine"),
     "runs in a file": ("RUNS", "room", "room"),
 }
 
@@ -145,8 +155,20 @@ def _forget_the_map() -> None:
     Path("map").mkdir()
 
 
+def _loop_of_links() -> None:
+    Path("one").symlink_to("other")
+    Path("other").symlink_to("one")
+
+
+def _cache_in_a_loop() -> None:
+    _loop_of_links()
+    os.environ["NBTRACK_RUNS"] = "one"
+
+
 KITTI = ["export", "run", "--to", "kitti", "poses.txt"]
 MESH = ["export", "map", "--to", "glb", "m.glb"]
+MAKE = ["data", "make", "office", "--out", "new"]
+OTHER = [*OWN, "--seed", "9"]  # whose map is not made: what is refused must not make it first
 IMAP, NO_STEPS = [*MAP, "--field", "imap"], [*OWN[:4], "--field", "neus"]
 NO_OPTIMIZER = {"optimizer": {"state": {}, "param_groups": []}, "iteration": 2}
 RUN_OF_WORDS = {"estimates": "here", "rows": [], "tracker": {}, "budget": {}}
@@ -154,6 +176,8 @@ CUT = "not a readable checkpoint"
 TRAJECTORY, MAP_FILE = "run/trajectory.txt", "map/map.safetensors"
 ROW = "0.1 1 2 3 0 0 0 1"
 FILES = {
+    "cache in a loop": (_cache_in_a_loop, OWN, "symbolic links"),
+    "result in a loop": (_loop_of_links, [*OWN[:-1], "neus", "--out", "one/run"], "one"),
     "no map": (_nothing, [*GIVEN, "nowhere"], "nowhere holds no finished map"),
     "empty folder": (_forget_the_map, [*GIVEN, "map"], "map holds no finished map"),
     "unfinished map": (_unfinished(), [*GIVEN, "map"], "map holds no finished map"),
@@ -227,11 +251,11 @@ ARGUMENTS = {
     "endless steps": ([*OWN, "--steps", "inf"], "steps_per_frame is inf"),
     "no grid size": (
         [*OWN, "--tracker", "lm", "--set", "tracking.lm.voxel=nan"],
-        "must be 0 or more",
+        "must be 0 to",
     ),
     "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames out"),
     "an unknown option": ([*OWN, "--bake", "nan"], "unknown argument '--bake': "),
-    "negative pixels": ([*OWN, "--pixels", "-5"], "must be 1 or more"),
+    "negative pixels": ([*OWN, "--pixels", "-5"], "must be 1 to"),
     "no frames to map": ([*OWN, "--map-frames", "10:20"], "select 0 of"),
     "negative seed": ([*OWN, "--seed", "-1"], "is no whole number from 0"),
     "giant seed": ([*OWN, "--seed", "9" * 30], "is no whole number from 0"),
@@ -242,7 +266,18 @@ ARGUMENTS = {
     "no step": ([*OWN, "--frames", "::0"], "with S above 0"),
     "one frame": ([*OWN, "--frames", "2:3"], "too short to track"),
     "nothing selected": ([*OWN, "--frames", "90:"], "select 0 of"),
-    "unknown motion": ([*OWN, "--set", "tracking.sdf.motion_model=leap"], "unknown motion model"),
+    "unknown motion": ([*OTHER, "--set", "tracking.sdf.motion_model=leap"], "unknown motion model"),
+    "unknown start": ([*OTHER, "--start", "unknown"], "whose first pose is not known"),
+    "unknown start of lm": (
+        [*OTHER, "--tracker", "lm", "--start", "unknown"],
+        "whose first pose is not known",
+    ),
+    "too many pixels": ([*OTHER, "--pixels", "16777216"], "must be 1 to"),
+    "steps without end": ([*OTHER, "--steps", "1e12"], "steps_per_frame is 1e+12"),
+    "frames without end": ([*NO_STEPS, "--rate", "1e-308"], "rate_hz is 1e-308"),
+    "too many frames": ([*MAKE, "--n-frames", "1000000000"], "must be 2 to"),
+    "too wide": ([*MAKE, "--width", "1000000"], "must be 11 to"),
+    "too many seeds": (["tables", "--seeds", "1000000000"], "from 1 to 1000"),
     "empty folder name": ([*OWN, "--out", ""], "the path is empty"),
     "no seeds": (["tables", "--seeds", "0"], "seeds"),
     "no workers": (["tables", "--workers", "0"], "from 1 to"),

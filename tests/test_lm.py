@@ -17,6 +17,8 @@ from nbtrack.tracking.metrics import pose_errors
 
 FRAME, T_TRUE = walk(1, narrow_room(), 48)[0], np.eye(4)
 ROOM = BakedField(narrow_room(), 0.04)
+# Off by less than makes an outlier of a point.
+BLENDED = FRAME.color // 4 * 3 + FRAME.color.flip(1) // 4
 FAR = np.array([0.0, 1.2, 0.5, 0.3, 0.2, 0.5])  # rad, m: a start that leads nowhere
 
 
@@ -53,6 +55,22 @@ def test_every_start_in_the_basin_reaches_the_true_pose(seed: int) -> None:
     assert not run(tracker, retract(T_TRUE, twist), 40)
     assert errors(tracker)[0] < 0.002  # depths are whole millimetres
     assert errors(tracker)[1] < 0.05
+
+
+@pytest.mark.parametrize("twist", [np.zeros(6), FAR], ids=["near", "restarted"])
+def test_without_colour_no_picture_counts(twist: np.ndarray) -> None:
+    """Catches intensities that choose between starts, stages or restarts, or that make a verdict,
+    where their weight is 0: of an inverted and a dark picture everything must be the same."""
+    pictures = [FRAME.color, 255 - FRAME.color, FRAME.color // 50]
+    told = []
+    for color in pictures:
+        tracker = begun(lambda_intensity=0.0)
+        assert not run(tracker, T_TRUE, 20, replace(FRAME, color=color))
+        run(tracker, retract(T_TRUE, twist), 200, replace(FRAME, color=color))
+        told.append(
+            (tracker.T_world_camera.tolist(), tracker.descent.cost(np.ones(2)), tracker.report())
+        )
+    assert told[0] == told[1] == told[2]
 
 
 def test_in_a_corridor_the_axis_is_flagged_and_the_pose_stays() -> None:
@@ -142,9 +160,8 @@ def test_a_pose_that_still_moves_when_the_budget_ends_is_lost() -> None:
 def test_in_doubt_intensities_must_be_as_usual(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a pose on a surface that the map made up: enough points fit there, but intensities
     are off by several times what they were; and a dark picture that is taken for one."""
-    other = FRAME.color.flip(1)
-    for color, is_lost in ((FRAME.color, False), (other, True), (0 * other, False)):
-        tracker = begun(n_restarts=0, lambda_intensity=0.0)  # any intensity fits
+    for color, is_lost in ((FRAME.color, False), (BLENDED, True), (0 * BLENDED, False)):
+        tracker = begun(n_restarts=0, lambda_intensity=1e-6)  # which no pose follows
         assert not run(tracker, T_TRUE, 20)
         assert tracker.usual_mad == tracker.report()["intensity_mad"]
         with monkeypatch.context() as patch:
@@ -156,9 +173,9 @@ def test_at_first_intensities_must_be_as_in_the_map(monkeypatch: pytest.MonkeyPa
     """Catches a first frame on a made-up surface that passes, as nothing came before it, though the
     map knows how well its own frames agreed with it."""
     monkeypatch.setattr("nbtrack.tracking.lm._DOUBTED", 1.1)
-    other = replace(FRAME, color=FRAME.color.flip(1))
+    other = replace(FRAME, color=BLENDED)
     for intensity_mad, is_lost in ((np.inf, False), (0.002, True)):
-        tracker = begun(n_restarts=0, lambda_intensity=0.0)
+        tracker = begun(n_restarts=0, lambda_intensity=1e-6)
         monkeypatch.setattr(tracker.field, "intensity_mad", intensity_mad)
         assert run(tracker, T_TRUE, 20, other) is is_lost
     assert not run(tracker, T_TRUE, 20)

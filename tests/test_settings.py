@@ -1,23 +1,36 @@
 """Settings: who overrides whom, and that a misspelt key can never pass for a valid one."""
 
+import contextlib
 import copy
 import json
 from argparse import Namespace
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
+from tiny import TINY
 
-from nbtrack.core.errors import ConfigError
+from nbtrack.core.errors import ConfigError, NbtrackError
 from nbtrack.core.files import fingerprint
 from nbtrack.core.settings import as_dict, changed_settings, with_settings
 from nbtrack.data.sequence import parse_frames
+from nbtrack.experiments.bench import measure_steps
 from nbtrack.experiments.commands import _preset_of
 from nbtrack.experiments.methods import METHODS, TABLE_1
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
+from nbtrack.experiments.scenes import open_scene, open_scenes
 from nbtrack.fields import NetworkSettings
+from nbtrack.fields.mlp import FourierMlp
+from nbtrack.mapping.correct import correct_map
+from nbtrack.mapping.files import Map
+from nbtrack.mapping.fit import learning_rate, map_sequence
 from nbtrack.synthetic import REPORTED_ROOMS
-from nbtrack.synthetic.make import MOTIONS
+from nbtrack.synthetic.make import MOTIONS, room_intrinsics
+from nbtrack.synthetic.motion import tour
 from nbtrack.synthetic.room import build_room
+from nbtrack.tracking import ClockBudget, StepBudget, make_budget, make_tracker
 from nbtrack.tracking.metrics import still_metrics
 
 KEY = "mapping.neus.iterations"
@@ -144,8 +157,8 @@ REFUSED = {  # beside those of test_faults.py
     "scenes.names=[1, 2]": "it must be str, for example",
     "tables.pixels.vr=[1.5]": "it must be int, for example",
     # A sign that turns a loss into a reward, and a list whose quotes the shell ate.
-    "mapping.imap.learning_rate=-1e-3": "it must be 0 or more",
-    "tables.rates_hz=[5, -1]": "it must be 0 or more",
+    "mapping.imap.learning_rate=-1e-3": "it must be 0",
+    "tables.rates_hz=[5, -1]": "it must be 0.01 to 100",
     "scenes.names=[office,bedroom]": "is no TOML",
 }
 
@@ -181,3 +194,136 @@ def test_fingerprint() -> None:
     assert len(found) == 3
     assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
     assert {len(text) for text in found} == {12}
+
+
+def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and values of a tree."""
+    for name, value in node.items():
+        is_tree = isinstance(value, dict)
+        yield from leaves(value, f"{prefix}{name}.") if is_tree else [(f"{prefix}{name}", value)]
+
+
+NO_SETTINGS = ("name", "chosen")
+EVERY_KEY = {k: v for k, v in leaves(as_dict(PRESETS["smoke"])) if k not in NO_SETTINGS}
+# Of each kind: the least, what casts, sums and casts of sums fail on, what is no value at all.
+TRIED = {
+    bool: ["true", "false"],
+    int: ["0", "1", "-1", "0x" + "f" * 5000],
+    float: ["0", "5e-324", "-1", "inf", "nan"],
+    str: ['""', "x", ":", '"a/../x"', '"a\\u0000b"', "y" * 300],
+}
+TOO_MUCH = {int: [2**31, 2**63, 10**30], float: [1e9, 1e30, 1e308]}
+SMALLEST = (
+    *TINY, "scenes.n_frames=3", "scenes.names=['office']", "scenes.motion=tour",
+    "tables.budgets_ms=[1]", "mapping.points.voxel=0.2", "tracking.lm.voxel=0.5",
+    "tracking.vr.n_stratified=2", "tracking.vr.n_importance=1",
+    "network.occupancy.width=16", "network.occupancy.n_frequencies=8",
+    *(
+        f"mapping.{field}.{value}"
+        for field in ("imap", "occupancy", "neus", "volsdf", "neus_plus")
+        for value in ("iterations=1", "n_rays=4", "n_stratified=2", "n_surface=1")
+    ),
+)  # fmt: skip
+FIELD_OF = {"vr": "imap", "sdf": "neus", "lm": "neus", "icp": "points"}
+
+
+class Small:
+    """A room of three frames, and maps of one iteration in it."""
+
+    def __init__(self) -> None:
+        self.preset = load_preset("smoke", settings=SMALLEST)
+        self.scene = open_scene("office", self.preset)
+        self.sequence = self.scene.read()
+        self.fields = {name: self.mapped(self.preset, name).field for name in FIELD_OF.values()}
+
+    def mapped(self, preset: Preset, field: str) -> Map:
+        settings = preset.mapping_of(field)
+        found = map_sequence(field, self.sequence, preset.network_of(field), settings)
+        if getattr(settings, "correct_voxel", 0.0):
+            found = correct_map(found, self.sequence, settings)
+        return found
+
+    def track(self, preset: Preset, tracker: str) -> None:
+        start, settings = self.sequence.T_world_camera[0], preset.tracking_of(tracker)
+        tracker = make_tracker(
+            tracker, self.fields[FIELD_OF[tracker]], start, StepBudget(1), settings
+        )
+        tracker.track(self.sequence[1])
+
+    def use(self, preset: Preset, key: str) -> None:
+        """Run what reads a key."""
+        part, name, *_ = key.split(".")
+        if part in ("network", "mapping"):
+            self.mapped(preset, name)
+        elif part == "tracking":
+            self.track(preset, name)
+        elif part == "tables":
+            measure_steps(preset, self.scene, ["vr", "sdf"])
+        else:
+            [scene.count(preset.scenes.track_frames) for scene in open_scenes(preset)]
+
+    def read(self, preset: Preset, key: str) -> None:
+        """The same, as far as it is a matter of seconds with large values too."""
+        part, name, *_ = key.split(".")
+        last, scenes = key.split(".")[-1], preset.scenes
+        if part == "network":
+            FourierMlp(
+                preset.network_of(name), self.fields["neus"].bounds, torch.relu, torch.Generator()
+            )
+        elif last == "iterations":
+            assert learning_rate(preset.mapping_of(name), 1) > 0
+        elif last == "width":
+            room_intrinsics(scenes.width, scenes.width * 3 // 4)
+        elif last == "n_frames":
+            tour(build_room("office"), scenes.n_frames, 0)
+        elif last == "rates_hz":
+            [
+                make_budget(METHODS[m].paper_steps(preset.tables.rates_hz[0]), None)
+                for m in ("vr", "sdf")
+            ]
+        elif last == "budgets_ms":
+            next(ClockBudget(1000 / preset.tables.budgets_ms[0]).frame())
+        elif part != "tables":
+            self.use(preset, key)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Small]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NBTRACK_RUNS", str(tmp_path_factory.mktemp("small")))
+        patch.setattr("nbtrack.fields.correction._N_POINTS", 1000)
+        patch.setattr("nbtrack.fields.neus_plus._MIN_VOXEL", 0.5)
+        yield Small()
+
+
+def largest(preset: Preset, key: str, kind: type) -> str:
+    """The largest allowed value of a number."""
+
+    def is_allowed(value: float) -> bool:
+        with contextlib.suppress(ConfigError):
+            return bool(with_settings(preset, f"{key}={value!r}"))
+        return False
+
+    if kind is float:
+        return repr(max(10.0**n for n in range(-3, 10) if is_allowed(10.0**n)))
+    return str(max(n for k in range(32) for n in (2**k, 2**k - 1, 10 ** (k % 10)) if is_allowed(n)))
+
+
+@pytest.mark.parametrize("key", EVERY_KEY)
+def test_every_key_at_its_limits(key: str, small: Small) -> None:
+    """Catches an allowed value that ends in a traceback of another library, memory that is not
+    there or a run without end: by running what reads the key."""
+    old = EVERY_KEY[key]
+    texts, kind = [], type(old)
+    if kind is list:
+        texts, kind = ["[]"], type(old[0])
+    for text in [*texts, *map(str, TOO_MUCH.get(kind, []))]:
+        with pytest.raises(ConfigError):
+            with_settings(small.preset, f"{key}={text}")
+    for text in TRIED[kind]:
+        with contextlib.suppress(NbtrackError, OSError):  # which users are told in a line
+            small.use(with_settings(small.preset, f"{key}={text}"), key)
+    if kind in TOO_MUCH:
+        text = largest(small.preset, key, kind)
+        with contextlib.suppress(NbtrackError):
+            small.read(with_settings(small.preset, f"{key}={text}"), key)

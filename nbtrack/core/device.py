@@ -30,10 +30,10 @@ def named_device(name: str) -> torch.device:
     """A device by its name. Raises ConfigError, saying what there is, if it is not there."""
     try:
         device = torch.device(name)
-        torch.empty(0, device=device)
+        torch.zeros(1, device=device).item()  # which a device without memory cannot say
         if device.index is not None:  # streams, and what is recorded on them, go to the current one
             torch.accelerator.set_device_index(device.index)
-    except (RuntimeError, AssertionError, NotImplementedError):
+    except (RuntimeError, AssertionError, NotImplementedError, ImportError):
         kind = torch.accelerator.current_accelerator(check_available=True)
         there = ["cpu", *(f"{kind}:{i}" for i in range(torch.accelerator.device_count()))]
         raise ConfigError(f"no device {name!r}: this machine has {', '.join(there)}") from None

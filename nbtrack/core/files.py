@@ -64,14 +64,19 @@ def project_folder() -> Path:
     return PACKAGE.parent if is_checkout else Path.cwd()
 
 
+def resolved(path: Path | str) -> Path:
+    """An absolute path without links. Where these form a loop, whoever opens it is told."""
+    return Path(os.path.realpath(path))
+
+
 def runs_folder() -> Path:
     """Cache of rooms, maps and trajectories: `NBTRACK_RUNS`, else `runs/` of the project."""
-    return Path(os.environ.get("NBTRACK_RUNS") or project_folder() / "runs").resolve()
+    return resolved(os.environ.get("NBTRACK_RUNS") or project_folder() / "runs")
 
 
 def data_folder() -> Path:
     """Folder with downloaded scenes: `NBTRACK_DATA`, else `data/` of the project."""
-    return Path(os.environ.get("NBTRACK_DATA") or project_folder() / "data").resolve()
+    return resolved(os.environ.get("NBTRACK_DATA") or project_folder() / "data")
 
 
 def tables_folder() -> Path:
@@ -272,7 +277,7 @@ def json_text(content: Any) -> str:
 def read_json(path: Path) -> dict[str, Any]:
     """An object from a JSON file of a finished result. Raises DataError if it is none."""
     with naming_damaged(path, "JSON object"):
-        return {**json.loads(path.read_text(encoding="utf-8"))}
+        return {**json.loads(path.read_text(encoding="utf-8", errors="surrogateescape"))}
 
 
 @contextlib.contextmanager

@@ -1,7 +1,8 @@
 """Settings: trees of frozen dataclasses and dictionaries of them, changed by checked `key=value`.
 
-Keys are dotted paths such as `mapping.neus.iterations`; an unknown one is an error. Counts are at
-least one, and other numbers at least zero, unless their field says otherwise.
+Keys are dotted paths such as `mapping.neus.iterations`; an unknown one is an error. Counts are 1 to
+a million, other numbers 0 to a million, unless their field says otherwise: what is beyond any use
+would overflow, fill the memory or never end. No list is empty.
 """
 
 import dataclasses
@@ -14,15 +15,18 @@ from typing import Any, TypeVar
 from nbtrack.core.errors import ConfigError, look_up
 
 Config = TypeVar("Config")
+_MANY = 1_000_000
+_DEEPEST = 10  # dots of a key: more than any has
+_USUAL_LIMITS = {int: (1, _MANY), float: (0.0, _MANY)}
 
 
 def may_be_zero(default: int) -> Any:
     """A dataclass field with a count that may also be 0."""
-    return limited(default, 0)
+    return limited(default, 0, _MANY)
 
 
-def limited(default: float, minimum: float, maximum: float = math.inf) -> Any:
-    """A dataclass field with a number that a user may set within limits."""
+def limited(default: float | tuple, minimum: float, maximum: float) -> Any:
+    """A dataclass field with a number, or some, that a user may set within limits."""
     return dataclasses.field(default=default, metadata={"limits": (minimum, maximum)})
 
 
@@ -47,9 +51,10 @@ def with_settings(config: Config, *settings: str) -> Config:
             raise ConfigError(f"setting {setting!r} has no value: write key=value")
         try:
             value = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
+        # Nesting thousands deep ends the parser's recursion, as do thousands of digits.
+        except (ValueError, RecursionError):
             if text.startswith(("[", "{", '"', "'")):
-                raise ConfigError(f"{text!r} is no TOML: write \"{key}=['a', 'b']\"") from None
+                raise ConfigError(f"{text!r:.40} is no TOML: write \"{key}=['a', 'b']\"") from None
             value = text  # a bare word is a string
         config = with_values(config, {key: value})
     return config
@@ -84,7 +89,7 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     if dataclasses.is_dataclass(node):
         fields = [f for f in dataclasses.fields(node) if f.metadata.get("is_setting", True)]
         node = {f.name: getattr(node, f.name) for f in fields}
-    if not isinstance(node, dict):
+    if not isinstance(node, dict) or prefix.count(".") > _DEEPEST:
         yield prefix, node
         return
     for name, value in node.items():
@@ -107,16 +112,21 @@ def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
     wanted = type(old)
     if wanted is tuple and isinstance(value, list | str | int | float):
         values = value if isinstance(value, list) else [value]
+        if not values:
+            raise ConfigError(f"{key} = []: give at least one, for example {list(old)}")
         return tuple(_converted(key, old[0], v, allowed) if old else v for v in values)
-    # Integers of TOML may be too large for a float.
+    # Integers of TOML may be too large for a float, or to be printed.
+    if type(value) is int and value.bit_length() > 10_000:
+        value = math.inf
     if wanted is float and type(value) is int and abs(value) < 1e300:
         value = float(value)
-    if type(value) is not wanted:
+    if type(value) is not wanted or (wanted is str and "\0" in value):
         raise ConfigError(f"{key} = {value!r}: it must be {wanted.__name__}, for example {old!r}")
-    minimum, maximum = allowed.get("limits", (int(wanted is int), math.inf))
-    if wanted in (int, float) and not (minimum <= value <= maximum and value < math.inf):
-        up_to = "or more" if maximum == math.inf else f"to {maximum:g}"
-        raise ConfigError(f"{key} = {value!r}: it must be {minimum:g} {up_to}, such as {old!r}")
+    if limits := allowed.get("limits", _USUAL_LIMITS.get(wanted)):
+        minimum, maximum = limits
+        if not minimum <= value <= maximum:
+            within = f"{minimum:g} to {maximum:g}"
+            raise ConfigError(f"{key} = {value!r}: it must be {within}, such as {old!r}")
     if value not in allowed.get("choices", [value]):
         raise ConfigError(f"{key} = {value!r}: write {' or '.join(map(repr, allowed['choices']))}")
     return value

@@ -4,7 +4,6 @@ A format of one's own is one more entry. What a recording does otherwise than it
 in `sequence.toml`: any field of `Declaration`.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.core.settings import limited, one_of, with_values
+from nbtrack.data.names import frame_keys
 from nbtrack.data.text_files import Calibration, read_object
 
 DECLARATION_FILE = "sequence.toml"
@@ -54,14 +54,20 @@ class Declaration:
 
     def poses_to_opencv(self, file_poses: Poses) -> Poses:
         """Camera-to-world poses with OpenCV's camera axes, of a file's; NaN poses stay NaN."""
-        T, axes = file_poses.copy(), self._axes
-        if self.poses == WORLD_TO_CAMERA:
-            # A transpose, unlike a solver, takes NaN and never fails.
-            T[:, :3, :3] = file_poses[:, :3, :3].mT
-            T[:, :3, 3:] = -T[:, :3, :3] @ file_poses[:, :3, 3:]
+        axes = self._axes
+        T = inverse(file_poses) if self.poses == WORLD_TO_CAMERA else file_poses.copy()
         T[:, :3, :3] = T[:, :3, :3] @ axes
         T[:, 2] *= np.linalg.det(axes)  # left-handed cameras come with a mirrored world
         return T
+
+
+def inverse(poses: Poses) -> Poses:
+    """World-to-camera of camera-to-world poses, and the other way round; NaN stays NaN."""
+    T = poses.copy()
+    # A transpose, unlike a solver, takes NaN and never fails.
+    T[:, :3, :3] = poses[:, :3, :3].mT
+    T[:, :3, 3:] = -T[:, :3, :3] @ poses[:, :3, 3:]
+    return T
 
 
 @dataclass(frozen=True)
@@ -76,6 +82,7 @@ class Format:
     cameras: tuple[str, ...]  # calibration files; the first that is there
     known_cameras: tuple[Calibration, ...] = ()  # without a file; `source` is in the folder's name
     declared: Declaration = Declaration()  # what its numbers mean
+    counts_from_0: bool = False  # a number is the place of the frame's pose in a list
     resize_color: bool = False  # colour has another size than depth and shows the same view
 
     @property
@@ -103,29 +110,8 @@ def files_of(folder: Path, pattern: str) -> list[Path]:
     paths = (folder / pattern).parent.glob(Path(pattern).name)
     # Hidden files are the system's.
     files = [p for p in paths if p.suffix.lower() in suffixes and p.name[0] != "." and p.is_file()]
-    # The name decides between img1 and img01.
-    return sorted(files, key=lambda path: (numbers_in(path), path.name))
-
-
-def stamp_in(path: Path) -> float | None:
-    """The time (s) that a file is named after, as 1305031102.175304.png or in nanoseconds.
-
-    >>> stamp_in(Path("1305031102.5.png")), stamp_in(Path("1305031102500000000.png"))
-    (1305031102.5, 1305031102.5)
-    >>> stamp_in(Path("000017.png")) is stamp_in(Path("img17.5.png")) is None
-    True
-    """
-    if re.fullmatch(r"\d{9,10}\.\d+", path.stem):
-        return float(path.stem)
-    # Micro- and nanoseconds since 1970 have so many digits.
-    is_whole = re.fullmatch(r"\d{16}|\d{19}", path.stem)
-    return int(path.stem) / 10 ** (len(path.stem) - 10) if is_whole else None
-
-
-def numbers_in(path: Path) -> list[int]:
-    """The numbers in a file's name."""
-    # A dot ends the stem: frame-000001.color.png counts as 1. Of more digits no camera is capable.
-    return [int(digits[-18:]) for digits in re.findall(r"[0-9]+", path.stem)]
+    keys = dict(zip(files, frame_keys(files), strict=True))
+    return sorted(files, key=lambda path: (keys[path], path.name))
 
 
 _VGA = (640, 480)
@@ -143,7 +129,7 @@ FORMATS: dict[str, Format] = {
         "Neural RGB-D", color=("images/*",),
         depth=("depth_filtered/*", "depth/*", "depth_with_noise/*"), poses=("poses.txt",),
         cameras=("intrinsics.txt", "focal.txt", "K.txt"),
-        declared=Declaration(camera_axes="opengl"),
+        declared=Declaration(camera_axes="opengl"), counts_from_0=True,
     ),
     # Sturm et al. 2012. The depth maps carry their scale correction already.
     "tum": Format(
@@ -156,7 +142,7 @@ FORMATS: dict[str, Format] = {
     "replica": Format(
         "Replica (NICE-SLAM)", color=("results/frame*",), depth=("results/depth*",),
         poses=("traj.txt",), cameras=("cam_params.json", "../cam_params.json"),
-        declared=Declaration(depth_scale=6553.5),
+        declared=Declaration(depth_scale=6553.5), counts_from_0=True,
     ),
     # Shotton et al. 2013. Colour and depth come from two cameras 25 mm apart that the dataset does
     # not register. Its page states the focal length and the principal point (320, 240), taken here

@@ -1,6 +1,7 @@
 """From image files to arrays: one size, depth in mm along the optical axis, no distortion."""
 
 import io
+import struct
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Int, Shaped, UInt8, UInt16
 from PIL import Image
+from PIL.Image import DecompressionBombError
 
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
@@ -82,7 +84,8 @@ def _is_complete(content: bytes) -> bool:
     try:
         with Image.open(io.BytesIO(content)) as image:
             image.verify()  # of a PNG the chunks, of a JPEG nothing
-    except (OSError, SyntaxError):
+    # Whatever a header that promises too much, or is cut, makes the parser raise.
+    except (OSError, SyntaxError, ValueError, LookupError, struct.error, DecompressionBombError):
         return False
     return image.format == "PNG" or content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
 

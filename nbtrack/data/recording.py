@@ -13,24 +13,29 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Frames, Poses, Position
 from nbtrack.core.errors import DataError, MissingError
 from nbtrack.data.formats import (
     FORMATS,
+    WORLD_TO_CAMERA,
     Declaration,
     Format,
     declaration,
     files_of,
+    inverse,
     is_declared,
-    numbers_in,
-    stamp_in,
 )
+from nbtrack.data.names import frame_keys, frame_numbers, stamp_in
 from nbtrack.data.text_files import Calibration, Times, read_calibration, read_poses, read_rows
 
 _END_OF_PNG = 64  # bytes: the checksum of all pixels, and the marker of the end
 _TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
-_SINCE_1970 = 1e8  # s: times of a clock, and not of a recording's beginning
+_SAME_TIME = 1e-6  # s: the last digit of lists
+_ON_TIME = 1e-3  # s between a stamp and the number, over the rate, of the same frame
+_GAP = 0.0505  # s between poses that are interpolated, 20 Hz: at a hand's 2 m/s² 0.6 mm off
+_ABSURD = 1e12  # s: no stamp, and larger numbers overflow
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 _ALONE = 1000.0  # m from the middle, and so many times as far as nine in ten: no camera went there
 TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
@@ -139,12 +144,11 @@ def _images(
 
 def _times(folder: Path, colors: list[Path], rate_hz: float) -> Times:
     """Of frames that no list of files times: from a file, their names, or the numbers in these."""
-    path, numbers, stamps = folder / TIMES_FILE, _numbers_of(colors), _stamps_of(colors)
+    path, numbers, stamps = folder / TIMES_FILE, frame_numbers(colors), _stamps_of(colors)
     if not path.is_file():
         if stamps is not None and (np.diff(stamps) > 0).all():
             return stamps
-        is_counted = (np.diff(numbers) > 0).all()
-        return (numbers - numbers[0] if is_counted else np.arange(len(colors))) / rate_hz
+        return (np.arange(len(colors)) if numbers is None else numbers - numbers[0]) / rate_hz
     rows = read_rows(path, lambda line: [float(line)], (1,), "the time (s) of a frame")
     times = np.array(rows).ravel()
     if len(times) != len(colors) or not (np.diff(times) > 0).all():
@@ -176,28 +180,28 @@ def _with_poses(recording: Recording, pose_file: str | None) -> Recording:
         return recording
     files = layout.files(folder, names, "poses")
     path = folder / there[0]
+    tables = [read_poses(file, recording.declared.quaternion) for file in files]
+    poses, stamps = np.concatenate([T for T, _ in tables]), tables[0][1]
+    is_listed, has_file = layout.color[0].endswith(".txt"), (folder / TIMES_FILE).is_file()
+    is_timed = is_listed or has_file or _stamps_of(colors) is not None
     if "*" in path.name:
         _check_paired(colors, files)
-    tables = [read_poses(file, recording.declared.quaternion) for file in files]
-    poses, pose_times = np.concatenate([T for T, _ in tables]), tables[0][1]
-    if pose_times is not None:
-        is_by_time = layout.color[0].endswith(".txt")
-        is_by_time |= _stamps_of(colors) is not None and pose_times.max() > _SINCE_1970
-        poses = _placed(poses, pose_times, recording.times, path, is_by_time)
-        is_untimed = not is_by_time and not (folder / TIMES_FILE).is_file()
-        if is_untimed and len(pose_times) == len(colors) and (np.diff(pose_times) > 0).all():
-            recording = replace(recording, times=pose_times)  # what they are stamped with
-    numbers = _numbers_of(colors)
-    if len(poses) > len(colors) and 0 <= numbers.min() <= numbers.max() < len(poses):
-        chosen = f"those of the {len(colors)} images' numbers"
-        recording.notes.append(f"of {len(poses)} poses in {path.name} {chosen}")
-        poses = poses[numbers]
-    if len(poses) != len(colors):
+        paired = poses
+    elif stamps is not None and (is_listed or (is_timed and _share_clock(recording, stamps))):
+        paired = _by_time(recording, poses, stamps, path)
+    else:
+        paired = _by_number(recording, poses, stamps, path)
+        is_whole = stamps is not None and len(stamps) == len(colors)
+        if is_whole and not is_timed and (np.diff(stamps) > 0).all():
+            recording = replace(recording, times=stamps)
+    if paired is None or len(paired) != len(colors):
         raise DataError(
-            f"{path} has {len(poses)} poses but there are {len(colors)} images: every image needs "
-            "one, 'nan' where it has none, and every pose an image; remove what is odd"
+            f"{path} has {len(poses)} poses but there are {len(colors)} images, {colors[0].name} "
+            f"to {colors[-1].name}, and nothing tells whose each is: every image needs one, 'nan' "
+            "where it has none, and every pose an image; remove what is odd, or write "
+            f"{TIMES_FILE}, a time (s) an image on the clock of the poses' stamps"
         )
-    recording = replace(recording, file_poses=poses, pose_file=path)
+    recording = replace(recording, file_poses=paired, pose_file=path)
     _check_together(recording)
     return recording
 
@@ -217,19 +221,97 @@ def _check_together(recording: Recording) -> None:
         )
 
 
-def _placed(poses: Poses, pose_times: Times, times: Times, path: Path, is_by_time: bool) -> Poses:
-    """The pose nearest to every frame in time; NaN where none is near.
+def _share_clock(recording: Recording, stamps: Times) -> bool:
+    """Whether stamps lie near frames' times, and are not all theirs to the last digit."""
+    is_near = _nearest(recording.times, stamps, _TOLERANCE) >= 0
+    is_own = np.isin(stamps, recording.times).all()
+    return is_near.any() and np.isfinite(stamps).all() and not is_own
 
-    In formats by number they are taken as they stand, but for nbtrack's own trajectories, which
-    leave frames out.
+
+def _by_time(recording: Recording, poses: Poses, stamps: Times, path: Path) -> Poses:
+    """Of every frame the pose: interpolated where one before and one after are close to each other,
+    else the nearest; NaN where none is near."""
+    times = recording.times
+    placed = _at(poses, _nearest(times, stamps, _TOLERANCE, path))
+    stamps = stamps.clip(-_ABSURD, _ABSURD)
+    order = np.argsort(stamps, kind="stable")
+    later = np.searchsorted(stamps[order], times).clip(1, len(order) - 1)
+    first, second = order[later - 1], order[later]
+    late, early = times - stamps[first], stamps[second] - times
+    apart = np.minimum(late, early)
+    # A frame keeps a pose of its very time as the file has it.
+    kept = (late + early <= _GAP) & (apart > _SAME_TIME)
+    kept &= np.isfinite(poses[first] + poses[second]).all(axis=(1, 2))
+    if kept.any():
+        flip = inverse if recording.declared.poses == WORLD_TO_CAMERA else np.copy
+        share = late[kept] / (late + early)[kept]
+        placed[kept] = flip(_between(flip(poses[first[kept]]), flip(poses[second[kept]]), share))
+        recording.notes.append(
+            f"{kept.sum()} of {len(times)} poses are interpolated, the nearest in {path.name} "
+            f"{1e3 * np.median(apart[kept]):.1f} ms away (at most {1e3 * apart[kept].max():.1f} ms)"
+        )
+    return placed
+
+
+def _at(poses: Poses, places: Frames) -> Poses:
+    """The poses at places in a list; NaN at -1."""
+    return np.where(places[:, None, None] >= 0, poses[places], np.nan)
+
+
+def _between(first: Poses, second: Poses, share: Times) -> Poses:
+    """Poses after a share of the way: the camera goes straight, and turns about one axis."""
+    T, start = first.copy(), Rotation.from_matrix(first[:, :3, :3])
+    turn = (start.inv() * Rotation.from_matrix(second[:, :3, :3])).as_rotvec()
+    T[:, :3, :3] = (start * Rotation.from_rotvec(share[:, None] * turn)).as_matrix()
+    T[:, :3, 3] += share[:, None] * (second - first)[:, :3, 3]
+    return T
+
+
+def _by_number(
+    recording: Recording, poses: Poses, stamps: Times | None, path: Path
+) -> Poses | None:
+    """Of every frame the pose in a list that names no images; None where nothing tells it.
+
+    By the images' numbers, where stamps, or places in the list, are these in just one way; else one
+    after another, if there are as many. Raises DataError if no stamp is a frame's.
     """
-    if len(poses) == len(times) and not is_by_time:
-        return poses
-    closest = _nearest(times, pose_times, _TOLERANCE if is_by_time else 1e-3, path)
-    placed = np.where(closest[:, None, None] >= 0, poses[closest], np.nan)
-    # Unless all poses find a frame the times are something else.
-    is_whole = np.isfinite(placed).sum() == np.isfinite(poses).sum()
-    return placed if is_by_time or is_whole else poses
+    colors, rate = recording.color_files, recording.declared.frame_rate
+    n_images, n_poses, numbers = len(colors), len(poses), frame_numbers(colors)
+    is_stamped = stamps is not None and (np.abs(stamps) < _ABSURD).all()
+    clock = stamps if is_stamped else np.arange(n_poses) / rate
+    near = min(_ON_TIME, 0.25 / rate)
+    ways = [_nearest(times, clock, near) for times in _clocks(recording, numbers, clock)]
+    whole = {tuple(way) for way in ways if (way >= 0).sum() == min(n_images, n_poses)}
+    if len(whole) == 1 and (is_stamped or n_poses > n_images):
+        if n_poses > n_images:
+            chosen = f"those of the {n_images} images' numbers"
+            recording.notes.append(f"of {n_poses} poses in {path.name} {chosen}")
+        return _at(poses, np.array(whole.pop()))
+    if n_poses != n_images:
+        if is_stamped and not whole:
+            _nearest(recording.times, clock, _ON_TIME, path)
+        return None
+    if is_stamped and any((way >= 0).mean() > 0.75 for way in ways):
+        steps, image_steps = rate * np.diff(clock), rate * np.diff(recording.times)
+        # Stamps leave out other frames than the images do. Equal steps only count the lines.
+        if np.ptp(steps) > 0.1 and (np.rint(steps) != np.rint(image_steps)).any():
+            return None
+    if not np.array_equal(numbers, np.arange(n_images)):
+        named = f"images {colors[0].name} to {colors[-1].name}"
+        recording.notes.append(f"{named} have the poses of {path.name} one after another")
+    return poses
+
+
+def _clocks(recording: Recording, numbers: Frames | None, clock: Times) -> list[Times]:
+    """Times (s) that frames may have on a clock of poses, by the number from which they count."""
+    if np.isin(clock, recording.times).all():
+        return [recording.times]  # as in trajectories that nbtrack wrote
+    if numbers is None:
+        return []
+    first, is_whole = numbers[0], np.ptp(numbers) == len(numbers) - 1
+    is_known = recording.format.counts_from_0 and not (first == 1 and is_whole)
+    starts = {0} if is_known else {0, min(first, 1), first}
+    return [(numbers - start) / recording.declared.frame_rate for start in starts]
 
 
 def _stamps_of(files: list[Path]) -> Times | None:
@@ -238,23 +320,18 @@ def _stamps_of(files: list[Path]) -> Times | None:
     return None if None in stamps else np.array(stamps)
 
 
-def _numbers_of(files: list[Path]) -> Frames:
-    """Frame numbers: the last in each file's name; -1 if it has none. Of times: microseconds."""
-    if (stamps := _stamps_of(files)) is not None:
-        return np.rint(1e6 * stamps).astype(np.int64)
-    return np.array([[-1, *numbers_in(path)][-1] for path in files])
-
-
 def _check_paired(colors: list[Path], others: list[Path]) -> None:
     """Raises DataError unless every image has its depth map or pose, with the same frame number."""
-    numbers, other_numbers = _numbers_of(colors), _numbers_of(others)
-    if not np.array_equal(numbers, other_numbers):
-        count = Counter([*numbers, *other_numbers])
-        odd = [path.name for path in (*colors, *others) if count[_numbers_of([path])[0]] != 2]
+    keys, other_keys = frame_keys(colors), frame_keys(others)
+    if keys != other_keys or len(set(keys)) < len(keys):
+        count = Counter([*keys, *other_keys])
+        both = zip((*colors, *others), (*keys, *other_keys), strict=True)
+        odd = [path.name for path, key in both if count[key] != 2]
         raise DataError(
             f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
-            f"{len(others)} {others[0].suffix} files ({len(odd)} without a partner: "
-            f"{', '.join(odd[:4])}): every image needs one of its number; rename or remove them"
+            f"{len(others)} {others[0].suffix} files ({len(odd)} without a partner, or with two: "
+            f"{', '.join(odd[:4])}): every image needs one of its number, and a folder one "
+            "session; rename or remove them"
         )
 
 
@@ -294,15 +371,15 @@ def _entry(line: str) -> tuple[float, str]:
     return float(time), name.strip()
 
 
-def _nearest(times: Times, others: Times, tolerance: float, path: Path) -> Frames:
+def _nearest(times: Times, others: Times, tolerance: float, path: Path | None = None) -> Frames:
     """For every time the index of the nearest other one; -1 if none is within the tolerance (s).
 
-    Raises DataError, which names the file of the others, if that is so everywhere, or one of them
-    is not finite.
+    Raises DataError, which names the file of the others where it is given, if that is so
+    everywhere, or one of them is not finite.
     """
     closest = cKDTree(np.nan_to_num(others)[:, None]).query(times[:, None], p=1)[1]
     is_near = np.abs(others[closest] - times) <= tolerance
-    if not (is_near.any() and np.isfinite(others).all()):
+    if path and not (is_near.any() and np.isfinite(others).all()):
         raise DataError(
             f"{path} ({_span(others)}) has no time within {tolerance:g} s of the images' "
             f"({_span(times)}): it needs finite timestamps of the same clock"

@@ -20,6 +20,7 @@ from nbtrack.core.errors import MissingError, NbtrackError
 from nbtrack.core.files import project_folder, runs_folder, write_atomic
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings
+from nbtrack.data.sequence import read_frames
 from nbtrack.experiments.grid import Execution, map_scene, track_scenes
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Methods, find_methods
 from nbtrack.experiments.output import output_folder
@@ -136,7 +137,7 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     """Steps within each budget for every tracker, in its first method's field, and its n (pixels).
 
     A tracker first spends one frame that is not counted, so that allocations and compilations are
-    done. The scene's first frame feeds it, in the scene's map, which is made if it is not cached.
+    done. The scene's first frame with a pose feeds it, in the scene's map, made if not cached.
 
     A row is a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames) and
     steps_std (over frames). Source: paper, Table II and evaluation protocol.
@@ -146,7 +147,8 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
         firsts.setdefault(method.tracker, method)
     pixels, rows = preset.tables.pixels, []
     plan = [(m, n) for m in firsts.values() for n in pixels.get(m.tracker, pixels["sdf"])]
-    sequence = scene.read(":1")
+    recording = scene.recording
+    sequence = read_frames(recording, np.flatnonzero(recording.has_pose)[:1])
     T_first = sequence.T_world_camera[0]
     with ProgressBar("Table II", len(plan)) as bar:
         for done, (method, n_pixels) in enumerate(plan):

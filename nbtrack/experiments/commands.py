@@ -11,7 +11,7 @@ import trimesh
 from nbtrack.core.errors import ConfigError, DataError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
-from nbtrack.core.settings import as_dict
+from nbtrack.core.settings import as_dict, with_values
 from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames
 from nbtrack.data.writer import convert_sequence
@@ -103,6 +103,8 @@ def track_command(options: Namespace) -> None:
     job = MapJob(scene, method.field, preset, *of_map)
     how = options.frames, options.seed, options.out, options.threads, options.start
     run = TrackJob(job, scene, method.tracker, steps, options.rate, *how)
+    if not given:
+        run.check()
     for warning in reach_warnings([run]):
         tell(f"nbtrack: warning: {warning}")
     with output_folder(options.out):
@@ -193,7 +195,6 @@ def _draw_overview(run: TrackJob) -> None:
         ate, still = (100 * metrics.get(n, np.nan) for n in ("ate_rmse_m", "still_ate_m"))
         title += f", ATE {ate:.2f} cm (standing still {still:.0f} cm)"
         paths["true"] = tracked.T_true[np.isfinite(tracked.T_true).all(axis=(1, 2))]
-    title = title.encode(errors="replace").decode()  # letters that the system's encoding lacks
     paths["tracked"] = tracked.T_estimated
     figure = plot_overview(cloud_of(surface), paths, tracked.frames, title)
     save_picture(figure, run.folder / OVERVIEW_FILE, dpi=120)
@@ -277,7 +278,7 @@ _EXPORTS = {
 def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
     chosen = "motion", "n_frames", "width", "seed"
-    config = ScenesConfig(**{name: getattr(options, name) for name in chosen})
+    config = with_values(ScenesConfig(), {name: getattr(options, name) for name in chosen})
     check_no_recording(options.out)
     write_room(options.room, options.out, config)
     print(f"{options.out}: {options.room}, {options.n_frames} frames, seed {options.seed}")

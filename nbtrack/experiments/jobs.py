@@ -15,6 +15,7 @@ from nbtrack.core.device import advise_on_memory, choose_device, device_name, th
 from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.settings import as_dict, changed_settings, with_settings
 from nbtrack.data.frame import Frame
+from nbtrack.data.sequence import parse_frames, select_frames
 from nbtrack.experiments.output import check_no_recording
 from nbtrack.experiments.presets import PRESETS, Preset
 from nbtrack.experiments.scenes import Scene
@@ -26,6 +27,7 @@ from nbtrack.mapping.quality import check_belongs, score_map
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
 from nbtrack.tracking.reach import reach_metrics
+from nbtrack.tracking.starts import expected_poses
 from nbtrack.tracking.trajectories import METRICS_FILE, in_world_of_map, shifted, tum_text
 
 RUN_FILE = "run.pt"
@@ -224,6 +226,15 @@ class TrackJob(Job):
     def is_done(self) -> bool:
         """Whether the run is finished; in a folder of the user's it is always made anew."""
         return self.out is None and (self.folder / METRICS_FILE).is_file()
+
+    def check(self) -> None:
+        """Raises ConfigError, before its map is made, where a run cannot begin in it."""
+        recording = self.scene.recording
+        frame_ids = select_frames(recording, parse_frames(self.frames), needs_poses=False)
+        expected_poses(self.settings.motion_model, [np.eye(4)])
+        if self.start == "unknown" or not recording.has_pose[frame_ids[0]]:
+            is_corrected = bool(getattr(self.needs.settings, "correct_voxel", 0.0))
+            tracker_class(self.tracker).check_finds(is_corrected)
 
     def result(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""

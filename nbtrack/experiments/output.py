@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from nbtrack.core.errors import ConfigError
-from nbtrack.core.files import locked, write_atomic
+from nbtrack.core.files import locked, resolved, write_atomic
 from nbtrack.data.formats import holds_recording
 from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, MESH_FILE
 from nbtrack.plots.style import in_house_style
@@ -82,7 +82,7 @@ def output_folder(folder: Path | None) -> Iterator[None]:
 
 def check_no_recording(path: Path) -> None:
     """Raises ConfigError if a path that is to be written is a recording, or lies within one."""
-    for folder in (path, *path.resolve().parents):
+    for folder in (path, *resolved(path).parents):
         if folder.is_dir() and holds_recording(folder):
             raise ConfigError(
                 f"{folder} holds a recording, where nothing is written: choose another"

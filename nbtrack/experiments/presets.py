@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from nbtrack.core.errors import ConfigError, MissingError, look_up
-from nbtrack.core.settings import may_be_zero, setting_texts, with_settings, with_values
+from nbtrack.core.settings import limited, setting_texts, with_settings, with_values
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, PointMapping, field_class
@@ -28,18 +28,18 @@ class ScenesConfig:
     names: tuple[str, ...] = ()  # synthetic rooms, or folders below the data folder
     synthetic: bool = True  # made by this package; otherwise read from the data folder
     motion: str = "keyframes"  # in a synthetic room: as the dataset's; or handheld, or a tour
-    n_frames: int = 300
-    width: int = 640  # pixels; the height is three quarters of it
+    n_frames: int = limited(300, 2, 10_000)
+    width: int = limited(640, 11, 4096)  # pixels; the height is three quarters of it
     track_frames: str = ":"  # the Python slice of frames that is tracked
-    seed: int = may_be_zero(0)
+    seed: int = limited(0, 0, 2**31 - 1)
 
 
 @dataclass(frozen=True)
 class TablesConfig:
     """What the two tables ask of the cells."""
 
-    rates_hz: tuple[float, ...] = (10.0, 5.0, 2.0)  # paper, Table I
-    budgets_ms: tuple[float, ...] = (50.0, 100.0, 500.0)  # paper, Table II
+    rates_hz: tuple[float, ...] = limited((10.0, 5.0, 2.0), 0.01, 100.0)  # paper, Table I
+    budgets_ms: tuple[float, ...] = limited((50.0, 100.0, 500.0), 0.1, 1e5)  # paper, Table II
     # Pixels n of each tracker in Table II (paper); others take those of the SDF tracker.
     pixels: dict[str, tuple[int, ...]] = field(
         default_factory=lambda: {"vr": (128, 512, 1024), "sdf": (2048, 4096, 16384)}

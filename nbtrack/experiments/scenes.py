@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up, nearest_name
-from nbtrack.core.files import data_folder, fingerprint, locked, runs_folder, write_atomic
+from nbtrack.core.files import (
+    data_folder,
+    fingerprint,
+    locked,
+    resolved,
+    runs_folder,
+    write_atomic,
+)
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.recording import Recording, image_digest, open_recording
@@ -86,7 +93,7 @@ def open_scenes(preset: Preset) -> list[Scene]:
     scene is whole, what is wrong with the first.
     """
     names, scenes, missing = preset.scenes.names, [], {}
-    if not names or len({Path(name).resolve().name for name in names}) < len(names):
+    if not names or len({resolved(name).name for name in names}) < len(names):
         given = ", ".join(names) or "(none)"
         raise ConfigError(f"scenes {given}: give at least one, and of one name only one")
     for name in names:

@@ -14,7 +14,7 @@ from nbtrack.core.arrays import Colors, Frames, Points, Pose, RayColors, RaySamp
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.core.device import constant
-from nbtrack.core.settings import may_be_zero
+from nbtrack.core.settings import limited, may_be_zero
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import rendering
@@ -41,10 +41,10 @@ class MappingSettings:
     """Fitting a field to posed frames. The paper gives none of these figures."""
 
     iterations: int = 20_000
-    n_rays: int = 1024  # a batch, drawn over all mapping frames
-    n_stratified: int = 32  # samples a ray, spread evenly (iMAP)
+    n_rays: int = limited(1024, 1, 65536)  # a batch, drawn over all mapping frames
+    n_stratified: int = limited(32, 1, 1024)  # samples a ray, spread evenly (iMAP)
     # Samples a ray at the surface: iMAP's second pass, or around the measured depth (NeuS).
-    n_surface: int = may_be_zero(12)
+    n_surface: int = limited(12, 0, 1024)
     learning_rate: float = 1e-3  # Adam's, at the start; falls to a twentieth along a cosine (NeuS)
     lambda_color: float = 5.0  # iMAP's, whose depth errors are relative to their std
     holdout_every: int = may_be_zero(10)  # every n-th frame is only scored

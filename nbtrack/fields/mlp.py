@@ -10,6 +10,7 @@ from torch import Generator, Tensor, nn
 
 from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.settings import limited
 
 _LAYER_SIZE = 2**18  # numbers that are worked on at once: 1 MB, which a core's cache holds
 
@@ -20,8 +21,8 @@ Activation = Callable[[Tensor], Tensor]
 class NetworkSettings:
     """The network that all fields share."""
 
-    width: int = 256  # hidden units a layer (iMAP)
-    n_frequencies: int = 93  # learnable sines of the embedding (iMAP)
+    width: int = limited(256, 1, 4096)  # hidden units a layer (iMAP)
+    n_frequencies: int = limited(93, 1, 4096)  # learnable sines of the embedding (iMAP)
     # Standard deviation of the sines' first frequencies, rad/m. 2.5 is iMAP's own: 25 on
     # coordinates scaled by 1/10.
     embedding_sigma: float = 2.5

@@ -7,6 +7,7 @@ from torch import Generator, Tensor
 
 from nbtrack.core.arrays import Colors, Points, RaySamples, Scalar, Values
 from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.settings import limited
 from nbtrack.data.pixels import Rays
 from nbtrack.fields import base, rendering
 from nbtrack.fields.base import Draw, LearnedField, Losses, rendered_losses
@@ -23,7 +24,7 @@ class NeusMapping(base.MappingSettings):
     lambda_depth: float = 1.0  # per metre
     lambda_eikonal: float = 0.5  # five times the method's own: rooms are mostly empty
     # Share of the samples that the eikonal term looks at: neighbours say the same.
-    eikonal_share: float = 0.25
+    eikonal_share: float = limited(0.25, 0.0, 1.0)
     correct_voxel: float = 0.0  # m; the finished map is corrected in such cells, 0: not at all
 
 

@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 
 from nbtrack.core.arrays import Frames, RaySamples
 from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.settings import limited
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Draw, Losses, measured_mean, rendered_losses
@@ -33,11 +34,11 @@ class NeusPlusMapping(NeusMapping):
     """Mapping of NeuS+: half the rays, and measured points besides."""
 
     iterations: int = 10_000
-    n_rays: int = 512
+    n_rays: int = limited(512, 1, 65536)
     lambda_color: float = 6.0
-    eikonal_share: float = 0.125
+    eikonal_share: float = limited(0.125, 0.0, 1.0)
     lambda_sdf: float = 10.0  # per metre
-    n_surface_points: int = 4096  # measured points an iteration, besides the rays
+    n_surface_points: int = limited(4096, 1, 65536)  # measured ones, besides the rays
     lambda_rendering: float = 1.0  # factor of rendered depth and colour; 0: none
     behind_band: float = 0.1  # distances are supervised so far behind surfaces, m
 

@@ -91,10 +91,9 @@ def read_map(path: Path | str) -> Map:
 
 def _read_file(file: Path) -> Map:
     """The map of a file. Raises ValueError, KeyError and others if it is not sound."""
-    with safetensors.safe_open(file, "pt") as opened:
-        header = dict(json.loads((opened.metadata() or {})[_FORMAT]))
-        names = opened.keys()
-        tensors = {name: opened.get_tensor(name).clone() for name in names}
+    content = file.read_bytes()  # safetensors itself opens no path whose letters are not UTF-8
+    tensors, size = safetensors.torch.load(content), int.from_bytes(content[:8], "little")
+    header = dict(json.loads(json.loads(content[8:][:size])["__metadata__"][_FORMAT]))
     if header.get("format_version") != _VERSION:
         raise ValueError(f"format {header.get('format_version')!r}; this nbtrack reads {_VERSION}")
     # A bit that flipped on a disk, or a number edited by hand, shows nowhere else.

@@ -65,6 +65,7 @@ def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **share
     """
     figure = NotebookFigure(figsize=(WIDTH, height), layout="compressed")
     if title:
+        title = title.encode(errors="replace").decode()  # letters that the system's encoding lacks
         figure.suptitle(textwrap.fill(title, 100).replace("$", r"\$"), x=0.01, ha="left")
     return figure.subplots(rows, columns, squeeze=False, **share)
 

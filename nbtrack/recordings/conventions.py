@@ -5,6 +5,7 @@ Under the right convention the surfaces that two frames both see coincide.
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ _SAME_SURFACE = 0.025  # of the depth: where neighbours blend to more, they lie 
 _POINTS_PER_FRAME = 1000  # 20 pairs of frames have enough for a median
 _CLEARLY_BETTER = 0.5  # of the distance as declared (our choice)
 _MIN_GAIN = 5e-4  # of the depth: 1 mm at 2 m, depth's resolution on disk
+PLAUSIBLE_DEPTH = (0.2, 20.0)  # m, of a depth camera's median: units in doubt are told by it
 _FAR_APART = 0.05  # m, median distance above which a map of the scene would be blurred (our choice)
 _FAR_APART_OF_FEW = 0.15  # the same where less than the first share overlaps (our choice)
 # Shares of points below which a median tells nothing, and below which not even a large one does: of
@@ -41,7 +43,7 @@ _CALIBRATIONS = {  # factors of focal lengths
     "one for images twice as large": 0.5,
     "one for images half as large": 2.0,
 }
-_UNITS = {"ones in millimetres": 1e-3, "ones in centimetres": 1e-2}
+_UNITS = {"ones in millimetres": 1e-3, "ones in centimetres": 1e-2, "ones in kilometres": 1e3}
 # The common camera axes first: where several fit alike, the first is named.
 _USUAL = {
     "right up backward": "OpenGL axes",
@@ -80,6 +82,7 @@ class Convention:
     camera: Intrinsics
     median_m: float = math.nan  # median |z difference| over the points that overlap
     relative: float = math.nan  # the same as a share of the depth, which no unit makes small
+    depth_m: float = math.nan  # their median depth
     overlap: float = 0.0  # share of all points that fall onto a measured, not nearer, surface
     metres: float = 1.0  # of one unit of the poses' positions
 
@@ -115,7 +118,7 @@ def fit_all(
     The sequence has depth values as in the files; pairs are positions in it.
     """
     declared, poses = recording.declared, recording.file_poses[sequence.frame_ids[pairs.ravel()]]
-    in_files = sequence.depths_mm[pairs], poses, declared.quaternion
+    in_files = read_pairs(sequence.depths_mm[pairs]), poses, declared.quaternion
     return [_fitted(c, *in_files) for c in _candidates(declared, sequence.intrinsics)]
 
 
@@ -145,36 +148,64 @@ def _candidates(declared: Declaration, camera: Intrinsics) -> list[Convention]:
     ]
 
 
-def _fitted(
-    convention: Convention, values: UInt16[np.ndarray, "2 pairs h w"], file_poses: Poses, order: str
-) -> Convention:
-    """How far points that the first frames of pairs measured lie from the second ones' surfaces.
+class Pairs(NamedTuple):
+    """Depth of frames in pairs that see much the same, with values as in the files."""
 
-    Depth is interpolated between four pixels, in 1/z, which is exact for planes. Points are left
-    out where the four lie on different surfaces, and where they are hidden. Values and poses are
-    as in the files, poses of the first frames before those of the second ones.
+    columns: Tensor  # (points,), of pixels of the first frames, on a grid
+    rows: Tensor
+    values: Tensor  # (pairs, points), of the first frames there
+    inverse: Tensor  # (pairs, 1, height, width), 1 / value of the second frames
+
+
+def read_pairs(values: UInt16[np.ndarray, "2 pairs h w"]) -> Pairs:
+    """The first frames of pairs on a grid, and the second ones whole."""
+    stride = math.ceil((math.prod(values.shape[2:]) / _POINTS_PER_FRAME) ** 0.5)
+    some = torch.from_numpy(values[0, :, ::stride, ::stride].astype(np.float32))
+    rows, columns = (stride * torch.from_numpy(np.indices(some.shape[1:]))).flatten(1)
+    inverse = 1 / torch.from_numpy(values[1, :, None].astype(np.float32))
+    return Pairs(columns, rows, some.flatten(1), inverse)
+
+
+def depth_differences(
+    pairs: Pairs, convention: "Convention", T_world_a: Poses, T_world_b: Poses
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """How far (m) points of the first frames lie behind the surface that the second ones measured.
+
+    Also the depth (m) measured there, whether a point counts, each (pairs, points), and where the
+    second frames see it: (pairs, 1, points, 2), -1 at the first pixel, 1 at the last. Depth is
+    interpolated between four pixels, in 1/z, which is exact for planes. Points do not count where
+    the four lie on different surfaces, and where they are hidden.
     """
-    height, width = values.shape[2:]
-    stride = math.ceil((height * width / _POINTS_PER_FRAME) ** 0.5)
-    points_a = convention.grid_points(values[0], stride)
-    T_world_a, T_world_b = np.split(convention.T_world_camera(file_poses, order), 2)
+    points_a = convention.points(pairs.columns, pairs.rows, pairs.values)
     T_b_a = torch.from_numpy(np.linalg.solve(T_world_b, T_world_a)).float()
     points_b = points_a @ T_b_a[:, :3, :3].mT + T_b_a[:, None, :3, 3]
     columns, rows, depth = project(convention.camera, points_b)
-    # From -1 at the first pixel to 1 at the last.
+    height, width = pairs.inverse.shape[2:]
     at = 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1)[:, None] - 1
-    inverse = 1 / torch.from_numpy(values[1, :, None].astype(np.float32))
-    blended = 1 / grid_sample(inverse, at, "bilinear", align_corners=True)[:, 0, 0]
-    nearest = 1 / grid_sample(inverse, at, "nearest", align_corners=True)[:, 0, 0]
+    blended = 1 / grid_sample(pairs.inverse, at, "bilinear", align_corners=True)[:, 0, 0]
+    nearest = 1 / grid_sample(pairs.inverse, at, "nearest", align_corners=True)[:, 0, 0]
     measured = convention.points(columns, rows, blended)[..., 2]
-    is_measured = points_a[..., 2] > 0
-    seen = is_measured & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
-    seen &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
-    seen &= depth - measured < _HIDDEN_BEHIND  # but in front is a contradiction, however far
-    apart, measured = (depth - measured).abs()[seen], measured[seen]
-    median_m, relative = float(apart.median()), float((apart / measured).median())
-    overlap = float(seen.sum() / is_measured.sum().clamp(1))
-    return replace(convention, median_m=median_m, relative=relative, overlap=overlap)
+    counts = (pairs.values > 0) & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
+    counts &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
+    counts &= depth - measured < _HIDDEN_BEHIND  # but in front is a contradiction, however far
+    return depth - measured, measured, counts, at
+
+
+def _fitted(convention: Convention, pairs: Pairs, file_poses: Poses, order: str) -> Convention:
+    """How far points that the first frames of pairs measured lie from the second ones' surfaces.
+
+    Poses are as in the file, those of the first frames before those of the second ones.
+    """
+    T_world_cameras = np.split(convention.T_world_camera(file_poses, order), 2)
+    apart, measured, counts, _ = depth_differences(pairs, convention, *T_world_cameras)
+    apart, measured = apart.abs()[counts], measured[counts]
+    return replace(
+        convention,
+        median_m=float(apart.median()),
+        relative=float((apart / measured).median()),
+        depth_m=float(measured.median()),
+        overlap=float(counts.sum() / (pairs.values > 0).sum().clamp(1)),
+    )
 
 
 def best_convention(results: list[Convention]) -> Convention:
@@ -182,16 +213,22 @@ def best_convention(results: list[Convention]) -> Convention:
 
     Another fits clearly better if its surfaces are at most half as far apart and overlap at least
     half as much. The second condition is needed because cameras that are turned away from each
-    other may agree on the few points that remain.
+    other may agree on the few points that remain. Its median depth is that of a depth camera, since
+    no other number tells a unit of depth from one of positions.
     """
     own, half = results[0], max(convention.overlap / 2 for convention in results)
     enough = max(_MIN_OVERLAP, half)
-    meeting = [r for r in results if r.overlap >= enough and r.median_m < _FAR_APART]
+    near, far = PLAUSIBLE_DEPTH
+    meeting = [
+        r
+        for r in results
+        if r.overlap >= enough and r.median_m < _FAR_APART and near <= r.depth_m <= far
+    ]
     minimum = min((convention.relative for convention in meeting), default=math.inf)
     if own.overlap >= half and not _is_clearly_less(minimum, own.relative):
         return own
-    near = max(1.1 * minimum, minimum + _MIN_GAIN)  # the common ones come first
-    return next((convention for convention in meeting if convention.relative <= near), own)
+    alike = max(1.1 * minimum, minimum + _MIN_GAIN)  # the common ones come first
+    return next((convention for convention in meeting if convention.relative <= alike), own)
 
 
 def _is_clearly_less(relative: float, other: float) -> bool:

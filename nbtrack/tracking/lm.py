@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Pose, Poses, Transform, Transforms
-from nbtrack.core.settings import may_be_zero
+from nbtrack.core.settings import limited
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
 from nbtrack.fields.grid import BakedField
@@ -47,7 +47,7 @@ class LmSettings(TrackerSettings):
     motion_model: str = "better_of_both"
     voxel: float = 0.04  # m; of the grid that a field is asked on, where it is not one
     lambda_intensity: float = 1.0  # weight of the intensity residual, both over their scale
-    n_restarts: int = may_be_zero(8)  # where the first descent ends lost
+    n_restarts: int = limited(8, 0, 1000)  # where the first descent ends lost
 
 
 class LmTracker(Tracker):
@@ -86,8 +86,7 @@ class LmTracker(Tracker):
     def restart_anywhere(self) -> None:
         """Look for the camera near all poses that the map was made from; see `_hypotheses`."""
         cameras = getattr(self.field, "T_world_cameras", None)
-        if cameras is None:
-            super().restart_anywhere()
+        self.check_finds(in_corrected=cameras is not None)
         self.restart(cameras[len(cameras) // 2].double().numpy())
         self.was_lost = True
 

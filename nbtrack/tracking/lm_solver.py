@@ -137,25 +137,27 @@ class Descent:
         return self.is_ended and self.stage.is_fine
 
     def cost(self, scales: Float[np.ndarray, "2"]) -> float:
-        """The robust cost of both residuals at given scales, by which descents are compared."""
-        return robust_cost(self.terms, scales, 1.0)
+        """The robust cost of both residuals at given scales, by which descents are compared.
+
+        Intensities have the weight of the fine stage, in the coarse one too.
+        """
+        return robust_cost(self.terms, scales, self.lambda_intensity)
 
     def certainty(self) -> dict[str, float]:
         """The share of points that fit, and how well the curvature of their cost holds the pose.
 
         Intensities count by their differences from the median of all; `intensity_mad` is the median
-        of those (MAD). Standard deviations are along the least certain direction, the condition
-        number without the pose prior, rotations at a lever arm of 1 m. Errors of the map are not
-        independent, as residuals are here taken to be: these are lower bounds, good for telling
-        poses apart, not for error bars.
+        of those (MAD), 0 where they have no weight. Standard deviations are along the least certain
+        direction, the condition number without the pose prior, rotations at a lever arm of 1 m.
+        Errors of the map are not independent, as residuals are here taken to be: these are lower
+        bounds, good for telling poses apart, not for error bars.
         """
         distance, intensity, reliability = self.terms[:3]
         is_inlier = np.abs(distance) < self.grid.inlier_distance
         is_inlier &= reliability > 0
         # A picture that is darker as a whole says nothing against a pose.
-        off = np.abs(intensity - _median(intensity))
-        if self.lambda_intensity:
-            is_inlier &= off < _INLIER_INTENSITY
+        off = np.abs(intensity - _median(intensity)) * (self.lambda_intensity > 0)
+        is_inlier &= off < _INLIER_INTENSITY
         matrix, _ = normal_equations(self.terms, self.scales, self.weight)
         values = np.linalg.eigvalsh(matrix)
         covariance = np.linalg.inv(matrix + PRIOR_WEIGHT * np.eye(6)) / _SIGMAS**2  # rad, m
@@ -371,7 +373,7 @@ def _try_step(observed, grid, is_fine, weight, T_start, T, terms, scales, dampin
     T_after = retract(T, twist)
     terms_after = residual_terms(observed, T_after, grid, is_fine)
     judged = terms_after[:3].copy()
-    if weight > 0:
+    if is_fine:
         judged[2] = np.where(judged[2] > 0, terms[2], _ZERO)
     before, after = robust_cost(terms, scales, weight), robust_cost(judged, scales, weight)
     longest = np.abs(twist).max()

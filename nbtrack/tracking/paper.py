@@ -9,7 +9,7 @@ from torch import Tensor
 from nbtrack.core import capture, geometry
 from nbtrack.core.arrays import Colors, Points, Scalar, Transform, Transforms, Values
 from nbtrack.core.camera import pixel_directions
-from nbtrack.core.settings import may_be_zero, one_of
+from nbtrack.core.settings import limited, one_of
 from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
 from nbtrack.fields.base import rendered_losses
@@ -128,11 +128,11 @@ class AdamTracker(Tracker):
 class VrSettings(AdamSettings):
     """Tracking by volume rendering."""
 
-    n_pixels: int = 512  # (paper)
+    n_pixels: int = limited(512, 1, 65536)  # (paper)
     lambda_color: float = 5.0  # (iMAP)
     lambda_depth: float = 1.0  # 0: by colour alone, of the same pixels (iNeRF)
-    n_stratified: int = 32  # samples of the first pass (iMAP)
-    n_importance: int = may_be_zero(12)  # of the second pass (iMAP)
+    n_stratified: int = limited(32, 1, 1024)  # samples of the first pass (iMAP)
+    n_importance: int = limited(12, 0, 1024)  # of the second pass (iMAP)
 
 
 class VrTracker(AdamTracker):

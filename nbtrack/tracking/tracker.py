@@ -13,6 +13,7 @@ from nbtrack.core import capture
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
 from nbtrack.core.device import suitable_threads, synchronize
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
+from nbtrack.core.settings import with_values
 from nbtrack.data.frame import Frame
 from nbtrack.data.text_files import checked_poses
 from nbtrack.fields import Field, LearnedField
@@ -20,8 +21,6 @@ from nbtrack.fields.grid import BakedField
 from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.reach import Reach
 from nbtrack.tracking.starts import expected_poses
-
-_MAX_PIXELS = 2**24
 
 
 @dataclass(frozen=True)
@@ -85,11 +84,7 @@ class Tracker(abc.ABC):
         is not rigid.
         """
         self.settings = settings or self.Settings()
-        if self.settings.n_pixels > _MAX_PIXELS:
-            raise ConfigError(
-                f"tracking.{self.name}.n_pixels = {self.settings.n_pixels}: allowed are 1 to "
-                f"{_MAX_PIXELS}, more than any depth image has; set for instance 4096"
-            )
+        with_values(self.settings, {"n_pixels": int(self.settings.n_pixels)})  # within its limits
         self.field = self.prepare(field).eval().requires_grad_(False)
         # One thread serves a grid, even one that keeps the network it was made from, and points.
         weights = [] if isinstance(self.field, BakedField) else self.field.parameters()
@@ -153,10 +148,16 @@ class Tracker(abc.ABC):
 
     def restart_anywhere(self) -> None:
         """Track from an unknown pose. ConfigError if this tracker cannot find the camera."""
-        raise ConfigError(
-            f"tracker {self.name!r} cannot find a camera whose first pose is not known: take lm in "
-            "a corrected map (--method corrected), or begin with a frame that has a pose"
-        )
+        self.check_finds(in_corrected=False)
+
+    @classmethod
+    def check_finds(cls, in_corrected: bool) -> None:
+        """Raises ConfigError if it cannot find a camera, in a corrected map or in another."""
+        if cls.restart_anywhere is Tracker.restart_anywhere or not in_corrected:
+            raise ConfigError(
+                f"tracker {cls.name!r} cannot find a camera whose first pose is not known: take lm "
+                "in a corrected map (--method corrected), or begin with a frame that has a pose"
+            )
 
     def state(self) -> dict[str, Any]:
         """What the tracker remembers from past frames: tensors and plain values."""

@@ -1,0 +1,197 @@
+"""Small misfits of recordings: each must be told with its size, and none where there is none."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from recordings import Source, camera_matrix, matrix_text, source, with_noise, write_images
+
+from nbtrack.data.recording import open_recording
+from nbtrack.data.sequence import read_sequence
+from nbtrack.experiments.presets import load_preset
+from nbtrack.recordings.check import DataReport, check_recording
+
+DATA = Path(__file__).resolve().parents[2] / "shared/data"
+REAL = {"real_room": "opengl", "real_office": "opencv"}  # and the axes of their cameras
+N_FRAMES = 120
+Change = Callable[[Source], Source]
+
+
+def check(folder: Path, data: Source) -> DataReport:
+    """Of a plain recording."""
+    write_images(folder, data)
+    (folder / "poses.txt").write_text(matrix_text(data.poses.reshape(-1, 16)))
+    (folder / "intrinsics.txt").write_text(matrix_text(camera_matrix(data.camera)))
+    return check_recording(open_recording(folder))
+
+
+@cache
+def room(name: str) -> Source:
+    return with_noise(source(name, N_FRAMES, 1))
+
+
+@cache
+def real(name: str) -> Source:
+    """A real recording, or a skipped test."""
+    if not (DATA / name).is_dir():
+        pytest.skip("no real recording here")
+    sequence = read_sequence(DATA / name, slice(N_FRAMES))
+    poses = sequence.T_world_camera
+    if name == "real_office":  # whose layout is that of a format with other axes
+        poses = poses @ np.diag([1.0, -1, -1, 1])
+    return Source(sequence.colors, sequence.depths_mm, poses, sequence.intrinsics)
+
+
+def late(images: np.ndarray, n_frames: int) -> np.ndarray:
+    """Each as so many frames earlier."""
+    return images[(np.arange(len(images)) - n_frames).clip(0, len(images) - 1)]
+
+
+def depth(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return lambda data: data._replace(depths_mm=np.rint(change(data.depths_mm)).astype(np.uint16))
+
+
+def color(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return lambda data: data._replace(colors=change(data.colors))
+
+
+def focal(factor: float) -> Change:
+    def change(data: Source) -> Source:
+        k = data.camera
+        return data._replace(camera=replace(k, fx=factor * k.fx, fy=factor * k.fy))
+
+    return change
+
+
+def positions(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    def moved(data: Source) -> Source:
+        poses = data.poses.copy()
+        poses[:, :3, 3] = change(poses[:, :3, 3])
+        return data._replace(poses=poses)
+
+    return moved
+
+
+def line(n: int) -> np.ndarray:
+    return np.linspace(0, 1, n)[:, None]
+
+
+def noise(t: np.ndarray) -> np.ndarray:
+    return np.random.default_rng(0).normal(scale=0.01, size=t.shape)
+
+
+def saturated(depths: np.ndarray) -> np.ndarray:
+    depths = depths.copy()
+    depths[:, : depths.shape[1] // 5, depths.shape[2] // 3 : 2 * depths.shape[2] // 3] = 65535
+    return depths
+
+
+def of_elsewhere(colors: np.ndarray) -> np.ndarray:
+    size = colors.shape[2:0:-1]
+    return np.stack(
+        [
+            cv2.resize(c, size)
+            for c in np.resize(
+                room("gallery").colors, (len(colors), *room("gallery").colors.shape[1:])
+            )
+        ]
+    )
+
+
+# What is said begins so; of numbers in braces the first must be as near as the second says.
+CASES: dict[str, tuple[Change, str, float, float]] = {
+    "depth one frame late": (depth(lambda d: late(d, 1)), "depth comes after", 1, 0.2),
+    "depth three frames late": (depth(lambda d: late(d, 3)), "depth comes after", 3, 0.2),
+    "poses one frame late": (
+        lambda data: data._replace(poses=late(data.poses, 1)), "depth comes after", -1, 0.2
+    ),
+    "focal length 5 % short": (focal(0.95), "focal lengths should change", 5.26, 0.7),
+    "focal length 5 % long": (focal(1.05), "focal lengths should change", -4.76, 0.7),
+    "depth 5 % short": (depth(lambda d: 0.95 * d), "depths should change", 5.26, 1),
+    "depth 5 % long": (depth(lambda d: 1.05 * d), "depths should change", -4.76, 1),
+    "depth 2 % short": (depth(lambda d: 0.98 * d), "depths should change", 2.04, 0.8),
+    "depth growing by 4 %": (
+        depth(lambda d: d * (1 + 0.04 * line(len(d))[..., None])), "depths grow", 4, 1.2
+    ),
+    "positions times 0.9": (positions(lambda t: 0.9 * t), "depths should change", -10, 1),
+    "positions off by 1 cm": (positions(lambda t: t + noise(t)), "positions scatter", 0.016, 0.003),
+    "one pose off by 20 cm": (
+        positions(lambda t: t + 0.2 * (np.arange(len(t)) == 60)[:, None] * [1, 0, 0]),
+        "1 of .* poses lie up to", 20, 2,
+    ),
+    "poses drifting by 30 cm": (
+        positions(lambda t: t + 0.3 * line(len(t)) * [0, 1, 0]), "poses drift along y", 0.3, 0.05
+    ),
+    "every image five times": (
+        lambda data: data._replace(
+            colors=data.colors[np.arange(len(data.colors)) // 5 * 5],
+            depths_mm=data.depths_mm[np.arange(len(data.colors)) // 5 * 5],
+        ),
+        "", 80, 1,
+    ),
+    "depth in steps of 64 mm": (depth(lambda d: d // 64 * 64), "depths come in steps of", 6.4, 0),
+    "positions in kilometres": (
+        positions(lambda t: t / 1000), "your poses look like ones in kilometres; mul.* by", 1000, 0
+    ),
+    "black colours": (color(lambda c: 0 * c), "the colour images are black", 0, 0),
+    "mirrored colours": (color(lambda c: c[:, :, ::-1]), "colours alone are mirrored: yes", 0, 0),
+    "colours 4 % to the right": (
+        color(lambda c: np.roll(c, round(c.shape[2] / 25), 2)), "colours lie too far right", 4, 1
+    ),
+    "colours three frames late": (color(lambda c: late(c, 3)), "colours come after depth", 3, 0.2),
+    "colours of elsewhere": (
+        color(of_elsewhere), "colours do not belong to the depth images", 0, 0
+    ),
+}  # fmt: skip
+SILENT = {
+    "right": lambda data: data,
+    "saturated depth": depth(saturated),
+    "red for blue": color(lambda c: c[..., ::-1].copy()),  # which no pair of frames can tell
+}
+SEEN_IN_REAL = (
+    "depth one frame late", "focal length 5 % short", "depth 5 % long", "positions off by 1 cm",
+    "mirrored colours", "colours three frames late", "colours of elsewhere",
+)  # fmt: skip
+
+
+def told_wrongly(tmp_path: Path, data: Source, cases: dict) -> dict[str, list[str]]:
+    """The cases of which something else is said first, or another size."""
+    wrong = {}
+    for number, (name, (change, says, size, within)) in enumerate(cases.items()):
+        first = (*check(tmp_path / str(number), change(data)).warnings, "nothing")[0]
+        found = re.match(rf"{says}[^-+\d]*([-+]?[\d.]+\d|\d)?", first)
+        if not found or (size and not abs(float(found[1]) - size) <= within):
+            wrong[name] = first
+    return wrong
+
+
+@pytest.mark.parametrize("name", ["living_room", "office"])
+def test_each_is_told_with_its_size(tmp_path: Path, name: str) -> None:
+    """Catches misfits that pass without a word, that are taken for others, and wrong sizes."""
+    assert told_wrongly(tmp_path, room(name), CASES) == {}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_recordings(tmp_path: Path, name: str) -> None:
+    """Catches what is told in synthetic rooms alone."""
+    assert told_wrongly(tmp_path, real(name), {c: CASES[c] for c in SEEN_IN_REAL}) == {}
+
+
+@pytest.mark.parametrize("name", load_preset("nine_rooms").scenes.names)
+def test_nothing_is_told_of_right_rooms(tmp_path: Path, name: str) -> None:
+    """Catches false alarms: the bar is none, but that a room may not prove its pose file."""
+    for number, change in enumerate(SILENT.values()):
+        said = check(tmp_path / str(number), change(room(name))).warnings
+        assert [text for text in said if "is not proved" not in text] == []
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_nothing_is_told_of_right_recordings(tmp_path: Path, name: str) -> None:
+    """Catches false alarms of real noise, exposure and calibration."""
+    for number, change in enumerate(SILENT.values()):
+        assert check(tmp_path / str(number), change(real(name))).warnings == []

@@ -1,0 +1,234 @@
+"""Which image, depth map and pose belong together: never a neighbour's, and never by a guess."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import N_FRAMES, START, matrix_text, source, tum_lines, write_recording
+from scipy.spatial.transform import Rotation
+
+from nbtrack.core.errors import DataError
+from nbtrack.data.recording import Recording, open_recording
+from nbtrack.data.sequence import read_sequence
+from nbtrack.data.text_files import read_poses
+
+RUN = tuple(range(N_FRAMES))
+
+
+@pytest.fixture
+def plain(tmp_path: Path) -> Path:
+    return write_recording("plain", tmp_path / "plain")
+
+
+def rename(files: Path, names: Sequence[str]) -> None:
+    """Give the images of a folder other names, and take away those for which there is none."""
+    contents = [(path.suffix, path.read_bytes()) for path in sorted(files.iterdir())]
+    for path in files.iterdir():
+        path.unlink()
+    for name, (suffix, content) in zip(names, contents, strict=False):
+        (files / (name + suffix)).write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("color", "depth", "numbers"),
+    [
+        ("{:04}_cam0", "{:04}_cam0", RUN),
+        ("rgb8_{:04}", "depth16_{:04}_of_6", RUN),
+        ("2026-11-25_{}_8bit", "{}", (8, 9, 10, 11, 99, 100)),
+        ("{0}_1305031102.{0}75", "{0}_1305031102.{0}75", RUN),
+        ("scan_{:03}.color", "scan_{:03}.depth", (0, 3, 4, 7, 8, 9)),
+    ],
+)
+def test_names_are_told_by_what_varies(
+    plain: Path, color: str, depth: str, numbers: tuple[int, ...]
+) -> None:
+    """Catches a number of the camera, the bits or the date that is taken for the frame's, and an
+    image that is refused, or put in another place, for it."""
+    rename(plain / "color", [color.format(i) for i in numbers])
+    rename(plain / "depth", [depth.format(i) for i in numbers])
+    (plain / "poses.txt").write_text(matrix_text(source().poses.reshape(-1, 16)))
+    sequence = read_sequence(plain, pose_file="poses.txt")
+    assert np.array_equal(sequence.colors, source().colors)
+    assert np.array_equal(sequence.depths_mm, source().depths_mm)
+    if "1305" not in color:
+        np.testing.assert_allclose(sequence.times, (np.array(numbers) - numbers[0]) / 30)
+
+
+def lost_ones(folder: Path) -> None:
+    """One image has no depth map, and another depth map no image."""
+    for kind in ("color", "depth"):
+        rename(folder / kind, [f"{i:04}_cam0" for i in RUN])
+    (folder / "color/0001_cam0.png").unlink()
+    (folder / "depth/0004_cam0.png").unlink()
+
+
+def shifted(folder: Path) -> None:
+    """Each camera counts for itself, and one of them began a frame later."""
+    for late, kind in enumerate(("color", "depth")):
+        rename(folder / kind, [f"{i}_1305031102.{i + late}33" for i in RUN])
+
+
+def named(*names: str) -> object:
+    """Colour and depth have these names."""
+
+    def change(folder: Path) -> None:
+        for kind in ("color", "depth"):
+            rename(folder / kind, names)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lost_ones, r"2 without .*0004_cam0.png, 0001_cam0.png\)"),
+        (shifted, r"12 without .* 0_1305031102.033.png, "),
+        (named("0", "1", "2", "3", "000003", "4"), r"000003.png, 3.png, 000003.png, 3.png\)"),
+        (named("A_0", "A_1", "A_2", "B_0", "B_1", "B_2"), "A_0.png, B_0.png,.* a folder one sess"),
+        (named("a", "b", "c"), "a.png, b.png"),
+    ],
+)
+def test_images_that_cannot_be_paired_are_named(plain: Path, change, expected: str) -> None:
+    """Catches images with their neighbours' depth where one of each is lost, two files of a number
+    that shift all poses behind them, and two sessions that are shuffled into one."""
+    change(plain)
+    with pytest.raises(DataError, match=expected) as caught:
+        open_recording(plain)
+    assert "\n" not in str(caught.value)
+
+
+# Images' numbers, whole multiples of the frame's time with which poses are stamped (None: without
+# stamps), format, and whose pose each image has to get: -1 for none, None for a refusal.
+LISTS = {
+    "from 0, cut": (RUN[:4], None, "plain", RUN[:4]),
+    "from 1": (range(1, 7), None, "plain", RUN),
+    "from 1, stamped": (range(1, 7), RUN, "plain", RUN),
+    "from 1, cut": (range(1, 5), None, "plain", None),
+    "from 1, cut, stamped": (range(1, 5), RUN, "plain", None),
+    "from 1, cut, of a dataset": (range(1, 5), None, "neural_rgbd", None),
+    "chosen, of a dataset": ((2, 3, 5), None, "neural_rgbd", (2, 3, 5)),
+    "chosen": ((2, 3, 5), None, "plain", None),
+    "chosen, all stamped": ((12, 13, 15), range(10, 16), "plain", None),
+    "chosen, stamped": ((12, 13, 15), (10, 12, 13, 15, 17, 20), "plain", (1, 2, 3)),
+    "from 1, one lost, stamped": ((1, 2, 4, 5, 6), RUN, "plain", (0, 1, 3, 4, 5)),
+    "one pose lost, stamped": (RUN, (0, 1, 2, 4, 5), "plain", (0, 1, 2, -1, 3, 4)),
+    "stamps of one lost": ((0, 1, 3, 4, 5, 6), RUN, "plain", RUN),
+    "others lost": (RUN, (0, 1, 2, 3, 4, 6), "plain", None),
+    "out of order": (RUN, (0, 2, 1, 3, 4, 5), "plain", (0, 2, 1, 3, 4, 5)),
+    "another clock": (RUN, (90, 92, 93, 94, 95, 99), "plain", RUN),
+    "another clock, cut": (RUN[:4], range(90, 96), "plain", None),
+    "another rate, cut": (RUN[:4], (0, 1.3, 2.6, 3.9, 5.2, 6.5), "plain", None),
+}
+
+
+def listed(folder: Path, case: str) -> Recording:
+    numbers, stamps, format, _ = LISTS[case]
+    write_recording(format, folder)
+    colors, depths = {"plain": ("color", "depth")}.get(format, ("images", "depth_filtered"))
+    for kind in (colors, depths):
+        rename(folder / kind, [f"{i:06}" for i in numbers])
+    if stamps is not None:
+        times = np.array(stamps) / 30
+        (folder / "trajectory.txt").write_text(tum_lines(times, source().poses[: len(times)]))
+    elif format == "plain":
+        (folder / "trajectory.txt").write_text(matrix_text(source().poses.reshape(-1, 16)))
+    return open_recording(folder)
+
+
+@pytest.mark.parametrize("case", LISTS)
+def test_poses_of_a_list_without_names(tmp_path: Path, case: str) -> None:
+    """Catches poses of neighbours: of images that count from 1, of a recording that was cut, or of
+    one that lost some; as many poses as images prove nothing where stamps say otherwise."""
+    numbers, _, _, expected = LISTS[case]
+    if expected is None:
+        with pytest.raises(DataError, match=r"poses but there are|no time within") as caught:
+            listed(tmp_path / "r", case)
+        assert "\n" not in str(caught.value)
+        return
+    recording = listed(tmp_path / "r", case)
+    has_pose = np.array(expected) >= 0
+    assert np.array_equal(recording.has_pose, has_pose)
+    wanted = source().poses[[i for i in expected if i >= 0]]
+    np.testing.assert_allclose(recording.T_world_camera[has_pose], wanted, atol=1e-9)
+    # What is taken by its place, or left out, is said.
+    is_proven = tuple(numbers) == RUN or case == "from 1, stamped"
+    assert bool(recording.notes) != is_proven
+
+
+def test_times_of_images_settle_it(tmp_path: Path) -> None:
+    """Catches advice that does not help: where poses are refused, a file of times is enough, and
+    an own trajectory of images that count from 1 is known by its times to the last digit."""
+    with pytest.raises(DataError, match=r"write timestamps\.txt"):
+        listed(tmp_path / "r", "from 1, cut, stamped")
+    (tmp_path / "r/timestamps.txt").write_text(matrix_text(np.arange(4)[:, None] / 30))
+    np.testing.assert_allclose(open_recording(tmp_path / "r").T_world_camera, source().poses[:4])
+    recording = listed(tmp_path / "own", "from 1")
+    fast = np.arange(N_FRAMES) / 200
+    for times in (recording.times, fast):
+        if times is fast:
+            (tmp_path / "own/timestamps.txt").write_text(matrix_text(fast[:, None]))
+        lines = tum_lines(times[1:], source().poses[1:])
+        (tmp_path / "own/trajectory.txt").write_text(lines)
+        own = open_recording(tmp_path / "own")
+        assert np.flatnonzero(~own.has_pose).tolist() == [0]
+        np.testing.assert_allclose(own.T_world_camera[1:], source().poses[1:])
+
+
+def test_times_in_names(plain: Path) -> None:
+    """Catches times in the order of their digits, .175304 behind .2, and times from 0 for images
+    that are named after theirs, whatever the poses are stamped with."""
+    names = ["1305031102.175304", "1305031102.2", "1305031102.25"]
+    names += ["1305031103.0", "1305031103.040", "1305031103.5"]
+    for kind in ("color", "depth"):
+        rename(plain / kind, names)
+    lines = tum_lines(np.arange(N_FRAMES) / 30, source().poses)
+    (plain / "trajectory.txt").write_text(lines)
+    recording, sequence = open_recording(plain), read_sequence(plain)
+    assert recording.times == pytest.approx(list(map(float, names)))
+    assert np.array_equal(sequence.colors, source().colors)
+    np.testing.assert_allclose(recording.T_world_camera, source().poses, atol=1e-9)
+    # A tool has lost a frame, and its time.
+    lines = tum_lines(recording.times + 0.001, source().poses).splitlines()
+    (plain / "trajectory.txt").write_text("\n".join([*lines[:2], "nan " * 8, *lines[3:]]))
+    assert np.flatnonzero(~open_recording(plain).has_pose).tolist() == [2]
+    (plain / "trajectory.txt").write_text("\n".join(lines))
+    milliseconds = [str(1305031102175 + 33 * i) for i in RUN]
+    for kind in ("color", "depth"):
+        rename(plain / kind, milliseconds)
+    assert np.diff(open_recording(plain).times) == pytest.approx(0.033, abs=1e-6)
+
+
+def moving(times: np.ndarray) -> np.ndarray:
+    """Poses far from the origin that go straight and turn evenly."""
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(times[:, None] * [0.3, 0.9, -0.2]).as_matrix()
+    poses[:, :3, 3] = [9, -4, 7] + times[:, None] * [0.4, -0.3, 0.5]
+    return poses
+
+
+@pytest.mark.parametrize("direction", ["camera-to-world", "world-to-camera"])
+def test_poses_between_stamps_are_interpolated(tmp_path: Path, direction: str) -> None:
+    """Catches the nearest pose of a slow list for images between two, which is millimetres off;
+    poses made up over a gap or from one that was lost, or at either end; and a pose of an image's
+    very time that comes back with another digit."""
+    frames = np.arange(N_FRAMES) / 10
+    folder = write_recording("tum", tmp_path / "r", source()._replace(poses=moving(frames)))
+    late = {0: (0.0, 0.03), 1: (-0.02, 0.02), 2: (-0.01, 0.05), 3: (-0.025, 0.03)}
+    late |= {4: (-0.025, 0.01), 5: (-0.015,)}
+    times = np.concatenate([frames[i] + np.array(late[i]) for i in late])
+    poses = moving(times)
+    if direction == "world-to-camera":
+        poses = np.linalg.inv(poses)
+        (folder / "sequence.toml").write_text(f'poses = "{direction}"\n')
+    lines = tum_lines(START + times, poses).splitlines()
+    lines[9] = f"{lines[9].split()[0]} nan nan nan nan nan nan nan"
+    (folder / "groundtruth.txt").write_text("\n".join(lines))
+    recording = open_recording(folder)
+    assert recording.has_pose.tolist() == [True, True, True, False, False, True]
+    in_file = read_poses(folder / "groundtruth.txt")[0]
+    assert np.array_equal(recording.file_poses[[0, 2, 5]], in_file[[0, 4, 10]])
+    np.testing.assert_allclose(recording.T_world_camera[1], moving(frames)[1], atol=1e-6)
+    (note,) = (text for text in recording.notes if "interpolated" in text)
+    assert note.startswith("1 of 6 poses")
+    assert "20.0 ms" in note
