@@ -1,6 +1,9 @@
 """`python -m nbtrack`."""
 
-from nbtrack.cli import main
+from nbtrack.core.interrupts import heed_interrupts
+
+heed_interrupts()
+from nbtrack.cli import main  # noqa: E402, only now: it takes a while
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 
 from nbtrack import __version__
 from nbtrack.core.errors import ConfigError, NbtrackError, nearest_name
+from nbtrack.core.interrupts import INTERRUPTED, STATUS, heed_interrupts
 
 _MAX_COUNT = 2**31 - 1  # what every random generator takes
 _MAX_THREADS = 1024  # OpenMP ends the process where it cannot start them
@@ -124,6 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     With `NBTRACK_DEBUG` set, the traceback of whatever ended it is printed too.
     """
     _open_streams()
+    heed_interrupts()
     try:
         options = _parsed(arguments)
         if options.device:
@@ -143,8 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         where = error.filename2 or error.filename or "the output"
         message, status = f"{where}: {error.strerror or error}; mend it and run again", 2
     except KeyboardInterrupt as interruption:
-        cause = interruption
-        message, status = "interrupted; run the same command again to go on", 130
+        cause, message, status = interruption, INTERRUPTED, STATUS
     if os.environ.get("NBTRACK_DEBUG"):
         traceback.print_exception(cause)
     print(f"nbtrack: {message}", file=sys.stderr)

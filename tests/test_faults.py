@@ -17,7 +17,7 @@ import pytest
 from finished import GIVEN, MAP, OWN
 
 from nbtrack.cli import main
-from nbtrack.core.files import loaded_checkpoint, save_checkpoint
+from nbtrack.core.files import _tell_of_no_locks, loaded_checkpoint, save_checkpoint
 
 CHECKPOINT = "map/mapping.pt"
 
@@ -404,3 +404,21 @@ def test_a_full_disk_while_a_room_is_made(work: Path, capsys: pytest.CaptureFixt
     with files_limited_to(400):
         error = assert_refused(work, capsys, command, os.strerror(errno.EFBIG))
     assert "new" in error
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
+def test_a_file_system_without_locks(
+    code: int, work: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches "No locks available", which no user can mend, in place of a room, a map and a run;
+    and a warning for every file of them."""
+
+    def no_lock(descriptor: int, operation: int) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr("fcntl.flock", no_lock)
+    _tell_of_no_locks.cache_clear()
+    assert main([*OWN, "--out", "elsewhere"]) == 0
+    told = capsys.readouterr().err
+    assert told.count("no locks") == 1
+    assert Path("elsewhere/metrics.json").is_file()

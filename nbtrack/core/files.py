@@ -8,6 +8,7 @@ import ast
 import contextlib
 import dataclasses
 import dis
+import errno
 import hashlib
 import importlib.metadata
 import importlib.util
@@ -21,6 +22,7 @@ import re
 import secrets
 import struct
 import textwrap
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -30,10 +32,12 @@ from types import CodeType, FunctionType
 from typing import Any
 
 import torch
+from filelock import FileLock
 from safetensors import SafetensorError
 
 import nbtrack
 from nbtrack.core.errors import DataError, NbtrackError
+from nbtrack.core.progress import tell
 from nbtrack.core.settings import as_dict
 
 PACKAGE = Path(nbtrack.__file__).resolve().parent
@@ -48,6 +52,7 @@ _MADE_BY_CONTENT = (
     OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, RuntimeError,
     pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile, SafetensorError,
 )  # fmt: skip
+_NO_LOCKS = errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP  # what their lack is called
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp")  # that compute results beside torch
 _LIBRARIES = ("nbtrack", "torch", "abc", "typing", "builtins")  # what own classes are built on
@@ -234,6 +239,34 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
         for aside in asides.values():
             with contextlib.suppress(OSError):  # what went wrong before is what users must hear
                 aside.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def locked(path: Path, timeout: float = -1) -> Iterator[bool]:
+    """Keep other processes out of a block by a lock file, and tell whether that was possible.
+
+    The system frees the lock when this process ends, however it ends. Where the file system knows
+    none, that is said once. Raises filelock's Timeout where others keep it for `timeout` s; less
+    than 0 waits as long as they do.
+    """
+    lock = FileLock(path, timeout=timeout)
+    try:
+        # It warns before it takes another kind, which would wait for files that locks have left.
+        with warnings.catch_warnings(action="error"):
+            lock.acquire()
+    except (OSError, UserWarning) as error:
+        if getattr(error, "errno", errno.ENOSYS) not in _NO_LOCKS:
+            raise
+        _tell_of_no_locks()
+    try:
+        yield lock.is_locked
+    finally:
+        lock.release()
+
+
+@cache
+def _tell_of_no_locks() -> None:
+    tell("nbtrack: warning: no locks on this file system: run one command at a time in a folder")
 
 
 def json_text(content: Any) -> str:

@@ -12,6 +12,7 @@ _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
 # Where nobody watches: the form of a line, and seconds before the first and between later ones.
 _LINE_FORMAT = "{desc}: {percentage:.0f} %, {elapsed} gone, {remaining} left{postfix}"
 _FIRST_LINE_SECONDS, _LINE_SECONDS = 2.0, 30.0
+tqdm.set_lock(threading.RLock())  # its own is one between processes, which killed ones leave behind
 
 
 def tell(news: str) -> None:

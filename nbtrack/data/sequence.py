@@ -21,6 +21,7 @@ from nbtrack.data.recording import Recording, open_recording
 # Of bounds (our choice): pixels looked at in each frame, on a regular grid, and the share of points
 # cut off at either end of each axis, so that a few wild depths do not stretch the box.
 _POINTS_PER_FRAME, _CUT_OFF = 2000, 0.002
+_ARRAYS = "colors", "depths_mm", "T_world_camera", "frame_ids", "times"  # a row a frame
 _SLICE = r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?"
 
 
@@ -77,8 +78,13 @@ class RgbdSequence:
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
         """The sequence of some of the frames, in the order given; slices copy nothing."""
-        arrays = ("colors", "depths_mm", "T_world_camera", "frame_ids", "times")
-        return replace(self, **{name: getattr(self, name)[indices] for name in arrays})
+        return replace(self, **{name: getattr(self, name)[indices] for name in _ARRAYS})
+
+
+def joined(parts: list[RgbdSequence]) -> RgbdSequence:
+    """Parts of one sequence, at least one, in the order given."""
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+    return replace(parts[0], **arrays)
 
 
 def parse_frames(text: str) -> slice:

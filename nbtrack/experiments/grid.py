@@ -22,6 +22,7 @@ import torch
 from nbtrack.core.device import choose_device, threads
 from nbtrack.core.errors import MissingError, NbtrackError
 from nbtrack.core.files import data_folder, runs_folder
+from nbtrack.core.interrupts import interrupts_put_off
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.experiments.jobs import Job, MapJob, TrackJob
 from nbtrack.experiments.methods import Methods, find_methods
@@ -222,7 +223,7 @@ def _on_workers(
     from distributed import wait
     from distributed.scheduler import KilledWorker
 
-    with dask.config.set(_LOCAL), _main_kept_back(), _client(address, workers) as client:
+    with dask.config.set(_LOCAL), _main_kept_back(), _cluster(address, workers) as client:
         topic, news = f"nbtrack-{os.getpid()}-{time.time_ns()}", []
         client.subscribe_topic(topic, lambda event: news.append(event[1]))
         settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
@@ -288,6 +289,19 @@ def _main_kept_back() -> Iterator[None]:
         yield
     finally:
         vars(main).update(kept)
+
+
+@contextlib.contextmanager
+def _cluster(address: str | None, workers: int) -> Iterator[Any]:
+    """A client of Dask's workers. Ctrl-C waits until they are all there, or all gone."""
+    opened = contextlib.ExitStack()
+    try:
+        with interrupts_put_off():
+            client = opened.enter_context(_client(address, workers))
+        yield client
+    finally:
+        with interrupts_put_off():
+            opened.close()
 
 
 def _client(address: str | None, workers: int) -> Any:

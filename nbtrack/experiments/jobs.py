@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock
 
 from nbtrack.beyond.correct import correct_map
 from nbtrack.core import files
@@ -68,8 +67,8 @@ class Job:
     def outcome(self, needed: Any, report: Report) -> Any:
         """Its `result`, made where it is missing, or the user's mistake that kept it from that.
 
-        What another process is computing is waited for. The lock is the system's, which frees it
-        when that process ends, however it ends.
+        What another process is computing is waited for. A lock keeps others out, which
+        the system frees when that process ends.
         """
         if isinstance(needed, NbtrackError):
             return NbtrackError(f"not run, because {self.needs.name} failed: {needed}")
@@ -77,7 +76,7 @@ class Job:
         report(0.0, "begins, or waits for another process that makes the same")
         try:
             check_no_recording(path)
-            with FileLock(path), advise_on_memory(f"the frames and settings of {self.name}"):
+            with files.locked(path), advise_on_memory(f"the frames and settings of {self.name}"):
                 return self.result() if self.is_done else self.compute(report)
         except NbtrackError as error:
             return error

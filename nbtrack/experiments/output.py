@@ -5,12 +5,12 @@ import io
 from collections.abc import Iterator
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from matplotlib.figure import Figure
 from PIL import Image
 
 from nbtrack.core.errors import ConfigError
-from nbtrack.core.files import resolved, write_atomic
+from nbtrack.core.files import locked, resolved, write_atomic
 from nbtrack.data.formats import holds_recording
 from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, MESH_FILE
 from nbtrack.plots.style import in_house_style
@@ -74,7 +74,7 @@ def output_folder(folder: Path | None) -> Iterator[None]:
     if foreign and not is_own_output(folder):
         raise ConfigError(f"{folder} has a {foreign[0]} that nbtrack did not write: move it away")
     try:
-        with FileLock(folder / LOCK_FILE, timeout=0):
+        with locked(folder / LOCK_FILE, timeout=0):
             yield
     except Timeout:
         raise ConfigError(f"another nbtrack command is writing to {folder}: wait for it") from None

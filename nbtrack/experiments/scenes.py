@@ -6,10 +6,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock
-
 from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up, nearest_name
-from nbtrack.core.files import data_folder, fingerprint, resolved, runs_folder, write_atomic
+from nbtrack.core.files import (
+    data_folder,
+    fingerprint,
+    locked,
+    resolved,
+    runs_folder,
+    write_atomic,
+)
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.recording import Recording, image_digest, open_recording
@@ -121,9 +126,7 @@ def _room(name: str, config: ScenesConfig) -> Scene:
     if not _is_whole(folder):
         check_no_recording(runs_folder())
         # Another command that needs the same room waits, and then reads it.
-        with FileLock(folder.with_suffix(".lock")):
-            for unfinished in folder.parent.glob(f".{name}.*.unfinished"):  # of a killed attempt
-                shutil.rmtree(unfinished, ignore_errors=True)
+        with locked(folder.with_suffix(".lock")):
             if not _is_whole(folder):
                 if folder.exists():
                     tell(f"{folder} is not as it was made: the room is made anew")

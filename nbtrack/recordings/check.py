@@ -1,6 +1,7 @@
 """Validate a recording, and find from its own depth maps whether its numbers are read rightly."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,10 +9,11 @@ import pandas as pd
 from jaxtyping import Int
 from scipy.spatial.transform import Rotation
 
-from nbtrack.core.arrays import Poses
+from nbtrack.core.arrays import Frames, Poses
 from nbtrack.core.errors import DataError
+from nbtrack.core.progress import ProgressBar
 from nbtrack.data.recording import Recording
-from nbtrack.data.sequence import RgbdSequence, read_frames, select_frames
+from nbtrack.data.sequence import RgbdSequence, joined, read_frames, select_frames
 from nbtrack.recordings.conventions import (
     PLAUSIBLE_DEPTH,
     Convention,
@@ -28,6 +30,7 @@ from nbtrack.recordings.misfits import (
 )
 from nbtrack.tracking import SdfSettings
 
+_FRAMES_AT_ONCE, _MAX_KEPT = 32, 1000  # frames: 50 MB and 1.5 GB at 640x480
 _CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
 # Of frames that are compared: for conventions, in a quick look, and for small misfits.
@@ -218,23 +221,27 @@ def check_recording(
 ) -> DataReport:
     """Read every frame of a recording and report what is there and whether it fits together.
 
-    All images are kept meanwhile. Unless the whole is asked for, only a few pairs of frames are
-    read, which takes about a second. Raises what `read_frames` does, and DataError where the whole
-    has no depth.
+    Of long ones only images of pairs that are compared are kept meanwhile. Unless the whole is
+    asked for, only a few pairs of frames are read, which takes about a second. Raises what
+    `read_frames` does, and DataError where the whole has no depth.
     """
     ids = select_frames(recording, slice(None))
     ids = ids[recording.has_pose[ids]]
-    pairs = ids[_pairs(recording.T_world_camera[ids], _N_PAIRS if is_whole else _QUICK_PAIRS)]
-    looked_at = ids if is_whole else np.unique(pairs)
-    sequence = read_frames(_as_in_files(recording), looked_at, progress)
-    frames = _by_frame(sequence)
+    poses = recording.T_world_camera[ids]
+    pairs = ids[_pairs(poses, _N_PAIRS if is_whole else _QUICK_PAIRS)]
+    looked_at = kept = ids if is_whole else np.unique(pairs)
+    fitted = _pairs(poses, _FIT_PAIRS, MAX_SHIFT) if is_whole else pairs[:, :0]
+    if len(kept) > _MAX_KEPT:
+        around = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
+        kept = np.union1d(pairs, ids[np.add.outer(fitted, around)])
+    sequence, frames = _read(_as_in_files(recording), looked_at, kept, progress)
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
-    results = fit_all(sequence, recording, np.searchsorted(looked_at, pairs))
+    results = fit_all(sequence, recording, np.searchsorted(kept, pairs))
     cloud, best = _cloud(results[0], sequence), best_convention(results)
     poses, found, correlation = sequence.T_world_camera, [], math.nan
     if is_whole and best is results[0]:
-        fitted = _pairs(poses, _FIT_PAIRS, MAX_SHIFT)
+        fitted = np.searchsorted(kept, ids[fitted])
         found, correlation = find_misfits(sequence, fitted, best)
     return DataReport(recording, frames, poses, cloud, results, best, found, correlation, is_whole)
 
@@ -265,18 +272,38 @@ def _pairs(T_world_camera: Poses, maximum: int, margin: int = 0) -> Int[np.ndarr
     return np.unique([first, first + gaps], axis=1)[:, : maximum * (n_frames > 1)]
 
 
-def _by_frame(sequence: RgbdSequence) -> pd.DataFrame:
+def _read(
+    recording: Recording, looked_at: Frames, kept: Frames, progress: bool
+) -> tuple[RgbdSequence, pd.DataFrame]:
+    """The frames to keep of those looked at, and what `_by_frame` tells of all, read in parts."""
+    parts = []
+
+    def images() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        with ProgressBar("reading frames", len(looked_at), progress) as bar:
+            for first in range(0, len(looked_at), _FRAMES_AT_ONCE):
+                part = read_frames(recording, looked_at[first : first + _FRAMES_AT_ONCE])
+                parts.append(part.select(np.isin(part.frame_ids, kept)))
+                yield from zip(part.depths_mm, part.colors, strict=True)
+                bar.move_to(first + len(part))
+
+    frames = _by_frame(images(), looked_at, recording.T_world_camera[looked_at])
+    return joined(parts), frames
+
+
+def _by_frame(
+    images: Iterator[tuple[np.ndarray, np.ndarray]], numbers: Frames, T: Poses
+) -> pd.DataFrame:
     """By number: share measured, brightness, and changes from the frame before, if it is there."""
     rows, before = [], None
-    for depth, color in zip(sequence.depths_mm, sequence.colors, strict=True):
+    for depth, color in images:
         is_repeated = before is not None and np.array_equal(depth, before)
         rows.append(
             ((depth > 0).mean(), color.mean() / 255, np.gcd.reduce(depth, None), is_repeated)
         )
         before = depth
     columns = ["measured", "brightness", "depth_step", "is_repeated"]
-    frames = pd.DataFrame(rows, sequence.frame_ids, columns)
-    T, levels = sequence.T_world_camera, np.log(frames.brightness + 1e-3)  # 0 has none
+    frames = pd.DataFrame(rows, numbers, columns)
+    levels = np.log(frames.brightness + 1e-3)  # 0 has none
     turns = Rotation.from_matrix(T[:-1, :3, :3].mT @ T[1:, :3, :3])
     moves = 1e3 * np.diff(T[:, :3, 3], axis=0)
     off_mm = np.linalg.norm(np.diff(moves, axis=0, append=np.nan), axis=1) / 2
