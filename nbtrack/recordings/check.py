@@ -228,6 +228,7 @@ def check_recording(
     ids = select_frames(recording, slice(None))
     ids = ids[recording.has_pose[ids]]
     poses = recording.T_world_camera[ids]
+    poses[:, :3, 3] -= recording.origin
     pairs = ids[_pairs(poses, _N_PAIRS if is_whole else _QUICK_PAIRS)]
     looked_at = kept = ids if is_whole else np.unique(pairs)
     fitted = _pairs(poses, _FIT_PAIRS, MAX_SHIFT) if is_whole else pairs[:, :0]
@@ -239,10 +240,10 @@ def check_recording(
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     results = fit_all(sequence, recording, np.searchsorted(kept, pairs))
     cloud, best = _cloud(results[0], sequence), best_convention(results)
-    poses, found, correlation = sequence.T_world_camera, [], math.nan
+    found, correlation = [], math.nan
     if is_whole and best is results[0]:
-        fitted = np.searchsorted(kept, ids[fitted])
-        found, correlation = find_misfits(sequence, fitted, best)
+        places = np.searchsorted(kept, ids[fitted])
+        found, correlation = find_misfits(sequence, poses, fitted, places, best)
     return DataReport(recording, frames, poses, cloud, results, best, found, correlation, is_whole)
 
 

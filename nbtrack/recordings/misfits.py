@@ -160,17 +160,22 @@ COLOR_PARAMETERS = [
 
 
 def find_misfits(
-    sequence: RgbdSequence, numbers: Int[np.ndarray, "2 pairs"], own: Convention
+    sequence: RgbdSequence,
+    T_world_camera: Poses,
+    numbers: Int[np.ndarray, "2 pairs"],
+    places: Int[np.ndarray, "2 pairs"],
+    own: Convention,
 ) -> tuple[list[Misfit], float]:
     """Misfits that pairs of frames can tell, whether there or not, and how alike their colours are:
     the correlation of intensities of points that both see, NaN without contrast.
 
-    Of a sequence with depth as in the files, by positions in it. Those of colours are looked for
+    Pairs are numbers of poses, and the places of their frames in a sequence with depth as in the
+    files; it holds the frames up to MAX_SHIFT around them too. Misfits of colours are looked for
     where depth is right.
     """
     if not numbers.size:
         return [], math.nan
-    frames = _PairedFrames(sequence, numbers, own)
+    frames = _PairedFrames(sequence, T_world_camera, numbers, places, own)
     found = [_estimate(p, frames.declared, frames.depth_cost) for p in DEPTH_PARAMETERS]
     correlation = frames.correlation()
     if not any(misfit.is_told for misfit in found if misfit):
@@ -193,13 +198,11 @@ def told_misfit(misfits: list[Misfit]) -> str:
 class _PairedFrames:
     """Pairs of frames that see much the same, and how well they agree as a recording is read."""
 
-    def __init__(
-        self, sequence: RgbdSequence, numbers: Int[np.ndarray, "2 pairs"], own: Convention
-    ) -> None:
-        """Of frames of a sequence with depth as in the files, by their positions in it."""
-        self.colors, self.numbers = sequence.colors, numbers
-        self.declared = Reading(own, sequence.T_world_camera)
-        self.pairs: Pairs = read_pairs(sequence.depths_mm[numbers])
+    def __init__(self, sequence, T_world_camera, numbers, places, own) -> None:
+        """See `find_misfits`."""
+        self.colors, self.numbers, self.places = sequence.colors, numbers, places
+        self.declared = Reading(own, T_world_camera)
+        self.pairs: Pairs = read_pairs(sequence.depths_mm[places])
         relative, counts, self.seen_at = self._relative(self.declared)
         self.scale = 3 * relative[counts].abs().median()
         self.agree = counts & (relative.abs() < self.scale)
@@ -247,7 +250,7 @@ class _PairedFrames:
     def _intensities(self, shift: int) -> Float[np.ndarray, "2 pairs height width"]:
         """Of both frames of pairs, in [0, 1], or of those that come so much later."""
         gray = [
-            cv2.cvtColor(self.colors[i], cv2.COLOR_RGB2GRAY) for i in self.numbers.ravel() + shift
+            cv2.cvtColor(self.colors[i], cv2.COLOR_RGB2GRAY) for i in self.places.ravel() + shift
         ]
         return np.stack(gray).reshape(*self.numbers.shape, *gray[0].shape).astype(np.float32) / 255
 
