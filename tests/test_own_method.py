@@ -15,11 +15,13 @@ from nbconvert.preprocessors import ExecutePreprocessor
 from tiny import TINY, tiny_words
 
 from nbtrack.cli import main
+from nbtrack.core.errors import ConfigError
 from nbtrack.core.files import foreign_source
 from nbtrack.core.settings import with_settings
+from nbtrack.experiments import presets
 from nbtrack.experiments.methods import METHODS
 from nbtrack.experiments.presets import load_preset
-from nbtrack.fields import FIELDS
+from nbtrack.fields import FIELDS, field_class
 from nbtrack.tracking import TRACKERS
 
 OWN = '''
@@ -182,6 +184,27 @@ def test_settings_of_what_is_registered_later(monkeypatch: pytest.MonkeyPatch) -
     again = with_settings(once, "tracking.mine.extra=2.0")
     assert again.tracking_of("mine").extra == 2.0
     assert again.tracking_of("mine").n_pixels == 7
+
+
+def test_settings_do_not_depend_on_when_a_class_is_registered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches sizes of a preset that miss what was registered before the presets were made, and a
+    class that loses its own defaults: smoke asks fewer pixels of all, and no other motion model."""
+    own = CELL.replace('name = "mine"', 'name, Settings = "mine", Own')
+    own = own.replace("class Mine", "@dataclass(frozen=True)\nclass Own(SdfSettings):\n"
+                      '    motion_model: str = "constant_velocity"\nclass Mine')  # fmt: skip
+    monkeypatch.setitem(TRACKERS, "mine", in_a_cell("from dataclasses import dataclass\n" + own))
+    for preset in (presets._from_file("smoke"), load_preset("smoke")):
+        settings = preset.tracking_of("mine")
+        assert (settings.n_pixels, settings.motion_model) == (512, "constant_velocity")
+
+
+def test_a_class_is_registered_by_its_own_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a subclass without a name of its own: its map would be read as its base's."""
+    monkeypatch.setitem(FIELDS, "tanh", FIELDS["neus"])
+    with pytest.raises(ConfigError, match="calls itself 'neus'"):
+        field_class("tanh")
 
 
 def test_a_method_in_a_notebook(tmp_path: Path) -> None:

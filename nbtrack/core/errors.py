@@ -38,6 +38,14 @@ def look_up(what: str, name: str, known: Mapping[str, Entry]) -> Entry:
     return known[name]
 
 
+def look_up_kind(what: str, name: str, known: Mapping[str, type]) -> type:
+    """A class by the name that it calls itself. Raises ConfigError for another, or an unknown."""
+    kind = look_up(what, name, known)
+    if kind.name != name:
+        raise ConfigError(f"{what} {name!r} calls itself {kind.name!r}: give the class this name")
+    return kind
+
+
 def nearest_name(text: str, allowed: list[str]) -> str:
     """Hint for a misspelt name, with every valid one in the order given; of many, the nearest few.
 

@@ -3,7 +3,7 @@
 import torch
 
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.errors import look_up
+from nbtrack.core.errors import look_up_kind
 from nbtrack.fields.base import Field, LearnedField, MappingSettings
 from nbtrack.fields.imap import IMapField
 from nbtrack.fields.mlp import NetworkSettings
@@ -15,7 +15,7 @@ FIELDS: dict[str, type[Field]] = {kind.name: kind for kind in (IMapField, NeuSFi
 
 def field_class(name: str) -> type[Field]:
     """The field of a name. Raises ConfigError, naming the nearest, for any other."""
-    return look_up("field", name, FIELDS)
+    return look_up_kind("field", name, FIELDS)
 
 
 def make_field(name: str, network: NetworkSettings, bounds: SceneBounds, seed: int) -> Field:

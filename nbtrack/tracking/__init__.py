@@ -3,7 +3,7 @@
 import importlib.util
 
 from nbtrack.core.arrays import Pose
-from nbtrack.core.errors import ConfigError, MissingError, look_up
+from nbtrack.core.errors import ConfigError, MissingError, look_up_kind
 from nbtrack.fields import FIELDS, Field, field_class
 from nbtrack.tracking.budget import Budget, ClockBudget, StepBudget, make_budget, paper_steps
 from nbtrack.tracking.paper import AdamTracker, SdfSettings, SdfTracker, VrSettings, VrTracker
@@ -16,7 +16,7 @@ TRACKERS: dict[str, type[Tracker]] = {"vr": VrTracker, "sdf": SdfTracker}
 
 def tracker_class(name: str) -> type[Tracker]:
     """The tracker of a name. Raises ConfigError, naming the nearest, for any other."""
-    return look_up("tracker", name, TRACKERS)
+    return look_up_kind("tracker", name, TRACKERS)
 
 
 def check_pair(tracker_name: str, field: str | type) -> None:
