@@ -118,8 +118,11 @@ def track_command(options: Namespace) -> None:
     if "ate_rmse_m" not in metrics:
         print("  no true pose is known of the tracked frames: errors cannot be computed")
     print(f"  on {metrics['device']}")
-    if metrics.get("map_warning"):
-        tell(f"nbtrack: warning: {metrics['map_warning']}")
+    outside = metrics.get("outside_map_share", 0.0)
+    is_outside = f"{outside:.0%} of the frames saw little of what was mapped" * (outside > 0)
+    for said in (metrics.get("map_warning"), is_outside, metrics.get("map_misfit")):
+        if said:
+            tell(f"nbtrack: warning: {said}")
 
 
 def _preset_of(options: Namespace, method: Method) -> Preset:

@@ -25,6 +25,7 @@ from nbtrack.fields import LearnedField, field_class, make_field
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
 from nbtrack.mapping.holdout import check_belongs
+from nbtrack.recordings.in_map import look_in_map
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
 from nbtrack.tracking.reach import reach_metrics
@@ -307,6 +308,12 @@ class TrackJob(Job):
         tracked = track_sequence(tracker, sequence, checkpoint, tell, is_start_known)
         reach = self.settings.reach(tracked.frames["steps"].mean(), bounds.metres_per_unit)
         how = sequence.T_world_camera, self.settings.motion_model
+        if self.needs.is_given:
+            followed = sequence.select(slice(len(sequence) - len(tracked.frames), None))
+            if notes["map_warning"] == _OTHER_WORLD:
+                followed = replace(followed, T_world_camera=tracked.T_estimated)
+            found = look_in_map(finished_map.field, followed, tracked.T_estimated)
+            notes |= {"outside_map_share": found.outside_share, "map_misfit": found.misfit}
         return tracked, notes | reach_metrics(reach, *how)
 
     def _map_warning(self, finished_map: Map, first: Frame, is_start_known: bool) -> str | None:
