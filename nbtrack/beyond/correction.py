@@ -39,7 +39,7 @@ _COLOR_STIFFNESS, _COLOR_HUBER, _COLOR_ROUNDS = 0.1, 0.05, 3
 # points leave, and no less. Chosen in the rooms for tuning and on a real recording, whose medians
 # are 1.8 mm and 0.002, and 4 mm and 0.02.
 _MEDIANS, _MIN_SCALES = np.array([5.5, 2.3]), np.array([0.01, 0.05])
-_UNMEASURED = 0.1  # confidence where nothing was measured: the word of the network is a guess
+_UNMEASURED = 0.1  # confidence where nothing was measured, and the network interpolates
 _MAX_CAMERAS = 200  # poses kept, evenly spread: where a lost camera may be looked for
 CORRECTIONS = ("numbers", "corrections", "cameras", "residual_medians")
 """What a file keeps of a correction, besides the field: see `CorrectedField`."""

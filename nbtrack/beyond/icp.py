@@ -28,7 +28,7 @@ _OPTIONS |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}
 
 @dataclass(frozen=True)
 class IcpSettings(TrackerSettings):
-    """Of ICP."""
+    """Settings of ICP."""
 
     n_pixels: int = 512  # points a frame; drawn as LM's are, so that their rows compare
     motion_model: str = "constant_velocity"

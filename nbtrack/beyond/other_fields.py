@@ -26,7 +26,7 @@ class OccupancyField(IMapField):
         return torch.sigmoid(raw_color), torch.sigmoid(raw_occupancy)
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
-        """Of samples, from their occupancies."""
+        """Weights of samples, from their occupancies."""
         return rendering.weights_from_occupancy(values)
 
 
@@ -43,7 +43,7 @@ class VolSdfField(NeuSField):
     label = "VolSDF"
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
-        """Of samples, from the density that belongs to the signed distance."""
+        """Weights of samples, from the density that belongs to the signed distance."""
         density = rendering.density_from_sdf(values, self.inverse_std)
         lengths = rays.directions_world.norm(dim=-1)
         return rendering.weights_from_density(density, depths, lengths)

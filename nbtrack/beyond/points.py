@@ -37,7 +37,7 @@ class PointCloud(Field):
     Settings = PointMapping
 
     def __init__(self, points: Points, colors: Colors, voxel: float, bounds: SceneBounds) -> None:
-        """Of points (m, world frame), colours in [0, 1], and the edge (m) of the points' cells."""
+        """Keep points (m, world frame), colours in [0, 1], and the edge (m) of their cells."""
         super().__init__(bounds)
         self.register_buffer("points", points)
         self.register_buffer("colors", colors)

@@ -24,7 +24,7 @@ class ConfigError(NbtrackError, ValueError):
 
 
 class NumericalError(NbtrackError, ArithmeticError):
-    """A loss or a pose stopped being finite; the message names where it was born."""
+    """A loss or a pose stopped being finite; the message names where that was found."""
 
 
 class OutOfMemory(NbtrackError, MemoryError):

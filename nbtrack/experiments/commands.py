@@ -243,7 +243,7 @@ def _export_map(source: Path, format_name: str, out: Path) -> str:
 
 
 def _export_movie(source: Path, format_name: str, out: Path) -> str:
-    """Of a run, whose recording and map must still be where they were."""
+    """A movie of a run, whose recording and map must still be where they were."""
     tracked = read_trajectory(source)
     metrics, last = tracked.metrics, len(tracked.frames) - 1
     stored = read_map(metrics["map"])

@@ -99,7 +99,7 @@ class MapJob(Job):
 
     @cached_property
     def key(self) -> str:
-        """Of code, device, data, settings and seed."""
+        """A digest of code, device, data, settings and seed."""
         device = choose_device().type
         if self.is_given:
             given = read_map(self.folder)
@@ -202,7 +202,7 @@ class TrackJob(Job):
 
     @cached_property
     def key(self) -> str:
-        """Of code, map, tracker, budget, threads, frames and seed; by the clock, of the machine."""
+        """A digest of code, map, tracker, budget, threads, frames, seed; by the clock, machine."""
         kinds = tracker_class(self.tracker), field_class(self.needs.field)
         own = type(self).compute, type(self)._tracked, _scores, make_tracker
         code = files.code_fingerprint(*kinds, "nbtrack.tracking.trajectories", *own)

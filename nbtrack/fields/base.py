@@ -62,7 +62,7 @@ class Field(nn.Module, abc.ABC):
     value_label: str = "signed distance (m)"  # on axes
     surface_level: float  # the value whose isosurface is drawn as the scene's surface
     # By how much its distance (m) and intensity are off at surfaces, together with depth cameras:
-    # larger residuals lose their say in second-order tracking. Our choice, for small networks.
+    # larger residuals are down-weighted in second-order tracking. Our choice, for small networks.
     residual_sigma: tuple[float, float] = (0.02, 0.05)
     inlier_distance: float = 0.05  # m from its surface within which a point fits
     intensity_mad: float = np.inf  # median residual of luma at what was mapped, where known
@@ -94,7 +94,7 @@ class Field(nn.Module, abc.ABC):
 
     @property
     def width(self) -> int:
-        """Of its widest layer, by which threads are chosen; 0 where one thread serves best."""
+        """Units of its widest layer, by which threads are chosen; 0 where one thread is best."""
         return max((len(weight) for weight in self.parameters() if weight.dim()), default=0)
 
     @property

@@ -35,7 +35,7 @@ class IMapField(LearnedField):
         return torch.sigmoid(raw_color), density
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
-        """Of samples, from their densities. Source: iMAP, Sec. 3.2."""
+        """Weights of samples, from their densities. Source: iMAP, Sec. 3.2."""
         return weights_from_density(values, depths, rays.directions_world.norm(dim=-1))
 
     def mapping_losses(self, draw: Draw, settings: MappingSettings, generator: Generator) -> Losses:

@@ -23,7 +23,7 @@ class NeusMapping(base.MappingSettings):
     surface_band: float = 0.15  # half width of the region around the measured depth, m
     lambda_depth: float = 1.0  # per metre
     lambda_eikonal: float = 0.5  # five times the method's own: rooms are mostly empty
-    # Share of the samples that the eikonal term looks at: neighbours say the same.
+    # Share of the samples that the eikonal term looks at: on neighbouring samples it is alike.
     eikonal_share: float = limited(0.25, 0.0, 1.0)
     correct_voxel: float = 0.0  # m; the finished map is corrected in such cells, 0: not at all
 
@@ -57,7 +57,7 @@ class NeuSField(LearnedField):
         return torch.sigmoid(raw_color), raw_sdf * self.mlp.metres_per_unit
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
-        """Of the sections between samples."""
+        """Weights of the sections between samples."""
         return rendering.weights_from_sdf(values, self.inverse_std)
 
     def mapping_losses(self, draw: Draw, settings: NeusMapping, generator: Generator) -> Losses:

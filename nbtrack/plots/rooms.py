@@ -231,7 +231,7 @@ def _inward_side(mesh: trimesh.Trimesh) -> float:
     """1 where the normals of a room's shell point inwards, else -1.
 
     Marching cubes orients faces by the sign of the field, which differs between densities and
-    distances. The room's shell outweighs what stands in it, so the middle votes.
+    distances. The room's shell outweighs what stands in it, so that the median is taken.
     """
     inwards = mesh.bounds.mean(axis=0) - mesh.triangles_center
     return np.sign((inwards * mesh.face_normals).sum(axis=1) @ mesh.area_faces)

@@ -255,7 +255,7 @@ def quick_warning(recording: Recording) -> str:
 
 
 def _as_in_files(recording: Recording) -> Recording:
-    """With depth values as they stand in the files, so that any unit can be tried."""
+    """The recording with depth values as they stand in the files, so that any unit can be tried."""
     declared = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
     return replace(recording, declared=declared)
 
@@ -294,7 +294,7 @@ def _read(
 def _by_frame(
     images: Iterator[tuple[np.ndarray, np.ndarray]], numbers: Frames, T: Poses
 ) -> pd.DataFrame:
-    """By number: share measured, brightness, and changes from the frame before, if it is there."""
+    """A row a frame: share measured, brightness, and changes from the frame before, if any."""
     rows, before = [], None
     for depth, color in images:
         is_repeated = before is not None and np.array_equal(depth, before)

@@ -40,7 +40,7 @@ class InMap:
 
 
 def look_in_map(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> InMap:
-    """Of a sequence's frames, spread evenly: whether what they measured lies outside of the map, at
+    """Look at some frames, spread evenly: whether what they measured lies outside of the map, at
     their true poses where known, and how it misfits at the estimated ones."""
     outside, parts = [], []
     low, high = (torch.tensor(corner) for corner in (field.bounds.minimum, field.bounds.maximum))
@@ -71,8 +71,8 @@ def _moved(points: Points, T_world_camera: Pose) -> Points:
 
 
 def _without_motion(field: Field, points: Points, T: Pose) -> Float[np.ndarray, "3 2"] | None:
-    """Of each explanation, motions projected out: its products with residuals and with itself, and
-    the variance of residuals (m²)."""
+    """A column an explanation, motions projected out: its products with residuals and with itself,
+    and the variance of residuals (m²)."""
     x = _moved(points, T).to(field.device).requires_grad_()
     distance = field(x)[1]
     (gradient,) = torch.autograd.grad(distance.sum(), x)

@@ -208,7 +208,7 @@ class _PairedFrames:
         self.agree = counts & (relative.abs() < self.scale)
 
     def correlation(self) -> float:
-        """Of the intensities of common points: the median over pairs; NaN without contrast."""
+        """The median over pairs of the correlation of intensities; NaN without contrast."""
         costs = self.color_cost(self.declared)
         return float(1 - np.nanmedian(costs)) if np.isfinite(costs).any() else math.nan
 
@@ -248,7 +248,7 @@ class _PairedFrames:
         return 1 - _correlations(own, seen, mask)
 
     def _intensities(self, shift: int) -> Float[np.ndarray, "2 pairs height width"]:
-        """Of both frames of pairs, in [0, 1], or of those that come so much later."""
+        """Intensities of both frames of pairs, in [0, 1], or of those that come so much later."""
         gray = [
             cv2.cvtColor(self.colors[i], cv2.COLOR_RGB2GRAY) for i in self.places.ravel() + shift
         ]
@@ -256,7 +256,7 @@ class _PairedFrames:
 
 
 def _correlations(a: Tensor, b: Tensor, mask: Tensor) -> Float[np.ndarray, "pairs"]:
-    """Of the values in each row where the mask is; NaN of few, or without contrast."""
+    """A correlation a row of the values where the mask is; NaN of few, or without contrast."""
     n = mask.sum(dim=1, keepdim=True)
     a, b = (torch.where(mask, x - torch.where(mask, x, 0.0).sum(1, True) / n, 0.0) for x in (a, b))
     variances = torch.stack([(x**2).sum(dim=1) for x in (a, b)]) / n[:, 0]
@@ -270,7 +270,7 @@ def _estimate(
     declared: Reading,
     cost: Callable[[Reading], Float[np.ndarray, "pairs"]],
 ) -> Misfit | None:
-    """Where the pairs agree best; None where too few see enough of the same at all values."""
+    """The value where pairs agree best; None if too few see enough of the same at all values."""
     values = parameter.values
     costs = np.stack([cost(parameter.reading(declared, value)) for value in values], axis=1)
     costs = costs[np.isfinite(costs).all(axis=1)]
@@ -287,7 +287,7 @@ def _estimate(
 def _lowest(
     values: Float[np.ndarray, "values"], costs: Float[np.ndarray, "*n values"]
 ) -> Float[np.ndarray, "*n"]:
-    """Where costs at equal steps are lowest: of a parabola through the lowest three."""
+    """The place of the lowest of costs at equal steps, by a parabola through three of them."""
     at = costs.argmin(axis=-1)
     inner = at.clip(1, max(1, len(values) - 2))
     around = np.stack([inner - 1, inner, inner + 1], axis=-1).clip(0, len(values) - 1)

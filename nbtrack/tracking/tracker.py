@@ -77,7 +77,7 @@ class Tracker(abc.ABC):
         settings: TrackerSettings | None = None,
         seed: int = 0,
     ) -> None:
-        """In a map, from a pose before the first frame (m), with a budget of its own.
+        """Begin in a map, from a pose before the first frame (m), with a budget of its own.
 
         Raises ConfigError for an unknown motion model or too many pixels, DataError for a pose that
         is not rigid.
