@@ -24,7 +24,7 @@ _COARSE_SHARE, _MIN_COARSE = 8, 128
 # Starts are compared by widely robust costs: narrow ones say the same of all that are off.
 _WIDE_SCALES = np.array([0.1, 0.2])
 # Starts that differ by more (m, rad), as of a fast camera that may have stopped, are compared after
-# their coarse stages, of so many steps at most: the costs of the starts themselves do not tell which
+# their coarse stages, of so many steps at most: costs of the starts themselves do not tell which
 # of them leads to the true pose.
 _FAR_APART, _MAX_COARSE_STEPS = 0.06, 30
 _MAX_STD = 0.04  # m; a pose whose position is less certain is taken for lost
