@@ -120,6 +120,20 @@ def test_the_field_of_the_notebook_in_every_command(grid_file: None, tmp_path: P
     assert (tmp_path / "out/table_1.csv").read_text().count("Grid,office") == 1
 
 
+def test_an_installed_package_joins_by_its_entry_point(tmp_path: Path) -> None:
+    """Catches a package whose methods no command knows unless somebody imports it."""
+    (tmp_path / "own_method.py").write_text(OWN)
+    about = tmp_path / "own_method-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: own-method\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[nbtrack]\nmine = own_method\n")
+    command = [sys.executable, "-m", "nbtrack", "methods"]
+    found = subprocess.run(
+        command, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True
+    )
+    assert "Mine" in found.stdout, found.stderr
+
+
 # What a notebook's cells may hold: constants and helpers, a base class, decorators, settings.
 CELL = """
 import torch
