@@ -144,6 +144,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cause = error
         where = error.filename2 or error.filename or "the output"
         message, status = f"{where}: {error.strerror or error}; mend it and run again", 2
+    except MemoryError as error:  # where no job says what needs it
+        cause = error
+        message, status = "out of memory: take fewer frames, as with --frames ::2", 2
     except KeyboardInterrupt as interruption:
         cause, message, status = interruption, INTERRUPTED, STATUS
     if os.environ.get("NBTRACK_DEBUG"):

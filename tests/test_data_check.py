@@ -34,8 +34,10 @@ from nbtrack.core.errors import DataError
 from nbtrack.core.settings import with_settings
 from nbtrack.data.formats import WORLD_TO_CAMERA
 from nbtrack.data.recording import open_recording
-from nbtrack.data.sequence import read_sequence
+from nbtrack.data.sequence import observed_bounds, read_sequence
 from nbtrack.experiments.presets import load_preset
+from nbtrack.experiments.scenes import Scene
+from nbtrack.recordings import check as check_module
 from nbtrack.recordings.check import DataReport, check_recording, quick_warning
 from nbtrack.recordings.conventions import CONVENTIONS
 
@@ -171,6 +173,64 @@ def test_nothing_to_look_at(box: Path, tmp_path: Path) -> None:
     rewrite_poses(box, np.full((N_FRAMES, 4, 4), np.nan))
     with pytest.raises(DataError, match="NaN"):
         check(box)
+
+
+def test_a_long_recording_is_read_in_parts(tmp_path: Path, monkeypatch) -> None:
+    """Catches 18 GB that 12,000 frames would take, images that are lost between two parts, and a
+    repeated image that is not seen since it begins one."""
+    folder = write_box(tmp_path / "box", walk(70))
+    (folder / "depth_filtered/depth32.png").write_bytes(
+        (folder / "depth_filtered/depth31.png").read_bytes()
+    )
+    whole, sizes, read = check(folder), [], check_module.read_frames
+    monkeypatch.setattr(check_module, "_MAX_KEPT", 3, raising=False)
+
+    def counted(recording, frames, *more):
+        sizes.append(len(frames))
+        return read(recording, frames, *more)
+
+    monkeypatch.setattr(check_module, "read_frames", counted)
+    report = check(folder)
+    assert max(sizes) < 70
+    assert sum(sizes) == 70
+    assert report.frames.equals(whole.frames)
+    assert list(report.frames.index[report.frames.is_repeated]) == [32]
+    assert report.conventions[0].median_m == whole.conventions[0].median_m
+    assert report.best.name == whole.best.name
+
+
+def test_no_memory_is_told_in_a_line(box: Path, capsys, monkeypatch) -> None:
+    """Catches a traceback, and no word of what would help."""
+
+    def full(*arguments, **options):
+        raise MemoryError
+
+    monkeypatch.setattr("nbtrack.data.images.np.empty", full)
+    assert main(["data", "convert", str(box), str(box.parent / "new")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--frames ::2" in line
+
+
+@pytest.mark.parametrize("share", [0.003, 0.08])
+def test_far_outliers(tmp_path: Path, share: float) -> None:
+    """Catches a scene of 140 m around a room of 4 m, which no map can be made of, without a word;
+    and that any depth of a right recording is taken for one."""
+    data, rng = source(), np.random.default_rng(0)
+    depths = data.depths_mm.copy()
+    is_far = rng.random(depths.shape) < share
+    depths[is_far] = rng.integers(40_000, 65_000, is_far.sum())
+    folders = [
+        write_recording("plain", tmp_path / "right"),
+        write_recording("plain", tmp_path / "far", data._replace(depths_mm=depths)),
+    ]
+    right, far = (Scene(path.name, path).read() for path in folders)
+    assert np.array_equal(right.depths_mm, read_sequence(folders[0]).depths_mm)
+    boxes = [observed_bounds(sequence) for sequence in (right, far)]
+    assert np.allclose(boxes[0].minimum, boxes[1].minimum, atol=0.03)
+    assert np.allclose(boxes[0].maximum, boxes[1].maximum, atol=0.03)
+    told = [text for text in check(folders[1]).warnings if "outliers" in text]
+    assert len(told) == 1
+    assert float(told[0].split("%")[0]) / 100 == pytest.approx(share, rel=0.5)
 
 
 @NEEDS_REAL

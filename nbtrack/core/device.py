@@ -104,7 +104,8 @@ def advise_on_memory(setting: str) -> Iterator[None]:
         if not (isinstance(error, MemoryError) or any(word in str(error) for word in words)):
             raise
         raise OutOfMemory(
-            f"out of memory with {setting}: lower it with --set; what was finished is kept"
+            f"out of memory with {setting}: lower it with --set, or take fewer frames, as with "
+            "--frames ::2; what was finished is kept"
         ) from None
 
 

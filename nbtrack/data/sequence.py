@@ -21,6 +21,9 @@ from nbtrack.data.recording import Recording, open_recording
 # Of bounds (our choice): pixels looked at in each frame, on a regular grid, and the share of points
 # cut off at either end of each axis, so that a few wild depths do not stretch the box.
 _POINTS_PER_FRAME, _CUT_OFF = 2000, 0.002
+# Beyond so many times the distance that nine in ten depths lie within, they are no measurement: of
+# eleven rooms and two real recordings the farthest was 2.1 times as far (our choice).
+FAR = 5.0
 _ARRAYS = "colors", "depths_mm", "T_world_camera", "frame_ids", "times"  # a row a frame
 _SLICE = r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?"
 
@@ -157,6 +160,20 @@ def select_frames(recording: Recording, frames: slice, needs_poses: bool = True)
             f" but no pose in {file} that is not NaN: choose others of 0:{n_frames}, or other poses"
         )
     return frame_ids
+
+
+def without_outliers(sequence: RgbdSequence) -> RgbdSequence:
+    """Without depths farther than `far_limit`; a sequence that has none is returned as it is."""
+    sample = sequence.depths_mm[:, ::4, ::4]
+    is_far = sequence.depths_mm > far_limit(sample[sample > 0])
+    if not is_far.any():
+        return sequence
+    return replace(sequence, depths_mm=np.where(is_far, np.uint16(0), sequence.depths_mm))
+
+
+def far_limit(depths: np.ndarray) -> float:
+    """The distance, in the unit of some measured depths, beyond which they are outliers."""
+    return FAR * float(np.quantile(depths, 0.9)) if len(depths) else np.inf
 
 
 def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:

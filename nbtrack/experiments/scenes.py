@@ -18,7 +18,13 @@ from nbtrack.core.files import (
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.recording import Recording, image_digest, open_recording
-from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames, select_frames
+from nbtrack.data.sequence import (
+    RgbdSequence,
+    parse_frames,
+    read_frames,
+    select_frames,
+    without_outliers,
+)
 from nbtrack.experiments.output import check_no_recording, is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
@@ -52,8 +58,9 @@ class Scene:
         return self.made_by or fingerprint(*self.recording.contents())
 
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
-        """The frames of a slice such as `10:50:2`; more options and errors: see `read_frames`."""
-        return read_frames(self.recording, parse_frames(frames), **options)
+        """The frames of a slice such as `10:50:2`, `without_outliers`; more options and errors: see
+        `read_frames`."""
+        return without_outliers(read_frames(self.recording, parse_frames(frames), **options))
 
     def count(self, frames: str, needs_poses: bool = True) -> int:
         """How many frames a slice selects; raises as `select_frames` does."""

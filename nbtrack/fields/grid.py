@@ -17,7 +17,7 @@ from nbtrack.core.errors import ConfigError
 from nbtrack.fields.base import Field
 
 _POINTS_AT_ONCE = 65_536
-_MAX_BYTES = 1_000_000_000
+_MAX_BYTES = 250_000_000  # sampled in two to four minutes on two cores (our choice)
 _BYTES_PER_VERTEX = 4 * (3 + 1 + 1)  # colour, value and confidence
 
 
@@ -35,7 +35,7 @@ class BakedField(Field):
 
         The interpolation's error falls with the voxel's square; the memory (20 bytes a vertex) and
         the time grow with its inverse's cube. Raises ConfigError where it is no positive number,
-        or the grid would exceed 1 GB.
+        or the grid would exceed 0.25 GB.
         """
         super().__init__(source.bounds)
         self.label, self.is_distance = f"{source.label} baked", source.is_distance
@@ -98,7 +98,8 @@ def _checked_size(field: Field, voxel: float | int) -> tuple[int, int, int]:
         # The smallest that fits, with 5 % for the cells to spare and for rounding.
         enough = 1.05 * (float(np.prod(extent)) * _BYTES_PER_VERTEX / _MAX_BYTES) ** (1 / 3)
         raise ConfigError(
-            f"voxel is {voxel} m: the grid of a baked field may take {_MAX_BYTES / 1e9:g} GB; set "
-            f"{enough:.2g} m or more, for instance 0.04, or choose smaller bounds"
+            f"voxel is {voxel} m, of a scene of {' x '.join(f'{x:.3g}' for x in extent)} m: the "
+            f"grid of a baked field may take {_MAX_BYTES / 1e9:g} GB; set {enough:.2g} m or more; "
+            "is the scene smaller than that, `data check` may tell which depths or poses are wrong"
         )
     return tuple(n_vertices.astype(int).tolist())

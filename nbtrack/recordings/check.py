@@ -13,7 +13,7 @@ from nbtrack.core.arrays import Frames, Poses
 from nbtrack.core.errors import DataError
 from nbtrack.core.progress import ProgressBar
 from nbtrack.data.recording import Recording
-from nbtrack.data.sequence import RgbdSequence, joined, read_frames, select_frames
+from nbtrack.data.sequence import FAR, RgbdSequence, far_limit, joined, read_frames, select_frames
 from nbtrack.recordings.conventions import (
     PLAUSIBLE_DEPTH,
     Convention,
@@ -61,6 +61,7 @@ class DataReport:
     frames: pd.DataFrame  # what `_by_frame` tells
     T_world_camera: Poses  # of the frames that have one, as declared
     cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m), frame
+    outliers: pd.DataFrame  # the same of depths beyond `far_limit`
     conventions: list[Convention]  # the declared one first
     best: Convention  # the declared one unless another is clearly better
     misfits: list[Misfit]  # of depth and poses, then of colours; where conventions are right
@@ -179,8 +180,15 @@ def _image_rules(report: DataReport) -> Rules:
 
 def _depth_rules(report: DataReport) -> Rules:
     (near, far), depth = PLAUSIBLE_DEPTH, report.cloud.depth.median()
-    measured = report.frames.measured.mean()
+    measured, outliers = report.frames.measured.mean(), report.outliers.depth
+    share = len(outliers) / max(1, len(outliers) + len(report.cloud))
     return [
+        (
+            len(outliers) > 0,
+            f"{share:.2%} of the depths are outliers, {outliers.min():.3g} to {outliers.max():.3g} "
+            f"m away, more than {FAR:g} times as far as nine in ten: maps and tracking leave them "
+            "out; check the camera, or set no_depth in sequence.toml to what it gives for none",
+        ),
         (
             not near <= depth <= far,
             f"the median depth is {depth:.3g} m, outside {near:g} to {far:g} m: set depth_scale, "
@@ -239,11 +247,13 @@ def check_recording(
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     results = fit_all(sequence, recording, np.searchsorted(kept, pairs))
     cloud, best = _cloud(results[0], sequence), best_convention(results)
-    poses, found, correlation = sequence.T_world_camera, [], math.nan
+    is_far = cloud.depth > far_limit(cloud.depth)
+    seen = recording, frames, sequence.T_world_camera, cloud[~is_far], cloud[is_far]
+    found, correlation = [], math.nan
     if is_whole and best is results[0]:
         fitted = np.searchsorted(kept, ids[fitted])
         found, correlation = find_misfits(sequence, fitted, best)
-    return DataReport(recording, frames, poses, cloud, results, best, found, correlation, is_whole)
+    return DataReport(*seen, results, best, found, correlation, is_whole)
 
 
 def quick_warning(recording: Recording) -> str:
