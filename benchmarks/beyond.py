@@ -16,6 +16,7 @@ from turns import in_turns
 from variants import FusedDistance
 
 from nbtrack import METHODS, Method, load_preset, make_tracker, map_scene, open_scenes, track_scenes
+from nbtrack.beyond.grid import BakedField
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
@@ -25,8 +26,7 @@ from nbtrack.experiments.methods import RATES_3_HZ, TABLE_3
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import Field
-from nbtrack.fields.grid import BakedField
-from nbtrack.mapping.quality import split_holdout
+from nbtrack.mapping.holdout import split_holdout
 from nbtrack.tables import write_table_3
 from nbtrack.tracking import StepBudget
 

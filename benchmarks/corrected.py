@@ -33,14 +33,14 @@ from nbtrack import (
     read_run,
     track_scenes,
 )
+from nbtrack.beyond import correction
+from nbtrack.beyond.correct import correct_map
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.grid import Execution, run_jobs
 from nbtrack.experiments.jobs import MapJob, TrackJob
 from nbtrack.experiments.methods import TABLE_1
-from nbtrack.fields import correction
-from nbtrack.mapping.correct import correct_map
 from nbtrack.tracking import StepBudget, track_sequence
 from nbtrack.tracking.metrics import trajectory_metrics
 

@@ -25,6 +25,7 @@ from scipy.stats import binomtest, bootstrap
 from variants import ExactDistance, FusedDistance, OtherDepth, with_variants
 
 from nbtrack import METHODS, load_preset, make_tracker, map_scene, open_scenes, track_scenes
+from nbtrack.beyond.grid import BakedField
 from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
@@ -33,8 +34,7 @@ from nbtrack.experiments.bench import camera_motion
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields.grid import BakedField
-from nbtrack.mapping.quality import split_holdout
+from nbtrack.mapping.holdout import split_holdout
 from nbtrack.tables import write_table_1
 from nbtrack.tracking import StepBudget, track_sequence
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M, still_metrics, trajectory_metrics

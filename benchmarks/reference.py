@@ -22,14 +22,14 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from nbtrack import METHODS, load_preset, make_tracker, open_scenes, read_sequence
+from nbtrack.beyond.correct import correct_map
+from nbtrack.beyond.observed import draw_points
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder
 from nbtrack.core.settings import with_settings
-from nbtrack.mapping.correct import correct_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.tables import write_csv
 from nbtrack.tracking import StepBudget, track_sequence
-from nbtrack.tracking.observed import draw_points
 
 TRACKED = METHODS["corrected_dense"], METHODS["icp_dense"]
 # Smooth errors like a registration's: so far (m, degrees) about a point ahead (m), with so many

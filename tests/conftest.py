@@ -28,8 +28,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def few_scores() -> Iterator[None]:
     """Most tests do not look at what their maps are worth."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbtrack.mapping.quality.POINTS_SCORED", 200)
-        patch.setattr("nbtrack.mapping.quality._MISFIT_FRAMES", 1)
+        patch.setattr("nbtrack.experiments.quality.POINTS_SCORED", 200)
+        patch.setattr("nbtrack.mapping.holdout._MISFIT_FRAMES", 1)
         yield
 
 

@@ -191,7 +191,7 @@ def test_a_recording_without_poses_is_tracked_in_a_map(
 ) -> None:
     """Catches `no poses in ...` where a map of the room is given: the camera is found first, every
     frame is tracked, and nothing is said of errors; and a picture that is not there."""
-    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 20_000)
+    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 20_000)
     recording = work / "rec"
     words = ["--set", "mapping.neus.iterations=200", "--set", "mapping.neus.correct_voxel=0.15"]
     made = ["data", "make", "office", "--out", str(recording), "--n-frames", "12", "--width", "64"]

@@ -8,14 +8,15 @@ import pytest
 import torch
 from box_room import BoxRoom, Formula, box_sequence
 
+from nbtrack.beyond import LmSettings, LmTracker
+from nbtrack.beyond.correct import correct_map
+from nbtrack.beyond.correction import CorrectedField, corrected, interpolation
+from nbtrack.beyond.grid import BakedField
 from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, NeusMapping, make_field
-from nbtrack.fields.correction import CorrectedField, corrected, interpolation
-from nbtrack.fields.grid import BakedField
-from nbtrack.mapping.correct import correct_map
 from nbtrack.mapping.files import Map, read_map, write_map
-from nbtrack.tracking import LmSettings, LmTracker, StepBudget
+from nbtrack.tracking import StepBudget
 
 ROOM, VOXEL = BoxRoom(half=(1.0, 0.5, 1.2)), 0.05
 
@@ -40,7 +41,7 @@ def sequence() -> RgbdSequence:
 def found(sequence: RgbdSequence) -> CorrectedField:
     dark = Formula(wavy, ROOM.bounds, lambda points: 0.8 * ROOM.color(points))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbtrack.fields.correction._N_POINTS", 40_000)
+        patch.setattr("nbtrack.beyond.correction._N_POINTS", 40_000)
         return corrected(dark, sequence, np.arange(12), VOXEL)
 
 
@@ -78,7 +79,7 @@ def test_the_same_data_give_the_same_corrections(
 ) -> None:
     """Catches draws that follow no seed. Frames without any surface are reported."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbtrack.fields.correction._N_POINTS", 40_000)
+        patch.setattr("nbtrack.beyond.correction._N_POINTS", 40_000)
         again = corrected(found.source, sequence, np.arange(12), VOXEL)
     assert torch.equal(found.corrections, again.corrections)
     sequence = box_sequence([[0.0, 0.0, 0.0]], ROOM)
@@ -101,7 +102,7 @@ def test_a_file_keeps_it_whole(
     tmp_path: Path, sequence: RgbdSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches corrections lost or rounded on the way to disk and back, and a wrong size."""
-    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 10_000)
+    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 10_000)
     network, settings = NetworkSettings(width=16), NeusMapping(correct_voxel=0.2)
     field = make_field("neus", network, ROOM.bounds, seed=0).eval().requires_grad_(False)
     made = {"field": "neus", "network": vars(network), "seconds": 0.0, "seed": 0}
@@ -132,7 +133,7 @@ def test_colours_are_those_of_the_surface(found: CorrectedField, sequence: RgbdS
     too, or that are as stiff as distances: an eightieth of the error would be left."""
     grey = Formula(wavy, ROOM.bounds)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbtrack.fields.correction._N_POINTS", 40_000)
+        patch.setattr("nbtrack.beyond.correction._N_POINTS", 40_000)
         assert errors(corrected(grey, sequence, np.arange(12), VOXEL))[1] < errors(grey)[1] / 150
 
 
@@ -141,7 +142,7 @@ def test_the_minimum_scales_follow_the_sensor(
 ) -> None:
     """Catches a tracker that takes a noisy camera's residuals for outliers, or a good one's for
     noise: 5.5 medians of normal noise are 3.7 of its standard deviations."""
-    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 40_000)
+    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 40_000)
     assert found.residual_sigma == pytest.approx((0.01, 0.05))  # nearly exact: no less than these
     noise = np.random.default_rng(0).normal(scale=6.0, size=sequence.depths_mm.shape)
     noisy = replace(sequence, depths_mm=(sequence.depths_mm + noise).astype(np.uint16))

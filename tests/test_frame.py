@@ -11,11 +11,12 @@ import pytest
 import torch
 from box_room import BoxRoom, box_sequence, narrow_room, walk
 
+from nbtrack.beyond import LmSettings
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.tracking import LmSettings, StepBudget, make_tracker
+from nbtrack.tracking import StepBudget, make_tracker
 
 SETTINGS = LmSettings(n_restarts=2)
 CAMERA_OF_BUFFERS = Intrinsics.from_focal(16, 12, 14.0)

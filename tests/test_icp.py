@@ -8,18 +8,19 @@ import pytest
 import torch
 from box_room import sequence_of
 
+from nbtrack.beyond import IcpSettings, PointMapping
+from nbtrack.beyond.lm_solver import retract
+from nbtrack.beyond.points import fuse_points
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError, MissingError
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields import NetworkSettings, PointMapping
-from nbtrack.fields.points import fuse_points
+from nbtrack.experiments.quality import score_map
+from nbtrack.fields import NetworkSettings
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.mapping.quality import score_map
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
-from nbtrack.tracking import IcpSettings, StepBudget, Tracker, make_tracker
-from nbtrack.tracking.lm_solver import retract
+from nbtrack.tracking import StepBudget, Tracker, make_tracker
 from nbtrack.tracking.metrics import pose_errors
 
 BOX = SceneBounds((-1.0, -1.0, 0.0), (1.0, 1.0, 3.0))
@@ -80,7 +81,7 @@ def test_only_the_frames_asked_for_and_what_lies_inside_are_fused() -> None:
 
 def test_scores_of_points(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches images asked of points, and points off the exact surface: depth here is clean."""
-    monkeypatch.setattr("nbtrack.mapping.quality.POINTS_SCORED", 4000)
+    monkeypatch.setattr("nbtrack.experiments.quality.POINTS_SCORED", 4000)
     sequence, made = room
     scores = score_map(made, sequence, build_room("bedroom"))
     assert scores["psnr_db"] is None

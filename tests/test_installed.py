@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from tiny import TINY
 
+from nbtrack.beyond import observed
 from nbtrack.cli import main
 from nbtrack.core import files
-from nbtrack.tracking import observed
 
 
 @pytest.fixture

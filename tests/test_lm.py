@@ -7,12 +7,13 @@ import pytest
 import torch
 from box_room import BoxRoom, box_sequence, narrow_room, sequence_of, walk
 
+from nbtrack.beyond import LmSettings, LmTracker
+from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.lm_solver import retract
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
-from nbtrack.fields.grid import BakedField
-from nbtrack.tracking import LmSettings, LmTracker, StepBudget
-from nbtrack.tracking.lm_solver import retract
+from nbtrack.tracking import StepBudget
 from nbtrack.tracking.metrics import pose_errors
 
 FRAME, T_TRUE = walk(1, narrow_room(), 48)[0], np.eye(4)
@@ -165,14 +166,14 @@ def test_in_doubt_intensities_must_be_as_usual(monkeypatch: pytest.MonkeyPatch) 
         assert not run(tracker, T_TRUE, 20)
         assert tracker.usual_mad == tracker.report()["intensity_mad"]
         with monkeypatch.context() as patch:
-            patch.setattr("nbtrack.tracking.lm._DOUBTED", 1.1)
+            patch.setattr("nbtrack.beyond.lm._DOUBTED", 1.1)
             assert run(tracker, T_TRUE, 20, replace(FRAME, color=color)) is is_lost
 
 
 def test_at_first_intensities_must_be_as_in_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a first frame on a made-up surface that passes, as nothing came before it, though the
     map knows how well its own frames agreed with it."""
-    monkeypatch.setattr("nbtrack.tracking.lm._DOUBTED", 1.1)
+    monkeypatch.setattr("nbtrack.beyond.lm._DOUBTED", 1.1)
     other = replace(FRAME, color=BLENDED)
     for intensity_mad, is_lost in ((np.inf, False), (0.002, True)):
         tracker = begun(n_restarts=0, lambda_intensity=1e-6)

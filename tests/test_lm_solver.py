@@ -5,11 +5,8 @@ import pytest
 import torch
 from box_room import BoxRoom, Formula, narrow_room, walk
 
-from nbtrack.core.bounds import SceneBounds
-from nbtrack.fields import NetworkSettings, make_field
-from nbtrack.fields.base import LUMA
-from nbtrack.fields.grid import BakedField
-from nbtrack.tracking.lm_solver import (
+from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.lm_solver import (
     COARSE,
     Descent,
     Grid,
@@ -20,7 +17,10 @@ from nbtrack.tracking.lm_solver import (
     robust_cost,
     scales_of,
 )
-from nbtrack.tracking.observed import draw_points, with_normals
+from nbtrack.beyond.observed import draw_points, with_normals
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.fields import NetworkSettings, make_field
+from nbtrack.fields.base import LUMA
 
 BOX = SceneBounds((-1.0, -1.2, -0.8), (1.0, 1.2, 0.8))
 ROOM = BakedField(BoxRoom(), 0.05)  # known better here, worse there, as corrected grids are

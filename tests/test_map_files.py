@@ -21,14 +21,15 @@ from finished import GIVEN
 from safetensors.torch import save
 from test_mapping import NETWORK, finished_wall, map_wall, wall_sequence
 
+from nbtrack.beyond import PointMapping
 from nbtrack.cli import main
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import DataError
 from nbtrack.experiments.output import LOCK_FILE
-from nbtrack.fields import NetworkSettings, PointMapping, make_field
+from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.mapping.files import MAP_FILE, Map, _digest, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.mapping.quality import check_belongs, depth_residual_of
+from nbtrack.mapping.holdout import check_belongs, depth_residual_of
 from nbtrack.tracking.trajectories import read_tum
 
 
@@ -81,7 +82,7 @@ OTHER, CHANGED = "is not a readable map file", "is not what was written"
 # What a file may hold in place of a map: a part of its header or a tensor, and what it is instead.
 # Where something else than the digest must tell, the file has one that is right.
 MAP_CONTENT: dict[str, tuple[str, Any, str]] = {
-    "a later version": ("format_version", 4, "format 4; this nbtrack reads 3"),
+    "a later version": ("format_version", 5, "format 5; this nbtrack reads 4"),
     "no version": ("format_version", GONE, "format None"),
     "a word for a version": ("format_version", "new", "format 'new'"),
     "unknown field": ("field", "nerf", "this nbtrack has no field 'nerf'"),

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
+from nbtrack.experiments.quality import score_map
 from nbtrack.mapping.files import Map
-from nbtrack.mapping.meshes import extract_mesh, seen_by
-from nbtrack.mapping.quality import score_map
+from nbtrack.plots.meshes import extract_mesh, seen_by
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
 
 ROOM = build_room("bedroom")
@@ -43,7 +43,7 @@ def quality_of(sequence: RgbdSequence, shift: float) -> dict:
 def test_scores(sequence: RgbdSequence, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches scores that punish an exact map, blind scores and wrong units: of the truth, within
     half a cell, and of a surface 8 cm inside the room, which is beyond 5 cm."""
-    monkeypatch.setattr("nbtrack.mapping.quality.POINTS_SCORED", 4000)
+    monkeypatch.setattr("nbtrack.experiments.quality.POINTS_SCORED", 4000)
     exact, inside = quality_of(sequence, 0.0), quality_of(sequence, 0.08)
     assert (exact["psnr_db"], exact["depth_l1_m"]) == (None, None)
     assert max(exact["sdf_near_m"], exact["sdf_free_m"]) < 1e-5

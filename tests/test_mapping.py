@@ -9,13 +9,14 @@ import pytest
 import torch
 from box_room import sequence_of
 
+from nbtrack.beyond import PointMapping
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError, NumericalError
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields import MappingSettings, NetworkSettings, PointMapping, field_class
+from nbtrack.fields import MappingSettings, NetworkSettings, field_class
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import learning_rate, map_sequence
-from nbtrack.mapping.quality import split_holdout
+from nbtrack.mapping.holdout import split_holdout
 
 NETWORK = NetworkSettings(width=48, n_frequencies=32)
 

@@ -4,13 +4,14 @@ import numpy as np
 import torch
 from box_room import sequence_of
 
+from nbtrack.beyond import NeusPlusMapping
+from nbtrack.beyond.neus_plus import ObservedDistance, distance_targets
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
-from nbtrack.fields import NetworkSettings, NeusPlusMapping
+from nbtrack.fields import NetworkSettings
 from nbtrack.fields.neus import guided_depths
-from nbtrack.fields.neus_plus import ObservedDistance, distance_targets
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
 

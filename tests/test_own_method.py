@@ -15,11 +15,13 @@ from nbconvert.preprocessors import ExecutePreprocessor
 from tiny import TINY, tiny_words
 
 from nbtrack.cli import main
+from nbtrack.core.errors import ConfigError
 from nbtrack.core.files import foreign_source
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments.methods import METHODS
+from nbtrack.experiments import presets
+from nbtrack.experiments.methods import METHODS, Method
 from nbtrack.experiments.presets import load_preset
-from nbtrack.fields import FIELDS
+from nbtrack.fields import FIELDS, field_class
 from nbtrack.tracking import TRACKERS
 
 OWN = '''
@@ -81,6 +83,41 @@ def test_a_row_in_both_tables(own_file: None, tmp_path: Path) -> None:
     assert main(["tables", "--method", "sdf,mine", *words]) == 0
     assert (tmp_path / "out/table_1.csv").read_text().count("Mine,office") == 1
     assert "DISTANCE,8," in (tmp_path / "out/table_2.csv").read_text()
+
+
+@pytest.fixture
+def grid_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The classes of notebook A4 as a file of one's own."""
+    notebook = Path(__file__).parents[1] / "notebooks/A4_a_field_of_your_own.ipynb"
+    cells = [c.source for c in nbformat.read(notebook, 4).cells if c.cell_type == "code"]
+    own = [cells[0], *(source for source in cells if "class " in source)]
+    (tmp_path / "own_grid.py").write_text("\n\n".join(own))
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.import_module("own_grid")
+    yield
+    del FIELDS["neus_grid"], TRACKERS["huber"], sys.modules["own_grid"]
+
+
+def test_the_field_of_the_notebook_in_every_command(grid_file: None, tmp_path: Path) -> None:
+    """Catches a field that is no network of the package's, and is lost in a map file, in a key, or
+    in a command: mapped, read, tracked in again, corrected, and a row of a table."""
+    words = tiny_words(
+        "scenes.names=['office']", "network.neus_grid.finest=0.3", "mapping.neus_grid.iterations=4",
+        "mapping.neus_grid.n_rays=8", "tracking.huber.n_pixels=8",
+    )  # fmt: skip
+    made = str(tmp_path / "map")
+    assert main(["map", "office", "--field", "neus_grid", *words, "--out", made]) == 0
+    for tracker in ("sdf", "huber", "vr", "lm"):
+        own = ["--tracker", tracker, "--steps", "1", "--out", str(tmp_path / tracker)]
+        assert main(["track", "office", "--map-from", made, *own, *words]) == 0
+        assert (tmp_path / tracker / "trajectory.txt").is_file()
+    METHODS["grid"] = Method("Grid", "neus_grid", "sdf", ("mapping.neus_grid.correct_voxel=0.2",))
+    try:
+        rows = ["--method", "sdf,grid", "--workers", "1", "--out", str(tmp_path / "out")]
+        assert main(["tables", *rows, *words, "--set", "tables.rates_hz=[10]"]) == 0
+    finally:
+        del METHODS["grid"]
+    assert (tmp_path / "out/table_1.csv").read_text().count("Grid,office") == 1
 
 
 # What a notebook's cells may hold: constants and helpers, a base class, decorators, settings.
@@ -182,6 +219,27 @@ def test_settings_of_what_is_registered_later(monkeypatch: pytest.MonkeyPatch) -
     again = with_settings(once, "tracking.mine.extra=2.0")
     assert again.tracking_of("mine").extra == 2.0
     assert again.tracking_of("mine").n_pixels == 7
+
+
+def test_settings_do_not_depend_on_when_a_class_is_registered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches sizes of a preset that miss what was registered before the presets were made, and a
+    class that loses its own defaults: smoke asks fewer pixels of all, and no other motion model."""
+    own = CELL.replace('name = "mine"', 'name, Settings = "mine", Own')
+    own = own.replace("class Mine", "@dataclass(frozen=True)\nclass Own(SdfSettings):\n"
+                      '    motion_model: str = "constant_velocity"\nclass Mine')  # fmt: skip
+    monkeypatch.setitem(TRACKERS, "mine", in_a_cell("from dataclasses import dataclass\n" + own))
+    for preset in (presets._from_file("smoke"), load_preset("smoke")):
+        settings = preset.tracking_of("mine")
+        assert (settings.n_pixels, settings.motion_model) == (512, "constant_velocity")
+
+
+def test_a_class_is_registered_by_its_own_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a subclass without a name of its own: its map would be read as its base's."""
+    monkeypatch.setitem(FIELDS, "tanh", FIELDS["neus"])
+    with pytest.raises(ConfigError, match="calls itself 'neus'"):
+        field_class("tanh")
 
 
 def test_a_method_in_a_notebook(tmp_path: Path) -> None:

@@ -39,9 +39,9 @@ def key() -> str:
         ("tracking/budget.py", "yield", "return", False),
         ("data/images.py", "INTER_NEAREST", "INTER_LINEAR", True),
         ("recordings/check.py", "a metre, in sequence.toml", "a metre", False),
-        ("fields/neus_plus.py", "class", "clas", False),
+        ("beyond/neus_plus.py", "class", "clas", False),
         ("fields/__init__.py", "NeuSField, ", "", False),
-        ("fields/correction.py", "300_000", "30", False),
+        ("beyond/correction.py", "300_000", "30", False),
     ],
 )
 def test_what_changes_a_key(package: Path, file: str, old: str, new: str, counts: bool) -> None:

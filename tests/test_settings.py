@@ -12,6 +12,7 @@ import pytest
 import torch
 from tiny import TINY
 
+from nbtrack.beyond.correct import correct_map
 from nbtrack.core.errors import ConfigError, NbtrackError
 from nbtrack.core.files import fingerprint
 from nbtrack.core.settings import as_dict, changed_settings, with_settings
@@ -23,7 +24,6 @@ from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.scenes import open_scene, open_scenes
 from nbtrack.fields import NetworkSettings
 from nbtrack.fields.mlp import FourierMlp
-from nbtrack.mapping.correct import correct_map
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import learning_rate, map_sequence
 from nbtrack.synthetic import REPORTED_ROOMS
@@ -291,8 +291,8 @@ class Small:
 def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Small]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NBTRACK_RUNS", str(tmp_path_factory.mktemp("small")))
-        patch.setattr("nbtrack.fields.correction._N_POINTS", 1000)
-        patch.setattr("nbtrack.fields.neus_plus._MIN_VOXEL", 0.5)
+        patch.setattr("nbtrack.beyond.correction._N_POINTS", 1000)
+        patch.setattr("nbtrack.beyond.neus_plus._MIN_VOXEL", 0.5)
         yield Small()
 
 

@@ -18,6 +18,8 @@ import pytest
 from recordings import write_recording
 from tiny import TINY, tiny_words
 
+from nbtrack.beyond import PointCloud
+from nbtrack.beyond.correction import CorrectedField
 from nbtrack.cli import main
 from nbtrack.core.errors import ConfigError, DataError, MissingError, NbtrackError
 from nbtrack.core.files import runs_folder
@@ -28,8 +30,7 @@ from nbtrack.experiments.jobs import MapJob
 from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, Method
 from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scenes
-from nbtrack.fields import FIELDS, PointCloud
-from nbtrack.fields.correction import CorrectedField
+from nbtrack.fields import FIELDS
 from nbtrack.tables import table_1
 from nbtrack.tracking import TRACKERS, make_tracker
 
@@ -138,7 +139,7 @@ def test_table_3(tmp_path: Path, scenes: list[Scene], monkeypatch: pytest.Monkey
     assert set(TABLE_1) < set(TABLE_3)
     assert RATES_3_HZ[0] == 30
     monkeypatch.setattr("nbtrack.experiments.bench.RATES_3_HZ", RATES_3_HZ[:1])
-    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 2000)
+    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
     for name in TABLE_3:  # a grid of a whole room in cells of 4 cm takes seconds to fill
         settings = tuple(text.replace("voxel=0.04", "voxel=0.3") for text in METHODS[name].settings)
         settings += ("tracking.lm.voxel=0.3",)
@@ -154,7 +155,7 @@ def test_every_method_is_made_again_from_its_command(
 ) -> None:
     """Catches a command that lacks a setting, a seed or a slice, or is refused; of the first method
     the map is made anew too."""
-    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 2000)
+    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
     few = [f"mapping.{field}.iterations=6" for field in ("volsdf", "occupancy")]
     coarse = with_settings(preset, "tracking.lm.voxel=0.3", *few)
     for name, method in METHODS.items():
@@ -240,7 +241,7 @@ def test_table_2_measures_what_a_method_uses(
         return make_tracker(name, field, *arguments)
 
     monkeypatch.setattr("nbtrack.experiments.bench.make_tracker", seen)
-    monkeypatch.setattr("nbtrack.fields.correction._N_POINTS", 2000)
+    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
     settings = ("mapping.neus_plus.correct_voxel=0.3", "tracking.lm.n_pixels=64")
     monkeypatch.setitem(METHODS, "corrected", replace(METHODS["corrected"], settings=settings))
     words = tiny_words("scenes.names=office", "tables.rates_hz=[10]", "scenes.track_frames=:2")
@@ -300,7 +301,7 @@ def test_a_damaged_scene_leaves_the_others(
     assert [s.name for s in open_scenes(with_settings(preset, names))] == ["office"]
     errors = capsys.readouterr().err
     assert f"left out: {broken}" in errors
-    assert "1 without a partner: depth2.png" in errors
+    assert "depth2.png): every image" in errors
 
 
 def test_a_failed_map_tells_why_in_every_cell(preset: Preset, own_scenes: list[Scene]) -> None:

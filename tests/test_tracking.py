@@ -11,10 +11,10 @@ import torch
 from box_room import BoxRoom, box_sequence, walk
 from scipy.spatial.transform import Rotation
 
+from nbtrack.beyond.grid import BakedField
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.grid import BakedField
 from nbtrack.tracking import (
     ClockBudget,
     SdfSettings,
@@ -162,7 +162,7 @@ def test_a_grid_is_tracked_in_by_one_thread() -> None:
     """Catches a wide network, kept with the grid that was made from it, that sets the threads."""
     grid = BakedField(BoxRoom(), 0.2)
     grid.source = torch.nn.Linear(3, 512)
-    assert make_tracker("sdf", grid, np.eye(4), StepBudget(1))._width == 0
+    assert make_tracker("sdf", grid, np.eye(4), StepBudget(1)).field.width == 0
 
 
 def test_the_frame_is_copied_within_its_time() -> None:

@@ -25,7 +25,7 @@ class Recorded:
     """
 
     def __init__(self, step: Callable[[], Scalar], owner: Any) -> None:
-        """Of a step that draws its random numbers from the owner's `generator`, on its device."""
+        """Record a step that draws random numbers from the owner's `generator`, on its device."""
         self._run, self._owner, self._calls = step, owner, 0
 
     def __call__(self) -> Scalar:

@@ -24,7 +24,7 @@ class ConfigError(NbtrackError, ValueError):
 
 
 class NumericalError(NbtrackError, ArithmeticError):
-    """A loss or a pose stopped being finite; the message names where it was born."""
+    """A loss or a pose stopped being finite; the message names where that was found."""
 
 
 class OutOfMemory(NbtrackError, MemoryError):
@@ -36,6 +36,14 @@ def look_up(what: str, name: str, known: Mapping[str, Entry]) -> Entry:
     if name not in known:
         raise ConfigError(f"unknown {what} {name[:40]!r}: {nearest_name(name, [*known])}")
     return known[name]
+
+
+def look_up_kind(what: str, name: str, known: Mapping[str, type]) -> type:
+    """A class by the name that it calls itself. Raises ConfigError for another, or an unknown."""
+    kind = look_up(what, name, known)
+    if kind.name != name:
+        raise ConfigError(f"{what} {name!r} calls itself {kind.name!r}: give the class this name")
+    return kind
 
 
 def nearest_name(text: str, allowed: list[str]) -> str:

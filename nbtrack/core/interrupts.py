@@ -13,7 +13,7 @@ STATUS = 130  # what shells say of a command that ended so
 
 
 def heed_interrupts() -> None:
-    """From now on, in a command's main thread; whoever has chosen another way keeps it."""
+    """Handle Ctrl-C in a command's main thread, unless somebody else does already."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         _handle_by(_end_or_raise)
 

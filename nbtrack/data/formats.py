@@ -87,7 +87,7 @@ class Format:
 
     @property
     def needs(self) -> tuple[tuple[str, ...], ...]:
-        """Of each of these patterns one must be there."""
+        """Groups of patterns; one of each group must be there."""
         cameras = () if self.known_cameras else (self.cameras,)
         return self.color, self.depth, self.poses, *cameras
 

@@ -41,7 +41,7 @@ def numbers_in(path: Path) -> tuple[int, ...]:
 
 
 def frame_keys(files: list[Path]) -> list[tuple[int, ...]]:
-    """Of each of a folder's files the numbers that vary in the names; all, where that tells none.
+    """The numbers that vary in the names of a folder's files, of each; all, where none does.
 
     >>> frame_keys([Path("0017_cam0.png"), Path("0018_cam0.png")])
     [(17,), (18,)]

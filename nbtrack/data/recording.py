@@ -143,7 +143,7 @@ def _images(
 
 
 def _times(folder: Path, colors: list[Path], rate_hz: float) -> Times:
-    """Of frames that no list of files times: from a file, their names, or the numbers in these."""
+    """Times of frames that no list names: from a file, their names, or the numbers in these."""
     path, numbers, stamps = folder / TIMES_FILE, frame_numbers(colors), _stamps_of(colors)
     if not path.is_file():
         if stamps is not None and (np.diff(stamps) > 0).all():
@@ -159,7 +159,7 @@ def _times(folder: Path, colors: list[Path], rate_hz: float) -> Times:
 
 
 def _calibration(folder: Path, layout: Format) -> Calibration:
-    """From the folder's own file, else assumed, by the folder's name."""
+    """The folder's own calibration, else one that is assumed by the folder's name."""
     known = [c for c in layout.known_cameras if c.source.name in folder.resolve().name]
     if known and not any((folder / name).is_file() for name in layout.cameras):
         return replace(known[0], source=folder / f"the camera assumed for {layout.label}")
@@ -229,7 +229,7 @@ def _share_clock(recording: Recording, stamps: Times) -> bool:
 
 
 def _by_time(recording: Recording, poses: Poses, stamps: Times, path: Path) -> Poses:
-    """Of every frame the pose: interpolated where one before and one after are close to each other,
+    """A pose a frame: interpolated where one before and one after are close to each other,
     else the nearest; NaN where none is near."""
     times = recording.times
     placed = _at(poses, _nearest(times, stamps, _TOLERANCE, path))
@@ -270,7 +270,7 @@ def _between(first: Poses, second: Poses, share: Times) -> Poses:
 def _by_number(
     recording: Recording, poses: Poses, stamps: Times | None, path: Path
 ) -> Poses | None:
-    """Of every frame the pose in a list that names no images; None where nothing tells it.
+    """A pose a frame, of a list that names no images; None where nothing tells it.
 
     By the images' numbers, where stamps, or places in the list, are these in just one way; else one
     after another, if there are as many. Raises DataError if no stamp is a frame's.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from nbtrack.beyond import PointCloud
 from nbtrack.core.errors import ConfigError, DataError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
@@ -28,10 +29,9 @@ from nbtrack.experiments.output import (
 )
 from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
-from nbtrack.fields import PointCloud
 from nbtrack.mapping.files import MAP_FILE, MESH_FILE, Map, read_map
-from nbtrack.mapping.meshes import extract_mesh
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
+from nbtrack.plots.meshes import extract_mesh
 from nbtrack.recordings.check import check_recording, quick_warning
 from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
@@ -118,8 +118,11 @@ def track_command(options: Namespace) -> None:
     if "ate_rmse_m" not in metrics:
         print("  no true pose is known of the tracked frames: errors cannot be computed")
     print(f"  on {metrics['device']}")
-    if metrics.get("map_warning"):
-        tell(f"nbtrack: warning: {metrics['map_warning']}")
+    outside = metrics.get("outside_map_share", 0.0)
+    is_outside = f"{outside:.0%} of the frames saw little of what was mapped" * (outside > 0)
+    for said in (metrics.get("map_warning"), is_outside, metrics.get("map_misfit")):
+        if said:
+            tell(f"nbtrack: warning: {said}")
 
 
 def _preset_of(options: Namespace, method: Method) -> Preset:
@@ -240,7 +243,7 @@ def _export_map(source: Path, format_name: str, out: Path) -> str:
 
 
 def _export_movie(source: Path, format_name: str, out: Path) -> str:
-    """Of a run, whose recording and map must still be where they were."""
+    """A movie of a run, whose recording and map must still be where they were."""
     tracked = read_trajectory(source)
     metrics, last = tracked.metrics, len(tracked.frames) - 1
     stored = read_map(metrics["map"])

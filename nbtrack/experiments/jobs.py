@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nbtrack.beyond.correct import correct_map
 from nbtrack.core import files
 from nbtrack.core.device import advise_on_memory, choose_device, device_name, threads
 from nbtrack.core.errors import DataError, NbtrackError
@@ -18,12 +19,13 @@ from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import parse_frames, select_frames
 from nbtrack.experiments.output import check_no_recording
 from nbtrack.experiments.presets import PRESETS, Preset
+from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import LearnedField, field_class, make_field
-from nbtrack.mapping.correct import correct_map
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
-from nbtrack.mapping.quality import check_belongs, score_map
+from nbtrack.mapping.holdout import check_belongs
+from nbtrack.recordings.in_map import look_in_map
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
 from nbtrack.tracking.reach import reach_metrics
@@ -97,12 +99,12 @@ class MapJob(Job):
 
     @cached_property
     def key(self) -> str:
-        """Of code, device, data, settings and seed."""
+        """A digest of code, device, data, settings and seed."""
         device = choose_device().type
         if self.is_given:
             given = read_map(self.folder)
             return files.fingerprint(given.key, files.code_fingerprint(type(given.field)), device)
-        correction = ["nbtrack.mapping.correct"] if self.needs else []
+        correction = ["nbtrack.beyond.correct"] if self.needs else []
         kind = field_class(self.field)
         code = kind, "nbtrack.mapping.fit", make_field, type(self).compute, *correction
         network = self.preset.network_of(self.field) if issubclass(kind, LearnedField) else None
@@ -200,7 +202,7 @@ class TrackJob(Job):
 
     @cached_property
     def key(self) -> str:
-        """Of code, map, tracker, budget, threads, frames and seed; by the clock, of the machine."""
+        """A digest of code, map, tracker, budget, threads, frames, seed; by the clock, machine."""
         kinds = tracker_class(self.tracker), field_class(self.needs.field)
         own = type(self).compute, type(self)._tracked, _scores, make_tracker
         code = files.code_fingerprint(*kinds, "nbtrack.tracking.trajectories", *own)
@@ -306,6 +308,12 @@ class TrackJob(Job):
         tracked = track_sequence(tracker, sequence, checkpoint, tell, is_start_known)
         reach = self.settings.reach(tracked.frames["steps"].mean(), bounds.metres_per_unit)
         how = sequence.T_world_camera, self.settings.motion_model
+        if self.needs.is_given:
+            followed = sequence.select(slice(len(sequence) - len(tracked.frames), None))
+            if notes["map_warning"] == _OTHER_WORLD:
+                followed = replace(followed, T_world_camera=tracked.T_estimated)
+            found = look_in_map(finished_map.field, followed, tracked.T_estimated)
+            notes |= {"outside_map_share": found.outside_share, "map_misfit": found.misfit}
         return tracked, notes | reach_metrics(reach, *how)
 
     def _map_warning(self, finished_map: Map, first: Frame, is_start_known: bool) -> str | None:

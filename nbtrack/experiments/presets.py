@@ -15,10 +15,10 @@ from nbtrack.core.errors import ConfigError, MissingError, look_up
 from nbtrack.core.settings import limited, setting_texts, with_settings, with_values
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.text_files import read_object
-from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, PointMapping, field_class
+from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, NeusMapping, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.tables import PAPER_PIXELS
-from nbtrack.tracking import TRACKERS, TrackerSettings, tracker_class
+from nbtrack.tracking import TRACKERS, SdfSettings, TrackerSettings, tracker_class
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Preset:
     name: str = field(metadata={"is_setting": False})  # no `key=value` reaches it
     # A density gains from finer detail; a distance must start smooth, or ripples satisfy the
     # eikonal term: at 4 rad/m in place of 2.5 it was off by 19 cm in free space, not by 5.
-    network: dict[str, NetworkSettings] = field(
+    network: dict[str, Any] = field(
         default_factory=lambda: {
             "imap": NetworkSettings(embedding_sigma=4.0),
             "neus": NetworkSettings(),
@@ -61,7 +61,7 @@ class Preset:
         }
     )
     # Of every field and tracker; of those that are not given, the defaults of their classes.
-    mapping: dict[str, MappingSettings | PointMapping] = field(default_factory=dict)
+    mapping: dict[str, Any] = field(default_factory=dict)
     tracking: dict[str, TrackerSettings] = field(default_factory=dict)
     scenes: ScenesConfig = ScenesConfig()
     tables: TablesConfig = TablesConfig()
@@ -69,7 +69,13 @@ class Preset:
     chosen: tuple[str, ...] = field(default=(), metadata={"is_setting": False})
 
     def __post_init__(self) -> None:
-        """Add the settings of all registered fields and trackers."""
+        """Add settings of all registered fields and trackers, and of networks of other kinds."""
+        others = {
+            name: self.network_of(name)
+            for name, kind in FIELDS.items()
+            if issubclass(kind, LearnedField) and kind.Network is not NetworkSettings
+        }
+        object.__setattr__(self, "network", self.network | others)
         object.__setattr__(self, "mapping", {name: self.mapping_of(name) for name in FIELDS})
         object.__setattr__(self, "tracking", {name: self.tracking_of(name) for name in TRACKERS})
 
@@ -86,27 +92,49 @@ class Preset:
         """The preset with the `key=value` texts of a method, and then those that a user chose."""
         return with_settings(self, *settings, *self.chosen)
 
-    def network_of(self, field_name: str) -> NetworkSettings:
-        """Network of a field; a field without its own takes that of NeuS."""
-        return self.network.get(field_name, self.network["neus"])
+    def network_of(self, field_name: str) -> Any:
+        """Network of a field; one without its own takes what was changed of NeuS's."""
+        kind = field_class(field_name)
+        network = kind.Network if issubclass(kind, LearnedField) else NetworkSettings
+        return _own_or_like("neus", self.network, field_name, network, NetworkSettings())
 
-    def mapping_of(self, field_name: str) -> MappingSettings | PointMapping:
-        """Mapping settings of a field; one that is added later takes what it shares with NeuS."""
-        return _own_or_like("neus", self.mapping, field_name, field_class(field_name).Settings)
+    def mapping_of(self, field_name: str) -> Any:
+        """Mapping settings of a field; one that has none takes what was changed of NeuS's."""
+        kind = field_class(field_name).Settings
+        return _own_or_like("neus", self.mapping, field_name, kind, NeusMapping())
 
     def tracking_of(self, tracker_name: str) -> TrackerSettings:
-        """Settings of a tracker; one that is added later takes what it shares with SDF tracking."""
+        """Settings of a tracker; one that has none takes what was changed of SDF tracking's."""
         kind = tracker_class(tracker_name).Settings
-        return _own_or_like("sdf", self.tracking, tracker_name, kind)
+        return _own_or_like("sdf", self.tracking, tracker_name, kind, SdfSettings())
 
 
-def _own_or_like(usual: str, known: dict[str, Any], name: str, kind: type) -> Any:
-    """Settings of a class: those of a name, else what they share with those of the usual one."""
-    other = known.get(name) or known.get(usual) or kind()
-    return kind(**{f.name: getattr(other, f.name) for f in fields(kind) if hasattr(other, f.name)})
+def _own_or_like(usual: str, known: dict[str, Any], name: str, kind: type, plain: Any) -> Any:
+    """Settings of a class: those of a name, else its defaults, but for what differs from `plain` in
+    those of the usual one: so a preset's sizes are those of what is registered later, too."""
+    if name in known:
+        return _shared(kind, known[name])
+    like = known.get(usual, plain)
+    changed = {f.name for f in fields(plain) if getattr(like, f.name) != getattr(plain, f.name)}
+    return _shared(kind, like, changed)
 
 
-_SMALL = with_values(Preset("smoke"), read_object(Path(__file__).with_name("smoke.toml")))
+def _shared(kind: type, other: Any, names: set[str] | None = None) -> Any:
+    """Settings of a class with those values of another's that both have, of these names."""
+    both = {f.name for f in fields(kind)} & {f.name for f in fields(other)}
+    both = both if names is None else both & names
+    return kind(**{name: getattr(other, name) for name in both})
+
+
+def _from_file(name: str) -> Preset:
+    """A preset of this folder; what it does not name follows what it does, whenever registered."""
+    said = read_object(Path(__file__).with_name(f"{name}.toml"))
+    mapping = {f: with_values(field_class(f).Settings(), v) for f, v in said["mapping"].items()}
+    tracking = {t: with_values(tracker_class(t).Settings(), v) for t, v in said["tracking"].items()}
+    return with_values(Preset(name, mapping=mapping, tracking=tracking), said)
+
+
+_SMALL = _from_file("smoke")
 _NINE = replace(_SMALL.scenes, names=REPORTED_ROOMS, track_frames=":")
 PRESETS = {
     "smoke": _SMALL,

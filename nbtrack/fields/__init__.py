@@ -3,24 +3,19 @@
 import torch
 
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.errors import look_up
+from nbtrack.core.errors import look_up_kind
 from nbtrack.fields.base import Field, LearnedField, MappingSettings
-from nbtrack.fields.imap import IMapField, OccupancyField
+from nbtrack.fields.imap import IMapField
 from nbtrack.fields.mlp import NetworkSettings
-from nbtrack.fields.neus import NeuSField, NeusMapping, VolSdfField
-from nbtrack.fields.neus_plus import NeuSPlusField, NeusPlusMapping
-from nbtrack.fields.points import PointCloud, PointMapping
+from nbtrack.fields.neus import NeuSField, NeusMapping
 
-FIELDS: dict[str, type[Field]] = {
-    kind.name: kind
-    for kind in (IMapField, NeuSField, NeuSPlusField, VolSdfField, OccupancyField, PointCloud)
-}
+FIELDS: dict[str, type[Field]] = {kind.name: kind for kind in (IMapField, NeuSField)}
 """What can be mapped, by name. A field of your own joins by `FIELDS["mine"] = MyField`."""
 
 
 def field_class(name: str) -> type[Field]:
     """The field of a name. Raises ConfigError, naming the nearest, for any other."""
-    return look_up("field", name, FIELDS)
+    return look_up_kind("field", name, FIELDS)
 
 
 def make_field(name: str, network: NetworkSettings, bounds: SceneBounds, seed: int) -> Field:

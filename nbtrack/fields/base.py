@@ -4,6 +4,7 @@ import abc
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from nbtrack.core.settings import limited, may_be_zero
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import rendering
+from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.rendering import Rendering, Weights
 
 LUMA = (0.299, 0.587, 0.114)
@@ -32,6 +34,7 @@ NEAR = 0.05  # m, z-depth before which nothing is looked for: closer than any de
 _N_STRATIFIED, _N_IMPORTANCE, _RAYS_AT_ONCE = 48, 24, 4096
 
 Losses = dict[str, Scalar]
+State = dict[str, Tensor]
 View = tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]
 Draw = Callable[..., Rays]  # of n_rays, and whether with tangent_planes: random measured pixels
 
@@ -59,12 +62,14 @@ class Field(nn.Module, abc.ABC):
     value_label: str = "signed distance (m)"  # on axes
     surface_level: float  # the value whose isosurface is drawn as the scene's surface
     # By how much its distance (m) and intensity are off at surfaces, together with depth cameras:
-    # larger residuals lose their say in second-order tracking. Our choice, for small networks.
+    # larger residuals are down-weighted in second-order tracking. Our choice, for small networks.
     residual_sigma: tuple[float, float] = (0.02, 0.05)
     inlier_distance: float = 0.05  # m from its surface within which a point fits
     intensity_mad: float = np.inf  # median residual of luma at what was mapped, where known
     min_inliers: float = 0.6  # share of a frame's points that fit where the camera is not lost
     Settings: type = MappingSettings  # of mapping
+    form: str = ""  # what a finished map was made of the field as mapped, by its name in map files
+    T_world_cameras: Float[Tensor, "cameras 4 4"] | None = None  # some that mapped it, where kept
 
     def __init__(self, bounds: SceneBounds) -> None:
         super().__init__()
@@ -74,6 +79,24 @@ class Field(nn.Module, abc.ABC):
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour in [0, 1] and the field's value at points (m, world frame)."""
 
+    @classmethod
+    def from_state(cls, state: State, made: dict[str, Any], bounds: SceneBounds) -> "Field":
+        """The field of a map file: what `state` gave, and how it was made (a `Map`'s record)."""
+        raise NotImplementedError(f"{cls.__name__} is kept in no map file")
+
+    def state(self) -> State:
+        """All that was learnt, by name, for a map file."""
+        return self.state_dict()
+
+    def diagnostics(self) -> dict[str, float]:
+        """Scalars worth a curve over training, beside the losses."""
+        return {}
+
+    @property
+    def width(self) -> int:
+        """Units of its widest layer, by which threads are chosen; 0 where one thread is best."""
+        return max((len(weight) for weight in self.parameters() if weight.dim()), default=0)
+
     @property
     def device(self) -> torch.device:
         """Where its tensors lie."""
@@ -82,7 +105,12 @@ class Field(nn.Module, abc.ABC):
 
 
 class LearnedField(Field):
-    """A field that is fitted to posed frames by gradient descent, and can be rendered."""
+    """A field that is fitted to posed frames by gradient descent, and can be rendered.
+
+    It is made of settings of its `Network`, the bounds and a generator.
+    """
+
+    Network: type = NetworkSettings
 
     @abc.abstractmethod
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
@@ -95,9 +123,12 @@ class LearnedField(Field):
     def prepare(self, sequence: RgbdSequence, frames: Frames) -> None:
         """Take from the frames to be mapped what the losses need besides the rays of a batch."""
 
-    def diagnostics(self) -> dict[str, float]:
-        """Scalars worth a curve over training, beside the losses."""
-        return {}
+    @classmethod
+    def from_state(cls, state: State, made: dict[str, Any], bounds: SceneBounds) -> "LearnedField":
+        """A network with these weights, which learns no more."""
+        field = cls(cls.Network(**made["network"]), bounds, Generator())
+        field.load_state_dict(state)
+        return field.eval().requires_grad_(False)
 
     def composite(
         self, colors: RayColors, values: RaySamples, rays: Rays, depths: RaySamples

@@ -1,4 +1,4 @@
-"""iMAP: colour and volume density (Sucar et al. 2021); and occupancy on the same network."""
+"""iMAP: colour and volume density (Sucar et al. 2021)."""
 
 import torch
 from torch import Generator
@@ -8,7 +8,7 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.pixels import Rays
 from nbtrack.fields.base import Draw, LearnedField, Losses, MappingSettings, rendered_losses
 from nbtrack.fields.mlp import FourierMlp, NetworkSettings
-from nbtrack.fields.rendering import Weights, weights_from_density, weights_from_occupancy
+from nbtrack.fields.rendering import Weights, weights_from_density
 
 DENSITY_PER_UNIT = 10.0  # 1/m of one unit of network output (vMAP's re-implementation of iMAP)
 
@@ -35,7 +35,7 @@ class IMapField(LearnedField):
         return torch.sigmoid(raw_color), density
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
-        """Of samples, from their densities. Source: iMAP, Sec. 3.2."""
+        """Weights of samples, from their densities. Source: iMAP, Sec. 3.2."""
         return weights_from_density(values, depths, rays.directions_world.norm(dim=-1))
 
     def mapping_losses(self, draw: Draw, settings: MappingSettings, generator: Generator) -> Losses:
@@ -45,25 +45,3 @@ class IMapField(LearnedField):
         n_samples = settings.n_stratified, settings.n_surface
         rendered = self.render(rays, self.hierarchical_depths(rays, *n_samples, generator))
         return rendered_losses(rendered, rays, settings.lambda_color, 1.0, over_std=True)
-
-
-class OccupancyField(IMapField):
-    """f: position -> (colour, occupancy in [0, 1]), as iMAP but for what a ray makes of it.
-
-    Occupancy is the probability that a place is taken (as in UNISURF and NICE-SLAM). Network,
-    samples and losses are iMAP's (our choice: the two maps differ in one equation alone).
-    """
-
-    name = "occupancy"
-    label = "Occupancy"
-    value_label = "occupancy"
-    surface_level = 0.5  # (UNISURF)
-
-    def forward(self, points_world: Points) -> tuple[Colors, Values]:
-        """Colour and occupancy, both in [0, 1]."""
-        raw_color, raw_occupancy = self.mlp(points_world)
-        return torch.sigmoid(raw_color), torch.sigmoid(raw_occupancy)
-
-    def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
-        """Of samples, from their occupancies."""
-        return weights_from_occupancy(values)

@@ -1,4 +1,4 @@
-"""NeuS: colour and signed distance on iMAP's network (Wang et al. 2021); and VolSDF."""
+"""NeuS: colour and signed distance on iMAP's network (Wang et al. 2021)."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class NeusMapping(base.MappingSettings):
     surface_band: float = 0.15  # half width of the region around the measured depth, m
     lambda_depth: float = 1.0  # per metre
     lambda_eikonal: float = 0.5  # five times the method's own: rooms are mostly empty
-    # Share of the samples that the eikonal term looks at: neighbours say the same.
+    # Share of the samples that the eikonal term looks at: on neighbouring samples it is alike.
     eikonal_share: float = limited(0.25, 0.0, 1.0)
     correct_voxel: float = 0.0  # m; the finished map is corrected in such cells, 0: not at all
 
@@ -57,7 +57,7 @@ class NeuSField(LearnedField):
         return torch.sigmoid(raw_color), raw_sdf * self.mlp.metres_per_unit
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
-        """Of the sections between samples."""
+        """Weights of the sections between samples."""
         return rendering.weights_from_sdf(values, self.inverse_std)
 
     def mapping_losses(self, draw: Draw, settings: NeusMapping, generator: Generator) -> Losses:
@@ -99,25 +99,6 @@ class NeuSField(LearnedField):
         moments = design.T @ (target / self.mlp.metres_per_unit).double()
         solution = torch.linalg.solve(normal, moments).float()
         self.mlp.head.weight[3], self.mlp.head.bias[3] = solution[:-1], solution[-1]
-
-
-class VolSdfField(NeuSField):
-    """f: position -> (colour, signed distance in m), as NeuS but for what a ray makes of it.
-
-    A signed distance, rendered through a density. Network, start, samples and losses are NeuS's,
-    and so is the one learnable scale, here beta = exp(-10 variance) in m: the two maps differ in
-    one equation alone (our choice; VolSDF places its samples by a bound on the error of the
-    integral). Source: Yariv et al. 2021.
-    """
-
-    name = "volsdf"
-    label = "VolSDF"
-
-    def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
-        """Of samples, from the density that belongs to the signed distance."""
-        density = rendering.density_from_sdf(values, self.inverse_std)
-        lengths = rays.directions_world.norm(dim=-1)
-        return rendering.weights_from_density(density, depths, lengths)
 
 
 def guided_depths(

@@ -19,13 +19,14 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import MissingError
 from nbtrack.core.files import naming_damaged, write_together
-from nbtrack.fields import FIELDS, Field, NetworkSettings, PointCloud, make_field
-from nbtrack.fields.correction import CORRECTIONS, CorrectedField
+from nbtrack.fields import FIELDS, Field
 
 MAP_FILE, HISTORY_FILE = "map.safetensors", "history.csv"
 MESH_FILE = "mesh.ply"  # what a map's frames have seen
 CHECKPOINT_FILE = "mapping.pt"  # of a map in the making
-_FORMAT, _VERSION = "nbtrack map", 3
+_FORMAT, _VERSION = "nbtrack map", 4
+FORMS: dict[str, type[Field]] = {}
+"""What may be made of a finished map's field, by name; see `Field.form`."""
 _AGAIN = "map again, and give the folder or its map.safetensors; an earlier nbtrack's are none"
 
 
@@ -44,7 +45,12 @@ class Map:
     @cached_property
     def key(self) -> str:
         """Twelve hexadecimal digits that change with the field, its bounds and its weights."""
-        plain = [self.field.name, self.record["network"], asdict(self.field.bounds)]
+        plain = [
+            self.field.name,
+            self.field.form,
+            self.record["network"],
+            asdict(self.field.bounds),
+        ]
         return _digest(plain, _tensors(self.field))[:12]
 
 
@@ -57,6 +63,7 @@ def write_map(path: Path, finished: Map) -> None:
     header = {
         "format_version": _VERSION,
         "field": finished.field.name,
+        "form": finished.field.form,
         "bounds": [list(bounds.minimum), list(bounds.maximum)],
         "declared_unit": bounds.declared_unit,
         "camera": asdict(finished.camera),
@@ -105,15 +112,8 @@ def _read_file(file: Path) -> Map:
     bounds = SceneBounds(*corners, header.get("declared_unit"))
     if name not in FIELDS:
         raise ValueError(f"this nbtrack has no field {name!r}")
-    if FIELDS[name] is PointCloud:
-        mapped = PointCloud(**tensors, voxel=float(record["settings"]["voxel"]), bounds=bounds)
-    else:
-        mapped = make_field(name, NetworkSettings(**record["network"]), bounds, seed=0)
-        correction = {key: tensors.pop(key) for key in CORRECTIONS if key in tensors}
-        mapped.load_state_dict({key.removeprefix("source."): t for key, t in tensors.items()})
-        mapped.eval().requires_grad_(False)
-        if correction:
-            mapped = CorrectedField(mapped, float(record["settings"]["correct_voxel"]), correction)
+    kind = FORMS[header["form"]] if header["form"] else FIELDS[name]
+    mapped = kind.from_state(tensors, record, bounds)
     return Map(mapped, Intrinsics(**header["camera"]), record)
 
 
@@ -134,14 +134,11 @@ def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise ValueError(f"{name} is not finite")
-    of_points = [tensors[name].shape for name in ("points", "colors") if name in tensors]
-    if len(set(of_points)) > 1:
-        raise ValueError("points and colours are not equally many")
 
 
 def _tensors(mapped: Field) -> dict[str, Tensor]:
     """All that was learnt, by name, on the CPU."""
-    state = mapped.state_dict()
+    state = mapped.state()
     return {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
 
 

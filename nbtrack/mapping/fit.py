@@ -16,16 +16,14 @@ from nbtrack.core.errors import DataError, NumericalError
 from nbtrack.core.files import code_fingerprint, loaded_checkpoint, save_checkpoint, versions
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
-from nbtrack.fields import LearnedField, MappingSettings, NetworkSettings, PointMapping, make_field
-from nbtrack.fields.points import fuse_points
+from nbtrack.fields import LearnedField, MappingSettings, field_class, make_field
 from nbtrack.mapping.files import Map
-from nbtrack.mapping.quality import split_holdout, usual_depth_residual
+from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 _PENDING = 10  # iterations between two looks at the losses, which wait for the device
 _FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
 
-Settings = MappingSettings | PointMapping
 OnIteration = Callable[[int, dict[str, float]], object]
 """Called with the iterations done and the last one's losses, a few times a second at most."""
 
@@ -40,14 +38,16 @@ def learning_rate(settings: MappingSettings, iteration: int) -> float:
 def map_sequence(
     field_name: str,
     sequence: RgbdSequence,
-    network: NetworkSettings,
-    settings: Settings,
+    network: Any,
+    settings: Any,
     seed: int = 0,
     device: torch.device | None = None,
     checkpoint: Path | None = None,
     on_iteration: OnIteration = lambda done, losses: None,
 ) -> Map:
-    """Fit a field to a sequence with known poses; points, which learn nothing, are fused.
+    """Fit a field to a sequence with known poses; one that learns nothing is made from its frames.
+
+    Settings are those of the field's `Network`, where it has one, and of its `Settings`.
 
     A `checkpoint` is written every few seconds and, where it exists, resumed from with the batches
     of an uninterrupted run. Who has written the finished map removes it. Raises DataError where no
@@ -57,18 +57,19 @@ def map_sequence(
     start, device = time.perf_counter(), device or torch.device("cpu")
     mapped, _ = split_holdout(len(sequence), settings.holdout_every)
     bounds = observed_bounds(sequence)
-    if isinstance(settings, PointMapping):
-        field = fuse_points(sequence, mapped, bounds, settings.voxel).to(device)
-        seconds = time.perf_counter() - start
-        history = [{"points": len(field.points), "bytes": 2 * field.points.nbytes}]
-        on_iteration(1, history[0])
-    else:
-        setting = f"mapping.{field_name}.n_rays={settings.n_rays}"
-        with advise_on_memory(setting), suitable_threads(network.width):
-            field = make_field(field_name, network, bounds, seed).to(device)
-            fit = _Fit(recipe, settings, field, sequence, mapped)
-            fit.run(checkpoint, on_iteration)
+    kind = field_class(field_name)
+    if issubclass(kind, LearnedField):
+        with advise_on_memory(f"mapping.{field_name}.n_rays={settings.n_rays}"):
+            with suitable_threads(0):
+                field = make_field(field_name, network, bounds, seed).to(device)
+            with suitable_threads(field.width):
+                fit = _Fit(recipe, settings, field, sequence, mapped)
+                fit.run(checkpoint, on_iteration)
         history, seconds = fit.history, fit.seconds
+    else:
+        field = kind.from_frames(sequence, mapped, bounds, settings).to(device)
+        history, seconds = [field.diagnostics()], time.perf_counter() - start
+        on_iteration(1, history[0])
     misfit_m = usual_depth_residual(field, sequence, mapped)
     record = {**recipe, "seconds": seconds, "misfit_m": misfit_m, "mapped_frames": len(mapped)}
     record |= {"device": device_name(device), "versions": versions()}
@@ -76,7 +77,7 @@ def map_sequence(
 
 
 def recipe_of(
-    field_name: str, sequence: RgbdSequence, network: NetworkSettings, settings: Settings, seed: int
+    field_name: str, sequence: RgbdSequence, network: Any, settings: Any, seed: int
 ) -> dict[str, Any]:
     """What a map is made of, as plain values: two maps of one recipe are the same map."""
     ids = sequence.frame_ids

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from nbtrack.core.arrays import Points, Poses, Transform, Values
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
-from nbtrack.mapping.meshes import query_field, seen_by
+from nbtrack.plots.meshes import query_field, seen_by
 from nbtrack.plots.style import DOTTED, log_axes, method_colors, new_axes, styled
 from nbtrack.synthetic import Room
 from nbtrack.tables import STANDING_STILL
@@ -231,7 +231,7 @@ def _inward_side(mesh: trimesh.Trimesh) -> float:
     """1 where the normals of a room's shell point inwards, else -1.
 
     Marching cubes orients faces by the sign of the field, which differs between densities and
-    distances. The room's shell outweighs what stands in it, so the middle votes.
+    distances. The room's shell outweighs what stands in it, so that the median is taken.
     """
     inwards = mesh.bounds.mean(axis=0) - mesh.triangles_center
     return np.sign((inwards * mesh.face_normals).sum(axis=1) @ mesh.area_faces)

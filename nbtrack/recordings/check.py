@@ -236,6 +236,7 @@ def check_recording(
     ids = select_frames(recording, slice(None))
     ids = ids[recording.has_pose[ids]]
     poses = recording.T_world_camera[ids]
+    poses[:, :3, 3] -= recording.origin
     pairs = ids[_pairs(poses, _N_PAIRS if is_whole else _QUICK_PAIRS)]
     looked_at = kept = ids if is_whole else np.unique(pairs)
     fitted = _pairs(poses, _FIT_PAIRS, MAX_SHIFT) if is_whole else pairs[:, :0]
@@ -248,11 +249,11 @@ def check_recording(
     results = fit_all(sequence, recording, np.searchsorted(kept, pairs))
     cloud, best = _cloud(results[0], sequence), best_convention(results)
     is_far = cloud.depth > far_limit(cloud.depth)
-    seen = recording, frames, sequence.T_world_camera, cloud[~is_far], cloud[is_far]
+    seen = recording, frames, poses, cloud[~is_far], cloud[is_far]
     found, correlation = [], math.nan
     if is_whole and best is results[0]:
-        fitted = np.searchsorted(kept, ids[fitted])
-        found, correlation = find_misfits(sequence, fitted, best)
+        places = np.searchsorted(kept, ids[fitted])
+        found, correlation = find_misfits(sequence, poses, fitted, places, best)
     return DataReport(*seen, results, best, found, correlation, is_whole)
 
 
@@ -264,7 +265,7 @@ def quick_warning(recording: Recording) -> str:
 
 
 def _as_in_files(recording: Recording) -> Recording:
-    """With depth values as they stand in the files, so that any unit can be tried."""
+    """The recording with depth values as they stand in the files, so that any unit can be tried."""
     declared = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
     return replace(recording, declared=declared)
 
@@ -303,7 +304,7 @@ def _read(
 def _by_frame(
     images: Iterator[tuple[np.ndarray, np.ndarray]], numbers: Frames, T: Poses
 ) -> pd.DataFrame:
-    """By number: share measured, brightness, and changes from the frame before, if it is there."""
+    """A row a frame: share measured, brightness, and changes from the frame before, if any."""
     rows, before = [], None
     for depth, color in images:
         is_repeated = before is not None and np.array_equal(depth, before)

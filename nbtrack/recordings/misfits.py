@@ -160,17 +160,22 @@ COLOR_PARAMETERS = [
 
 
 def find_misfits(
-    sequence: RgbdSequence, numbers: Int[np.ndarray, "2 pairs"], own: Convention
+    sequence: RgbdSequence,
+    T_world_camera: Poses,
+    numbers: Int[np.ndarray, "2 pairs"],
+    places: Int[np.ndarray, "2 pairs"],
+    own: Convention,
 ) -> tuple[list[Misfit], float]:
     """Misfits that pairs of frames can tell, whether there or not, and how alike their colours are:
     the correlation of intensities of points that both see, NaN without contrast.
 
-    Of a sequence with depth as in the files, by positions in it. Those of colours are looked for
+    Pairs are numbers of poses, and the places of their frames in a sequence with depth as in the
+    files; it holds the frames up to MAX_SHIFT around them too. Misfits of colours are looked for
     where depth is right.
     """
     if not numbers.size:
         return [], math.nan
-    frames = _PairedFrames(sequence, numbers, own)
+    frames = _PairedFrames(sequence, T_world_camera, numbers, places, own)
     found = [_estimate(p, frames.declared, frames.depth_cost) for p in DEPTH_PARAMETERS]
     correlation = frames.correlation()
     if not any(misfit.is_told for misfit in found if misfit):
@@ -193,19 +198,17 @@ def told_misfit(misfits: list[Misfit]) -> str:
 class _PairedFrames:
     """Pairs of frames that see much the same, and how well they agree as a recording is read."""
 
-    def __init__(
-        self, sequence: RgbdSequence, numbers: Int[np.ndarray, "2 pairs"], own: Convention
-    ) -> None:
-        """Of frames of a sequence with depth as in the files, by their positions in it."""
-        self.colors, self.numbers = sequence.colors, numbers
-        self.declared = Reading(own, sequence.T_world_camera)
-        self.pairs: Pairs = read_pairs(sequence.depths_mm[numbers])
+    def __init__(self, sequence, T_world_camera, numbers, places, own) -> None:
+        """See `find_misfits`."""
+        self.colors, self.numbers, self.places = sequence.colors, numbers, places
+        self.declared = Reading(own, T_world_camera)
+        self.pairs: Pairs = read_pairs(sequence.depths_mm[places])
         relative, counts, self.seen_at = self._relative(self.declared)
         self.scale = 3 * relative[counts].abs().median()
         self.agree = counts & (relative.abs() < self.scale)
 
     def correlation(self) -> float:
-        """Of the intensities of common points: the median over pairs; NaN without contrast."""
+        """The median over pairs of the correlation of intensities; NaN without contrast."""
         costs = self.color_cost(self.declared)
         return float(1 - np.nanmedian(costs)) if np.isfinite(costs).any() else math.nan
 
@@ -245,15 +248,15 @@ class _PairedFrames:
         return 1 - _correlations(own, seen, mask)
 
     def _intensities(self, shift: int) -> Float[np.ndarray, "2 pairs height width"]:
-        """Of both frames of pairs, in [0, 1], or of those that come so much later."""
+        """Intensities of both frames of pairs, in [0, 1], or of those that come so much later."""
         gray = [
-            cv2.cvtColor(self.colors[i], cv2.COLOR_RGB2GRAY) for i in self.numbers.ravel() + shift
+            cv2.cvtColor(self.colors[i], cv2.COLOR_RGB2GRAY) for i in self.places.ravel() + shift
         ]
         return np.stack(gray).reshape(*self.numbers.shape, *gray[0].shape).astype(np.float32) / 255
 
 
 def _correlations(a: Tensor, b: Tensor, mask: Tensor) -> Float[np.ndarray, "pairs"]:
-    """Of the values in each row where the mask is; NaN of few, or without contrast."""
+    """A correlation a row of the values where the mask is; NaN of few, or without contrast."""
     n = mask.sum(dim=1, keepdim=True)
     a, b = (torch.where(mask, x - torch.where(mask, x, 0.0).sum(1, True) / n, 0.0) for x in (a, b))
     variances = torch.stack([(x**2).sum(dim=1) for x in (a, b)]) / n[:, 0]
@@ -267,7 +270,7 @@ def _estimate(
     declared: Reading,
     cost: Callable[[Reading], Float[np.ndarray, "pairs"]],
 ) -> Misfit | None:
-    """Where the pairs agree best; None where too few see enough of the same at all values."""
+    """The value where pairs agree best; None if too few see enough of the same at all values."""
     values = parameter.values
     costs = np.stack([cost(parameter.reading(declared, value)) for value in values], axis=1)
     costs = costs[np.isfinite(costs).all(axis=1)]
@@ -284,7 +287,7 @@ def _estimate(
 def _lowest(
     values: Float[np.ndarray, "values"], costs: Float[np.ndarray, "*n values"]
 ) -> Float[np.ndarray, "*n"]:
-    """Where costs at equal steps are lowest: of a parabola through the lowest three."""
+    """The place of the lowest of costs at equal steps, by a parabola through three of them."""
     at = costs.argmin(axis=-1)
     inner = at.clip(1, max(1, len(values) - 2))
     around = np.stack([inner - 1, inner, inner + 1], axis=-1).clip(0, len(values) - 1)

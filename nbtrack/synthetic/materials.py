@@ -123,7 +123,7 @@ def framed(
 def lining(
     points: Points, shell: Box, floor: Material, ceiling: Material, sides: Material, ends: Material
 ) -> Points:
-    """Of a room's shell; `sides` are the walls perpendicular to x, `ends` those to z."""
+    """Colours of a room's shell; `sides` are the walls perpendicular to x, `ends` those to z."""
     colors, (side, up, end) = np.empty_like(points), shell.normals(points).T
     walls = (np.abs(side) > 0.5, sides), (np.abs(end) > 0.5, ends)
     for chosen, material in ((up > 0.5, floor), (up < -0.5, ceiling), *walls):

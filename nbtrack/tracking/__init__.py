@@ -3,22 +3,20 @@
 import importlib.util
 
 from nbtrack.core.arrays import Pose
-from nbtrack.core.errors import ConfigError, MissingError, look_up
+from nbtrack.core.errors import ConfigError, MissingError, look_up_kind
 from nbtrack.fields import FIELDS, Field, field_class
 from nbtrack.tracking.budget import Budget, ClockBudget, StepBudget, make_budget, paper_steps
-from nbtrack.tracking.icp import IcpSettings, IcpTracker
-from nbtrack.tracking.lm import LmSettings, LmTracker
 from nbtrack.tracking.paper import AdamTracker, SdfSettings, SdfTracker, VrSettings, VrTracker
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 from nbtrack.tracking.trajectories import Trajectory, track_sequence
 
-TRACKERS = {"vr": VrTracker, "sdf": SdfTracker, "lm": LmTracker, "icp": IcpTracker}
+TRACKERS: dict[str, type[Tracker]] = {"vr": VrTracker, "sdf": SdfTracker}
 """What can track, by name. A tracker of your own joins by `TRACKERS["mine"] = MyTracker`."""
 
 
 def tracker_class(name: str) -> type[Tracker]:
     """The tracker of a name. Raises ConfigError, naming the nearest, for any other."""
-    return look_up("tracker", name, TRACKERS)
+    return look_up_kind("tracker", name, TRACKERS)
 
 
 def check_pair(tracker_name: str, field: str | type) -> None:

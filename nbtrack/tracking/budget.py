@@ -33,7 +33,7 @@ class ClockBudget:
     """
 
     def __init__(self, rate_hz: Number, clock: Callable[[], float] = time.perf_counter) -> None:
-        """Of frames a second and a clock (s); ConfigError if the rate is not 0.001 to 1e6."""
+        """Take frames a second and a clock (s); ConfigError if the rate is not 0.001 to 1e6."""
         self.rate_hz, self._clock = _positive("rate_hz", rate_hz), clock
         self.memory: float | None = None  # mean seconds of a step in the last frame
 

@@ -34,7 +34,7 @@ class Reach:
     orientation: float  # rad
 
     def is_exceeded(self, motion: Motion) -> Float[np.ndarray, "frames"]:
-        """In which frames the camera moves or turns farther than that."""
+        """Whether the camera moves or turns farther than that, a flag a frame."""
         too_far = np.abs(motion.position).max(axis=1) > self.position
         return too_far | (np.abs(motion.orientation).max(axis=1) > self.orientation)
 
@@ -100,6 +100,6 @@ def reach_metrics(
 
 
 def _nearest_start(motion_model: str, found: list[np.ndarray], T_true: np.ndarray) -> np.ndarray:
-    """Of the poses where a search may start, the one nearest to the true position."""
+    """The pose nearest to the true position, of those where a search may start."""
     starts = expected_poses(motion_model, found)
     return min(starts, key=lambda T_start: np.linalg.norm(T_start[:3, 3] - T_true[:3, 3]))

@@ -17,7 +17,6 @@ from nbtrack.core.settings import with_values
 from nbtrack.data.frame import Frame
 from nbtrack.data.text_files import checked_poses
 from nbtrack.fields import Field, LearnedField
-from nbtrack.fields.grid import BakedField
 from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.reach import Reach
 from nbtrack.tracking.starts import expected_poses
@@ -78,7 +77,7 @@ class Tracker(abc.ABC):
         settings: TrackerSettings | None = None,
         seed: int = 0,
     ) -> None:
-        """In a map, from a pose before the first frame (m), with a budget of its own.
+        """Begin in a map, from a pose before the first frame (m), with a budget of its own.
 
         Raises ConfigError for an unknown motion model or too many pixels, DataError for a pose that
         is not rigid.
@@ -86,9 +85,6 @@ class Tracker(abc.ABC):
         self.settings = settings or self.Settings()
         with_values(self.settings, {"n_pixels": int(self.settings.n_pixels)})  # within its limits
         self.field = self.prepare(field).eval().requires_grad_(False)
-        # One thread serves a grid, even one that keeps the network it was made from, and points.
-        weights = [] if isinstance(self.field, BakedField) else self.field.parameters()
-        self._width = max((len(weight) for weight in weights if weight.dim()), default=0)
         self.device, self.budget = self.field.device, budget
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self._is_warm = False
@@ -127,7 +123,7 @@ class Tracker(abc.ABC):
         T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
         estimate = Estimate(T_starts[0], without_depth=True)
         if self.copes_without_depth or frame.has_depth:
-            with suitable_threads(self._width):
+            with suitable_threads(self.field.width):
                 estimate = self._search(frame, T_starts, budget or self.budget)
         self.estimates.append(estimate.T_world_camera.copy())  # the other one is the user's
         return estimate

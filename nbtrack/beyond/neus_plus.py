@@ -8,15 +8,15 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Generator, Tensor
 
+from nbtrack.beyond.grid import trilinear
+from nbtrack.beyond.points import cells_of, fuse_points, min_depth_behind
 from nbtrack.core.arrays import Frames, RaySamples
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.settings import limited
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Draw, Losses, measured_mean, rendered_losses
-from nbtrack.fields.grid import trilinear
 from nbtrack.fields.neus import NeuSField, NeusMapping, guided_depths
-from nbtrack.fields.points import cells_of, fuse_points, min_depth_behind
 
 # Distances are kept at corners so far apart (m), unless there would be more of them a side, and
 # measured from the mean points of cells half as wide, of three or more: single ones are noise.

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from nbtrack.beyond.observed import draw_points
+from nbtrack.beyond.points import PointCloud
 from nbtrack.core.arrays import Transforms
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
-from nbtrack.fields import PointCloud
-from nbtrack.tracking.observed import draw_points
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 # How far from the map a point may be to have a partner there, m: first wide, to get home from
@@ -28,7 +28,7 @@ _OPTIONS |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}
 
 @dataclass(frozen=True)
 class IcpSettings(TrackerSettings):
-    """Of ICP."""
+    """Settings of ICP."""
 
     n_pixels: int = 512  # points a frame; drawn as LM's are, so that their rows compare
     motion_model: str = "constant_velocity"

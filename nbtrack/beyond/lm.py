@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.lm_solver import Descent, Grid, retract
+from nbtrack.beyond.observed import draw_points, with_normals
 from nbtrack.core.arrays import Pose, Poses, Transform, Transforms
 from nbtrack.core.settings import limited
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
-from nbtrack.fields.grid import BakedField
-from nbtrack.tracking.lm_solver import Descent, Grid, retract
-from nbtrack.tracking.observed import draw_points, with_normals
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 _MIN_POINTS = 20  # below, a frame says too little for six unknowns
@@ -24,7 +24,8 @@ _COARSE_SHARE, _MIN_COARSE = 8, 128
 # Starts are compared by widely robust costs: narrow ones say the same of all that are off.
 _WIDE_SCALES = np.array([0.1, 0.2])
 # Starts that differ by more (m, rad), as of a fast camera that may have stopped, are compared after
-# their coarse stages, of so many steps at most: at the starts themselves walls hide who is right.
+# their coarse stages, of so many steps at most: costs of the starts themselves do not tell which
+# of them leads to the true pose.
 _FAR_APART, _MAX_COARSE_STEPS = 0.06, 30
 _MAX_STD = 0.04  # m; a pose whose position is less certain is taken for lost
 # With fewer inliers even a pose is lost to which the frame before led, within so much (m, rad).
@@ -85,7 +86,7 @@ class LmTracker(Tracker):
 
     def restart_anywhere(self) -> None:
         """Look for the camera near all poses that the map was made from; see `_hypotheses`."""
-        cameras = getattr(self.field, "T_world_cameras", None)
+        cameras = self.field.T_world_cameras
         self.check_finds(in_corrected=cameras is not None)
         self.restart(cameras[len(cameras) // 2].double().numpy())
         self.was_lost = True
@@ -183,7 +184,7 @@ class LmTracker(Tracker):
 
     def _other_starts(self) -> list[Pose]:
         """Where else the camera may be, the likeliest first."""
-        cameras = getattr(self.field, "T_world_cameras", None)
+        cameras = self.field.T_world_cameras
         if cameras is None:
             # The last good pose itself, then turned about x, y and z both ways, and wider.
             turns = [way * axis for axis in np.eye(6)[:3] for way in (1, -1)]

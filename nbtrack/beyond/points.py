@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,7 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError
 from nbtrack.core.settings import may_be_zero
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.base import Field
+from nbtrack.fields.base import Field, State
 
 _MAX_CELLS_A_SIDE = 2**20  # so that a cell's number fits into 64 bits
 _ASKED_EVERY = 5  # frames
@@ -36,11 +37,29 @@ class PointCloud(Field):
     Settings = PointMapping
 
     def __init__(self, points: Points, colors: Colors, voxel: float, bounds: SceneBounds) -> None:
-        """Of points (m, world frame), colours in [0, 1], and the edge (m) of the points' cells."""
+        """Keep points (m, world frame), colours in [0, 1], and the edge (m) of their cells."""
         super().__init__(bounds)
         self.register_buffer("points", points)
         self.register_buffer("colors", colors)
         self.voxel = voxel
+
+    @classmethod
+    def from_frames(
+        cls, sequence: RgbdSequence, frames: Frames, bounds: SceneBounds, settings: PointMapping
+    ) -> "PointCloud":
+        """Fused points; see `fuse_points`."""
+        return fuse_points(sequence, frames, bounds, settings.voxel)
+
+    @classmethod
+    def from_state(cls, state: State, made: dict[str, Any], bounds: SceneBounds) -> "PointCloud":
+        """ValueError unless points and colours are equally many."""
+        if len(state["points"]) != len(state["colors"]):
+            raise ValueError("points and colours are not equally many")
+        return cls(**state, voxel=float(made["settings"]["voxel"]), bounds=bounds)
+
+    def diagnostics(self) -> dict[str, float]:
+        """How many points there are, and what memory (bytes) they take."""
+        return {"points": len(self.points), "bytes": 2 * self.points.nbytes}
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour of the nearest point, and distance (m, without sign) from it."""

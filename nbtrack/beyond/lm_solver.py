@@ -43,10 +43,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.observed import Observed, compiled
 from nbtrack.core.arrays import Pose
 from nbtrack.fields.base import intensity_of
-from nbtrack.fields.grid import BakedField
-from nbtrack.tracking.observed import Observed, compiled
 
 G_MIN, G_MAX, G_SCALE = 0.3, 2.0, 0.5
 MARGIN = 0.3  # m beyond a field's bounds, where walls lie if the pose is off
@@ -80,7 +80,7 @@ class Grid:
     """A baked field as the compiled functions take it."""
 
     def __init__(self, field: BakedField) -> None:
-        """Of a field on the host."""
+        """The grid of a field on the host."""
         low, high = np.array(field.bounds.minimum), np.array(field.bounds.maximum)
         usable = low - MARGIN, high + MARGIN
         place = np.concatenate([field.low.double().numpy(), [field.voxel], *usable])
@@ -94,7 +94,7 @@ class Grid:
 
 
 class Descent:
-    """From a start, on some of a frame's points, then on all; poses are in double precision.
+    """A search from a start, on some of a frame's points, then on all, in double precision.
 
     The caller takes steps until `is_ended`, refines, and takes steps until `is_ended` again.
 
@@ -105,7 +105,7 @@ class Descent:
     def __init__(
         self, grid: Grid, some: Observed, all: Observed, lambda_intensity: float, T_start: Pose
     ) -> None:
-        """With some points for the coarse stage, and all for the fine one."""
+        """Begin with some points, for the coarse stage, and all, for the fine one."""
         self.grid, self.points, self.lambda_intensity = grid, (some, all), lambda_intensity
         self.T_start = self.T_world_camera = T_start
         self.last_step = np.inf  # rad or m, whichever is more
@@ -234,7 +234,7 @@ def _locate(terms, points, T, shape, place):
 @no_type_check
 @compiled
 def residual_terms(observed, T, grid, is_fine):
-    """Of every point a column of twelve: r_d, r_i, w, a (3), q_d (3), q_i (3), at a pose.
+    """A column of twelve a point: r_d, r_i, w, a (3), q_d (3), q_i (3), at a pose.
 
     Loops are plain, which numba compiles soonest; no result depends on the number of threads.
     """

@@ -3,15 +3,15 @@
 import time
 from dataclasses import asdict, replace
 
+from nbtrack.beyond.correction import corrected
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import MappingSettings
-from nbtrack.fields.correction import corrected
 from nbtrack.mapping.files import Map
-from nbtrack.mapping.quality import split_holdout, usual_depth_residual
+from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 
 
 def correct_map(finished: Map, sequence: RgbdSequence, settings: MappingSettings) -> Map:
-    """A map corrected at its surfaces by the frames it was made from; see `fields.correction`.
+    """A map corrected at its surfaces by the frames it was made from; see `correction`.
 
     It says how long that took, and how much memory network and corrections take.
     """

@@ -1,19 +1,18 @@
-"""How good a map is, against held-out images and the exact surface; and whether it belongs."""
+"""How good a map is, against held-out images and the exact surface."""
 
 import numpy as np
 import torch
+import trimesh
 from scipy.spatial import cKDTree
 
 from nbtrack.core.arrays import Frames, Values
-from nbtrack.core.camera import pixel_directions
 from nbtrack.core.errors import DataError
-from nbtrack.core.geometry import transform_points
-from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields import Field, LearnedField, PointCloud
+from nbtrack.fields import Field, LearnedField
 from nbtrack.mapping.files import Map
-from nbtrack.mapping.meshes import extract_mesh, query_field
+from nbtrack.mapping.holdout import split_holdout
+from nbtrack.plots.meshes import extract_mesh, query_field
 from nbtrack.synthetic import Room
 
 Scores = dict[str, float | None]
@@ -28,26 +27,6 @@ SCORES = (
 )
 NEAR = 0.05  # m: distances below this count as near a surface, and as found by the F-score
 POINTS_SCORED = 20_000  # on surfaces and along rays; as many pixels
-_MISFIT_PIXELS, _MISFIT_FRAMES = 500, 10
-# A map is refused where its misfit exceeds both. Measured on nine maps of three rooms (one a real
-# recording): frames of the same room 0.024 m at most, of other rooms 0.095 m at least.
-MISFIT_FACTOR, MISFIT_ALLOWED = 3.0, 0.05  # times what is usual in the map's own frames; m
-
-
-def split_holdout(n_frames: int, every: int) -> tuple[Frames, Frames]:
-    """Indices of the frames to map and of those kept back for scoring.
-
-    Every `every`-th frame is kept back, beginning in the middle of the first stretch; with
-    `every` = 0, or too few frames, none is.
-
-    >>> split_holdout(6, 3)
-    (array([0, 2, 3, 5]), array([1, 4]))
-    """
-    indices = np.arange(n_frames)
-    if every < 2 or n_frames < every:
-        return indices, indices[:0]
-    held_out = indices[every // 2 :: every]
-    return np.setdiff1d(indices, held_out), held_out
 
 
 def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -> Scores:
@@ -118,7 +97,7 @@ def _score_surface(field: Field, sequence, mapped: Frames, rays: Rays, room: Roo
         mesh = extract_mesh(field, sequence, mapped)
     except DataError:
         return {}
-    if isinstance(field, PointCloud):
+    if isinstance(mesh, trimesh.PointCloud):
         points = np.random.default_rng(0).permutation(mesh.vertices)[:POINTS_SCORED]
     else:
         points = mesh.sample(POINTS_SCORED, seed=0)
@@ -132,51 +111,3 @@ def _score_surface(field: Field, sequence, mapped: Frames, rays: Rays, room: Roo
         "mesh_completion_m": float(to_map.mean()),
         "mesh_f_score": 2 * precision * recall / max(precision + recall, 1e-9),
     }
-
-
-def depth_residual_of(field: Field, frame: Frame) -> float:
-    """How far (m) a map is from what a frame measured, at the frame's given pose.
-
-    The median over random pixels of |rendered depth - measured depth|; of points and grids, which
-    cannot be rendered, the distance at what was measured. NaN where nothing was.
-    """
-    if not frame.has_depth:
-        return float("nan")
-    frame = frame.to(field.device)
-    pixels = frame.measured_pixels()
-    order = torch.randperm(pixels.shape[1], generator=torch.Generator().manual_seed(0))
-    rows, columns = pixels[:, order[:_MISFIT_PIXELS].to(pixels.device)]
-    T_world_camera = torch.from_numpy(frame.T_world_camera).float().to(rows.device)
-    if not isinstance(field, LearnedField):
-        points_world = transform_points(T_world_camera, frame.points(rows, columns)[0])
-        return float(field(points_world)[1].abs().median())
-    directions = pixel_directions(frame.camera, columns, rows) @ T_world_camera[:3, :3].T
-    origins, measured = T_world_camera[:3, 3].expand_as(directions), frame.at(rows, columns)[1]
-    return float((field.render_rays(origins, directions)[1] - measured).abs().median())
-
-
-def usual_depth_residual(field: Field, sequence: RgbdSequence, mapped: Frames) -> float:
-    """The median misfit (m) of some of the mapped frames, evenly spread; 0 if none has a depth."""
-    spread = np.linspace(0, len(mapped) - 1, min(_MISFIT_FRAMES, len(mapped))).round().astype(int)
-    frames = [sequence[index] for index in mapped[spread].tolist()]
-    return float(np.median([depth_residual_of(field, f) for f in frames if f.has_depth] or [0.0]))
-
-
-def check_belongs(finished: Map, frame: Frame) -> str | None:
-    """A warning where it cannot be told whether a map belongs to a frame; None where it does.
-
-    The rule: its misfit is at most 5 cm, or three times what is usual in the map's own frames.
-    Raises DataError if it is more.
-    """
-    name, usual = f"the map of {finished.record['scene']}", finished.record["misfit_m"]
-    misfit_m = depth_residual_of(finished.field, frame)
-    if np.isnan(misfit_m):
-        return f"{frame.name} has no depth: whether {name} belongs to it cannot be told"
-    allowed = max(MISFIT_ALLOWED, MISFIT_FACTOR * usual)
-    if misfit_m > allowed:
-        raise DataError(
-            f"at its given pose {frame.name} is off {name} by {misfit_m:.3f} m (usual in this map "
-            f"{usual:.3f} m, allowed {allowed:.3f} m): give the room's own map, poses in the map's "
-            "world frame, begin where it was mapped, or let the camera be found: --start unknown"
-        )
-    return None

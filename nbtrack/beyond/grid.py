@@ -28,6 +28,7 @@ class BakedField(Field):
     """
 
     name = "baked"
+    width = 0  # one thread serves a grid, even one that keeps the network it was made from
 
     @torch.no_grad()
     def __init__(self, source: Field, voxel: float | int) -> None:

@@ -6,6 +6,7 @@ eight vertices. What the network says away from surfaces stays.
 """
 
 import copy
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,12 +16,14 @@ from scipy.ndimage import binary_dilation
 from scipy.sparse.linalg import cg
 from torch import Tensor
 
+from nbtrack.beyond.grid import BakedField
 from nbtrack.core.arrays import Frames, WorldPoints
+from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import DataError
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.base import LUMA, Field
-from nbtrack.fields.grid import BakedField
+from nbtrack.fields import Field, field_class
+from nbtrack.fields.base import LUMA, State
 
 # All our choice, tried in the two rooms for tuning. Measured points, and where along their normals
 # (m) the distance is that offset. Nearer than a voxel: farther out, planes end.
@@ -36,10 +39,11 @@ _COLOR_STIFFNESS, _COLOR_HUBER, _COLOR_ROUNDS = 0.1, 0.05, 3
 # points leave, and no less. Chosen in the rooms for tuning and on a real recording, whose medians
 # are 1.8 mm and 0.002, and 4 mm and 0.02.
 _MEDIANS, _MIN_SCALES = np.array([5.5, 2.3]), np.array([0.01, 0.05])
-_UNMEASURED = 0.1  # confidence where nothing was measured: the word of the network is a guess
+_UNMEASURED = 0.1  # confidence where nothing was measured, and the network interpolates
 _MAX_CAMERAS = 200  # poses kept, evenly spread: where a lost camera may be looked for
-CORRECTIONS = ("numbers", "corrections", "T_world_cameras", "residual_medians")
+CORRECTIONS = ("numbers", "corrections", "cameras", "residual_medians")
 """What a file keeps of a correction, besides the field: see `CorrectedField`."""
+_SOURCE = "source."  # how names of the field as mapped begin
 Columns = Float[np.ndarray, "rows columns"]
 
 
@@ -48,11 +52,12 @@ class CorrectedField(BakedField):
 
     What a file keeps is the field itself and, by name: the `numbers` (n) of corrected vertices,
     their `corrections` (n x 5) of colour, distance (m) and confidence in half precision, mapped
-    poses `T_world_cameras` (n x 4 x 4), and `residual_medians` (2), of distance (m) and luma, that
+    poses `cameras` (n x 4 x 4), and `residual_medians` (2), of distance (m) and luma, that
     the corrections leave at measured points: from them follow the least scales of a tracker's
     residuals.
     """
 
+    form = "corrected"
     inlier_distance, min_inliers = 0.025, 0.8
 
     def __init__(self, source: Field, voxel: float, correction: dict[str, Tensor]) -> None:
@@ -66,6 +71,26 @@ class CorrectedField(BakedField):
         self.intensity_mad = float(medians[1])
         self.volume[4] = _UNMEASURED
         self.volume[:, self.numbers.long()] += self.corrections.float().T
+
+    @property
+    def T_world_cameras(self) -> Float[Tensor, "cameras 4 4"]:
+        """Some of the poses that it was mapped from, evenly spread."""
+        return self.cameras
+
+    def state(self) -> State:
+        """That of the field as mapped, and the corrections."""
+        corrections = {name: getattr(self, name) for name in CORRECTIONS}
+        return corrections | {f"{_SOURCE}{name}": x for name, x in self.source.state().items()}
+
+    @classmethod
+    def from_state(
+        cls, state: State, made: dict[str, Any], bounds: SceneBounds
+    ) -> "CorrectedField":
+        """The field as mapped, sampled and corrected anew."""
+        source = {n.removeprefix(_SOURCE): x for n, x in state.items() if n.startswith(_SOURCE)}
+        mapped = field_class(made["field"]).from_state(source, made, bounds)
+        correction = {name: state[name] for name in CORRECTIONS}
+        return cls(mapped, float(made["settings"]["correct_voxel"]), correction)
 
 
 def corrected(

@@ -1,0 +1,19 @@
+"""What goes beyond the paper: fields and trackers that join as a user's own file does."""
+
+from nbtrack.beyond.correct import correct_map
+from nbtrack.beyond.correction import CorrectedField
+from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.icp import IcpSettings, IcpTracker
+from nbtrack.beyond.lm import LmSettings, LmTracker
+from nbtrack.beyond.neus_plus import NeuSPlusField, NeusPlusMapping
+from nbtrack.beyond.other_fields import OccupancyField, VolSdfField
+from nbtrack.beyond.points import PointCloud, PointMapping
+from nbtrack.fields import FIELDS
+from nbtrack.mapping.files import FORMS
+from nbtrack.tracking import TRACKERS
+
+for kind in (NeuSPlusField, VolSdfField, OccupancyField, PointCloud):
+    FIELDS[kind.name] = kind
+for tracker in (LmTracker, IcpTracker):
+    TRACKERS[tracker.name] = tracker
+FORMS[CorrectedField.form] = CorrectedField

@@ -1,0 +1,67 @@
+"""What a recording says of a map, in a box whose distance is exact."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from box_room import BoxRoom, box_sequence
+from scipy.spatial.transform import Rotation
+
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.data.sequence import RgbdSequence
+from nbtrack.recordings.in_map import look_in_map
+
+ROOM = BoxRoom(half=(1.5, 1.2, 2.0))
+
+
+def seen(n_frames: int = 12) -> RgbdSequence:
+    """From near the middle, turned to all sides a little."""
+    random = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (n_frames, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(
+        random.normal(scale=0.4, size=(n_frames, 3))
+    ).as_matrix()
+    poses[:, :3, 3] = random.uniform(-0.5, 0.5, (n_frames, 3))
+    return box_sequence(poses, ROOM, 20)  # wide: with three walls a motion does the same
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "off"),
+    [
+        (lambda s: s, "", 0),
+        (
+            lambda s: replace(s, depths_mm=np.rint(1.03 * s.depths_mm).astype(np.uint16)),
+            "depths",
+            3,
+        ),
+        (lambda s: replace(s, intrinsics=replace(s.intrinsics, fx=21.0, fy=21.0)), "focal", 5),
+        (lambda s: replace(s, intrinsics=replace(s.intrinsics, fx=19.0, fy=19.0)), "focal", -5),
+    ],
+    ids=["right", "long depths", "long focal", "short focal"],
+)
+def test_what_misfits_is_told_with_its_size(change, name: str, off: float) -> None:
+    """Catches a scale that is taken for a motion of the camera, or one mistake for the other; the
+    poses are off by what a tracker would make of it."""
+    sequence = change(seen())
+    estimated = sequence.T_world_camera.copy()
+    estimated[:, :3, 3] += np.random.default_rng(1).normal(scale=0.01, size=(12, 3))
+    said = look_in_map(ROOM, sequence, estimated).misfit
+    assert bool(said) == bool(name)
+    if name:
+        assert f"as if {name}" in said
+        assert float(re.search(r"by ([-+][\d.]+)%", said)[1]) == pytest.approx(off, abs=1)
+
+
+def test_frames_outside_of_what_was_mapped() -> None:
+    """Catches a camera in a part that no map holds, without a word: the map ends at x = 0, and half
+    of the frames look to where it is not, known by their true poses alone."""
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    poses[:5, :3, :3] = Rotation.from_rotvec([0, np.pi / 2, 0]).as_matrix()  # towards x
+    poses[5:, :3, :3] = Rotation.from_rotvec([0, -np.pi / 2, 0]).as_matrix()
+    half = BoxRoom(half=(1.5, 1.2, 2.0))
+    half.bounds = SceneBounds((-1.6, -1.3, -2.1), (0.0, 1.3, 2.1))
+    astray = np.tile(poses[9], (10, 1, 1))
+    assert look_in_map(half, box_sequence(poses, ROOM, 48), astray).outside_share == 0.5
+    torch.testing.assert_close(look_in_map(ROOM, seen(), seen().T_world_camera).outside_share, 0.0)
