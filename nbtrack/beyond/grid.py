@@ -17,7 +17,7 @@ from nbtrack.core.errors import ConfigError
 from nbtrack.fields.base import Field
 
 _POINTS_AT_ONCE = 65_536
-_MAX_BYTES = 250_000_000  # sampled in two to four minutes on two cores (our choice)
+_MAX_BYTES = 500_000_000  # 25 million vertices, sampled in some minutes (our choice)
 _BYTES_PER_VERTEX = 4 * (3 + 1 + 1)  # colour, value and confidence
 
 
@@ -36,7 +36,7 @@ class BakedField(Field):
 
         The interpolation's error falls with the voxel's square; the memory (20 bytes a vertex) and
         the time grow with its inverse's cube. Raises ConfigError where it is no positive number,
-        or the grid would exceed 0.25 GB.
+        or the grid would exceed 0.5 GB.
         """
         super().__init__(source.bounds)
         self.label, self.is_distance = f"{source.label} baked", source.is_distance

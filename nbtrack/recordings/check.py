@@ -249,11 +249,11 @@ def check_recording(
     results = fit_all(sequence, recording, np.searchsorted(kept, pairs))
     cloud, best = _cloud(results[0], sequence), best_convention(results)
     is_far = cloud.depth > far_limit(cloud.depth)
-    seen = recording, frames, poses, cloud[~is_far], cloud[is_far]
     found, correlation = [], math.nan
     if is_whole and best is results[0]:
         places = np.searchsorted(kept, ids[fitted])
         found, correlation = find_misfits(sequence, poses, fitted, places, best)
+    seen = recording, frames, poses, cloud[~is_far], cloud[is_far]
     return DataReport(*seen, results, best, found, correlation, is_whole)
 
 
