@@ -1,6 +1,9 @@
 """The network's answers in parts, what a step leaves behind, and a device without memory."""
 
 import gc
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -62,3 +65,17 @@ def test_running_out_of_memory_names_the_setting() -> None:
     # A wrong shape is no lack of memory.
     with pytest.raises(RuntimeError, match="size of tensor"), advise_on_memory("x"):
         torch.ones(2) + torch.ones(3)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes by fork here")
+def test_a_child_by_fork_computes() -> None:
+    """Catches a child, such as a loader's or a server's, that waits for ever for threads that its
+    parent has used and that it does not have."""
+    code = (
+        "import os, signal, sys, torch; from nbtrack.core import device; torch.set_num_threads(2)\n"
+        "work = lambda: torch.rand(1000, 1000).exp().sum()\n"
+        "work()\n"
+        "if child := os.fork(): sys.exit(os.waitpid(child, 0)[1] != 0)\n"
+        "signal.alarm(10), work(), os._exit(0)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

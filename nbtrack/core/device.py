@@ -14,6 +14,8 @@ from nbtrack.core.errors import ConfigError, OutOfMemory
 # Below this width matrix products are too small to share: on two cores, two threads were slower
 # than one. Rooms and methods then run side by side in processes instead.
 _WIDTH_FOR_THREADS = 192
+if hasattr(os, "register_at_fork"):  # a child has none of OpenMP's threads, and would wait for them
+    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def choose_device() -> torch.device:
