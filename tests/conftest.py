@@ -14,7 +14,10 @@ for name in ("PRESET", "CONFIG", "SET", "DATA", "RUNS"):  # of whoever runs the 
     os.environ.pop(f"NBTRACK_{name}", None)
 os.environ["NBTRACK_DEVICE"] = "cpu"  # where there is a GPU too: what is tested there says so
 os.environ["OMP_NUM_THREADS"] = "1"  # images are so small that threads would only wait for others
-LONG = ["test_lm_solver", "test_grid", "test_tables_of_runs", "test_data_check"]
+LONG = [
+    "test_lm_solver", "test_grid", "test_misfits", "test_own_method", "test_tables_of_runs",
+    "test_data_check", "test_settings",
+]  # fmt: skip
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
