@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,8 @@ def make_room(
     record |= {"frames": n_frames, "width": width, "height": height}
     frames = room_frames(build_room(name), n_frames, width, height, seed, motion)
     notes = {ROOM_FILE: json_text(record)}
-    write_sequence(folder, room_intrinsics(width, height), frames, notes, progress)
+    with closing(frames):  # its threads end with it, whatever keeps it from being written
+        write_sequence(folder, room_intrinsics(width, height), frames, notes, progress)
     return folder
 
 
