@@ -2,11 +2,12 @@
 
     python benchmarks/evidence.py EXPERIMENT [SEEDS]
 
-EXPERIMENT is one of nine_rooms, scores, dataset_path, readings, speeds, more_steps (as the dataset
-moves), steps, factors, oracle, choices, basin (hand-held). Rows are added to a CSV under
-paper_tables/ as they are finished, the first seed first; those that are there are not made again,
-whatever has changed since: remove the file to begin anew. Maps and runs are kept with all others
-(`NBTRACK_RUNS`). Only nine_rooms uses all cores: run others side by side.
+EXPERIMENT is one of nine_rooms, full_size, scores, dataset_path, readings, speeds, more_steps (as
+the dataset moves), steps, factors, oracle, choices, basin (hand-held). Rows are added to a CSV
+under paper_tables/ as they are finished, the first seed first; those that are there are not made
+again, whatever has changed since: remove the file to begin anew. Maps and runs are kept with all
+others (`NBTRACK_RUNS`), so that a killed experiment goes on where it was. nine_rooms and full_size
+use all cores: run others side by side.
 """
 
 import sys
@@ -15,6 +16,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -33,6 +35,7 @@ from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.bench import camera_motion
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import TABLE_1
+from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.mapping.holdout import split_holdout
 from nbtrack.tables import write_table_1
@@ -45,6 +48,17 @@ Chunk = tuple[dict[str, str | int], Callable[[], pd.DataFrame]]
 NINE = load_preset("nine_rooms")
 THREE_ROOMS = [*NINE.scenes.names[:3]]  # the first of the nine, whatever was found in them
 THREE = with_settings(NINE, f"scenes.names={THREE_ROOMS}")
+# The paper's sizes: 640 x 480 pixels, 256 units, 512 and 4,096 pixels a step. Both maps together
+# have three hours of a core (3.3 s an iteration of both).
+FULL = load_preset(
+    "synthetic",
+    settings=[
+        f"scenes.names={THREE_ROOMS[:1]}",
+        "scenes.n_frames=240",
+        "mapping.imap.iterations=3300",
+        "mapping.neus.iterations=3300",
+    ],
+)
 HELD = with_settings(NINE, *HAND_HELD)
 PRESET = with_variants(load_preset("smoke", settings=[f"scenes.names={THREE_ROOMS}", *HAND_HELD]))
 KEPT = [
@@ -72,13 +86,21 @@ def main(experiment: str, seeds: int) -> None:
             made = made[[*place, *made.columns.difference([*place], sort=False)]]
             rows = pd.concat([rows, made])
             write_atomic(path, rows.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+    rows = pd.read_csv(path)  # as anybody has them, rounded
     if experiment == "nine_rooms":
-        rows = pd.read_csv(path)  # as anybody has them, rounded
-        motion = camera_motion(NINE, rows.query("path == 'mapped'"))
-        note = f"{motion}; preset: {NINE.name}; budget: {NINE.step_counts}; {machine}."
-        write_table_1(path.parent, rows.query("path == 'mapped'"), note)
+        write_table(path.parent, NINE, rows.query("path == 'mapped'"))
         judged = verdicts(rows).to_csv(index=False, float_format="%.4g", lineterminator="\n")
         write_atomic(path.parent / "verdicts.csv", judged)
+    elif experiment == "full_size":
+        write_table(path.parent, FULL, rows)
+
+
+def write_table(folder: Path, preset: Preset, rows: pd.DataFrame) -> None:
+    """Table I of some rows, with what its caption says."""
+    machine = ", ".join(rows["device"].unique())
+    motion = camera_motion(preset, rows)
+    note = f"{motion}; preset: {preset.name}; budget: {preset.step_counts}; {machine}."
+    write_table_1(folder, rows, note)
 
 
 def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
@@ -121,6 +143,24 @@ def nine_rooms(seed: int) -> Iterator[Chunk]:
         there = {"seeds": [seed], "tracked": paths[number : number + 1], "workers": None}
         place = {"path": path, "scene": scenes[number].name}
         yield place, partial(track, scenes[number : number + 1], TABLE_1, NINE, **there)
+
+
+def full_size(seed: int) -> Iterator[Chunk]:
+    """Table I at the paper's sizes in one room, with one seed. It takes some six core-hours."""
+    for scene in open_scenes(FULL):
+        yield {"scene": scene.name}, partial(_full_size, scene, seed)
+
+
+def _full_size(scene: Scene, seed: int) -> pd.DataFrame:
+    rows = track([scene], TABLE_1, FULL, None, seeds=[seed])
+    for name in TABLE_1:
+        made = map_scene(scene, METHODS[name].field, FULL, seed).record
+        own = rows["method"] == METHODS[name].label
+        rows.loc[own, "iterations"] = made["settings"]["iterations"]
+        rows.loc[own, "mapping_seconds"] = made["seconds"]
+        for score, value in made["quality"].items():
+            rows.loc[own, score] = value
+    return rows
 
 
 def dataset_path(seed: int) -> Iterator[Chunk]:
@@ -279,6 +319,7 @@ def basin(seed: int) -> Iterator[Chunk]:
 
 EXPERIMENTS = {
     "nine_rooms": (nine_rooms, "nine_rooms/table_1_cells.csv"),
+    "full_size": (full_size, "full_size/table_1_cells.csv"),
     **{
         f.__name__: (f, f"evidence/{f.__name__}.csv")
         for f in (
