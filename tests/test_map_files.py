@@ -29,7 +29,8 @@ from nbtrack.experiments.output import LOCK_FILE
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.mapping.files import MAP_FILE, Map, _digest, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.mapping.holdout import check_belongs, depth_residual_of
+from nbtrack.mapping.holdout import depth_residual_of
+from nbtrack.recordings.belongs import check_belongs
 from nbtrack.tracking.trajectories import read_tum
 
 

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import json_text, write_atomic
+from nbtrack.recordings.belongs import other_world
 from nbtrack.tracking.metrics import (
     align_rigidly,
-    other_world,
     pose_errors,
     score_detection,
     still_metrics,

@@ -6,13 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from nbtrack.beyond.other_fields import density_from_sdf, weights_from_occupancy
 from nbtrack.fields.rendering import (
     composite,
-    density_from_sdf,
     importance_depths,
     stratified_depths,
     weights_from_density,
-    weights_from_occupancy,
     weights_from_sdf,
 )
 

@@ -2,10 +2,10 @@
 
 import torch
 
-from nbtrack.core.arrays import Colors, Points, RaySamples, Values
+from nbtrack.core.arrays import Colors, Points, RaySamples, Scalar, Values
 from nbtrack.data.pixels import Rays
-from nbtrack.fields import IMapField, NeuSField, rendering
-from nbtrack.fields.rendering import Weights
+from nbtrack.fields import IMapField, NeuSField
+from nbtrack.fields.rendering import Weights, weights_from_density
 
 
 class OccupancyField(IMapField):
@@ -27,7 +27,7 @@ class OccupancyField(IMapField):
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
         """Weights of samples, from their occupancies."""
-        return rendering.weights_from_occupancy(values)
+        return weights_from_occupancy(values)
 
 
 class VolSdfField(NeuSField):
@@ -44,6 +44,28 @@ class VolSdfField(NeuSField):
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
         """Weights of samples, from the density that belongs to the signed distance."""
-        density = rendering.density_from_sdf(values, self.inverse_std)
+        density = density_from_sdf(values, self.inverse_std)
         lengths = rays.directions_world.norm(dim=-1)
-        return rendering.weights_from_density(density, depths, lengths)
+        return weights_from_density(density, depths, lengths)
+
+
+def density_from_sdf(sdf: RaySamples, inverse_scale: Scalar) -> RaySamples:
+    """density = Psi(-d) / beta, with Psi the cumulative function of Laplace's distribution.
+
+    Of the signed distance d (m, positive in free space) and 1 / beta (1/m): half of 1 / beta on the
+    surface, all of it inside, and exp(-d / beta) / (2 beta) outside.
+    Source: Yariv et al. 2021 (VolSDF), Eq. 2 and 3, with their alpha = 1 / beta.
+    """
+    tail = torch.exp(-inverse_scale * sdf.abs()) / 2
+    return inverse_scale * torch.where(sdf < 0, 1 - tail, tail)
+
+
+def weights_from_occupancy(occupancy: RaySamples) -> RaySamples:
+    """Probabilities w_i = o_i prod_{j<i} (1 - o_j) that a ray ends at its i-th sample.
+
+    Unlike a density's they do not know how far samples lie apart: of two samples in a half-taken
+    place the ray passes a quarter, however near they are.
+    Source: Oechsle et al. 2021 (UNISURF), Sec. 3; Zhu et al. 2022 (NICE-SLAM), Sec. 3.2.
+    """
+    passed = torch.cat([torch.ones_like(occupancy[:, :1]), 1 - occupancy[:, :-1]], dim=-1)
+    return occupancy * passed.cumprod(dim=-1)

@@ -24,13 +24,13 @@ from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import LearnedField, field_class, make_field
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
-from nbtrack.mapping.holdout import check_belongs
+from nbtrack.recordings.belongs import check_belongs, in_world_of_map
 from nbtrack.recordings.in_map import look_in_map
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
 from nbtrack.tracking.reach import reach_metrics
 from nbtrack.tracking.starts import expected_poses
-from nbtrack.tracking.trajectories import METRICS_FILE, in_world_of_map, shifted, tum_text
+from nbtrack.tracking.trajectories import METRICS_FILE, shifted, tum_text
 
 RUN_FILE = "run.pt"
 _OTHER_WORLD = (

@@ -66,28 +66,6 @@ def weights_from_sdf(sdf: RaySamples, inverse_std: Scalar) -> Float[Tensor, "ray
     return -torch.expm1(log_ratio) * torch.exp(passed)
 
 
-def density_from_sdf(sdf: RaySamples, inverse_scale: Scalar) -> RaySamples:
-    """density = Psi(-d) / beta, with Psi the cumulative function of Laplace's distribution.
-
-    Of the signed distance d (m, positive in free space) and 1 / beta (1/m): half of 1 / beta on the
-    surface, all of it inside, and exp(-d / beta) / (2 beta) outside.
-    Source: Yariv et al. 2021 (VolSDF), Eq. 2 and 3, with their alpha = 1 / beta.
-    """
-    tail = torch.exp(-inverse_scale * sdf.abs()) / 2
-    return inverse_scale * torch.where(sdf < 0, 1 - tail, tail)
-
-
-def weights_from_occupancy(occupancy: RaySamples) -> RaySamples:
-    """Probabilities w_i = o_i prod_{j<i} (1 - o_j) that a ray ends at its i-th sample.
-
-    Unlike a density's they do not know how far samples lie apart: of two samples in a half-taken
-    place the ray passes a quarter, however near they are.
-    Source: Oechsle et al. 2021 (UNISURF), Sec. 3; Zhu et al. 2022 (NICE-SLAM), Sec. 3.2.
-    """
-    passed = torch.cat([torch.ones_like(occupancy[:, :1]), 1 - occupancy[:, :-1]], dim=-1)
-    return occupancy * passed.cumprod(dim=-1)
-
-
 def composite(weights: RaySamples, colors: RayColors, depths: RaySamples) -> Rendering:
     """Expected colour, z-depth and depth variance: sum w c, sum w d and sum w (D - d)^2.
 

@@ -111,28 +111,5 @@ def rigid_motion(points: Positions, targets: Positions) -> Pose:
     return T_target_points
 
 
-def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
-    """The one rigid motion (m) from true to estimated poses that explains the errors of a run.
-
-    After it those of most frames are below `LOST_THRESHOLD_M` and a tenth of what they were (our
-    choice); None where no motion does that, or too little is known to tell.
-    """
-    is_known = np.isfinite(T_true).all(axis=(1, 2))
-    if is_known.sum() < 3:
-        return None
-    T_estimated, T_true = T_estimated[is_known], T_true[is_known]
-    # From orientations too, which tell it where the camera moves along a line.
-    turns = Rotation.from_matrix(T_estimated[:, :3, :3] @ T_true[:, :3, :3].mT)
-    T_map_world = np.eye(4)
-    is_usual = (turns.mean().inv() * turns).magnitude()
-    is_usual = is_usual <= np.median(is_usual)  # lost frames say nothing of it
-    T_map_world[:3, :3] = turns[is_usual].mean().as_matrix()
-    moved = T_true[:, :3, 3] @ T_map_world[:3, :3].T
-    T_map_world[:3, 3] = np.median(T_estimated[:, :3, 3] - moved, axis=0)
-    before, after = (pose_errors(T_estimated, T)[0] for T in (T_true, T_map_world @ T_true))
-    explained = np.median(after) < min(LOST_THRESHOLD_M, np.median(before) / 10)
-    return T_map_world if explained and np.median(before) > LOST_THRESHOLD_M else None
-
-
 def _root_mean_square(values: Errors) -> float:
     return float(np.sqrt(np.mean(values**2)))

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from nbtrack.core.errors import DataError, MissingError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.data.text_files import read_poses
 from nbtrack.tracking.budget import StepBudget
-from nbtrack.tracking.metrics import other_world, pose_errors
+from nbtrack.tracking.metrics import pose_errors
 from nbtrack.tracking.tracker import Estimate, Tracker
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
@@ -75,20 +75,6 @@ def track_sequence(
                 last_saved = time.perf_counter()
     T_estimated = np.stack(tracker.estimates[1:])  # after the start, known or not
     return Trajectory(T_estimated, sequence.T_world_camera[first:], pd.DataFrame(rows))
-
-
-def in_world_of_map(tracked: Trajectory) -> tuple[Trajectory, bool]:
-    """The trajectory with true poses in the map's world, and whether they were in another one."""
-    T_map_world = other_world(tracked.T_estimated, tracked.T_true)
-    if T_map_world is None:
-        return tracked, False
-    T_true = T_map_world @ tracked.T_true  # NaN stays
-    is_known = np.isfinite(T_true).all(axis=(1, 2))
-    frames = tracked.frames.copy()
-    columns = ["translation_error_m", "rotation_error_deg"]
-    errors = pose_errors(tracked.T_estimated[is_known], T_true[is_known])
-    frames.loc[is_known, columns] = np.column_stack(errors)
-    return replace(tracked, T_true=T_true, frames=frames), True
 
 
 def _check_trackable(sequence: RgbdSequence) -> None:
