@@ -10,7 +10,14 @@ from box_room import BoxRoom, Formula, box_sequence
 
 from nbtrack.beyond import LmSettings, LmTracker
 from nbtrack.beyond.correct import correct_map
-from nbtrack.beyond.correction import CorrectedField, corrected, interpolation
+from nbtrack.beyond.correction import (
+    CorrectedField,
+    _add_equations,
+    _stiffness,
+    _to_be_corrected,
+    corrected,
+    interpolation,
+)
 from nbtrack.beyond.grid import BakedField
 from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence
@@ -96,6 +103,36 @@ def test_weights_of_interpolation(found: CorrectedField) -> None:
     expected = found(torch.from_numpy(points).float())[1]
     values = (found.volume[3].numpy()[vertices] * weights).sum(axis=1)
     np.testing.assert_allclose(values, expected, atol=1e-5)
+
+
+def test_equations_are_summed_as_sparse_products() -> None:
+    """Catches a product in a wrong entry of the matrix, a neighbour beyond the grid's border that
+    comes back at the other side, and weights that count twice or not at all."""
+    shape, rng, huber = (5, 4, 6), np.random.default_rng(1), 0.1
+    corners = np.array([*np.ndindex(2, 2, 2)])
+    cells = np.vstack([rng.integers(0, [4, 3, 5], size=(40, 3)), [[0, 0, 0], [3, 2, 4]]])
+    vertices = np.ravel_multi_index((cells[:, None] + corners).transpose(2, 0, 1), shape)
+    numbers, columns = _to_be_corrected(vertices, shape)
+    stiffness, slots = _stiffness(numbers, shape)
+    np.testing.assert_allclose(stiffness.toarray(), stiffness.toarray().T)
+    dense, weights = np.zeros((42, len(numbers))), rng.random((42, 8))
+    np.put_along_axis(dense, columns, weights, axis=1)
+    wanted, reliability = rng.normal(size=(42, 2)), rng.random(42)
+    solution = rng.normal(size=(len(numbers), 2))
+    matrix, vectors = stiffness.copy(), np.zeros_like(solution)
+    equations = columns, weights, wanted, reliability
+    _add_equations(*equations, huber, solution, slots, matrix.data, vectors)
+    largest = np.abs(wanted - dense @ solution).max(axis=1)
+    weighted = dense * (reliability * huber / largest.clip(huber))[:, None]
+    np.testing.assert_allclose(matrix.toarray(), dense.T @ weighted + stiffness.toarray())
+    np.testing.assert_allclose(vectors, weighted.T @ wanted)
+
+
+def test_stiffness_by_hand() -> None:
+    """Catches springs across edges and corners of cells: two vertices of a row, one of another."""
+    stiffness, _ = _stiffness(np.array([0, 1, 7]), (2, 2, 2))
+    expected = [[0.7, -0.1, 0.0], [-0.1, 0.7, 0.0], [0.0, 0.0, 0.7]]
+    np.testing.assert_allclose(stiffness.toarray(), expected)
 
 
 def test_a_file_keeps_it_whole(

@@ -6,7 +6,7 @@ eight vertices. What the network says away from surfaces stays.
 """
 
 import copy
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from scipy.sparse.linalg import cg
 from torch import Tensor
 
 from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.observed import compiled
 from nbtrack.core.arrays import Frames, WorldPoints
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import DataError
@@ -45,6 +46,14 @@ CORRECTIONS = ("numbers", "corrections", "cameras", "residual_medians")
 """What a file keeps of a correction, besides the field: see `CorrectedField`."""
 _SOURCE = "source."  # how names of the field as mapped begin
 Columns = Float[np.ndarray, "rows columns"]
+Vertices = Int[np.ndarray, "points 8"]
+Corners = Float[np.ndarray, "points 8"]
+_CORNERS = np.stack(np.meshgrid(*3 * [[0, 1]], indexing="ij"), -1).reshape(8, 3)
+# A vertex is coupled to the 27 around it, itself the middle one; and which of them, seen from one
+# corner of a cell, is another corner.
+_AROUND = np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), -1).reshape(27, 3)
+_ITSELF = 13
+_TO_CORNER = (_CORNERS[None] - _CORNERS[:, None] + 1) @ [9, 3, 1]
 
 
 class CorrectedField(BakedField):
@@ -60,10 +69,15 @@ class CorrectedField(BakedField):
     form = "corrected"
     inlier_distance, min_inliers = 0.025, 0.8
 
-    def __init__(self, source: Field, voxel: float, correction: dict[str, Tensor]) -> None:
-        """Add to what a field gives at vertices; the correction's tensors are `CORRECTIONS`."""
+    def __init__(self, source: Field, voxel: float) -> None:
+        """Sample a field as `BakedField` does; `add` then corrects it."""
         super().__init__(source, voxel)
-        self.name, self.label, self.source = source.name, f"{source.label} corrected", source
+        self.name = source.name
+        self.label = f"{source.label} corrected"
+        self.source = source
+
+    def add(self, correction: dict[str, Tensor]) -> None:
+        """Add to what the field gives at vertices; the correction's tensors are `CORRECTIONS`."""
         for name in CORRECTIONS:
             self.register_buffer(name, correction[name])
         medians = self.residual_medians.double().numpy()
@@ -89,8 +103,9 @@ class CorrectedField(BakedField):
         """The field as mapped, sampled and corrected anew."""
         source = {n.removeprefix(_SOURCE): x for n, x in state.items() if n.startswith(_SOURCE)}
         mapped = field_class(made["field"]).from_state(source, made, bounds)
-        correction = {name: state[name] for name in CORRECTIONS}
-        return cls(mapped, float(made["settings"]["correct_voxel"]), correction)
+        field = cls(mapped, float(made["settings"]["correct_voxel"]))
+        field.add({name: state[name] for name in CORRECTIONS})
+        return field
 
 
 def corrected(
@@ -99,40 +114,55 @@ def corrected(
     """A map with a signed distance, corrected in cells of `voxel` (m) by its mapped frames.
 
     At a measured point p with normal n the interpolated distance at p + s n shall be s, at five
-    offsets s, and the colour at p that of the pixel: equations linear in the corrections of the
-    vertices around, weighted by 1 / depth^2, solved by conjugate gradients together with a little
-    stiffness (see `_unknowns`, `_solve`). Colours are asked for at the surface alone: off it a
-    camera saw none. Raises DataError where no frame shows a plane.
+    offsets s, and the colour at p that of the pixel, but at the surface alone: off it a camera saw
+    none. These equations, weighted by 1 / depth^2, are linear in the corrections of the vertices
+    around; see `_solve`. Raises DataError where no frame shows a plane.
     """
-    source = copy.deepcopy(source).cpu()
-    baked = BakedField(source, voxel)
-    points, normals, depth, color = _measured_planes(sequence, frames)
+    field = CorrectedField(copy.deepcopy(source).cpu(), voxel)
+    points, normals, depth, color = _measured_planes(sequence, frames, field)
     asked = np.concatenate([points + offset * normals for offset in _OFFSETS])
-    numbers, design, stiffness = _unknowns(*interpolation(asked, baked), baked.n_vertices)
-    values = baked.volume[:4].T.double().numpy()[numbers]
+    vertices, weights = interpolation(asked, field)
+    numbers, columns = _to_be_corrected(vertices, field.n_vertices)
+    stiffness, slots = _stiffness(numbers, field.n_vertices)
+    values = field.volume[:4].T.double().numpy()[numbers]
     reliability = (depth.mean() / depth) ** 2
 
-    missing = np.repeat(_OFFSETS, len(points))[:, None] - design @ values[:, 3:]
-    weights = np.tile(reliability, len(_OFFSETS))
-    distance, diagonal = _solve(design, stiffness, missing, weights, _HUBER, _ROUNDS)
+    offsets = np.repeat(_OFFSETS, len(points))[:, None]
+    missing = offsets - _interpolated(columns, weights, values[:, 3:])
+    equations = columns, weights, missing, np.tile(reliability, len(_OFFSETS))
+    distance, diagonal = _solve(equations, stiffness, slots, _HUBER, _ROUNDS)
     # The share of measurements, not stiffness, in a vertex's diagonal.
     confidence = (1 - _UNMEASURED) * (1 - stiffness.diagonal() / diagonal)
 
-    at_surface, missing = design[: len(points)], missing[: len(points), 0]
-    missing_color, soft = color - at_surface @ values[:, :3], _COLOR_STIFFNESS * stiffness
-    colors, _ = _solve(at_surface, soft, missing_color, reliability, _COLOR_HUBER, _COLOR_ROUNDS)
+    columns, weights, missing = (part[: len(points)] for part in equations[:3])
+    missing_color = color - _interpolated(columns, weights, values[:, :3])
+    equations = columns, weights, missing_color, reliability
+    stiffness = _COLOR_STIFFNESS * stiffness
+    colors, _ = _solve(equations, stiffness, slots, _COLOR_HUBER, _COLOR_ROUNDS)
 
-    left = missing - at_surface @ distance[:, 0], (missing_color - at_surface @ colors) @ LUMA
-    spread = np.linspace(0, len(frames) - 1, min(_MAX_CAMERAS, len(frames))).round().astype(int)
+    left = missing - _interpolated(columns, weights, distance)
+    left_luma = (missing_color - _interpolated(columns, weights, colors)) @ LUMA
+    medians = [float(np.median(np.abs(residual))) for residual in (left, left_luma)]
     corrections = torch.from_numpy(np.column_stack([colors, distance, confidence])).float().half()
-    poses = torch.from_numpy(sequence.T_world_camera[frames[spread]]).float()
-    medians = torch.from_numpy(np.median(np.abs(left), axis=1)).float()
-    parts = torch.from_numpy(numbers).int(), corrections, poses, medians
-    return CorrectedField(source, voxel, dict(zip(CORRECTIONS, parts, strict=True)))
+    poses = torch.from_numpy(sequence.T_world_camera[_spread(frames)]).float()
+    parts = torch.from_numpy(numbers).int(), corrections, poses, torch.tensor(medians)
+    field.add(dict(zip(CORRECTIONS, parts, strict=True)))
+    return field
 
 
-def _measured_planes(sequence: RgbdSequence, frames: Frames) -> tuple[np.ndarray, ...]:
-    """Random measured points (n x 3, m) with normals, their z-depths (n, m) and colours (n x 3)."""
+def _spread(frames: Frames) -> Frames:
+    """Some of the frames, evenly spread."""
+    n_kept = min(_MAX_CAMERAS, len(frames))
+    return frames[np.linspace(0, len(frames) - 1, n_kept).round().astype(int)]
+
+
+def _measured_planes(
+    sequence: RgbdSequence, frames: Frames, grid: BakedField
+) -> tuple[np.ndarray, ...]:
+    """Random measured points (n x 3, m) with normals, their z-depths (n, m) and colours (n x 3).
+
+    Neighbours come one after another: their vertices are then still in the processor's cache.
+    """
     sampler = PixelSampler(sequence, torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
     rays = sampler.draw(_N_POINTS, generator, torch.from_numpy(frames), tangent_planes=True)
@@ -141,65 +171,108 @@ def _measured_planes(sequence: RgbdSequence, frames: Frames) -> tuple[np.ndarray
         raise DataError(f"{sequence.name} shows no surface to correct a map by: check its depth")
     points = rays.points(rays.depth[:, None])[:, 0]
     parts = points, rays.normals_world, rays.depth, rays.color
-    return tuple(part[has_plane].double().numpy() for part in parts)
+    parts = [part[has_plane].double().numpy() for part in parts]
+    order = np.argsort(interpolation(parts[0], grid)[0][:, 0], kind="stable")
+    return tuple(part[order] for part in parts)
 
 
-def interpolation(
-    points_world: WorldPoints, grid: BakedField
-) -> tuple[Int[np.ndarray, "_ 8"], Float[np.ndarray, "_ 8"]]:
+def interpolation(points_world: WorldPoints, grid: BakedField) -> tuple[Vertices, Corners]:
     """Numbers of the eight vertices around points (m), and their weights in the interpolation."""
     shape = np.array(grid.n_vertices)
     scaled = (points_world - grid.low.double().numpy()) / grid.voxel
     cells = np.clip(np.floor(scaled).astype(np.int64), 0, shape - 2)
-    corners = np.stack(np.meshgrid(*3 * [[0, 1]], indexing="ij"), -1).reshape(8, 3)
-    fraction = (scaled - cells)[:, None]
-    weights = np.where(corners, fraction, 1 - fraction).prod(axis=-1)
-    around = (cells[:, None] + corners).reshape(-1, 3)
-    return np.ravel_multi_index(tuple(around.T), tuple(shape)).reshape(-1, 8), weights
+    x, y, z = np.moveaxis(np.stack([1 - (scaled - cells), scaled - cells], axis=-1), 1, 0)
+    weights = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
+    strides = np.array([shape[1] * shape[2], shape[2], 1])
+    return (cells @ strides)[:, None] + _CORNERS @ strides, weights.reshape(-1, 8)
 
 
-def _unknowns(
-    vertices, weights, shape
-) -> tuple[Int[np.ndarray, "_"], sparse.csr_array, sparse.csr_array]:
-    """The vertices to correct, the interpolation as a matrix over them, and their stiffness.
+def _interpolated(columns: Vertices, weights: Corners, values: Columns) -> Columns:
+    """Weighted means of the values of eight vertices."""
+    return np.einsum("ij,ijc->ic", weights, values[columns])
 
-    The stiffness is that of springs between neighbours and to zero; neighbours that are not
-    corrected stand at zero, so that corrections fade out.
-    """
+
+def _to_be_corrected(
+    vertices: Vertices, shape: tuple[int, int, int]
+) -> tuple[Int[np.ndarray, "_"], Vertices]:
+    """The vertices to correct, which are those near points, and their numbers among these."""
     is_touched = np.zeros(shape, dtype=bool)
     is_touched.flat[vertices] = True
-    is_free = binary_dilation(is_touched, iterations=_FADE)
-    numbers, column = np.flatnonzero(is_free), np.full(shape, -1)
-    column.flat[numbers] = np.arange(len(numbers))
-    rows = np.arange(0, vertices.size + 1, 8)
-    size = (len(vertices), len(numbers))
-    design = sparse.csr_array((weights.ravel(), column.flat[vertices].ravel(), rows), shape=size)
-    stiffness = _PULL * sparse.eye_array(len(numbers), format="csr")
-    for axis in range(3):
-        along = np.moveaxis(column, axis, 0)
-        pairs = np.stack([along[:-1].ravel(), along[1:].ravel()])
-        pairs = pairs[:, (pairs >= 0).all(axis=0)]
-        spring = sparse.coo_array((np.ones(pairs.shape[1]), pairs), shape=2 * size[1:])
-        stiffness = stiffness - _SMOOTHNESS * (spring + spring.T)
-    return numbers, design, stiffness + 6 * _SMOOTHNESS * sparse.eye_array(len(numbers))
+    numbers = np.flatnonzero(binary_dilation(is_touched, iterations=_FADE))
+    column = np.empty(is_touched.size, dtype=np.int32)
+    column[numbers] = np.arange(len(numbers), dtype=np.int32)
+    return numbers, column[vertices]
+
+
+def _stiffness(
+    numbers: Int[np.ndarray, "n"], shape: tuple[int, int, int]
+) -> tuple[sparse.csr_array, Int[np.ndarray, "n 27"]]:
+    """The stiffness of corrections as a matrix, with an entry for each two vertices of a cell; and
+    where these entries stand among its data, by vertex and neighbour (`_AROUND`).
+
+    It is that of springs between neighbours and to zero; neighbours that are not corrected stand at
+    zero, so that corrections fade out.
+    """
+    column = np.full([n + 2 for n in shape], -1)  # with a border that is never corrected
+    column[1:-1, 1:-1, 1:-1].flat[numbers] = np.arange(len(numbers))
+    places = np.stack(np.unravel_index(numbers, shape), axis=-1)[:, None] + 1 + _AROUND
+    neighbours = column[tuple(np.moveaxis(places, -1, 0))]
+    is_corrected = neighbours >= 0
+    slots = np.where(is_corrected, is_corrected.cumsum().reshape(is_corrected.shape) - 1, -1)
+    distances = np.abs(_AROUND).sum(axis=1)
+    springs = np.where(distances == 1, -_SMOOTHNESS, 0.0)
+    springs[_ITSELF] = _PULL + 6 * _SMOOTHNESS
+    data = np.broadcast_to(springs, slots.shape)[is_corrected]
+    rows = np.concatenate([[0], is_corrected.sum(axis=1).cumsum()])
+    size = len(numbers), len(numbers)
+    return sparse.csr_array((data, neighbours[is_corrected], rows), shape=size), slots
 
 
 def _solve(
-    design, stiffness, wanted: Columns, reliability: np.ndarray, huber: float, rounds: int
+    equations: tuple[Vertices, Corners, Columns, np.ndarray],
+    stiffness: sparse.csr_array,
+    slots: Int[np.ndarray, "n 27"],
+    huber: float,
+    rounds: int,
 ) -> tuple[Columns, np.ndarray]:
-    """Minimise |W^(1/2) (design x - wanted)|^2 + x' stiffness x; and the system's diagonal.
+    """Minimise |W^(1/2) (A x - wanted)|^2 + x' stiffness x; and the diagonal of its matrix.
 
-    Of sparse matrices, and columns of `wanted` with an equation, and its reliability, a row. W
+    An equation is a row of A, eight columns and their weights, what is wanted, and a reliability. W
     holds the reliability, times huber / |residual| where the largest residual of an equation's
     columns is above that; it is judged anew in every round.
     """
-    solution = np.zeros((design.shape[1], wanted.shape[1]))
+    solution = np.zeros((len(slots), equations[2].shape[1]))
     for _ in range(rounds):
-        residual = np.abs(wanted - design @ solution).max(axis=1)
-        weighted = (design * (reliability * huber / residual.clip(huber))[:, None]).tocsr()
-        matrix, vectors = design.T @ weighted + stiffness, weighted.T @ wanted
+        matrix, vectors = stiffness.copy(), np.zeros_like(solution)
+        _add_equations(*equations, huber, solution, slots, matrix.data, vectors)
         scaling = sparse.dia_array((1 / matrix.diagonal()[None], 0), shape=matrix.shape)
         for column, vector in enumerate(vectors.T):
             start = solution[:, column].copy()
             solution[:, column], _ = cg(matrix, vector, start, rtol=1e-3, M=scaling)
     return solution, matrix.diagonal()
+
+
+@no_type_check
+@compiled
+def _add_equations(
+    columns, weights, wanted, reliability, huber, solution, slots, matrix_data, vectors
+):
+    """Add A' W A to the entries of a matrix, and A' W wanted to some vectors; see `_solve`.
+
+    The pattern of the matrix never changes: an equation adds 8 x 8 products to it, in place.
+    """
+    for equation in range(len(columns)):
+        largest = huber
+        for channel in range(wanted.shape[1]):
+            residual = wanted[equation, channel]
+            for corner in range(8):
+                residual -= weights[equation, corner] * solution[columns[equation, corner], channel]
+            largest = max(largest, abs(residual))
+        weight = reliability[equation] * huber / largest
+        for corner in range(8):
+            row, weighted = columns[equation, corner], weight * weights[equation, corner]
+            for other in range(8):
+                slot = slots[row, _TO_CORNER[corner, other]]
+                matrix_data[slot] += weighted * weights[equation, other]
+            for channel in range(wanted.shape[1]):
+                vectors[row, channel] += weighted * wanted[equation, channel]
