@@ -97,7 +97,7 @@ def test_facts(box: Path) -> None:
     field of view is 2 atan(32/48) = 67.4 degrees."""
     report = check(box)
     assert report.warnings == []
-    assert report.best.declared.camera_axes == "opengl"
+    assert report.best.reading.declared.camera_axes == "opengl"
     assert report.best.median_m < 0.02
     assert report.best.overlap > 0.5
     lines = str(report).replace(str(box), "box").splitlines()  # wherever the test runs
@@ -183,7 +183,6 @@ def test_a_long_recording_is_read_in_parts(tmp_path: Path, monkeypatch) -> None:
         (folder / "depth_filtered/depth31.png").read_bytes()
     )
     whole, sizes, read = check(folder), [], check_module.read_frames
-    monkeypatch.setattr(check_module, "_MAX_KEPT", 3, raising=False)
 
     def counted(recording, frames, *more):
         sizes.append(len(frames))
