@@ -140,7 +140,7 @@ def test_misread_is_named(tmp_path: Path, name: str, keys: dict[str, str], scale
         (
             JUMPING,
             1.0,
-            "1 of 15 steps are longer than 0.3 m, first to img8.png: check .* --frames of map",
+            "1 of 16 poses lie up to 25 cm beside .*, first img[78].png: check .* --frames of map",
         ),
         (walk(6, 0.03, 120.0), 1.0, "poses.txt is not proved: two frames see too little of the sa"),
     ],

@@ -15,20 +15,8 @@ from nbtrack.core.errors import DataError
 from nbtrack.core.progress import ProgressBar
 from nbtrack.data.recording import Recording
 from nbtrack.data.sequence import FAR, RgbdSequence, far_limit, joined, read_frames, select_frames
-from nbtrack.recordings.conventions import (
-    PLAUSIBLE_DEPTH,
-    Convention,
-    best_convention,
-    diagnosis,
-    fit_all,
-)
-from nbtrack.recordings.misfits import (
-    MAX_SHIFT,
-    MIN_CORRELATION,
-    Misfit,
-    find_misfits,
-    told_misfit,
-)
+from nbtrack.recordings.conventions import PLAUSIBLE_DEPTH, Convention, diagnosis, fit_all
+from nbtrack.recordings.misfits import MAX_SHIFT, MIN_CORRELATION, Misfit, find_misfits, told_misfit
 from nbtrack.recordings.readings import FramePairs, Reading, on_grid
 
 _FRAMES_AT_ONCE = 32  # 50 MB at 640x480
@@ -40,16 +28,13 @@ _GAPS = (5, 10, 20, 40)  # frames between the two: they moved, and still see the
 _TURNED_DEG = 60  # which they do where the camera has not turned by more in between
 _CELL = 0.1  # m: edge of the cells of surface that coverage counts
 _CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
-_JUMP = 0.3  # m between consecutive frames, and five times what is usual; a hand moves 0.02
 _FLICKER = 0.35  # share by which brightness may change between frames (our choice)
 _SAME_VIEW_DEG = 10  # where they are turned by no more
-_OFF, _OFF_STEPS = 0.05, 5  # m, and usual steps: a pose so far from the middle of its neighbours
+# A pose so far (m) from the middle of its neighbours, and so many usual steps; a hand moves 0.02.
+_OFF, _OFF_STEPS = 0.05, 5
 _MIN_REPEATED = 0.05  # share of frames whose depth is that of the frame before, though they moved
 _MAX_STEP = 0.01  # share of the depth between depths that a camera can tell (our choice)
 _BLACK = 0.02  # brightness, in [0, 1]
-_MIN_MEASURED = 0.3  # share of pixels with a depth, below which maps have holes (our choice)
-# What the second-order tracker still followed, of a real recording thinned to every third frame.
-_FOLLOWED_MM, _FOLLOWED_DEG = 70, 3.6
 _PRINTED = ["measured", "brightness", "moved_mm", "turned_deg", "flicker"]
 _XYZ, _RGB = ["x", "y", "z"], ["red", "green", "blue"]
 
@@ -88,7 +73,9 @@ class DataReport:
         return [text for text in [*found, *_color_warnings(self)] if text]
 
     def __str__(self) -> str:
-        cloud, recording, (own, *others) = self.cloud, self.recording, self.conventions
+        cloud = self.cloud
+        recording = self.recording
+        own, *others = self.conventions
         rivals = sorted((r for r in others if r.overlap > 0), key=lambda r: r.relative)[:3]
         c = own.reading.camera
         wide = 2 * np.degrees(np.arctan(c.width / 2 / c.fx))
@@ -114,44 +101,27 @@ class DataReport:
             *["  misfits, as pairs of frames tell them (95 %)"][: len(self.misfits)],
             *(f"    {misfit}" for misfit in self.misfits),
             *(f"  warning: {text}" for text in self.warnings),
-            f"  start with: track {recording.folder}{_fast(self.frames)}",
+            f"  start with: track {recording.folder}",
         ]
         return "\n".join(lines)
 
 
-def _fast(frames: pd.DataFrame) -> str:
-    """What to do where the camera moves faster than the tracker has followed; else nothing."""
-    mm, deg = frames[["moved_mm", "turned_deg"]].quantile(0.95).fillna(0)  # not jumps
-    if mm <= _FOLLOWED_MM and deg <= _FOLLOWED_DEG:
-        return ""
-    apart = f"frames are up to {mm / 10:.0f} cm and {deg:.1f} deg apart"
-    return f"; {apart}: if it gets lost, record slower or at a higher rate"
-
-
 def _pose_warnings(report: DataReport) -> Iterator[str]:
-    frames, files = report.frames, report.recording.color_files
-    moved, off = frames.moved_mm / 1e3, frames.off_mm / 1e3
-    jumps = moved[moved > max(_JUMP, 5 * moved.median())]
-    odd = off[off > max(_OFF, _OFF_STEPS * moved.median())]
+    off = report.frames.off_mm / 1e3
+    odd = off[off > max(_OFF, _OFF_STEPS * report.frames.moved_mm.median() / 1e3)]
     odd = odd[odd == odd.rolling(3, 1, center=True).max()]  # its neighbours are off by half
-    advice = "check the poses there, or leave frames out with --frames of map and track"
-    if len(jumps):
-        first = files[jumps.index[0]].name
+    if len(odd):
         yield (
-            f"{len(jumps)} of {moved.count()} steps are longer than {_JUMP} m, first to {first}: "
-            f"{advice}"
-        )
-    elif len(odd):
-        first = files[odd.index[0]].name
-        yield (
-            f"{len(odd)} of {len(frames)} poses lie up to {100 * odd.max():.0f} cm beside the path "
-            f"of their neighbours, first {first}: {advice}"
+            f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path of "
+            f"their neighbours, first {report.recording.color_files[odd.index[0]].name}: check the "
+            "poses there, or leave frames out with --frames of map and track"
         )
 
 
 def _image_warnings(report: DataReport) -> Iterator[str]:
     """On depth images that tell too little, whatever their numbers mean."""
-    frames, depth = report.frames, report.cloud.depth
+    frames = report.frames
+    depth = report.cloud.depth
     step = np.gcd.reduce(frames.depth_step) / report.recording.declared.depth_scale
     repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
     if _MAX_STEP * depth.median() < step < depth.max() / 8:
@@ -167,8 +137,9 @@ def _image_warnings(report: DataReport) -> Iterator[str]:
 
 
 def _depth_warnings(report: DataReport) -> Iterator[str]:
-    (near, far), depth = PLAUSIBLE_DEPTH, report.cloud.depth.median()
-    measured, outliers = report.frames.measured.mean(), report.outliers.depth
+    near, far = PLAUSIBLE_DEPTH
+    depth = report.cloud.depth.median()
+    outliers = report.outliers.depth
     if len(outliers):
         share = len(outliers) / (len(outliers) + len(report.cloud))
         yield (
@@ -180,11 +151,6 @@ def _depth_warnings(report: DataReport) -> Iterator[str]:
         yield (
             f"the median depth is {depth:.3g} m, outside {near:g} to {far:g} m: set depth_scale, "
             "the depth values a metre, in sequence.toml"
-        )
-    if measured < _MIN_MEASURED:
-        yield (
-            f"only {measured:.0%} of the pixels have a depth: stay within the camera's range, or "
-            "record less glass and black; maps will have holes"
         )
 
 
@@ -235,11 +201,12 @@ def check_recording(
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     compared = FramePairs(recording, ids, sequence, pairs)
-    conventions = fit_all(compared, recording.declared, sequence.intrinsics)
-    best, own = best_convention(conventions), conventions[0].reading
+    conventions, best = fit_all(compared, recording.declared, sequence.intrinsics)
+    own = conventions[0].reading
     cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))
     is_far = cloud.depth > far_limit(cloud.depth)
-    found, correlation = [], math.nan
+    found = []
+    correlation = math.nan
     if best is conventions[0] and fitted.size:
         compared = FramePairs(recording, ids, sequence, fitted)
         found, correlation = find_misfits(compared, sequence, own)
@@ -278,7 +245,8 @@ def _read(
     recording: Recording, looked_at: Frames, kept: Frames, progress: bool
 ) -> tuple[RgbdSequence, pd.DataFrame]:
     """The frames to keep of those looked at, and what is told of each, read in parts."""
-    parts, rows = [], []
+    parts = []
+    rows = []
     with ProgressBar("reading frames", len(looked_at), progress) as bar:
         for first in range(0, len(looked_at), _FRAMES_AT_ONCE):
             part = read_frames(recording, looked_at[first : first + _FRAMES_AT_ONCE])

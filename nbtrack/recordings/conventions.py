@@ -75,16 +75,20 @@ class Convention:
     overlap: float  # share of all points that fall onto a measured, not nearer, surface
 
 
-def fit_all(pairs: FramePairs, declared: Declaration, camera: Intrinsics) -> list[Convention]:
-    """All conventions, the declared one first, with how well pairs of frames agree under each."""
+def fit_all(
+    pairs: FramePairs, declared: Declaration, camera: Intrinsics
+) -> tuple[list[Convention], Convention]:
+    """All conventions, the declared one first, with how well pairs of frames agree under each; and
+    the best: the declared one, unless another is clearly better."""
     conventions = []
     for subject, name, reading in _candidates(declared, camera):
         apart, measured, counts, _ = pairs.differences(reading)
-        apart, measured = apart.abs()[counts], measured[counts]
+        apart = apart.abs()[counts]
+        measured = measured[counts]
         numbers = apart.median(), (apart / measured).median(), measured.median()
         overlap = counts.sum() / (pairs.values > 0).sum().clamp(1)
         conventions.append(Convention(subject, name, reading, *map(float, (*numbers, overlap))))
-    return conventions
+    return conventions, _best_of(conventions)
 
 
 def _candidates(declared: Declaration, camera: Intrinsics) -> list[tuple[str, str, Reading]]:
@@ -109,7 +113,7 @@ def _candidates(declared: Declaration, camera: Intrinsics) -> list[tuple[str, st
     return [("poses", name, own), *(row for row in table if row[2] != own)]
 
 
-def best_convention(results: list[Convention]) -> Convention:
+def _best_of(results: list[Convention]) -> Convention:
     """The declared convention (the first), unless another fits clearly better.
 
     Another fits clearly better if its surfaces are at most half as far apart and overlap at least
@@ -141,7 +145,8 @@ def diagnosis(
 
     Where proof is needed, a camera that moves too little to tell conventions apart is wrong too.
     """
-    own, file = results[0], recording.pose_file.name
+    own = results[0]
+    file = recording.pose_file.name
     apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
     if best is not own:
         look = "look" if best.subject == "poses" else "looks"

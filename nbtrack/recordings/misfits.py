@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from nbtrack.data.sequence import RgbdSequence
@@ -159,17 +158,16 @@ class _Costs:
         seen = grid_sample(second[:, None], at, "bilinear", align_corners=True)[:, 0, 0]
         own = first[:, self.pairs.rows, columns.round().long().clamp(0, last)]
         mask = self.agree & (at.abs() <= 1).all(dim=-1)[:, 0]
-        return 1 - _correlations(own, seen, mask)
+        few = _MIN_OVERLAP * mask.shape[1]
+        rows = zip(own.numpy(), seen.numpy(), mask.numpy(), strict=True)
+        return np.array([1 - _correlation(a[m], b[m], few) for a, b, m in rows])
 
 
-def _correlations(a: Tensor, b: Tensor, mask: Tensor) -> Float[np.ndarray, "pairs"]:
-    """A correlation a row of the values where the mask is; NaN of few, or without contrast."""
-    n = mask.sum(dim=1, keepdim=True)
-    a, b = (torch.where(mask, x - torch.where(mask, x, 0.0).sum(1, True) / n, 0.0) for x in (a, b))
-    variances = torch.stack([(x**2).sum(dim=1) for x in (a, b)]) / n[:, 0]
-    enough = (n[:, 0] >= _MIN_OVERLAP * mask.shape[1]) & (variances > _MIN_CONTRAST**2).all(dim=0)
-    correlation = (a * b).sum(dim=1) / n[:, 0] / variances.prod(dim=0).sqrt()
-    return torch.where(enough, correlation, torch.nan).numpy()
+def _correlation(a: Float[np.ndarray, "n"], b: Float[np.ndarray, "n"], few: float) -> float:
+    """NaN of few values, and without contrast."""
+    if len(a) < few or min(a.std(), b.std()) < _MIN_CONTRAST:
+        return math.nan
+    return np.corrcoef(a, b)[0, 1]
 
 
 def _estimates(
