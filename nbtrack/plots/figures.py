@@ -47,7 +47,8 @@ def plot_views(
     """
     depths = np.ma.stack([np.ma.masked_equal(sequence.depth(index), 0) for index in indices])
     errors = 100 * np.abs(np.stack([depth for _, depth in views]) - depths)
-    far, worst = _upper_limit(depths), _upper_limit(errors)
+    far = _upper_limit(depths)
+    worst = _upper_limit(errors)
     aspect = sequence.intrinsics.height / sequence.intrinsics.width
     height = 0.9 + len(views) * (0.2 + 0.2 * style.WIDTH * aspect)
     grid = style.new_axes(title, height, len(views), 5)
@@ -199,9 +200,11 @@ def plot_ate(results: pd.DataFrame, title: str = "") -> Figure:
     which the table prints red; a missing point is a run without result. Thin lines span a
     std over seeds either way; the dotted line is a camera that stands still.
     """
-    means, stds = table_1(results), table_1(results, "ate_std_m")
+    means = table_1(results)
+    stds = table_1(results, "ate_std_m")
     rates, methods = (means.index.unique(level) for level in means.index.names)
-    columns, rows = min(5, len(means.columns)), -(-len(means.columns) // 5)
+    columns = min(5, len(means.columns))
+    rows = -(-len(means.columns) // 5)
     panels = style.new_axes(title, 0.9 + 2.1 * rows, rows, columns, sharey=True).flat
     for axes, scene in zip(panels, means, strict=False):
         for label, look, offset in _looks(methods.drop(STANDING_STILL, errors="ignore")):

@@ -30,8 +30,9 @@ _CELL = 0.1  # m: edge of the cells of surface that coverage counts
 _CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
 _FLICKER = 0.35  # share by which brightness may change between frames (our choice)
 _SAME_VIEW_DEG = 10  # where they are turned by no more
-# A pose so far (m) from the middle of its neighbours, and so many usual steps; a hand moves 0.02.
-_OFF, _OFF_STEPS = 0.05, 5
+# A pose so far (m) from the middle of its neighbours, and so many usual steps: real recordings, and
+# rooms thinned to every twentieth frame, have 1.1. Half as far is a pose before or after a jump.
+_OFF, _OFF_STEPS = 0.05, 2.5
 _MIN_REPEATED = 0.05  # share of frames whose depth is that of the frame before, though they moved
 _MAX_STEP = 0.01  # share of the depth between depths that a camera can tell (our choice)
 _BLACK = 0.02  # brightness, in [0, 1]
@@ -119,7 +120,7 @@ def _pose_warnings(report: DataReport) -> Iterator[str]:
 
 
 def _image_warnings(report: DataReport) -> Iterator[str]:
-    """On depth images that tell too little, whatever their numbers mean."""
+    """What is wrong with the depth images, whatever their numbers mean."""
     frames = report.frames
     depth = report.cloud.depth
     step = np.gcd.reduce(frames.depth_step) / report.recording.declared.depth_scale
@@ -259,8 +260,8 @@ def _read(
 
 
 def _facts(depth: np.ndarray, color: np.ndarray) -> dict[str, float]:
-    """Of a frame: the share measured, brightness in [0, 1], what divides all depths, and which
-    depth image it is."""
+    """The share of a frame that is measured, its brightness in [0, 1], the number that divides all
+    its depths, and a checksum of these."""
     return {
         "measured": (depth > 0).mean(),
         "brightness": color.mean() / 255,

@@ -63,14 +63,15 @@ class Reading:
         """Camera-to-world poses with OpenCV axes, of a file read with this order of quaternions."""
         T = file_poses.copy()
         if self.declared.quaternion != order:
-            # Numbers a b c d read as xyzw that are wxyz: x y z w is b c d a.
-            q = np.roll(Rotation.from_matrix(T[:, :3, :3]).as_quat(), 1 - 2 * (order == "xyzw"), 1)
-            T[:, :3, :3] = Rotation.from_quat(q).as_matrix()
+            rotations = Rotation.from_matrix(T[:, :3, :3])
+            numbers = rotations.as_quat(scalar_first=order == "wxyz")
+            rotations = Rotation.from_quat(numbers, scalar_first=order == "xyzw")
+            T[:, :3, :3] = rotations.as_matrix()
         T[:, :3, 3] *= self.metres
         T = self.declared.poses_to_opencv(T)
         drift = [self.drift_x, self.drift_y, self.drift_z]
         T[:, :3, 3] -= np.outer(np.linspace(0, 1, len(T)), drift)
-        # Towards the averages over neighbours.
+        # Scattered positions move towards the averages over their neighbours.
         off = T[:, :3, 3] - uniform_filter1d(T[:, :3, 3], _SMOOTHED, axis=0, mode="nearest")
         T[:, :3, 3] -= self.scatter * off / max(1e-9, np.sqrt((off**2).sum(axis=1).mean()))
         return T
@@ -95,7 +96,8 @@ class FramePairs:
     ) -> None:
         """Pairs are positions in the numbers of a recording's frames that have a pose; a sequence
         of some of these, with depth values as in the files, holds those of the pairs."""
-        self.pairs, self.file_poses = pairs, recording.file_poses[ids]
+        self.pairs = pairs
+        self.file_poses = recording.file_poses[ids]
         self.order = recording.declared.quaternion
         self.places = np.searchsorted(sequence.frame_ids, ids[pairs])
         first, second = sequence.depths_mm[self.places]
