@@ -455,7 +455,6 @@ def test_images_that_change(tmp_path: Path) -> None:
     report = check(write(tmp_path / "r", "office", case))
     assert report.frames.measured.tolist() == [1.0] * 3 + [0.5] + [1.0] * 14
     assert report.frames.flicker.max() > 0.8
-    assert re.search(r"m, \d+% of the surface seen by 3 of 18 frames", str(report))
     (advice,) = (text for text in report.warnings if "brightness changes by" in text)
     settings = re.findall(r"tracking\.\w+\.\w+=0", advice)
     changed = with_settings(load_preset("smoke"), *settings).tracking

@@ -26,7 +26,6 @@ _POINTS_PER_FRAME = 3000
 _N_PAIRS, _QUICK_PAIRS, _FIT_PAIRS = 20, 6, 60
 _GAPS = (5, 10, 20, 40)  # frames between the two: they moved, and still see the same,
 _TURNED_DEG = 60  # which they do where the camera has not turned by more in between
-_CELL = 0.1  # m: edge of the cells of surface that coverage counts
 _CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
 _FLICKER = 0.35  # share by which brightness may change between frames (our choice)
 _SAME_VIEW_DEG = 10  # where they are turned by no more
@@ -47,7 +46,7 @@ class DataReport:
     recording: Recording
     frames: pd.DataFrame  # what `_facts` and `_changes` tell of each
     T_world_camera: Poses  # of the frames that have one, as declared
-    cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m), frame
+    cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m)
     outliers: pd.DataFrame  # the same of depths beyond `far_limit`
     conventions: list[Convention]  # the declared one first
     best: Convention  # the declared one unless another is clearly better
@@ -82,9 +81,6 @@ class DataReport:
         wide = 2 * np.degrees(np.arctan(c.width / 2 / c.fx))
         near, far = cloud.depth.quantile([0.01, 0.99])
         x, y, z = np.ptp(cloud[_XYZ].quantile(_CUT), axis=0)
-        cells = (cloud[_XYZ] // _CELL).assign(frame=cloud.frame).drop_duplicates()
-        n_seen = cells.frame.nunique()
-        covered = (cells.groupby(_XYZ).size() >= min(3, n_seen)).mean()
         lines = [
             f"{recording.name}: {recording.format.label}, {len(self.frames)} of {len(recording)} "
             f"frames have a pose, {c.width} x {c.height} px",
@@ -92,14 +88,13 @@ class DataReport:
             f"principal point ({c.cx:g}, {c.cy:g})",
             *(f"  note: {text}" for text in recording.notes),
             f"  depth: {near:.2f} to {far:.2f} m (1% and 99%)",
-            f"  scene: {x:.2f} x {y:.2f} x {z:.2f} m, {covered:.0%} of the surface seen by 3 of "
-            f"{n_seen} frames looked at",
+            f"  scene: {x:.2f} x {y:.2f} x {z:.2f} m",
             self.frames[_PRINTED]
             .agg(["mean", "min", "max"])
             .T.to_string(float_format="{:10.2f}".format),
             "  overlap of two frames' surfaces (median distance, share of points), read as",
             *(f"{1e3 * r.median_m:12.1f} mm {r.overlap:5.0%}  {r.name}" for r in (own, *rivals)),
-            *["  misfits, as pairs of frames tell them (95 %)"][: len(self.misfits)],
+            f"  misfits, as pairs of frames tell them (95 %): {len(self.misfits)} looked for",
             *(f"    {misfit}" for misfit in self.misfits),
             *(f"  warning: {text}" for text in self.warnings),
             f"  start with: track {recording.folder}",
@@ -211,8 +206,9 @@ def check_recording(
     if best is conventions[0] and fitted.size:
         compared = FramePairs(recording, ids, sequence, fitted)
         found, correlation = find_misfits(compared, sequence, own)
-    seen = recording, frames, poses, cloud[~is_far], cloud[is_far]
-    return DataReport(*seen, conventions, best, found, correlation, is_whole)
+    of_points = cloud[~is_far], cloud[is_far]
+    agreement = conventions, best, found, correlation
+    return DataReport(recording, frames, poses, *of_points, *agreement, is_whole)
 
 
 def quick_warning(recording: Recording) -> str:
@@ -292,6 +288,5 @@ def _cloud(own: Reading, sequence: RgbdSequence) -> pd.DataFrame:
     world = points @ T[:, :3, :3].mT + T[:, None, :3, 3]
     colors = sequence.colors[:, ::stride, ::stride].reshape(*points.shape)
     cloud = np.concatenate([world, colors, points[..., 2:]], axis=-1).reshape(-1, 7)
-    frames = np.arange(len(sequence)).repeat(points.shape[1])
-    cloud = pd.DataFrame(cloud, columns=[*_XYZ, *_RGB, "depth"]).assign(frame=frames)
+    cloud = pd.DataFrame(cloud, columns=[*_XYZ, *_RGB, "depth"])
     return cloud[cloud.depth > 0]
