@@ -269,7 +269,9 @@ def _facts(depth: np.ndarray, color: np.ndarray) -> dict[str, float]:
 def _changes(frames: pd.DataFrame, T_world_camera: Poses) -> pd.DataFrame:
     """A row a frame that follows another: by what it differs from that one, and how far it is off
     the middle of its neighbours."""
+    is_next = np.diff(frames.index) == 1
     moves = 1e3 * np.diff(T_world_camera[:, :3, 3], axis=0)
+    moves[~is_next] = np.nan
     levels = np.log(frames.brightness + 1e-3)  # 0 has none
     changes = {
         "moved_mm": np.linalg.norm(moves, axis=1),
@@ -277,7 +279,7 @@ def _changes(frames: pd.DataFrame, T_world_camera: Poses) -> pd.DataFrame:
         "flicker": np.expm1(np.abs(np.diff(levels))),  # share of the darker one
         "off_mm": np.linalg.norm(np.diff(moves, axis=0, append=np.nan), axis=1) / 2,
     }
-    return pd.DataFrame(changes, frames.index[1:])[np.diff(frames.index) == 1]
+    return pd.DataFrame(changes, frames.index[1:])[is_next]
 
 
 def _cloud(own: Reading, sequence: RgbdSequence) -> pd.DataFrame:
