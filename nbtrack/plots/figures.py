@@ -28,9 +28,9 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     some = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
     height = style.WIDTH * sequence.intrinsics.height / sequence.intrinsics.width  # inches
     left, right = style.new_axes(title, 0.4 + 0.5 * height, 1, 2)[0]
-    _show(left, sequence.color(index), f"frame {sequence.frame_ids[index]}: colour")
+    show_image(left, sequence.color(index), f"frame {sequence.frame_ids[index]}: colour")
     depth = np.ma.masked_equal(sequence.depth(index), 0)
-    image = _show(right, depth, "depth", MILLIMETRE * _upper_limit(some))
+    image = show_image(right, depth, "depth", MILLIMETRE * _upper_limit(some))
     right.figure.colorbar(image, ax=right, label="depth (m)", extend="max", aspect=25, pad=0.02)
     return right.figure
 
@@ -54,18 +54,18 @@ def plot_views(
     grid = style.new_axes(title, height, len(views), 5)
     parts = zip(grid, indices, views, depths, errors, strict=True)
     for row, index, (color, rendered), depth, error in parts:
-        _show(row[0], sequence.color(index), f"frame {sequence.frame_ids[index]}")
-        _show(row[1], color, "rendered colour")
-        _show(row[2], depth, "depth", far)
-        depth_image = _show(row[3], rendered, "rendered depth", far)
-        error_image = _show(row[4], error, "|error|", worst, "magma")
+        show_image(row[0], sequence.color(index), f"frame {sequence.frame_ids[index]}")
+        show_image(row[1], color, "rendered colour")
+        show_image(row[2], depth, "depth", far)
+        depth_image = show_image(row[3], rendered, "rendered depth", far)
+        error_image = show_image(row[4], error, "|error|", worst, "magma")
     bars = {"location": "bottom", "pad": 0.02, "aspect": 30, "extend": "max"}
     depth_image.figure.colorbar(depth_image, ax=grid[:, 2:4], label="depth (m)", **bars)
     error_image.figure.colorbar(error_image, ax=grid[:, 4:], label="depth error (cm)", **bars)
     return error_image.figure
 
 
-def _show(
+def show_image(
     axes: Axes, image: np.ndarray, title: str, maximum: float | None = None, colors: str = "viridis"
 ) -> AxesImage:
     """An image without ticks, grid and frame; unknown pixels are grey."""

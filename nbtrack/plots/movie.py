@@ -13,6 +13,7 @@ from PIL import Image
 from nbtrack.core.arrays import Pose, Poses
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.plots.figures import show_image
 from nbtrack.plots.meshes import Mesh
 from nbtrack.plots.rooms import draw_cloud
 from nbtrack.plots.style import new_axes, styled
@@ -49,12 +50,10 @@ def movie_pictures(
     left.figure.set_dpi(_DPI)
     for index, row in enumerate(run.itertuples()):
         view = view_of(surface, sequence.intrinsics, T_estimated[index])
-        shown = {"observed": sequence.color(index), "the map from the estimated pose": view}
-        for axes, (label, image) in zip((left, middle), shown.items(), strict=True):
-            axes.clear()
-            axes.imshow(image)
-            axes.set_title(label)
-            axes.axis("off")
+        left.clear()
+        show_image(left, sequence.color(index), "observed")
+        middle.clear()
+        show_image(middle, view, "the map from the estimated pose")
         places = T_estimated[: index + 1, :3, 3][:, page].T
         path.set_data(*places)
         here.set_data(*places[:, -1:])

@@ -45,31 +45,28 @@ def plot_slice(
     axes = new_axes(title, 5.4)[0, 0]
     up, page = _draw_from_above(axes, {"camera path": sequence.T_world_camera})
     # A regular grid, with coordinates to the right and ahead.
-    low, high = np.array(field.bounds.minimum)[page], np.array(field.bounds.maximum)[page]
+    low, high = np.array([field.bounds.minimum, field.bounds.maximum])[:, page]
     step = (high - low).max() / _POINTS_ALONG
     right, ahead = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))
-    shape = len(ahead), len(right)
     points = np.tile(height * up, (len(ahead) * len(right), 1))
     points[:, page] = np.stack(np.meshgrid(right, ahead), axis=-1).reshape(-1, 2)
-    values = query_field(field, points)[1].reshape(shape)
-    seen = seen_by(points, sequence).reshape(shape)
+    values = query_field(field, points)[1].reshape(len(ahead), len(right))
+    seen = seen_by(points, sequence).reshape(values.shape)
     norm, colors = _scale_of(field, values)
     grid = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
     image = axes.pcolormesh(right, ahead, values, cmap=colors, norm=norm, **grid)
-    axes.figure.colorbar(
-        image, ax=axes, label=field.value_label, extend="both", aspect=25, pad=0.015
-    )
-    lines = {
-        "surface": (values - field.surface_level, 2, "black", "-")
-    }  # below what makes the unseen pale
+    look = {"label": field.value_label, "extend": "both", "aspect": 25, "pad": 0.015}
+    axes.figure.colorbar(image, ax=axes, **look)
+    # The map's surface lies below what makes the unseen pale.
+    lines = {"surface": (values - field.surface_level, 2, "black", "-")}
     if room is not None:
-        lines["true surface"] = (room.sdf(points).reshape(shape), 3, "#1a9641", "--")
+        lines["true surface"] = (room.sdf(points).reshape(values.shape), 3, "#1a9641", "--")
     for name, (zero_there, zorder, color, style) in lines.items():
         axes.plot([], [], style, color=color, label=name)
         if zero_there.min() < 0 < zero_there.max():  # matplotlib warns where there is no line
             look = {"colors": color, "linestyles": style, "zorder": zorder}
             axes.contour(right, ahead, zero_there, [0.0], **look)
-    veil = np.dstack([np.ones((*shape, 3)), _DIMMED * ~seen])
+    veil = np.dstack([np.ones((*values.shape, 3)), _DIMMED * ~seen])
     axes.pcolormesh(right, ahead, veil, gid="unseen", zorder=2.5, **grid)
     axes.set_title(f"{field.label} at height {height:.2f} m; pale: never seen")
     axes.figure.legend_below()
