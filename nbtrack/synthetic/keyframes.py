@@ -140,7 +140,7 @@ def _path(keys: _Keys, length: int) -> Poses:
         velocities = along[k : k + 2] * speed[k]
         places[piece == k] = CubicHermiteSpline([start, end], ends, velocities)(at[piece == k])
     level = np.zeros(len(keys.yaw))
-    turned = camera_poses(keys.places.T, keys.yaw, keys.pitch, level)[:, :3, :3]
+    turned = camera_poses(tuple(keys.places.T), keys.yaw, keys.pitch, level)[:, :3, :3]
     poses = np.tile(np.eye(4), (length, 1, 1))
     turning = Slerp(keys.times, Rotation.from_matrix(turned))
     poses[:, :3, :3] = turning(at.clip(max=keys.times[-1])).as_matrix()

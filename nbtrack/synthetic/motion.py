@@ -3,8 +3,6 @@
 Both have height, tilt and roll that wander, bursts of speed, and a tremor. Source: our choice.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
@@ -208,7 +206,7 @@ def _tremor(n_frames: int, rng: np.random.Generator) -> Float[np.ndarray, "n 6"]
 
 
 def camera_poses(
-    places: Sequence[Values], yaw: Values, pitch: Values, roll: Values, trembling=_NO_TREMOR
+    places: tuple[Values, ...], yaw: Values, pitch: Values, roll: Values, trembling=_NO_TREMOR
 ) -> Poses:
     """Poses (OpenCV axes) at places (x, y and z, m) with angles (rad), and a tremor on top.
 
