@@ -195,14 +195,3 @@ def test_nothing_is_told_of_right_recordings(tmp_path: Path, name: str) -> None:
     """Catches false alarms of real noise, exposure and calibration."""
     for number, change in enumerate(SILENT.values()):
         assert check(tmp_path / str(number), change(real(name))).warnings == []
-
-
-def test_a_long_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches estimates that depend on which images are kept: of long recordings only those of
-    pairs are, and of positions that scatter the neighbours count."""
-    data = positions(lambda t: t + noise(t))(room("living_room"))
-    whole = check(tmp_path / "r", data)
-    monkeypatch.setattr("nbtrack.recordings.check._MAX_KEPT", 10)
-    in_parts = check_recording(whole.recording)
-    assert in_parts.misfits == whole.misfits
-    assert in_parts.warnings == whole.warnings

@@ -361,6 +361,6 @@ def test_a_movie_shows_every_frame(sequence) -> None:
     pictures = plots.movie_pictures(wall, sequence, frames, poses, "A wall")
     assert len(pictures) == 2
     assert not np.array_equal(*pictures)
-    with Image.open(io.BytesIO(plots.movie_bytes(pictures, "gif"))) as movie:
+    with Image.open(io.BytesIO(plots.movie_bytes(pictures))) as movie:
         assert movie.n_frames == 2
         assert movie.size == pictures[0].shape[1::-1]

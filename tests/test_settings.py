@@ -128,7 +128,7 @@ def test_values_take_the_type_of_the_preset(monkeypatch: pytest.MonkeyPatch) -> 
     """Catches integers left in real settings, single values where several are allowed, and, in the
     environment, a split at commas or within quotes."""
     settings = (
-        "mapping.neus.learning_rate=1", "tables.rates_hz=[4, 2.5]", "scenes.synthetic=false",
+        "mapping.neus.learning_rate=1", "tables.rates_hz=[4, 2.5]",
         "scenes.track_frames=0:10:2", "scenes.width = 64", "mapping.neus.holdout_every=0",
     )  # fmt: skip
     resolved = load_preset(settings=(*settings, "scenes.names=office"))
@@ -136,7 +136,6 @@ def test_values_take_the_type_of_the_preset(monkeypatch: pytest.MonkeyPatch) -> 
     assert resolved.mapping["neus"].holdout_every == 0
     assert resolved.scenes.names == ("office",)
     assert [type(rate) for rate in resolved.tables.rates_hz] == [float, float]
-    assert resolved.scenes.synthetic is False
     assert (resolved.scenes.track_frames, resolved.scenes.width) == ("0:10:2", 64)
     monkeypatch.setenv("NBTRACK_SET", """scenes.n_frames=7 "scenes.names=['office', 'bedroom']" """)
     scenes = load_preset().scenes
@@ -152,7 +151,6 @@ REFUSED = {  # beside those of test_faults.py
     "__class__=5": "unknown config key '__class__'",
     # Values that would fail, or worse would not, somewhere in a run of hours.
     "mapping.neus.learning_rate=false": "it must be float, for example",
-    "scenes.synthetic=1": "it must be bool, for example",
     "scenes.track_frames=10": "it must be str, for example",
     "scenes.names=[1, 2]": "it must be str, for example",
     "tables.pixels.vr=[1.5]": "it must be int, for example",

@@ -26,6 +26,7 @@ from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Methods, f
 from nbtrack.experiments.output import output_folder
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
+from nbtrack.synthetic import ROOMS
 from nbtrack.tracking import ClockBudget, StepBudget, make_tracker
 
 _FRAMES_A_CELL = 3  # that a mean of steps in Table II is taken over
@@ -180,7 +181,8 @@ def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]
 
 def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
     """For captions: how the camera of some runs moves, and how far a frame in the mean."""
-    kind = f"{preset.scenes.motion} motion" if preset.scenes.synthetic else "recorded motion"
+    are_rooms = set(preset.scenes.names) <= set(ROOMS)
+    kind = f"{preset.scenes.motion} motion" if are_rooms else "recorded motion"
     if "path_m" not in results:
         return f"Camera: {kind}"
     return f"Camera: {kind}, {1e3 * (results['path_m'] / results['frames']).mean():.1f} mm a frame"

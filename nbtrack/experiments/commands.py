@@ -257,7 +257,7 @@ def _export_movie(source: Path, format_name: str, out: Path) -> str:
     with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
         of_run = tracked.frames.iloc[shown], seen.T_world_camera, title
         pictures = movie_pictures(surface, seen, *of_run, bar.move_to)
-        content = movie_bytes(pictures, format_name)
+        content = movie_bytes(pictures)
     write_atomic(out, content)
     return f"{len(shown)} of {last + 1} frames, {len(content) / 1e6:.1f} MB"
 
@@ -274,7 +274,7 @@ def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
 _EXPORTS = {
     **dict.fromkeys(("tum", "kitti"), _export_trajectory),
     **dict.fromkeys(("ply", "glb", "map"), _export_map),
-    **dict.fromkeys(("gif", "mp4"), _export_movie),
+    "gif": _export_movie,
 }
 
 

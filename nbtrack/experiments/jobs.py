@@ -312,8 +312,7 @@ class TrackJob(Job):
             followed = sequence.select(slice(len(sequence) - len(tracked.frames), None))
             if notes["map_warning"] == _OTHER_WORLD:
                 followed = replace(followed, T_world_camera=tracked.T_estimated)
-            found = look_in_map(finished_map.field, followed, tracked.T_estimated)
-            notes |= {"outside_map_share": found.outside_share, "map_misfit": found.misfit}
+            notes |= look_in_map(finished_map.field, followed, tracked.T_estimated)
         return tracked, notes | reach_metrics(reach, *how)
 
     def _map_warning(self, finished_map: Map, first: Frame, is_start_known: bool) -> str | None:

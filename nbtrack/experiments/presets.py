@@ -26,7 +26,6 @@ class ScenesConfig:
     """Which sequences a preset maps and tracks, and how synthetic rooms are made."""
 
     names: tuple[str, ...] = ()  # synthetic rooms, or folders below the data folder
-    synthetic: bool = True  # made by this package; otherwise read from the data folder
     motion: str = "keyframes"  # in a synthetic room: as the dataset's; or handheld, or a tour
     n_frames: int = limited(300, 2, 10_000)
     width: int = limited(640, 11, 4096)  # pixels; the height is three quarters of it
@@ -140,7 +139,7 @@ PRESETS = {
     "smoke": _SMALL,
     "nine_rooms": replace(_SMALL, name="nine_rooms", scenes=_NINE),
     "synthetic": Preset("synthetic", scenes=ScenesConfig(REPORTED_ROOMS)),
-    "paper": Preset("paper", scenes=ScenesConfig(tuple(DATASET_SCENES), synthetic=False)),
+    "paper": Preset("paper", scenes=ScenesConfig(tuple(DATASET_SCENES))),
 }
 
 

@@ -79,7 +79,7 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     text, folder = str(sequence), Path(sequence)
     if text in _KNOWN and folder.is_dir() and not is_own_output(folder):
         tell(f"{text}: the folder {folder.resolve()} is read, not the room or scene of that name")
-    elif text in ROOMS and (preset.scenes.synthetic or text not in DATASET_SCENES):
+    elif text in ROOMS:
         return _room(text, preset.scenes)
     elif text in DATASET_SCENES:
         if (folder := data_folder() / text).is_dir():

@@ -28,9 +28,9 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     some = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
     height = style.WIDTH * sequence.intrinsics.height / sequence.intrinsics.width  # inches
     left, right = style.new_axes(title, 0.4 + 0.5 * height, 1, 2)[0]
-    _show(left, sequence.color(index), f"frame {sequence.frame_ids[index]}: colour")
+    show_image(left, sequence.color(index), f"frame {sequence.frame_ids[index]}: colour")
     depth = np.ma.masked_equal(sequence.depth(index), 0)
-    image = _show(right, depth, "depth", MILLIMETRE * _upper_limit(some))
+    image = show_image(right, depth, "depth", MILLIMETRE * _upper_limit(some))
     right.figure.colorbar(image, ax=right, label="depth (m)", extend="max", aspect=25, pad=0.02)
     return right.figure
 
@@ -47,24 +47,25 @@ def plot_views(
     """
     depths = np.ma.stack([np.ma.masked_equal(sequence.depth(index), 0) for index in indices])
     errors = 100 * np.abs(np.stack([depth for _, depth in views]) - depths)
-    far, worst = _upper_limit(depths), _upper_limit(errors)
+    far = _upper_limit(depths)
+    worst = _upper_limit(errors)
     aspect = sequence.intrinsics.height / sequence.intrinsics.width
     height = 0.9 + len(views) * (0.2 + 0.2 * style.WIDTH * aspect)
     grid = style.new_axes(title, height, len(views), 5)
     parts = zip(grid, indices, views, depths, errors, strict=True)
     for row, index, (color, rendered), depth, error in parts:
-        _show(row[0], sequence.color(index), f"frame {sequence.frame_ids[index]}")
-        _show(row[1], color, "rendered colour")
-        _show(row[2], depth, "depth", far)
-        depth_image = _show(row[3], rendered, "rendered depth", far)
-        error_image = _show(row[4], error, "|error|", worst, "magma")
+        show_image(row[0], sequence.color(index), f"frame {sequence.frame_ids[index]}")
+        show_image(row[1], color, "rendered colour")
+        show_image(row[2], depth, "depth", far)
+        depth_image = show_image(row[3], rendered, "rendered depth", far)
+        error_image = show_image(row[4], error, "|error|", worst, "magma")
     bars = {"location": "bottom", "pad": 0.02, "aspect": 30, "extend": "max"}
     depth_image.figure.colorbar(depth_image, ax=grid[:, 2:4], label="depth (m)", **bars)
     error_image.figure.colorbar(error_image, ax=grid[:, 4:], label="depth error (cm)", **bars)
     return error_image.figure
 
 
-def _show(
+def show_image(
     axes: Axes, image: np.ndarray, title: str, maximum: float | None = None, colors: str = "viridis"
 ) -> AxesImage:
     """An image without ticks, grid and frame; unknown pixels are grey."""
@@ -199,9 +200,11 @@ def plot_ate(results: pd.DataFrame, title: str = "") -> Figure:
     which the table prints red; a missing point is a run without result. Thin lines span a
     std over seeds either way; the dotted line is a camera that stands still.
     """
-    means, stds = table_1(results), table_1(results, "ate_std_m")
+    means = table_1(results)
+    stds = table_1(results, "ate_std_m")
     rates, methods = (means.index.unique(level) for level in means.index.names)
-    columns, rows = min(5, len(means.columns)), -(-len(means.columns) // 5)
+    columns = min(5, len(means.columns))
+    rows = -(-len(means.columns) // 5)
     panels = style.new_axes(title, 0.9 + 2.1 * rows, rows, columns, sharey=True).flat
     for axes, scene in zip(panels, means, strict=False):
         for label, look, offset in _looks(methods.drop(STANDING_STILL, errors="ignore")):

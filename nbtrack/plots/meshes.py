@@ -34,7 +34,7 @@ def extract_mesh(
     if isinstance(field, PointCloud):
         colors = (255 * field.colors).round().byte()
         return trimesh.PointCloud(field.points.cpu().numpy(), colors.cpu().numpy())
-    low, high = np.array(field.bounds.minimum), np.array(field.bounds.maximum)
+    low, high = np.array([field.bounds.minimum, field.bounds.maximum])
     axes = [np.arange(a, b + voxel, voxel) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     values = query_field(field, points)[1].reshape([len(axis) for axis in axes])

@@ -1,9 +1,7 @@
 """A tracked run as a moving picture: what was observed, what the map shows there, and the path."""
 
 import io
-import tempfile
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,12 +12,12 @@ from PIL import Image
 
 from nbtrack.core.arrays import Pose, Poses
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.plots.figures import show_image
+from nbtrack.plots.meshes import Mesh
 from nbtrack.plots.rooms import draw_cloud
 from nbtrack.plots.style import new_axes, styled
 
-Surface = trimesh.Trimesh | trimesh.PointCloud
 _WIDTH = 240  # pixels of the map's view
 _NEAR = 0.1  # m; nearer surfaces are not drawn
 _POINT_SIZE = 0.02  # m, of a map of points
@@ -29,7 +27,7 @@ _RATE_HZ, _GIF_COLORS = 10, 64
 
 @styled
 def movie_pictures(
-    surface: Surface,
+    surface: Mesh,
     sequence: RgbdSequence,
     run: pd.DataFrame,
     T_estimated: Poses,
@@ -47,16 +45,15 @@ def movie_pictures(
     path, here = right.lines
     here.set_color(path.get_color())
     words = right.text(0, 1.03, "", transform=right.transAxes)
-    canvas, pictures = FigureCanvasAgg(left.figure), []
+    canvas = FigureCanvasAgg(left.figure)
+    pictures = []
     left.figure.set_dpi(_DPI)
     for index, row in enumerate(run.itertuples()):
         view = view_of(surface, sequence.intrinsics, T_estimated[index])
-        shown = {"observed": sequence.color(index), "the map from the estimated pose": view}
-        for axes, (label, image) in zip((left, middle), shown.items(), strict=True):
-            axes.clear()
-            axes.imshow(image)
-            axes.set_title(label)
-            axes.axis("off")
+        left.clear()
+        show_image(left, sequence.color(index), "observed")
+        middle.clear()
+        show_image(middle, view, "the map from the estimated pose")
         places = T_estimated[: index + 1, :3, 3][:, page].T
         path.set_data(*places)
         here.set_data(*places[:, -1:])
@@ -71,7 +68,7 @@ def movie_pictures(
 
 
 def view_of(
-    surface: Surface, camera: Intrinsics, T_world_camera: Pose, width: int = _WIDTH
+    surface: Mesh, camera: Intrinsics, T_world_camera: Pose, width: int = _WIDTH
 ) -> np.ndarray:
     """The surface (m, world frame) as a camera sees it, (height, width, 3; uint8); white elsewhere.
 
@@ -80,8 +77,7 @@ def view_of(
     the fields differ in the side that they call the front.
     """
     scale = width / camera.width
-    rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    points = (np.asarray(surface.vertices) - position) @ rotation
+    points = (np.asarray(surface.vertices) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     depth = np.maximum(points[:, 2:], _NEAR)
     pixels = scale * (points[:, :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
     if isinstance(surface, trimesh.Trimesh):
@@ -104,26 +100,17 @@ def view_of(
     return image
 
 
-def cloud_of(surface: Surface) -> pd.DataFrame:
+def cloud_of(surface: Mesh) -> pd.DataFrame:
     """Vertices or points: x, y, z (m, world frame), red, green, blue (0 to 255)."""
     cloud = pd.DataFrame(surface.vertices, columns=["x", "y", "z"])
     cloud[["red", "green", "blue"]] = surface.visual.vertex_colors[:, :3]
     return cloud
 
 
-def movie_bytes(pictures: Sequence[np.ndarray], format_name: str) -> bytes:
-    """A GIF that repeats, or an MP4. Raises DataError where OpenCV cannot write the latter."""
-    if format_name == "gif":
-        images = [Image.fromarray(picture).quantize(_GIF_COLORS) for picture in pictures]
-        content, options = io.BytesIO(), {"duration": 1000 // _RATE_HZ, "loop": 0, "optimize": True}
-        images[0].save(content, "GIF", save_all=True, append_images=images[1:], **options)
-        return content.getvalue()
-    with tempfile.TemporaryDirectory() as folder:
-        path, size = Path(folder) / "movie.mp4", pictures[0].shape[1::-1]
-        movie = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), _RATE_HZ, size)
-        if not movie.isOpened():
-            raise DataError("OpenCV cannot write MP4 here: export to gif instead")
-        for picture in pictures:
-            movie.write(picture[..., ::-1])
-        movie.release()
-        return path.read_bytes()
+def movie_bytes(pictures: Sequence[np.ndarray]) -> bytes:
+    """A GIF that repeats."""
+    images = [Image.fromarray(picture).quantize(_GIF_COLORS) for picture in pictures]
+    content = io.BytesIO()
+    options = {"duration": 1000 // _RATE_HZ, "loop": 0, "optimize": True}
+    images[0].save(content, "GIF", save_all=True, append_images=images[1:], **options)
+    return content.getvalue()

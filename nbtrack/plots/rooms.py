@@ -45,28 +45,28 @@ def plot_slice(
     axes = new_axes(title, 5.4)[0, 0]
     up, page = _draw_from_above(axes, {"camera path": sequence.T_world_camera})
     # A regular grid, with coordinates to the right and ahead.
-    low, high = np.array(field.bounds.minimum)[page], np.array(field.bounds.maximum)[page]
+    low, high = np.array([field.bounds.minimum, field.bounds.maximum])[:, page]
     step = (high - low).max() / _POINTS_ALONG
     right, ahead = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))
-    shape, level = (len(ahead), len(right)), field.surface_level
     points = np.tile(height * up, (len(ahead) * len(right), 1))
     points[:, page] = np.stack(np.meshgrid(right, ahead), axis=-1).reshape(-1, 2)
-    values, seen = query_field(field, points)[1].reshape(shape), seen_by(points, sequence)
+    values = query_field(field, points)[1].reshape(len(ahead), len(right))
+    seen = seen_by(points, sequence).reshape(values.shape)
     norm, colors = _scale_of(field, values)
     grid = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
     image = axes.pcolormesh(right, ahead, values, cmap=colors, norm=norm, **grid)
-    axes.figure.colorbar(
-        image, ax=axes, label=field.value_label, extend="both", aspect=25, pad=0.015
-    )
-    lines = {"surface": (values - level, 2, "black", "-")}  # below what makes the unseen pale
+    look = {"label": field.value_label, "extend": "both", "aspect": 25, "pad": 0.015}
+    axes.figure.colorbar(image, ax=axes, **look)
+    # The map's surface lies below what makes the unseen pale.
+    lines = {"surface": (values - field.surface_level, 2, "black", "-")}
     if room is not None:
-        lines["true surface"] = (room.sdf(points).reshape(shape), 3, "#1a9641", "--")
+        lines["true surface"] = (room.sdf(points).reshape(values.shape), 3, "#1a9641", "--")
     for name, (zero_there, zorder, color, style) in lines.items():
         axes.plot([], [], style, color=color, label=name)
         if zero_there.min() < 0 < zero_there.max():  # matplotlib warns where there is no line
             look = {"colors": color, "linestyles": style, "zorder": zorder}
             axes.contour(right, ahead, zero_there, [0.0], **look)
-    veil = np.dstack([np.ones((*shape, 3)), _DIMMED * ~seen.reshape(shape)])
+    veil = np.dstack([np.ones((*values.shape, 3)), _DIMMED * ~seen])
     axes.pcolormesh(right, ahead, veil, gid="unseen", zorder=2.5, **grid)
     axes.set_title(f"{field.label} at height {height:.2f} m; pale: never seen")
     axes.figure.legend_below()
@@ -133,9 +133,9 @@ def plot_overview(
     left.figure.legend_below()
     for axes in right:
         seconds = frames["time"] - frames["time"].iloc[0]
-        tracked, still = 100 * frames["translation_error_m"], 100 * frames["still_error_m"]
-        axes.plot(seconds, tracked, color=method_colors(["tracked"])["tracked"], label="tracked")
-        axes.plot(seconds, still, label=STANDING_STILL, **DOTTED)
+        color = method_colors(["tracked"])["tracked"]
+        axes.plot(seconds, 100 * frames["translation_error_m"], color=color, label="tracked")
+        axes.plot(seconds, 100 * frames["still_error_m"], label=STANDING_STILL, **DOTTED)
         axes.set(xlabel="time (s)", ylabel="translation error (cm)")
         log_axes(axes, "y")
         axes.legend(loc="best")
@@ -147,30 +147,33 @@ def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) ->
 
     Returns the indices of the world's axes to the right and ahead.
     """
-    (up, page), places = _draw_from_above(axes, T_paths), cloud[["x", "y", "z"]]
+    up, page = _draw_from_above(axes, T_paths)
+    places = cloud[["x", "y", "z"]]
     inside = (places >= places.quantile(_CUT)) & (places <= places.quantile(1 - _CUT))
     heights = (places @ up)[inside.all(axis=1)].sort_values()  # drawn from the floor up
     highest = max((path[:, :3, 3] @ up).max() for path in T_paths.values())
     shown = cloud.loc[heights.index[heights <= highest + 0.1]]
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
-    axes.scatter(*shown[["x", "y", "z"]].to_numpy()[:, page].T, c=colors, s=4, linewidths=0)
+    axes.scatter(*places.loc[shown.index].to_numpy()[:, page].T, c=colors, s=4, linewidths=0)
     return page
 
 
 @styled
 def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = "") -> Figure:
-    """A vertex-coloured mesh as a doll's house: the near walls and the ceiling are left out.
+    """A vertex-coloured mesh of a room from outside, without the near walls and the ceiling.
 
-    Left out is every face that shows its back, so that one looks into a room from outside, from
-    where most surface shows. Parallel projection; lengths across the picture are true (m). The
-    camera-to-world poses by label are drawn on top; "true" is green, "tracked" red.
+    Every face that shows its back is left out, and one looks from where most surface shows. The
+    projection is parallel; lengths across the picture are true (m). The camera-to-world poses by
+    label are drawn on top; "true" is green, "tracked" red.
     """
-    up, side = up_of(*T_paths.values()), _inward_side(mesh)
+    up = up_of(*T_paths.values())
+    side = _inward_side(mesh)
     # None of the azimuths looks along the walls of a room aligned to the axes.
     screens = np.stack([screen_axes(up, azimuth) for azimuth in np.arange(15.0, 360.0, 30.0)])
     fronts = side * mesh.face_normals @ screens[:, 2].T
     best = (mesh.area_faces @ fronts.clip(0)).argmax()
-    to_screen, faces = screens[best], mesh.faces[fronts[:, best] > 0]
+    to_screen = screens[best]
+    faces = mesh.faces[fronts[:, best] > 0]
     corners = (mesh.vertices @ to_screen.T)[faces]
     # Smoothed normals: those of single marching-cubes faces flicker.
     normals = side * mesh.vertex_normals[faces].mean(axis=1)
@@ -204,7 +207,7 @@ def mesh_viewer(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses]) -> trimesh.
     Each path is a tube that ends in a pyramid, which opens where the last camera looks. The mesh is
     made coarser: the viewer adds 1.2 MB to the notebook, 0.7 MB of it the viewer's own.
     """
-    room, up = mesh.copy(), up_of(*T_paths.values())
+    room = mesh.copy()
     if len(room.faces) > _MAX_FACES_TO_TURN:  # vertices of a grid cell merge
         cell = np.sqrt(2.2 * room.area / _MAX_FACES_TO_TURN)
         room.apply_scale(1 / cell)
@@ -221,7 +224,7 @@ def mesh_viewer(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses]) -> trimesh.
         path.visual.face_colors = trimesh.visual.color.hex_to_rgba(color)
         scene.add_geometry(path, geom_name=label)
     view = np.eye(4)
-    view[:3, :3] = screen_axes(up, 15.0).T
+    view[:3, :3] = screen_axes(up_of(*T_paths.values()), 15.0).T
     scene.camera = trimesh.scene.Camera(name="viewer", fov=(60, 45))
     scene.camera_transform = scene.camera.look_at(room.vertices, rotation=view)
     return scene
@@ -231,7 +234,8 @@ def _inward_side(mesh: trimesh.Trimesh) -> float:
     """1 where the normals of a room's shell point inwards, else -1.
 
     Marching cubes orients faces by the sign of the field, which differs between densities and
-    distances. The room's shell outweighs what stands in it, so that the median is taken.
+    distances. The sign is that of the sum over the area, since a room's shell is larger than what
+    stands in it.
     """
     inwards = mesh.bounds.mean(axis=0) - mesh.triangles_center
     return np.sign((inwards * mesh.face_normals).sum(axis=1) @ mesh.area_faces)
@@ -290,7 +294,8 @@ def _draw_paths(axes: Axes, T_paths: Mapping[str, Poses], to_page: np.ndarray) -
 
 def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
     """Rows: the picture's right, its upward direction, and the way to the viewer (world frame)."""
-    side, azimuth = np.roll(up, 1), np.radians(azimuth_deg)  # any horizontal axis is azimuth 0
+    side = np.roll(up, 1)  # any horizontal axis is azimuth 0
+    azimuth = np.radians(azimuth_deg)
     level = np.cos(azimuth) * side + np.sin(azimuth) * np.cross(up, side)
     viewer = np.cos(_ELEVATION) * level + np.sin(_ELEVATION) * up
     right = np.cross(up, level)

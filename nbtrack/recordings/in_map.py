@@ -8,13 +8,12 @@ least-squares problem: the motions are projected out of each frame.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from nbtrack.core.arrays import Points, Pose, Poses
+from nbtrack.core.arrays import Pose, Poses, WorldPoints
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 
@@ -31,81 +30,72 @@ _EXPLANATIONS = {  # how a point changes with each: factors of its x, y and z
 }
 
 
-@dataclass(frozen=True)
-class InMap:
-    """How a tracked recording lies in a map."""
-
-    outside_share: float  # of frames that saw little of what was mapped
-    misfit: str  # a sentence; empty where nothing misfits
-
-
-def look_in_map(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> InMap:
+def look_in_map(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> dict[str, float | str]:
     """Look at some frames, spread evenly: whether what they measured lies outside of the map, at
-    their true poses where known, and how it misfits at the estimated ones."""
-    outside, parts = [], []
-    low, high = (torch.tensor(corner) for corner in (field.bounds.minimum, field.bounds.maximum))
+    their true poses where known, and how it misfits at the estimated ones.
+
+    Returns `outside_map_share`, that of the frames that saw little of what was mapped, and
+    `map_misfit`, a sentence, which is empty where nothing misfits.
+    """
+    outside, sums = [], []
+    low, high = np.array([field.bounds.minimum, field.bounds.maximum])
     for index in range(0, len(sequence), math.ceil(len(sequence) / _N_FRAMES)):
-        points, T = _points_of(sequence, index), sequence.T_world_camera[index]
-        if not len(points):
+        frame = sequence[index]
+        pixels = frame.measured_pixels()
+        if not pixels.shape[1]:
             continue
-        x = _moved(points, T if np.isfinite(T).all() else T_estimated[index])
-        is_inside = ((x >= low) & (x <= high)).all(dim=-1)
-        outside.append(float(is_inside.float().mean()) < _MOSTLY)
+        drawn = np.random.default_rng(index).permutation(pixels.shape[1])[:_N_POINTS]
+        points = frame.points(*pixels[:, drawn])[0].double().numpy()
+        T = sequence.T_world_camera[index]
+        world = _moved(points, T if np.isfinite(T).all() else T_estimated[index])
+        outside.append(((world < low) | (world > high)).any(axis=1).mean() > _MOSTLY)
         if field.is_distance:
-            parts.append(_without_motion(field, points, T_estimated[index]))
-    parts = [part for part in parts if part is not None]
-    return InMap(float(np.mean(outside or [0.0])), _misfit(np.array(parts)))
+            sums.append(_without_motion(field, points, T_estimated[index]))
+    sums = [part for part in sums if part is not None]
+    misfit = _misfit(np.array(sums)) if len(sums) >= _MIN_FRAMES else ""
+    return {"outside_map_share": float(np.mean(outside or [0.0])), "map_misfit": misfit}
 
 
-def _points_of(sequence: RgbdSequence, index: int) -> Points:
-    """Random measured points (m, camera frame) of a frame."""
-    frame = sequence[index]
-    pixels = frame.measured_pixels()
-    order = torch.randperm(pixels.shape[1], generator=torch.Generator().manual_seed(index))
-    return frame.points(*pixels[:, order[:_N_POINTS]])[0]
+def _moved(points: WorldPoints, T_world_camera: Pose) -> WorldPoints:
+    return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
 
-def _moved(points: Points, T_world_camera: Pose) -> Points:
-    pose = torch.from_numpy(T_world_camera).float()
-    return points @ pose[:3, :3].T + pose[:3, 3]
-
-
-def _without_motion(field: Field, points: Points, T: Pose) -> Float[np.ndarray, "3 2"] | None:
+def _without_motion(field: Field, points: WorldPoints, T: Pose) -> Float[np.ndarray, "3 2"] | None:
     """A column an explanation, motions projected out: its products with residuals and with itself,
-    and the variance of residuals (m²)."""
-    x = _moved(points, T).to(field.device).requires_grad_()
+    and the variance of residuals (m²); None of few. Points are in the camera's frame (m)."""
+    x = torch.from_numpy(_moved(points, T)).float().to(field.device).requires_grad_()
     distance = field(x)[1]
     (gradient,) = torch.autograd.grad(distance.sum(), x)
-    r, q = distance.detach().cpu().double().numpy(), gradient.cpu().double().numpy() @ T[:3, :3]
+    r = distance.detach().cpu().double().numpy()
     near = np.abs(r) < _MAX_DISTANCE
     if near.sum() < _MIN_POINTS:
         return None
-    r, q, p = r[near], q[near], points.double().numpy()[near]
+    q = (gradient.cpu().double().numpy() @ T[:3, :3])[near]
+    p = points[near]
     motions, _ = np.linalg.qr(np.hstack([np.cross(p, q), q]))
-    columns = np.column_stack([r, *((q * p) @ change for change in _EXPLANATIONS.values())])
+    columns = np.column_stack([r[near], *((q * p) @ change for change in _EXPLANATIONS.values())])
     columns -= motions @ (motions.T @ columns)
     squares = (columns**2).sum(axis=0)
-    return np.stack([columns[:, 1:].T @ columns[:, 0], squares[1:], 2 * [squares[0] / len(r)]])
+    return np.stack([columns[:, 1:].T @ columns[:, 0], squares[1:], 2 * [squares[0] / len(p)]])
 
 
 def _misfit(sums: Float[np.ndarray, "frames 3 2"]) -> str:
     """A sentence on the explanation that takes most off the residuals, if it is not negligible."""
-    if len(sums) < _MIN_FRAMES:
-        return ""
     drawn = np.random.default_rng(0).integers(len(sums), size=(_RESAMPLED, len(sums)))
+    products, squares, _ = np.moveaxis(sums[drawn].sum(axis=1), 1, 0)
+    low, high = np.quantile(products / squares.clip(_TINY), _INTERVAL, axis=0)
     products, squares, variance = sums.sum(axis=0)
+    shares = products / squares.clip(_TINY)
     # With up to three walls in view a motion does the same as a scale, which is then not known.
     error = np.sqrt(variance / len(sums) / squares.clip(_TINY))
-    gains = np.where(error < _NEGLIGIBLE / 2, products**2 / squares.clip(_TINY), 0.0)
+    gains = np.where(error < _NEGLIGIBLE / 2, products * shares, 0.0)
     best = int(gains.argmax())
-    of_draws = sums[drawn].sum(axis=1)[:, :, best]
-    low, high = np.quantile(of_draws[:, 0] / of_draws[:, 1].clip(_TINY), _INTERVAL)
-    if not gains.any():
+    low, high = low[best], high[best]
+    if not gains.any() or (low <= _NEGLIGIBLE and high >= -_NEGLIGIBLE):
         return ""
-    if not (low > _NEGLIGIBLE or high < -_NEGLIGIBLE):
-        return ""
-    off, name = products[best] / squares[best], [*_EXPLANATIONS][best]
+    name = [*_EXPLANATIONS][best]
     return (
-        f"residuals in the map grow with depth, as if {name} were off by {off:+.1%} ({low:+.1%} to "
-        f"{high:+.1%}), or somewhat more, against those of the map: compare both by `data check`"
+        f"residuals in the map grow with depth, as if {name} were off by {shares[best]:+.1%} "
+        f"({low:+.1%} to {high:+.1%}), or somewhat more, against those of the map: compare both by "
+        "`data check`"
     )

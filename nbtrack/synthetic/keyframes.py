@@ -13,8 +13,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from nbtrack.core.arrays import Poses
-from nbtrack.core.errors import NumericalError
-from nbtrack.synthetic.motion import CLEARANCE, camera_poses, steps_between
+from nbtrack.synthetic.motion import CLEARANCE, camera_poses, steps_between, too_full
 from nbtrack.synthetic.primitives import Points, Values
 from nbtrack.synthetic.room import Room
 
@@ -65,27 +64,30 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
         poses = _calibrated_path(room, moved, length)
         if _still(poses) > least and _is_fit(room, poses):
             return poses[:n_frames]
-    raise _too_full(room)
+    raise too_full(room)
 
 
 def _keys_of_room(room: Room, length: int) -> _Keys:
     """The first drawn key poses whose path leaves its start by enough, else by the most."""
-    best, farthest = None, 0.0
+    best = None
+    farthest = 0.0
     for attempt in range(_ATTEMPTS):
         keys = _drawn_keys(room, length, np.random.default_rng([attempt, room.number]))
         poses = _calibrated_path(room, keys, length)
         if _still(poses) > farthest and _is_fit(room, poses):
-            best, farthest = keys, _still(poses)
+            best = keys
+            farthest = _still(poses)
         if farthest > _MIN_STILL:
             break
     if best is None:
-        raise _too_full(room)
+        raise too_full(room)
     return best
 
 
 def _drawn_keys(room: Room, length: int, rng: np.random.Generator) -> _Keys:
     """Random key poses: legs of a walk whose heading, height, speed and turning rate vary."""
-    size, n_pieces = np.array(room.parts[0].solid.size), max(2, round(length / _FRAMES_A_PIECE))
+    size = np.array(room.parts[0].solid.size)
+    n_pieces = max(2, round(length / _FRAMES_A_PIECE))
     frames = rng.uniform(_SHORTEST, _LONGEST, n_pieces)
     frames *= (length - 1) / frames.sum()
     bend = rng.uniform(-1.2, 1.2, n_pieces)
@@ -107,7 +109,9 @@ def _drawn_keys(room: Room, length: int, rng: np.random.Generator) -> _Keys:
 
 def _calibrated_path(room: Room, keys: _Keys, length: int) -> Poses:
     """The path through key poses, which are moved together and turned until speeds are right."""
-    places, yaw, unit = keys.places, keys.yaw, np.max(room.parts[0].solid.size) / 2
+    places = keys.places
+    yaw = keys.yaw
+    unit = np.max(room.parts[0].solid.size) / 2
     for _ in range(4):
         poses = _path(_Keys(places, yaw, keys.pitch, keys.times), length)
         step_mm, step_deg = steps_between(poses).mean(axis=1)
@@ -123,7 +127,8 @@ def _path(keys: _Keys, length: int) -> Poses:
 
     At a join the camera keeps its direction, and is the slower the more the direction bends.
     """
-    legs, frames = np.diff(keys.places, axis=0), np.diff(keys.times)[:, None]
+    legs = np.diff(keys.places, axis=0)
+    frames = np.diff(keys.times)[:, None]
     towards = legs / np.linalg.norm(legs, axis=1, keepdims=True)
     along = np.concatenate([towards[:1], (towards[1:] + towards[:-1]) / 2, towards[-1:]])
     speed = np.linalg.norm(legs, axis=1, keepdims=True) / frames
@@ -131,10 +136,11 @@ def _path(keys: _Keys, length: int) -> Poses:
     piece = np.minimum(np.searchsorted(keys.times, at, side="right") - 1, len(legs) - 1)
     places = np.empty((length, 3))
     for k, (start, end) in enumerate(zip(keys.times, keys.times[1:], strict=False)):
-        ends, velocities = keys.places[k : k + 2], along[k : k + 2] * speed[k]
+        ends = keys.places[k : k + 2]
+        velocities = along[k : k + 2] * speed[k]
         places[piece == k] = CubicHermiteSpline([start, end], ends, velocities)(at[piece == k])
     level = np.zeros(len(keys.yaw))
-    turned = camera_poses(keys.places.T, keys.yaw, keys.pitch, level)[:, :3, :3]
+    turned = camera_poses(tuple(keys.places.T), keys.yaw, keys.pitch, level)[:, :3, :3]
     poses = np.tile(np.eye(4), (length, 1, 1))
     turning = Slerp(keys.times, Rotation.from_matrix(turned))
     poses[:, :3, :3] = turning(at.clip(max=keys.times[-1])).as_matrix()
@@ -172,9 +178,3 @@ def _is_fit(room: Room, poses: Poses) -> bool:
     is_calm &= (np.abs(steps.mean(axis=1) / MEAN_STEP - 1) < 0.03).all()
     depths = _views(room, poses)[1].reshape(-1, len(_ACROSS) * len(_DOWN))
     return bool(is_calm and np.quantile(depths, 0.25, axis=1).min() > _NEAR)
-
-
-def _too_full(room: Room) -> NumericalError:
-    return NumericalError(
-        f"room '{room.name}': no path keeps {CLEARANCE} m from surfaces; move its furniture"
-    )

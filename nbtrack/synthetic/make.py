@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import ConfigError, DataError, look_up
+from nbtrack.core.errors import DataError, look_up
 from nbtrack.core.files import fingerprint, json_text, naming_damaged, sources_fingerprint
 from nbtrack.data.writer import WrittenFrame, write_sequence
 from nbtrack.synthetic.keyframes import keyframe_trajectory
@@ -38,12 +38,8 @@ def room_frames(
 
     `seed` is that of the camera's path and of the depth noise. Every frame has its own random
     numbers, so that the result does not depend on the number of threads.
-    Raises `ConfigError` for a number that is too small, and for an unknown motion.
+    Raises `ConfigError` for an unknown motion.
     """
-    asked = [("frames", n_frames, 2), ("width", width, 8), ("height", height, 8), ("seed", seed, 0)]
-    for label, value, minimum in asked:
-        if value < minimum:
-            raise ConfigError(f"{label} = {value}; {minimum} or more are allowed; raise it")
     camera = room_intrinsics(width, height)
     poses = look_up("motion", motion, MOTIONS)(room, n_frames, seed)
 
@@ -104,7 +100,8 @@ def room_of(folder: Path) -> Room | None:
         return None
     with naming_damaged(path, "record of a room", _AGAIN):
         record = json.loads(path.read_text(encoding="utf-8"))
-        name, version = record["room"], record["version"]
+        name = record["room"]
+        version = record["version"]
     if version != ROOM_VERSION:
         raise DataError(f"{path} has version {version}; {ROOM_VERSION} is made here; {_AGAIN}")
     return build_room(name)

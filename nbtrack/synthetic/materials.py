@@ -124,7 +124,8 @@ def lining(
     points: Points, shell: Box, floor: Material, ceiling: Material, sides: Material, ends: Material
 ) -> Points:
     """Colours of a room's shell; `sides` are the walls perpendicular to x, `ends` those to z."""
-    colors, (side, up, end) = np.empty_like(points), shell.normals(points).T
+    colors = np.empty_like(points)
+    side, up, end = shell.normals(points).T
     walls = (np.abs(side) > 0.5, sides), (np.abs(end) > 0.5, ends)
     for chosen, material in ((up > 0.5, floor), (up < -0.5, ceiling), *walls):
         colors[chosen] = material(points[chosen])

@@ -26,6 +26,7 @@ _CALIBRATION_FRAMES = 120  # shorter trajectories are the beginning of one of th
 _CENTER_REACH, _HEADING_REACH = 0.3, 0.25
 _FLATTENING = 0.25  # width of the path's ellipse over its length
 _ATTEMPTS = 400
+_NO_TREMOR = np.zeros((1, 6))
 _CELL = 0.1  # m, of a tour's plan of free space
 _MARGIN = 0.1  # m that the plan keeps in addition to the clearance, since the path is smoothed
 _COVERED = 2.0  # m: the tour passes so near to every free place
@@ -51,13 +52,19 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([seed, attempt, room.number])
         poses = _calibrated_path(room.walk, length, rng)
-        steps, height = steps_between(poses), poses[:, 1, 3]
+        steps = steps_between(poses)
+        height = poses[:, 1, 3]
         calm = (steps.max(axis=1) < 3 * MEAN_STEP).all()
         calm &= (np.abs(steps.mean(axis=1) / MEAN_STEP - 1) < 0.05).all()
         upright = height.min() >= HEIGHTS[0] and height.max() <= HEIGHTS[1]
         if calm and upright and room.sdf(poses[:, :3, 3]).min() >= CLEARANCE:
             return poses[:n_frames]
-    raise NumericalError(
+    raise too_full(room)
+
+
+def too_full(room: Room) -> NumericalError:
+    """What is wrong with a room where no path keeps `CLEARANCE`."""
+    return NumericalError(
         f"room '{room.name}': no path keeps {CLEARANCE} m from surfaces; move its walk or furniture"
     )
 
@@ -71,23 +78,27 @@ def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses
     values[:, 3] += walk.pitch
     values[:, 5] = np.clip(values[:, 5] + rng.uniform(1.3, 1.5), 1.15, 1.65)
     path = CubicSpline(knots * _KNOT_SPACING, values)  # over the angle turned
-    speed, trembling = _relative_speed(length, rng), _tremor(length, rng)
+    speed = _relative_speed(length, rng)
+    trembling = _tremor(length, rng)
     center = np.asarray(walk.center) + rng.uniform(-_CENTER_REACH, _CENTER_REACH, 2)
     heading = walk.start_yaw + rng.uniform(-_HEADING_REACH, _HEADING_REACH)
     axes = -np.array([[np.sin(heading), np.cos(heading)], [np.cos(heading), -np.sin(heading)]])
-    radius, rate = 0.7, np.radians(0.5)
+    radius = 0.7
+    rate = np.radians(0.5)
     for _ in range(12):
         angle = rate * np.concatenate([[0.0], np.cumsum(speed)[:-1]])
         relative_radius, side, yaw_offset, pitch, roll, height = path(angle).T
         turned = walk.turn * angle
         # Opposite to the direction of view, so that the room lies before the camera.
-        along, across = -np.cos(turned + side), -_FLATTENING * np.sin(turned + side)
+        along = -np.cos(turned + side)
+        across = -_FLATTENING * np.sin(turned + side)
         reach = radius * (1.0 + relative_radius[:, None])
         x, z = (center + reach * (np.stack([along, across], axis=1) @ axes)).T
         yaw = heading + turned + yaw_offset
         poses = camera_poses((x, height, z), yaw, pitch, roll, trembling)
         slower = np.clip(MEAN_STEP / steps_between(poses).mean(axis=1), 0.7, 1.4)
-        radius, rate = radius * slower[0], rate * slower[1]
+        radius *= slower[0]
+        rate *= slower[1]
     return poses
 
 
@@ -126,13 +137,10 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     yaw = ndimage.gaussian_filter1d(yaw, _AHEAD)[n_frames : 2 * n_frames]
     height = rng.uniform(1.3, 1.5) + _wander(n_frames, rng, 0.05)
     pitch = room.walk.pitch + _wander(n_frames, rng, 0.09)
-    roll, trembling = _wander(n_frames, rng, 0.025), _tremor(n_frames, rng)
-    poses = camera_poses((x, height, z), yaw, pitch, roll, trembling)
-    if (nearest := room.sdf(poses[:, :3, 3]).min()) < CLEARANCE:
-        raise NumericalError(
-            f"room '{room.name}': the tour comes within {nearest:.2f} m of a surface; "
-            f"{CLEARANCE} m or more are allowed; move the furniture"
-        )
+    roll = _wander(n_frames, rng, 0.025)
+    poses = camera_poses((x, height, z), yaw, pitch, roll, _tremor(n_frames, rng))
+    if room.sdf(poses[:, :3, 3]).min() < CLEARANCE:
+        raise too_full(room)
     return poses
 
 
@@ -190,24 +198,29 @@ def _tremor(n_frames: int, rng: np.random.Generator) -> Float[np.ndarray, "n 6"]
 
     Four sines of 1.5 to 5 Hz each.
     """
-    cycles_per_frame, phases = rng.uniform(1.5, 5.0, (4, 6)) / 30, rng.uniform(0, 2 * np.pi, (4, 6))
+    cycles_per_frame = rng.uniform(1.5, 5.0, (4, 6)) / 30
+    phases = rng.uniform(0, 2 * np.pi, (4, 6))
     amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / 2.0
     waves = np.sin(2 * np.pi * cycles_per_frame * np.arange(n_frames)[:, None, None] + phases)
     return amplitude * waves.sum(axis=1)
 
 
-def camera_poses(places, yaw: Values, pitch: Values, roll: Values, trembling=None) -> Poses:
+def camera_poses(
+    places: tuple[Values, ...], yaw: Values, pitch: Values, roll: Values, trembling=_NO_TREMOR
+) -> Poses:
     """Poses (OpenCV axes) at places (x, y and z, m) with angles (rad), and a tremor on top.
 
     Yaw 0 looks along -z and positive turns left; positive pitch looks up.
     """
-    trembling = np.zeros((len(yaw), 6)) if trembling is None else trembling
-    yaw, pitch = yaw + trembling[:, 4], pitch + trembling[:, 3]
+    yaw = yaw + trembling[:, 4]
+    pitch = pitch + trembling[:, 3]
     roll = (roll + trembling[:, 5])[:, None]
     forward = [-np.sin(yaw) * np.cos(pitch), np.sin(pitch), -np.cos(yaw) * np.cos(pitch)]
     forward = np.stack(forward, axis=-1)
     right = np.stack([np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)], axis=-1)
-    down, cosine, sine = np.cross(forward, right), np.cos(roll), np.sin(roll)
+    down = np.cross(forward, right)
+    cosine = np.cos(roll)
+    sine = np.sin(roll)
     poses = np.tile(np.eye(4), (len(yaw), 1, 1))
     poses[:, :3, 3] = np.stack(places, axis=1) + trembling[:, :3]
     axes = [cosine * right + sine * down, cosine * down - sine * right, forward]

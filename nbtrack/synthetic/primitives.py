@@ -94,7 +94,8 @@ class Box(Solid):
     @cached_property
     def _axes(self) -> Float[np.ndarray, "3 3"]:
         """World from box: the rotation by its yaw."""
-        cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
+        cosine = np.cos(self.yaw)
+        sine = np.sin(self.yaw)
         return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
     def _coordinates(self, points: Points) -> Points:

@@ -44,7 +44,8 @@ def render_frame(
         return room.cast(T_world_camera[:3, 3], directions_camera @ T_world_camera[:3, :3].T)
 
     depth, colors, index = cast(columns, rows)
-    image, surfaces = colors.reshape(height, width, 3), index.reshape(height, width)
+    image = colors.reshape(height, width, 3)
+    surfaces = index.reshape(height, width)
     rough = np.flatnonzero(_rough(image, surfaces))
     # One call for all samples: culling and shading cost per call, not only per ray.
     dx, dy = np.array(_SUBPIXELS).T[:, :, None]
@@ -58,7 +59,8 @@ def _rough(image: Float[np.ndarray, "h w 3"], surfaces: Surfaces) -> Bool[np.nda
     """Pixels that differ from a neighbor in surface or color."""
     looks = np.dstack([image, surfaces])  # another surface differs by one or more
     steep = [np.abs(np.diff(looks, axis=axis)).max(axis=2) > _CONTRAST for axis in (0, 1)]
-    below, right = np.pad(steep[0], ((1, 1), (0, 0))), np.pad(steep[1], ((0, 0), (1, 1)))
+    below = np.pad(steep[0], ((1, 1), (0, 0)))
+    right = np.pad(steep[1], ((0, 0), (1, 1)))
     return below[1:] | below[:-1] | right[:, 1:] | right[:, :-1]
 
 

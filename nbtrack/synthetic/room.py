@@ -90,7 +90,8 @@ class Room:
         points = origin + t[:, None] * directions
         albedo, normals = np.empty_like(points), np.empty_like(points)
         for number in np.unique(index):
-            part, chosen = self.parts[number], np.flatnonzero(index == number)
+            part = self.parts[number]
+            chosen = np.flatnonzero(index == number)
             normals[chosen] = part.solid.normals(points[chosen])
             albedo[chosen] = part.material(points[chosen])
         lifted = points + _OPENNESS_RADIUS * normals
@@ -118,8 +119,8 @@ def build_room(name: str) -> Room:
     for kind, *arguments in table["parts"]:
         material, *shape = _resolved(arguments, named)
         parts.append(Part(getattr(primitives, kind.capitalize())(*shape), material))
-    light, walk = (_resolved(table[key], named) for key in ("light", "walk"))
-    return Room(name, tuple(parts), Light(**light), Walk(**walk))
+    light = Light(**_resolved(table["light"], named))
+    return Room(name, tuple(parts), light, Walk(**_resolved(table["walk"], named)))
 
 
 def _resolved(value: Any, named: dict[str, Material]) -> Any:
