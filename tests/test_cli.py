@@ -110,7 +110,7 @@ def test_a_map_is_taken_with_the_settings_that_made_it(
     """Catches a refusal of the very settings that a map was made with, because a method set others
     beside them; and settings that the map does not have, which no run could follow."""
     folder, out = write_recording("plain", tmp_path / "r"), str(tmp_path / "m")
-    made = ["map", str(folder), "--field", "neus", *TINY, "--set", "mapping.neus.correct_voxel=0.3"]
+    made = ["map", str(folder), "--field", "neus", *TINY, "--set", "correction.neus=0.3"]
     assert main([*made, "--out", out]) == 0
     given = ["track", str(folder), "--map-from", out, "--tracker", "lm", "--steps", "2", *TINY]
     assert main([*given, "--out", str(tmp_path / "run")]) == 0
@@ -193,7 +193,7 @@ def test_a_recording_without_poses_is_tracked_in_a_map(
     frame is tracked, and nothing is said of errors; and a picture that is not there."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 20_000)
     recording = work / "rec"
-    words = ["--set", "mapping.neus.iterations=200", "--set", "mapping.neus.correct_voxel=0.15"]
+    words = ["--set", "mapping.neus.iterations=200", "--set", "correction.neus=0.15"]
     made = ["data", "make", "office", "--out", str(recording), "--n-frames", "12", "--width", "64"]
     assert main(made) == 0
     small = [*TINY_MAP, *words]

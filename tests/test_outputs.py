@@ -260,7 +260,8 @@ def test_threads_belong_to_a_run_and_its_key(work: Path) -> None:
     """Catches seconds a frame of two threads that are given out as those of one."""
     preset = load_preset(settings=[*SET[1::2], "scenes.names=['living_room']"])
     scenes = open_scenes(preset)
-    job = TrackJob(MapJob(scenes[0], "neus", preset), scenes[0], "sdf", 2)
+    made = MapJob.of(scenes[0], "neus", preset)
+    job = TrackJob(made, scenes[0], "sdf", preset.tracking_of("sdf"), 2)
     assert job.key != replace(job, n_threads=2).key
     found = [
         track_scenes(scenes, ["sdf"], preset, [30], clock=True, execution=Execution(threads=n))

@@ -118,7 +118,7 @@ def test_a_method_gives_way_to_the_user(
     preset = load_preset(**given, settings=[f"{key}=64"] if source == "set" else [])
     own = preset.with_method(method.settings)
     assert own.tracking["lm"].n_pixels == 64
-    assert own.mapping["neus_plus"].correct_voxel == 0.04  # what the user left to the method
+    assert own.correction["neus_plus"] == 0.04  # what the user left to the method
     options = Namespace(preset=None, config=given.get("config_file"), settings=[f"{key}=32"])
     assert _preset_of(options, method).tracking["lm"].n_pixels == 32  # as `track` does
     assert load_preset(settings=[f"{key}=512"]).with_method(method.settings) != own
@@ -239,8 +239,8 @@ class Small:
     def mapped(self, preset: Preset, field: str) -> Map:
         settings = preset.mapping_of(field)
         found = map_sequence(field, self.sequence, preset.network_of(field), settings)
-        if getattr(settings, "correct_voxel", 0.0):
-            found = correct_map(found, self.sequence, settings)
+        if preset.correction.get(field):
+            found = correct_map(found, self.sequence, preset.correction[field])
         return found
 
     def track(self, preset: Preset, tracker: str) -> None:
@@ -253,7 +253,7 @@ class Small:
     def use(self, preset: Preset, key: str) -> None:
         """Run what reads a key."""
         part, name, *_ = key.split(".")
-        if part in ("network", "mapping"):
+        if part in ("network", "mapping", "correction"):
             self.mapped(preset, name)
         elif part == "tracking":
             self.track(preset, name)

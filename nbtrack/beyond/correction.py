@@ -90,7 +90,7 @@ class CorrectedField(BakedField):
         source = {n.removeprefix(_SOURCE): x for n, x in state.items() if n.startswith(_SOURCE)}
         mapped = field_class(made["field"]).from_state(source, made, bounds)
         correction = {name: state[name] for name in CORRECTIONS}
-        return cls(mapped, float(made["settings"]["correct_voxel"]), correction)
+        return cls(mapped, float(made["correction"]), correction)
 
 
 def corrected(

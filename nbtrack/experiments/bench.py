@@ -22,11 +22,12 @@ from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings
 from nbtrack.data.sequence import read_frames
 from nbtrack.experiments.grid import Execution, map_scene, track_scenes
-from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Methods, find_methods
+from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
 from nbtrack.experiments.output import output_folder
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.tracking import ClockBudget, StepBudget, make_tracker
+from nbtrack.tracking.methods import Methods, find_methods
 
 _FRAMES_A_CELL = 3  # that a mean of steps in Table II is taken over
 # What a run's row tells beside its place; none of it depends on how fast the machine was.
@@ -60,7 +61,7 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
     execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
     scenes, clock = open_scenes(preset), options.budget == "clock"
     rates_hz = RATES_3_HZ if options.beyond else None
-    how = {"clock": clock, "seeds": options.seeds, "execution": execution}
+    how = {"clock": clock, "seeds": range(options.seeds), "execution": execution}
     results = track_scenes(scenes, methods, preset, rates_hz, **how)
     name = f"{preset.name}_clock" if clock else preset.name
     folder = options.out or runs_folder() / "tables" / name

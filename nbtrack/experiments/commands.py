@@ -12,13 +12,13 @@ from nbtrack.beyond import PointCloud
 from nbtrack.core.errors import ConfigError, DataError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
-from nbtrack.core.settings import as_dict, with_values
+from nbtrack.core.settings import read_settings, with_values
 from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.grid import run_jobs
-from nbtrack.experiments.jobs import OF_MAPS, MapJob, TrackJob
-from nbtrack.experiments.methods import DEFAULT_METHOD, METHODS, Method, method_of
+from nbtrack.experiments.jobs import OF_MAPS, GivenMap, MapJob, TrackJob
+from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
 from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.output import (
     OVERVIEW_FILE,
@@ -34,6 +34,7 @@ from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh
 from nbtrack.recordings.check import check_recording, quick_warning
 from nbtrack.tracking import Trajectory, make_budget
+from nbtrack.tracking.methods import METHODS, Method
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 from nbtrack.tracking.trajectories import read_trajectory, read_tum, write_kitti
 
@@ -60,7 +61,8 @@ def map_command(options: Namespace) -> None:
     preset = _preset_of(options, method)
     scene = _opened(options, preset)
     scene.count(options.frames)
-    job = MapJob(scene, method.field, preset, options.frames, options.seed, options.out)
+    job = MapJob.of(scene, method.field, preset, options.frames, options.seed)
+    job = replace(job, out=options.out)
     with output_folder(options.out):
         _map(job)
         finished = job.map()
@@ -90,21 +92,21 @@ def track_command(options: Namespace) -> None:
     given = read_map(options.map_from) if options.map_from else None
     own = given.field.name if given and not options.method else None
     method = method_of(options.method, options.field or own, options.tracker)
-    preset, map_frames = _preset_of(options, method), options.map_frames or ":"
+    preset = _preset_of(options, method)
     if given:
         _check_fits(given, method, preset, options)
     steps = method.usual_steps if options.steps is options.rate is None else options.steps
     budget = make_budget(steps, options.rate)  # told before a room is made
     scene = _opened(options, preset)
-    scene.count(options.frames, needs_poses=False)
-    if not given:
-        scene.count(map_frames)
-    of_map = map_frames, options.seed, options.map_from, bool(given)
-    job = MapJob(scene, method.field, preset, *of_map)
+    if given:
+        job = GivenMap(given, options.map_from)
+    else:
+        job = MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
+        scene.count(job.frames)
+    what = job, scene, method.tracker, preset.tracking_of(method.tracker)
     how = options.frames, options.seed, options.out, options.threads, options.start
-    run = TrackJob(job, scene, method.tracker, steps, options.rate, *how)
-    if not given:
-        run.check()
+    run = TrackJob(*what, steps, options.rate, *how, preset.words)
+    run.check()
     for warning in reach_warnings([run]):
         tell(f"nbtrack: warning: {warning}")
     with output_folder(options.out):
@@ -127,10 +129,11 @@ def track_command(options: Namespace) -> None:
 
 def _preset_of(options: Namespace, method: Method) -> Preset:
     """The preset with what a method changes, and then the user."""
-    settings = [*options.settings]
-    if getattr(options, "pixels", None) is not None:
-        settings.append(f"tracking.{method.tracker}.n_pixels={options.pixels}")
-    return load_preset(options.preset, options.config, settings).with_method(method.settings)
+    preset = load_preset(options.preset, options.config, options.settings)
+    preset = preset.with_method(method.settings)
+    if getattr(options, "pixels", None) is None:
+        return preset
+    return with_values(preset, {f"tracking.{method.tracker}.n_pixels": options.pixels})
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:
@@ -150,18 +153,15 @@ def _check_fits(given: Map, method: Method, preset: Preset, options: Namespace) 
     if method.field != name:
         advice = "leave --method and --field out"
         raise ConfigError(f"{path} is a map of field {name!r}, not {method.field!r}: {advice}")
-    made = {"network": record["network"], "mapping": record["settings"]}
-    parts = {"network": preset.network_of(name), "mapping": preset.mapping_of(name)}
-    asked = {part: as_dict(settings) for part, settings in parts.items()}
-    of_network = name if name in preset.network else "neus"
-    texts = {text.partition("=")[0].strip(): text for text in options.settings}
-    for part, kind in (("network", of_network), ("mapping", name)):
-        for key in asked[part]:
-            text = texts.get(f"{part}.{kind}.{key}")
-            if text and asked[part][key] != made[part].get(key):
-                advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
-                found = f"{path} was made with other settings than --set {text}"
-                raise ConfigError(f"{found}: {advice}")
+    network = name if name in preset.network else "neus"
+    made = {f"network.{network}.{k}": v for k, v in record["network"].items()}
+    made |= {f"mapping.{name}.{k}": v for k, v in record["settings"].items()}
+    made[f"correction.{name}"] = record.get("correction", 0.0)
+    for key, value in read_settings(*options.settings).items():
+        if made.get(key, value) != value:
+            advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
+            found = f"{path} was made with other settings than --set {key}={value}"
+            raise ConfigError(f"{found}: {advice}")
 
 
 def _map(job: MapJob) -> None:
