@@ -1,9 +1,7 @@
 """The commands that compute the paper anew: `tables`, `bench` (Table II alone), `notebooks`."""
 
-import html
 import importlib.util
 import os
-import re
 import shlex
 from argparse import Namespace
 from dataclasses import replace
@@ -36,11 +34,6 @@ _CELL_COLUMNS = (
     "rotation_rmse_deg", "max_error_m", "frames", "lost_frames", "steps_per_frame", "run",
     "failure",
 )  # fmt: skip
-# Of notebooks as pages: long lines of code; formulas, code and links in Markdown.
-_STYLE = "<style>.jp-InputArea pre { white-space: pre-wrap; }</style>"
-_FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$\n]+?)\$", re.DOTALL)
-_CODE = re.compile(r"(`[^`]*`)")
-_LINK = re.compile(r"\]\(([\w./-]+)\)")
 
 
 def tables_command(options: Namespace) -> None:
@@ -109,7 +102,7 @@ def notebooks_command(options: Namespace) -> None:
     """
     # A wrong setting is refused before the first kernel starts.
     preset = load_preset(options.preset, options.config, options.settings).name
-    if not all(map(importlib.util.find_spec, ("nbconvert", "ipykernel", "latex2mathml"))):
+    if not all(map(importlib.util.find_spec, ("nbconvert", "ipykernel"))):
         raise MissingError("notebooks need Jupyter: pip install 'nbtrack[notebooks]'")
     paths = sorted((project_folder() / "notebooks").glob("[0-9A]*_*.ipynb"))
     if not paths:
@@ -216,40 +209,15 @@ def _run_notebook(path: Path, folder: Path) -> None:
 
 
 def write_page(notebook: Any, source: Path, page: Path) -> None:
-    """Write a notebook as a page that needs no network for its formulas, and the pages' index.
+    """Write a notebook as a page whose title is the notebook's heading.
 
-    Formulas become MathML. Links to notebooks lead to their pages, those to other files to where
-    these lie beside the notebook's `source`. The page has the notebook's heading as its title.
+    Links to notebooks lead to their pages, those to other files to where these lie from the
+    notebook's `source`.
     """
     from nbconvert import HTMLExporter
 
     title = notebook.cells[0].source.splitlines()[0].lstrip("# ")
-    for cell in notebook.cells:
-        if cell.cell_type == "markdown":
-            cell.source = _for_a_page(cell.source, source.parent, page.parent)
-    exporter = HTMLExporter(mathjax_url="")
-    text, _ = exporter.from_notebook_node(notebook, {"metadata": {"name": title}})
-    write_atomic(page, text.replace("</head>", f"{_STYLE}</head>", 1))
-    pages = sorted(page.parent.glob("[0-9A]*.html"))
-    entries = [f'<li><a href="{p.name}">{p.stem.replace("_", " ")}</a></li>' for p in pages]
-    index = "<!doctype html><meta charset=utf-8><title>nbtrack</title><h1>nbtrack</h1><ul>"
-    write_atomic(page.parent / "index.html", index + "".join(entries) + "</ul>\n")
-
-
-def _for_a_page(text: str, source_folder: Path, page_folder: Path) -> str:
-    """Markdown with formulas as MathML and links that lead somewhere; code stays as it is."""
-    from latex2mathml.converter import convert
-
-    def formula(match: re.Match) -> str:
-        kind = "block" if match[1] else "inline"
-        return convert(match[1] or match[2], display=kind)
-
-    def link(match: re.Match) -> str:
-        target = match[1]
-        if target.endswith(".ipynb"):
-            return f"]({Path(target).with_suffix('.html')})"
-        path = os.path.relpath((source_folder / target).resolve(), page_folder.resolve())
-        return f"]({html.escape(path)})"
-
-    parts = _CODE.split(_LINK.sub(link, text))
-    return "".join(p if p.startswith("`") else _FORMULA.sub(formula, p) for p in parts)
+    text, _ = HTMLExporter().from_notebook_node(notebook, {"metadata": {"name": title}})
+    folder = os.path.relpath(source.parent, page.parent)
+    text = text.replace('.ipynb"', '.html"').replace('href="../', f'href="{folder}/../')
+    write_atomic(page, text)

@@ -74,12 +74,12 @@ def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
 def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -> pd.DataFrame:
     """Scores of the maps of some scenes; those that are not cached are made, side by side.
 
-    A row is a map: field, scene, seconds, and the scores, `SCORES`.
+    A row is a map: field, scene, seed, seconds, and the scores, `SCORES`.
     """
     jobs = [MapJob.of(scene, field, preset) for field, scene in product(fields, scenes)]
     return pd.DataFrame(
-        {"field": job.field, "scene": job.scene.name, "seconds": record["seconds"]}
-        | record["quality"]
+        {"field": job.field, "scene": job.scene.name, "seed": job.seed}
+        | {"seconds": record["seconds"], **record["quality"]}
         for job, record in zip(jobs, run_jobs(jobs, "mapping"), strict=True)
     )
 
