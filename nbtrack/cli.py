@@ -63,7 +63,7 @@ OPTIONS = {
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from": _option("track in this map of the room: its folder or file", a_path),
     "--start": _option("given: its own pose, if any (default); unknown: found first", **_STARTS),
-    "--to!": _option("tum, kitti: trajectory; gif, mp4: movie; ply, glb: mesh; map", required=True),
+    "--to!": _option("kitti: trajectory; gif, mp4: movie; ply, glb: mesh", required=True),
     "--budget": _option("steps: the paper's counts (default); clock: this machine's", **_BUDGETS),
     "--scenes": _option("only these scenes of the preset's kind", metavar="A,B"),
     "--seeds": _option("so many maps and runs a cell: mean ± std", some_seeds, default=1),
@@ -114,8 +114,6 @@ class Parser(argparse.ArgumentParser):
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
             choices = [choice.strip("' ") for choice in wrong[2].split(",")]
             message = f"unknown {wrong[1]!r}: {nearest_name(wrong[1], choices)}"
-        dashed = [word for word in sys.argv[1:] if word.startswith("-") and Path(word).exists()]
-        message += "".join(f"; write ./{word} for the file or folder {word}" for word in dashed)
         raise ConfigError(f"{message}; see {self.prog} --help")
 
 

@@ -168,18 +168,6 @@ def test_version(capsys: pytest.CaptureFixture) -> None:
     assert capsys.readouterr().out == f"nbtrack {nbtrack.__version__}\n"
 
 
-@pytest.mark.parametrize("words", [["-dash"], ["office", "--out", "-dash"], ["-dash", "office"]])
-def test_a_folder_that_looks_like_an_option(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    """Catches a refusal that leaves a folder of such a name without a way to give it."""
-    monkeypatch.chdir(tmp_path)
-    Path("-dash").mkdir()
-    monkeypatch.setattr("sys.argv", ["nbtrack", "map", *words, "--field", "neus"])
-    assert main() == 2
-    assert "write ./-dash for the file or folder -dash" in capsys.readouterr().err
-
-
 def test_what_completion_offers() -> None:
     """Catches `nbtrack.<Tab>` that offers imports of the module and none of the public names."""
     assert dir(nbtrack) == sorted(nbtrack.__all__)

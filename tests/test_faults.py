@@ -208,15 +208,15 @@ FILES = {
     "no rotation": (_write(TRAJECTORY, ROW[:-1] + "0"), KITTI, "not a finite pose"),
     "another order": (_write(TRAJECTORY, "0.5 0 0 1 1 2 3 4"), KITTI, "of norm 5.48"),
     "second line": (_write(TRAJECTORY, f"{ROW}\n{ROW[:-2]}"), KITTI, "line 2 is"),
-    "a map for a run": (_nothing, ["export", "map", "--to", "tum", "p"], "no finished run in map"),
+    "a map for a run": (_nothing, ["export", "map", "--to", "kitti", "p"], "no finished run"),
     "no frames": (
         _write("run/frames.csv", ""),
-        ["export", "run", "--to", "tum", "t.txt"],
+        ["export", "run", "--to", "kitti", "t.txt"],
         "run/frames.csv is not a readable table of frames",
     ),
     "bytes for frames": (
         _write("run/frames.csv", b"\x00\xff\xfe\n" * 9),
-        ["export", "run", "--to", "tum", "t.txt"],
+        ["export", "run", "--to", "kitti", "t.txt"],
         "run/frames.csv is not a readable table of frames",
     ),
     "a run for a mesh": (_nothing, ["export", "run", "--to", "glb", "m.glb"], "run holds no"),
@@ -232,7 +232,7 @@ ARGUMENTS = {
     "no format": (["export", "map", "x"], "--to"),
     "no output": (["export", "map", "--to", "glb"], "out"),
     "empty output": (["export", "map", "--to", "glb", ""], "the path is empty"),
-    "onto itself": (["export", "room", "--to", "map", "room"], "room exists: choose another"),
+    "onto itself": (["export", "room", "--to", "ply", "room"], "room exists: choose another"),
     "a method and a field": ([*OWN, "--method", "sdf"], "leave --field and --tracker out"),
     "unknown method": (["track", "living_room", "--method", "corected"], "mean 'corrected'"),
     "a method in another map": ([*GIVEN[:2], "--method", "vr", "--map-from", "map"], "not 'imap'"),
@@ -308,7 +308,7 @@ OUTPUTS = {
     "run below a file": [*OWN, "--out", "room/run"],
     "map into a file": [*MAP, "--out", "room"],
     "map below a file": [*MAP, "--out", "room/map"],
-    "export onto a folder": ["export", "map", "--to", "map", "run"],
+    "export onto a folder": ["export", "map", "--to", "ply", "run"],
     "export below a file": ["export", "run", "--to", "kitti", "room/poses.txt"],
     "export into the kernel": ["export", "run", "--to", "kitti", "/proc/nbtrack/poses.txt"],
     "run into the kernel": [*OWN, "--out", "/proc/nbtrack"],
@@ -371,7 +371,7 @@ def test_a_disk_that_fills_up_while_results_are_written(
     with files_limited_to(n_bytes):
         error = assert_refused(work, capsys, [*OWN, "--seed", "0", "--frames", "1:"], "run")
         assert os.strerror(errno.EFBIG) in error
-        for kind, source in (("map", "map"), ("kitti", "run")):
+        for kind, source in (("ply", "map"), ("kitti", "run")):
             if n_bytes < 200:
                 command = ["export", source, "--to", kind, "new"]
                 assert_refused(work, capsys, command, "File too large")

@@ -52,7 +52,7 @@ def test_a_recording_is_never_written_to(
     commands = [
         ["track", "rec", *OWN[2:], "--out", "rec"],
         ["map", "rec", *MAP[2:], "--out", "rec"],
-        ["export", "run", "--to", "tum", "rec/poses_again.txt"],
+        ["export", "run", "--to", "kitti", "rec/poses_again.txt"],
         ["data", "check", "rec", "--out", "rec"],
         ["tables", *SET, "--out", "rec"],
         ["bench", *SET, "--out", "rec"],
@@ -61,7 +61,7 @@ def test_a_recording_is_never_written_to(
         ["data", "check", "rec", "--out", "rec/depth"],
         ["data", "convert", "rec", "rec/color/again"],
         ["data", "make", "office", "--out", "rec/office"],
-        ["export", "run", "--to", "tum", "rec/poses/new/poses.txt"],
+        ["export", "run", "--to", "kitti", "rec/poses/new/poses.txt"],
     ]
     for command in commands:
         assert_refused(work, capsys, command, "rec holds a recording, where nothing is written")
@@ -76,7 +76,9 @@ def test_files_of_others_stay(work: Path, capsys: pytest.CaptureFixture) -> None
     (work / "mine/trajectory.txt").write_text("0 1 2 3 0 0 0 1\n")
     says = "mine has a trajectory.txt that nbtrack did not write"
     assert_refused(work, capsys, [*OWN, "--out", "mine"], says)
-    assert_refused(work, capsys, ["export", "run", "--to", "tum", "mine/trajectory.txt"], "exists")
+    assert_refused(
+        work, capsys, ["export", "run", "--to", "kitti", "mine/trajectory.txt"], "exists"
+    )
     (work / "mine/trajectory.txt").rename(work / "mine/notes.txt")
     for _ in range(2):  # what it wrote itself, it replaces
         assert main([*OWN, "--out", "mine"]) == 0
@@ -179,7 +181,7 @@ def test_a_folder_comes_before_a_room_of_its_name(
     assert command[4] == str(work / "office")
     shutil.rmtree(work / "office")
     shutil.copytree(work / "run", work / "office")
-    assert open_scene("office", preset).made_by
+    assert open_scene("office", preset).made
 
 
 @pytest.mark.parametrize("kind", ["color", "depth"])

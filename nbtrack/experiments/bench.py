@@ -3,10 +3,10 @@
 import importlib.util
 import os
 import shlex
+import subprocess
+import sys
 from argparse import Namespace
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,7 +15,7 @@ import torch
 from nbtrack import tables
 from nbtrack.core.device import advise_on_memory, choose_device, device_name
 from nbtrack.core.errors import MissingError, NbtrackError
-from nbtrack.core.files import project_folder, runs_folder, write_atomic
+from nbtrack.core.files import project_folder, runs_folder
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings
 from nbtrack.data.sequence import read_frames
@@ -94,11 +94,11 @@ def bench_command(options: Namespace) -> None:
 
 
 def notebooks_command(options: Namespace) -> None:
-    """Execute every notebook in order, as `jupyter nbconvert --execute`.
+    """Execute every notebook in order, by `jupyter nbconvert --execute --to html`.
 
-    Copies, executed and HTML, go to `runs/notebooks/<preset>/`. Settings reach the kernels through
-    the environment, where each notebook's settings cell finds them. Raises MissingError without
-    notebooks or Jupyter, NbtrackError if a cell failed; the copy up to there is kept.
+    Pages go to `runs/notebooks/<preset>/`. Settings reach the kernels through the environment,
+    where each notebook's settings cell finds them. Raises MissingError without notebooks or
+    Jupyter, NbtrackError if a cell failed.
     """
     # A wrong setting is refused before the first kernel starts.
     preset = load_preset(options.preset, options.config, options.settings).name
@@ -111,10 +111,15 @@ def notebooks_command(options: Namespace) -> None:
     os.environ |= {"NBTRACK_PRESET": preset, "NBTRACK_SET": settings.strip()}
     if options.config:
         os.environ["NBTRACK_CONFIG"] = str(options.config.resolve())
+    folder = runs_folder() / "notebooks" / preset
+    convert = [sys.executable, "-m", "nbconvert", "--execute", "--to=html", "--output-dir", folder]
     with ProgressBar("notebooks", len(paths)) as bar:
         for done, path in enumerate(paths):
             bar.move_to(done, path.stem)
-            _run_notebook(path, runs_folder() / "notebooks" / preset)
+            found = subprocess.run([*convert, path], stderr=subprocess.PIPE, text=True)
+            if found.returncode != 0:
+                raise NbtrackError(f"{path.name} failed: {found.stderr.strip().splitlines()[-1]}")
+            print(folder / f"{path.stem}.html")
         bar.move_to(len(paths))
 
 
@@ -187,37 +192,3 @@ def _note(preset: Preset, clock: bool) -> str:
     label = f"{preset.name}, with {changed}" if changed else preset.name
     budget = "wall clock" if clock else preset.step_counts
     return f"Preset: {label}; budget: {budget}; device: {device_name(choose_device())}."
-
-
-def _run_notebook(path: Path, folder: Path) -> None:
-    """Run one notebook in a fresh kernel; its copies go to the folder."""
-    import nbformat
-    from nbconvert.preprocessors import CellExecutionError, ExecutePreprocessor
-
-    notebook, page = nbformat.read(path, 4), folder / f"{path.stem}.html"
-    options = {"record_timing": False, "extra_arguments": ["--log-level=ERROR"]}  # no talk of ports
-    run = ExecutePreprocessor(timeout=None, kernel_name="python3", **options)
-    try:
-        run.preprocess(notebook, {"metadata": {"path": str(path.parent)}})
-    except CellExecutionError as error:
-        failed = f"{path.name} failed with {error.ename}: {error.evalue}"
-        raise NbtrackError(f"{failed}; see the last cell of {folder / path.name}") from None
-    finally:
-        write_atomic(folder / path.name, nbformat.writes(notebook) + "\n")
-    write_page(notebook, path, page)
-    print(page)
-
-
-def write_page(notebook: Any, source: Path, page: Path) -> None:
-    """Write a notebook as a page whose title is the notebook's heading.
-
-    Links to notebooks lead to their pages, those to other files to where these lie from the
-    notebook's `source`.
-    """
-    from nbconvert import HTMLExporter
-
-    title = notebook.cells[0].source.splitlines()[0].lstrip("# ")
-    text, _ = HTMLExporter().from_notebook_node(notebook, {"metadata": {"name": title}})
-    folder = os.path.relpath(source.parent, page.parent)
-    text = text.replace('.ipynb"', '.html"').replace('href="../', f'href="{folder}/../')
-    write_atomic(page, text)

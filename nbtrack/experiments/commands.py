@@ -14,7 +14,13 @@ from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import read_settings, with_values
 from nbtrack.data.recording import Recording, open_recording
-from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames
+from nbtrack.data.sequence import (
+    RgbdSequence,
+    parse_frames,
+    read_frames,
+    select_frames,
+    without_outliers,
+)
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.grid import run_jobs
 from nbtrack.experiments.jobs import OF_MAPS, GivenMap, MapJob, TrackJob
@@ -27,9 +33,9 @@ from nbtrack.experiments.output import (
     output_folder,
     save_picture,
 )
-from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
+from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
-from nbtrack.mapping.files import MAP_FILE, MESH_FILE, Map, read_map
+from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh
 from nbtrack.recordings.check import check_recording, quick_warning
@@ -45,6 +51,7 @@ _MEANINGS = {
     "frames_without_reference": "frames without a true pose, in no error",
     "frames_without_depth": "frames without any depth, not searched",
 }
+_FRAMES_APART = 10  # of a mesh: neighbours see the same
 _FRAMES_SHOWN, _CELLS = 20, 120  # of an overview: frames that tell what was seen; cells across
 _MOVIE_FRAMES = 100
 
@@ -75,9 +82,11 @@ def map_command(options: Namespace) -> None:
 def _write_mesh(job: MapJob, finished: Map) -> None:
     """The mesh of what was seen, beside a map."""
     try:
-        # Every tenth frame says enough of what has been seen: neighbours see the same.
-        sequence = job.scene.read(job.frames)
-        mesh = extract_mesh(finished.field, sequence.select(slice(None, None, 10)))
+        recording = job.scene.recording
+        frame_ids = select_frames(recording, parse_frames(job.frames))
+        mapped = frame_ids[recording.has_pose[frame_ids]]
+        seen = without_outliers(read_frames(recording, mapped[::_FRAMES_APART]))
+        mesh = extract_mesh(finished.field, seen)
     except DataError as error:
         print(f"  no mesh: {error}")
         return
@@ -105,7 +114,7 @@ def track_command(options: Namespace) -> None:
         scene.count(job.frames)
     what = job, scene, method.tracker, preset.tracking_of(method.tracker)
     how = options.frames, options.seed, options.out, options.threads, options.start
-    run = TrackJob(*what, steps, options.rate, *how, preset.words)
+    run = TrackJob(*what, steps, options.rate, *how)
     run.check()
     for warning in reach_warnings([run]):
         tell(f"nbtrack: warning: {warning}")
@@ -140,7 +149,7 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
     """The scene that is named, and a warning where it is likely read wrongly."""
     scene = open_scene(options.sequence, preset, options.format)
     # A room of the cache is as it should be.
-    if not scene.made_by and (said := quick_warning(scene.recording)):
+    if not scene.made and (said := quick_warning(scene.recording)):
         tell(f"nbtrack: warning: {said}; `data check` tells more")
     return scene
 
@@ -229,11 +238,6 @@ def export_command(options: Namespace) -> None:
 
 def _export_map(source: Path, format_name: str, out: Path) -> str:
     finished, seen = read_map(source), source / MESH_FILE
-    if format_name == "map":
-        content = (source / MAP_FILE if source.is_dir() else source).read_bytes()
-        write_atomic(out, content)
-        megabytes = len(content) / 1e6
-        return f"{finished.field.label} map of {finished.record['scene']}, {megabytes:.2f} MB"
     is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
     with naming_damaged(seen, "mesh", "remove it and map again"):
         mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)
@@ -263,25 +267,21 @@ def _export_movie(source: Path, format_name: str, out: Path) -> str:
 
 
 def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
-    n_poses, path = len(read_trajectory(source).frames), source / "trajectory.txt"
-    if format_name == "kitti":
-        write_kitti(out, read_tum(path)[1])
-        return f"{n_poses} poses, KITTI: three rows of the matrix (m), no time stamps"
-    write_atomic(out, path.read_bytes())
-    return f"{n_poses} poses, TUM: timestamp (s), position (m), quaternion xyzw"
+    n_poses = len(read_trajectory(source).frames)
+    write_kitti(out, read_tum(source / "trajectory.txt")[1])
+    return f"{n_poses} poses, KITTI: three rows of the matrix (m), no time stamps"
 
 
 _EXPORTS = {
-    **dict.fromkeys(("tum", "kitti"), _export_trajectory),
-    **dict.fromkeys(("ply", "glb", "map"), _export_map),
+    "kitti": _export_trajectory,
+    **dict.fromkeys(("ply", "glb"), _export_map),
     **dict.fromkeys(("gif", "mp4"), _export_movie),
 }
 
 
 def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
-    chosen = "motion", "n_frames", "width", "seed"
-    config = with_values(ScenesConfig(), {name: getattr(options, name) for name in chosen})
+    config = with_values(ScenesConfig(), {name: getattr(options, name) for name in SIZES})
     check_no_recording(options.out)
     write_room(options.room, options.out, config)
     print(f"{options.out}: {options.room}, {options.n_frames} frames, seed {options.seed}")

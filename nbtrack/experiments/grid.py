@@ -120,7 +120,7 @@ def track_scenes(
         what = made, seen, method.tracker, own.tracking_of(method.tracker)
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
         budget = n_steps, rate_hz if clock else None
-        jobs.append(TrackJob(*what, *budget, seed=seed, words=own.words, **how))
+        jobs.append(TrackJob(*what, *budget, seed=seed, **how))
         rows.append({"rate_hz": rate_hz, "steps": n_steps, "method": method.label})
     return pd.DataFrame(map(_row_of, rows, jobs, _run(jobs, clock, execution)))
 
@@ -146,7 +146,7 @@ def _row_of(
     row["n_pixels"] = job.settings.n_pixels
     if isinstance(result, NbtrackError):
         return {**row, "failure": str(result), "ate_m": float("nan")}
-    metrics = {k: v for k, v in result.items() if k not in ("config", "versions")}
+    metrics = {k: v for k, v in result.items() if k not in ("config", "map_config", "versions")}
     return {**metrics, **row, "failure": "", "ate_m": result.get("ate_rmse_m", float("nan"))}
 
 
@@ -165,7 +165,7 @@ def run_jobs(jobs: Sequence[Job], title: str, execution: Execution | None = None
     done = dict.fromkeys(missing, 0.0)  # shares: each job counts as one, however long it takes
 
     def show(folder: Path, share: float, status: str) -> None:
-        done[folder] = share
+        done[folder] = max(share, done[folder])  # news of a worker may come late
         ended = f"{len(results)} of {len(missing)} done"
         bar.move_to(sum(done.values()), f"{ended}, {missing[folder].name}: {status}")
 
@@ -215,34 +215,29 @@ def _on_workers(
     processes are started.
     """
     import dask
-    from distributed import wait
+    from distributed import as_completed
     from distributed.scheduler import KilledWorker
 
     with dask.config.set(_LOCAL), _main_kept_back(), _cluster(address, workers) as client:
-        topic, news = f"nbtrack-{os.getpid()}-{time.time_ns()}", []
-        client.subscribe_topic(topic, lambda event: news.append(event[1]))
+        topic = f"nbtrack-{os.getpid()}-{time.time_ns()}"
+        client.subscribe_topic(topic, lambda event: show(Path(event[1][0]), *event[1][1:]))
         settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
         settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
         how = topic, settings, n_threads, (FIELDS, TRACKERS)
-        waiting: dict[Path, Any] = {}
+        futures: dict[Path, Any] = {}
         for folder, job in jobs.items():
-            needed = waiting.get(job.needs.folder) if job.needs else None
-            waiting[folder] = client.submit(_outcome_there, job, needed, *how, pure=False)
-        while waiting:
-            with contextlib.suppress(TimeoutError):
-                wait([*waiting.values()], timeout=_REPORT_SECONDS, return_when="FIRST_COMPLETED")
-            while news:
-                name, share, status = news.pop(0)
-                if Path(name) in waiting:
-                    show(Path(name), share, status)
-            for folder in [folder for folder, future in waiting.items() if future.done()]:
-                try:
-                    outcome = waiting.pop(folder).result()
-                except KilledWorker:
-                    died = f"a worker process died at {folder.name}, perhaps for lack of memory"
-                    advice = "run it again, with fewer --workers or smaller settings"
-                    outcome = NbtrackError(f"{died}: {advice}")
-                yield folder, outcome
+            needed = futures.get(job.needs.folder) if job.needs else None
+            futures[folder] = client.submit(_outcome_there, job, needed, *how, pure=False)
+        folders = {future: folder for folder, future in futures.items()}
+        for future in as_completed(folders):
+            folder = folders[future]
+            try:
+                outcome = future.result()
+            except KilledWorker:
+                died = f"a worker process died at {folder.name}, perhaps for lack of memory"
+                advice = "run it again, with fewer --workers or smaller settings"
+                outcome = NbtrackError(f"{died}: {advice}")
+            yield folder, outcome
 
 
 def _outcome_there(

@@ -14,11 +14,11 @@ from nbtrack.beyond.correct import correct_map
 from nbtrack.core import files
 from nbtrack.core.device import advise_on_memory, choose_device, device_name, threads
 from nbtrack.core.errors import DataError, NbtrackError
-from nbtrack.core.settings import as_dict
+from nbtrack.core.settings import as_dict, changed_settings
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import parse_frames, select_frames
 from nbtrack.experiments.output import check_no_recording
-from nbtrack.experiments.presets import Preset
+from nbtrack.experiments.presets import PRESETS, SIZES, Preset
 from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class, make_field
@@ -46,7 +46,8 @@ _OTHER_WORLD = (
 )
 OF_MAPS = ("network.", "mapping.", "correction.")
 """How keys of settings begin that only matter where a map is made."""
-_WORDS_OF_MAPS = tuple(f"--set={key}" for key in OF_MAPS)
+_MAP_SETTINGS = ("network", "settings", "correction")  # in the record of a map
+_PLAIN = "synthetic"  # the preset whose settings are the classes' own
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""
 
@@ -143,6 +144,15 @@ class MapJob(Job):
             return read_map(self.folder).record.get("key") == self.key
         return is_there
 
+    def setting_tree(self) -> dict[str, Any]:
+        """Its settings where a preset has them."""
+        network = self.field if self.field in replace(PRESETS[_PLAIN]).network else "neus"
+        return {
+            "network": {network: self.network} if self.network else {},
+            "mapping": {self.field: self.settings},
+            "correction": {self.field: self.correction} if self.correction else {},
+        }
+
     def result(self) -> dict[str, Any]:
         """How the finished map was made, and its scores."""
         return self.map().record
@@ -228,7 +238,6 @@ class TrackJob(Job):
     out: Path | None = None
     n_threads: int | None = None  # CPU threads to track with; by default the process's
     start: str = "given"  # the first frame's true pose, where known; or "unknown"
-    words: tuple[str, ...] = ()  # of the command line, that give the settings
 
     kind = "tracks"
 
@@ -254,12 +263,8 @@ class TrackJob(Job):
     @property
     def is_elsewhere(self) -> bool:
         """Whether the map was made from another recording."""
-        return self.is_in_given_map or self.scene.folder != self.needs.scene.folder
-
-    @property
-    def is_in_given_map(self) -> bool:
-        """Whether the map was not made for this run."""
-        return isinstance(self.needs, GivenMap)
+        made = self.needs
+        return isinstance(made, GivenMap) or self.scene.folder != made.scene.folder
 
     @property
     def is_done(self) -> bool:
@@ -297,9 +302,7 @@ class TrackJob(Job):
             tracked, is_explained = in_world_of_map(tracked)
             notes["map_warning"] = _OTHER_WORLD if is_explained else None
         metrics = _scores(tracked) | self._provenance(n_threads) | notes
-        if metrics.get("path_m") and "ate_rmse_m" in metrics:
-            metrics["ate_over_path"] = metrics["ate_rmse_m"] / metrics["path_m"]
-        times, origin = tracked.frames["time"].to_numpy(), np.array(notes.get("origin", [0, 0, 0]))
+        times, origin = tracked.frames["time"].to_numpy(), np.array(notes["origin"])
         texts = {
             "trajectory.txt": tum_text(times, shifted(tracked.T_estimated, origin)),
             "groundtruth.txt": tum_text(times, shifted(tracked.T_true, origin)),
@@ -319,12 +322,9 @@ class TrackJob(Job):
         origin = np.array(finished_map.record["origin"])
         sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
         notes = {"map_seconds": finished_map.record["seconds"], "budget": str(budget)}
-        if origin.any():
-            notes["origin"] = origin.tolist()
-        notes |= still_metrics(sequence.T_world_camera)
-        bounds = finished_map.field.bounds
-        notes["metres_per_unit"] = bounds.metres_per_unit
-        notes["half_longest_side_m"] = bounds.half_longest_side
+        notes |= {"origin": origin.tolist(), **still_metrics(sequence.T_world_camera)}
+        metres_per_unit = finished_map.field.bounds.metres_per_unit
+        notes["metres_per_unit"] = metres_per_unit
         if self.is_elsewhere:
             notes["map_from"] = finished_map.record
         T_first = sequence.T_world_camera[0]
@@ -342,9 +342,9 @@ class TrackJob(Job):
 
         checkpoint = self.cache / RUN_FILE  # a folder of the user's holds results alone
         tracked = track_sequence(tracker, sequence, checkpoint, tell, is_start_known)
-        reach = self.settings.reach(tracked.frames["steps"].mean(), bounds.metres_per_unit)
+        reach = self.settings.reach(tracked.frames["steps"].mean(), metres_per_unit)
         how = sequence.T_world_camera, self.settings.motion_model
-        if self.is_in_given_map:
+        if isinstance(self.needs, GivenMap):
             followed = sequence.select(slice(len(sequence) - len(tracked.frames), None))
             if notes["map_warning"] == _OTHER_WORLD:
                 followed = replace(followed, T_world_camera=tracked.T_estimated)
@@ -357,7 +357,7 @@ class TrackJob(Job):
 
         Where that is not used, and the map does not fit it, the recording has a world of its own.
         """
-        if not self.is_in_given_map or first.T_world_camera is None:
+        if not isinstance(self.needs, GivenMap) or first.T_world_camera is None:
             return None  # another path of a room may begin where no map reaches
         try:
             return check_belongs(finished_map, first)
@@ -382,37 +382,29 @@ class TrackJob(Job):
             "format": self.scene.format,
             "map": str(self.needs.folder.resolve()),
             "map_key": finished.key,
-            "config": {
-                "network": finished.record["network"],
-                "mapping": finished.record["settings"],
-                "correction": finished.record.get("correction", 0.0),
-                "tracking": as_dict(self.settings),
-            },
+            "config": as_dict(self.settings),
+            "map_config": {name: finished.record.get(name) for name in _MAP_SETTINGS},
         }
 
     def _command(self) -> str:
         """What makes this run anew, and its map where that is not cached."""
-        sequence, words = str(self.scene.folder), self.words
+        options = {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
+        options |= {"start": self.start, "frames": self.frames, "seed": self.seed}
+        options |= {"device": choose_device().type, "threads": self.n_threads}
+        options |= {"format": self.scene.format, "preset": _PLAIN}
+        settings: dict[str, Any] = {"tracking": {self.tracker: self.settings}}
         if self.is_elsewhere:
-            of_map = {"map-from": self.needs.folder}
-            words = [word for word in words if not word.startswith(_WORDS_OF_MAPS)]
+            options["map-from"] = self.needs.folder
         else:
-            of_map = {"field": self.needs.field, "map-frames": self.needs.frames}
-            sequence = self.scene.name if self.scene.made_by else sequence
-        options = {
-            "format": self.scene.format,
-            **of_map,
-            "tracker": self.tracker,
-            "rate": self.rate_hz,
-            "steps": self.steps,
-            "start": self.start,
-            "frames": self.frames,
-            "seed": self.seed,
-            "device": choose_device().type,
-            "threads": self.n_threads,
-        }
-        given = [f"--{name}={value}" for name, value in options.items() if value is not None]
-        words = ["python", "-m", "nbtrack", "track", sequence, *words, *given]
+            options |= {"field": self.needs.field, "map-frames": self.needs.frames}
+            settings |= self.needs.setting_tree()
+        sequence = str(self.scene.folder)
+        if self.scene.made and not self.is_elsewhere:
+            sequence, made = self.scene.name, self.scene.made
+            settings["scenes"] = {name: getattr(made, name) for name in SIZES}
+        words = [f"--set={text}" for text in changed_settings(settings, replace(PRESETS[_PLAIN]))]
+        words += [f"--{name}={value}" for name, value in options.items() if value is not None]
+        words = ["python", "-m", "nbtrack", "track", sequence, *words]
         return shlex.join([*words, "--out", f"again_{self.name}"])
 
 

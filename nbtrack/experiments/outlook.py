@@ -1,10 +1,9 @@
 """What can be said of runs before they are made: whether the camera outruns their search."""
 
 import contextlib
+import math
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
-
-import numpy as np
 
 from nbtrack.core.errors import NbtrackError
 from nbtrack.data.sequence import observed_bounds, parse_frames, read_frames, select_frames
@@ -20,31 +19,28 @@ _LEAST_ATE, _SHARE = 0.01, 0.5
 
 
 def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
-    """A line for each kind of run whose search falls behind its camera, whatever the map is."""
-    kinds: dict[tuple, list[TrackJob]] = {}
+    """A line for each kind of run whose search falls behind its camera, whatever the map is; it
+    names the first scene where that is so."""
+    told = set()
     for run in runs:
-        kinds.setdefault((run.tracker, run.settings, run.steps), []).append(run)
-    for (tracker, settings, steps), alike in kinds.items():
-        seen = {run.scene.name: expected_reach(run) for run in alike}
-        short = {name: r for name, r in seen.items() if _is_short(r)}
-        if not short:
+        kind = run.tracker, run.settings, run.steps
+        if kind in told:
             continue
-        scene, worst = max(short.items(), key=lambda pair: pair[1]["least_ate_m"])
-        others = f" (of {len(short)} scenes)" if len(short) > 1 else ""
-        bound = f", and the best that follows it has an ATE of {worst['least_ate_m']:.3f} m there"
-        velocity = f"--set tracking.{tracker}.motion_model=constant_velocity, "
+        found = expected_reach(run)
+        least_m, share = found.get("least_ate_m", 0.0), found.get("beyond_reach_share", 0.0)
+        if least_m <= _LEAST_ATE and share <= _SHARE:
+            continue
+        told.add(kind)
+        bound = f", and the best that follows it has an ATE of {least_m:.3f} m there"
+        velocity = f"--set tracking.{run.tracker}.motion_model=constant_velocity, "
         yield (
-            f"{steps:g} steps of {tracker} move the camera by at most {1e3 * worst['reach_m']:.1f} "
-            f"mm along an axis and {worst['reach_deg']:.2f} deg about it; it moves farther in "
-            f"{worst['beyond_reach_share']:.0%} of the frames of {scene}{others}"
-            f"{bound if worst['least_ate_m'] > _LEAST_ATE else ''}: take more steps, a lower rate, "
-            f"{velocity if settings.motion_model == 'previous_pose' else ''}or --method corrected"
+            f"{run.steps:g} steps of {run.tracker} move the camera by at most "
+            f"{1e3 * found['reach_m']:.1f} mm along an axis and {found['reach_deg']:.2f} deg about "
+            f"it; it moves farther in {share:.0%} of the frames of {run.scene.name}"
+            f"{bound if least_m > _LEAST_ATE else ''}: take more steps, a lower rate, "
+            f"{velocity if run.settings.motion_model == 'previous_pose' else ''}"
+            "or --method corrected"
         )
-
-
-def _is_short(reach: dict[str, float]) -> bool:
-    least_m, share = reach.get("least_ate_m", 0.0), reach.get("beyond_reach_share", 0.0)
-    return least_m > _LEAST_ATE or share > _SHARE
 
 
 def expected_reach(run: TrackJob) -> dict[str, float]:
@@ -62,13 +58,12 @@ def expected_reach(run: TrackJob) -> dict[str, float]:
 
 def _unit_of(job: MapJob) -> float:
     """Metres a unit of a map; about those of one that is still to be made."""
-    if job.is_done:
-        return job.map().field.bounds.metres_per_unit
-    return _rough_unit(job.scene, job.frames)
+    is_done = job.is_done
+    return job.map().field.bounds.metres_per_unit if is_done else _rough_unit(job.scene, job.frames)
 
 
 @lru_cache
 def _rough_unit(scene: Scene, frames: str) -> float:
     ids = select_frames(scene.recording, parse_frames(frames))
-    some = ids[np.linspace(0, len(ids) - 1, min(len(ids), _FRAMES_LOOKED_AT)).astype(int)]
+    some = ids[:: math.ceil(len(ids) / _FRAMES_LOOKED_AT)]
     return observed_bounds(read_frames(scene.recording, some)).metres_per_unit

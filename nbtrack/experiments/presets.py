@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from nbtrack.core.errors import ConfigError, MissingError, look_up
-from nbtrack.core.settings import changed_settings, flat, limited, read_settings, with_values
+from nbtrack.core.settings import flat, limited, read_settings, with_values
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
@@ -32,6 +32,10 @@ class ScenesConfig:
     width: int = limited(640, 11, 4096)  # pixels; the height is three quarters of it
     track_frames: str = ":"  # the Python slice of frames that is tracked
     seed: int = limited(0, 0, 2**31 - 1)
+
+
+SIZES = ("motion", "n_frames", "width", "seed")
+"""What tells a synthetic room's recording from others of it."""
 
 
 @dataclass(frozen=True)
@@ -94,12 +98,6 @@ class Preset:
         width, own_width = NetworkSettings().width, self.network_of("neus").width
         there = f"measured there with n = {paper} and {width} units a layer"
         return f"the paper's step counts, {there}; here n = {own} and {own_width} units"
-
-    @property
-    def words(self) -> tuple[str, ...]:
-        """What gives this preset on the command line."""
-        changed = changed_settings(self, PRESETS[self.name])
-        return f"--preset={self.name}", *(f"--set={text}" for text in changed)
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
         """The preset with the `key=value` texts of a method, and then what a user chose."""

@@ -40,7 +40,7 @@ class Scene:
     name: str
     folder: Path
     format: str | None = None  # None: told by the files that are there
-    made_by: str = ""  # of a room in the cache: what tells its generator from others; else empty
+    made: ScenesConfig | None = None  # how, if it is a room of the cache
 
     @property
     def room(self) -> Room | None:
@@ -55,7 +55,7 @@ class Scene:
     @cached_property
     def fingerprint(self) -> str:
         """Changes with what is read. A room of the cache is made anew as it was."""
-        return self.made_by or fingerprint(*self.recording.contents())
+        return self.folder.parent.name if self.made else fingerprint(*self.recording.contents())
 
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
         """The frames of a slice such as `10:50:2`, `without_outliers`; more options and errors: see
@@ -140,7 +140,7 @@ def _room(name: str, config: ScenesConfig) -> Scene:
                     shutil.rmtree(folder)
                 write_room(name, folder, config)
                 write_atomic(folder.with_suffix(".digest"), _digest_of(folder))
-    return Scene(name, folder, made_by=f"{name}-{recipe}")
+    return Scene(name, folder, made=config)
 
 
 def _is_whole(folder: Path) -> bool:
