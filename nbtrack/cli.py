@@ -58,7 +58,6 @@ OPTIONS = {
     "--tracker": _option("in place of a method: vr, sdf, lm or another tracker"),
     "--rate": _option("frames a second, by the clock", float, metavar="HZ"),
     "--steps": _option("steps a frame (default: to convergence; vr, sdf: as at 2 Hz)", float),
-    "--pixels": _option("pixels or points a frame, or a step of vr and sdf", int),
     "--frames": _option("Python slice of frames, A:B:S", default=":"),
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from": _option("track in this map of the room: its folder or file", a_path),
@@ -88,7 +87,7 @@ _PRESET = " --preset --config --set"
 _RUN = " --device --threads" + _PRESET
 _MADE = " --method --field --format --frames --seed --out" + _RUN
 _PARTS = " --format --depth-folder --poses"
-_TRACKED = " --tracker --rate --steps --pixels --map-frames --map-from --start"
+_TRACKED = " --tracker --rate --steps --map-frames --map-from --start"
 _CELLS = "--budget --scenes --method --beyond --seeds --workers --dask --out"
 # By name: what it does, and its options. `map` is done by the function `map_command`, `data make`
 # by `make_command`.

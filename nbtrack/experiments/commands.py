@@ -139,10 +139,7 @@ def track_command(options: Namespace) -> None:
 def _preset_of(options: Namespace, method: Method) -> Preset:
     """The preset with what a method changes, and then the user."""
     preset = load_preset(options.preset, options.config, options.settings)
-    preset = preset.with_method(method.settings)
-    if getattr(options, "pixels", None) is None:
-        return preset
-    return with_values(preset, {f"tracking.{method.tracker}.n_pixels": options.pixels})
+    return preset.with_method(method.settings)
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:

@@ -139,10 +139,9 @@ class MapJob(Job):
     @property
     def is_done(self) -> bool:
         """Whether the map is finished and scored; in a folder of the user's, whether it is this."""
-        is_there = (self.folder / MAP_FILE).is_file()
-        if is_there and self.out is not None:
-            return read_map(self.folder).record.get("key") == self.key
-        return is_there
+        if not (self.folder / MAP_FILE).is_file():
+            return False
+        return self.out is None or self._stored().record.get("key") == self.key
 
     def setting_tree(self) -> dict[str, Any]:
         """Its settings where a preset has them."""
@@ -155,12 +154,15 @@ class MapJob(Job):
 
     def result(self) -> dict[str, Any]:
         """How the finished map was made, and its scores."""
-        return self.map().record
+        return self._stored().record
 
     def map(self) -> Map:
         """The finished map, ready for tracking."""
-        finished = _read(self.folder, self.key)
+        finished = self._stored()
         return replace(finished, field=finished.field.to(choose_device()))
+
+    def _stored(self) -> Map:
+        return _read(self.folder, (self.folder / MAP_FILE).stat().st_mtime_ns)
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Map and score, or resume; write the map's files."""
@@ -173,7 +175,7 @@ class MapJob(Job):
         parts = self.field, sequence, self.network, self.settings, self.seed
         if path.is_file():  # a folder of the user's, with another finished map
             recipe = recipe_of(*parts) | {"correction": self.correction}
-            check_recipe(path, read_map(self.folder).record, recipe)
+            check_recipe(path, self._stored().record, recipe)
         if self.needs:
             finished = correct_map(self.needs.map(), sequence, self.correction)
         else:
@@ -218,7 +220,7 @@ class GivenMap(Job):
 
 
 @lru_cache(maxsize=4)
-def _read(folder: Path, key: str) -> Map:
+def _read(folder: Path, modified_ns: int) -> Map:
     """Read once for all runs in a map: a corrected one samples its network, which takes seconds."""
     return read_map(folder)
 
