@@ -135,21 +135,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)
         return 0
-    except NbtrackError as error:
-        cause, message, status = error, " ".join(str(error).split()), 2
-    except OSError as error:  # a disk that is full or read-only, a file where a folder should be
-        cause = error
+    except (NbtrackError, OSError, MemoryError, KeyboardInterrupt) as error:
+        if os.environ.get("NBTRACK_DEBUG"):
+            traceback.print_exception(error)
+        print(f"nbtrack: {_message_of(error)}", file=sys.stderr)
+        return STATUS if isinstance(error, KeyboardInterrupt) else 2
+
+
+def _message_of(error: BaseException) -> str:
+    """What a user is told of what ended a command, in a line."""
+    if isinstance(error, NbtrackError):
+        return " ".join(str(error).split())
+    if isinstance(error, OSError):  # a disk that is full, a file where a folder should be
         where = error.filename2 or error.filename or "the output"
-        message, status = f"{where}: {error.strerror or error}; mend it and run again", 2
-    except MemoryError as error:  # where no job says what needs it
-        cause = error
-        message, status = "out of memory: take fewer frames, as with --frames ::2", 2
-    except KeyboardInterrupt as interruption:
-        cause, message, status = interruption, INTERRUPTED, STATUS
-    if os.environ.get("NBTRACK_DEBUG"):
-        traceback.print_exception(cause)
-    print(f"nbtrack: {message}", file=sys.stderr)
-    return status
+        return f"{where}: {error.strerror or error}; mend it and run again"
+    if isinstance(error, MemoryError):  # where no job says what needs it
+        return "out of memory: take fewer frames, as with --frames ::2"
+    return INTERRUPTED
 
 
 class _Pipe(io.FileIO):

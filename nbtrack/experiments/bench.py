@@ -151,7 +151,8 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     T_first = sequence.T_world_camera[0]
     with ProgressBar("Table II", len(plan)) as bar:
         for done, (method, n_pixels) in enumerate(plan):
-            name, own = method.tracker, preset.with_method(method.settings)
+            name = method.tracker
+            own = preset.with_method(method.settings)
             bar.move_to(done, f"{name}={n_pixels}")
             settings = replace(own.tracking_of(name), n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):

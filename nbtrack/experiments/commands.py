@@ -199,7 +199,8 @@ def _draw_overview(run: TrackJob) -> None:
     except DataError as error:
         print(f"  no picture: {error}")
         return
-    title, paths = f"{run.scene.name}: {run.tracker} in {field.label}, {n_frames} frames", {}
+    title = f"{run.scene.name}: {run.tracker} in {field.label}, {n_frames} frames"
+    paths = {}
     if "ate_rmse_m" in metrics:
         ate, still = (100 * metrics.get(n, np.nan) for n in ("ate_rmse_m", "still_ate_m"))
         title += f", ATE {ate:.2f} cm (standing still {still:.0f} cm)"

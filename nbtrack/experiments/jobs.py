@@ -26,17 +26,11 @@ from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, writ
 from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
 from nbtrack.mapping.holdout import check_belongs
 from nbtrack.recordings.in_map import look_in_map
-from nbtrack.tracking import (
-    TrackerSettings,
-    Trajectory,
-    make_budget,
-    make_tracker,
-    track_sequence,
-    tracker_class,
-)
+from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
 from nbtrack.tracking.reach import reach_metrics
 from nbtrack.tracking.starts import expected_poses
+from nbtrack.tracking.tracker import TrackerSettings
 from nbtrack.tracking.trajectories import METRICS_FILE, in_world_of_map, shifted, tum_text
 
 RUN_FILE = "run.pt"

@@ -99,10 +99,11 @@ def open_scenes(preset: Preset) -> list[Scene]:
     returned. Raises ConfigError where no name is given, or one twice, or an unknown one; where no
     scene is whole, what is wrong with the first.
     """
-    names, scenes, missing = preset.scenes.names, [], {}
+    names = preset.scenes.names
     if not names or len({resolved(name).name for name in names}) < len(names):
         given = ", ".join(names) or "(none)"
         raise ConfigError(f"scenes {given}: give at least one, and of one name only one")
+    scenes, missing = [], {}
     for name in names:
         try:
             scene = open_scene(name, preset)
