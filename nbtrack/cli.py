@@ -97,7 +97,6 @@ COMMANDS = {
     "methods": ("list what --method takes", ""),
     "export": ("a run's trajectory or a map elsewhere", "source out --to!"),
     "tables": ("the paper's tables, and one beyond, CSV and LaTeX", _CELLS + _RUN),
-    "notebooks": ("run all notebooks headless, with HTML copies", _PRESET),
     "data make": ("write a synthetic room", "room --out! --motion --n-frames --width --seed"),
     "data check": ("what is wrong with a recording", "folder --out" + _PARTS),
     "data convert": ("write a recording as the dataset is", "folder out --frames" + _PARTS),
@@ -131,7 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             import torch
 
             torch.set_num_threads(options.threads)
-        module = "bench" if options.command in ("tables", "bench", "notebooks") else "commands"
+        module = "bench" if options.command in ("tables", "bench") else "commands"
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)
         return 0

@@ -12,10 +12,7 @@ from numpy.testing import assert_allclose
 from nbtrack.core.files import tables_folder
 from nbtrack.data.formats import DATASET_UNITS, declaration
 from nbtrack.data.sequence import observed_bounds, read_sequence
-from nbtrack.experiments.jobs import MapJob, TrackJob
-from nbtrack.experiments.outlook import expected_reach, reach_warnings
-from nbtrack.experiments.presets import load_preset
-from nbtrack.experiments.scenes import Scene
+from nbtrack.experiments.outlook import reach_warning
 from nbtrack.synthetic import make_room
 from nbtrack.tables import published_table_1
 from nbtrack.tracking import SdfSettings, StepBudget, VrSettings, make_tracker, paper_steps
@@ -155,21 +152,14 @@ def test_bounds_of_the_dataset(source: str) -> None:
         assert bounds[*cell, "map"] <= published_m
 
 
-def test_a_warning_before_the_work(tmp_path: Path) -> None:
-    """Catches a run that cannot follow and says so only by its error; a warning where the steps
-    suffice; and a bound that the finished run contradicts."""
-    scene = Scene(
-        "office", make_room("office", tmp_path / "office", 12, 32, 24, motion="keyframes")
-    )
-    preset = load_preset("smoke")
-    (few, many), job = (2, 60), MapJob.of(scene, "neus", preset)
-    runs = {n: TrackJob(job, scene, "sdf", preset.tracking_of("sdf"), n) for n in (few, many)}
-    (said,) = reach_warnings([*runs.values()])
-    assert said.startswith(f"{few} steps of sdf")
-    assert expected_reach(runs[few])["least_ate_m"] > expected_reach(runs[many])["least_ate_m"]
-    assert not [*reach_warnings([TrackJob(job, scene, "lm", preset.tracking_of("lm"), few)])]
-    by_clock = TrackJob(job, scene, "sdf", preset.tracking_of("sdf"), rate_hz=10)
-    assert expected_reach(by_clock) == {}
+def test_a_warning_of_reach() -> None:
+    """Catches a run that could not follow and says so only by its error, and a warning where the
+    steps sufficed, or where no bound is known."""
+    run = {"tracker": "sdf", "scene": "office", "steps_per_frame": 2, "reach_m": 0.001}
+    run |= {"reach_deg": 0.1, "beyond_reach_share": 0.9, "least_ate_m": 0.3}
+    assert reach_warning(run).startswith("2 steps of sdf move the camera by at most 1.0 mm")
+    assert reach_warning(run | {"beyond_reach_share": 0.1, "least_ate_m": 0.001}) is None
+    assert reach_warning({"tracker": "lm", "scene": "office"}) is None
 
 
 def test_no_tracker_beats_the_bound() -> None:

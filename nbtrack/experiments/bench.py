@@ -1,10 +1,6 @@
-"""The commands that compute the paper anew: `tables`, `bench` (Table II alone), `notebooks`."""
+"""The commands that compute the paper's tables anew: `tables`, and `bench`, Table II alone."""
 
-import importlib.util
 import os
-import shlex
-import subprocess
-import sys
 from argparse import Namespace
 from dataclasses import replace
 
@@ -14,13 +10,14 @@ import torch
 
 from nbtrack import tables
 from nbtrack.core.device import advise_on_memory, choose_device, device_name
-from nbtrack.core.errors import MissingError, NbtrackError
-from nbtrack.core.files import project_folder, runs_folder
-from nbtrack.core.progress import ProgressBar
+from nbtrack.core.errors import NbtrackError
+from nbtrack.core.files import runs_folder
+from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import changed_settings
 from nbtrack.data.sequence import read_frames
 from nbtrack.experiments.grid import Execution, map_scene, track_scenes
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
+from nbtrack.experiments.outlook import reach_warning
 from nbtrack.experiments.output import output_folder
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
@@ -73,6 +70,10 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
     cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
     paths.append(tables.write_csv(cells, results.filter(_CELL_COLUMNS), float_format=None))
     print("\n".join(map(str, paths)))
+    rows = results.to_dict("records")
+    warnings = {(row["method"], row["steps"]): reach_warning(row) for row in rows}
+    for said in filter(None, warnings.values()):
+        tell(f"nbtrack: warning: {said}")
     failed = results[results["failure"] != ""]
     if len(failed):
         first, why = failed.iloc[0][["run", "failure"]]
@@ -91,36 +92,6 @@ def bench_command(options: Namespace) -> None:
         steps = _table_2(preset, open_scene(preset.scenes.names[0], preset))
         folder = options.out or runs_folder() / "bench" / preset.name
         print(tables.write_csv(folder / "table_2.csv", steps))
-
-
-def notebooks_command(options: Namespace) -> None:
-    """Execute every notebook in order, by `jupyter nbconvert --execute --to html`.
-
-    Pages go to `runs/notebooks/<preset>/`. Settings reach the kernels through the environment,
-    where each notebook's settings cell finds them. Raises MissingError without notebooks or
-    Jupyter, NbtrackError if a cell failed.
-    """
-    # A wrong setting is refused before the first kernel starts.
-    preset = load_preset(options.preset, options.config, options.settings).name
-    if not all(map(importlib.util.find_spec, ("nbconvert", "ipykernel"))):
-        raise MissingError("notebooks need Jupyter: pip install 'nbtrack[notebooks]'")
-    paths = sorted((project_folder() / "notebooks").glob("[0-9A]*_*.ipynb"))
-    if not paths:
-        raise MissingError(f"no notebooks in {project_folder()}: run the command in a checkout")
-    settings = f"{os.environ.get('NBTRACK_SET', '')} {shlex.join(options.settings)}"
-    os.environ |= {"NBTRACK_PRESET": preset, "NBTRACK_SET": settings.strip()}
-    if options.config:
-        os.environ["NBTRACK_CONFIG"] = str(options.config.resolve())
-    folder = runs_folder() / "notebooks" / preset
-    convert = [sys.executable, "-m", "nbconvert", "--execute", "--to=html", "--output-dir", folder]
-    with ProgressBar("notebooks", len(paths)) as bar:
-        for done, path in enumerate(paths):
-            bar.move_to(done, path.stem)
-            found = subprocess.run([*convert, path], stderr=subprocess.PIPE, text=True)
-            if found.returncode != 0:
-                raise NbtrackError(f"{path.name} failed: {found.stderr.strip().splitlines()[-1]}")
-            print(folder / f"{path.stem}.html")
-        bar.move_to(len(paths))
 
 
 def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:

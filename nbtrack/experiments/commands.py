@@ -1,4 +1,4 @@
-"""What each command does; `tables`, `bench` and `notebooks` stand in `bench.py`."""
+"""What each command does; `tables` and `bench` stand in `bench.py`."""
 
 from argparse import Namespace
 from dataclasses import replace
@@ -25,7 +25,7 @@ from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.grid import run_jobs
 from nbtrack.experiments.jobs import OF_MAPS, GivenMap, MapJob, TrackJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
-from nbtrack.experiments.outlook import reach_warnings
+from nbtrack.experiments.outlook import reach_warning
 from nbtrack.experiments.output import (
     OVERVIEW_FILE,
     check_no_recording,
@@ -116,8 +116,6 @@ def track_command(options: Namespace) -> None:
     how = options.frames, options.seed, options.out, options.threads, options.start
     run = TrackJob(*what, steps, options.rate, *how)
     run.check()
-    for warning in reach_warnings([run]):
-        tell(f"nbtrack: warning: {warning}")
     with output_folder(options.out):
         if not given:
             _map(job)
@@ -131,7 +129,8 @@ def track_command(options: Namespace) -> None:
     print(f"  on {metrics['device']}")
     outside = metrics.get("outside_map_share", 0.0)
     is_outside = f"{outside:.0%} of the frames saw little of what was mapped" * (outside > 0)
-    for said in (metrics.get("map_warning"), is_outside, metrics.get("map_misfit")):
+    said_of_map = metrics.get("map_warning"), is_outside, metrics.get("map_misfit")
+    for said in (reach_warning(metrics), *said_of_map):
         if said:
             tell(f"nbtrack: warning: {said}")
 

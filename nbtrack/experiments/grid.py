@@ -25,7 +25,6 @@ from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.interrupts import interrupts_put_off
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.experiments.jobs import Job, MapJob, TrackJob
-from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import FIELDS
@@ -130,8 +129,6 @@ def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[An
     missing = [job for job in jobs if not job.is_done]
     if 0 < len(missing) < len(jobs):
         tell(f"{len(jobs) - len(missing)} of {len(jobs)} runs are cached")
-    for warning in reach_warnings(missing):
-        tell(f"nbtrack: warning: {warning}")
     if clock:
         run_jobs([job.needs for job in missing], "mapping", execution)
         execution = replace(execution, workers=1, dask=None)
