@@ -43,30 +43,29 @@ def as_dict(config: Any) -> dict[str, Any]:
 def with_settings(config: Config, *settings: str) -> Config:
     """The config with some `key=value` texts applied, the last one last.
 
-    Raises ConfigError as `with_values` and `read_settings` do.
+    Raises ConfigError as `with_values` and `read_setting` do.
     """
-    return with_values(config, read_settings(*settings))
+    for setting in settings:
+        config = with_values(config, read_setting(setting))
+    return config
 
 
-def read_settings(*settings: str) -> dict[str, Any]:
-    """Values by their dotted keys of `key=value` texts; of the same key the last one counts.
+def read_setting(setting: str) -> dict[str, Any]:
+    """The value of a `key=value` text, or the values where it is a table, by dotted keys.
 
     Raises ConfigError for a text that is none.
     """
-    values: dict[str, Any] = {}
-    for setting in settings:
-        key, equals, text = (part.strip() for part in setting.partition("="))
-        if not equals:
-            raise ConfigError(f"setting {setting!r} has no value: write key=value")
-        try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        # Nesting thousands deep ends the parser's recursion, as do thousands of digits.
-        except (ValueError, RecursionError):
-            if text.startswith(("[", "{", '"', "'")):
-                raise ConfigError(f"{text!r:.40} is no TOML: write \"{key}=['a', 'b']\"") from None
-            value = text  # a bare word is a string
-        values |= flat({key: value})
-    return values
+    key, equals, text = (part.strip() for part in setting.partition("="))
+    if not equals:
+        raise ConfigError(f"setting {setting!r} has no value: write key=value")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    # Nesting thousands deep ends the parser's recursion, as do thousands of digits.
+    except (ValueError, RecursionError):
+        if text.startswith(("[", "{", '"', "'")):
+            raise ConfigError(f"{text!r:.40} is no TOML: write \"{key}=['a', 'b']\"") from None
+        value = text  # a bare word is a string
+    return flat({key: value})
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:

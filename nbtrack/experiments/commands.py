@@ -12,7 +12,7 @@ from nbtrack.beyond import PointCloud
 from nbtrack.core.errors import ConfigError, DataError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
-from nbtrack.core.settings import read_settings, with_values
+from nbtrack.core.settings import read_setting, with_values
 from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import (
     RgbdSequence,
@@ -162,11 +162,10 @@ def _check_fits(given: Map, method: Method, preset: Preset, options: Namespace) 
     made = {f"network.{network}.{k}": v for k, v in record["network"].items()}
     made |= {f"mapping.{name}.{k}": v for k, v in record["settings"].items()}
     made[f"correction.{name}"] = record.get("correction", 0.0)
-    for key, value in read_settings(*options.settings).items():
-        if made.get(key, value) != value:
+    for text in options.settings:
+        if any(made.get(key, value) != value for key, value in read_setting(text).items()):
             advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
-            found = f"{path} was made with other settings than --set {key}={value}"
-            raise ConfigError(f"{found}: {advice}")
+            raise ConfigError(f"{path} was made with other settings than --set {text}: {advice}")
 
 
 def _map(job: MapJob) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from nbtrack.core.errors import ConfigError, MissingError, look_up
-from nbtrack.core.settings import flat, limited, read_settings, with_values
+from nbtrack.core.settings import flat, limited, read_setting, with_settings, with_values
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
@@ -101,7 +101,7 @@ class Preset:
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
         """The preset with the `key=value` texts of a method, and then what a user chose."""
-        return with_values(self, read_settings(*settings) | self.chosen)
+        return with_values(with_settings(self, *settings), self.chosen)
 
     def network_of(self, field_name: str) -> Any:
         """Network of a field, by default that of NeuS; None of a field that learns nothing."""
@@ -155,15 +155,18 @@ def load_preset(
     wrong type; MissingError if the file does not exist, DataError if it is no TOML.
     """
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
-    chosen: dict[str, Any] = {}
+    layers = []
     if config_file := config_file or os.environ.get("NBTRACK_CONFIG"):
         if not Path(config_file).is_file():
             raise MissingError(f"no config file {config_file}: give a TOML file of settings")
-        chosen |= flat(read_object(Path(config_file)))
+        layers.append(flat(read_object(Path(config_file))))
     try:
         before = shlex.split(os.environ.get("NBTRACK_SET", ""))
     except ValueError as error:
         advice = "quote each setting as in a shell"
         raise ConfigError(f"NBTRACK_SET cannot be split ({error}): {advice}") from None
-    chosen |= read_settings(*before, *settings)
-    return replace(with_values(preset, chosen), chosen=chosen)
+    chosen: dict[str, Any] = {}
+    for layer in [*layers, *map(read_setting, [*before, *settings])]:
+        preset = with_values(preset, layer)  # a value that a later one replaces is checked too
+        chosen |= layer
+    return replace(preset, chosen=chosen)
