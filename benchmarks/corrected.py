@@ -56,7 +56,7 @@ COMPARED = [
     METHODS["icp_dense"],
 ]
 ON_RECORDINGS = [method for method in COMPARED if method != METHODS["neus_corrected"]]
-SEEDS = 3  # of map and tracker, on recordings
+SEEDS = range(3)  # of map and tracker, on recordings
 COLUMNS = [
     "frames", "path", "scene", "method", "n_pixels", "seed", "ate_m", "still_ate_m", "max_error_m",
     "lost_frames", "seconds_per_frame", "steps_per_frame", "map_seconds",
@@ -68,7 +68,7 @@ ABLATION = [
     ("at the surface alone", (), {"_OFFSETS": (0.0,)}),
     ("30,000 points", (), {"_N_POINTS": 30_000}),
     ("every point alike", (), {"_UNMEASURED": 1.0}),  # confidence is 1 everywhere
-    ("cells of 8 cm", ("mapping.neus_plus.correct_voxel=0.08",), {}),
+    ("cells of 8 cm", ("correction.neus_plus=0.08",), {}),
     ("colours as the network has them", (), {"_COLOR_STIFFNESS": 1e9}),
     ("colours as stiff as distances", (), {"_COLOR_STIFFNESS": 1.0}),
     ("colours of outliers count", (), {"_COLOR_ROUNDS": 1, "_COLOR_HUBER": 1e9}),
@@ -112,7 +112,7 @@ def main() -> None:
             paper = [METHODS[name] for name in TABLE_1]
             runs.append(_track([recording], ON_RECORDINGS, *how, seeds=SEEDS))
             runs.append(_track([recording], paper, *how, seeds=SEEDS, steps=None))
-        runs += [_held_out(recording, preset, seed) for seed in range(SEEDS)]
+        runs += [_held_out(recording, preset, seed) for seed in SEEDS]
         _write("tracking.csv", pd.concat(runs))
     if recordings:
         _write("agreement.csv", agreement(recordings[0], preset))
@@ -123,7 +123,9 @@ def main() -> None:
     print("verdicts, wrong by 5 cm or 3 degrees", verdicts, sep="\n")
 
 
-def _track(scenes, methods, preset, frames, path, tracked=None, seeds=1, steps=30) -> pd.DataFrame:
+def _track(
+    scenes, methods, preset, frames, path, tracked=None, seeds=(0,), steps=30
+) -> pd.DataFrame:
     """At most so many steps a frame; without a number those of the paper at 2 Hz."""
     how = {"steps": steps, "frames": frames, "seeds": seeds, "execution": ALONE}
     found = track_scenes(scenes, methods, preset, [2], tracked=tracked, **how)
@@ -177,10 +179,10 @@ def ablation(recordings) -> pd.DataFrame:
 
 def _corrected_now(scene, field, preset):
     """A field corrected by the constants of this moment, which no cache knows; and its seconds."""
-    made = MapJob(scene, field, preset)
+    made = MapJob.of(scene, field, preset)
     run_jobs([made.needs], f"mapping {scene.name}", ALONE)
     base, sequence, began = made.needs.map(), scene.read(), time.perf_counter()
-    return correct_map(base, sequence, made.settings).field, time.perf_counter() - began
+    return correct_map(base, sequence, made.correction).field, time.perf_counter() - began
 
 
 def _error(field, sequence, settings) -> float:
@@ -238,12 +240,13 @@ def _held_out(scene, preset, seed: int) -> pd.DataFrame:
     rows = []
     for method in ON_RECORDINGS:
         changed = with_settings(preset, *method.settings)
-        made = MapJob(scene, method.field, changed, "::2", seed)
-        job = TrackJob(made, scene, method.tracker, 30, frames="1::2", seed=seed)
+        made = MapJob.of(scene, method.field, changed, "::2", seed)
+        settings = changed.tracking_of(method.tracker)
+        job = TrackJob(made, scene, method.tracker, settings, 30, frames="1::2", seed=seed)
         (found,) = run_jobs([job], f"tracking {scene.name}", ALONE)
         row = {name: found[name] for name in COLUMNS if name in found}
-        n_pixels = changed.tracking_of(method.tracker).n_pixels
-        row |= {"ate_m": found["ate_rmse_m"], "method": method.label, "n_pixels": n_pixels}
+        row |= {"ate_m": found["ate_rmse_m"], "method": method.label}
+        row["n_pixels"] = settings.n_pixels
         rows.append({**row, "scene": scene.name, "frames": "1::2", "path": "odd, mapped even"})
     return pd.DataFrame(rows)[COLUMNS]
 

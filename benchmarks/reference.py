@@ -93,8 +93,8 @@ def tracked_path(method, sequence, preset):
     changed = with_settings(preset, *method.settings)
     settings, network = changed.mapping_of(method.field), changed.network_of(method.field)
     made = map_sequence(method.field, sequence, network, settings, device=torch.device("cpu"))
-    if getattr(settings, "correct_voxel", 0.0):
-        made = correct_map(made, sequence, settings)
+    if voxel := changed.correction.get(method.field):
+        made = correct_map(made, sequence, voxel)
     how = sequence.T_world_camera[0], StepBudget(30), changed.tracking_of(method.tracker)
     found = track_sequence(make_tracker(method.tracker, made.field, *how), sequence)
     given = sequence.T_world_camera[:1]

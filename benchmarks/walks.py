@@ -53,8 +53,9 @@ def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
     tracker does not call it lost; `found_again` counts how often a wrong frame is followed by a
     right one."""
     preset = with_settings(PRESET, *method.settings)
-    made = MapJob(room, method.field, preset, MAPPED)
-    job = TrackJob(made, room, method.tracker, steps, frames=frames, n_threads=1)
+    settings = preset.tracking_of(method.tracker)
+    made = MapJob.of(room, method.field, preset, MAPPED)
+    job = TrackJob(made, room, method.tracker, settings, steps, frames=frames, n_threads=1)
     found = run_jobs([job], f"{room.name}, {method.label}", Execution(workers=1))[0]
     tracked = read_run(job.folder.name).frames
     is_wrong = (tracked["translation_error_m"] > WRONG_M).to_numpy()
@@ -66,7 +67,7 @@ def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
         "scene": room.name,
         "floor_m2": width * depth,
         "method": method.label,
-        "n_pixels": preset.tracking_of(method.tracker).n_pixels,
+        "n_pixels": settings.n_pixels,
         "frames": frames,
         "ate_m": found["ate_rmse_m"],
         "milliseconds": 1e3 * tracked["seconds"].median(),

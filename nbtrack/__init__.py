@@ -9,7 +9,7 @@ __version__ = "0.1.0"
 _MODULES = {
     "data.frame": ["Frame"],
     "data.sequence": ["read_sequence"],
-    "experiments.methods": ["METHODS", "Method"],
+    "tracking.methods": ["METHODS", "Method"],
     "experiments.presets": ["load_preset"],
     "experiments.grid": ["map_scene", "map_scenes", "read_run", "track_scenes"],
     "experiments.scenes": ["open_scene", "open_scenes"],

@@ -58,12 +58,11 @@ OPTIONS = {
     "--tracker": _option("in place of a method: vr, sdf, lm or another tracker"),
     "--rate": _option("frames a second, by the clock", float, metavar="HZ"),
     "--steps": _option("steps a frame (default: to convergence; vr, sdf: as at 2 Hz)", float),
-    "--pixels": _option("pixels or points a frame, or a step of vr and sdf", int),
     "--frames": _option("Python slice of frames, A:B:S", default=":"),
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from": _option("track in this map of the room: its folder or file", a_path),
     "--start": _option("given: its own pose, if any (default); unknown: found first", **_STARTS),
-    "--to!": _option("tum, kitti: trajectory; gif: movie; ply, glb: mesh; map", required=True),
+    "--to!": _option("kitti: trajectory; gif: movie; ply, glb: mesh", required=True),
     "--budget": _option("steps: the paper's counts (default); clock: this machine's", **_BUDGETS),
     "--scenes": _option("only these scenes of the preset's kind", metavar="A,B"),
     "--seeds": _option("so many maps and runs a cell: mean ± std", some_seeds, default=1),
@@ -88,7 +87,7 @@ _PRESET = " --preset --config --set"
 _RUN = " --device --threads" + _PRESET
 _MADE = " --method --field --format --frames --seed --out" + _RUN
 _PARTS = " --format --depth-folder --poses"
-_TRACKED = " --tracker --rate --steps --pixels --map-frames --map-from --start"
+_TRACKED = " --tracker --rate --steps --map-frames --map-from --start"
 _CELLS = "--budget --scenes --method --beyond --seeds --workers --dask --out"
 # By name: what it does, and its options. `map` is done by the function `map_command`, `data make`
 # by `make_command`.
@@ -98,7 +97,6 @@ COMMANDS = {
     "methods": ("list what --method takes", ""),
     "export": ("a run's trajectory or a map elsewhere", "source out --to!"),
     "tables": ("the paper's tables, and one beyond, CSV and LaTeX", _CELLS + _RUN),
-    "notebooks": ("run all notebooks headless, with HTML copies", _PRESET),
     "data make": ("write a synthetic room", "room --out! --motion --n-frames --width --seed"),
     "data check": ("what is wrong with a recording", "folder --out" + _PARTS),
     "data convert": ("write a recording as the dataset is", "folder out --frames" + _PARTS),
@@ -114,8 +112,6 @@ class Parser(argparse.ArgumentParser):
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
             choices = [choice.strip("' ") for choice in wrong[2].split(",")]
             message = f"unknown {wrong[1]!r}: {nearest_name(wrong[1], choices)}"
-        dashed = [word for word in sys.argv[1:] if word.startswith("-") and Path(word).exists()]
-        message += "".join(f"; write ./{word} for the file or folder {word}" for word in dashed)
         raise ConfigError(f"{message}; see {self.prog} --help")
 
 
@@ -134,25 +130,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
             import torch
 
             torch.set_num_threads(options.threads)
-        module = "bench" if options.command in ("tables", "bench", "notebooks") else "commands"
+        module = "bench" if options.command in ("tables", "bench") else "commands"
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)
         return 0
-    except NbtrackError as error:
-        cause, message, status = error, " ".join(str(error).split()), 2
-    except OSError as error:  # a disk that is full or read-only, a file where a folder should be
-        cause = error
+    except (NbtrackError, OSError, MemoryError, KeyboardInterrupt) as error:
+        if os.environ.get("NBTRACK_DEBUG"):
+            traceback.print_exception(error)
+        print(f"nbtrack: {_message_of(error)}", file=sys.stderr)
+        return STATUS if isinstance(error, KeyboardInterrupt) else 2
+
+
+def _message_of(error: BaseException) -> str:
+    """What a user is told of what ended a command, in a line."""
+    if isinstance(error, NbtrackError):
+        return " ".join(str(error).split())
+    if isinstance(error, OSError):  # a disk that is full, a file where a folder should be
         where = error.filename2 or error.filename or "the output"
-        message, status = f"{where}: {error.strerror or error}; mend it and run again", 2
-    except MemoryError as error:  # where no job says what needs it
-        cause = error
-        message, status = "out of memory: take fewer frames, as with --frames ::2", 2
-    except KeyboardInterrupt as interruption:
-        cause, message, status = interruption, INTERRUPTED, STATUS
-    if os.environ.get("NBTRACK_DEBUG"):
-        traceback.print_exception(cause)
-    print(f"nbtrack: {message}", file=sys.stderr)
-    return status
+        return f"{where}: {error.strerror or error}; mend it and run again"
+    if isinstance(error, MemoryError):  # where no job says what needs it
+        return "out of memory: take fewer frames, as with --frames ::2"
+    return INTERRUPTED
 
 
 class _Pipe(io.FileIO):

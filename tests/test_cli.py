@@ -110,7 +110,7 @@ def test_a_map_is_taken_with_the_settings_that_made_it(
     """Catches a refusal of the very settings that a map was made with, because a method set others
     beside them; and settings that the map does not have, which no run could follow."""
     folder, out = write_recording("plain", tmp_path / "r"), str(tmp_path / "m")
-    made = ["map", str(folder), "--field", "neus", *TINY, "--set", "mapping.neus.correct_voxel=0.3"]
+    made = ["map", str(folder), "--field", "neus", *TINY, "--set", "correction.neus=0.3"]
     assert main([*made, "--out", out]) == 0
     given = ["track", str(folder), "--map-from", out, "--tracker", "lm", "--steps", "2", *TINY]
     assert main([*given, "--out", str(tmp_path / "run")]) == 0
@@ -168,18 +168,6 @@ def test_version(capsys: pytest.CaptureFixture) -> None:
     assert capsys.readouterr().out == f"nbtrack {nbtrack.__version__}\n"
 
 
-@pytest.mark.parametrize("words", [["-dash"], ["office", "--out", "-dash"], ["-dash", "office"]])
-def test_a_folder_that_looks_like_an_option(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    """Catches a refusal that leaves a folder of such a name without a way to give it."""
-    monkeypatch.chdir(tmp_path)
-    Path("-dash").mkdir()
-    monkeypatch.setattr("sys.argv", ["nbtrack", "map", *words, "--field", "neus"])
-    assert main() == 2
-    assert "write ./-dash for the file or folder -dash" in capsys.readouterr().err
-
-
 def test_what_completion_offers() -> None:
     """Catches `nbtrack.<Tab>` that offers imports of the module and none of the public names."""
     assert dir(nbtrack) == sorted(nbtrack.__all__)
@@ -193,7 +181,7 @@ def test_a_recording_without_poses_is_tracked_in_a_map(
     frame is tracked, and nothing is said of errors; and a picture that is not there."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 20_000)
     recording = work / "rec"
-    words = ["--set", "mapping.neus.iterations=200", "--set", "mapping.neus.correct_voxel=0.15"]
+    words = ["--set", "mapping.neus.iterations=200", "--set", "correction.neus=0.15"]
     made = ["data", "make", "office", "--out", str(recording), "--n-frames", "12", "--width", "64"]
     assert main(made) == 0
     small = [*TINY_MAP, *words]

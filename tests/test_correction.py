@@ -1,6 +1,6 @@
 """The corrected field: better at surfaces that were measured, as before elsewhere; in a file."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -140,11 +140,12 @@ def test_a_file_keeps_it_whole(
 ) -> None:
     """Catches corrections lost or rounded on the way to disk and back, and a wrong size."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 10_000)
-    network, settings = NetworkSettings(width=16), NeusMapping(correct_voxel=0.2)
+    network = NetworkSettings(width=16)
     field = make_field("neus", network, ROOM.bounds, seed=0).eval().requires_grad_(False)
     made = {"field": "neus", "network": vars(network), "seconds": 0.0, "seed": 0}
     made |= {"scene": "box", "n_frames": len(sequence), "origin": [0.0, 0.0, 0.0]}
-    finished = correct_map(Map(field, sequence.intrinsics, made), sequence, settings)
+    made["settings"] = asdict(NeusMapping())
+    finished = correct_map(Map(field, sequence.intrinsics, made), sequence, 0.2)
     write_map(tmp_path / "map.safetensors", finished)
     stored, points = read_map(tmp_path), torch.rand(100, 3)
     assert torch.equal(stored.field(points)[1], finished.field(points)[1])

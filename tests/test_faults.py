@@ -208,15 +208,15 @@ FILES = {
     "no rotation": (_write(TRAJECTORY, ROW[:-1] + "0"), KITTI, "not a finite pose"),
     "another order": (_write(TRAJECTORY, "0.5 0 0 1 1 2 3 4"), KITTI, "of norm 5.48"),
     "second line": (_write(TRAJECTORY, f"{ROW}\n{ROW[:-2]}"), KITTI, "line 2 is"),
-    "a map for a run": (_nothing, ["export", "map", "--to", "tum", "p"], "no finished run in map"),
+    "a map for a run": (_nothing, ["export", "map", "--to", "kitti", "p"], "no finished run"),
     "no frames": (
         _write("run/frames.csv", ""),
-        ["export", "run", "--to", "tum", "t.txt"],
+        ["export", "run", "--to", "kitti", "t.txt"],
         "run/frames.csv is not a readable table of frames",
     ),
     "bytes for frames": (
         _write("run/frames.csv", b"\x00\xff\xfe\n" * 9),
-        ["export", "run", "--to", "tum", "t.txt"],
+        ["export", "run", "--to", "kitti", "t.txt"],
         "run/frames.csv is not a readable table of frames",
     ),
     "a run for a mesh": (_nothing, ["export", "run", "--to", "glb", "m.glb"], "run holds no"),
@@ -232,7 +232,7 @@ ARGUMENTS = {
     "no format": (["export", "map", "x"], "--to"),
     "no output": (["export", "map", "--to", "glb"], "out"),
     "empty output": (["export", "map", "--to", "glb", ""], "the path is empty"),
-    "onto itself": (["export", "room", "--to", "map", "room"], "room exists: choose another"),
+    "onto itself": (["export", "room", "--to", "ply", "room"], "room exists: choose another"),
     "a method and a field": ([*OWN, "--method", "sdf"], "leave --field and --tracker out"),
     "unknown method": (["track", "living_room", "--method", "corected"], "mean 'corrected'"),
     "a method in another map": ([*GIVEN[:2], "--method", "vr", "--map-from", "map"], "not 'imap'"),
@@ -255,7 +255,6 @@ ARGUMENTS = {
     ),
     "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames out"),
     "an unknown option": ([*OWN, "--bake", "nan"], "unknown argument '--bake': "),
-    "negative pixels": ([*OWN, "--pixels", "-5"], "must be 1 to"),
     "no frames to map": ([*OWN, "--map-frames", "10:20"], "select 0 of"),
     "negative seed": ([*OWN, "--seed", "-1"], "is no whole number from 0"),
     "giant seed": ([*OWN, "--seed", "9" * 30], "is no whole number from 0"),
@@ -272,7 +271,7 @@ ARGUMENTS = {
         [*OTHER, "--tracker", "lm", "--start", "unknown"],
         "whose first pose is not known",
     ),
-    "too many pixels": ([*OTHER, "--pixels", "16777216"], "must be 1 to"),
+    "too many pixels": ([*OTHER, "--set", "tracking.sdf.n_pixels=16777216"], "must be 1 to"),
     "steps without end": ([*OTHER, "--steps", "1e12"], "steps_per_frame is 1e+12"),
     "frames without end": ([*NO_STEPS, "--rate", "1e-308"], "rate_hz is 1e-308"),
     "too many frames": ([*MAKE, "--n-frames", "1000000000"], "must be 2 to"),
@@ -308,7 +307,7 @@ OUTPUTS = {
     "run below a file": [*OWN, "--out", "room/run"],
     "map into a file": [*MAP, "--out", "room"],
     "map below a file": [*MAP, "--out", "room/map"],
-    "export onto a folder": ["export", "map", "--to", "map", "run"],
+    "export onto a folder": ["export", "map", "--to", "ply", "run"],
     "export below a file": ["export", "run", "--to", "kitti", "room/poses.txt"],
     "export into the kernel": ["export", "run", "--to", "kitti", "/proc/nbtrack/poses.txt"],
     "run into the kernel": [*OWN, "--out", "/proc/nbtrack"],
@@ -371,7 +370,7 @@ def test_a_disk_that_fills_up_while_results_are_written(
     with files_limited_to(n_bytes):
         error = assert_refused(work, capsys, [*OWN, "--seed", "0", "--frames", "1:"], "run")
         assert os.strerror(errno.EFBIG) in error
-        for kind, source in (("map", "map"), ("kitti", "run")):
+        for kind, source in (("ply", "map"), ("kitti", "run")):
             if n_bytes < 200:
                 command = ["export", source, "--to", kind, "new"]
                 assert_refused(work, capsys, command, "File too large")

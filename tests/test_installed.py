@@ -39,7 +39,6 @@ def test_folders(elsewhere: Path) -> None:
         ("distributed", ["tables", "--dask", "tcp://h:1"], "pip install 'nbtrack[cluster]'"),
         ("small_gicp", ["track", "office", "--field", "points", "--tracker", "icp", "--steps", "1"],
          "pip install 'nbtrack[icp]'"),
-        ("nbconvert", ["notebooks"], "pip install 'nbtrack[notebooks]'"),
     ],
 )  # fmt: skip
 def test_a_missing_extra_is_told_before_any_work(

@@ -248,7 +248,7 @@ def test_a_file_gives_the_same_trajectory_elsewhere(
         assert (work / "again" / name).read_bytes() == (work / "run" / name).read_bytes()
     metrics = json.loads((work / "again/metrics.json").read_text())
     assert (metrics["map_from"]["scene"], metrics["field"]) == ("living_room", "neus")
-    assert metrics["config"]["network"]["neus"]["width"] == 16
+    assert metrics["map_config"]["network"]["width"] == 16
     names = {path.name for path in (work / "map").iterdir()}
     assert names == {MAP_FILE, "history.csv", "mesh.ply", LOCK_FILE}
     assert (work / "room").read_bytes() == (work / "map" / MAP_FILE).read_bytes()
@@ -257,9 +257,7 @@ def test_a_file_gives_the_same_trajectory_elsewhere(
 
 def test_trajectories(work: Path) -> None:
     """Catches another order of numbers, lost digits, and inverted poses."""
-    for name in ("tum", "kitti"):
-        assert main(["export", "run", "--to", name, name]) == 0
-    assert Path("tum").read_bytes() == Path("run/trajectory.txt").read_bytes()
+    assert main(["export", "run", "--to", "kitti", "kitti"]) == 0
     expected = read_tum(work / "run/trajectory.txt")[1][:, :3]
     np.testing.assert_allclose(np.loadtxt("kitti").reshape(-1, 3, 4), expected, atol=1e-15)
 

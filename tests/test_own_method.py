@@ -111,7 +111,7 @@ def test_the_field_of_the_notebook_in_every_command(grid_file: None, tmp_path: P
         own = ["--tracker", tracker, "--steps", "1", "--out", str(tmp_path / tracker)]
         assert main(["track", "office", "--map-from", made, *own, *words]) == 0
         assert (tmp_path / tracker / "trajectory.txt").is_file()
-    METHODS["grid"] = Method("Grid", "neus_grid", "sdf", ("mapping.neus_grid.correct_voxel=0.2",))
+    METHODS["grid"] = Method("Grid", "neus_grid", "sdf", ("correction.neus_grid=0.2",))
     try:
         rows = ["--method", "sdf,grid", "--workers", "1", "--out", str(tmp_path / "out")]
         assert main(["tables", *rows, *words, "--set", "tables.rates_hz=[10]"]) == 0

@@ -74,9 +74,9 @@ def test_keys_hold_all_that_makes_a_result(tmp_path: Path, monkeypatch: pytest.M
     preset = load_preset("smoke")
 
     def keys(preset: Preset = preset) -> tuple[str, str, str]:
-        made = MapJob(scene, "neus", preset)
-        points = MapJob(scene, "points", preset)
-        return made.key, TrackJob(made, scene, "sdf", 2).key, points.key
+        made = MapJob.of(scene, "neus", preset)
+        points = MapJob.of(scene, "points", preset)
+        return made.key, TrackJob(made, scene, "sdf", preset.tracking_of("sdf"), 2).key, points.key
 
     before = keys()
     assert keys() == before

@@ -161,14 +161,16 @@ def test_a_warning_before_the_work(tmp_path: Path) -> None:
     scene = Scene(
         "office", make_room("office", tmp_path / "office", 12, 32, 24, motion="keyframes")
     )
+    few, many = 2, 60
     preset = load_preset("smoke")
-    (few, many), job = (2, 60), MapJob(scene, "neus", preset)
-    runs = {n: TrackJob(job, scene, "sdf", n) for n in (few, many)}
+    job = MapJob.of(scene, "neus", preset)
+    sdf, lm = preset.tracking_of("sdf"), preset.tracking_of("lm")
+    runs = {n: TrackJob(job, scene, "sdf", sdf, n) for n in (few, many)}
     (said,) = reach_warnings([*runs.values()])
     assert said.startswith(f"{few} steps of sdf")
     assert expected_reach(runs[few])["least_ate_m"] > expected_reach(runs[many])["least_ate_m"]
-    assert not [*reach_warnings([TrackJob(job, scene, "lm", few)])]
-    by_clock = TrackJob(job, scene, "sdf", rate_hz=10)
+    assert not [*reach_warnings([TrackJob(job, scene, "lm", lm, few)])]
+    by_clock = TrackJob(job, scene, "sdf", sdf, rate_hz=10)
     assert expected_reach(by_clock) == {}
 
 

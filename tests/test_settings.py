@@ -118,10 +118,17 @@ def test_a_method_gives_way_to_the_user(
     preset = load_preset(**given, settings=[f"{key}=64"] if source == "set" else [])
     own = preset.with_method(method.settings)
     assert own.tracking["lm"].n_pixels == 64
-    assert own.mapping["neus_plus"].correct_voxel == 0.04  # what the user left to the method
+    assert own.correction["neus_plus"] == 0.04  # what the user left to the method
     options = Namespace(preset=None, config=given.get("config_file"), settings=[f"{key}=32"])
     assert _preset_of(options, method).tracking["lm"].n_pixels == 32  # as `track` does
     assert load_preset(settings=[f"{key}=512"]).with_method(method.settings) != own
+
+
+def test_a_preset_that_is_changed_later_stays_so() -> None:
+    """Catches an earlier choice that comes back when a method adds its own settings."""
+    preset = load_preset(settings=["mapping.imap.iterations=30"])
+    changed = with_settings(preset, "mapping.imap.iterations=4").with_method(())
+    assert changed.mapping_of("imap").iterations == 4
 
 
 def test_values_take_the_type_of_the_preset(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,8 +244,8 @@ class Small:
     def mapped(self, preset: Preset, field: str) -> Map:
         settings = preset.mapping_of(field)
         found = map_sequence(field, self.sequence, preset.network_of(field), settings)
-        if getattr(settings, "correct_voxel", 0.0):
-            found = correct_map(found, self.sequence, settings)
+        if preset.correction.get(field):
+            found = correct_map(found, self.sequence, preset.correction[field])
         return found
 
     def track(self, preset: Preset, tracker: str) -> None:
@@ -251,7 +258,7 @@ class Small:
     def use(self, preset: Preset, key: str) -> None:
         """Run what reads a key."""
         part, name, *_ = key.split(".")
-        if part in ("network", "mapping"):
+        if part in ("network", "mapping", "correction"):
             self.mapped(preset, name)
         elif part == "tracking":
             self.track(preset, name)

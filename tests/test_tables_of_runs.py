@@ -92,16 +92,16 @@ def test_table_1_is_complete_cached_and_repeatable(
 def test_keys_change_with_what_matters(preset: Preset, scenes: list[Scene]) -> None:
     """Catches a cached result that is taken for one of another setting, seed or slice."""
     cells = [
-        MapJob(scenes[0], "neus", preset),
-        MapJob(scenes[0], "imap", preset),
-        MapJob(scenes[0], "neus", preset, seed=1),
-        MapJob(scenes[0], "neus", preset, frames=":3"),
-        MapJob(scenes[0], "neus", with_settings(preset, "mapping.neus.n_rays=9")),
-        MapJob(scenes[1], "neus", preset),
+        MapJob.of(scenes[0], "neus", preset),
+        MapJob.of(scenes[0], "imap", preset),
+        MapJob.of(scenes[0], "neus", preset, seed=1),
+        MapJob.of(scenes[0], "neus", preset, frames=":3"),
+        MapJob.of(scenes[0], "neus", with_settings(preset, "mapping.neus.n_rays=9")),
+        MapJob.of(scenes[1], "neus", preset),
     ]
     assert len({cell.key for cell in cells}) == 6
     untouched = with_settings(preset, "tracking.sdf.n_pixels=17")
-    assert MapJob(scenes[0], "neus", untouched).key == cells[0].key
+    assert MapJob.of(scenes[0], "neus", untouched).key == cells[0].key
 
 
 def test_maps_and_their_scores(preset: Preset, scenes: list[Scene]) -> None:
@@ -141,7 +141,7 @@ def test_table_3(tmp_path: Path, scenes: list[Scene], monkeypatch: pytest.Monkey
     monkeypatch.setattr("nbtrack.experiments.bench.RATES_3_HZ", RATES_3_HZ[:1])
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
     for name in TABLE_3:  # a grid of a whole room in cells of 4 cm takes seconds to fill
-        settings = tuple(text.replace("voxel=0.04", "voxel=0.3") for text in METHODS[name].settings)
+        settings = tuple(text.replace("=0.04", "=0.3") for text in METHODS[name].settings)
         settings += ("tracking.lm.voxel=0.3",)
         monkeypatch.setitem(METHODS, name, replace(METHODS[name], settings=settings))
     words = tiny_words("scenes.names=office", "scenes.track_frames=:2")
@@ -159,7 +159,7 @@ def test_every_method_is_made_again_from_its_command(
     few = [f"mapping.{field}.iterations=6" for field in ("volsdf", "occupancy")]
     coarse = with_settings(preset, "tracking.lm.voxel=0.3", *few)
     for name, method in METHODS.items():
-        settings = tuple(text.replace("voxel=0.04", "voxel=0.3") for text in method.settings)
+        settings = tuple(text.replace("=0.04", "=0.3") for text in method.settings)
         monkeypatch.setitem(METHODS, name, replace(method, settings=settings))
     how = {"steps": 2, "frames": "1:4", "seeds": [1], "execution": Execution(workers=1, threads=1)}
     runs = track_scenes(scenes[1:], [*METHODS], coarse, **how)
@@ -242,7 +242,7 @@ def test_table_2_measures_what_a_method_uses(
 
     monkeypatch.setattr("nbtrack.experiments.bench.make_tracker", seen)
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
-    settings = ("mapping.neus_plus.correct_voxel=0.3", "tracking.lm.n_pixels=64")
+    settings = ("correction.neus_plus=0.3", "tracking.lm.n_pixels=64")
     monkeypatch.setitem(METHODS, "corrected", replace(METHODS["corrected"], settings=settings))
     words = tiny_words("scenes.names=office", "tables.rates_hz=[10]", "scenes.track_frames=:2")
     words += ["--set", "tracking.lm.n_pixels=8", "--workers", "1", "--out", str(tmp_path)]

@@ -1,5 +1,6 @@
-"""What goes beyond the paper: fields and trackers that join as a user's own file does."""
+"""What goes beyond the paper: fields, trackers and methods that join as a user's own file does."""
 
+import nbtrack.beyond.methods  # joins the registry
 from nbtrack.beyond.correct import correct_map
 from nbtrack.beyond.correction import CorrectedField
 from nbtrack.beyond.grid import BakedField

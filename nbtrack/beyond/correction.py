@@ -103,7 +103,7 @@ class CorrectedField(BakedField):
         """The field as mapped, sampled and corrected anew."""
         source = {n.removeprefix(_SOURCE): x for n, x in state.items() if n.startswith(_SOURCE)}
         mapped = field_class(made["field"]).from_state(source, made, bounds)
-        field = cls(mapped, float(made["settings"]["correct_voxel"]))
+        field = cls(mapped, float(made["correction"]))
         field.add({name: state[name] for name in CORRECTIONS})
         return field
 

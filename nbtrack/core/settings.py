@@ -43,21 +43,29 @@ def as_dict(config: Any) -> dict[str, Any]:
 def with_settings(config: Config, *settings: str) -> Config:
     """The config with some `key=value` texts applied, the last one last.
 
-    Raises ConfigError as `with_values` does, and for a text that is none.
+    Raises ConfigError as `with_values` and `read_setting` do.
     """
     for setting in settings:
-        key, equals, text = (part.strip() for part in setting.partition("="))
-        if not equals:
-            raise ConfigError(f"setting {setting!r} has no value: write key=value")
-        try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        # Nesting thousands deep ends the parser's recursion, as do thousands of digits.
-        except (ValueError, RecursionError):
-            if text.startswith(("[", "{", '"', "'")):
-                raise ConfigError(f"{text!r:.40} is no TOML: write \"{key}=['a', 'b']\"") from None
-            value = text  # a bare word is a string
-        config = with_values(config, {key: value})
+        config = with_values(config, read_setting(setting))
     return config
+
+
+def read_setting(setting: str) -> dict[str, Any]:
+    """The value of a `key=value` text, or the values where it is a table, by dotted keys.
+
+    Raises ConfigError for a text that is none.
+    """
+    key, equals, text = (part.strip() for part in setting.partition("="))
+    if not equals:
+        raise ConfigError(f"setting {setting!r} has no value: write key=value")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    # Nesting thousands deep ends the parser's recursion, as do thousands of digits.
+    except (ValueError, RecursionError):
+        if text.startswith(("[", "{", '"', "'")):
+            raise ConfigError(f"{text!r:.40} is no TOML: write \"{key}=['a', 'b']\"") from None
+        value = text  # a bare word is a string
+    return flat({key: value})
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
@@ -66,8 +74,8 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     Raises ConfigError for an unknown key, or a value of the wrong type or range.
     """
     config = dataclasses.replace(config)  # a class may take up what was added since it was made
-    valid = dict(_leaves(config))
-    for key, value in _leaves(dict(values)):
+    valid = flat(config)
+    for key, value in flat(dict(values)).items():
         look_up("config key", key, valid)
         config = _replaced(config, key.split("."), key, value, {})
     return config
@@ -75,17 +83,16 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
 
 def changed_settings(config: Config, original: Config) -> list[str]:
     """The `key=value` texts that turn the original into this config."""
-    before = dict(_leaves(original)).items()
-    return setting_texts({k: v for k, v in _leaves(config) if (k, v) not in before})
+    before = flat(original).items()
+    return [f"{k}={json.dumps(v)}" for k, v in flat(config).items() if (k, v) not in before]
 
 
-def setting_texts(values: Mapping[str, Any]) -> list[str]:
-    """Values of dotted keys, or of trees of keys, as `key=value` texts."""
-    return [f"{key}={json.dumps(value)}" for key, value in _leaves(dict(values))]
+def flat(config: Any) -> dict[str, Any]:
+    """The values of a config, or of a tree as TOML gives it, by their dotted keys."""
+    return dict(_leaves(config))
 
 
 def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and values of all settings, or of a tree of them."""
     if dataclasses.is_dataclass(node):
         fields = [f for f in dataclasses.fields(node) if f.metadata.get("is_setting", True)]
         node = {f.name: getattr(node, f.name) for f in fields}

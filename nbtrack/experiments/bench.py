@@ -1,14 +1,8 @@
-"""The commands that compute the paper anew: `tables`, `bench` (Table II alone), `notebooks`."""
+"""The commands that compute the paper's tables anew: `tables`, and `bench`, Table II alone."""
 
-import html
-import importlib.util
 import os
-import re
-import shlex
 from argparse import Namespace
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,18 +10,19 @@ import torch
 
 from nbtrack import tables
 from nbtrack.core.device import advise_on_memory, choose_device, device_name
-from nbtrack.core.errors import MissingError, NbtrackError
-from nbtrack.core.files import project_folder, runs_folder, write_atomic
+from nbtrack.core.errors import NbtrackError
+from nbtrack.core.files import runs_folder
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings
 from nbtrack.data.sequence import read_frames
 from nbtrack.experiments.grid import Execution, map_scene, track_scenes
-from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3, Methods, find_methods
+from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
 from nbtrack.experiments.output import output_folder
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.synthetic import ROOMS
 from nbtrack.tracking import ClockBudget, StepBudget, make_tracker
+from nbtrack.tracking.methods import Methods, find_methods
 
 _FRAMES_A_CELL = 3  # that a mean of steps in Table II is taken over
 # What a run's row tells beside its place; none of it depends on how fast the machine was.
@@ -36,11 +31,6 @@ _CELL_COLUMNS = (
     "rotation_rmse_deg", "max_error_m", "frames", "lost_frames", "steps_per_frame", "run",
     "failure",
 )  # fmt: skip
-# Of notebooks as pages: long lines of code; formulas, code and links in Markdown.
-_STYLE = "<style>.jp-InputArea pre { white-space: pre-wrap; }</style>"
-_FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$\n]+?)\$", re.DOTALL)
-_CODE = re.compile(r"(`[^`]*`)")
-_LINK = re.compile(r"\]\(([\w./-]+)\)")
 
 
 def tables_command(options: Namespace) -> None:
@@ -61,7 +51,7 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
     execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
     scenes, clock = open_scenes(preset), options.budget == "clock"
     rates_hz = RATES_3_HZ if options.beyond else None
-    how = {"clock": clock, "seeds": options.seeds, "execution": execution}
+    how = {"clock": clock, "seeds": range(options.seeds), "execution": execution}
     results = track_scenes(scenes, methods, preset, rates_hz, **how)
     name = f"{preset.name}_clock" if clock else preset.name
     folder = options.out or runs_folder() / "tables" / name
@@ -100,31 +90,6 @@ def bench_command(options: Namespace) -> None:
         print(tables.write_csv(folder / "table_2.csv", steps))
 
 
-def notebooks_command(options: Namespace) -> None:
-    """Execute every notebook in order, as `jupyter nbconvert --execute`.
-
-    Copies, executed and HTML, go to `runs/notebooks/<preset>/`. Settings reach the kernels through
-    the environment, where each notebook's settings cell finds them. Raises MissingError without
-    notebooks or Jupyter, NbtrackError if a cell failed; the copy up to there is kept.
-    """
-    # A wrong setting is refused before the first kernel starts.
-    preset = load_preset(options.preset, options.config, options.settings).name
-    if not all(map(importlib.util.find_spec, ("nbconvert", "ipykernel", "latex2mathml"))):
-        raise MissingError("notebooks need Jupyter: pip install 'nbtrack[notebooks]'")
-    paths = sorted((project_folder() / "notebooks").glob("[0-9A]*_*.ipynb"))
-    if not paths:
-        raise MissingError(f"no notebooks in {project_folder()}: run the command in a checkout")
-    settings = f"{os.environ.get('NBTRACK_SET', '')} {shlex.join(options.settings)}"
-    os.environ |= {"NBTRACK_PRESET": preset, "NBTRACK_SET": settings.strip()}
-    if options.config:
-        os.environ["NBTRACK_CONFIG"] = str(options.config.resolve())
-    with ProgressBar("notebooks", len(paths)) as bar:
-        for done, path in enumerate(paths):
-            bar.move_to(done, path.stem)
-            _run_notebook(path, runs_folder() / "notebooks" / preset)
-        bar.move_to(len(paths))
-
-
 def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
     """Measure and print it."""
     steps, pixels = measure_steps(preset, scene, methods), default_pixels(preset, methods)
@@ -153,7 +118,8 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     T_first = sequence.T_world_camera[0]
     with ProgressBar("Table II", len(plan)) as bar:
         for done, (method, n_pixels) in enumerate(plan):
-            name, own = method.tracker, preset.with_method(method.settings)
+            name = method.tracker
+            own = preset.with_method(method.settings)
             bar.move_to(done, f"{name}={n_pixels}")
             settings = replace(own.tracking_of(name), n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
@@ -195,62 +161,3 @@ def _note(preset: Preset, clock: bool) -> str:
     label = f"{preset.name}, with {changed}" if changed else preset.name
     budget = "wall clock" if clock else preset.step_counts
     return f"Preset: {label}; budget: {budget}; device: {device_name(choose_device())}."
-
-
-def _run_notebook(path: Path, folder: Path) -> None:
-    """Run one notebook in a fresh kernel; its copies go to the folder."""
-    import nbformat
-    from nbconvert.preprocessors import CellExecutionError, ExecutePreprocessor
-
-    notebook, page = nbformat.read(path, 4), folder / f"{path.stem}.html"
-    options = {"record_timing": False, "extra_arguments": ["--log-level=ERROR"]}  # no talk of ports
-    run = ExecutePreprocessor(timeout=None, kernel_name="python3", **options)
-    try:
-        run.preprocess(notebook, {"metadata": {"path": str(path.parent)}})
-    except CellExecutionError as error:
-        failed = f"{path.name} failed with {error.ename}: {error.evalue}"
-        raise NbtrackError(f"{failed}; see the last cell of {folder / path.name}") from None
-    finally:
-        write_atomic(folder / path.name, nbformat.writes(notebook) + "\n")
-    write_page(notebook, path, page)
-    print(page)
-
-
-def write_page(notebook: Any, source: Path, page: Path) -> None:
-    """Write a notebook as a page that needs no network for its formulas, and the pages' index.
-
-    Formulas become MathML. Links to notebooks lead to their pages, those to other files to where
-    these lie beside the notebook's `source`. The page has the notebook's heading as its title.
-    """
-    from nbconvert import HTMLExporter
-
-    title = notebook.cells[0].source.splitlines()[0].lstrip("# ")
-    for cell in notebook.cells:
-        if cell.cell_type == "markdown":
-            cell.source = _for_a_page(cell.source, source.parent, page.parent)
-    exporter = HTMLExporter(mathjax_url="")
-    text, _ = exporter.from_notebook_node(notebook, {"metadata": {"name": title}})
-    write_atomic(page, text.replace("</head>", f"{_STYLE}</head>", 1))
-    pages = sorted(page.parent.glob("[0-9A]*.html"))
-    entries = [f'<li><a href="{p.name}">{p.stem.replace("_", " ")}</a></li>' for p in pages]
-    index = "<!doctype html><meta charset=utf-8><title>nbtrack</title><h1>nbtrack</h1><ul>"
-    write_atomic(page.parent / "index.html", index + "".join(entries) + "</ul>\n")
-
-
-def _for_a_page(text: str, source_folder: Path, page_folder: Path) -> str:
-    """Markdown with formulas as MathML and links that lead somewhere; code stays as it is."""
-    from latex2mathml.converter import convert
-
-    def formula(match: re.Match) -> str:
-        kind = "block" if match[1] else "inline"
-        return convert(match[1] or match[2], display=kind)
-
-    def link(match: re.Match) -> str:
-        target = match[1]
-        if target.endswith(".ipynb"):
-            return f"]({Path(target).with_suffix('.html')})"
-        path = os.path.relpath((source_folder / target).resolve(), page_folder.resolve())
-        return f"]({html.escape(path)})"
-
-    parts = _CODE.split(_LINK.sub(link, text))
-    return "".join(p if p.startswith("`") else _FORMULA.sub(formula, p) for p in parts)

@@ -1,4 +1,4 @@
-"""What each command does; `tables`, `bench` and `notebooks` stand in `bench.py`."""
+"""What each command does; `tables` and `bench` stand in `bench.py`."""
 
 from argparse import Namespace
 from dataclasses import replace
@@ -12,13 +12,19 @@ from nbtrack.beyond import PointCloud
 from nbtrack.core.errors import ConfigError, DataError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
-from nbtrack.core.settings import as_dict, with_values
+from nbtrack.core.settings import read_setting, with_values
 from nbtrack.data.recording import Recording, open_recording
-from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames
+from nbtrack.data.sequence import (
+    RgbdSequence,
+    parse_frames,
+    read_frames,
+    select_frames,
+    without_outliers,
+)
 from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.grid import run_jobs
-from nbtrack.experiments.jobs import OF_MAPS, MapJob, TrackJob
-from nbtrack.experiments.methods import DEFAULT_METHOD, METHODS, Method, method_of
+from nbtrack.experiments.jobs import OF_MAPS, GivenMap, MapJob, TrackJob
+from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
 from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.output import (
     OVERVIEW_FILE,
@@ -27,13 +33,14 @@ from nbtrack.experiments.output import (
     output_folder,
     save_picture,
 )
-from nbtrack.experiments.presets import Preset, ScenesConfig, load_preset
+from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
-from nbtrack.mapping.files import MAP_FILE, MESH_FILE, Map, read_map
+from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh
 from nbtrack.recordings.check import check_recording, quick_warning
 from nbtrack.tracking import Trajectory, make_budget
+from nbtrack.tracking.methods import METHODS, Method
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 from nbtrack.tracking.trajectories import read_trajectory, read_tum, write_kitti
 
@@ -44,6 +51,7 @@ _MEANINGS = {
     "frames_without_reference": "frames without a true pose, in no error",
     "frames_without_depth": "frames without any depth, not searched",
 }
+_FRAMES_APART = 10  # of a mesh: neighbours see the same
 _FRAMES_SHOWN, _CELLS = 20, 120  # of an overview: frames that tell what was seen; cells across
 _MOVIE_FRAMES = 100
 
@@ -60,7 +68,8 @@ def map_command(options: Namespace) -> None:
     preset = _preset_of(options, method)
     scene = _opened(options, preset)
     scene.count(options.frames)
-    job = MapJob(scene, method.field, preset, options.frames, options.seed, options.out)
+    job = MapJob.of(scene, method.field, preset, options.frames, options.seed)
+    job = replace(job, out=options.out)
     with output_folder(options.out):
         _map(job)
         finished = job.map()
@@ -73,9 +82,11 @@ def map_command(options: Namespace) -> None:
 def _write_mesh(job: MapJob, finished: Map) -> None:
     """The mesh of what was seen, beside a map."""
     try:
-        # Every tenth frame says enough of what has been seen: neighbours see the same.
-        sequence = job.scene.read(job.frames)
-        mesh = extract_mesh(finished.field, sequence.select(slice(None, None, 10)))
+        recording = job.scene.recording
+        frame_ids = select_frames(recording, parse_frames(job.frames))
+        mapped = frame_ids[recording.has_pose[frame_ids]]
+        seen = without_outliers(read_frames(recording, mapped[::_FRAMES_APART]))
+        mesh = extract_mesh(finished.field, seen)
     except DataError as error:
         print(f"  no mesh: {error}")
         return
@@ -90,21 +101,21 @@ def track_command(options: Namespace) -> None:
     given = read_map(options.map_from) if options.map_from else None
     own = given.field.name if given and not options.method else None
     method = method_of(options.method, options.field or own, options.tracker)
-    preset, map_frames = _preset_of(options, method), options.map_frames or ":"
+    preset = _preset_of(options, method)
     if given:
         _check_fits(given, method, preset, options)
     steps = method.usual_steps if options.steps is options.rate is None else options.steps
     budget = make_budget(steps, options.rate)  # told before a room is made
     scene = _opened(options, preset)
-    scene.count(options.frames, needs_poses=False)
-    if not given:
-        scene.count(map_frames)
-    of_map = map_frames, options.seed, options.map_from, bool(given)
-    job = MapJob(scene, method.field, preset, *of_map)
+    if given:
+        job = GivenMap(given, options.map_from)
+    else:
+        job = MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
+        scene.count(job.frames)
+    what = job, scene, method.tracker, preset.tracking_of(method.tracker)
     how = options.frames, options.seed, options.out, options.threads, options.start
-    run = TrackJob(job, scene, method.tracker, steps, options.rate, *how)
-    if not given:
-        run.check()
+    run = TrackJob(*what, steps, options.rate, *how)
+    run.check()
     for warning in reach_warnings([run]):
         tell(f"nbtrack: warning: {warning}")
     with output_folder(options.out):
@@ -127,17 +138,15 @@ def track_command(options: Namespace) -> None:
 
 def _preset_of(options: Namespace, method: Method) -> Preset:
     """The preset with what a method changes, and then the user."""
-    settings = [*options.settings]
-    if getattr(options, "pixels", None) is not None:
-        settings.append(f"tracking.{method.tracker}.n_pixels={options.pixels}")
-    return load_preset(options.preset, options.config, settings).with_method(method.settings)
+    preset = load_preset(options.preset, options.config, options.settings)
+    return preset.with_method(method.settings)
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:
     """The scene that is named, and a warning where it is likely read wrongly."""
     scene = open_scene(options.sequence, preset, options.format)
     # A room of the cache is as it should be.
-    if not scene.made_by and (said := quick_warning(scene.recording)):
+    if not scene.made and (said := quick_warning(scene.recording)):
         tell(f"nbtrack: warning: {said}; `data check` tells more")
     return scene
 
@@ -150,18 +159,14 @@ def _check_fits(given: Map, method: Method, preset: Preset, options: Namespace) 
     if method.field != name:
         advice = "leave --method and --field out"
         raise ConfigError(f"{path} is a map of field {name!r}, not {method.field!r}: {advice}")
-    made = {"network": record["network"], "mapping": record["settings"]}
-    parts = {"network": preset.network_of(name), "mapping": preset.mapping_of(name)}
-    asked = {part: as_dict(settings) for part, settings in parts.items()}
-    of_network = name if name in preset.network else "neus"
-    texts = {text.partition("=")[0].strip(): text for text in options.settings}
-    for part, kind in (("network", of_network), ("mapping", name)):
-        for key in asked[part]:
-            text = texts.get(f"{part}.{kind}.{key}")
-            if text and asked[part][key] != made[part].get(key):
-                advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
-                found = f"{path} was made with other settings than --set {text}"
-                raise ConfigError(f"{found}: {advice}")
+    network = name if name in preset.network else "neus"
+    made = {f"network.{network}.{k}": v for k, v in record["network"].items()}
+    made |= {f"mapping.{name}.{k}": v for k, v in record["settings"].items()}
+    made[f"correction.{name}"] = record.get("correction", 0.0)
+    for text in options.settings:
+        if any(made.get(key, value) != value for key, value in read_setting(text).items()):
+            advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
+            raise ConfigError(f"{path} was made with other settings than --set {text}: {advice}")
 
 
 def _map(job: MapJob) -> None:
@@ -193,7 +198,8 @@ def _draw_overview(run: TrackJob) -> None:
     except DataError as error:
         print(f"  no picture: {error}")
         return
-    title, paths = f"{run.scene.name}: {run.tracker} in {field.label}, {n_frames} frames", {}
+    title = f"{run.scene.name}: {run.tracker} in {field.label}, {n_frames} frames"
+    paths = {}
     if "ate_rmse_m" in metrics:
         ate, still = (100 * metrics.get(n, np.nan) for n in ("ate_rmse_m", "still_ate_m"))
         title += f", ATE {ate:.2f} cm (standing still {still:.0f} cm)"
@@ -229,11 +235,6 @@ def export_command(options: Namespace) -> None:
 
 def _export_map(source: Path, format_name: str, out: Path) -> str:
     finished, seen = read_map(source), source / MESH_FILE
-    if format_name == "map":
-        content = (source / MAP_FILE if source.is_dir() else source).read_bytes()
-        write_atomic(out, content)
-        megabytes = len(content) / 1e6
-        return f"{finished.field.label} map of {finished.record['scene']}, {megabytes:.2f} MB"
     is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
     with naming_damaged(seen, "mesh", "remove it and map again"):
         mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)
@@ -263,25 +264,21 @@ def _export_movie(source: Path, format_name: str, out: Path) -> str:
 
 
 def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
-    n_poses, path = len(read_trajectory(source).frames), source / "trajectory.txt"
-    if format_name == "kitti":
-        write_kitti(out, read_tum(path)[1])
-        return f"{n_poses} poses, KITTI: three rows of the matrix (m), no time stamps"
-    write_atomic(out, path.read_bytes())
-    return f"{n_poses} poses, TUM: timestamp (s), position (m), quaternion xyzw"
+    n_poses = len(read_trajectory(source).frames)
+    write_kitti(out, read_tum(source / "trajectory.txt")[1])
+    return f"{n_poses} poses, KITTI: three rows of the matrix (m), no time stamps"
 
 
 _EXPORTS = {
-    **dict.fromkeys(("tum", "kitti"), _export_trajectory),
-    **dict.fromkeys(("ply", "glb", "map"), _export_map),
+    "kitti": _export_trajectory,
+    **dict.fromkeys(("ply", "glb"), _export_map),
     "gif": _export_movie,
 }
 
 
 def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
-    chosen = "motion", "n_frames", "width", "seed"
-    config = with_values(ScenesConfig(), {name: getattr(options, name) for name in chosen})
+    config = with_values(ScenesConfig(), {name: getattr(options, name) for name in SIZES})
     check_no_recording(options.out)
     write_room(options.room, options.out, config)
     print(f"{options.out}: {options.room}, {options.n_frames} frames, seed {options.seed}")

@@ -25,13 +25,13 @@ from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.interrupts import interrupts_put_off
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.experiments.jobs import Job, MapJob, TrackJob
-from nbtrack.experiments.methods import Methods, find_methods
 from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import FIELDS
 from nbtrack.mapping.files import Map
 from nbtrack.tracking import TRACKERS
+from nbtrack.tracking.methods import Methods, find_methods
 from nbtrack.tracking.trajectories import Trajectory, read_trajectory
 
 _REPORT_SECONDS = 0.3  # between two reports of a worker
@@ -66,29 +66,21 @@ class Execution:
 
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
     """The map of a scene, from the cache or made now."""
-    job = MapJob(scene, field, preset, seed=seed)
+    job = MapJob.of(scene, field, preset, seed=seed)
     run_jobs([job], f"mapping {job.name}")
     return job.map()
 
 
-def map_scenes(
-    scenes: Sequence[Scene],
-    fields: Sequence[str],
-    preset: Preset,
-    seeds: int = 1,
-    execution: Execution | None = None,
-) -> pd.DataFrame:
+def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -> pd.DataFrame:
     """Scores of the maps of some scenes; those that are not cached are made, side by side.
 
     A row is a map: field, scene, seed, seconds, and the scores, `SCORES`.
     """
-    places = [*product(fields, range(seeds), scenes)]
-    jobs = [MapJob(scene, field, preset, seed=seed) for field, seed, scene in places]
-    records = run_jobs(jobs, "mapping", execution)
+    jobs = [MapJob.of(scene, field, preset) for field, scene in product(fields, scenes)]
     return pd.DataFrame(
-        {"field": field, "scene": scene.name, "seed": seed}
+        {"field": job.field, "scene": job.scene.name, "seed": job.seed}
         | {"seconds": record["seconds"], **record["quality"]}
-        for (field, seed, scene), record in zip(places, records, strict=True)
+        for job, record in zip(jobs, run_jobs(jobs, "mapping"), strict=True)
     )
 
 
@@ -100,7 +92,7 @@ def track_scenes(
     steps: float | int | None = None,
     clock: bool = False,
     frames: str | None = None,
-    seeds: int | Sequence[int] = 1,
+    seeds: Sequence[int] = (0,),
     execution: Execution | None = None,
     tracked: Sequence[Scene] | None = None,
 ) -> pd.DataFrame:
@@ -110,28 +102,27 @@ def track_scenes(
         rates_hz: by default the preset's; each frame has the steps of the paper's hardware.
         steps, clock: so many steps a frame instead, or 1/rate seconds by this machine's clock.
         frames: the slice to track; by default the preset's.
-        seeds: of map and run together, so many or these: their spread is that of the method.
+        seeds: of map and run together: their spread is that of the method.
         tracked: other recordings of the same rooms, in the same order, which no map has seen.
 
     Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), ate_m (NaN
     where it failed, or no true pose is known), failure (why) and the other metrics.
     """
-    execution, rates = execution or Execution(), [None] if steps else rates_hz
-    seeds = range(seeds) if isinstance(seeds, int) else seeds
+    execution = execution or Execution()
+    rates = [None] if steps else rates_hz or preset.tables.rates_hz
     # By the clock, how far a run comes depends on its threads.
     n_threads = execution.threads or (torch.get_num_threads() if clock else None)
-    options = {"frames": frames or preset.scenes.track_frames, "n_threads": n_threads}
+    how = {"frames": frames or preset.scenes.track_frames, "n_threads": n_threads}
     pairs, jobs, rows = list(zip(scenes, tracked or scenes, strict=True)), [], []
-    grid = product(find_methods(methods), seeds, rates or preset.tables.rates_hz, pairs)
-    for method, seed, rate_hz, (scene, seen) in grid:
-        map_job = MapJob(scene, method.field, preset.with_method(method.settings), seed=seed)
+    for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
+        own = preset.with_method(method.settings)
+        made = MapJob.of(scene, method.field, own, seed=seed)
+        what = made, seen, method.tracker, own.tracking_of(method.tracker)
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
         budget = n_steps, rate_hz if clock else None
-        job = TrackJob(map_job, seen, method.tracker, *budget, seed=seed, **options)
-        row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
-        jobs.append(job)
-        rows.append(row | {"seed": seed, "run": job.folder.name, "n_pixels": job.settings.n_pixels})
-    return pd.DataFrame(map(_row_of, rows, _run(jobs, clock, execution)))
+        jobs.append(TrackJob(*what, *budget, seed=seed, **how))
+        rows.append({"rate_hz": rate_hz, "steps": n_steps, "method": method.label})
+    return pd.DataFrame(map(_row_of, rows, jobs, _run(jobs, clock, execution)))
 
 
 def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:
@@ -147,11 +138,15 @@ def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[An
     return run_jobs(jobs, "by the clock" if clock else "tracking", execution)
 
 
-def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[str, Any]:
+def _row_of(
+    row: dict[str, Any], job: TrackJob, result: dict[str, Any] | NbtrackError
+) -> dict[str, Any]:
     """A whole row. Its scene is the mapped one; metrics name the one that was tracked."""
+    row |= {"scene": job.needs.scene.name, "seed": job.seed, "run": job.folder.name}
+    row["n_pixels"] = job.settings.n_pixels
     if isinstance(result, NbtrackError):
         return {**row, "failure": str(result), "ate_m": float("nan")}
-    metrics = {k: v for k, v in result.items() if k not in ("config", "versions")}
+    metrics = {k: v for k, v in result.items() if k not in ("config", "map_config", "versions")}
     return {**metrics, **row, "failure": "", "ate_m": result.get("ate_rmse_m", float("nan"))}
 
 
@@ -170,7 +165,7 @@ def run_jobs(jobs: Sequence[Job], title: str, execution: Execution | None = None
     done = dict.fromkeys(missing, 0.0)  # shares: each job counts as one, however long it takes
 
     def show(folder: Path, share: float, status: str) -> None:
-        done[folder] = share
+        done[folder] = max(share, done[folder])  # news of a worker may come late
         ended = f"{len(results)} of {len(missing)} done"
         bar.move_to(sum(done.values()), f"{ended}, {missing[folder].name}: {status}")
 
@@ -220,34 +215,29 @@ def _on_workers(
     processes are started.
     """
     import dask
-    from distributed import wait
+    from distributed import as_completed
     from distributed.scheduler import KilledWorker
 
     with dask.config.set(_LOCAL), _main_kept_back(), _cluster(address, workers) as client:
-        topic, news = f"nbtrack-{os.getpid()}-{time.time_ns()}", []
-        client.subscribe_topic(topic, lambda event: news.append(event[1]))
+        topic = f"nbtrack-{os.getpid()}-{time.time_ns()}"
+        client.subscribe_topic(topic, lambda event: show(Path(event[1][0]), *event[1][1:]))
         settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
         settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
         how = topic, settings, n_threads, (FIELDS, TRACKERS)
-        waiting: dict[Path, Any] = {}
+        futures: dict[Path, Any] = {}
         for folder, job in jobs.items():
-            needed = waiting.get(job.needs.folder) if job.needs else None
-            waiting[folder] = client.submit(_outcome_there, job, needed, *how, pure=False)
-        while waiting:
-            with contextlib.suppress(TimeoutError):
-                wait([*waiting.values()], timeout=_REPORT_SECONDS, return_when="FIRST_COMPLETED")
-            while news:
-                name, share, status = news.pop(0)
-                if Path(name) in waiting:
-                    show(Path(name), share, status)
-            for folder in [folder for folder, future in waiting.items() if future.done()]:
-                try:
-                    outcome = waiting.pop(folder).result()
-                except KilledWorker:
-                    died = f"a worker process died at {folder.name}, perhaps for lack of memory"
-                    advice = "run it again, with fewer --workers or smaller settings"
-                    outcome = NbtrackError(f"{died}: {advice}")
-                yield folder, outcome
+            needed = futures.get(job.needs.folder) if job.needs else None
+            futures[folder] = client.submit(_outcome_there, job, needed, *how, pure=False)
+        folders = {future: folder for folder, future in futures.items()}
+        for future in as_completed(folders):
+            folder = folders[future]
+            try:
+                outcome = future.result()
+            except KilledWorker:
+                died = f"a worker process died at {folder.name}, perhaps for lack of memory"
+                advice = "run it again, with fewer --workers or smaller settings"
+                outcome = NbtrackError(f"{died}: {advice}")
+            yield folder, outcome
 
 
 def _outcome_there(

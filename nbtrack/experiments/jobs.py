@@ -14,14 +14,14 @@ from nbtrack.beyond.correct import correct_map
 from nbtrack.core import files
 from nbtrack.core.device import advise_on_memory, choose_device, device_name, threads
 from nbtrack.core.errors import DataError, NbtrackError
-from nbtrack.core.settings import as_dict, changed_settings, with_settings
+from nbtrack.core.settings import as_dict, changed_settings
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import parse_frames, select_frames
 from nbtrack.experiments.output import check_no_recording
-from nbtrack.experiments.presets import PRESETS, Preset
+from nbtrack.experiments.presets import PRESETS, SIZES, Preset
 from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import LearnedField, field_class, make_field
+from nbtrack.fields import field_class, make_field
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
 from nbtrack.recordings.belongs import check_belongs, in_world_of_map
@@ -30,6 +30,7 @@ from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequen
 from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
 from nbtrack.tracking.reach import reach_metrics
 from nbtrack.tracking.starts import expected_poses
+from nbtrack.tracking.tracker import TrackerSettings
 from nbtrack.tracking.trajectories import METRICS_FILE, shifted, tum_text
 
 RUN_FILE = "run.pt"
@@ -37,8 +38,10 @@ _OTHER_WORLD = (
     "the recording's poses are in another world than the map: they were moved into it by the one "
     "rigid motion that explains the difference, and errors are those that remain"
 )
-OF_MAPS = ("network.", "mapping.")
+OF_MAPS = ("network.", "mapping.", "correction.")
 """How keys of settings begin that only matter where a map is made."""
+_MAP_SETTINGS = ("network", "settings", "correction")  # in the record of a map
+_PLAIN = "synthetic"  # the preset whose settings are the classes' own
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""
 
@@ -85,95 +88,133 @@ class Job:
 
 @dataclass(frozen=True)
 class MapJob(Job):
-    """One map: a field fitted to some frames of a scene, or a map made earlier in its place."""
+    """One map: a field fitted to some frames of a scene, and perhaps corrected by them."""
 
     scene: Scene
     field: str
-    preset: Preset
+    network: Any  # settings of the field's network; None where it has none
+    settings: Any  # of the mapping
     frames: str = ":"
     seed: int = 0
+    correction: float = 0.0  # cells (m) in which the fitted map is corrected; 0: it is not
     out: Path | None = None
-    is_given: bool = False  # made elsewhere, and only read: `out` is its folder, or its file
 
     kind = "maps"
+
+    @classmethod
+    def of(
+        cls, scene: Scene, field: str, preset: Preset, frames: str = ":", seed: int = 0
+    ) -> "MapJob":
+        """The map of a scene with the settings of a preset."""
+        settings = preset.network_of(field), preset.mapping_of(field)
+        return cls(scene, field, *settings, frames, seed, preset.correction.get(field, 0.0))
 
     @cached_property
     def key(self) -> str:
         """A digest of code, device, data, settings and seed."""
-        device = choose_device().type
-        if self.is_given:
-            given = read_map(self.folder)
-            return files.fingerprint(given.key, files.code_fingerprint(type(given.field)), device)
-        correction = ["nbtrack.beyond.correct"] if self.needs else []
-        kind = field_class(self.field)
-        code = kind, "nbtrack.mapping.fit", make_field, type(self).compute, *correction
-        network = self.preset.network_of(self.field) if issubclass(kind, LearnedField) else None
-        parts = self.scene.fingerprint, self.field, network, self.settings, self.frames, self.seed
-        how = files.code_fingerprint(*code), files.versions(), device
-        return files.fingerprint(*how, *parts)
-
-    @property
-    def settings(self) -> Any:
-        """Settings of the mapping."""
-        return self.preset.mapping_of(self.field)
+        correction = ["nbtrack.beyond.correct"] if self.correction else []
+        code = field_class(self.field), "nbtrack.mapping.fit", make_field, type(self).compute
+        settings = self.field, self.network, self.settings, self.correction
+        what = self.scene.fingerprint, self.frames, self.seed
+        how = files.code_fingerprint(*code, *correction), files.versions(), choose_device().type
+        return files.fingerprint(*how, *settings, *what)
 
     @property
     def name(self) -> str:
         """Scene and field, and the seed if it is not the first."""
-        name = f"{self.scene.name}-{self.field}{'-corrected' if self.needs else ''}"
+        name = f"{self.scene.name}-{self.field}{'-corrected' if self.correction else ''}"
         return f"{name}-seed{self.seed}" if self.seed else name
 
-    @property
+    @cached_property
     def needs(self) -> "MapJob | None":
         """The map that this one corrects, if it is a corrected one."""
-        if not getattr(self.settings, "correct_voxel", 0.0):
-            return None
-        preset = with_settings(self.preset, f"mapping.{self.field}.correct_voxel=0.0")
-        return replace(self, preset=preset, out=None)
+        return replace(self, correction=0.0, out=None) if self.correction else None
 
     @property
     def is_done(self) -> bool:
         """Whether the map is finished and scored; in a folder of the user's, whether it is this."""
-        if self.is_given or not (self.folder / MAP_FILE).is_file():
-            return self.is_given
-        return self.out is None or read_map(self.folder).record.get("key") == self.key
+        if not (self.folder / MAP_FILE).is_file():
+            return False
+        return self.out is None or self._stored().record.get("key") == self.key
+
+    def setting_tree(self) -> dict[str, Any]:
+        """Its settings where a preset has them."""
+        network = self.field if self.field in replace(PRESETS[_PLAIN]).network else "neus"
+        return {
+            "network": {network: self.network} if self.network else {},
+            "mapping": {self.field: self.settings},
+            "correction": {self.field: self.correction} if self.correction else {},
+        }
 
     def result(self) -> dict[str, Any]:
         """How the finished map was made, and its scores."""
-        return self.map().record
+        return self._stored().record
 
     def map(self) -> Map:
         """The finished map, ready for tracking."""
-        finished = _read(self.folder, self.key)
+        finished = self._stored()
         return replace(finished, field=finished.field.to(choose_device()))
+
+    def _stored(self) -> Map:
+        return _read(self.folder, (self.folder / MAP_FILE).stat().st_mtime_ns)
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Map and score, or resume; write the map's files."""
-        iterations = getattr(self.settings, "iterations", 1)
         path, checkpoint = self.folder / MAP_FILE, self.folder / CHECKPOINT_FILE
 
-        def tell(done: int, losses: dict[str, float | int]) -> None:
-            words = [f"{name} {loss:.3f}" for name, loss in losses.items()]
-            report(done / iterations, " ".join(words))
+        def tell(share: float, losses: dict[str, float | int]) -> None:
+            report(share, " ".join(f"{name} {loss:.3f}" for name, loss in losses.items()))
 
-        sequence, network = self.scene.read(self.frames), self.preset.network_of(self.field)
-        parts = self.field, sequence, network, self.settings, self.seed
+        sequence = self.scene.read(self.frames)
+        parts = self.field, sequence, self.network, self.settings, self.seed
         if path.is_file():  # a folder of the user's, with another finished map
-            check_recipe(path, read_map(self.folder).record, recipe_of(*parts))
+            recipe = recipe_of(*parts) | {"correction": self.correction}
+            check_recipe(path, self._stored().record, recipe)
         if self.needs:
-            finished = correct_map(self.needs.map(), sequence, self.settings)
+            finished = correct_map(self.needs.map(), sequence, self.correction)
         else:
             finished = map_sequence(*parts, choose_device(), checkpoint, tell)
         record = {"quality": score_map(finished, sequence, self.scene.room)}
-        record |= {"frames": self.frames, "key": self.key, "config": as_dict(self.preset)}
+        record |= {"frames": self.frames, "key": self.key, "correction": self.correction}
         finished = replace(finished, record=finished.record | record)
         write_map(path, finished)
         checkpoint.unlink(missing_ok=True)
         return finished.record
 
 
+@dataclass(frozen=True, eq=False)
+class GivenMap(Job):
+    """A map that was made before, and is only read."""
+
+    finished: Map
+    out: Path  # its folder, or its file
+
+    needs = None
+    is_done = True
+
+    @cached_property
+    def key(self) -> str:
+        """A digest of the map, its field's code and the device."""
+        code = files.code_fingerprint(type(self.finished.field))
+        return files.fingerprint(self.finished.key, code, choose_device().type)
+
+    @property
+    def field(self) -> str:
+        """The name of its field."""
+        return self.finished.field.name
+
+    @property
+    def correction(self) -> float:
+        """Cells (m) in which it was corrected; 0: it was not."""
+        return self.finished.record.get("correction", 0.0)
+
+    def map(self) -> Map:
+        """The map, ready for tracking."""
+        return replace(self.finished, field=self.finished.field.to(choose_device()))
+
+
 @lru_cache(maxsize=4)
-def _read(folder: Path, key: str) -> Map:
+def _read(folder: Path, modified_ns: int) -> Map:
     """Read once for all runs in a map: a corrected one samples its network, which takes seconds."""
     return read_map(folder)
 
@@ -182,9 +223,10 @@ def _read(folder: Path, key: str) -> Map:
 class TrackJob(Job):
     """One tracked run in a map, under one budget: so many steps a frame, or a rate by the clock."""
 
-    needs: MapJob
+    needs: MapJob | GivenMap
     scene: Scene  # the mapped one, or another recording of the same room
     tracker: str
+    settings: TrackerSettings
     steps: float | int | None = None
     rate_hz: float | int | None = None
     frames: str = ":"
@@ -194,11 +236,6 @@ class TrackJob(Job):
     start: str = "given"  # the first frame's true pose, where known; or "unknown"
 
     kind = "tracks"
-
-    @property
-    def settings(self) -> Any:
-        """Settings of the tracker."""
-        return self.needs.preset.tracking_of(self.tracker)
 
     @cached_property
     def key(self) -> str:
@@ -222,7 +259,8 @@ class TrackJob(Job):
     @property
     def is_elsewhere(self) -> bool:
         """Whether the map was made from another recording."""
-        return self.needs.is_given or self.scene.folder != self.needs.scene.folder
+        made = self.needs
+        return isinstance(made, GivenMap) or self.scene.folder != made.scene.folder
 
     @property
     def is_done(self) -> bool:
@@ -230,13 +268,12 @@ class TrackJob(Job):
         return self.out is None and (self.folder / METRICS_FILE).is_file()
 
     def check(self) -> None:
-        """Raises ConfigError, before its map is made, where a run cannot begin in it."""
+        """Raises ConfigError or DataError, before anything is made, where a run cannot begin."""
         recording = self.scene.recording
         frame_ids = select_frames(recording, parse_frames(self.frames), needs_poses=False)
         expected_poses(self.settings.motion_model, [np.eye(4)])
         if self.start == "unknown" or not recording.has_pose[frame_ids[0]]:
-            is_corrected = bool(getattr(self.needs.settings, "correct_voxel", 0.0))
-            tracker_class(self.tracker).check_finds(is_corrected)
+            tracker_class(self.tracker).check_finds(in_corrected=self.needs.correction > 0)
 
     def result(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""
@@ -261,9 +298,7 @@ class TrackJob(Job):
             tracked, is_explained = in_world_of_map(tracked)
             notes["map_warning"] = _OTHER_WORLD if is_explained else None
         metrics = _scores(tracked) | self._provenance(n_threads) | notes
-        if metrics.get("path_m") and "ate_rmse_m" in metrics:
-            metrics["ate_over_path"] = metrics["ate_rmse_m"] / metrics["path_m"]
-        times, origin = tracked.frames["time"].to_numpy(), np.array(notes.get("origin", [0, 0, 0]))
+        times, origin = tracked.frames["time"].to_numpy(), np.array(notes["origin"])
         texts = {
             "trajectory.txt": tum_text(times, shifted(tracked.T_estimated, origin)),
             "groundtruth.txt": tum_text(times, shifted(tracked.T_true, origin)),
@@ -283,12 +318,9 @@ class TrackJob(Job):
         origin = np.array(finished_map.record["origin"])
         sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
         notes = {"map_seconds": finished_map.record["seconds"], "budget": str(budget)}
-        if origin.any():
-            notes["origin"] = origin.tolist()
-        notes |= still_metrics(sequence.T_world_camera)
-        bounds = finished_map.field.bounds
-        notes["metres_per_unit"] = bounds.metres_per_unit
-        notes["half_longest_side_m"] = bounds.half_longest_side
+        notes |= {"origin": origin.tolist(), **still_metrics(sequence.T_world_camera)}
+        metres_per_unit = finished_map.field.bounds.metres_per_unit
+        notes["metres_per_unit"] = metres_per_unit
         if self.is_elsewhere:
             notes["map_from"] = finished_map.record
         T_first = sequence.T_world_camera[0]
@@ -306,9 +338,9 @@ class TrackJob(Job):
 
         checkpoint = self.cache / RUN_FILE  # a folder of the user's holds results alone
         tracked = track_sequence(tracker, sequence, checkpoint, tell, is_start_known)
-        reach = self.settings.reach(tracked.frames["steps"].mean(), bounds.metres_per_unit)
+        reach = self.settings.reach(tracked.frames["steps"].mean(), metres_per_unit)
         how = sequence.T_world_camera, self.settings.motion_model
-        if self.needs.is_given:
+        if isinstance(self.needs, GivenMap):
             followed = sequence.select(slice(len(sequence) - len(tracked.frames), None))
             if notes["map_warning"] == _OTHER_WORLD:
                 followed = replace(followed, T_world_camera=tracked.T_estimated)
@@ -320,7 +352,7 @@ class TrackJob(Job):
 
         Where that is not used, and the map does not fit it, the recording has a world of its own.
         """
-        if not self.needs.is_given or first.T_world_camera is None:
+        if not isinstance(self.needs, GivenMap) or first.T_world_camera is None:
             return None  # another path of a room may begin where no map reaches
         try:
             return check_belongs(finished_map, first)
@@ -331,6 +363,7 @@ class TrackJob(Job):
 
     def _provenance(self, n_threads: int) -> dict[str, Any]:
         """Where a run comes from: data, map, method, settings, machine; how to make it again."""
+        finished = self.needs.map()
         return {
             "threads": n_threads,
             "scene": self.scene.name,
@@ -343,28 +376,31 @@ class TrackJob(Job):
             "recording": str(self.scene.folder.resolve()),
             "format": self.scene.format,
             "map": str(self.needs.folder.resolve()),
-            "map_key": self.needs.map().key,
-            "config": as_dict(self.needs.preset),
+            "map_key": finished.key,
+            "config": as_dict(self.settings),
+            "map_config": {name: finished.record.get(name) for name in _MAP_SETTINGS},
         }
 
     def _command(self) -> str:
         """What makes this run anew, and its map where that is not cached."""
-        preset, sequence = self.needs.preset, str(self.scene.folder)
-        settings = changed_settings(preset, PRESETS[preset.name])
-        of_map = {"field": self.needs.field, "map-frames": self.needs.frames}
-        options = {"format": self.scene.format, **of_map}
-        if self.is_elsewhere:
-            options = {"format": self.scene.format, "map-from": self.needs.folder}
-            settings = [text for text in settings if not text.startswith(OF_MAPS)]
-        elif self.scene.made_by:
-            sequence = self.scene.name
-        options |= {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
+        options = {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
         options |= {"start": self.start, "frames": self.frames, "seed": self.seed}
         options |= {"device": choose_device().type, "threads": self.n_threads}
-        given = [f"--{name}={value}" for name, value in options.items() if value is not None]
-        words = ["python", "-m", "nbtrack", "track", sequence, f"--preset={preset.name}"]
-        words += [f"--set={text}" for text in settings]
-        return shlex.join([*words, *given, "--out", f"again_{self.name}"])
+        options |= {"format": self.scene.format, "preset": _PLAIN}
+        settings: dict[str, Any] = {"tracking": {self.tracker: self.settings}}
+        if self.is_elsewhere:
+            options["map-from"] = self.needs.folder
+        else:
+            options |= {"field": self.needs.field, "map-frames": self.needs.frames}
+            settings |= self.needs.setting_tree()
+        sequence = str(self.scene.folder)
+        if self.scene.made and not self.is_elsewhere:
+            sequence, made = self.scene.name, self.scene.made
+            settings["scenes"] = {name: getattr(made, name) for name in SIZES}
+        words = [f"--set={text}" for text in changed_settings(settings, replace(PRESETS[_PLAIN]))]
+        words += [f"--{name}={value}" for name, value in options.items() if value is not None]
+        words = ["python", "-m", "nbtrack", "track", sequence, *words]
+        return shlex.join([*words, "--out", f"again_{self.name}"])
 
 
 def _scores(tracked: Trajectory) -> dict[str, Any]:

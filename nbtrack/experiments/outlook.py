@@ -8,7 +8,7 @@ import numpy as np
 
 from nbtrack.core.errors import NbtrackError
 from nbtrack.data.sequence import observed_bounds, parse_frames, read_frames, select_frames
-from nbtrack.experiments.jobs import MapJob, TrackJob
+from nbtrack.experiments.jobs import GivenMap, MapJob, TrackJob
 from nbtrack.experiments.scenes import Scene
 from nbtrack.tracking.reach import reach_metrics
 
@@ -60,7 +60,7 @@ def expected_reach(run: TrackJob) -> dict[str, float]:
     return {}
 
 
-def _unit_of(job: MapJob) -> float:
+def _unit_of(job: MapJob | GivenMap) -> float:
     """Metres a unit of a map; about those of one that is still to be made."""
     if job.is_done:
         return job.map().field.bounds.metres_per_unit

@@ -7,18 +7,18 @@ Precedence, in every command: class defaults < preset < method < TOML file (`NBT
 import os
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from nbtrack.core.errors import ConfigError, MissingError, look_up
-from nbtrack.core.settings import limited, setting_texts, with_settings, with_values
+from nbtrack.core.settings import flat, limited, read_setting, with_values
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.data.text_files import read_object
-from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, NeusMapping, field_class
+from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.tables import PAPER_PIXELS
-from nbtrack.tracking import TRACKERS, SdfSettings, TrackerSettings, tracker_class
+from nbtrack.tracking import TRACKERS, TrackerSettings, tracker_class
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,10 @@ class ScenesConfig:
     width: int = limited(640, 11, 4096)  # pixels; the height is three quarters of it
     track_frames: str = ":"  # the Python slice of frames that is tracked
     seed: int = limited(0, 0, 2**31 - 1)
+
+
+SIZES = ("motion", "n_frames", "width", "seed")
+"""What tells a synthetic room's recording from others of it."""
 
 
 @dataclass(frozen=True)
@@ -61,22 +65,29 @@ class Preset:
     )
     # Of every field and tracker; of those that are not given, the defaults of their classes.
     mapping: dict[str, Any] = field(default_factory=dict)
+    # Cells (m) in which the finished map of a field with a distance is corrected; 0: it is not.
+    correction: dict[str, float] = field(default_factory=dict)
     tracking: dict[str, TrackerSettings] = field(default_factory=dict)
     scenes: ScenesConfig = ScenesConfig()
     tables: TablesConfig = TablesConfig()
-    # The `key=value` texts of the user's own, which come after those of a method.
-    chosen: tuple[str, ...] = field(default=(), metadata={"is_setting": False})
+    # Dotted keys of the user's own values, which a method does not change.
+    chosen: frozenset[str] = field(default=frozenset(), metadata={"is_setting": False})
 
     def __post_init__(self) -> None:
-        """Add settings of all registered fields and trackers, and of networks of other kinds."""
-        others = {
-            name: self.network_of(name)
-            for name, kind in FIELDS.items()
-            if issubclass(kind, LearnedField) and kind.Network is not NetworkSettings
-        }
-        object.__setattr__(self, "network", self.network | others)
-        object.__setattr__(self, "mapping", {name: self.mapping_of(name) for name in FIELDS})
-        object.__setattr__(self, "tracking", {name: self.tracking_of(name) for name in TRACKERS})
+        """Add settings of what is registered and has none; one without its own takes what was
+        changed in those of NeuS or of SDF tracking."""
+        learned = {n: kind for n, kind in FIELDS.items() if issubclass(kind, LearnedField)}
+        networks = {n: k.Network for n, k in learned.items() if k.Network is not NetworkSettings}
+        self._complete("network", networks, "neus")
+        self._complete("mapping", {n: kind.Settings for n, kind in FIELDS.items()}, "neus")
+        self._complete("tracking", {n: kind.Settings for n, kind in TRACKERS.items()}, "sdf")
+        none = {name: 0.0 for name, kind in learned.items() if kind.is_distance}
+        object.__setattr__(self, "correction", none | self.correction)
+
+    def _complete(self, part: str, kinds: dict[str, type], usual: str) -> None:
+        known = getattr(self, part)
+        found = {n: _like(known.get(n, known.get(usual)), kind) for n, kind in kinds.items()}
+        object.__setattr__(self, part, known | found)
 
     @property
     def step_counts(self) -> str:
@@ -88,41 +99,35 @@ class Preset:
         return f"the paper's step counts, {there}; here n = {own} and {own_width} units"
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
-        """The preset with the `key=value` texts of a method, and then those that a user chose."""
-        return with_settings(self, *settings, *self.chosen)
+        """The preset with the `key=value` texts of a method, but for what a user chose."""
+        changed = self
+        for values in map(read_setting, settings):
+            own = {key: value for key, value in values.items() if key not in self.chosen}
+            changed = with_values(changed, own)
+        return changed
 
     def network_of(self, field_name: str) -> Any:
-        """Network of a field; one without its own takes what was changed of NeuS's."""
-        kind = field_class(field_name)
-        network = kind.Network if issubclass(kind, LearnedField) else NetworkSettings
-        return _own_or_like("neus", self.network, field_name, network, NetworkSettings())
+        """Network of a field, by default that of NeuS; None of a field that learns nothing."""
+        known = replace(self).network  # with those of fields registered since
+        is_learned = issubclass(field_class(field_name), LearnedField)
+        return known.get(field_name, known["neus"]) if is_learned else None
 
     def mapping_of(self, field_name: str) -> Any:
-        """Mapping settings of a field; one that has none takes what was changed of NeuS's."""
-        kind = field_class(field_name).Settings
-        return _own_or_like("neus", self.mapping, field_name, kind, NeusMapping())
+        """Mapping settings of a field."""
+        return look_up("field", field_name, replace(self).mapping)
 
     def tracking_of(self, tracker_name: str) -> TrackerSettings:
-        """Settings of a tracker; one that has none takes what was changed of SDF tracking's."""
-        kind = tracker_class(tracker_name).Settings
-        return _own_or_like("sdf", self.tracking, tracker_name, kind, SdfSettings())
+        """Settings of a tracker."""
+        return look_up("tracker", tracker_name, replace(self).tracking)
 
 
-def _own_or_like(usual: str, known: dict[str, Any], name: str, kind: type, plain: Any) -> Any:
-    """Settings of a class: those of a name, else its defaults, but for what differs from `plain` in
-    those of the usual one: so a preset's sizes are those of what is registered later, too."""
-    if name in known:
-        return _shared(kind, known[name])
-    like = known.get(usual, plain)
-    changed = {f.name for f in fields(plain) if getattr(like, f.name) != getattr(plain, f.name)}
-    return _shared(kind, like, changed)
-
-
-def _shared(kind: type, other: Any, names: set[str] | None = None) -> Any:
-    """Settings of a class with those values of another's that both have, of these names."""
-    both = {f.name for f in fields(kind)} & {f.name for f in fields(other)}
-    both = both if names is None else both & names
-    return kind(**{name: getattr(other, name) for name in both})
+def _like(other: Any, kind: type) -> Any:
+    """Settings of a class, with what is changed in those of another where both have it."""
+    if other is None or type(other) is kind:
+        return other or kind()
+    usual = vars(type(other)())
+    changed = {name for name, value in vars(other).items() if value != usual[name]}
+    return kind(**{name: getattr(other, name) for name in changed & vars(kind()).keys()})
 
 
 def _from_file(name: str) -> Preset:
@@ -153,16 +158,18 @@ def load_preset(
     wrong type; MissingError if the file does not exist, DataError if it is no TOML.
     """
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
-    in_file: list[str] = []
+    layers = []
     if config_file := config_file or os.environ.get("NBTRACK_CONFIG"):
         if not Path(config_file).is_file():
             raise MissingError(f"no config file {config_file}: give a TOML file of settings")
-        values = read_object(Path(config_file))
-        preset, in_file = with_values(preset, values), setting_texts(values)
+        layers.append(flat(read_object(Path(config_file))))
     try:
         before = shlex.split(os.environ.get("NBTRACK_SET", ""))
     except ValueError as error:
         advice = "quote each setting as in a shell"
         raise ConfigError(f"NBTRACK_SET cannot be split ({error}): {advice}") from None
-    chosen = *in_file, *before, *settings
-    return replace(with_settings(preset, *before, *settings), chosen=chosen)
+    chosen: set[str] = set()
+    for layer in [*layers, *map(read_setting, [*before, *settings])]:
+        preset = with_values(preset, layer)  # a value that a later one replaces is checked too
+        chosen |= layer.keys()
+    return replace(preset, chosen=frozenset(chosen))

@@ -1,6 +1,5 @@
 """From what a user calls a sequence to a folder on disk: a path, a room, a scene of the dataset."""
 
-import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,11 +12,10 @@ from nbtrack.core.files import (
     locked,
     resolved,
     runs_folder,
-    write_atomic,
 )
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.formats import DATASET_SCENES
-from nbtrack.data.recording import Recording, image_digest, open_recording
+from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import (
     RgbdSequence,
     parse_frames,
@@ -40,7 +38,7 @@ class Scene:
     name: str
     folder: Path
     format: str | None = None  # None: told by the files that are there
-    made_by: str = ""  # of a room in the cache: what tells its generator from others; else empty
+    made: ScenesConfig | None = None  # how, if it is a room of the cache
 
     @property
     def room(self) -> Room | None:
@@ -54,8 +52,8 @@ class Scene:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Changes with what is read. A room of the cache is made anew as it was."""
-        return self.made_by or fingerprint(*self.recording.contents())
+        """Changes with what is read."""
+        return fingerprint(*self.recording.contents())
 
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
         """The frames of a slice such as `10:50:2`, `without_outliers`; more options and errors: see
@@ -99,10 +97,11 @@ def open_scenes(preset: Preset) -> list[Scene]:
     returned. Raises ConfigError where no name is given, or one twice, or an unknown one; where no
     scene is whole, what is wrong with the first.
     """
-    names, scenes, missing = preset.scenes.names, [], {}
+    names = preset.scenes.names
     if not names or len({resolved(name).name for name in names}) < len(names):
         given = ", ".join(names) or "(none)"
         raise ConfigError(f"scenes {given}: give at least one, and of one name only one")
+    scenes, missing = [], {}
     for name in names:
         try:
             scene = open_scene(name, preset)
@@ -130,25 +129,10 @@ def _room(name: str, config: ScenesConfig) -> Scene:
     recipe = f"{config.motion}-{config.n_frames}x{config.width}-seed{config.seed}"
     recipe += f"-{room_version(name)}"
     folder = runs_folder() / "rooms" / f"{name}-{recipe}" / name
-    if not _is_whole(folder):
+    if not folder.is_dir():  # it appears when it is complete
         check_no_recording(runs_folder())
         # Another command that needs the same room waits, and then reads it.
         with locked(folder.with_suffix(".lock")):
-            if not _is_whole(folder):
-                if folder.exists():
-                    tell(f"{folder} is not as it was made: the room is made anew")
-                    shutil.rmtree(folder)
+            if not folder.is_dir():
                 write_room(name, folder, config)
-                write_atomic(folder.with_suffix(".digest"), _digest_of(folder))
-    return Scene(name, folder, made_by=f"{name}-{recipe}")
-
-
-def _is_whole(folder: Path) -> bool:
-    """Whether a room of the cache is there, every file of it as it was written."""
-    digest = folder.with_suffix(".digest")
-    return folder.is_dir() and digest.is_file() and digest.read_text() == _digest_of(folder)
-
-
-def _digest_of(folder: Path) -> str:
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return fingerprint([(str(path.relative_to(folder)), image_digest(path)) for path in files])
+    return Scene(name, folder, made=config)

@@ -25,7 +25,6 @@ class NeusMapping(base.MappingSettings):
     lambda_eikonal: float = 0.5  # five times the method's own: rooms are mostly empty
     # Share of the samples that the eikonal term looks at: on neighbouring samples it is alike.
     eikonal_share: float = limited(0.25, 0.0, 1.0)
-    correct_voxel: float = 0.0  # m; the finished map is corrected in such cells, 0: not at all
 
 
 class NeuSField(LearnedField):

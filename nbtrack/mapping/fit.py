@@ -24,8 +24,8 @@ CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at
 _PENDING = 10  # iterations between two looks at the losses, which wait for the device
 _FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
 
-OnIteration = Callable[[int, dict[str, float]], object]
-"""Called with the iterations done and the last one's losses, a few times a second at most."""
+OnIteration = Callable[[float, dict[str, float]], object]
+"""Called with the share that is done and the last losses, a few times a second at most."""
 
 
 def learning_rate(settings: MappingSettings, iteration: int) -> float:
@@ -47,7 +47,7 @@ def map_sequence(
 ) -> Map:
     """Fit a field to a sequence with known poses; one that learns nothing is made from its frames.
 
-    Settings are those of the field's `Network`, where it has one, and of its `Settings`.
+    Settings are those of the field's `Network`, None where it has none, and of its `Settings`.
 
     A `checkpoint` is written every few seconds and, where it exists, resumed from with the batches
     of an uninterrupted run. Who has written the finished map removes it. Raises DataError where no
@@ -69,7 +69,7 @@ def map_sequence(
     else:
         field = kind.from_frames(sequence, mapped, bounds, settings).to(device)
         history, seconds = [field.diagnostics()], time.perf_counter() - start
-        on_iteration(1, history[0])
+        on_iteration(1.0, history[0])
     misfit_m = usual_depth_residual(field, sequence, mapped)
     record = {**recipe, "seconds": seconds, "misfit_m": misfit_m, "mapped_frames": len(mapped)}
     record |= {"device": device_name(device), "versions": versions()}
@@ -89,7 +89,7 @@ def recipe_of(
         "data": sequence.digest,
         "origin": sequence.origin.tolist(),
         "seed": seed,
-        "network": asdict(network),
+        "network": asdict(network) if network else {},
         "settings": asdict(settings),
     }
 
@@ -125,7 +125,7 @@ class _Fit:
         last_saved, end = time.perf_counter(), self.settings.iterations
         while (done := len(self.history)) < end:
             self._advance(range(done, min(end, done + _PENDING)))
-            on_iteration(len(self.history), self.history[-1])
+            on_iteration(len(self.history) / end, self.history[-1])
             is_due = time.perf_counter() - last_saved > CHECKPOINT_SECONDS
             if checkpoint and (is_due or len(self.history) == end):
                 self._save(checkpoint)

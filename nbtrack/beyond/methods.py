@@ -1,0 +1,33 @@
+"""Methods beyond the paper: NeuS+, other fields, corrected maps, LM and ICP."""
+
+from nbtrack.tracking.methods import METHODS, Method
+
+_COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
+_NEUS_CORRECTED = ("correction.neus=0.04",)
+# As good as from 1400 iterations, in half the time (benchmarks/README.md; rooms for tuning).
+_CORRECTED = ("correction.neus_plus=0.04", "mapping.neus_plus.iterations=600")
+_SPARSE, _MIDDLE, _DENSE = ((*_CORRECTED, f"tracking.lm.n_pixels={n}") for n in (512, 2048, 4096))
+_GEOMETRY = (*_MIDDLE, "tracking.lm.lambda_intensity=0")
+
+METHODS |= {
+    "vr_plus": Method("NeuS+ with VR", "neus_plus", "vr"),
+    "vr_volsdf": Method("VolSDF with VR", "volsdf", "vr"),
+    "sdf_volsdf": Method("VolSDF with SDF", "volsdf", "sdf"),
+    "vr_occupancy": Method("Occupancy with VR", "occupancy", "vr"),
+    "color_plus": Method("NeuS+ with VR, colour only", "neus_plus", "vr", _COLOR_ONLY),
+    "color_volsdf": Method("VolSDF with VR, colour only", "volsdf", "vr", _COLOR_ONLY),
+    "color_occupancy": Method("Occupancy with VR, colour only", "occupancy", "vr", _COLOR_ONLY),
+    "sdf_plus": Method("NeuS+ with SDF (Adam)", "neus_plus", "sdf"),
+    "baked": Method("NeuS+ baked (LM)", "neus_plus", "lm"),
+    "corrected": Method("NeuS+ corrected (LM)", "neus_plus", "lm", _MIDDLE),
+    "corrected_sparse": Method("NeuS+ corrected (LM), sparse", "neus_plus", "lm", _SPARSE),
+    "corrected_dense": Method("NeuS+ corrected (LM), dense", "neus_plus", "lm", _DENSE),
+    "corrected_geometry": Method(
+        "NeuS+ corrected (LM), without colour", "neus_plus", "lm", _GEOMETRY
+    ),
+    "neus_corrected": Method("NeuS corrected (LM)", "neus", "lm", _NEUS_CORRECTED),
+    "sdf_corrected": Method("NeuS corrected with SDF (Adam)", "neus", "sdf", _NEUS_CORRECTED),
+    "icp": Method("ICP", "points", "icp"),
+    "icp_middle": Method("ICP, 2048", "points", "icp", ("tracking.icp.n_pixels=2048",)),
+    "icp_dense": Method("ICP, dense", "points", "icp", ("tracking.icp.n_pixels=4096",)),
+}

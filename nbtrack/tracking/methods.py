@@ -1,0 +1,64 @@
+"""Methods: a tracker in a field, with settings of its own, and the registry of their names."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from nbtrack.core.errors import look_up
+from nbtrack.tracking import check_pair, paper_steps, tracker_class
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of Table I or III."""
+
+    label: str
+    field: str
+    tracker: str
+    settings: tuple[str, ...] = ()  # key=value, over the preset's and under the user's own
+
+    def paper_steps(self, rate_hz: float | int) -> float:
+        """Steps a frame on the paper's hardware: of VR for what renders, else of SDF."""
+        return paper_steps("vr" if tracker_class(self.tracker).renders else "sdf", rate_hz)
+
+    @property
+    def usual_steps(self) -> float:
+        """Steps a frame where nobody says how many: up to 30 of a tracker that ends by itself.
+
+        The paper's trackers do not; they take the steps of its slowest rate, 2 Hz.
+        """
+        return 30 if tracker_class(self.tracker).converges else self.paper_steps(2)
+
+
+Methods = Sequence[str | Method]
+"""By name, or as they are."""
+
+_COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
+_VR_VELOCITY = ("tracking.vr.motion_model=constant_velocity",)
+_SDF_VELOCITY = ("tracking.sdf.motion_model=constant_velocity",)
+_VR_METRES = ("tracking.vr.position_unit=metre",)
+_SDF_METRES = ("tracking.sdf.position_unit=metre",)
+METHODS = {
+    "vr": Method("iMAP with VR", "imap", "vr"),
+    "sdf": Method("NeuS with SDF", "neus", "sdf"),
+    "vr_velocity": Method("iMAP with VR, constant velocity", "imap", "vr", _VR_VELOCITY),
+    "sdf_velocity": Method("NeuS with SDF, constant velocity", "neus", "sdf", _SDF_VELOCITY),
+    "vr_metres": Method("iMAP with VR, rates in metres", "imap", "vr", _VR_METRES),
+    "sdf_metres": Method("NeuS with SDF, rates in metres", "neus", "sdf", _SDF_METRES),
+    "vr_neus": Method("NeuS with VR", "neus", "vr"),
+    "color": Method("iMAP with VR, colour only", "imap", "vr", _COLOR_ONLY),
+    "color_neus": Method("NeuS with VR, colour only", "neus", "vr", _COLOR_ONLY),
+}
+"""The paper's, and variants of them, by name; those of the room `beyond` join where it is imported.
+A method of your own joins by `METHODS["mine"] = Method(...)`."""
+
+
+def find_methods(methods: Methods) -> list[Method]:
+    """The methods of these names; a `Method` stands for itself.
+
+    Raises ConfigError if a name is unknown, or its field and tracker do not go together.
+    """
+    chosen = []
+    for method in dict.fromkeys(methods):
+        chosen.append(look_up("method", method, METHODS) if isinstance(method, str) else method)
+        check_pair(chosen[-1].tracker, chosen[-1].field)
+    return chosen
