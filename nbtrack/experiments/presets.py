@@ -71,7 +71,7 @@ class Preset:
     scenes: ScenesConfig = ScenesConfig()
     tables: TablesConfig = TablesConfig()
     # Dotted keys of the user's own values, which a method does not change.
-    chosen: frozenset[str] = field(default=frozenset(), metadata={"is_setting": False})
+    chosen: tuple[str, ...] = field(default=(), metadata={"is_setting": False})
 
     def __post_init__(self) -> None:
         """Add settings of what is registered and has none; one without its own takes what was
@@ -172,4 +172,4 @@ def load_preset(
     for layer in [*layers, *map(read_setting, [*before, *settings])]:
         preset = with_values(preset, layer)  # a value that a later one replaces is checked too
         chosen |= layer.keys()
-    return replace(preset, chosen=frozenset(chosen))
+    return replace(preset, chosen=tuple(sorted(chosen)))
