@@ -42,7 +42,7 @@ from nbtrack.core.settings import as_dict
 
 PACKAGE = Path(nbtrack.__file__).resolve().parent
 _WITHOUT_EFFECT = {
-    "core.capture", "core.device", "core.errors", "core.files", "core.progress", "core.settings",
+    "core.device", "core.errors", "core.files", "core.progress", "core.settings",
     "mapping.files",
 }  # fmt: skip
 """Modules that change no digit of a result."""
