@@ -31,7 +31,7 @@ from nbtrack.core.errors import ConfigError, DataError, MissingError
 from nbtrack.data.formats import FORMATS
 from nbtrack.data.recording import open_recording
 from nbtrack.data.sequence import RgbdSequence, observed_bounds, parse_frames, read_sequence
-from nbtrack.data.writer import convert_sequence
+from nbtrack.recordings.writer import convert_sequence
 
 LOSSY = ("replica", "scannet")  # colour is JPEG
 

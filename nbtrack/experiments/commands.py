@@ -15,7 +15,6 @@ from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import as_dict, with_values
 from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import RgbdSequence, parse_frames, read_frames
-from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.grid import run_jobs
 from nbtrack.experiments.jobs import OF_MAPS, MapJob, TrackJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, METHODS, Method, method_of
@@ -33,6 +32,7 @@ from nbtrack.mapping.files import MAP_FILE, MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh
 from nbtrack.recordings.check import check_recording, quick_warning
+from nbtrack.recordings.writer import convert_sequence
 from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 from nbtrack.tracking.trajectories import read_trajectory, read_tum, write_kitti
