@@ -142,7 +142,7 @@ def test_poses_of_a_list_without_names(tmp_path: Path, case: str) -> None:
     one that lost some; as many poses as images prove nothing where stamps say otherwise."""
     numbers, _, _, expected = LISTS[case]
     if expected is None:
-        with pytest.raises(DataError, match=r"poses but there are|no time within") as caught:
+        with pytest.raises(DataError, match="poses but there are") as caught:
             listed(tmp_path / "r", case)
         assert "\n" not in str(caught.value)
         return
@@ -230,5 +230,5 @@ def test_poses_between_stamps_are_interpolated(tmp_path: Path, direction: str) -
     assert np.array_equal(recording.file_poses[[0, 2, 5]], in_file[[0, 4, 10]])
     np.testing.assert_allclose(recording.T_world_camera[1], moving(frames)[1], atol=1e-6)
     (note,) = (text for text in recording.notes if "interpolated" in text)
-    assert note.startswith("1 of 6 poses")
+    assert note.startswith("groundtruth.txt: 1 of 6 poses")
     assert "20.0 ms" in note
