@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 from nbtrack import __version__
 from nbtrack.core.errors import ConfigError, NbtrackError, nearest_name
-from nbtrack.core.interrupts import INTERRUPTED, STATUS, heed_interrupts
+from nbtrack.core.interrupts import INTERRUPTED, STATUS
 
 _MAX_COUNT = 2**31 - 1  # what every random generator takes
 _MAX_THREADS = 1024  # OpenMP ends the process where it cannot start them
@@ -125,7 +125,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     With `NBTRACK_DEBUG` set, the traceback of whatever ended it is printed too.
     """
     _open_streams()
-    heed_interrupts()
     try:
         options = _parsed(arguments)
         if options.device:

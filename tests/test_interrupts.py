@@ -7,22 +7,6 @@ from pathlib import Path
 import pytest
 from tiny import tiny_words
 
-# As libraries do that try what else there is: an import that takes Ctrl-C for a failure of its own.
-IMPORTING = """
-import os, signal, sys
-from nbtrack.cli import main
-
-class Swallowing:
-    def find_spec(self, name, *more):
-        try:
-            if name == "torch":
-                os.kill(os.getpid(), signal.SIGINT)
-        except KeyboardInterrupt:
-            pass
-
-sys.meta_path.insert(0, Swallowing())
-sys.exit(main(["track", "nowhere"]))
-"""
 # To the whole group, as a terminal does, while its workers begin.
 WORKING = """
 import os, signal, sys, threading
@@ -48,11 +32,6 @@ def interrupted(script: Path, content: str) -> str:
     assert "Traceback" not in found.stderr
     assert "Warning" not in found.stderr
     return found.stderr.splitlines()[-1]
-
-
-def test_while_a_library_is_imported(tmp_path: Path) -> None:
-    """Catches Ctrl-C that is swallowed, so that the command goes on for minutes."""
-    assert "interrupted" in interrupted(tmp_path / "importing.py", IMPORTING)
 
 
 def test_while_workers_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,8 +19,8 @@ import os
 import pickle
 import platform
 import re
-import secrets
 import struct
+import tempfile
 import textwrap
 import warnings
 import zipfile
@@ -219,26 +219,22 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
     earlier ones as they were. Whoever is killed between two moves leaves a folder without the last.
     Missing folders are made. Raises OSError, which names the last file, where that is not possible.
     """
-    # A random name, which must be new: nobody else writes there, or has put a link in its place.
-    asides = {folder / name: folder / f".{name}.{secrets.token_hex(6)}.tmp" for name in contents}
-    *_, last = asides
+    *_, last = contents
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for aside, content in zip(asides.values(), contents.values(), strict=True):
-            # Paths whose letters the system's encoding lacks come as surrogates.
-            is_text = isinstance(content, str)
-            with aside.open("xb") as opened:
-                opened.write(content.encode(errors="surrogateescape") if is_text else content)
-        if len(contents) > 1:
-            last.unlink(missing_ok=True)
-        for path, aside in asides.items():
-            os.replace(aside, path)
+        # A new folder of a random name: nobody else writes there, or has put a link in its place.
+        with tempfile.TemporaryDirectory(".tmp", ".", folder) as aside:
+            for name, content in contents.items():
+                # Paths whose letters the system's encoding lacks come as surrogates.
+                is_text = isinstance(content, str)
+                encoded = content.encode(errors="surrogateescape") if is_text else content
+                Path(aside, name).write_bytes(encoded)
+            if len(contents) > 1:
+                (folder / last).unlink(missing_ok=True)
+            for name in contents:
+                os.replace(Path(aside, name), folder / name)
     except OSError as error:  # a write that finds the disk full has no name of its own
-        raise OSError(error.errno, error.strerror or str(error), str(last)) from None
-    finally:
-        for aside in asides.values():
-            with contextlib.suppress(OSError):  # what went wrong before is what users must hear
-                aside.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror or str(error), str(folder / last)) from None
 
 
 @contextlib.contextmanager

@@ -1,7 +1,6 @@
-"""Ctrl-C: the end at once while a library is imported, which might swallow it; else as usual."""
+"""Ctrl-C, put off while processes are started or ended that it would reach as well."""
 
 import contextlib
-import os
 import signal
 from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
@@ -12,17 +11,14 @@ INTERRUPTED = "interrupted; run the same command again to go on"
 STATUS = 130  # what shells say of a command that ended so
 
 
-def heed_interrupts() -> None:
-    """Handle Ctrl-C in a command's main thread, unless somebody else does already."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        _handle_by(_end_or_raise)
-
-
 @contextlib.contextmanager
 def interrupts_put_off() -> Iterator[None]:
-    """Ctrl-C waits for the end of a block, and never reaches what is started within: processes that
-    this one ends by itself, and that would each end with a traceback."""
-    came, usual = [], signal.getsignal(signal.SIGINT)
+    """Let Ctrl-C wait for the end of a block, and never reach what is started within.
+
+    These are processes that this one ends by itself, and that would each end with a traceback.
+    """
+    came: list[bool] = []
+    usual = signal.getsignal(signal.SIGINT)
     resource_tracker.ensure_running()  # started within, it would let Ctrl-C through again
     _handle_by(lambda *_: came.append(True))
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which they inherit
@@ -38,13 +34,3 @@ def interrupts_put_off() -> Iterator[None]:
 def _handle_by(handler: Callable[[int, FrameType | None], Any]) -> None:
     with contextlib.suppress(ValueError):  # of another thread, which Ctrl-C does not reach
         signal.signal(signal.SIGINT, handler)
-
-
-def _end_or_raise(number: int, frame: FrameType | None) -> None:
-    at = frame
-    while at is not None:
-        if at.f_code.co_filename.startswith("<frozen importlib"):
-            os.write(2, f"nbtrack: {INTERRUPTED}\n".encode())
-            os._exit(STATUS)
-        at = at.f_back
-    signal.default_int_handler(number, frame)
