@@ -201,7 +201,7 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "3 images, 2 depths": (without("depth_filtered/depth2.png"), "6 images but .* has 5 .png"),
         "other frame numbers": (renamed(DEPTH_1, "depth_filtered/depth7.png"), "img1.png, depth7"),
         "PGM": (suffix("depth_filtered/*", ".pgm"), r"no depth maps \(PNG of 16 bits\) in"),
-        "format: one level too high": (in_a_folder, "level too high: give .*inner"),
+        "format: one level too high": (in_a_folder, "is no recording: it needs the files of"),
         "depth of another size": (image(DEPTH_1, SMALL), r"depth1.png is .* of shape \(18, 24\)"),
         "8-bit depth": (image(DEPTH_1, EIGHT_BIT), "depth1.png is uint8"),
         "colour of another size": (image("images/img2.png", SMALL), r"img2.png is .*\(18, 24\)"),

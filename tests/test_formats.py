@@ -144,7 +144,7 @@ def test_text_that_is_no_slice(scene: Path, text: str) -> None:
     one that selects nothing, which would fail somewhere in the mathematics later."""
     with pytest.raises(DataError, match=f"^frames '{text}' .*: "):
         parse_frames(text)
-    with pytest.raises(DataError, match=r"frames 7:9: select 0 of the 6 .*: choose others of 0:6"):
+    with pytest.raises(DataError, match="0 of the 6 frames .*: choose others"):
         read_sequence(scene, slice(7, 9))
 
 

@@ -148,7 +148,7 @@ def test_a_flipped_bit_in_a_checkpoint_is_noticed(name: str, tmp_path: Path) -> 
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
-    says = "not a readable checkpoint .*its content is not what was written"
+    says = "not a readable checkpoint"
     with pytest.raises(files.DataError, match=says), files.loaded_checkpoint(path):
         pass
 
