@@ -144,7 +144,7 @@ def test_text_that_is_no_slice(scene: Path, text: str) -> None:
     one that selects nothing, which would fail somewhere in the mathematics later."""
     with pytest.raises(DataError, match=f"^frames '{text}' .*: "):
         parse_frames(text)
-    with pytest.raises(DataError, match="0 of the 6 frames .*: choose others"):
+    with pytest.raises(DataError, match=r"0 of the 6 frames .*: choose others"):
         read_sequence(scene, slice(7, 9))
 
 
@@ -378,7 +378,7 @@ def test_images_as_cameras_write_them(plain: Path) -> None:
     assert np.abs(after.colors.astype(int) - before.colors).mean() < 3
     whole = jpeg.read_bytes()
     jpeg.write_bytes(whole[: len(whole) // 2 - 2048])
-    with pytest.raises(DataError, match="damaged"):
+    with pytest.raises(DataError, match="readable PNG or JPEG"):
         read_sequence(plain)
     jpeg.write_bytes(whole)
     for path in (plain / "depth").iterdir():

@@ -16,15 +16,12 @@ import inspect
 import io
 import json
 import os
-import pickle
 import platform
 import re
-import struct
 import tempfile
 import textwrap
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -33,7 +30,6 @@ from typing import Any
 
 import torch
 from filelock import FileLock
-from safetensors import SafetensorError
 
 import nbtrack
 from nbtrack.core.errors import DataError, NbtrackError
@@ -46,11 +42,11 @@ _WITHOUT_EFFECT = {
     "mapping.files",
 }  # fmt: skip
 """Modules that change no digit of a result."""
-# What readers raise for bytes of another kind: numbers and texts (ValueError, which those of JSON,
-# TOML, CSV and Unicode are), missing keys, wrong types and sizes, torch and compressed archives.
-_MADE_BY_CONTENT = (
-    OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, RuntimeError,
-    pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile, SafetensorError,
+# Content of a file makes readers raise anything else: these are a program's mistakes, or speak of
+# a device, or say already what is wrong.
+_NOT_BY_CONTENT = (
+    NbtrackError, MemoryError, torch.OutOfMemoryError, torch.AcceleratorError, NameError,
+    AttributeError, AssertionError,
 )  # fmt: skip
 _NO_LOCKS = errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP  # what their lack is called
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp")  # that compute results beside torch
@@ -279,13 +275,13 @@ def naming_damaged(
 ) -> Iterator[None]:
     """Turn what goes wrong in reading a file and taking up its content into a DataError in a line.
 
-    These are the errors that content makes readers raise. Others, as of a name that is not there,
-    are mistakes of a program and pass.
+    Mistakes of a program, as a name that is not there, pass, and so does a device that fails, which
+    says nothing about the file.
     """
     try:
         yield
-    except (NbtrackError, MemoryError, torch.OutOfMemoryError, torch.AcceleratorError):
-        raise  # a device that fails says nothing about the file
-    except _MADE_BY_CONTENT as error:
+    except _NOT_BY_CONTENT:
+        raise
+    except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:120]
         raise DataError(f"{path} is not a readable {kind} ({reason}): {advice}") from error

@@ -1,6 +1,5 @@
 """From image files to arrays: one size, depth in mm along the optical axis, no distortion."""
 
-import struct
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -8,10 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Int, Shaped, UInt8, UInt16
 from PIL import Image
-from PIL.Image import DecompressionBombError
 
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
+from nbtrack.core.files import naming_damaged
 from nbtrack.core.progress import ProgressBar
 from nbtrack.data.recording import Recording
 from nbtrack.data.text_files import camera_matrix
@@ -64,18 +63,13 @@ def _read_image(path: Path, is_color: bool) -> Shaped[np.ndarray, "height width 
 
     The orientation that a file gives to viewers does not count: depth images know none.
     """
-    try:
+    advice = "copy it again, or remove the frame's image, depth and pose"
+    with naming_damaged(path, "PNG or JPEG", advice):
         with Image.open(path, formats=("PNG", "JPEG")) as image:
             image.verify()  # the checksums of a PNG; reading finds what a JPEG lacks
         with Image.open(path) as image:
             is_8_bit = not image.mode.startswith("I")
             return np.array(image.convert("RGB") if is_color and is_8_bit else image)
-    # Whatever a header that promises too much, or is cut, makes the parser raise.
-    except (OSError, SyntaxError, ValueError, LookupError, struct.error, DecompressionBombError):
-        raise DataError(
-            f"{path} is damaged or not a complete PNG or JPEG: copy it again, or remove the "
-            "frame's image, depth and pose"
-        ) from None
 
 
 def _check(path: Path, image: np.ndarray, wanted: np.ndarray, first: Path) -> None:

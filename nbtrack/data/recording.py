@@ -15,6 +15,7 @@ from jaxtyping import Bool
 
 from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.errors import DataError, MissingError
+from nbtrack.core.files import naming_damaged
 from nbtrack.data.formats import (
     FORMATS,
     WORLD_TO_CAMERA,
@@ -232,14 +233,12 @@ def _listed_pairs(
 def _read_list(path: Path) -> tuple[Times, list[Path]]:
     """Times and files of a list with `timestamp file` a line, in the order of time."""
     rows = [line.strip().split(maxsplit=1) for line in read_lines(path)]
-    try:
+    advice = "every line holds 'timestamp file', such as '1305031102.175 rgb/1305031102.175.png'"
+    with naming_damaged(path, "list", advice):
         rows = sorted((float(time), name) for time, name in rows)
         times = np.array([time for time, _ in rows])
-    except ValueError:
-        times = np.array([np.nan])
-    if not np.isfinite(times).all():
-        example = "'1305031102.175 rgb/1305031102.175.png'"
-        raise DataError(f"{path}: every line holds 'timestamp file', such as {example}")
+        if not np.isfinite(times).all():
+            raise ValueError("a time is not finite")
     files = [path.parent / name for _, name in rows]
     for file in files:
         if not os.path.isfile(file):  # unlike pathlib's, it takes names that no file can have

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from nbtrack.core.arrays import Poses
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
+from nbtrack.core.files import naming_damaged
 
 Times = Float[np.ndarray, "_"]  # s
 _TOLERANT = {"encoding": "utf-8-sig", "errors": "replace"}  # of a byte-order mark, and of any bytes
@@ -40,15 +41,9 @@ _MIN_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 def read_object(path: Path) -> dict[str, Any]:
     """A JSON or TOML file, by its name, that holds an object. Raises DataError otherwise."""
     kind = "JSON" if path.suffix.lower() == ".json" else "TOML"
-    try:
+    with naming_damaged(path, f"{kind} file of names and values", "correct it or write it anew"):
         text = path.read_text(**_TOLERANT)
-        content = tomllib.loads(text) if kind == "TOML" else json.loads(text)
-    # Nesting thousands deep ends the parser's recursion.
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path} is no {kind} ({error}): correct it or write it anew") from None
-    if not isinstance(content, dict):
-        raise DataError(f"{path} holds {content!r:.40}: it must be an object of names and values")
-    return content
+        return {**(tomllib.loads(text) if kind == "TOML" else json.loads(text))}
 
 
 def read_lines(path: Path) -> list[str]:
@@ -67,15 +62,12 @@ def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np
     lines = read_lines(path)
     if path.suffix == ".log":  # Open3D's, with a head of three numbers before each matrix
         lines = [line for line in lines if len(line.split()) != 3]
-    try:
+    with naming_damaged(path, "table", f"every line holds {meaning}"):
         if any(map(_DECIMAL_COMMA.search, lines)):
             raise ValueError("write decimal points, not commas")
         numbers = np.loadtxt([line.replace(",", " ") for line in lines], ndmin=2)
         if numbers.shape[1] not in columns:
             raise ValueError(f"there are {numbers.shape[1]} columns")
-    except ValueError as error:
-        reason = str(error).partition(";")[0][:150]
-        raise DataError(f"{path} is no table ({reason}): every line holds {meaning}") from None
     return numbers
 
 
