@@ -199,6 +199,21 @@ def test_times_in_names(plain: Path) -> None:
     assert np.diff(open_recording(plain).times) == pytest.approx(0.033, abs=1e-6)
 
 
+def test_few_poses_and_names_that_tell_no_number(tmp_path: Path) -> None:
+    """Catches a single pose between no two stamps, and names in which two numbers vary."""
+    folder = write_recording("tum", tmp_path / "r")
+    (folder / "groundtruth.txt").write_text(tum_lines(np.array([START]) + 0.1, source().poses[:1]))
+    assert np.flatnonzero(open_recording(folder).has_pose).tolist() == [1]
+    plain = write_recording("plain", tmp_path / "plain")
+    for kind in ("color", "depth"):
+        rename(plain / kind, [f"{i // 3}_{i % 3}" for i in RUN])
+    (plain / "trajectory.txt").write_text(tum_lines(np.array(RUN) / 7, source().poses))
+    assert "one after another" in open_recording(plain).notes[0]
+    (plain / "trajectory.txt").write_text(tum_lines(np.arange(5) / 7, source().poses[:5]))
+    with pytest.raises(DataError, match="5 poses but there are 6"):
+        open_recording(plain)
+
+
 def moving(times: np.ndarray) -> np.ndarray:
     """Poses far from the origin that go straight and turn evenly."""
     poses = np.tile(np.eye(4), (len(times), 1, 1))

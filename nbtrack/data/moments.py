@@ -72,14 +72,17 @@ class Moments:
         """
         found = _at(poses, near)
         stamps, first = np.unique(stamps, return_index=True)
-        later = np.searchsorted(stamps, self.times).clip(1, max(1, len(stamps) - 1))
-        before, after = self.times - stamps[later - 1], stamps[later] - self.times
+        later = np.searchsorted(stamps, self.times).clip(1, len(stamps) - 1)
+        before = self.times - stamps[later - 1]
+        after = stamps[later] - self.times
         apart = np.minimum(before, after)
         is_between = (before + after <= _GAP) & (apart > _SAME_TIME)
         if not is_between.any():
             return found, ""
-        T, later = flip(poses[first]), later[is_between]
-        between, share = T[later - 1], (before / (before + after))[is_between]
+        later = later[is_between]
+        share = (before / (before + after))[is_between]
+        T = flip(poses[first])
+        between = T[later - 1]
         between[:, :3, 3] += share[:, None] * (T[later] - T[later - 1])[:, :3, 3]
         turns = Slerp(stamps, Rotation.from_matrix(T[:, :3, :3]))
         between[:, :3, :3] = turns(self.times[is_between]).as_matrix()
@@ -99,7 +102,8 @@ class Moments:
         clock = np.arange(n_poses) / self.rate_hz if stamps is None else stamps
         near = min(_ON_TIME, 0.25 / self.rate_hz)
         ways = np.array([nearest(times, clock, near) for times in self._counted()], dtype=int)
-        n_found = (ways.reshape(-1, n_frames) >= 0).sum(axis=1)
+        ways = ways.reshape(-1, n_frames)
+        n_found = (ways >= 0).sum(axis=1)
         whole = np.unique(ways[n_found == min(n_frames, n_poses)], axis=0)
         if len(whole) == 1 and n_poses > n_frames:
             return _at(poses, whole[0]), f"of {n_poses} poses those of the images' numbers"

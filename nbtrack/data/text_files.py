@@ -79,7 +79,8 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
     """
     numbers = read_numbers(path, (4, 8, 12, 16), _POSE_LINE)
     if numbers.shape[1] == 8:
-        return _from_quaternions(numbers, quaternion, path), numbers[:, 0]
+        stamps = np.where(np.abs(numbers[:, 0]) < _LATEST, numbers[:, 0], np.nan)
+        return _from_quaternions(numbers, quaternion, path), stamps
     if numbers.shape == (3, 4):
         numbers = numbers.reshape(1, 12)
     if numbers.shape[1] == 12:
