@@ -1,9 +1,9 @@
-"""Times of steps, on a GPU recorded and plain, in single precision and in TF32; and of mapping.
+"""Times of steps, on a GPU in single precision and in TF32; and of mapping.
 
 `python benchmarks/step_times.py steps` or `mapping`, CSV files into the folder $OUT. Of untrained
 networks of full size and an image of noise before a wall: a step costs the same whatever they show.
-On a CPU, where nothing is recorded, everything is small, which only says that the script runs;
-unless `full` follows, which takes minutes.
+On a CPU everything is small, which only says that the script runs; unless `full` follows, which
+takes minutes.
 """
 
 import os
@@ -20,7 +20,6 @@ import torch
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.capture import WARM_STEPS
 from nbtrack.core.device import choose_device, device_name, synchronize
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, field_class, make_field
@@ -51,16 +50,13 @@ def noise(n_frames: int) -> RgbdSequence:
 SEQUENCE = noise(20)
 
 
-def warm_tracker(name: str, field_name: str, is_recorded: bool) -> Tracker:
+def warm_tracker(name: str, field_name: str) -> Tracker:
     """At the start of a frame, after all that counts nowhere."""
     field = make_field(field_name, NETWORK, BOUNDS, seed=0).to(DEVICE)
     settings = TRACKERS[name].Settings() if IS_FULL else TRACKERS[name].Settings(n_pixels=32)
     tracker = make_tracker(name, field, np.eye(4), StepBudget(1), settings)
     tracker.track(SEQUENCE[0])
-    recorded = tracker.recorded if is_recorded else None
-    tracker.recorded = recorded
     tracker.begin(SEQUENCE[1].to(DEVICE), torch.eye(4, device=DEVICE)[None])
-    tracker.recorded = recorded  # without it, kernels are launched one by one
     return tracker
 
 
@@ -83,21 +79,12 @@ def milliseconds(call: Callable[[], object], waits: bool) -> tuple[float, float,
 
 
 def step_rows() -> Iterator[dict]:
-    """Step times of the paper's trackers in its fields, and how far recorded steps lead off."""
+    """Step times of the paper's trackers in its fields."""
     for name, field_name in (("sdf", "neus"), ("vr", "imap")):
-        kinds = {kind: warm_tracker(name, field_name, kind == "recorded") for kind in
-                 ("recorded", "plain")}  # fmt: skip
-        recording = kinds["recorded"].recorded
-        is_recorded = recording is not None and recording._run != kinds["recorded"]._descend
-        losses = [[float(kinds[kind].step()) for _ in range(20)] for kind in kinds]
-        one, other = (kinds[kind].T_world_camera.detach() for kind in kinds)
-        told = {"is_recorded": is_recorded, "pose_gap_after_20": float((one - other).abs().max()),
-                "loss_gap_after_20": float(np.abs(np.diff(losses, axis=0)).max())}  # fmt: skip
-        for kind, tracker in kinds.items():
-            for waits in (True, False):
-                median, low, high = milliseconds(tracker.step, waits)
-                yield {"tracker": name, "steps": kind, "waits": waits, "ms": median,
-                       "ms_low": low, "ms_high": high, **told}  # fmt: skip
+        tracker = warm_tracker(name, field_name)
+        for waits in (True, False):
+            median, low, high = milliseconds(tracker.step, waits)
+            yield {"tracker": name, "waits": waits, "ms": median, "ms_low": low, "ms_high": high}
 
 
 def mapping_rows() -> Iterator[dict]:
@@ -139,7 +126,7 @@ def main(part: str) -> None:
     torch.set_num_threads(1)
     found, out = [], Path(os.environ.get("OUT", "runs/first_gpu_run"))
     out.mkdir(parents=True, exist_ok=True)
-    about = {"device": device_name(DEVICE), "torch": torch.__version__, "warm_steps": WARM_STEPS}
+    about = {"device": device_name(DEVICE), "torch": torch.__version__}
     for precision, word in PRECISIONS.items():
         torch.set_float32_matmul_precision(word)
         for row in {"steps": step_rows, "mapping": mapping_rows}[part]():

@@ -14,7 +14,7 @@ from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import read_sequence
-from nbtrack.data.writer import WrittenFrame, write_sequence
+from nbtrack.recordings.writer import WrittenFrame, write_sequence
 
 CAMERA = Intrinsics(12, 8, 10.123456789012345, 10.123456789012345, 6.0, 4.0)
 RNG = np.random.default_rng(0)
@@ -46,7 +46,7 @@ def test_converter_selects(tmp_path: Path, capsys: pytest.CaptureFixture) -> Non
     assert main([*convert, str(tmp_path / "out"), "--frames", "2:5"]) == 0
     assert np.array_equal(read_sequence(tmp_path / "out").depths_mm, source().depths_mm[2:5])
     assert main([*convert, str(tmp_path / "new"), "--frames", "9:"]) == 2
-    assert "select 0 of the 6 frames" in capsys.readouterr().err
+    assert "0 of the 6 frames" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
@@ -68,7 +68,9 @@ def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path) -> None:
 def test_what_a_killed_writer_leaves(tmp_path: Path) -> None:
     """Catches a folder aside that stays for good, and one of another writer that is removed while
     it is being written."""
-    killed = "from nbtrack.data.writer import write_sequence as w; from test_writer import *; "
+    killed = (
+        "from nbtrack.recordings.writer import write_sequence as w; from test_writer import *; "
+    )
     killed += "import os; w(Path('room'), CAMERA, (x or os.kill(os.getpid(), 9) for x in "
     killed += "[*frames(1), None]))"
     paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])

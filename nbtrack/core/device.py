@@ -33,8 +33,6 @@ def named_device(name: str) -> torch.device:
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()  # which a device without memory cannot say
-        if device.index is not None:  # streams, and what is recorded on them, go to the current one
-            torch.accelerator.set_device_index(device.index)
     except (RuntimeError, AssertionError, NotImplementedError, ImportError):
         kind = torch.accelerator.current_accelerator(check_available=True)
         there = ["cpu", *(f"{kind}:{i}" for i in range(torch.accelerator.device_count()))]

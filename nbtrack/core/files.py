@@ -16,15 +16,12 @@ import inspect
 import io
 import json
 import os
-import pickle
 import platform
 import re
-import secrets
-import struct
+import tempfile
 import textwrap
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -33,7 +30,6 @@ from typing import Any
 
 import torch
 from filelock import FileLock
-from safetensors import SafetensorError
 
 import nbtrack
 from nbtrack.core.errors import DataError, NbtrackError
@@ -42,18 +38,17 @@ from nbtrack.core.settings import as_dict
 
 PACKAGE = Path(nbtrack.__file__).resolve().parent
 _WITHOUT_EFFECT = {
-    "core.capture", "core.device", "core.errors", "core.files", "core.progress", "core.settings",
+    "core.device", "core.errors", "core.files", "core.progress", "core.settings",
     "mapping.files",
 }  # fmt: skip
 """Modules that change no digit of a result."""
-# What readers raise for bytes of another kind: numbers and texts (ValueError, which those of JSON,
-# TOML, CSV and Unicode are), missing keys, wrong types and sizes, torch and compressed archives.
-_MADE_BY_CONTENT = (
-    OSError, ValueError, LookupError, TypeError, ArithmeticError, EOFError, RuntimeError,
-    pickle.UnpicklingError, struct.error, zlib.error, zipfile.BadZipFile, SafetensorError,
+# Content of a file makes readers raise anything else: these are a program's mistakes, or speak of
+# a device, or say already what is wrong.
+_NOT_BY_CONTENT = (
+    NbtrackError, MemoryError, torch.OutOfMemoryError, torch.AcceleratorError, NameError,
+    AttributeError, AssertionError,
 )  # fmt: skip
 _NO_LOCKS = errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP  # what their lack is called
-_DIGEST_BYTES = hashlib.sha256().digest_size
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp")  # that compute results beside torch
 _LIBRARIES = ("nbtrack", "torch", "abc", "typing", "builtins")  # what own classes are built on
 
@@ -185,11 +180,10 @@ def versions() -> dict[str, str]:
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Writes tensors and plain values as one file that begins with the digest of the rest."""
+    """Writes tensors and plain values as one file, an archive with checksums."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
-    content = buffer.getvalue()
-    write_atomic(path, hashlib.sha256(content).digest() + content)
+    write_atomic(path, buffer.getvalue())
 
 
 @contextlib.contextmanager
@@ -197,11 +191,10 @@ def loaded_checkpoint(path: Path) -> Iterator[dict[str, Any]]:
     """What `save_checkpoint` wrote, on the CPU. Raises DataError, also for what is made of it
     within the block, if the file is damaged or of another kind."""
     with naming_damaged(path):
-        content = path.read_bytes()
-        digest, content = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-        if hashlib.sha256(content).digest() != digest:
-            raise ValueError("its content is not what was written")
-        yield torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        with zipfile.ZipFile(path) as archive:  # torch checks no checksums
+            if damaged := archive.testzip():
+                raise ValueError(f"{damaged} is not what was written")
+        yield torch.load(path, map_location="cpu", weights_only=True)
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
@@ -219,26 +212,22 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
     earlier ones as they were. Whoever is killed between two moves leaves a folder without the last.
     Missing folders are made. Raises OSError, which names the last file, where that is not possible.
     """
-    # A random name, which must be new: nobody else writes there, or has put a link in its place.
-    asides = {folder / name: folder / f".{name}.{secrets.token_hex(6)}.tmp" for name in contents}
-    *_, last = asides
+    *_, last = contents
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for aside, content in zip(asides.values(), contents.values(), strict=True):
-            # Paths whose letters the system's encoding lacks come as surrogates.
-            is_text = isinstance(content, str)
-            with aside.open("xb") as opened:
-                opened.write(content.encode(errors="surrogateescape") if is_text else content)
-        if len(contents) > 1:
-            last.unlink(missing_ok=True)
-        for path, aside in asides.items():
-            os.replace(aside, path)
+        # A new folder of a random name: nobody else writes there, or has put a link in its place.
+        with tempfile.TemporaryDirectory(".tmp", ".", folder) as aside:
+            for name, content in contents.items():
+                # Paths whose letters the system's encoding lacks come as surrogates.
+                is_text = isinstance(content, str)
+                encoded = content.encode(errors="surrogateescape") if is_text else content
+                Path(aside, name).write_bytes(encoded)
+            if len(contents) > 1:
+                (folder / last).unlink(missing_ok=True)
+            for name in contents:
+                os.replace(Path(aside, name), folder / name)
     except OSError as error:  # a write that finds the disk full has no name of its own
-        raise OSError(error.errno, error.strerror or str(error), str(last)) from None
-    finally:
-        for aside in asides.values():
-            with contextlib.suppress(OSError):  # what went wrong before is what users must hear
-                aside.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror or str(error), str(folder / last)) from None
 
 
 @contextlib.contextmanager
@@ -286,13 +275,13 @@ def naming_damaged(
 ) -> Iterator[None]:
     """Turn what goes wrong in reading a file and taking up its content into a DataError in a line.
 
-    These are the errors that content makes readers raise. Others, as of a name that is not there,
-    are mistakes of a program and pass.
+    Mistakes of a program, as a name that is not there, pass, and so does a device that fails, which
+    says nothing about the file.
     """
     try:
         yield
-    except (NbtrackError, MemoryError, torch.OutOfMemoryError, torch.AcceleratorError):
-        raise  # a device that fails says nothing about the file
-    except _MADE_BY_CONTENT as error:
+    except _NOT_BY_CONTENT:
+        raise
+    except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:120]
         raise DataError(f"{path} is not a readable {kind} ({reason}): {advice}") from error

@@ -2,16 +2,15 @@
 
 import sys
 import threading
-import time
 from typing import Any
 
 from tqdm import tqdm
 
 _DELAY_SECONDS = 1.0  # so that a mistake which ends the work at once is told alone
 _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
-# Where nobody watches: the form of a line, and seconds before the first and between later ones.
+# Where nobody watches: the form of a line, and seconds between two.
 _LINE_FORMAT = "{desc}: {percentage:.0f} %, {elapsed} gone, {remaining} left{postfix}"
-_FIRST_LINE_SECONDS, _LINE_SECONDS = 2.0, 30.0
+_LINE_SECONDS = 30.0
 tqdm.set_lock(threading.RLock())  # its own is one between processes, which killed ones leave behind
 
 
@@ -25,64 +24,45 @@ def _is_notebook() -> bool:
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
 
-class _NotebookLine:
-    """A file whose text is one output of a notebook's cell, replaced at every write.
+class _Line:
+    """A file that shows each text written to it: as a line, or as the output of a notebook's cell.
 
-    It needs no widget, so that stored notebooks and exported pages end with the last text.
+    The latter needs no widget, so that stored notebooks and exported pages end with the last text.
     """
 
     handle: Any = None
 
     def write(self, text: str) -> None:
-        from IPython.display import display
-
-        shown = {"text/plain": text.strip()}
-        if not shown["text/plain"]:
+        """Show a text, without what moves it to the beginning of a line."""
+        text = text.strip()
+        if not text:
             return
-        if self.handle is None:
-            self.handle = display(shown, raw=True, display_id=True)
+        if not _is_notebook():
+            print(text, file=sys.stderr)
+        elif self.handle is None:
+            from IPython.display import display
+
+            self.handle = display({"text/plain": text}, raw=True, display_id=True)
         else:
-            self.handle.update(shown, raw=True)
+            self.handle.update({"text/plain": text}, raw=True)
 
 
-class ProgressBar:
+class ProgressBar(tqdm):
     """Progress with an ETA over a known amount of work, to be used in a `with` block."""
 
     def __init__(self, title: str, total: float | int, is_shown: bool = True) -> None:
-        is_notebook, form = _is_notebook(), _FORMAT
-        self.title, self._start, self._ended = title, time.monotonic(), threading.Event()
-        # A notebook's kernel drops messages once a thousand wait to be read.
-        file, pause = (_NotebookLine(), 1.0) if is_notebook else (sys.stderr, 0.1)
-        self._is_logged = is_shown and not (is_notebook or sys.stderr.isatty())
-        if self._is_logged:  # never by itself: `_log` asks for what would be shown
-            form, pause = _LINE_FORMAT, float("inf")
+        """Begin; nothing is shown before a second has gone."""
+        options = {"file": sys.stderr, "mininterval": 0.1, "bar_format": _FORMAT}
+        if _is_notebook():  # its kernel drops messages once a thousand wait to be read
+            options |= {"file": _Line(), "mininterval": 1.0}
+        elif not sys.stderr.isatty():
+            options |= {"file": _Line(), "mininterval": _LINE_SECONDS, "bar_format": _LINE_FORMAT}
         # Without smoothing the ETA comes from the mean speed, not from that of the last step.
-        options = {"mininterval": pause, "disable": not is_shown, "ascii": False, "smoothing": 0}
-        options |= {"file": file, "bar_format": form, "delay": _DELAY_SECONDS}
-        self._bar = tqdm(total=total, desc=title, **options)
+        options |= {"disable": not is_shown, "smoothing": 0, "delay": _DELAY_SECONDS}
+        super().__init__(total=total, desc=title, ascii=False, **options)
 
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much is done, and a word on how it goes."""
+        self.set_postfix_str(status, refresh=False)
         # Sums of fractions may end a rounding error above the total, which a bar does not like.
-        done = min(done, self._bar.total)
-        self._bar.set_postfix_str(status, refresh=False)
-        self._bar.update(done - self._bar.n)
-
-    def __enter__(self) -> "ProgressBar":
-        if self._is_logged:
-            threading.Thread(target=self._log, daemon=True).start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        seconds = time.monotonic() - self._start
-        self._ended.set()
-        self._bar.close()
-        if self._is_logged and kind is None and seconds > _DELAY_SECONDS:
-            print(f"{self.title}: done in {seconds:.0f} s", file=sys.stderr)
-
-    def _log(self) -> None:
-        """A line now and then, also while a long step has nothing to report."""
-        pause = _FIRST_LINE_SECONDS
-        while not self._ended.wait(pause):
-            print(self._bar, file=sys.stderr)
-            pause = _LINE_SECONDS
+        self.update(min(done, self.total) - self.n)

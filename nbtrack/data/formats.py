@@ -190,12 +190,17 @@ def declaration(folder: Path, format: str | None = None) -> Declaration:
     if not folder.is_dir():
         raise MissingError(f"no folder {folder}: give a recording's, or a synthetic room's name")
     path = folder / DECLARATION_FILE
-    format = format or _declared(path, Declaration()).format or _told_by_files(folder)
+    said = read_object(path) if path.is_file() else {}
+    try:
+        own_format = with_values(Declaration(), said).format
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from None
+    format = format or own_format or _told_by_files(folder)
     usual = look_up("format", format, FORMATS).declared
     if format == "neural_rgbd":
         unit = DATASET_UNITS.get(folder.resolve().name, usual.metres_per_unit)
         usual = replace(usual, metres_per_unit=unit)
-    return replace(_declared(path, usual), format=format)
+    return replace(with_values(usual, said), format=format)
 
 
 def is_declared(folder: Path, key: str) -> bool:
@@ -206,15 +211,14 @@ def is_declared(folder: Path, key: str) -> bool:
 
 def _told_by_files(folder: Path) -> str:
     """The format with the largest share of what it needs."""
-    shares = _shares(folder)
+    shares = {
+        name: np.mean([_is_there(folder, patterns) for patterns in layout.needs])
+        for name, layout in FORMATS.items()
+    }
     maximum = max(shares.values())
     best = [name for name, share in shares.items() if share == maximum]
-    if maximum < 1:
-        folders = sorted(path for path in folder.iterdir() if path.is_dir())
-        if inner := [path for path in folders if 1 in _shares(path).values()]:
-            raise MissingError(f"{folder} is one level too high: give {inner[0]}, say")
     if maximum == 0:
-        files = (f"{name} ({', '.join(map(' or '.join, FORMATS[name].needs))})" for name in best)
+        files = (f"{name} ({', '.join(p[0] for p in FORMATS[name].needs)})" for name in best)
         raise MissingError(f"{folder} is no recording: it needs the files of {'; '.join(files)}")
     if len(best) > 1 and maximum == 1:
         raise DataError(
@@ -230,18 +234,5 @@ def holds_recording(folder: Path) -> bool:
     return any(_is_there(folder, f.color) and _is_there(folder, f.depth) for f in layouts)
 
 
-def _shares(folder: Path) -> dict[str, float]:
-    """How much of what each format needs is in a folder."""
-    return {name: np.mean([_is_there(folder, p) for p in FORMATS[name].needs]) for name in FORMATS}
-
-
 def _is_there(folder: Path, patterns: tuple[str, ...]) -> bool:
     return any(any(folder.glob(pattern)) for pattern in patterns)
-
-
-def _declared(path: Path, defaults: Declaration) -> Declaration:
-    """The defaults, changed by what a file declares where there is one."""
-    try:
-        return with_values(defaults, read_object(path)) if path.is_file() else defaults
-    except ConfigError as error:
-        raise DataError(f"{path}: {error}") from None

@@ -1,10 +1,11 @@
 """One RGB-D image: the unit of tracking, from a recording or from a running camera."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8, UInt16
 from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values
@@ -39,8 +40,8 @@ class Frame:
                 are none, and so are masked ones.
         """
         size, metres = (camera.height, camera.width), "uint16 in mm, or floating point in metres"
-        _check("color", color, (*size, 3), np.uint8, asked="uint8")
-        _check("depth", depth, size, np.uint16, np.floating, asked=metres)
+        _check("color", color, (*size, 3), UInt8, asked="uint8")
+        _check("depth", depth, size, UInt16, Float, asked=metres)
         if np.ma.is_masked(color):
             raise DataError("color has masked pixels: fill them; only depth may lack some")
         color, depth = np.ma.getdata(color), np.ma.filled(depth, 0)
@@ -55,8 +56,8 @@ class Frame:
 
     @property
     def has_depth(self) -> bool:
-        """Whether any pixel is measured; few are looked at where many are."""
-        return bool(self.depth_mm[::8, ::8].any()) or bool(self.depth_mm.any())
+        """Whether any pixel is measured."""
+        return bool(self.depth_mm.any())
 
     def to(self, device: torch.device) -> "Frame":
         """The same on a device."""
@@ -93,12 +94,11 @@ class Frame:
         return behind
 
 
-def _check(what: str, image: np.ndarray, shape: tuple[int, ...], *kinds: type, asked: str) -> None:
+def _check(what: str, image: np.ndarray, shape: tuple[int, ...], *kinds: Any, asked: str) -> None:
     """Raises DataError for another shape or type."""
-    if not isinstance(image, np.ndarray):
+    wanted = " ".join(map(str, shape))
+    if not any(isinstance(image, kind[np.ndarray, wanted]) for kind in kinds):
         found = f"of type {type(image).__name__}"
-    elif image.shape == shape and issubclass(image.dtype.type, kinds):
-        return
-    else:
-        found = f"{image.dtype} of shape {image.shape}"
-    raise DataError(f"{what} is {found}: give a numpy array, {asked}, of shape {shape}")
+        if isinstance(image, np.ndarray):
+            found = f"{image.dtype} of shape {image.shape}"
+        raise DataError(f"{what} is {found}: give a numpy array, {asked}, of shape {shape}")

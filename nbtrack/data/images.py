@@ -1,7 +1,5 @@
 """From image files to arrays: one size, depth in mm along the optical axis, no distortion."""
 
-import io
-import struct
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -9,17 +7,15 @@ import cv2
 import numpy as np
 from jaxtyping import Int, Shaped, UInt8, UInt16
 from PIL import Image
-from PIL.Image import DecompressionBombError
 
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
+from nbtrack.core.files import naming_damaged
 from nbtrack.core.progress import ProgressBar
 from nbtrack.data.recording import Recording
 from nbtrack.data.text_files import camera_matrix
 
 _FARTHEST_MM = _SATURATED = 65535  # what 16 bits hold; a camera's "farther than I can say"
-# Pixels as they are stored: depth images know no orientation that a viewer should turn them by.
-_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def decode(
@@ -32,7 +28,7 @@ def decode(
     files = [(recording.color_files[i], recording.depth_files[i]) for i in frame_ids]
     resize = recording.format.resize_color
     first = files[0][1 if resize else 0]  # the size is its
-    height, width = _read_image(first, _AS_STORED).shape[:2]
+    height, width = _read_image(first, is_color=not resize).shape[:2]
     camera = recording.calibration.for_size(width, height, first)
     maps = _undistortion(camera, recording.calibration.distortion)
     colors = np.empty((len(files), height, width, 3), np.uint8)
@@ -40,8 +36,8 @@ def decode(
 
     def read(index: int) -> None:
         color_file, depth_file = files[index]
-        color = _read_image(color_file, _AS_STORED)
-        depth = _read_image(depth_file, cv2.IMREAD_UNCHANGED)
+        color = _read_image(color_file, is_color=True)
+        depth = _read_image(depth_file, is_color=False)
         if resize:
             color = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
         _check(color_file, color, colors[index], first)
@@ -52,7 +48,7 @@ def decode(
             depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
         depth[(depth == recording.declared.no_depth) | (depth == _SATURATED)] = 0
         depths[index] = _in_millimetres(depth, recording, camera, depth_file)
-        colors[index] = cv2.cvtColor(color, cv2.COLOR_BGR2RGB)
+        colors[index] = color
 
     # Decoding releases the interpreter lock, so a few threads suffice.
     bar = ProgressBar("reading frames", len(files), progress)
@@ -62,32 +58,18 @@ def decode(
     return camera, colors, depths
 
 
-def _read_image(path: Path, flags: int) -> Shaped[np.ndarray, "height width *channels"]:
-    """Decoded PNG or JPEG file, checked before: of a damaged one OpenCV fills in anything."""
-    content = path.read_bytes()
-    is_complete = _is_complete(content)
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if is_complete else None
-    if image is None:
-        raise DataError(
-            f"{path} is damaged or not a complete PNG or JPEG ({len(content)} bytes): copy it "
-            "again, or remove the frame's image, depth and pose"
-        )
-    return image
+def _read_image(path: Path, is_color: bool) -> Shaped[np.ndarray, "height width *channels"]:
+    """A PNG or JPEG file's pixels as they are stored, colour as RGB of 8 bits.
 
-
-def _is_complete(content: bytes) -> bool:
-    """A JPEG with its end marker, or a PNG with all chunks, whose checksums agree.
-
-    Compressed JPEG data holds neither the marker of its beginning nor that of its end, so that the
-    end of the last picture comes after its beginning, whatever a camera has appended.
+    The orientation that a file gives to viewers does not count: depth images know none.
     """
-    try:
-        with Image.open(io.BytesIO(content)) as image:
-            image.verify()  # of a PNG the chunks, of a JPEG nothing
-    # Whatever a header that promises too much, or is cut, makes the parser raise.
-    except (OSError, SyntaxError, ValueError, LookupError, struct.error, DecompressionBombError):
-        return False
-    return image.format == "PNG" or content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
+    advice = "copy it again, or remove the frame's image, depth and pose"
+    with naming_damaged(path, "PNG or JPEG", advice):
+        with Image.open(path, formats=("PNG", "JPEG")) as image:
+            image.verify()  # the checksums of a PNG; reading finds what a JPEG lacks
+        with Image.open(path) as image:
+            is_8_bit = not image.mode.startswith("I")
+            return np.array(image.convert("RGB") if is_color and is_8_bit else image)
 
 
 def _check(path: Path, image: np.ndarray, wanted: np.ndarray, first: Path) -> None:

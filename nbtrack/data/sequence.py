@@ -145,19 +145,16 @@ def read_frames(
 def select_frames(recording: Recording, frames: slice, needs_poses: bool = True) -> Frames:
     """Numbers of the selected frames. Raises DataError if there is none, or none with a pose."""
     frame_ids = np.arange(len(recording))[frames]
+    if needs_poses and recording.pose_file is None:
+        raise MissingError(
+            f"no poses in {recording.folder}: {recording.format.label} needs "
+            f"{' or '.join(recording.format.poses)}; add it, or track in a map of the same place "
+            "with --map-from"
+        )
     if not (recording.has_pose[frame_ids].any() if needs_poses else len(frame_ids)):
-        parts = (frames.start, frames.stop, frames.step)
-        text = ":".join("" if part is None else str(part) for part in parts)
-        n_frames, file = len(recording), recording.pose_file
-        if file is None:
-            needed = " or ".join(recording.format.poses)
-            raise MissingError(
-                f"no poses in {recording.folder}: {recording.format.label} needs {needed}; add it, "
-                "or track in a map of the same place with --map-from"
-            )
         raise DataError(
-            f"frames {text} select {len(frame_ids)} of the {n_frames} frames in {recording.folder},"
-            f" but no pose in {file} that is not NaN: choose others of 0:{n_frames}, or other poses"
+            f"{len(frame_ids)} of the {len(recording)} frames in {recording.folder} are selected, "
+            f"but no pose in {recording.pose_file} that is not NaN: choose others, or other poses"
         )
     return frame_ids
 

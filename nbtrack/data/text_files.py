@@ -7,7 +7,6 @@ datasets have it: the middle of 640 pixels is 319.5. Inside the package they lie
 import json
 import re
 import tomllib
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,75 +18,57 @@ from scipy.spatial.transform import Rotation
 from nbtrack.core.arrays import Poses
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
+from nbtrack.core.files import naming_damaged
 
 Times = Float[np.ndarray, "_"]  # s
-Parse = Callable[[str], Sequence]
 _TOLERANT = {"encoding": "utf-8-sig", "errors": "replace"}  # of a byte-order mark, and of any bytes
-_NO_ROW = r"\s*(#|$)"
-_HEAD = r"|\s*-?\d+\s+-?\d+\s+-?\d+\s*$"  # of each matrix in Open3D's .log: three whole numbers
+_DECIMAL_COMMA = re.compile(r"(?<!\S)[-+]?\d+,\d+(e[-+]?\d+)?(?!\S)")
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
 _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
 _FARTHEST = 1e7  # m from the origin: beyond map coordinates, within what floats can square
+_ALONE = 1000.0  # m from the middle, and so many times as far as nine in ten: no camera went there
+_LATEST = 1e12  # s: no timestamp is larger, and larger numbers overflow
 _RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 _LARGEST = 1e6  # pixels: no image is so wide
 _LENS = ("k1", "k2", "p1", "p2", "k3")  # in OpenCV's order
-_CAMERA_KEYS = {
-    "fx", "fy", "cx", "cy", "width", "height", "intrinsic_matrix", "distortion", "coeffs",
-    "depth_scale", "scale", *_LENS,
-}  # fmt: skip
+# Entries of a camera's JSON file, and how many numbers each may have.
+_COUNTS = dict.fromkeys(("fx", "fy", "cx", "cy", "width", "height", *_LENS), (1,))
+_COUNTS |= {"depth_scale": (1,), "scale": (1,), "intrinsic_matrix": (9,)}
+_COUNTS |= {"distortion": (0, 4, 5, 8), "coeffs": (0, 4, 5, 8)}
 _MIN_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 
 
 def read_object(path: Path) -> dict[str, Any]:
     """A JSON or TOML file, by its name, that holds an object. Raises DataError otherwise."""
     kind = "JSON" if path.suffix.lower() == ".json" else "TOML"
-    try:
+    with naming_damaged(path, f"{kind} file of names and values", "correct it or write it anew"):
         text = path.read_text(**_TOLERANT)
-        content = tomllib.loads(text) if kind == "TOML" else json.loads(text)
-    # Nesting thousands deep ends the parser's recursion.
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path} is no {kind} ({error}): correct it or write it anew") from None
-    if not isinstance(content, dict):
-        raise DataError(f"{path} holds {content!r:.40}: it must be an object of names and values")
-    return content
+        return {**(tomllib.loads(text) if kind == "TOML" else json.loads(text))}
 
 
-def read_rows(
-    path: Path, parse: Parse, columns: tuple[int, ...], meaning: str, skipped: str = _NO_ROW
-) -> list[Sequence]:
-    """What `parse` makes of every line that does not begin as `skipped`: blank, or with `#`.
+def read_lines(path: Path) -> list[str]:
+    """The lines of a text file that are neither blank nor comments. DataError if there is none."""
+    lines = path.read_text(**_TOLERANT).splitlines()
+    if lines := [line for line in lines if line.partition("#")[0].strip()]:
+        return lines
+    raise DataError(f"{path} is empty: write it anew")
 
-    Raises DataError for a line of other columns, or for which `parse` raises ValueError.
+
+def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np.ndarray, "n m"]:
+    """A table of numbers, separated by blanks or commas; NaN and infinity are kept.
+
+    Raises DataError for anything else, or if it has not one of the numbers of columns.
     """
-    rows: list[Sequence] = []
-    for number, line in enumerate(path.read_text(**_TOLERANT).splitlines(), start=1):
-        if re.match(skipped, line):
-            continue
-        try:
-            row = parse(line)
-        except ValueError:
-            row = ()
-        if len(row) not in (columns if not rows else (len(rows[0]),)):
-            advice = "; write decimal points, not commas" * _has_decimal_commas(line)
-            found = f"{path} line {number} is {line[:60]!r}"
-            raise DataError(f"{found}: every line holds {meaning}{advice}")
-        rows.append(row)
-    if not rows:
-        raise DataError(f"{path} is empty: every line holds {meaning}; write it anew")
-    return rows
-
-
-def _has_decimal_commas(line: str) -> bool:
-    """Whether its words are numbers with a comma in place of the point."""
-    words = line.split()
-    return len(words) > 1 and any(re.fullmatch(r"[-+]?\d+,\d+(e[-+]?\d+)?", w) for w in words)
-
-
-def _numbers(line: str) -> list[float]:
-    """Separated by blanks or commas; NaN and infinity are kept."""
-    if _has_decimal_commas(line):
-        raise ValueError
-    return [float(word) for word in line.replace(",", " ").split()]
+    lines = read_lines(path)
+    if path.suffix == ".log":  # Open3D's, with a head of three numbers before each matrix
+        lines = [line for line in lines if len(line.split()) != 3]
+    with naming_damaged(path, "table", f"every line holds {meaning}"):
+        if any(map(_DECIMAL_COMMA.search, lines)):
+            raise ValueError("write decimal points, not commas")
+        numbers = np.loadtxt([line.replace(",", " ") for line in lines], ndmin=2)
+        if numbers.shape[1] not in columns:
+            raise ValueError(f"there are {numbers.shape[1]} columns")
+    return numbers
 
 
 def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | None]:
@@ -96,10 +77,10 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
     Lines hold `timestamp tx ty tz` and a quaternion in the order that is given, a 4x4 or 3x4
     matrix, or one of the rows of a matrix; else DataError is raised. NaN gives NaN poses.
     """
-    skipped = _NO_ROW + _HEAD * (path.suffix == ".log")
-    numbers = np.array(read_rows(path, _numbers, (4, 8, 12, 16), _POSE_LINE, skipped))
+    numbers = read_numbers(path, (4, 8, 12, 16), _POSE_LINE)
     if numbers.shape[1] == 8:
-        return _from_quaternions(numbers[:, 1:], quaternion, path), numbers[:, 0]
+        stamps = np.where(np.abs(numbers[:, 0]) < _LATEST, numbers[:, 0], np.nan)
+        return _from_quaternions(numbers, quaternion, path), stamps
     if numbers.shape == (3, 4):
         numbers = numbers.reshape(1, 12)
     if numbers.shape[1] == 12:
@@ -109,24 +90,26 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
     return checked_poses(numbers.reshape(-1, 4, 4), path), None
 
 
-def _from_quaternions(numbers: np.ndarray, order: str, path: Path) -> Poses:
-    """Poses of rows with a position and a quaternion.
+def _from_quaternions(numbers: Float[np.ndarray, "n 8"], order: str, path: Path) -> Poses:
+    """Poses of rows with a timestamp, a position and a quaternion.
 
     NaN for a frame if a number is none, or its quaternion is zero, as tools write a lost frame.
     """
-    is_known = np.isfinite(numbers).all(axis=1, keepdims=True)
-    is_known &= (numbers[:, 3:] != 0).any(axis=1, keepdims=True)
-    numbers = np.where(is_known, numbers, 3 * [np.nan] + 4 * [0.5])
-    # Clipped, so that absurd numbers are refused below and overflow nothing here.
-    norms = np.linalg.norm(numbers[:, 3:].clip(-1e6, 1e6), axis=1)
-    for i in np.flatnonzero(np.abs(norms - 1) > _RIGID):
+    is_known = np.isfinite(numbers[:, 1:]).all(axis=1) & (numbers[:, 4:] != 0).any(axis=1)
+    values = np.where(is_known[:, None], numbers, 4 * [np.nan] + 4 * [0.5])
+    # Clipped, so that absurd numbers are refused and overflow nothing here.
+    norms = np.linalg.norm(values[:, 4:].clip(-1e6, 1e6), axis=1)
+    is_timed = np.abs(numbers[:, 0]) < _LATEST
+    for i in np.flatnonzero((np.abs(norms - 1) > _RIGID) | (is_known & ~is_timed)):
         raise DataError(
-            f"{path} pose {i} has a quaternion of norm {norms[i]:.3g}: columns must be "
-            f"tx ty tz and a unit quaternion ({' '.join('q' + axis for axis in order)})"
+            f"{path} pose {i} has the time {numbers[i, 0]:.13g} and a quaternion of norm "
+            f"{norms[i]:.3g}: columns must be finite timestamps (s), tx ty tz and a unit "
+            f"quaternion ({' '.join('q' + axis for axis in order)})"
         )
-    q_xyzw = numbers[:, [3 + order.index(axis) for axis in "xyzw"]]
     poses = np.tile(np.eye(4), (len(numbers), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_quat(q_xyzw).as_matrix(), numbers[:, :3]
+    q_xyzw = values[:, [4 + order.index(axis) for axis in "xyzw"]]
+    poses[:, :3, :3] = Rotation.from_quat(q_xyzw).as_matrix()
+    poses[:, :3, 3] = values[:, 1:4]
     return checked_poses(poses, path)
 
 
@@ -135,22 +118,27 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
 
     Raises DataError if a pose is no rigid transform, or absurdly far from the origin.
     """
-    is_known = np.isfinite(poses).all(axis=(1, 2))[:, None, None]
-    is_known &= (poses[:, :3] != 0).any(axis=(1, 2))[:, None, None]  # of zeros: a lost frame
+    is_known = np.isfinite(poses).all(axis=(1, 2)) & (poses[:, :3] != 0).any(axis=(1, 2))
     # Clipped, so that absurd numbers are refused and overflow nothing.
-    T = np.where(is_known, poses, np.eye(4)).clip(-1e8, 1e8)
-    R, bottom, far = T[:, :3, :3], T[:, 3] - [0, 0, 0, 1], np.abs(T[:, :3, 3]) > _FARTHEST
+    T = np.where(is_known[:, None, None], poses, np.eye(4)).clip(-1e8, 1e8)
+    R = T[:, :3, :3]
     is_wrong = (np.abs(R @ R.mT - np.eye(3)) > _RIGID).any(axis=(1, 2))
     is_wrong |= np.abs(np.linalg.det(R) - 1) > _RIGID
-    is_wrong |= (np.abs(bottom) > _RIGID).any(axis=1) | far.any(axis=1)
+    is_wrong |= (np.abs(T[:, 3] - [0, 0, 0, 1]) > _RIGID).any(axis=1)
+    is_wrong |= (np.abs(T[:, :3, 3]) > _FARTHEST).any(axis=1)
+    if is_known.any():
+        away = np.linalg.norm(T[:, :3, 3] - np.median(T[is_known, :3, 3], axis=0), axis=1)
+        usual = np.quantile(away[is_known], 0.9, method="lower")
+        is_wrong |= is_known & (away > _ALONE * max(1.0, usual))
     for i in np.flatnonzero(is_wrong):
         frame = f" frame {i}" if len(poses) > 1 else ""
         numbers = " ".join(f"{number:.4g}" for number in poses[i].flat)
         raise DataError(
             f"{path}{frame} is no rigid transform in metres ({numbers}): "
-            f"rows must be [R | t], right-handed rotation R and t up to {_FARTHEST:g}, and 0 0 0 1"
+            f"rows must be [R | t], right-handed rotation R and t up to {_FARTHEST:g} and near the "
+            "other frames', and 0 0 0 1; write nan for a frame that is lost"
         )
-    return np.where(is_known, poses, np.nan)
+    return np.where(is_known[:, None, None], poses, np.nan)
 
 
 @dataclass(frozen=True)
@@ -197,12 +185,6 @@ def read_calibration(path: Path) -> Calibration:
     is_matrix = np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6)
     # NaN fails both: numpy's minimum keeps it, unlike Python's.
     is_camera = np.min([fx, fy]) >= _MIN_FOCAL and np.abs([fx, fy, cx, cy]).max() < _LARGEST
-    if fx >= _MIN_FOCAL and -_LARGEST < fy <= -_MIN_FOCAL:
-        raise DataError(
-            f"{path} gives fy = {fy:g}, as ICL-NUIM does, whose camera has its y axis up: write "
-            f'{-fy:g} and, where the poses are of that camera, camera_axes = "right up forward" in '
-            "sequence.toml"
-        )
     if not (is_matrix and is_camera):
         raise DataError(
             f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
@@ -212,12 +194,12 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
-    """OpenCV's, as `read_calibration` takes it."""
+    """OpenCV's camera matrix, as `read_calibration` takes it."""
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
 
 
 def _from_text(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
-    numbers = np.array(read_rows(path, _numbers, (1, 3, 4, 9, 16), _CAMERA_LINE))
+    numbers = read_numbers(path, (1, 3, 4, 9, 16), _CAMERA_LINE)
     if numbers.size == 1:
         focal = numbers.item()
         return camera_matrix(focal, focal, 0.0, 0.0), {"principal_point": None}
@@ -233,32 +215,32 @@ def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     content = read_object(path)
     camera = content["camera"] if isinstance(content.get("camera"), dict) else content
     camera = {{"w": "width", "h": "height"}.get(key, key): camera[key] for key in camera}
-
-    def numbers(key: str, *counts: int) -> list[float]:
-        """The list of an entry; a single number counts as a list of one."""
-        values = camera[key] if isinstance(camera.get(key), list) else [camera.get(key)]
+    others: dict[str, Any] = {"unused": tuple(sorted(camera.keys() - _COUNTS.keys()))}
+    found = {}
+    for key in camera.keys() & _COUNTS.keys():
+        values = camera[key] if isinstance(camera[key], list) else [camera[key]]
         # NaN is not below anything, and True is no number here.
         are_numbers = all(type(v) in (int, float) and abs(v) < _LARGEST for v in values)
-        if not (are_numbers and len(values) in counts):
-            text = f"{path}: {key} is {str(camera.get(key))[:40]!r}: write"
-            raise DataError(f"{text} {' or '.join(map(str, counts))} finite number(s)")
-        return [float(value) for value in values]
-
-    others: dict[str, Any] = {"unused": tuple(sorted(camera.keys() - _CAMERA_KEYS))}
-    if lens := camera.keys() & _LENS:
-        others["distortion"] = tuple(numbers(key, 1)[0] if key in lens else 0.0 for key in _LENS)
-    for key in camera.keys() & {"distortion", "coeffs"}:
-        others["distortion"] = tuple(numbers(key, 0, 4, 5, 8))
-    for key in camera.keys() & {"depth_scale", "scale"}:
-        (value,) = numbers(key, 1)
+        if not are_numbers or len(values) not in _COUNTS[key]:
+            counts = " or ".join(map(str, _COUNTS[key]))
+            said = f"{path}: {key} is {str(camera[key])[:40]!r}"
+            raise DataError(f"{said}: write {counts} finite number(s)")
+        found[key] = [float(value) for value in values]
+    if found.keys() & _LENS:
+        others["distortion"] = tuple(found.get(key, [0.0])[0] for key in _LENS)
+    for key in found.keys() & {"distortion", "coeffs"}:
+        others["distortion"] = tuple(found[key])
+    for key in found.keys() & {"depth_scale", "scale"}:
+        (value,) = found[key]
         if value <= 0:
             raise DataError(f"{path}: {key} is {value:g}: write how many depth values make a metre")
         others["depth_scale"] = value if value >= 1 else 1 / value
-    if camera.keys() & {"width", "height"}:
-        width, height = *numbers("width", 1), *numbers("height", 1)
-        if not (width % 1 == height % 1 == 0 and min(width, height) > 0):
-            raise DataError(f"{path} gives a size of {width} x {height}: whole pixels, 1 or more")
-        others["size"] = (int(width), int(height))
-    if "intrinsic_matrix" in camera:
-        return np.array(numbers("intrinsic_matrix", 9)).reshape(3, 3).T, others
-    return camera_matrix(*(numbers(key, 1)[0] for key in ("fx", "fy", "cx", "cy"))), others
+    if found.keys() & {"width", "height"}:
+        size = [*found.get("width", []), *found.get("height", [])]
+        if len(size) < 2 or min(size) < 1 or any(side % 1 for side in size):
+            raise DataError(f"{path} gives the size {size}: write width and height, whole pixels")
+        others["size"] = tuple(map(int, size))
+    if "intrinsic_matrix" in found:
+        return np.array(found["intrinsic_matrix"]).reshape(3, 3).T, others
+    named = (found.get(key, [np.nan])[0] for key in ("fx", "fy", "cx", "cy"))
+    return camera_matrix(*named), others

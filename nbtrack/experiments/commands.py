@@ -21,7 +21,6 @@ from nbtrack.data.sequence import (
     select_frames,
     without_outliers,
 )
-from nbtrack.data.writer import convert_sequence
 from nbtrack.experiments.grid import run_jobs
 from nbtrack.experiments.jobs import OF_MAPS, GivenMap, MapJob, TrackJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
@@ -39,6 +38,7 @@ from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh
 from nbtrack.recordings.check import check_recording, quick_warning
+from nbtrack.recordings.writer import convert_sequence
 from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.methods import METHODS, Method
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M

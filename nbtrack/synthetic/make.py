@@ -12,7 +12,7 @@ import numpy as np
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError, look_up
 from nbtrack.core.files import fingerprint, json_text, naming_damaged, sources_fingerprint
-from nbtrack.data.writer import WrittenFrame, write_sequence
+from nbtrack.recordings.writer import WrittenFrame, write_sequence
 from nbtrack.synthetic.keyframes import keyframe_trajectory
 from nbtrack.synthetic.motion import handheld_trajectory, tour
 from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame

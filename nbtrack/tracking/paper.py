@@ -4,9 +4,8 @@ import abc
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
-from nbtrack.core import capture, geometry
+from nbtrack.core import geometry
 from nbtrack.core.arrays import Colors, Points, Scalar, Transform, Transforms, Values
 from nbtrack.core.camera import pixel_directions
 from nbtrack.core.settings import limited, one_of
@@ -47,8 +46,6 @@ class AdamTracker(Tracker):
     """
 
     Settings = AdamSettings
-    pixels: Tensor | None = None  # n x 7: rays, colours and depths that may be drawn
-    recorded: capture.Recorded | None = None  # the step, where its device can
 
     @abc.abstractmethod
     def loss(
@@ -58,64 +55,37 @@ class AdamTracker(Tracker):
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Take up a frame; of several starts, that with the lowest loss on the same pixels."""
-        self._list_pixels(frame)
+        self.frame, self.measured = frame, frame.measured_pixels()
         T_starts = T_starts.to(self.device, torch.float32)
         T_start = T_starts[0]
         if len(T_starts) > 1:
-            self._draw()
+            drawn = self._draw()
             with torch.no_grad():
-                losses = torch.stack([self.loss(T, *self._drawn()) for T in T_starts])
+                losses = torch.stack([self.loss(T, *drawn) for T in T_starts])
             T_start = T_starts[losses.argmin()]
-        start = T_start[:3, 3].clone(), geometry.matrix_to_quaternion(T_start[:3, :3])
-        if self.recorded:  # the recorded step holds these very tensors
-            with torch.no_grad():
-                self.position.copy_(start[0])
-                self.q_wxyz.copy_(start[1])
-            for moments in self.optimizer.state.values():
-                torch._foreach_zero_([*moments.values()])
-            return
-        self.position, self.q_wxyz = (part.requires_grad_() for part in start)
+        self.position = T_start[:3, 3].clone().requires_grad_()
+        self.q_wxyz = geometry.matrix_to_quaternion(T_start[:3, :3]).requires_grad_()
         position_rate = self.settings.position_rate_m(self.field.bounds.metres_per_unit)
         position = {"params": [self.position], "lr": position_rate}
         orientation = {"params": [self.q_wxyz], "lr": self.settings.orientation_rate}
-        can, groups = capture.can_record(self.device), [position, orientation]
-        self.optimizer = torch.optim.Adam(groups, fused=can or None, capturable=can)
-        # What another class does in its steps may not bear to be replayed.
-        is_known = type(self).begin is AdamTracker.begin and type(self).step is AdamTracker.step
-        self.recorded = capture.Recorded(self._descend, self) if can and is_known else None
+        self.optimizer = torch.optim.Adam([position, orientation])
 
     def step(self) -> Scalar:
         """Draw pixels, lower their loss by one step of Adam, renormalise the quaternion."""
-        self._draw()
-        return (self.recorded or self._descend)()
-
-    def _list_pixels(self, frame: Frame) -> None:
-        """Rays, colours and depths of all measured pixels, where those of the last frame were."""
-        rows, columns = frame.measured_pixels()
-        if self.pixels is None or len(self.pixels) != frame.depth_mm.numel():
-            self.pixels = torch.empty(frame.depth_mm.numel(), 7, device=self.device)
-            self.drawn = rows.new_empty(self.settings.n_pixels)
-            self.recorded = None
-        self.n_measured = len(rows)
-        listed = self.pixels[: self.n_measured]
-        listed[:, :3] = pixel_directions(frame.camera, columns, rows)
-        listed[:, 3:6], listed[:, 6] = frame.at(rows, columns)
-
-    def _draw(self) -> None:
-        torch.randint(self.n_measured, self.drawn.shape, generator=self.generator, out=self.drawn)
-
-    def _drawn(self) -> tuple[Points, Colors, Values]:
-        directions, color, depth = self.pixels[self.drawn].split([3, 3, 1], dim=1)
-        return directions, color, depth.squeeze(1)
-
-    def _descend(self) -> Scalar:
         self.optimizer.zero_grad()
-        loss = self.loss(self.T_world_camera, *self._drawn())
+        loss = self.loss(self.T_world_camera, *self._draw())
         loss.backward()
         self.optimizer.step()
         with torch.no_grad():
             self.q_wxyz.div_(self.q_wxyz.norm(dim=-1, keepdim=True))
         return loss.detach()
+
+    def _draw(self) -> tuple[Points, Colors, Values]:
+        """Rays, colours and depths of random measured pixels."""
+        shape, like = (self.settings.n_pixels,), {"device": self.device}
+        drawn = torch.randint(self.measured.shape[1], shape, generator=self.generator, **like)
+        rows, columns = self.measured[:, drawn]
+        return pixel_directions(self.frame.camera, columns, rows), *self.frame.at(rows, columns)
 
     @property
     def T_world_camera(self) -> Transform:

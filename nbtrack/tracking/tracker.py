@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from nbtrack.core import capture
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
 from nbtrack.core.device import suitable_threads, synchronize
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
@@ -177,11 +176,10 @@ class Tracker(abc.ABC):
 
     def _search(self, frame: Frame, T_starts: Poses, budget: Budget) -> Estimate:
         if not self._is_warm and frame.has_depth:
-            # Steps that count nowhere: first calls load, allocate and record for a second or more.
+            # A step that counts nowhere: first calls load and allocate for a second or more.
             state, self._is_warm = self.state(), True
             self._begin(frame, T_starts[:1])
-            for _ in range(capture.WARM_STEPS + 1 if capture.can_record(self.device) else 1):
-                self.step()
+            self.step()
             self.report()
             self.restore(state)
             synchronize(self.device)
