@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from tiny import TINY
 
 from nbtrack.beyond.correct import correct_map
@@ -22,8 +21,7 @@ from nbtrack.experiments.commands import _preset_of
 from nbtrack.experiments.methods import METHODS, TABLE_1
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.scenes import open_scene, open_scenes
-from nbtrack.fields import NetworkSettings
-from nbtrack.fields.mlp import FourierMlp
+from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import learning_rate, map_sequence
 from nbtrack.synthetic import REPORTED_ROOMS
@@ -225,7 +223,7 @@ SMALLEST = (
     "network.occupancy.width=16", "network.occupancy.n_frequencies=8",
     *(
         f"mapping.{field}.{value}"
-        for field in ("imap", "occupancy", "neus", "volsdf", "neus_plus")
+        for field in ("imap", "occupancy", "neus", "volsdf", "neus_plus", "grid_plus")
         for value in ("iterations=1", "n_rays=4", "n_stratified=2", "n_surface=1")
     ),
 )  # fmt: skip
@@ -272,9 +270,7 @@ class Small:
         part, name, *_ = key.split(".")
         last, scenes = key.split(".")[-1], preset.scenes
         if part == "network":
-            FourierMlp(
-                preset.network_of(name), self.fields["neus"].bounds, torch.relu, torch.Generator()
-            )
+            make_field(name, preset.network_of(name), self.fields["neus"].bounds, 0)
         elif last == "iterations":
             assert learning_rate(preset.mapping_of(name), 1) > 0
         elif last == "width":
@@ -310,7 +306,8 @@ def largest(preset: Preset, key: str, kind: type) -> str:
         return False
 
     if kind is float:
-        return repr(max(10.0**n for n in range(-3, 10) if is_allowed(10.0**n)))
+        powers = (10.0**n for n in range(-3, 10))
+        return repr(max(filter(is_allowed, powers), default=0.0))
     return str(max(n for k in range(32) for n in (2**k, 2**k - 1, 10 ** (k % 10)) if is_allowed(n)))
 
 

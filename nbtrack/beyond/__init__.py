@@ -3,6 +3,7 @@
 import nbtrack.beyond.methods  # joins the registry
 from nbtrack.beyond.correct import correct_map
 from nbtrack.beyond.correction import CorrectedField
+from nbtrack.beyond.feature_grid import GridPlusField
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.icp import IcpSettings, IcpTracker
 from nbtrack.beyond.lm import LmSettings, LmTracker
@@ -13,7 +14,7 @@ from nbtrack.fields import FIELDS
 from nbtrack.mapping.files import FORMS
 from nbtrack.tracking import TRACKERS
 
-for kind in (NeuSPlusField, VolSdfField, OccupancyField, PointCloud):
+for kind in (NeuSPlusField, GridPlusField, VolSdfField, OccupancyField, PointCloud):
     FIELDS[kind.name] = kind
 for tracker in (LmTracker, IcpTracker):
     TRACKERS[tracker.name] = tracker

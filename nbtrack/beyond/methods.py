@@ -8,9 +8,11 @@ _NEUS_CORRECTED = ("correction.neus=0.04",)
 _CORRECTED = ("correction.neus_plus=0.04", "mapping.neus_plus.iterations=600")
 _SPARSE, _MIDDLE, _DENSE = ((*_CORRECTED, f"tracking.lm.n_pixels={n}") for n in (512, 2048, 4096))
 _GEOMETRY = (*_MIDDLE, "tracking.lm.lambda_intensity=0")
+_GRID_CORRECTED = ("correction.grid_plus=0.04", "tracking.lm.n_pixels=2048")
 
 METHODS |= {
     "vr_plus": Method("NeuS+ with VR", "neus_plus", "vr"),
+    "vr_grid": Method("NeuS+ grid with VR", "grid_plus", "vr"),
     "vr_volsdf": Method("VolSDF with VR", "volsdf", "vr"),
     "sdf_volsdf": Method("VolSDF with SDF", "volsdf", "sdf"),
     "vr_occupancy": Method("Occupancy with VR", "occupancy", "vr"),
@@ -18,6 +20,7 @@ METHODS |= {
     "color_volsdf": Method("VolSDF with VR, colour only", "volsdf", "vr", _COLOR_ONLY),
     "color_occupancy": Method("Occupancy with VR, colour only", "occupancy", "vr", _COLOR_ONLY),
     "sdf_plus": Method("NeuS+ with SDF (Adam)", "neus_plus", "sdf"),
+    "sdf_grid": Method("NeuS+ grid with SDF", "grid_plus", "sdf"),
     "baked": Method("NeuS+ baked (LM)", "neus_plus", "lm"),
     "corrected": Method("NeuS+ corrected (LM)", "neus_plus", "lm", _MIDDLE),
     "corrected_sparse": Method("NeuS+ corrected (LM), sparse", "neus_plus", "lm", _SPARSE),
@@ -25,6 +28,7 @@ METHODS |= {
     "corrected_geometry": Method(
         "NeuS+ corrected (LM), without colour", "neus_plus", "lm", _GEOMETRY
     ),
+    "grid_corrected": Method("NeuS+ grid corrected (LM)", "grid_plus", "lm", _GRID_CORRECTED),
     "neus_corrected": Method("NeuS corrected (LM)", "neus", "lm", _NEUS_CORRECTED),
     "sdf_corrected": Method("NeuS corrected with SDF (Adam)", "neus", "sdf", _NEUS_CORRECTED),
     "icp": Method("ICP", "points", "icp"),

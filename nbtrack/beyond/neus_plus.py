@@ -69,13 +69,15 @@ class NeuSPlusField(NeuSField):
         surface_color, surface_sdf = self(surface.points(surface.depth[:, None])[:, 0])
         measured = (surface.depth > 0).float()
         color_error = (surface_color - surface.color).abs().mean(dim=-1)
-        return {
+        losses = {
             **rendered_losses(rendering, rays, *lambdas),
             "sdf": settings.lambda_sdf * measured_mean((sdf - target).abs(), known),
             "surface": settings.lambda_sdf * measured_mean(surface_sdf.abs(), measured),
             "surface_color": settings.lambda_color * measured_mean(color_error, measured),
-            "eikonal": self._eikonal(rays.points(depths), settings, generator),
         }
+        if settings.lambda_eikonal:
+            losses["eikonal"] = self._eikonal(rays.points(depths), settings, generator)
+        return losses
 
 
 def distance_targets(

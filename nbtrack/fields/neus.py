@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 
 from nbtrack.core.arrays import Colors, Points, RaySamples, Scalar, Values
 from nbtrack.core.bounds import SceneBounds
@@ -41,9 +41,13 @@ class NeuSField(LearnedField):
 
     def __init__(self, network: NetworkSettings, bounds: SceneBounds, generator: Generator) -> None:
         super().__init__(bounds)
-        self.mlp = FourierMlp(network, bounds, torch.nn.functional.silu, generator)
-        self.variance = torch.nn.Parameter(torch.tensor(0.3))
+        self.mlp = self.make_network(network, generator)
+        self.variance = nn.Parameter(torch.tensor(0.3))
         self._start_as_empty_room(generator)
+
+    def make_network(self, settings: NetworkSettings, generator: Generator) -> nn.Module:
+        """What answers points with raw colours and values; its `head` reads its `features`."""
+        return FourierMlp(settings, self.bounds, nn.functional.silu, generator)
 
     @property
     def inverse_std(self) -> Scalar:
