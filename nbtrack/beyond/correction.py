@@ -28,6 +28,9 @@ from nbtrack.fields.base import LUMA, State
 # All our choice, tried in the two rooms for tuning. Measured points, and where along their normals
 # (m) the distance is that offset. Nearer than a voxel: farther out, planes end.
 _N_POINTS, _OFFSETS = 300_000, (0.0, -0.03, -0.015, 0.015, 0.03)
+# A larger place takes more, up to so many times, lest a frame see cells that none lies in: with so
+# many a cell in the mean, as rooms have anyway (3 in an office of 15 by 17 m; see docs/tried.md).
+_POINTS_A_CELL, _MAX_TIMES = 10, 4
 # The residual (m) from which one counts less (Huber), and how often that is judged anew.
 _HUBER, _ROUNDS = 0.01, 4
 # What a difference between neighbouring corrections, and a correction itself, cost, in points seen
@@ -106,7 +109,12 @@ def corrected(
     """
     source = copy.deepcopy(source).cpu()
     baked = BakedField(source, voxel)
-    points, normals, depth, color = _measured_planes(sequence, frames)
+    planes = _measured_planes(sequence, frames, _N_POINTS)
+    n_cells = len(np.unique(np.floor(planes[0] / voxel).astype(np.int64), axis=0))
+    times = min(_POINTS_A_CELL * n_cells / len(planes[0]), _MAX_TIMES)
+    if times > 1:
+        planes = _measured_planes(sequence, frames, round(times * _N_POINTS))
+    points, normals, depth, color = planes
     asked = np.concatenate([points + offset * normals for offset in _OFFSETS])
     numbers, design, stiffness = _unknowns(*interpolation(asked, baked), baked.n_vertices)
     values = baked.volume[:4].T.double().numpy()[numbers]
@@ -131,11 +139,13 @@ def corrected(
     return CorrectedField(source, voxel, dict(zip(CORRECTIONS, parts, strict=True)))
 
 
-def _measured_planes(sequence: RgbdSequence, frames: Frames) -> tuple[np.ndarray, ...]:
+def _measured_planes(
+    sequence: RgbdSequence, frames: Frames, n_points: int
+) -> tuple[np.ndarray, ...]:
     """Random measured points (n x 3, m) with normals, their z-depths (n, m) and colours (n x 3)."""
     sampler = PixelSampler(sequence, torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
-    rays = sampler.draw(_N_POINTS, generator, torch.from_numpy(frames), tangent_planes=True)
+    rays = sampler.draw(n_points, generator, torch.from_numpy(frames), tangent_planes=True)
     has_plane = rays.normals_world.any(dim=-1)
     if not has_plane.any():
         raise DataError(f"{sequence.name} shows no surface to correct a map by: check its depth")
