@@ -17,6 +17,7 @@ from scipy.sparse.linalg import cg
 from torch import Tensor
 
 from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.views import spread_out, view_of
 from nbtrack.core.arrays import Frames, WorldPoints
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import DataError
@@ -43,8 +44,7 @@ _COLOR_STIFFNESS, _COLOR_HUBER, _COLOR_ROUNDS = 0.1, 0.05, 3
 # are 1.8 mm and 0.002, and 4 mm and 0.02.
 _MEDIANS, _MIN_SCALES = np.array([5.5, 2.3]), np.array([0.01, 0.05])
 _UNMEASURED = 0.1  # confidence where nothing was measured, and the network interpolates
-_MAX_CAMERAS = 200  # poses kept, evenly spread: where a lost camera may be looked for
-CORRECTIONS = ("numbers", "corrections", "cameras", "residual_medians")
+CORRECTIONS = ("numbers", "corrections", "cameras", "views", "residual_medians")
 """What a file keeps of a correction, besides the field: see `CorrectedField`."""
 _SOURCE = "source."  # how names of the field as mapped begin
 Columns = Float[np.ndarray, "rows columns"]
@@ -54,9 +54,10 @@ class CorrectedField(BakedField):
     """A grid of a learned field with corrections at vertices near surfaces. Our choice.
 
     What a file keeps is the field itself and, by name: the `numbers` (n) of corrected vertices,
-    their `corrections` (n x 5) of colour, distance (m) and confidence in half precision, mapped
-    poses `cameras` (n x 4 x 4), and `residual_medians` (2), of distance (m) and luma, that
-    the corrections leave at measured points: from them follow the least scales of a tracker's
+    their `corrections` (n x 5) of colour, distance (m) and confidence in half precision, some
+    mapped poses `cameras` (n x 4 x 4) with the small `views` (n x 2 x 30 x 40) from them, by which
+    a lost camera is found, and `residual_medians` (2), of distance (m) and luma, that the
+    corrections leave at measured points: from them follow the least scales of a tracker's
     residuals.
     """
 
@@ -77,7 +78,7 @@ class CorrectedField(BakedField):
 
     @property
     def T_world_cameras(self) -> Float[Tensor, "cameras 4 4"]:
-        """Some of the poses that it was mapped from, evenly spread."""
+        """Some of the poses that it was mapped from, spread by place and direction."""
         return self.cameras
 
     def state(self) -> State:
@@ -131,11 +132,12 @@ def corrected(
     colors, _ = _solve(at_surface, soft, missing_color, reliability, _COLOR_HUBER, _COLOR_ROUNDS)
 
     left = missing - at_surface @ distance[:, 0], (missing_color - at_surface @ colors) @ LUMA
-    spread = np.linspace(0, len(frames) - 1, min(_MAX_CAMERAS, len(frames))).round().astype(int)
     corrections = torch.from_numpy(np.column_stack([colors, distance, confidence])).float().half()
-    poses = torch.from_numpy(sequence.T_world_camera[frames[spread]]).float()
+    kept = frames[spread_out(sequence.T_world_camera[frames])]
+    views = torch.stack([view_of(sequence[index]) for index in kept.tolist()])
+    poses = torch.from_numpy(sequence.T_world_camera[kept]).float()
     medians = torch.from_numpy(np.median(np.abs(left), axis=1)).float()
-    parts = torch.from_numpy(numbers).int(), corrections, poses, medians
+    parts = torch.from_numpy(numbers).int(), corrections, poses, views, medians
     return CorrectedField(source, voxel, dict(zip(CORRECTIONS, parts, strict=True)))
 
 

@@ -59,7 +59,7 @@ _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e-9, 1e3
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.2
 _MIN_RATIO, _MAX_RATIO = 0.5, 0.9  # of two steps' lengths: creeping; the limit is tried up to
 # The coarse stage may lead away from a good start: the better of both goes on, at these scales.
-_NEAR_SCALES = np.array([0.02, 0.05])
+NEAR_SCALES = np.array([0.02, 0.05])
 _ONE, _ZERO = np.float32(1), np.float32(0)
 
 
@@ -111,7 +111,7 @@ class Descent:
         self.T_start = self.T_world_camera = T_start
         self.last_step = np.inf  # rad or m, whichever is more
         self._begin(COARSE)
-        self._start_cost = self.cost(_NEAR_SCALES)
+        self._start_cost = self.cost(NEAR_SCALES)
 
     def step(self) -> float:
         """One step, taken or refused; returns the robust cost before it."""
@@ -128,7 +128,7 @@ class Descent:
 
     def refine(self) -> None:
         """Go on with all points from where the coarse stage ended, or from the start if better."""
-        if self.cost(_NEAR_SCALES) > self._start_cost:
+        if self.cost(NEAR_SCALES) > self._start_cost:
             self.T_world_camera = self.T_start
         self._begin(FINE)
 
@@ -147,6 +147,8 @@ class Descent:
     def certainty(self) -> dict[str, float]:
         """The share of points that fit, and how well the curvature of their cost holds the pose.
 
+        `known_ratio` is the mean reliability of the points, `fitting_ratio` the share of those that
+        fit, each counted by its reliability: where little was mapped, few can fit at any pose.
         Intensities count by their differences from the median of all; `intensity_mad` is the median
         of those (MAD), 0 where they have no weight. Standard deviations are along the least certain
         direction, the condition number without the pose prior, rotations at a lever arm of 1 m.
@@ -159,6 +161,8 @@ class Descent:
         # A picture that is darker as a whole says nothing against a pose.
         off = np.abs(intensity - _median(intensity)) * (self.lambda_intensity > 0)
         is_inlier &= off < _INLIER_INTENSITY
+        known_ratio = float(reliability.mean())
+        fitting = float((reliability * is_inlier).mean()) / max(known_ratio, 1e-6)
         matrix, _ = normal_equations(self.terms, self.scales, self.weight)
         values = np.linalg.eigvalsh(matrix)
         covariance = np.linalg.inv(matrix + PRIOR_WEIGHT * np.eye(6)) / _SIGMAS**2  # rad, m
@@ -166,6 +170,8 @@ class Descent:
         rotation, position = np.linalg.eigvalsh(blocks)[:, -1] ** 0.5
         return {
             "inlier_ratio": float(is_inlier.mean()),
+            "known_ratio": known_ratio,
+            "fitting_ratio": fitting,
             "intensity_mad": float(_median(off)),
             "position_std_m": float(position),
             "rotation_std_deg": float(np.rad2deg(rotation)),

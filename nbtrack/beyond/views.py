@@ -16,12 +16,12 @@ from nbtrack.core.arrays import Poses
 from nbtrack.data.frame import MILLIMETRE, Frame
 
 # Directions x / z and y / z of a view: so many columns and rows, so far apart, 53 by 41 degrees.
-_COLUMNS, _ROWS, _STEP = 40, 30, 0.025
+_COLUMNS, _ROWS, _STEP = 20, 15, 0.05
 _DEPTH_UNIT = 0.05  # m; depths are kept in one byte, 0 where little was measured
 _MAX_VIEWS = 150  # 360 kB
 _RADIAN = 1.0  # m; of how far apart two poses are: as much as turning the optical axis so far
 # A camera may be turned against a view: by so many columns and rows, and in steps of so many.
-_TURNS, _TURN_STEP = (12, 6), 3
+_TURNS, _TURN_STEP = (6, 3), 3
 _MAX_LOG_RATIO = 0.3  # of depths; those that differ by more are of other surfaces
 View = UInt8[Tensor, "2 rows columns"]
 
@@ -92,5 +92,5 @@ def _unlikeness(here, there):
     ratio = (here[1].clamp(min=1) / there[:, 1].clamp(min=1)).log().abs().clamp(max=_MAX_LOG_RATIO) / _MAX_LOG_RATIO
     count = has_depth.sum(dim=(1, 2))
     depth = (ratio * has_depth).sum(dim=(1, 2)) / count.clamp(min=1)
-    depth = torch.where(count > 100, depth, 1)
+    depth = torch.where(count > 0.1 * _COLUMNS * _ROWS, depth, 1)
     return luma + 2 * depth
