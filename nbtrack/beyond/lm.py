@@ -120,6 +120,9 @@ class LmTracker(Tracker):
         R = starts[:, :3, :3]
         R[:] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
         self.frame, self.expected, self.best = frame, starts, None
+        # Poses that a right one is near: after a lost frame the last good one, if there was any.
+        n_good = int(self.last_good is not None)
+        self.trusted = starts[len(starts) - n_good :] if self.was_lost else starts
         observed = draw_points(frame, self.settings.n_pixels, self.generator)
         n_points = len(observed[0])
         self.search = Search.FOLLOWING if n_points >= _MIN_POINTS else Search.DONE
@@ -171,12 +174,12 @@ class LmTracker(Tracker):
         said = descent.certainty()
         mad = self.field.intensity_mad
         usual_mad = max(mad if np.isfinite(mad) else _UNKNOWN_MAD, _ROUNDING)
-        changes = np.linalg.inv(self.expected) @ descent.T_world_camera - np.eye(4)
-        surprise = _SURPRISE if self.was_lost else float(np.abs(changes).max(axis=(1, 2)).min())
+        changes = np.linalg.inv(self.trusted) @ descent.T_world_camera - np.eye(4)
+        surprise = np.abs(changes).max(axis=(1, 2)).min(initial=_SURPRISE)
         said |= {
             "intensity_ratio": said["intensity_mad"] / usual_mad,
             "last_step": 0.0 if descent.is_finished else float(descent.last_step),
-            "surprise": min(surprise, _SURPRISE),
+            "surprise": float(surprise),
         }
         probability = p_lost(said)
         return {**said, "p_lost": probability, "lost": probability >= _LOST}

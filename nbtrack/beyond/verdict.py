@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 _LEAST_SHARE = 0.01  # of points; shares of none and of all would be infinitely telling
-_INTERCEPT, _COEFFICIENTS = 0.0, np.zeros(6)
+_INTERCEPT = 3.45
+_COEFFICIENTS = np.array([-1.62, -1.2, 1.88, 0.18, 0.07, 0.58])
 
 
 def features(said: Mapping[str, float]) -> Float[np.ndarray, "6"]:
@@ -27,7 +28,7 @@ def features(said: Mapping[str, float]) -> Float[np.ndarray, "6"]:
     return np.array([
         np.log(fitting / (1 - fitting)),
         np.log(known / (1 - known)),
-        np.log(np.clip(said["intensity_ratio"], 0.5, 20)),
+        np.log(np.clip(said["intensity_ratio"], 0.5, 10)),
         np.log(np.clip(said["position_std_m"], 1e-4, 0.1) / 1e-3),
         np.log(1 + min(said["last_step"], 0.05) / 1e-3),
         np.log(np.clip(said["surprise"], 0.02, 1)),

@@ -1,0 +1,121 @@
+"""Fits the probability that a pose of LM is wrong: the coefficients of `beyond/verdict.py`.
+
+    python benchmarks/verdict.py RECORDING
+
+In corrected maps of the two rooms for tuning and of a recording: frames tracked, on the mapped path
+and on another, slow and fast; searched for from wrong starts; and shown to the map of another room.
+Prints intercept and coefficients, and both kinds of mistakes at a few thresholds. Minutes.
+"""
+
+import sys
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+import pandas as pd
+import torch
+from basin import twist
+from motions import HAND_HELD
+from scipy.optimize import minimize
+
+from nbtrack import METHODS, load_preset, make_tracker, map_scene, open_scene, open_scenes
+from nbtrack.beyond.lm_solver import retract
+from nbtrack.beyond.verdict import features
+from nbtrack.core.settings import with_settings
+from nbtrack.data.sequence import RgbdSequence
+from nbtrack.fields import Field
+from nbtrack.tracking import StepBudget, track_sequence
+from nbtrack.tracking.metrics import pose_errors
+
+WRONG_M, WRONG_DEG, STIFFNESS = 0.05, 3.0, 1e-3
+GROWS = (False, False, True, True, True, True)  # whether a feature speaks for a wrong pose
+OFFSETS = ((10, 8), (20, 15), (50, 40), (150, 90))  # cm, degrees
+
+
+def main() -> None:
+    """Collect, fit, print."""
+    torch.set_num_threads(1)
+    tuning = "scenes.names=['bedroom', 'kitchen_nook']"
+    preset, second = (
+        load_preset("smoke", settings=[tuning, *HAND_HELD, f"scenes.seed={n}"]) for n in (0, 1)
+    )
+    scenes = [*open_scenes(preset), *(open_scene(folder, preset) for folder in sys.argv[1:])]
+    method = METHODS["corrected"]
+    changed = with_settings(preset, *method.settings)
+    fields = [map_scene(scene, method.field, changed).field for scene in scenes]
+    paths = [[scene.read()] for scene in scenes]
+    for place, other in zip(paths, open_scenes(second), strict=False):
+        place.append(other.read())
+    print_fit(pd.concat(collected(fields, paths)))
+
+
+def collected(fields: list[Field], paths: list[list[RgbdSequence]]) -> Iterator[pd.DataFrame]:
+    """What LM says of its poses, and their errors."""
+    for (place, field), n_pixels in product(enumerate(fields), (512, 2048)):
+        for sequence, stride in product(paths[place], (1, 4, 8)):
+            how = sequence.T_world_camera[0], StepBudget(30), settings(n_pixels, 8)
+            chosen = select(sequence, stride)
+            tracked = track_sequence(make_tracker("lm", field, *how), chosen).frames
+            yield tracked.assign(kind="tracked", place=place)
+        for sequence, (cm, degrees), steps in product(paths[place], OFFSETS, (4, 60)):
+            yield searched(field, sequence, cm, degrees, n_pixels, steps).assign(place=place)
+        stranger = paths[(place + 1) % len(paths)][0]
+        found = searched(field, stranger, 20, 15, n_pixels)
+        yield found.assign(place=place, kind="stranger", translation_error_m=10.0)
+
+
+def settings(n_pixels: int, n_restarts: int):
+    """Settings of LM."""
+    preset = load_preset("smoke")
+    changed = f"tracking.lm.n_pixels={n_pixels}", f"tracking.lm.n_restarts={n_restarts}"
+    return with_settings(preset, *changed).tracking_of("lm")
+
+
+def select(sequence: RgbdSequence, stride: int) -> RgbdSequence:
+    """Every so manieth frame."""
+    from nbtrack.data.sequence import select_frames
+    return sequence
+
+
+def searched(field, sequence, cm, degrees, n_pixels, steps=60) -> pd.DataFrame:
+    """Every eighth frame from a start that is off, as if the frame before had been lost."""
+    rows = []
+    tracker = make_tracker("lm", field, np.eye(4), StepBudget(steps), settings(n_pixels, 0))
+    for number in range(0, len(sequence), 8):
+        frame = sequence[number]
+        offset = twist(number, cm, degrees).double().numpy()
+        tracker.restart(retract(frame.T_world_camera, offset))
+        tracker.was_lost = cm > 20
+        found = tracker.track(frame)
+        (off_m,), (off_deg,) = pose_errors(found.T_world_camera[None], frame.T_world_camera[None])
+        told = {"translation_error_m": off_m, "rotation_error_deg": off_deg, "kind": f"{cm} cm"}
+        rows.append(found.report | told)
+    return pd.DataFrame(rows)
+
+
+def print_fit(rows: pd.DataFrame) -> None:
+    """Logistic regression, a little stiff; every place counts alike."""
+    rows = rows[rows["position_std_m"].notna()].reset_index(drop=True)
+    is_wrong = (rows["translation_error_m"] > WRONG_M) | (rows["rotation_error_deg"] > WRONG_DEG)
+    sign, x = np.where(is_wrong, 1.0, -1.0), np.stack([features(r) for _, r in rows.iterrows()])
+    design = np.column_stack([np.ones(len(x)), x])
+    weight = 1 / rows.groupby("place")["place"].transform("size").to_numpy()
+
+    def loss(beta):
+        return weight @ np.logaddexp(0, -sign * (design @ beta)) + STIFFNESS * beta[1:] @ beta[1:]
+
+    bounds = [(None, None), *((0, None) if up else (None, 0) for up in GROWS)]
+    beta = minimize(loss, np.zeros(design.shape[1]), bounds=bounds).x
+    print("intercept and coefficients", beta.round(2).tolist())
+    probability = 1 / (1 + np.exp(-(design @ beta)))
+    for threshold in (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7):
+        lost = probability > threshold
+        print(f"{threshold}: {(is_wrong & ~lost).sum()} of {is_wrong.sum()} wrong ones missed, "
+              f"{(~is_wrong & lost).sum()} of {lost.sum()} called lost in vain")
+    edges = [0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 1]
+    part = pd.cut(probability, edges)
+    print(pd.DataFrame({"p": probability, "wrong": is_wrong}).groupby(part, observed=True).agg(["mean", "size"]).round(3))
+
+
+if __name__ == "__main__":
+    main()
