@@ -19,10 +19,11 @@ from motions import HAND_HELD
 from scipy.optimize import minimize
 
 from nbtrack import METHODS, load_preset, make_tracker, map_scene, open_scene, open_scenes
+from nbtrack.beyond import LmSettings
 from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.verdict import features
 from nbtrack.core.settings import with_settings
-from nbtrack.data.sequence import RgbdSequence
+from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import Field
 from nbtrack.tracking import StepBudget, track_sequence
 from nbtrack.tracking.metrics import pose_errors
@@ -43,45 +44,38 @@ def main() -> None:
     method = METHODS["corrected"]
     changed = with_settings(preset, *method.settings)
     fields = [map_scene(scene, method.field, changed).field for scene in scenes]
-    paths = [[scene.read()] for scene in scenes]
+    paths = [[scene] for scene in scenes]
     for place, other in zip(paths, open_scenes(second), strict=False):
-        place.append(other.read())
+        place.append(other)
     print_fit(pd.concat(collected(fields, paths)))
 
 
-def collected(fields: list[Field], paths: list[list[RgbdSequence]]) -> Iterator[pd.DataFrame]:
+def collected(fields: list[Field], paths: list[list[Scene]]) -> Iterator[pd.DataFrame]:
     """What LM says of its poses, and their errors."""
     for (place, field), n_pixels in product(enumerate(fields), (512, 2048)):
-        for sequence, stride in product(paths[place], (1, 4, 8)):
-            how = sequence.T_world_camera[0], StepBudget(30), settings(n_pixels, 8)
-            chosen = select(sequence, stride)
-            tracked = track_sequence(make_tracker("lm", field, *how), chosen).frames
+        for scene, frames in product(paths[place], ("::2", "::4", "::8")):
+            sequence = scene.read(frames)
+            how = sequence.T_world_camera[0], StepBudget(30), settings(n_pixels)
+            tracked = track_sequence(make_tracker("lm", field, *how), sequence).frames
             yield tracked.assign(kind="tracked", place=place)
-        for sequence, (cm, degrees), steps in product(paths[place], OFFSETS, (4, 60)):
-            yield searched(field, sequence, cm, degrees, n_pixels, steps).assign(place=place)
-        stranger = paths[(place + 1) % len(paths)][0]
-        found = searched(field, stranger, 20, 15, n_pixels)
+        for scene, (cm, degrees), steps in product(paths[place], OFFSETS, (4, 60)):
+            found = searched(field, scene.read("::8"), cm, degrees, n_pixels, steps)
+            yield found.assign(place=place)
+        stranger = paths[(place + 1) % len(paths)][0].read("::8")
+        found = searched(field, stranger, 20, 15, n_pixels, 60)
         yield found.assign(place=place, kind="stranger", translation_error_m=10.0)
 
 
-def settings(n_pixels: int, n_restarts: int):
-    """Settings of LM."""
-    preset = load_preset("smoke")
-    changed = f"tracking.lm.n_pixels={n_pixels}", f"tracking.lm.n_restarts={n_restarts}"
-    return with_settings(preset, *changed).tracking_of("lm")
+def settings(n_pixels: int) -> LmSettings:
+    """Without restarts, which would leave few wrong poses to learn from."""
+    return LmSettings(n_pixels=n_pixels, n_restarts=0)
 
 
-def select(sequence: RgbdSequence, stride: int) -> RgbdSequence:
-    """Every so manieth frame."""
-    from nbtrack.data.sequence import select_frames
-    return sequence
-
-
-def searched(field, sequence, cm, degrees, n_pixels, steps=60) -> pd.DataFrame:
-    """Every eighth frame from a start that is off, as if the frame before had been lost."""
+def searched(field, sequence, cm, degrees, n_pixels, steps) -> pd.DataFrame:
+    """Frames from starts that are off; far ones as if the frame before had been lost."""
     rows = []
-    tracker = make_tracker("lm", field, np.eye(4), StepBudget(steps), settings(n_pixels, 0))
-    for number in range(0, len(sequence), 8):
+    tracker = make_tracker("lm", field, np.eye(4), StepBudget(steps), settings(n_pixels))
+    for number in range(len(sequence)):
         frame = sequence[number]
         offset = twist(number, cm, degrees).double().numpy()
         tracker.restart(retract(frame.T_world_camera, offset))
@@ -110,11 +104,18 @@ def print_fit(rows: pd.DataFrame) -> None:
     probability = 1 / (1 + np.exp(-(design @ beta)))
     for threshold in (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7):
         lost = probability > threshold
-        print(f"{threshold}: {(is_wrong & ~lost).sum()} of {is_wrong.sum()} wrong ones missed, "
-              f"{(~is_wrong & lost).sum()} of {lost.sum()} called lost in vain")
+        print(
+            f"{threshold}: {(is_wrong & ~lost).sum()} of {is_wrong.sum()} wrong ones missed, "
+            f"{(~is_wrong & lost).sum()} of {lost.sum()} called lost in vain"
+        )
     edges = [0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 1]
     part = pd.cut(probability, edges)
-    print(pd.DataFrame({"p": probability, "wrong": is_wrong}).groupby(part, observed=True).agg(["mean", "size"]).round(3))
+    print(
+        pd.DataFrame({"p": probability, "wrong": is_wrong})
+        .groupby(part, observed=True)
+        .agg(["mean", "size"])
+        .round(3)
+    )
 
 
 if __name__ == "__main__":

@@ -77,7 +77,11 @@ class IcpTracker(Tracker):
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Draw the frame's points and find their planes."""
-        self.T_starts, self.T_world_camera, self.source = T_starts.double().numpy(), T_starts[0], None
+        self.T_starts, self.T_world_camera, self.source = (
+            T_starts.double().numpy(),
+            T_starts[0],
+            None,
+        )
         self.is_converged, self.inlier_ratio = False, 0.0
         points = draw_points(frame, self.settings.n_pixels, self.generator, _EDGE_JUMP)[0]
         if len(points):

@@ -188,7 +188,7 @@ class LmTracker(Tracker):
         return Descent(self.grid, *self.points, self.settings.lambda_intensity, T_start)
 
     def _look_elsewhere(self) -> None:
-        """One more descent, if a start is left: what it finds takes over if it is clearly better."""
+        """One more descent; what it finds takes over if it is clearly better."""
         if self.others is None:
             self.others = self._other_starts()[: self.settings.n_restarts]
         descent = self._descent_from(self.others.pop(0))

@@ -39,9 +39,9 @@ def draw_points(
     """Observed points (m, camera frame) of evenly spread pixels, and intensities; no normals.
 
     Not those at depth edges, which may belong to either side, nor at the border: a neighbouring
-    depth that differs by a larger share than `edge_jump` marks an edge, if infinite none. Only a few times
-    as many pixels as wanted are looked at, from a random one on: where little is measured, fewer
-    points come back.
+    depth that differs by a larger share than `edge_jump` marks an edge, if infinite none. Only a
+    few times as many pixels as wanted are looked at, from a random one on: where little is
+    measured, fewer points come back.
     """
     starts = torch.randint(_MODULUS, (2,), generator=generator).numpy()
     images = frame.depth_mm.numpy(), frame.color.numpy()
