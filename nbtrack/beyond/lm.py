@@ -33,8 +33,10 @@ _WIDE_SCALES, _CLEARLY = np.array([0.1, 0.2]), 0.97
 # of them leads to the true pose.
 _FAR_APART, _MAX_COARSE_STEPS = 0.06, 30
 # A pose is lost from this probability on that it is wrong; from the lower one on another is looked
-# for, by so many steps a descent at most.
-_LOST, _DOUBTFUL, _MAX_STEPS = 0.5, 0.05, 60
+# for. What a descent needs beyond so many steps, and one elsewhere, counts as one step; each of its
+# two stages takes so many at most.
+_LOST, _DOUBTFUL, _MAX_FOLLOWING, _MAX_STEPS = 0.5, 0.1, 20, 60
+_SAME = 0.01  # rad, m; another descent that ends so near a pose confirms it
 _SURPRISE = 1.0  # rad, m; of a pose where the frame before led to none
 # Intensities are no better than what rounding to 256 grey levels leaves in the median, and as good
 # as this where the map does not say how good they are.
@@ -119,12 +121,13 @@ class LmTracker(Tracker):
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
         R = starts[:, :3, :3]
         R[:] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
-        self.frame, self.expected, self.best = frame, starts, None
+        self.frame, self.expected, self.best, self.steps = frame, starts, None, 0
         # Poses that a right one is near: after a lost frame the last good one, if there was any.
         n_good = int(self.last_good is not None)
         self.trusted = starts[len(starts) - n_good :] if self.was_lost else starts
         observed = draw_points(frame, self.settings.n_pixels, self.generator)
         n_points = len(observed[0])
+        self.others: list[Pose] | None = None  # starts elsewhere, once they are looked for
         self.search = Search.FOLLOWING if n_points >= _MIN_POINTS else Search.DONE
         if self.is_converged:
             return
@@ -150,12 +153,15 @@ class LmTracker(Tracker):
             self._look_elsewhere()
             return before
         before = self.best.step()
-        if self.best.is_finished:
-            is_sure = self._judge(self.best)["p_lost"] < _DOUBTFUL or not self.settings.n_restarts
-            self.search = Search.DONE if is_sure else Search.LOOKING
-            self.others = None  # starts elsewhere; not yet known
-        elif self.best.is_ended:
+        self.steps += 1
+        if self.steps == _MAX_FOLLOWING:
+            _descend(self.best)
+        elif self.best.is_ended and not self.best.is_finished:
             self.best.refine()
+        if self.best.is_finished or self.steps == _MAX_FOLLOWING:
+            self.verdict = self._judge(self.best)
+            is_sure = self.verdict["p_lost"] < _DOUBTFUL or not self.settings.n_restarts
+            self.search = Search.DONE if is_sure else Search.LOOKING
         return before
 
     @property
@@ -167,17 +173,19 @@ class LmTracker(Tracker):
         """Inliers, stds, condition number, the probability of a wrong pose, and the verdict."""
         if self.best is None:
             return {"inlier_ratio": 0.0, "p_lost": 1.0, "lost": True}
-        return self._judge(self.best)
+        return self._judge(self.best) if self.search is Search.FOLLOWING else self.verdict
 
     def _judge(self, descent: Descent) -> dict[str, float | bool]:
         """What a descent says of its pose, and how likely that makes it a wrong one."""
         said = descent.certainty()
         mad = self.field.intensity_mad
         usual_mad = max(mad if np.isfinite(mad) else _UNKNOWN_MAD, _ROUNDING)
+        # Where colour shall not count, or the picture is dark or overexposed, it says nothing.
+        is_telling = self.settings.lambda_intensity > 0 and self.points[1][1].std() > usual_mad
         changes = np.linalg.inv(self.trusted) @ descent.T_world_camera - np.eye(4)
         surprise = np.abs(changes).max(axis=(1, 2)).min(initial=_SURPRISE)
         said |= {
-            "intensity_ratio": said["intensity_mad"] / usual_mad,
+            "intensity_ratio": said["intensity_mad"] / usual_mad if is_telling else 1.0,
             "last_step": 0.0 if descent.is_finished else float(descent.last_step),
             "surprise": float(surprise),
         }
@@ -192,13 +200,13 @@ class LmTracker(Tracker):
         if self.others is None:
             self.others = self._other_starts()[: self.settings.n_restarts]
         descent = self._descent_from(self.others.pop(0))
-        _take_steps(descent, _MAX_STEPS)
-        descent.refine()
-        _take_steps(descent, _MAX_STEPS)
+        _descend(descent)
+        is_confirmed = _apart(descent, self.best) < _SAME
         if descent.cost(NEAR_SCALES) < _CLEARLY * self.best.cost(NEAR_SCALES):
             self.best = descent
-        if not self.others or self._judge(self.best)["p_lost"] < _DOUBTFUL:
-            self.search = Search.DONE
+        self.verdict = self._judge(self.best)
+        is_sure = self.verdict["p_lost"] < (_LOST if is_confirmed else _DOUBTFUL)
+        self.search = Search.DONE if is_sure or not self.others else Search.LOOKING
 
     def _other_starts(self) -> list[Pose]:
         """Where else the camera may be, the likeliest first."""
@@ -235,6 +243,20 @@ class LmTracker(Tracker):
 def _by_cost(descents: Sequence[Descent]) -> list[Descent]:
     """Descents in the order of their robust costs, all at equal scales."""
     return sorted(descents, key=lambda d: d.cost(_WIDE_SCALES)) if descents[1:] else [*descents]
+
+
+def _apart(first: Descent, second: Descent) -> float:
+    """How far two descents' poses are apart (rad or m, whichever is more)."""
+    change = np.linalg.inv(first.T_world_camera) @ second.T_world_camera - np.eye(4)
+    return float(np.abs(change).max())
+
+
+def _descend(descent: Descent) -> None:
+    """The rest of a descent."""
+    _take_steps(descent, _MAX_STEPS)
+    if not descent.stage.is_fine:
+        descent.refine()
+        _take_steps(descent, _MAX_STEPS)
 
 
 def _take_steps(descent: Descent, max_steps: int) -> None:
