@@ -10,6 +10,7 @@ Prints intercept and coefficients, and both kinds of mistakes at a few threshold
 import sys
 from collections.abc import Iterator
 from itertools import product
+from unittest import mock
 
 import numpy as np
 import pandas as pd
@@ -19,17 +20,17 @@ from motions import HAND_HELD
 from scipy.optimize import minimize
 
 from nbtrack import METHODS, load_preset, make_tracker, map_scene, open_scene, open_scenes
-from nbtrack.beyond import LmSettings
+from nbtrack.beyond import LmSettings, verdict
 from nbtrack.beyond.lm_solver import retract
-from nbtrack.beyond.verdict import features
+from nbtrack.beyond.verdict import WRONG_DEG, WRONG_M, features
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import Field
 from nbtrack.tracking import StepBudget, track_sequence
 from nbtrack.tracking.metrics import pose_errors
 
-WRONG_M, WRONG_DEG, STIFFNESS = 0.05, 3.0, 1e-3
-GROWS = (False, False, True, True, True, True)  # whether a feature speaks for a wrong pose
+STIFFNESS = 1e-3
+GROWS = (False, False, True, True)  # whether a feature speaks for a wrong pose
 OFFSETS = ((10, 8), (20, 15), (50, 40), (150, 90))  # cm, degrees
 
 
@@ -101,7 +102,8 @@ def print_fit(rows: pd.DataFrame) -> None:
     bounds = [(None, None), *((0, None) if up else (None, 0) for up in GROWS)]
     beta = minimize(loss, np.zeros(design.shape[1]), bounds=bounds).x
     print("intercept and coefficients", beta.round(2).tolist())
-    probability = 1 / (1 + np.exp(-(design @ beta)))
+    with mock.patch.multiple(verdict, _INTERCEPT=beta[0], _COEFFICIENTS=beta[1:]):
+        probability = rows.apply(verdict.p_lost, axis=1).to_numpy()
     for threshold in (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7):
         lost = probability > threshold
         print(

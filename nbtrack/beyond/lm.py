@@ -41,6 +41,7 @@ _SURPRISE = 1.0  # rad, m; of a pose where the frame before led to none
 # Intensities are no better than what rounding to 256 grey levels leaves in the median, and as good
 # as this where the map does not say how good they are.
 _ROUNDING, _UNKNOWN_MAD = 0.25 / 255, 0.02
+_MIN_CONTRAST = 0.01  # standard deviation of a picture that is not dark, covered or overexposed
 _RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
 # Where a map has views, a lost camera is looked for where so many of them were taken that are most
 # like the frame, and at so many random poses, so far (m) from where any was. From the cheapest
@@ -133,6 +134,8 @@ class LmTracker(Tracker):
             return
         n_coarse = max(_MIN_COARSE, n_points // _COARSE_SHARE)
         self.points = with_normals(frame, observed, n_coarse), observed
+        has_contrast = observed[1].std() > _MIN_CONTRAST  # else the picture says nothing
+        self.weight = self.settings.lambda_intensity if has_contrast else 0.0
         descents = [self._descent_from(T) for T in starts]
         if np.abs(starts - starts[0]).max() > _FAR_APART:
             for descent in descents:
@@ -180,12 +183,10 @@ class LmTracker(Tracker):
         said = descent.certainty()
         mad = self.field.intensity_mad
         usual_mad = max(mad if np.isfinite(mad) else _UNKNOWN_MAD, _ROUNDING)
-        # Where colour shall not count, or the picture is dark or overexposed, it says nothing.
-        is_telling = self.settings.lambda_intensity > 0 and self.points[1][1].std() > usual_mad
         changes = np.linalg.inv(self.trusted) @ descent.T_world_camera - np.eye(4)
         surprise = np.abs(changes).max(axis=(1, 2)).min(initial=_SURPRISE)
         said |= {
-            "intensity_ratio": said["intensity_mad"] / usual_mad if is_telling else 1.0,
+            "intensity_ratio": said["intensity_mad"] / usual_mad if self.weight else 1.0,
             "last_step": 0.0 if descent.is_finished else float(descent.last_step),
             "surprise": float(surprise),
         }
@@ -193,7 +194,7 @@ class LmTracker(Tracker):
         return {**said, "p_lost": probability, "lost": probability >= _LOST}
 
     def _descent_from(self, T_start: Pose) -> Descent:
-        return Descent(self.grid, *self.points, self.settings.lambda_intensity, T_start)
+        return Descent(self.grid, *self.points, self.weight, T_start)
 
     def _look_elsewhere(self) -> None:
         """One more descent; what it finds takes over if it is clearly better."""
