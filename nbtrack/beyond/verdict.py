@@ -15,8 +15,9 @@ from jaxtyping import Float
 
 WRONG_M, WRONG_DEG = 0.05, 3.0
 _LEAST_SHARE = 0.01  # of points; shares of none and of all would be infinitely telling
-_INTERCEPT = 4.08
-_COEFFICIENTS = np.array([-1.62, -1.34, 2.04, 0.67])
+_INTERCEPT = 2.01
+_COEFFICIENTS = np.array([-2.06, -0.28, 2.8, 1.39])
+_CORRELATED = 2.0  # by how much stds that take errors for independent are too small
 
 
 def features(said: Mapping[str, float]) -> Float[np.ndarray, "4"]:
@@ -46,6 +47,6 @@ def p_lost(said: Mapping[str, float]) -> float:
     The last step is in rad or m, 0 where the pose has settled.
     """
     is_right = 1 / (1 + math.exp(_INTERCEPT + _COEFFICIENTS @ features(said)))
-    spread = math.hypot(said["position_std_m"], said["last_step"])
+    spread = math.hypot(_CORRELATED * said["position_std_m"], said["last_step"])
     is_held = math.erf(WRONG_M / math.sqrt(2) / spread)
     return 1 - is_right * is_held
