@@ -110,12 +110,7 @@ def corrected(
     """
     source = copy.deepcopy(source).cpu()
     baked = BakedField(source, voxel)
-    planes = _measured_planes(sequence, frames, _N_POINTS)
-    n_cells = len(np.unique(np.floor(planes[0] / voxel).astype(np.int64), axis=0))
-    times = min(_POINTS_A_CELL * n_cells / len(planes[0]), _MAX_TIMES)
-    if times > 1:
-        planes = _measured_planes(sequence, frames, round(times * _N_POINTS))
-    points, normals, depth, color = planes
+    points, normals, depth, color = _enough_planes(sequence, frames, voxel)
     asked = np.concatenate([points + offset * normals for offset in _OFFSETS])
     numbers, design, stiffness = _unknowns(*interpolation(asked, baked), baked.n_vertices)
     values = baked.volume[:4].T.double().numpy()[numbers]
@@ -139,6 +134,14 @@ def corrected(
     medians = torch.from_numpy(np.median(np.abs(left), axis=1)).float()
     parts = torch.from_numpy(numbers).int(), corrections, poses, views, medians
     return CorrectedField(source, voxel, dict(zip(CORRECTIONS, parts, strict=True)))
+
+
+def _enough_planes(sequence: RgbdSequence, frames: Frames, voxel: float) -> tuple[np.ndarray, ...]:
+    """`_measured_planes`, as many as the cells (of `voxel`, m) that they lie in ask for."""
+    planes = _measured_planes(sequence, frames, _N_POINTS)
+    n_cells = len(np.unique(np.floor(planes[0] / voxel), axis=0))
+    times = min(_POINTS_A_CELL * n_cells / len(planes[0]), _MAX_TIMES)
+    return planes if times <= 1 else _measured_planes(sequence, frames, round(times * _N_POINTS))
 
 
 def _measured_planes(
