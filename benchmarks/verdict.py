@@ -3,7 +3,8 @@
     python benchmarks/verdict.py RECORDING
 
 In corrected maps of the two rooms for tuning and of a recording: frames tracked, on the mapped path
-and on another, slow and fast; searched for from wrong starts; and shown to the map of another room.
+and on another, slow and fast; searched for from wrong starts; shown to the map of another room; and
+tracked in the map of the first third of them.
 Prints intercept and coefficients, and both kinds of mistakes at a few thresholds. Minutes.
 """
 
@@ -24,6 +25,9 @@ from nbtrack.beyond import LmSettings, verdict
 from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.verdict import WRONG_DEG, WRONG_M, features
 from nbtrack.core.settings import with_settings
+from nbtrack.experiments.grid import run_jobs
+from nbtrack.experiments.jobs import MapJob
+from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import Field
 from nbtrack.tracking import StepBudget, track_sequence
@@ -45,10 +49,11 @@ def main() -> None:
     method = METHODS["corrected"]
     changed = with_settings(preset, *method.settings)
     fields = [map_scene(scene, method.field, changed).field for scene in scenes]
+    parts = [part_of(scene, method.field, changed) for scene in scenes]
     paths = [[scene] for scene in scenes]
     for place, other in zip(paths, open_scenes(second), strict=False):
         place.append(other)
-    print_fit(pd.concat(collected(fields, paths)))
+    print_fit(pd.concat([*collected(fields, paths), *in_parts(parts, scenes)]))
 
 
 def collected(fields: list[Field], paths: list[list[Scene]]) -> Iterator[pd.DataFrame]:
@@ -65,6 +70,26 @@ def collected(fields: list[Field], paths: list[list[Scene]]) -> Iterator[pd.Data
         stranger = paths[(place + 1) % len(paths)][0].read("::8")
         found = searched(field, stranger, 20, 15, n_pixels, 60)
         yield found.assign(place=place, kind="stranger", translation_error_m=10.0)
+
+
+def part_of(scene: Scene, field: str, preset: Preset) -> Field:
+    """The map of its first frames: a third of a recording, a quarter of a room's path."""
+    frames = ":60" if scene.room else ":40"
+    job = MapJob(scene, field, preset, frames)
+    run_jobs([job], f"mapping a part of {scene.name}")
+    return job.map().field
+
+
+def in_parts(parts: list[Field], scenes: list[Scene]) -> Iterator[pd.DataFrame]:
+    """Frames tracked into what was not mapped, and searched for there."""
+    for (place, field), n_pixels in product(enumerate(parts), (512, 2048)):
+        for frames in ("::2", "::4", "::8") if scenes[place].room else (":", "::2", "::4"):
+            sequence = scenes[place].read(frames)
+            how = sequence.T_world_camera[0], StepBudget(30), settings(n_pixels)
+            tracked = track_sequence(make_tracker("lm", field, *how), sequence).frames
+            yield tracked.assign(kind="part", place=place)
+            found = searched(field, sequence, 10, 8, n_pixels, 60)
+            yield found.assign(kind="part", place=place)
 
 
 def settings(n_pixels: int) -> LmSettings:

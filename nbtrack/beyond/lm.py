@@ -100,7 +100,7 @@ class LmTracker(Tracker):
         return grid
 
     def restart_anywhere(self) -> None:
-        """Look for the camera near all poses that the map was made from; see `_hypotheses`."""
+        """Look for the camera near all poses that the map was made from; see `_other_starts`."""
         self.check_finds(in_corrected=self.field.T_world_cameras is not None)
         self.restart(self.field.T_world_cameras[0].double().numpy())
         self.was_lost = True
@@ -199,7 +199,8 @@ class LmTracker(Tracker):
     def _look_elsewhere(self) -> None:
         """One more descent; what it finds takes over if it is clearly better."""
         if self.others is None:
-            self.others = self._other_starts()[: self.settings.n_restarts]
+            others = self._other_starts()  # all are tried where nothing is known of the camera
+            self.others = others[: self.settings.n_restarts] if len(self.trusted) else others
         descent = self._descent_from(self.others.pop(0))
         _descend(descent)
         is_confirmed = _apart(descent, self.best) < _SAME

@@ -27,18 +27,20 @@ def features(said: Mapping[str, float]) -> Float[np.ndarray, "4"]:
     `intensity_ratio` (median difference over the usual one) and `surprise` (how far from where the
     frames before led to, rad or m).
     """
-    fitting, known = (
-        np.clip(said[name], _LEAST_SHARE, 1 - _LEAST_SHARE)
-        for name in ("fitting_ratio", "known_ratio")
-    )
+    fitting = _within(said["fitting_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
+    known = _within(said["known_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
     return np.array(
         [
-            np.log(fitting / (1 - fitting)),
-            np.log(known / (1 - known)),
-            np.log(np.clip(said["intensity_ratio"], 0.5, 10)),
-            np.log(np.clip(said["surprise"], 0.02, 1)),
+            math.log(fitting / (1 - fitting)),
+            math.log(known / (1 - known)),
+            math.log(_within(said["intensity_ratio"], 0.5, 10)),
+            math.log(_within(said["surprise"], 0.02, 1)),
         ]
     )
+
+
+def _within(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
 
 
 def p_lost(said: Mapping[str, float]) -> float:
