@@ -75,6 +75,7 @@ def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
         "wrong_frames": int(is_wrong.sum()),
         "lost_frames": int(is_lost.sum()),
         "missed_frames": int((is_wrong & ~is_lost).sum()),
+        "frames_lost_in_vain": int((is_lost & ~is_wrong).sum()),
         "found_again": int((is_wrong[:-1] & ~is_wrong[1:]).sum()),
         "map_mb": sum(part.nbytes for part in field.state_dict().values()) / 1e6,
     }

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from box_room import BoxRoom, Formula, box_sequence
+from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond import LmSettings, LmTracker
 from nbtrack.beyond.correct import correct_map
@@ -19,11 +20,14 @@ from nbtrack.beyond.correction import (
     interpolation,
 )
 from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.views import likeliest, spread_out, view_of
 from nbtrack.core.errors import DataError
+from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, NeusMapping, make_field
 from nbtrack.mapping.files import Map, read_map, write_map
 from nbtrack.tracking import StepBudget
+from nbtrack.tracking.tracker import Estimate
 
 ROOM, VOXEL = BoxRoom(half=(1.0, 0.5, 1.2)), 0.05
 
@@ -155,15 +159,69 @@ def test_a_file_keeps_it_whole(
     assert finished.record["map_bytes"] < size < finished.record["map_bytes"] + 20_000
 
 
+def tracked(field: CorrectedField, T_start: np.ndarray) -> LmTracker:
+    return LmTracker(field, T_start, StepBudget(30), LmSettings(n_pixels=1024))
+
+
+def error_m(found: Estimate, frame: Frame) -> float:
+    return float(np.linalg.norm(found.T_world_camera[:3, 3] - frame.T_world_camera[:3, 3]))
+
+
 def test_a_kidnapped_camera_is_found(found: CorrectedField, sequence: RgbdSequence) -> None:
-    """Catches a tracker that looks only around where it last was: here it starts half a turn
-    off, and the map's own cameras stand 30 degrees apart."""
-    T_start = sequence.T_world_camera[7]
-    tracker = LmTracker(found, T_start, StepBudget(200), LmSettings(n_pixels=1024))
-    estimate = tracker.track(sequence[1])
+    """Catches a tracker that looks only around where it last was: it is teleported half a turn
+    away, where the map's own cameras stand 30 degrees apart."""
+    tracker = tracked(found, sequence.T_world_camera[7])
+    assert not tracker.track(sequence[7]).lost
+    for number in (1, 2):
+        estimate = tracker.track(sequence[number])
+        assert error_m(estimate, sequence[number]) < 0.05
+        assert estimate.lost is (estimate.report["p_lost"] >= 0.5)
     assert not estimate.lost
-    off = estimate.T_world_camera[:3, 3] - sequence.T_world_camera[1, :3, 3]
-    assert np.linalg.norm(off) < 0.05
+    assert estimate.report["p_lost"] < 0.1
+
+
+def test_a_covered_camera_is_lost_until_it_sees_again(
+    found: CorrectedField, sequence: RgbdSequence
+) -> None:
+    """Catches a pose that passes while a hand covers the camera, and one that it leads astray."""
+    tracker, covered = tracked(found, sequence.T_world_camera[3]), sequence[3]
+    hand = replace(covered, depth_mm=0 * covered.depth_mm + 120, color=0 * covered.color + 90)
+    assert tracker.track(covered).report["p_lost"] < 0.1
+    for estimate in (tracker.track(hand) for _ in range(30)):
+        assert estimate.lost
+        assert estimate.report["p_lost"] > 0.5
+    estimate = tracker.track(sequence[4])
+    assert error_m(estimate, sequence[4]) < 0.05
+    assert not estimate.lost
+
+
+def test_a_room_that_was_never_mapped_is_told(found: CorrectedField) -> None:
+    """Catches a pose that passes because some walls fit: another room's frames are all lost."""
+    other = BoxRoom(half=(0.7, 0.6, 2.0))
+    frames = box_sequence([[0.05 * n, 0.0, 0.0] for n in range(6)], other, 96)
+    tracker = tracked(found, np.eye(4))
+    for number in range(6):
+        estimate = tracker.track(frames[number])
+        assert estimate.lost
+        assert estimate.report["p_lost"] > 0.75
+
+
+def test_views_are_told_apart_and_spread(found: CorrectedField, sequence: RgbdSequence) -> None:
+    """Catches views of the wrong frame or unit, turns of the wrong sign, and poses that are kept by
+    time: a camera that stood still for most of a recording would fill them all."""
+    cameras = found.T_world_cameras.double().numpy()
+    assert found.views.shape == (len(sequence), 2, 15, 20)
+    ahead = sequence[2].depth_mm[45:51, 61:67].float().mean().item() / 50  # in units of 5 cm
+    nearest = np.linalg.norm(cameras - sequence.T_world_camera[2], axis=(1, 2)).argmin()
+    assert found.views[nearest, 1, 7, 9:11].float().mean().item() == pytest.approx(ahead, abs=1)
+    off = np.eye(4)
+    off[:3, :3] = Rotation.from_rotvec([0.0, 0.12, 0.0]).as_matrix()
+    turned = box_sequence((sequence.T_world_camera[2] @ off)[None], ROOM, 96)[0]
+    (guess,) = likeliest(view_of(turned), found.views, cameras, 1)
+    angle = Rotation.from_matrix(guess[:3, :3].T @ turned.T_world_camera[:3, :3]).magnitude()
+    assert angle < 0.06
+    still = np.concatenate([np.tile(np.eye(4), (500, 1, 1)), sequence.T_world_camera])
+    assert set(spread_out(still)[:12]) - {0} == set(range(501, 512))
 
 
 def test_colours_are_those_of_the_surface(found: CorrectedField, sequence: RgbdSequence) -> None:

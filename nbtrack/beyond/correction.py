@@ -18,6 +18,7 @@ from torch import Tensor
 
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.observed import compiled
+from nbtrack.beyond.views import Views, spread_out, view_of
 from nbtrack.core.arrays import Frames, WorldPoints
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import DataError
@@ -29,6 +30,9 @@ from nbtrack.fields.base import LUMA, State
 # All our choice, tried in the two rooms for tuning. Measured points, and where along their normals
 # (m) the distance is that offset. Nearer than a voxel: farther out, planes end.
 _N_POINTS, _OFFSETS = 300_000, (0.0, -0.03, -0.015, 0.015, 0.03)
+# A larger place takes more, up to so many times, lest a frame see cells that none lies in: with so
+# many a cell in the mean, as rooms have anyway (3 in an office of 15 by 17 m; see docs/tried.md).
+_POINTS_A_CELL, _MAX_TIMES = 10, 4
 # The residual (m) from which one counts less (Huber), and how often that is judged anew.
 _HUBER, _ROUNDS = 0.01, 4
 # What a difference between neighbouring corrections, and a correction itself, cost, in points seen
@@ -41,8 +45,7 @@ _COLOR_STIFFNESS, _COLOR_HUBER, _COLOR_ROUNDS = 0.1, 0.05, 3
 # are 1.8 mm and 0.002, and 4 mm and 0.02.
 _MEDIANS, _MIN_SCALES = np.array([5.5, 2.3]), np.array([0.01, 0.05])
 _UNMEASURED = 0.1  # confidence where nothing was measured, and the network interpolates
-_MAX_CAMERAS = 200  # poses kept, evenly spread: where a lost camera may be looked for
-CORRECTIONS = ("numbers", "corrections", "cameras", "residual_medians")
+CORRECTIONS = ("numbers", "corrections", "cameras", "views", "residual_medians")
 """What a file keeps of a correction, besides the field: see `CorrectedField`."""
 _SOURCE = "source."  # how names of the field as mapped begin
 Columns = Float[np.ndarray, "rows columns"]
@@ -60,9 +63,10 @@ class CorrectedField(BakedField):
     """A grid of a learned field with corrections at vertices near surfaces. Our choice.
 
     What a file keeps is the field itself and, by name: the `numbers` (n) of corrected vertices,
-    their `corrections` (n x 5) of colour, distance (m) and confidence in half precision, mapped
-    poses `cameras` (n x 4 x 4), and `residual_medians` (2), of distance (m) and luma, that
-    the corrections leave at measured points: from them follow the least scales of a tracker's
+    their `corrections` (n x 5) of colour, distance (m) and confidence in half precision, some
+    mapped poses `cameras` (n x 4 x 4) with the small `views` (n x 2 x 15 x 20) from them, by which
+    a lost camera is found, and `residual_medians` (2), of distance (m) and luma, that the
+    corrections leave at measured points: from them follow the least scales of a tracker's
     residuals.
     """
 
@@ -88,7 +92,7 @@ class CorrectedField(BakedField):
 
     @property
     def T_world_cameras(self) -> Float[Tensor, "cameras 4 4"]:
-        """Some of the poses that it was mapped from, evenly spread."""
+        """Some of the poses that it was mapped from, spread by place and direction."""
         return self.cameras
 
     def state(self) -> State:
@@ -119,7 +123,7 @@ def corrected(
     around; see `_solve`. Raises DataError where no frame shows a plane.
     """
     field = CorrectedField(copy.deepcopy(source).cpu(), voxel)
-    points, normals, depth, color = _measured_planes(sequence, frames, field)
+    points, normals, depth, color = _enough_planes(sequence, frames, field)
     asked = np.concatenate([points + offset * normals for offset in _OFFSETS])
     vertices, weights = interpolation(asked, field)
     numbers, columns = _to_be_corrected(vertices, field.n_vertices)
@@ -144,20 +148,32 @@ def corrected(
     left_luma = (missing_color - _interpolated(columns, weights, colors)) @ LUMA
     medians = [float(np.median(np.abs(residual))) for residual in (left, left_luma)]
     corrections = torch.from_numpy(np.column_stack([colors, distance, confidence])).float().half()
-    poses = torch.from_numpy(sequence.T_world_camera[_spread(frames)]).float()
-    parts = torch.from_numpy(numbers).int(), corrections, poses, torch.tensor(medians)
-    field.add(dict(zip(CORRECTIONS, parts, strict=True)))
+    kept = torch.from_numpy(numbers).int(), corrections, *_views(sequence, frames)
+    field.add(dict(zip(CORRECTIONS, (*kept, torch.tensor(medians)), strict=True)))
     return field
 
 
-def _spread(frames: Frames) -> Frames:
-    """Some of the frames, evenly spread."""
-    n_kept = min(_MAX_CAMERAS, len(frames))
-    return frames[np.linspace(0, len(frames) - 1, n_kept).round().astype(int)]
+def _views(sequence: RgbdSequence, frames: Frames) -> tuple[Tensor, Views]:
+    """Some of the frames' poses, T_world_camera (n x 4 x 4), and what the camera saw from them."""
+    kept = frames[spread_out(sequence.T_world_camera[frames])]
+    views = torch.stack([view_of(sequence[index]) for index in kept.tolist()])
+    return torch.from_numpy(sequence.T_world_camera[kept]).float(), views
+
+
+def _enough_planes(
+    sequence: RgbdSequence, frames: Frames, grid: BakedField
+) -> tuple[np.ndarray, ...]:
+    """`_measured_planes`, as many as the cells that they lie in ask for."""
+    planes = _measured_planes(sequence, frames, grid, _N_POINTS)
+    n_cells = len(np.unique(interpolation(planes[0], grid)[0][:, 0]))
+    times = min(_POINTS_A_CELL * n_cells / len(planes[0]), _MAX_TIMES)
+    if times <= 1:
+        return planes
+    return _measured_planes(sequence, frames, grid, round(times * _N_POINTS))
 
 
 def _measured_planes(
-    sequence: RgbdSequence, frames: Frames, grid: BakedField
+    sequence: RgbdSequence, frames: Frames, grid: BakedField, n_points: int
 ) -> tuple[np.ndarray, ...]:
     """Random measured points (n x 3, m) with normals, their z-depths (n, m) and colours (n x 3).
 
@@ -165,7 +181,7 @@ def _measured_planes(
     """
     sampler = PixelSampler(sequence, torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
-    rays = sampler.draw(_N_POINTS, generator, torch.from_numpy(frames), tangent_planes=True)
+    rays = sampler.draw(n_points, generator, torch.from_numpy(frames), tangent_planes=True)
     has_plane = rays.normals_world.any(dim=-1)
     if not has_plane.any():
         raise DataError(f"{sequence.name} shows no surface to correct a map by: check its depth")

@@ -51,6 +51,7 @@ class BakedField(Field):
         volume = torch.cat([color.T, value[None], torch.ones_like(value)[None]])
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("volume", volume, persistent=False)
+        self.register_buffer("views", None)  # of `T_world_cameras`, where the map keeps any
 
     @property
     def n_bytes(self) -> int:

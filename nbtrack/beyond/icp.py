@@ -10,7 +10,7 @@ import torch
 
 from nbtrack.beyond.observed import draw_points
 from nbtrack.beyond.points import PointCloud
-from nbtrack.core.arrays import Transforms
+from nbtrack.core.arrays import Pose, Transforms
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
@@ -18,6 +18,8 @@ from nbtrack.tracking.tracker import Tracker, TrackerSettings
 # How far from the map a point may be to have a partner there, m: first wide, to get home from
 # where the motion model errs, then so narrow that what was not mapped pulls no more.
 _MAX_CORRESPONDENCE_DISTANCES = (0.3, 0.1)
+FAR_APART = 0.06  # m, rad; of starts, as LM has it
+_EDGE_JUMP = np.inf
 _SOURCE_VOXEL = 0.01  # m: points that are closer count once
 _NEIGHBOURS = 20  # points that tell a point's plane
 _MIN_POINTS, _MIN_INLIERS = 20, 0.5  # a number and a share; below, a frame is lost
@@ -30,12 +32,15 @@ _OPTIONS |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}
 class IcpSettings(TrackerSettings):
     """Settings of ICP."""
 
-    n_pixels: int = 512  # points a frame; drawn as LM's are, so that their rows compare
-    motion_model: str = "constant_velocity"
+    n_pixels: int = 512  # points a frame; evenly spread, as LM's are
+    motion_model: str = "better_of_both"
 
 
 class IcpTracker(Tracker):
-    """Generalised ICP, plane to plane, from the first start. One step is the whole alignment.
+    """Generalised ICP, plane to plane. One step is the whole alignment.
+
+    Of the motion model's starts that are far apart, the one that finds partners for more points
+    counts; else the first.
 
     Source: Segal, Haehnel, Thrun, "Generalized-ICP", RSS 2009, as in the package small_gicp (Koide
     2024). Distances, neighbours and voxels: our choice, tried on synthetic and real rooms.
@@ -71,10 +76,12 @@ class IcpTracker(Tracker):
         return issubclass(field, PointCloud)
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
-        """Draw the frame's points and find their planes; the first pose is the start."""
-        self.T_world_camera, self.source = T_starts[0], None
+        """Draw the frame's points and find their planes."""
+        self.T_starts = T_starts.double().numpy()
+        self.T_world_camera = T_starts[0]
+        self.source = None
         self.is_converged, self.inlier_ratio = False, 0.0
-        points = draw_points(frame, self.settings.n_pixels, self.generator)[0]
+        points = draw_points(frame, self.settings.n_pixels, self.generator, _EDGE_JUMP)[0]
         if len(points):
             thinned = self.small_gicp.voxelgrid_sampling(points, _SOURCE_VOXEL)
             self.source, _ = self._with_planes(thinned)
@@ -87,20 +94,30 @@ class IcpTracker(Tracker):
         self.is_converged = True
         if self.source is None or self.source.size() < _MIN_POINTS:
             return float("nan")
-        T_world_camera = self.T_world_camera.double().numpy()
-        points_world = (self.source.points() @ T_world_camera.T)[:, :3]
-        if not ((points_world > self.low) & (points_world < self.high)).all(axis=1).any():
+        starts = [T for T in self.T_starts if self._is_near(T)]
+        if not starts:
             return float("nan")  # of points so far away the tree finds no partner, in seconds
+        if np.abs(self.T_starts - self.T_starts[0]).max() < FAR_APART:
+            starts = starts[:1]
+        wide, narrow = _MAX_CORRESPONDENCE_DISTANCES
+        found = max((self._align(T, wide) for T in starts), key=lambda result: result.num_inliers)
+        found = self._align(found.T_target_source, narrow) if found.num_inliers else found
+        if not found.num_inliers or not np.isfinite(found.T_target_source).all():
+            return float("nan")
+        self.T_world_camera = torch.from_numpy(found.T_target_source.copy())
+        self.inlier_ratio = found.num_inliers / self.source.size()
+        return found.error / found.num_inliers
+
+    def _is_near(self, T_world_camera: Pose) -> bool:
+        """Whether any point lies near the map's box at a pose."""
+        points_world = (self.source.points() @ T_world_camera.T)[:, :3]
+        return bool(((points_world > self.low) & (points_world < self.high)).all(axis=1).any())
+
+    def _align(self, T_start: Pose, distance: float) -> Any:
+        """The frame aligned with the map, where partners are so near (m)."""
+        options = {**_OPTIONS, "max_correspondence_distance": distance}
         map_and_frame = self.target, self.source, self.target_tree
-        for distance in _MAX_CORRESPONDENCE_DISTANCES:
-            options = {**_OPTIONS, "max_correspondence_distance": distance}
-            result = self.small_gicp.align(*map_and_frame, T_world_camera, **options)
-            if not result.num_inliers or not np.isfinite(result.T_target_source).all():
-                return float("nan")
-            T_world_camera = result.T_target_source
-        self.T_world_camera = torch.from_numpy(T_world_camera.copy())
-        self.inlier_ratio = result.num_inliers / self.source.size()
-        return result.error / result.num_inliers
+        return self.small_gicp.align(*map_and_frame, T_start, **options)
 
     def report(self) -> dict[str, float | bool]:
         """The share of the points that lie near the map; lost where most do not."""

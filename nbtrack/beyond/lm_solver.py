@@ -57,8 +57,9 @@ PRIOR_WEIGHT = 1 / 0.5**2
 _INLIER_INTENSITY = 0.25
 _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e-9, 1e3
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.2
+_MIN_RATIO, _MAX_RATIO = 0.5, 0.9  # of two steps' lengths: creeping; the limit is tried up to
 # The coarse stage may lead away from a good start: the better of both goes on, at these scales.
-_NEAR_SCALES = np.array([0.02, 0.05])
+NEAR_SCALES = np.array([0.02, 0.05])
 _ONE, _ZERO = np.float32(1), np.float32(0)
 
 
@@ -110,13 +111,13 @@ class Descent:
         self.T_start = self.T_world_camera = T_start
         self.last_step = np.inf  # rad or m, whichever is more
         self._begin(COARSE)
-        self._start_cost = self.cost(_NEAR_SCALES)
+        self._start_cost = self.cost(NEAR_SCALES)
 
     def step(self) -> float:
         """One step, taken or refused; returns the robust cost before it."""
-        is_better, self.T_world_camera, self.terms, before, self.last_step = _try_step(
+        is_better, self.T_world_camera, self.terms, before, self.twist, self.last_step = _try_step(
             self.points[self.stage.is_fine], self.grid.arrays, self.stage.is_fine, self.weight,
-            self.T_start, self.T_world_camera, self.terms, self.scales, self.damping,
+            self.T_start, self.T_world_camera, self.terms, self.scales, self.damping, self.twist,
         )  # fmt: skip
         if is_better:
             self._narrow()
@@ -127,7 +128,7 @@ class Descent:
 
     def refine(self) -> None:
         """Go on with all points from where the coarse stage ended, or from the start if better."""
-        if self.cost(_NEAR_SCALES) > self._start_cost:
+        if self.cost(NEAR_SCALES) > self._start_cost:
             self.T_world_camera = self.T_start
         self._begin(FINE)
 
@@ -146,6 +147,8 @@ class Descent:
     def certainty(self) -> dict[str, float]:
         """The share of points that fit, and how well the curvature of their cost holds the pose.
 
+        `known_ratio` is the mean reliability of the points, `fitting_ratio` the share of those that
+        fit, each counted by its reliability: where little was mapped, few can fit at any pose.
         Intensities count by their differences from the median of all; `intensity_mad` is the median
         of those (MAD), 0 where they have no weight. Standard deviations are along the least certain
         direction, the condition number without the pose prior, rotations at a lever arm of 1 m.
@@ -158,6 +161,8 @@ class Descent:
         # A picture that is darker as a whole says nothing against a pose.
         off = np.abs(intensity - _median(intensity)) * (self.lambda_intensity > 0)
         is_inlier &= off < _INLIER_INTENSITY
+        known_ratio = float(reliability.mean())
+        fitting = float((reliability * is_inlier).mean()) / max(known_ratio, 1e-6)
         matrix, _ = normal_equations(self.terms, self.scales, self.weight)
         values = np.linalg.eigvalsh(matrix)
         covariance = np.linalg.inv(matrix + PRIOR_WEIGHT * np.eye(6)) / _SIGMAS**2  # rad, m
@@ -165,6 +170,8 @@ class Descent:
         rotation, position = np.linalg.eigvalsh(blocks)[:, -1] ** 0.5
         return {
             "inlier_ratio": float(is_inlier.mean()),
+            "known_ratio": known_ratio,
+            "fitting_ratio": fitting,
             "intensity_mad": float(_median(off)),
             "position_std_m": float(position),
             "rotation_std_deg": float(np.rad2deg(rotation)),
@@ -173,6 +180,7 @@ class Descent:
 
     def _begin(self, stage: Stage) -> None:
         self.stage, self.damping, self.is_ended = stage, _FIRST_DAMPING, False
+        self.twist = np.zeros(6)  # of the step before
         self.weight = self.lambda_intensity if stage.is_fine else 0.0
         observed, T = self.points[stage.is_fine], self.T_world_camera
         self.terms = residual_terms(observed, T, self.grid.arrays, stage.is_fine)
@@ -363,20 +371,28 @@ def damped_step(terms, scales, weight, T_start, T, damping):
 
 @no_type_check
 @compiled
-def _try_step(observed, grid, is_fine, weight, T_start, T, terms, scales, damping):
-    """A step: whether it is better, pose and terms after it, cost before, and its length.
+def _try_step(observed, grid, is_fine, weight, T_start, T, terms, scales, damping, last):
+    """A step: whether it is better, pose and terms after it, cost before, its twist and length.
+
+    Steps that creep, each hardly shorter than the last one, are a geometric series: first its
+    limit is tried (Aitken 1926), so far as `_MAX_RATIO` allows.
 
     From cell to cell of a grid gradients jump, and reliabilities: in the fine stage a pose is no
     worse for that. But at first, from afar, the gradient tells that a surface is near.
     """
     twist = damped_step(terms, scales, weight, T_start, T, damping)
-    T_after = retract(T, twist)
-    terms_after = residual_terms(observed, T_after, grid, is_fine)
-    judged = terms_after[:3].copy()
-    if is_fine:
-        judged[2] = np.where(judged[2] > 0, terms[2], _ZERO)
-    before, after = robust_cost(terms, scales, weight), robust_cost(judged, scales, weight)
-    longest = np.abs(twist).max()
-    if after < before:
-        return True, T_after, terms_after, before, longest
-    return False, T, terms, before, longest
+    before = robust_cost(terms, scales, weight)
+    along, length = (twist * last).sum(), (last * last).sum()
+    does_creep = along > _MIN_RATIO * length and along**2 > 0.5 * length * (twist * twist).sum()
+    stride = 1 / (1 - min(along / length, _MAX_RATIO)) if does_creep else 1.0
+    for factor in (stride, 1.0):
+        T_after = retract(T, factor * twist)
+        terms_after = residual_terms(observed, T_after, grid, is_fine)
+        judged = terms_after[:3].copy()
+        if is_fine:
+            judged[2] = np.where(judged[2] > 0, terms[2], _ZERO)
+        if robust_cost(judged, scales, weight) < before:
+            return True, T_after, terms_after, before, twist, factor * np.abs(twist).max()
+        if factor == 1:
+            break
+    return False, T, terms, before, last, np.abs(twist).max()

@@ -33,16 +33,20 @@ def compiled(function: Callable) -> Callable:
         return njit(**_JIT)(function)
 
 
-def draw_points(frame: Frame, n_points: int, generator: torch.Generator) -> Observed:
+def draw_points(
+    frame: Frame, n_points: int, generator: torch.Generator, edge_jump: float = _EDGE_JUMP
+) -> Observed:
     """Observed points (m, camera frame) of evenly spread pixels, and intensities; no normals.
 
-    Not those at depth edges, which may belong to either side, nor at the border. Only a few times
-    as many pixels as wanted are looked at, from a random one on: where little is measured, fewer
-    points come back.
+    Not those at depth edges, which may belong to either side, nor at the border: a neighbouring
+    depth that differs by a larger share than `edge_jump` marks an edge, if infinite none. Only a
+    few times as many pixels as wanted are looked at, from a random one on: where little is
+    measured, fewer points come back.
     """
     starts = torch.randint(_MODULUS, (2,), generator=generator).numpy()
     images = frame.depth_mm.numpy(), frame.color.numpy()
-    return *_drawn_points(*images, _pinhole(frame), n_points, starts), np.empty((0, 3))
+    drawn = _drawn_points(*images, _pinhole(frame), n_points, starts, edge_jump)
+    return *drawn, np.empty((0, 3))
 
 
 def with_normals(frame: Frame, observed: Observed, n_points: int) -> Observed:
@@ -58,7 +62,7 @@ def _pinhole(frame: Frame) -> tuple[float, float, float, float]:
 
 @no_type_check
 @compiled
-def _drawn_points(depth_mm, color, pinhole, n_points, starts):
+def _drawn_points(depth_mm, color, pinhole, n_points, starts, edge_jump):
     (height, width), (fx, fy, cx, cy), n_drawn = depth_mm.shape, pinhole, 0
     points, luma = np.empty((n_points, 3)), np.empty(n_points)
     n_looked_at = _DRAWN_PER_POINT * n_points if min(height, width) > 2 else 0
@@ -68,7 +72,7 @@ def _drawn_points(depth_mm, color, pinhole, n_points, starts):
         v = 1 + (starts[0] + _EVEN_STEPS[0] * order) % _MODULUS * (height - 2) // _MODULUS
         u = 1 + (starts[1] + _EVEN_STEPS[1] * order) % _MODULUS * (width - 2) // _MODULUS
         z = depth_mm[v, u]
-        jump = _EDGE_JUMP * z
+        jump = edge_jump * z
         is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
         is_smooth &= abs(depth_mm[v, u + 1] - z) < jump and abs(depth_mm[v, u - 1] - z) < jump
         if is_smooth:  # never without a depth: nothing is below a jump of zero

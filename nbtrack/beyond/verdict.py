@@ -1,0 +1,54 @@
+"""How likely a pose is wrong, by what a descent says of it.
+
+Off by more than 5 cm or 3 degrees it may be for two reasons. It may be another pose altogether:
+logistic regression, whose coefficients `benchmarks/verdict.py` fits, in the two rooms for tuning
+and on a real recording. Or it is near the right one, but nothing holds it along some direction, or
+the budget ended while it still moved: that error is taken to be normal, with the standard deviation
+that the curvature of the cost tells, and the last step's length.
+"""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+WRONG_M, WRONG_DEG = 0.05, 3.0
+_LEAST_SHARE = 0.01  # of points; shares of none and of all would be infinitely telling
+_INTERCEPT = 2.01
+_COEFFICIENTS = np.array([-2.06, -0.28, 2.8, 1.39])
+_CORRELATED = 2.0  # by how much stds that take errors for independent are too small
+
+
+def features(said: Mapping[str, float]) -> Float[np.ndarray, "4"]:
+    """Numbers that grow about linearly with the log odds of a wrong pose.
+
+    Of what a tracker says: `fitting_ratio`, `known_ratio` (see `Descent.certainty`),
+    `intensity_ratio` (median difference over the usual one) and `surprise` (how far from where the
+    frames before led to, rad or m).
+    """
+    fitting = _within(said["fitting_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
+    known = _within(said["known_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
+    return np.array(
+        [
+            math.log(fitting / (1 - fitting)),
+            math.log(known / (1 - known)),
+            math.log(_within(said["intensity_ratio"], 0.5, 10)),
+            math.log(_within(said["surprise"], 0.02, 1)),
+        ]
+    )
+
+
+def _within(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
+def p_lost(said: Mapping[str, float]) -> float:
+    """The probability that the pose is wrong, by its features, `position_std_m` and `last_step`.
+
+    The last step is in rad or m, 0 where the pose has settled.
+    """
+    is_right = 1 / (1 + math.exp(_INTERCEPT + _COEFFICIENTS @ features(said)))
+    spread = math.hypot(_CORRELATED * said["position_std_m"], said["last_step"])
+    is_held = math.erf(WRONG_M / math.sqrt(2) / spread)
+    return 1 - is_right * is_held

@@ -1,0 +1,110 @@
+"""Small blurry views of a map's frames, by which a camera is found that may be anywhere in it.
+
+A view is what a camera saw along fixed directions, whatever its lens: luma and depth, blurred.
+Source: the small blurry images of PTAM (Klein and Murray 2008); views spread by place and
+direction, and depth in them, as in Glocker et al. 2015. Sizes, weights and numbers: our choice.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, grid_sample
+
+from nbtrack.core.arrays import Poses
+from nbtrack.data.frame import MILLIMETRE, Frame
+
+# Directions x / z and y / z of a view: so many columns and rows, so far apart; 53 by 41 degrees.
+_COLUMNS, _ROWS, _STEP = 20, 15, 0.05
+_DEPTH_UNIT = 0.05  # m; depths are kept in a byte, 0 where less than half of a cell was measured
+_MAX_VIEWS = 150  # 90 kB
+_RADIAN = 1.0  # m; poses whose optical axes differ by it are as far apart as if moved by so much
+# A camera may be turned against a view: by so many columns and rows, tried in steps of so many.
+_TURNS_ACROSS, _TURNS_DOWN = np.arange(-6, 7, 3), np.arange(-3, 4, 3)
+_MAX_LOG_RATIO = 0.3  # of depths; those that differ by more are of other surfaces
+_DEPTH_WEIGHT = 2.0  # of the depths' unlikeness against the luma's
+_MIN_OVERLAP = 30  # cells with both depths; below, they say nothing
+View = UInt8[Tensor, "2 15 20"]
+Views = UInt8[Tensor, "n 2 15 20"]
+
+
+def view_of(frame: Frame) -> View:
+    """Luma (0 to 255; 0 out of the picture) and depth (in 5 cm) of a frame, in one byte each."""
+    camera = frame.camera
+    luma, depth = frame.color.float().mean(dim=-1), frame.depth_mm.float()
+    parts = torch.stack([luma, depth * (MILLIMETRE / _DEPTH_UNIT), (depth > 0).float()])
+    cells = [  # as large as those of a view
+        max(1, round(pixels / (focal * _STEP)))
+        for pixels, focal in ((camera.height, camera.fy), (camera.width, camera.fx))
+    ]
+    x, y = (_STEP * (torch.arange(n) - (n - 1) / 2) for n in (_COLUMNS, _ROWS))
+    u = 2 * (camera.fx * x + camera.cx) / camera.width - 1
+    v = 2 * (camera.fy * y + camera.cy) / camera.height - 1
+    at = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
+    blurred = adaptive_avg_pool2d(parts.to("cpu"), cells)[None]
+    luma, depth, share = grid_sample(blurred, at[None], align_corners=False)[0]
+    luma = luma.clamp(1, 255) * (at.abs() < 1).all(dim=-1)
+    depth = torch.where(share > 0.5, depth / share, 0).clamp(0, 255)
+    return torch.stack([luma, depth]).round().byte()
+
+
+def spread_out(T_world_camera: Poses) -> Int[np.ndarray, "_"]:
+    """Numbers of poses for views, spread by place and direction.
+
+    The first, then again and again the one that is farthest from all before it.
+    """
+    axes = _RADIAN * T_world_camera[:, :3, 2]
+    places = np.concatenate([T_world_camera[:, :3, 3], axes], axis=1)
+    chosen, apart = [0], np.full(len(places), np.inf)
+    while len(chosen) < min(_MAX_VIEWS, len(places)):
+        apart = np.minimum(apart, np.linalg.norm(places - places[chosen[-1]], axis=1))
+        chosen.append(int(apart.argmax()))
+    return np.array(chosen)
+
+
+def likeliest(view: View, views: Views, T_world_camera: Poses, n: int) -> Poses:
+    """Where a camera may be that saw a view: the poses of the `n` views most like it, in order.
+
+    Each is turned about the camera's x and y as it fits best.
+    """
+    seen, known, unlikeness, turns = view.float(), views.float(), [], []
+    for across in _TURNS_ACROSS:
+        for down in _TURNS_DOWN:
+            here = _moved(seen, down, across)
+            there = _moved(known, -down, -across)
+            unlikeness.append(_unlikeness(here, there))
+            turns.append(_STEP * np.array([down, -across, 0.0]))
+    least, turn = torch.stack(unlikeness).min(dim=0)
+    order = least.argsort()[:n].numpy()
+    poses = T_world_camera[order].copy()
+    turned = Rotation.from_rotvec(np.stack(turns)[turn[order].numpy()]).as_matrix()
+    poses[:, :3, :3] = poses[:, :3, :3] @ turned
+    return poses
+
+
+def _moved(view: Tensor, down: int, across: int) -> Tensor:
+    """What of a view remains where it is shifted; of the other one `_moved` the other way."""
+    rows = slice(max(0, down), _ROWS + min(0, down))
+    columns = slice(max(0, across), _COLUMNS + min(0, across))
+    return view[..., rows, columns]
+
+
+def _unlikeness(
+    here: Float[Tensor, "2 _ _"], there: Float[Tensor, "n 2 _ _"]
+) -> Float[Tensor, "n"]:
+    """One less the correlation of luma, and how far depths are apart; 0 for the same."""
+    is_seen = ((here[0] > 0) & (there[:, 0] > 0)).float()
+    count = is_seen.sum(dim=(1, 2), keepdim=True).clamp(min=1)
+    first, second = (
+        (luma - (luma * is_seen).sum(dim=(1, 2), keepdim=True) / count) * is_seen
+        for luma in (here[0].expand_as(is_seen), there[:, 0])
+    )
+    norms = first.norm(dim=(1, 2)) * second.norm(dim=(1, 2))
+    correlation = (first * second).sum(dim=(1, 2)) / norms.clamp(min=1e-3)
+    are_measured = ((here[1] > 0) & (there[:, 1] > 0)).float()
+    ratio = (here[1].clamp(min=1) / there[:, 1].clamp(min=1)).log().abs()
+    apart = (ratio / _MAX_LOG_RATIO).clamp(max=1) * are_measured
+    count = are_measured.sum(dim=(1, 2))
+    depth = torch.where(count > _MIN_OVERLAP, apart.sum(dim=(1, 2)) / count, 1.0)
+    return 1 - correlation + _DEPTH_WEIGHT * depth
