@@ -81,10 +81,10 @@ def main() -> None:
     """Measure and write everything."""
     torch.set_num_threads(1)
     if sys.argv[1:2] == ["ablation"]:
-        _write("ablation.csv", ablation(sys.argv[2:]))
+        write_rows("ablation.csv", ablation(sys.argv[2:]))
         return
     if sys.argv[1:] == ["fast"]:
-        _write("fast.csv", fast())
+        write_rows("fast.csv", fast())
         return
     preset = load_preset("smoke", settings=HAND_HELD)
     second = with_settings(preset, "scenes.seed=1")
@@ -94,8 +94,8 @@ def main() -> None:
     for tracked, path in ((rooms, "mapped"), (elsewhere, "second")):
         for frames in (":", "::4"):
             runs.append(_track(rooms, COMPARED, preset, frames, path, tracked))
-    _write("tracking.csv", pd.concat(runs))
-    _write("times.csv", frame_times(rooms, preset))
+    write_rows("tracking.csv", pd.concat(runs))
+    write_rows("times.csv", frame_times(rooms, preset))
     searches = []
     for room, other in zip(rooms, elsewhere, strict=True):
         for n_restarts, steps in ((0, 60), (8, 1000)):
@@ -105,7 +105,7 @@ def main() -> None:
             searches.append(afar.assign(offset=told, scene=room.name))
         searches.append(_without_a_start(room, other, preset))
     found = pd.concat(searches)
-    _write("searches.csv", found)
+    write_rows("searches.csv", found)
     for recording in recordings:
         for frames in (":", "::2", "::4"):
             how = preset, frames, "mapped"
@@ -113,9 +113,9 @@ def main() -> None:
             runs.append(_track([recording], ON_RECORDINGS, *how, seeds=SEEDS))
             runs.append(_track([recording], paper, *how, seeds=SEEDS, steps=None))
         runs += [_held_out(recording, preset, seed) for seed in SEEDS]
-        _write("tracking.csv", pd.concat(runs))
+        write_rows("tracking.csv", pd.concat(runs))
     if recordings:
-        _write("agreement.csv", agreement(recordings[0], preset))
+        write_rows("agreement.csv", agreement(recordings[0], preset))
     print(pd.concat(runs).to_string(index=False))
     print(found.groupby(["scene", "offset"])[["recovered", "seconds"]].mean().to_string())
     is_wrong = (found["error_m"] > FOUND_M) | (found["error_deg"] > FOUND_DEG)
@@ -279,7 +279,7 @@ def _without_a_start(room, elsewhere, preset, n_views: int = 50) -> pd.DataFrame
     return pd.DataFrame(rows, columns=columns).assign(scene=room.name)
 
 
-def _write(name: str, rows: pd.DataFrame) -> None:
+def write_rows(name: str, rows: pd.DataFrame) -> None:
     """With machine and date."""
     made = {"device": device_name(choose_device()), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
     text = rows.assign(**made).to_csv(index=False, float_format="%.6g", lineterminator="\n")
