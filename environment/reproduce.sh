@@ -8,11 +8,9 @@ started=$(mktemp)
 trap 'rm -f "$started"' EXIT
 
 runs=${NBTRACK_RUNS:-$project_root/runs}
-"$venv_python" -m nbconvert --execute --to html --output-dir "$runs/notebooks" \
-    "$project_root"/notebooks/*.ipynb
+"$venv_python" "$project_root/environment/pages.py" --execute "$runs/pages"
 
 printf '\nTables:\n'
 find "$runs/tables" -type f -newer "$started" | sort
-printf 'Notebooks as they ran:\n'
-find "$runs" -type f -name '*.html' -newer "$started" | sort
+printf 'Notebooks as they ran: %s\n' "$runs/pages/index.html"
 printf 'Everything took %d min %d s.\n' "$((SECONDS / 60))" "$((SECONDS % 60))"

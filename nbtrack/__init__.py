@@ -10,7 +10,7 @@ _MODULES = {
     "data.frame": ["Frame"],
     "data.sequence": ["read_sequence"],
     "tracking.methods": ["METHODS", "Method"],
-    "experiments.presets": ["load_preset"],
+    "experiments.presets": ["claim", "load_preset"],
     "experiments.grid": ["map_scene", "map_scenes", "read_run", "track_scenes"],
     "experiments.scenes": ["open_scene", "open_scenes"],
     "mapping.files": ["read_map"],

@@ -17,7 +17,6 @@ from matplotlib.axis import Axis
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from PIL import Image
-from trimesh.viewer.notebook import scene_to_notebook
 
 from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
@@ -26,7 +25,7 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.output import save_picture
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.plots.movie import view_of
-from nbtrack.plots.rooms import screen_axes
+from nbtrack.plots.rooms import screen_axes, viewer_scene
 from nbtrack.plots.style import PALETTE, method_colors
 from nbtrack.synthetic import build_room
 from nbtrack.tables import published_table_1
@@ -115,10 +114,10 @@ def test_every_axis_has_a_unit_and_nothing_leaks(name: str, sequence) -> None:
     before = dict(matplotlib.rcParams)
     figure = FIGURES[name](sequence)
     assert dict(matplotlib.rcParams) == before
-    png = figure._repr_png_()
+    png, described = figure._repr_png_()
     assert png.startswith(b"\x89PNG")
     assert len(png) < 150_000
-    assert figure.get_suptitle()
+    assert described["alt"] == figure.get_suptitle() != ""
     assert " at 0x" not in repr(figure)
     for axes in figure.axes:
         if axes.axison:
@@ -252,7 +251,9 @@ def test_one_looks_into_the_doll_house(inverted, sequence) -> None:
     mesh = room_mesh()
     if inverted:
         mesh.invert()
-    (faces,) = plots.plot_mesh(mesh, {"true": sequence.T_world_camera}).axes[0].collections
+    room, enlarged = plots.plot_mesh(mesh, {"true": sequence.T_world_camera}).axes
+    assert np.ptp(enlarged.get_xlim()) < 0.2 < np.ptp(room.get_xlim())  # the path is 5 cm long
+    (faces,) = room.collections
     # Two triangles each of the floor and of the two far walls.
     assert len(faces.get_paths()) == 6
     screen = screen_axes(np.array([0, 0, -1]), 35.0)
@@ -266,7 +267,8 @@ def test_the_viewer_holds_mesh_and_paths_and_stays_small(sequence) -> None:
     is named anew at every save, and notebooks of many megabytes."""
     fine = trimesh.creation.icosphere(subdivisions=6, radius=2.0)
     fine.visual.vertex_colors = np.full((len(fine.vertices), 4), 200, np.uint8)
-    scene = plots.mesh_viewer(fine, {"true": sequence.T_world_camera})
+    paths = {"true": sequence.T_world_camera}
+    scene = viewer_scene(fine, paths)
     assert set(scene.geometry) == {"mesh", "true"}
     room, tube, radius = scene.geometry["mesh"], scene.geometry["true"], 0.004 * fine.scale
     for place in sequence.T_world_camera[[0, -1], :3, 3]:
@@ -278,7 +280,9 @@ def test_the_viewer_holds_mesh_and_paths_and_stays_small(sequence) -> None:
     assert faces_inside.mean() > 0.9  # merging turns a few around
     assert b"KHR_materials_unlit" in scene.export(file_type="glb")
     assert scene.camera.name == "viewer"
-    assert len(scene_to_notebook(scene).data) < 1_300_000
+    page = plots.mesh_viewer(fine, paths).data
+    assert page.count("addEventListener('wheel', e => e.stopImmediatePropagation(), true)") == 1
+    assert len(page) < 1_300_000
 
 
 def test_a_method_keeps_its_color() -> None:

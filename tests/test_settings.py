@@ -19,7 +19,7 @@ from nbtrack.data.sequence import parse_frames
 from nbtrack.experiments.bench import measure_steps
 from nbtrack.experiments.commands import _preset_of
 from nbtrack.experiments.methods import METHODS, TABLE_1
-from nbtrack.experiments.presets import PRESETS, Preset, load_preset
+from nbtrack.experiments.presets import PRESETS, Preset, claim, load_preset
 from nbtrack.experiments.scenes import open_scene, open_scenes
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.mapping.files import Map
@@ -329,3 +329,15 @@ def test_every_key_at_its_limits(key: str, small: Small) -> None:
         text = largest(small.preset, key, kind)
         with contextlib.suppress(NbtrackError):
             small.read(with_settings(small.preset, f"{key}={text}"), key)
+
+
+def test_claims_of_results(capsys: pytest.CaptureFixture) -> None:
+    """Catches a claim that stops the reader who changed a setting, and one that is never checked."""
+    changed = load_preset(settings=["mapping.imap.iterations=300"])
+    claim(changed, True, "it is sharp")
+    assert capsys.readouterr().out == "it is sharp\n"
+    for preset in (changed, PRESETS["paper"]):
+        with pytest.warns(UserWarning, match="it is sharp"):
+            claim(preset, False, "it is sharp")
+    with pytest.raises(AssertionError, match="it is sharp"):
+        claim(load_preset(), False, "it is sharp")

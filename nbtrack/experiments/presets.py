@@ -6,6 +6,7 @@ Precedence, in every command: class defaults < preset < method < TOML file (`NBT
 
 import os
 import shlex
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -173,3 +174,16 @@ def load_preset(
         preset = with_values(preset, layer)  # a value that a later one replaces is checked too
         chosen |= layer.keys()
     return replace(preset, chosen=tuple(sorted(chosen)))
+
+
+def claim(preset: Preset, holds: bool, text: str) -> None:
+    """Print what a notebook claims of its results, or warn that it does not hold.
+
+    What is claimed was found with `smoke` as it is: there it must hold, or it is an AssertionError.
+    """
+    if holds:
+        print(text)
+    elif preset.name == "smoke" and not preset.chosen:
+        raise AssertionError(f"it does not hold that {text}")
+    else:
+        warnings.warn(f"with these settings it does not hold that {text}", stacklevel=2)

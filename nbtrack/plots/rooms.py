@@ -5,6 +5,8 @@ Up is the axis of the world that the cameras' own up is nearest to: they are mos
 
 from collections.abc import Mapping
 from functools import partial
+from itertools import cycle
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from trimesh.viewer.notebook import scene_to_notebook
 
 from nbtrack.core.arrays import Points, Poses, Transform, Values
 from nbtrack.data.sequence import RgbdSequence
@@ -28,6 +31,7 @@ _CUT = 0.01  # share of a recording's points cut off at either end: wild depths 
 _MAX_FACES_TO_TURN = 10_000  # more are merged for the viewer
 _MAX_TUBES = 80  # straight pieces of a path in the viewer
 _ELEVATION = np.radians(45)  # of the viewer of a mesh
+_GREEN = method_colors(["true"])["true"]
 _AMBIENT = 0.55  # share of the light on a mesh that comes from everywhere
 
 
@@ -60,7 +64,7 @@ def plot_slice(
     # The map's surface lies below what makes the unseen pale.
     lines = {"surface": (values - field.surface_level, 2, "black", "-")}
     if room is not None:
-        lines["true surface"] = (room.sdf(points).reshape(values.shape), 3, "#1a9641", "--")
+        lines["true surface"] = (room.sdf(points).reshape(values.shape), 3, _GREEN, "--")
     for name, (zero_there, zorder, color, style) in lines.items():
         axes.plot([], [], style, color=color, label=name)
         if zero_there.min() < 0 < zero_there.max():  # matplotlib warns where there is no line
@@ -164,7 +168,7 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
 
     Every face that shows its back is left out, and one looks from where most surface shows. The
     projection is parallel; lengths across the picture are true (m). The camera-to-world poses by
-    label are drawn on top; "true" is green, "tracked" red.
+    label are drawn on top, and larger beside it; "true" is green, "tracked" red.
     """
     up = up_of(*T_paths.values())
     side = _inward_side(mesh)
@@ -181,15 +185,17 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
     shade = _AMBIENT + (1 - _AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)
     colors = mesh.visual.vertex_colors[faces, :3].mean(axis=1) / 255 * shade[:, None]
     order = corners[..., 2].mean(axis=1).argsort()  # from the farthest to the nearest
-    axes = new_axes(title, 5.6)[0, 0]
+    room, enlarged = new_axes(title, 5.0, 1, 2, width_ratios=[2, 1])[0]
     look = {"edgecolors": "face", "linewidths": 0.4, "rasterized": True}
-    axes.add_collection(PolyCollection(corners[order, :, :2], facecolors=colors[order], **look))
-    _draw_paths(axes, T_paths, to_screen[:2])
-    axes.set(aspect="equal", xlabel="across the picture (m)", yticks=[])
-    axes.spines["left"].set_visible(False)
-    axes.grid(False)
-    axes.legend(loc="upper right")
-    return axes.figure
+    room.add_collection(PolyCollection(corners[order, :, :2], facecolors=colors[order], **look))
+    for axes in (room, enlarged):
+        _draw_paths(axes, T_paths, to_screen[:2])
+        axes.set(aspect="equal", xlabel="across the picture (m)", yticks=[])
+        axes.spines["left"].set_visible(False)
+        axes.grid(False)
+    enlarged.set_title("The path, larger")
+    room.figure.legend_below()
+    return room.figure
 
 
 def _make_unlit(tree: dict) -> None:
@@ -201,11 +207,21 @@ def _make_unlit(tree: dict) -> None:
             primitive["material"] = 0
 
 
-def mesh_viewer(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses]) -> trimesh.Scene:
-    """The same, to be turned by hand: `mesh_viewer(...).show()` in a notebook.
+def mesh_viewer(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses]) -> Any:
+    """The same, to be turned by hand: HTML for a notebook. The mouse wheel scrolls the page.
 
-    Each path is a tube that ends in a pyramid, which opens where the last camera looks. The mesh is
-    made coarser: the viewer adds 1.2 MB to the notebook, 0.7 MB of it the viewer's own.
+    It adds 1.2 MB to the notebook, 0.7 MB of it the viewer's own.
+    """
+    viewer = scene_to_notebook(viewer_scene(mesh, T_paths))
+    quiet = "<script>addEventListener('wheel', e => e.stopImmediatePropagation(), true)</script>"
+    viewer.data = viewer.data.replace("<body>", f"<body>{quiet}", 1)
+    return viewer
+
+
+def viewer_scene(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses]) -> trimesh.Scene:
+    """What it shows: the mesh, made coarser, and a tube for each path.
+
+    A tube ends in a pyramid, which opens where the last camera looks.
     """
     room = mesh.copy()
     if len(room.faces) > _MAX_FACES_TO_TURN:  # vertices of a grid cell merge
@@ -284,10 +300,12 @@ def _draw_from_above(
 def _draw_paths(axes: Axes, T_paths: Mapping[str, Poses], to_page: np.ndarray) -> None:
     """Trajectories by label on a page, (2, 3), with a dot at the start of each."""
     starts = []
+    styles = cycle(("--", "-.", ":"))
     for label, color in method_colors(T_paths).items():
         path = T_paths[label][:, :3, 3] @ to_page.T
-        look = {"linewidth": 2.6 if label == "true" else 1.4, "zorder": 3}
-        axes.plot(*path.T, color=color, label=label, **look)
+        # The true path is wide, so that the others do not hide it.
+        look = ("-", 4.0) if label == "true" else (next(styles), 1.6)
+        axes.plot(*path.T, look[0], linewidth=look[1], color=color, label=label, zorder=3)
         starts.append(path[0])
     axes.plot(*np.transpose(starts), "o", color="black", markersize=5, zorder=4, label="start")
 

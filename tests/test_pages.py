@@ -1,0 +1,56 @@
+"""Pages of notebooks and texts: whole without a network, with right formulas and living links."""
+
+import re
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+
+import bs4
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = SimpleNamespace(**runpy.run_path(str(ROOT / "environment/pages.py")))
+FIRST = ROOT / "notebooks/01_map_imap.ipynb"
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, bs4.BeautifulSoup]:
+    """The pages of the first notebook and of all that it names, with stored outputs."""
+    folder = tmp_path_factory.mktemp("pages")
+    PAGES.write_pages(folder, [FIRST], execute=False)
+    texts = {path: path.read_text(encoding="utf-8") for path in folder.rglob("*.html")}
+    return {path: bs4.BeautifulSoup(text, "html.parser") for path, text in texts.items()}
+
+
+def test_links_lead_somewhere(pages: dict[Path, bs4.BeautifulSoup]) -> None:
+    """Catches a link to a text or a notebook that has no page, and a missing picture or heading."""
+    assert {"01_map_imap.html", "07_corrected_map.html", "choices.html"} <= {p.name for p in pages}
+    for path, page in pages.items():
+        for tag in page.select("a[href], img[src]"):
+            url, _, heading = (tag.get("href") or tag["src"]).partition("#")
+            if url.startswith(("http", "data:")):
+                continue
+            assert not url or (path.parent / url).is_file(), (path, url)
+            assert not heading or page.find(id=heading), (path, heading)
+
+
+def test_a_page_loads_nothing_and_tells_what_it_is(pages: dict[Path, bs4.BeautifulSoup]) -> None:
+    """Catches a script, a style sheet or an image from the network, a page without a language or a
+    title, a picture without a description, and a slider that cannot slide."""
+    (page,) = (page for path, page in pages.items() if path.stem == FIRST.stem)
+    assert not page.select("script, link, img[src^=http]")
+    assert page.html["lang"] == "en"
+    assert page.select("meta[name=viewport]")
+    assert page.title.text.startswith("1. Map known rooms")
+    assert not page.select("img[alt^='No description'], img[alt='']")
+    assert "interactive(" not in page.text
+
+
+def test_formulas_are_mathml() -> None:
+    """Catches letters that are not bold, one bar unlike the other, and TeX left over."""
+    made = PAGES.mathml(r"\lVert\hat{\mathbf c}_k\rVert_1", "block")
+    assert "&#x1D41C;" in made
+    bars = re.findall("<mo[^>]*>&#x02016;</mo>", made)
+    assert len(bars) == 2
+    assert bars[0] == bars[1]
+    assert "\\" not in made
