@@ -332,7 +332,7 @@ def test_every_key_at_its_limits(key: str, small: Small) -> None:
 
 
 def test_claims_of_results(capsys: pytest.CaptureFixture) -> None:
-    """Catches a claim that stops the reader who changed a setting, and one that is never checked."""
+    """Catches a claim that stops a reader who changed a setting, and one that is never checked."""
     changed = load_preset(settings=["mapping.imap.iterations=300"])
     claim(changed, True, "it is sharp")
     assert capsys.readouterr().out == "it is sharp\n"
