@@ -12,6 +12,7 @@ import pytest
 import torch
 import trimesh
 from box_room import Formula
+from IPython.core.formatters import DisplayFormatter
 from ipywidgets import fixed, interactive
 from matplotlib.axis import Axis
 from matplotlib.contour import ContourSet
@@ -114,10 +115,11 @@ def test_every_axis_has_a_unit_and_nothing_leaks(name: str, sequence) -> None:
     before = dict(matplotlib.rcParams)
     figure = FIGURES[name](sequence)
     assert dict(matplotlib.rcParams) == before
-    png, described = figure._repr_png_()
+    png = figure._repr_png_()
     assert png.startswith(b"\x89PNG")
     assert len(png) < 150_000
-    assert described["alt"] == figure.get_suptitle() != ""
+    _, described = DisplayFormatter().format(figure)
+    assert described["image/png"]["alt"] == figure.get_suptitle() != ""
     assert " at 0x" not in repr(figure)
     for axes in figure.axes:
         if axes.axison:

@@ -48,11 +48,14 @@ styled = in_house_style()
 class NotebookFigure(Figure):
     """A figure that is shown once where a cell ends with it; it is not registered with pyplot."""
 
-    def _repr_png_(self) -> tuple[bytes, dict[str, str]]:
-        """The picture; its title describes it where it cannot be seen."""
+    def _repr_mimebundle_(self, **chosen: object) -> tuple[dict, dict]:
+        """The picture's title describes it where it cannot be seen, whichever way it is drawn."""
+        return {}, {"image/png": {"alt": self.get_suptitle().replace("\n", " ")}}
+
+    def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
         self.savefig(buffer, format="png", pil_kwargs={"optimize": True})  # notebooks stay small
-        return buffer.getvalue(), {"alt": self.get_suptitle().replace("\n", " ")}
+        return buffer.getvalue()
 
     def legend_below(self) -> None:
         """The first panel's legend for the whole figure."""
