@@ -108,7 +108,8 @@ def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figur
     """
     # Loss terms are the columns before their total; what is behind it are diagnostics.
     terms = {label: history.loc[:, :"total"].iloc[:, :-1] for label, history in histories.items()}
-    names = dict.fromkeys(name for losses in terms.values() for name in losses)
+    # A term of weight zero has no place on a logarithmic axis.
+    names = dict.fromkeys(n for losses in terms.values() for n in losses if losses[n].any())
     panels = style.new_axes(title, 3.0, 1, len(names), sharex=True)[0]
     for axes, name in zip(panels, names, strict=True):
         for label, color in style.method_colors(terms).items():
