@@ -62,8 +62,9 @@ def read_source(path: Path, execute: bool) -> nbformat.NotebookNode:
         return nbformat.v4.new_notebook(cells=[nbformat.v4.new_markdown_cell(text)])
     notebook = nbformat.read(path, as_version=4)
     if execute:
-        runner = ExecutePreprocessor(timeout=None, store_widget_state=False)
+        runner = ExecutePreprocessor(timeout=None)
         runner.preprocess(notebook, {"metadata": {"path": path.parent}})
+        notebook.metadata.pop("widgets", None)  # a page has no kernel that would move them
     return notebook
 
 
