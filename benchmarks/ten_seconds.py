@@ -15,7 +15,8 @@ from itertools import product
 
 import pandas as pd
 import torch
-from corrected import ALONE, FOUND_M, SEEDS, write_rows
+from corrected import ALONE, SEEDS, WRONG_IN_RECORDING_M, WRONG_M, write_rows
+from mistakes import mistakes
 from motions import HAND_HELD
 
 from nbtrack import METHODS, load_preset, open_scene, open_scenes, read_run, track_scenes
@@ -39,7 +40,7 @@ def main() -> None:
 
 
 def accuracy(folders: list[str]) -> pd.DataFrame:
-    """A row a run: its error, frames off by more than 5 cm (a recording: 20 cm), and verdicts."""
+    """A row a run: its error, and the mistakes of its verdicts."""
     second = load_preset("nine_rooms", settings=[*HAND_HELD, "scenes.seed=1"])
     rooms, elsewhere = open_scenes(PRESET), open_scenes(second)
     recordings = [open_scene(folder, PRESET) for folder in folders]
@@ -52,20 +53,12 @@ def accuracy(folders: list[str]) -> pd.DataFrame:
 
 
 def judged(scenes, tracked, path: str, frames: str) -> pd.DataFrame:
-    """Both methods with all seeds. Wrong frames that are not called lost are missed; right ones
-    that are called lost are lost in vain."""
+    """Both methods with all seeds."""
     how = {"steps": 30, "frames": frames, "seeds": SEEDS, "execution": ALONE}
     found = track_scenes(scenes, COMPARED, PRESET, tracked=tracked, **how)
-    counts = []
-    for run in found["run"]:
-        rows = read_run(run).frames
-        is_lost = rows["lost"].astype(bool)
-        is_wrong = rows["translation_error_m"] > (FOUND_M if path == "second" else 0.2)
-        counts.append((is_wrong.sum(), (is_wrong & ~is_lost).sum(), (is_lost & ~is_wrong).sum()))
-    told = ["wrong_frames", "missed_frames", "frames_lost_in_vain"]
-    found = found.assign(path=path, frames=frames)
-    found[told] = counts
-    return found[[*KEPT, *told]]
+    wrong_m = WRONG_M if scenes[0].room else WRONG_IN_RECORDING_M
+    counts = pd.DataFrame([mistakes(read_run(run).frames, wrong_m) for run in found["run"]])
+    return found.assign(path=path, frames=frames, **counts)[[*KEPT, *counts]]
 
 
 def times(folder: str) -> pd.DataFrame:
