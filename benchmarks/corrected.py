@@ -4,7 +4,7 @@
     python benchmarks/corrected.py ablation [RECORDING]
     python benchmarks/corrected.py fast
 
-Writes tracking, times, searches and agreement.csv, ablation.csv or fast.csv to
+Writes tracking, times, searches and agreement.csv, ablation.csv, or fast.csv and reliability.csv to
 paper_tables/corrected.
 RECORDING is a folder in the dataset's layout; of the first, `agreement` is asked. Times count: run
 nothing else.
@@ -46,7 +46,7 @@ from nbtrack.experiments.methods import TABLE_1
 from nbtrack.tracking import StepBudget, track_sequence
 from nbtrack.tracking.metrics import trajectory_metrics
 
-ALONE, FOUND_M, FOUND_DEG = Execution(workers=1), 0.05, 3.0
+ALONE = Execution(workers=1)
 COMPARED = [
     METHODS["baked"],
     METHODS["corrected_sparse"],
@@ -64,7 +64,8 @@ COLUMNS = [
     "lost_frames", "seconds_per_frame", "steps_per_frame", "map_seconds", "median_error_m",
     "wrong_frames", "longest_wrong", "called_lost", "missed_frames", "frames_lost_in_vain",
 ]  # fmt: skip
-WRONG_M = 0.05  # in a room, whose truth is known
+P_EDGES = [0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 1]
+WRONG_M, WRONG_DEG = 0.05, 3.0  # in a room, whose truth is known
 WRONG_IN_RECORDING_M = 0.2  # there the reference is off, too
 
 # What a correction is made with, changed one at a time: settings, and constants of its module.
@@ -89,7 +90,9 @@ def main() -> None:
         write_rows("ablation.csv", ablation(sys.argv[2:]))
         return
     if sys.argv[1:] == ["fast"]:
-        write_rows("fast.csv", fast())
+        runs = fast()
+        write_rows("fast.csv", runs)
+        write_rows("reliability.csv", reliability(runs))
         return
     preset = load_preset("smoke", settings=HAND_HELD)
     second = with_settings(preset, "scenes.seed=1")
@@ -123,7 +126,7 @@ def main() -> None:
         write_rows("agreement.csv", agreement(recordings[0], preset))
     print(pd.concat(runs).to_string(index=False))
     print(found.groupby(["scene", "offset"])[["recovered", "seconds"]].mean().to_string())
-    is_wrong = (found["error_m"] > FOUND_M) | (found["error_deg"] > FOUND_DEG)
+    is_wrong = (found["error_m"] > WRONG_M) | (found["error_deg"] > WRONG_DEG)
     verdicts = pd.crosstab(found["lost"], is_wrong.rename("wrong"))
     print("verdicts, wrong by 5 cm or 3 degrees", verdicts, sep="\n")
 
@@ -134,7 +137,7 @@ def _track(scenes, methods, preset, frames, path, tracked=None, steps=30) -> pd.
     found = track_scenes(scenes, methods, preset, [2], tracked=tracked, **how)
     wrong_m = WRONG_M if scenes[0].room else WRONG_IN_RECORDING_M
     counts = pd.DataFrame([_judged(run, wrong_m) for run in found["run"]])
-    return found.assign(path=path, frames=frames, **counts)[COLUMNS]
+    return found.assign(path=path, frames=frames, **counts)[[*COLUMNS, "run"]]
 
 
 def _judged(run: str, wrong_m: float) -> dict[str, float]:
@@ -220,6 +223,20 @@ def fast() -> pd.DataFrame:
     return pd.concat(runs)
 
 
+def reliability(runs: pd.DataFrame) -> pd.DataFrame:
+    """How often LM's poses are wrong, off by more than 5 cm or 3 degrees, by how likely they were
+    said to be."""
+    runs = runs[runs["method"].str.startswith("NeuS+ corrected")]
+    frames = pd.concat([read_run(run).frames for run in runs["run"]])
+    is_wrong = (frames["translation_error_m"] > WRONG_M) | (
+        frames["rotation_error_deg"] > WRONG_DEG
+    )
+    said = pd.DataFrame({"p_lost": frames["p_lost"], "wrong": is_wrong})
+    groups = said.groupby(pd.cut(frames["p_lost"], P_EDGES, include_lowest=True), observed=True)
+    table = groups.agg(frames=("wrong", "size"), wrong=("wrong", "sum"), p_lost=("p_lost", "mean"))
+    return table.reset_index(drop=True)
+
+
 def agreement(scene, preset) -> pd.DataFrame:
     """How far (RMS, m) paths are from one another: both trackers, two seeds, and the reference."""
     methods, seeds = [METHODS["corrected_dense"], METHODS["icp_dense"]], [0, 1]
@@ -268,7 +285,7 @@ def _without_a_start(room, elsewhere, preset, n_views: int = 50) -> pd.DataFrame
         off = np.linalg.inv(frame.T_world_camera) @ found.T_world_camera
         error_m = float(np.linalg.norm(off[:3, 3]))
         error_deg = float(np.degrees(Rotation.from_matrix(off[:3, :3]).magnitude()))
-        is_found = error_m < FOUND_M and error_deg < FOUND_DEG
+        is_found = error_m < WRONG_M and error_deg < WRONG_DEG
         rows.append((method.label, "no start", error_m, error_deg, is_found, found.lost, seconds))
     columns = ["method", "offset", "error_m", "error_deg", "recovered", "lost", "seconds"]
     return pd.DataFrame(rows, columns=columns).assign(scene=room.name)
@@ -277,6 +294,7 @@ def _without_a_start(room, elsewhere, preset, n_views: int = 50) -> pd.DataFrame
 def write_rows(name: str, rows: pd.DataFrame) -> None:
     """With machine and date."""
     made = {"device": device_name(choose_device()), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
+    rows = rows.drop(columns="run", errors="ignore")
     text = rows.assign(**made).to_csv(index=False, float_format="%.6g", lineterminator="\n")
     write_atomic(tables_folder() / "corrected" / name, text)
 
