@@ -53,6 +53,7 @@ COMPARED = [
     METHODS["corrected"],
     METHODS["corrected_dense"],
     METHODS["neus_corrected"],
+    METHODS["grid_corrected"],
     METHODS["icp"],
     METHODS["icp_middle"],
     METHODS["icp_dense"],
