@@ -1,15 +1,19 @@
 """The larger results that notebook 6 reads: CSV in paper_tables/beyond.
 
-    python benchmarks/beyond.py
+    python benchmarks/beyond.py [convergence]
 
 On the two rooms of the `smoke` preset, with the paper's step counts; an hour on one CPU core.
 Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed run goes on.
 """
 
+import sys
+import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 
 import pandas as pd
+import torch
 from basin import find_from_afar
 from motions import HAND_HELD
 from turns import in_turns
@@ -24,11 +28,14 @@ from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_3
 from nbtrack.experiments.presets import Preset
+from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import Field
+from nbtrack.mapping.fit import map_sequence
 from nbtrack.mapping.holdout import split_holdout
 from nbtrack.tables import write_table_3
-from nbtrack.tracking import StepBudget
+from nbtrack.tracking import StepBudget, track_sequence
+from nbtrack.tracking.metrics import trajectory_metrics
 
 _COLUMNS = ["rate_hz", "method", "n_pixels", "scene", "frames"]
 _COLUMNS += ["steps_per_frame", "seconds_per_frame", "still_ate_m", "ate_m"]
@@ -79,13 +86,29 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
 
 
 def convergence(scene: Scene, preset: Preset) -> pd.DataFrame:
-    """Seconds of mapping, and the error (m) of the distance near surfaces, of longer maps."""
-    rows = []
-    for name, iterations in product(("neus", "neus_plus"), (30, 60, 125, 250, 500, 1000)):
+    """Seconds of a core that longer maps take, and how good they are, three seeds.
+
+    `near_m` and `free_m` are the errors of the distance near surfaces and in free space, `lm_m` is
+    the ATE of LM with 2,048 points in the map as sampled, at every fourth frame.
+    """
+    sequence, tracked, rows = scene.read(), scene.read("::4"), []
+    fields = "neus", "neus_plus", "grid_plus"
+    torch.set_num_threads(1)
+    for seed, name, iterations in product(range(3), fields, (30, 60, 125, 250, 500, 1000)):
         longer = with_settings(preset, f"mapping.{name}.iterations={iterations}")
-        made = map_scene(scene, name, longer).record
-        rows.append((name, iterations, made["seconds"], made["quality"]["sdf_near_m"]))
-    return pd.DataFrame(rows, columns=["field", "iterations", "seconds", "near_m"])
+        how = longer.network_of(name), longer.mapping_of(name), seed
+        began = time.process_time()
+        made = map_sequence(name, sequence, *how)
+        seconds = time.process_time() - began
+        scores = score_map(made, sequence, scene.room)
+        settings = replace(longer.tracking_of("lm"), n_pixels=2048)
+        start = tracked.T_world_camera[0], StepBudget(30), settings
+        run = track_sequence(make_tracker("lm", made.field, *start), tracked)
+        lm_m = trajectory_metrics(run.T_estimated, run.T_true)["ate_rmse_m"]
+        told = scores["sdf_near_m"], scores["sdf_free_m"], lm_m
+        rows.append((seed, name, iterations, seconds, *told))
+    columns = ["seed", "field", "iterations", "seconds", "near_m", "free_m", "lm_m"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def points_time_and_bytes(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
@@ -132,4 +155,8 @@ def _maps(scene: Scene, preset: Preset) -> Iterator[tuple[str, tuple[int, Field,
 
 if __name__ == "__main__":
     smoke = load_preset("smoke", settings=HAND_HELD)
-    beyond(open_scenes(smoke), smoke)
+    rooms = open_scenes(smoke)
+    if sys.argv[1:] == ["convergence"]:
+        write("convergence", convergence(rooms[0], smoke))
+    else:
+        beyond(rooms, smoke)

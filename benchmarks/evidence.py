@@ -2,8 +2,9 @@
 
     python benchmarks/evidence.py EXPERIMENT [SEEDS]
 
-EXPERIMENT is one of nine_rooms, full_size, scores, dataset_path, readings, speeds, more_steps (as
-the dataset moves), steps, factors, oracle, choices, basin (hand-held). Rows are added to a CSV
+EXPERIMENT is one of nine_rooms, full_size, scores, dataset_path, readings, speeds, more_steps,
+cheap_queries, by_the_clock (as the dataset moves), steps, factors, oracle, choices, basin
+(hand-held). Rows are added to a CSV
 under paper_tables/ as they are finished, the first seed first; those that are there are not made
 again, whatever has changed since: remove the file to begin anew. Maps and runs are kept with all
 others (`NBTRACK_RUNS`), so that a killed experiment goes on where it was. nine_rooms and full_size
@@ -67,6 +68,7 @@ KEPT = [
     "reach_m", "reach_deg", "beyond_reach_share", "least_ate_m",
 ]  # fmt: skip
 _SPEEDS = (0.5, 1.5)  # times that of the dataset
+IN_GRIDS = ("vr_grid", "sdf_grid")
 
 
 def main(experiment: str, seeds: int) -> None:
@@ -216,6 +218,22 @@ def more_steps(seed: int) -> Iterator[Chunk]:
         yield {"steps": n_steps}, partial(track, open_scenes(THREE), TABLE_1, THREE, **there)
 
 
+def cheap_queries(seed: int) -> Iterator[Chunk]:
+    """VR and SDF in grids of features, with the paper's steps."""
+    for scene in open_scenes(THREE):
+        there = {"seeds": [seed], "workers": None}
+        yield {"scene": scene.name}, partial(track, [scene], IN_GRIDS, THREE, **there)
+
+
+def by_the_clock(seed: int) -> Iterator[Chunk]:
+    """VR and SDF in the paper's fields and in grids of features, in 1/10 s a frame: run nothing
+    else."""
+    for scene in open_scenes(THREE):
+        there = {"rates_hz": [10], "clock": True, "seeds": [seed]}
+        methods = [*TABLE_1, *IN_GRIDS]
+        yield {"scene": scene.name}, partial(track, [scene], methods, THREE, **there)
+
+
 def scores(seed: int) -> Iterator[Chunk]:
     """How good the maps of nine rooms are."""
     for scene in open_scenes(NINE):
@@ -328,6 +346,8 @@ EXPERIMENTS = {
             readings,
             speeds,
             more_steps,
+            cheap_queries,
+            by_the_clock,
             steps,
             factors,
             oracle,

@@ -1,12 +1,10 @@
-"""A map in ten seconds: NeuS+ on grids of features beside NeuS+ as an MLP, both corrected.
+"""Seconds of a core from a recording to its corrected map: NeuS+ as an MLP, and on grids of
+features.
 
-    python benchmarks/ten_seconds.py accuracy [RECORDING ...]
-    python benchmarks/ten_seconds.py times RECORDING
+    python benchmarks/ten_seconds.py RECORDING
 
-`accuracy` writes paper_tables/corrected/grid.csv: LM with 2,048 points in both maps of all nine
-rooms, on the mapped path and on another, and of recordings, three seeds each. `times` prints
-seconds of a core from a recording to its corrected map, of both in turns, six rounds. Times count:
-run nothing else.
+Both in turns, six rounds; writes paper_tables/corrected/mapping.csv. How accurate LM is in both
+maps is measured by `corrected.py`. Run nothing else.
 """
 
 import sys
@@ -15,75 +13,34 @@ from itertools import product
 
 import pandas as pd
 import torch
-from corrected import ALONE, FOUND_M, SEEDS, write_rows
-from motions import HAND_HELD
+from corrected import write_rows
 
-from nbtrack import METHODS, load_preset, open_scene, open_scenes, read_run, track_scenes
+from nbtrack import METHODS, load_preset, open_scene
 from nbtrack.beyond.correct import correct_map
 from nbtrack.mapping.fit import map_sequence
 
 COMPARED = [METHODS["corrected"], METHODS["grid_corrected"]]
-KEPT = ["frames", "path", "scene", "method", "seed", "ate_m", "still_ate_m", "map_seconds"]
-PRESET = load_preset("nine_rooms", settings=HAND_HELD)
 ROUNDS = 6
 
 
-def main() -> None:
-    """What is asked for."""
+def main(folder: str) -> None:
+    """Map and correct, again and again."""
     torch.set_num_threads(1)
-    what, *folders = sys.argv[1:]
-    if what == "times":
-        print(times(folders[0]).to_string(index=False))
-    else:
-        write_rows("grid.csv", accuracy(folders))
-
-
-def accuracy(folders: list[str]) -> pd.DataFrame:
-    """A row a run: its error, frames off by more than 5 cm (a recording: 20 cm), and verdicts."""
-    second = load_preset("nine_rooms", settings=[*HAND_HELD, "scenes.seed=1"])
-    rooms, elsewhere = open_scenes(PRESET), open_scenes(second)
-    recordings = [open_scene(folder, PRESET) for folder in folders]
-    runs = [judged(recordings, recordings, "mapped", frames) for frames in (":", "::2", "::4")]
-    for (path, tracked), frames in product(
-        (("mapped", rooms), ("second", elsewhere)), (":", "::4", "::8")
-    ):
-        runs.append(judged(rooms, tracked, path, frames))
-    return pd.concat(runs)
-
-
-def judged(scenes, tracked, path: str, frames: str) -> pd.DataFrame:
-    """Both methods with all seeds. Wrong frames that are not called lost are missed; right ones
-    that are called lost are lost in vain."""
-    how = {"steps": 30, "frames": frames, "seeds": SEEDS, "execution": ALONE}
-    found = track_scenes(scenes, COMPARED, PRESET, tracked=tracked, **how)
-    counts = []
-    for run in found["run"]:
-        rows = read_run(run).frames
-        is_lost = rows["lost"].astype(bool)
-        is_wrong = rows["translation_error_m"] > (FOUND_M if path == "second" else 0.2)
-        counts.append((is_wrong.sum(), (is_wrong & ~is_lost).sum(), (is_lost & ~is_wrong).sum()))
-    told = ["wrong_frames", "missed_frames", "frames_lost_in_vain"]
-    found = found.assign(path=path, frames=frames)
-    found[told] = counts
-    return found[[*KEPT, *told]]
-
-
-def times(folder: str) -> pd.DataFrame:
-    """Seconds of a core that mapping and correction take, and the map's size."""
-    scene, rows = open_scene(folder, PRESET), []
+    preset, rows = load_preset("smoke"), []
+    scene = open_scene(folder, preset)
     sequence = scene.read()
     for number, method in product(range(ROUNDS), COMPARED):
-        own = PRESET.with_method(method.settings)
+        own = preset.with_method(method.settings)
         network, settings = own.network_of(method.field), own.mapping_of(method.field)
         began = time.process_time()
         made = map_sequence(method.field, sequence, network, settings)
-        mapping = time.process_time()
+        mapped = time.process_time()
         correct_map(made, sequence, own.correction[method.field])
-        seconds = mapping - began, time.process_time() - mapping
-        rows.append((number, method.label, *seconds, sum(seconds)))
-    columns = ["round", "method", "mapping_s", "correction_s", "seconds"]
-    return pd.DataFrame(rows, columns=columns)
+        seconds = mapped - began, time.process_time() - mapped
+        rows.append((scene.name, number, method.label, *seconds))
+    columns = ["scene", "round", "method", "mapping_s", "correction_s"]
+    write_rows("mapping.csv", pd.DataFrame(rows, columns=columns))
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1])

@@ -11,9 +11,9 @@ nothing else.
 
 from itertools import product
 
-import numpy as np
 import pandas as pd
 import torch
+from mistakes import mistakes
 from motions import HAND_HELD
 
 from nbtrack import METHODS, Method, load_preset, open_scenes, read_run
@@ -49,9 +49,7 @@ def main() -> None:
 
 
 def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
-    """One tracked walk. A frame that is off by more than 5 cm is wrong, and missed where the
-    tracker does not call it lost; `found_again` counts how often a wrong frame is followed by a
-    right one."""
+    """One tracked walk; `found_again` counts how often a wrong frame is followed by a right one."""
     preset = with_settings(PRESET, *method.settings)
     settings = preset.tracking_of(method.tracker)
     made = MapJob.of(room, method.field, preset, MAPPED)
@@ -59,8 +57,6 @@ def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
     found = run_jobs([job], f"{room.name}, {method.label}", Execution(workers=1))[0]
     tracked = read_run(job.folder.name).frames
     is_wrong = (tracked["translation_error_m"] > WRONG_M).to_numpy()
-    # The paper's methods do not judge themselves.
-    is_lost = tracked["lost"].to_numpy(bool) if "lost" in tracked else np.zeros_like(is_wrong)
     width, _, depth = room.room.parts[0].solid.size
     field = made.map().field
     return {
@@ -72,10 +68,7 @@ def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
         "ate_m": found["ate_rmse_m"],
         "milliseconds": 1e3 * tracked["seconds"].median(),
         **{name: found[name] for name in KEPT},
-        "wrong_frames": int(is_wrong.sum()),
-        "lost_frames": int(is_lost.sum()),
-        "missed_frames": int((is_wrong & ~is_lost).sum()),
-        "frames_lost_in_vain": int((is_lost & ~is_wrong).sum()),
+        **mistakes(tracked, WRONG_M),
         "found_again": int((is_wrong[:-1] & ~is_wrong[1:]).sum()),
         "map_mb": sum(part.nbytes for part in field.state_dict().values()) / 1e6,
     }

@@ -1,11 +1,14 @@
 """Ctrl-C in a terminal: a line and status 130, at whatever moment, and nothing left running."""
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from tiny import tiny_words
+
+from nbtrack.core.interrupts import interrupts_put_off
 
 # As libraries do that try what else there is: an import that takes Ctrl-C for a failure of its own.
 IMPORTING = """
@@ -62,3 +65,12 @@ def test_while_workers_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     long = "mapping.imap.iterations=100000", "mapping.neus.iterations=100000"
     command = ["tables", "--workers", "2", *tiny_words(*long)]
     assert "interrupted" in interrupted(tmp_path / "working.py", WORKING.format(command))
+
+
+def test_windows_has_no_signal_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches workers that cannot be started where signals cannot be blocked."""
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.delattr(signal, "pthread_sigmask")
+    with interrupts_put_off():
+        ran = True
+    assert ran

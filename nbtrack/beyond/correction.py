@@ -27,23 +27,29 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, field_class
 from nbtrack.fields.base import LUMA, State
 
-# All our choice, tried in the two rooms for tuning. Measured points, and where along their normals
-# (m) the distance is that offset. Nearer than a voxel: farther out, planes end.
-_N_POINTS, _OFFSETS = 300_000, (0.0, -0.03, -0.015, 0.015, 0.03)
-# A larger place takes more, up to so many times, lest a frame see cells that none lies in: with so
-# many a cell in the mean, as rooms have anyway (3 in an office of 15 by 17 m; see docs/tried.md).
-_POINTS_A_CELL, _MAX_TIMES = 10, 4
-# The residual (m) from which one counts less (Huber), and how often that is judged anew.
-_HUBER, _ROUNDS = 0.01, 4
+# All our choice, tried in the two rooms for tuning.
+_N_POINTS = 300_000  # measured points
+# Where along their normals (m) the distance is that offset: within a voxel, as planes end.
+_OFFSETS = (0.0, -0.03, -0.015, 0.015, 0.03)
+# A larger place takes more points, so that a frame sees no cells in which none lies. Rooms have so
+# many a cell anyway; an office of 15 by 17 m had 3 (docs/tried.md).
+_POINTS_A_CELL = 10
+_MAX_TIMES = 4  # as many points at most
+_HUBER = 0.01  # m; a larger residual counts less
+_ROUNDS = 4  # how often that is judged anew
 # What a difference between neighbouring corrections, and a correction itself, cost, in points seen
-# from the mean distance. Corrections fade out over so many vertices beyond those that points touch.
-_SMOOTHNESS, _PULL, _FADE = 0.1, 0.1, 1
-# Of colours, which change faster than distances: their share of that stiffness, and as above.
-_COLOR_STIFFNESS, _COLOR_HUBER, _COLOR_ROUNDS = 0.1, 0.05, 3
+# from the mean distance.
+_SMOOTHNESS = 0.1
+_PULL = 0.1
+_FADE = 1  # vertices beyond those that points touch, over which corrections fade out
+_COLOR_STIFFNESS = 0.1  # of that stiffness, since colours change faster than distances
+_COLOR_HUBER = 0.05
+_COLOR_ROUNDS = 3
 # The least scales of a tracker's residuals (distance, luma): so many medians of what the measured
 # points leave, and no less. Chosen in the rooms for tuning and on a real recording, whose medians
 # are 1.8 mm and 0.002, and 4 mm and 0.02.
-_MEDIANS, _MIN_SCALES = np.array([5.5, 2.3]), np.array([0.01, 0.05])
+_MEDIANS = np.array([5.5, 2.3])
+_MIN_SCALES = np.array([0.01, 0.05])
 _UNMEASURED = 0.1  # confidence where nothing was measured, and the network interpolates
 CORRECTIONS = ("numbers", "corrections", "cameras", "views", "residual_medians")
 """What a file keeps of a correction, besides the field: see `CorrectedField`."""

@@ -22,31 +22,35 @@ from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.tracker import Estimate, Tracker, TrackerSettings
 
 _MIN_POINTS = 20  # below, a frame says too little for six unknowns
-# A descent begins on some of the points, a share but so many, and ends on all of them: far from the
-# pose the coarse answer is as good and costs less.
-_COARSE_SHARE, _MIN_COARSE = 8, 128
-# Starts are compared by widely robust costs: narrow ones say the same of all that are off. Poses
-# that descents found are compared by narrower ones; one that costs less by this share takes over.
-_WIDE_SCALES, _CLEARLY = np.array([0.1, 0.2]), 0.97
+# A descent begins on a part of the points, and ends on all of them: far from the pose the coarse
+# answer is as good and costs less.
+_COARSE_SHARE = 8  # one in so many
+_MIN_COARSE = 128  # points
+# Starts are compared at wide robust scales (m, luma): at narrow ones all that are off cost alike.
+_WIDE_SCALES = np.array([0.1, 0.2])
+_CLEARLY = 0.97  # a pose that costs less than this share of the best one's cost takes over
 # Starts that differ by more (m, rad), as of a fast camera that may have stopped, are compared after
-# their coarse stages, of so many steps at most: costs of the starts themselves do not tell which
-# of them leads to the true pose.
-_FAR_APART, _MAX_COARSE_STEPS = 0.06, 30
-# A pose is lost from this probability on that it is wrong; from the lower one on another is looked
-# for. What a descent needs beyond so many steps, and one elsewhere, counts as one step; each of its
-# two stages takes so many at most.
-_LOST, _DOUBTFUL, _MAX_FOLLOWING, _MAX_STEPS = 0.5, 0.1, 20, 60
+# their coarse stages, since the costs of the starts do not tell which leads to the true pose.
+_FAR_APART = 0.06
+_MAX_COARSE_STEPS = 30
+_LOST = 0.5  # a pose is lost from this probability on that it is wrong
+_DOUBTFUL = 0.1  # from this one on another is looked for
+# What a descent needs beyond so many steps counts as one step, and so does a descent elsewhere.
+_MAX_FOLLOWING = 20
+_MAX_STEPS = 60  # of each of a descent's two stages
 _SAME = 0.01  # rad, m; another descent that ends so near a pose confirms it
 _SURPRISE = 1.0  # rad, m; of a pose where the frame before led to none
-# Intensities are no better than what rounding to 256 grey levels leaves in the median, and as good
-# as this where the map does not say how good they are.
-_ROUNDING, _UNKNOWN_MAD = 0.25 / 255, 0.02
+_ROUNDING = 0.25 / 255  # median that 256 grey levels leave; no intensity is more accurate
+_UNKNOWN_MAD = 0.02  # of intensities, where the map does not say how accurate they are
 _MIN_CONTRAST = 0.01  # standard deviation of a picture that is not dark, covered or overexposed
 _RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
-# Where a map has views, a lost camera is looked for where so many of them were taken that are most
-# like the frame, and at so many random poses, so far (m) from where any was. From the cheapest
-# some steps are taken, before the cheapest of those are followed.
-_ALIKE, _RANDOM, _RANDOM_STD, _TRIED, _TRIED_STEPS = 20, 1000, 0.3, 20, 6
+# Where a map has views, a lost camera is looked for where the views most like the frame were taken,
+# and at random poses. A few steps are taken from each; the cheapest are then followed.
+_ALIKE = 20  # views
+_RANDOM = 1000  # poses, of which the cheapest `_TRIED` are kept
+_RANDOM_STD = 0.3  # m, of their offsets from where a view was taken
+_TRIED = 20
+_TRIED_STEPS = 6
 
 
 class Search(Enum):
@@ -122,7 +126,10 @@ class LmTracker(Tracker):
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
         R = starts[:, :3, :3]
         R[:] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
-        self.frame, self.expected, self.best, self.steps = frame, starts, None, 0
+        self.frame = frame
+        self.expected = starts
+        self.best = None
+        self.steps = 0
         # Poses that a right one is near: after a lost frame the last good one, if there was any.
         n_good = int(self.last_good is not None)
         self.trusted = starts[len(starts) - n_good :] if self.was_lost else starts

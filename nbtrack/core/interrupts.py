@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
 from types import FrameType
@@ -22,7 +23,11 @@ def heed_interrupts() -> None:
 def interrupts_put_off() -> Iterator[None]:
     """Ctrl-C waits for the end of a block, and never reaches what is started within: processes that
     this one ends by itself, and that would each end with a traceback."""
-    came, usual = [], signal.getsignal(signal.SIGINT)
+    if sys.platform == "win32":  # there is no mask that a process inherits
+        yield
+        return
+    came = []
+    usual = signal.getsignal(signal.SIGINT)
     resource_tracker.ensure_running()  # started within, it would let Ctrl-C through again
     _handle_by(lambda *_: came.append(True))
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which they inherit
