@@ -41,8 +41,8 @@ def look_up(what: str, name: str, known: Mapping[str, Entry]) -> Entry:
 def look_up_kind(what: str, name: str, known: Mapping[str, type]) -> type:
     """A class by the name that it calls itself. Raises ConfigError for another, or an unknown."""
     kind = look_up(what, name, known)
-    if kind.name != name:
-        raise ConfigError(f"{what} {name!r} calls itself {kind.name!r}: give the class this name")
+    if (own := getattr(kind, "name", None)) != name:
+        raise ConfigError(f"{what} {name!r} calls itself {own!r}: give the class this name")
     return kind
 
 

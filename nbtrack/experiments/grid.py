@@ -24,6 +24,7 @@ from nbtrack.core.errors import MissingError, NbtrackError
 from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.interrupts import interrupts_put_off
 from nbtrack.core.progress import ProgressBar, tell
+from nbtrack.experiments import IMPORTED, import_own
 from nbtrack.experiments.jobs import Job, MapJob, TrackJob
 from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.presets import Preset
@@ -223,6 +224,8 @@ def _on_workers(
         client.subscribe_topic(topic, lambda event: show(Path(event[1][0]), *event[1][1:]))
         settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
         settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
+        for source in IMPORTED:
+            client.run(import_own, source)
         how = topic, settings, n_threads, (FIELDS, TRACKERS)
         futures: dict[Path, Any] = {}
         for folder, job in jobs.items():

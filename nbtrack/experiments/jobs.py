@@ -17,6 +17,7 @@ from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.settings import as_dict, changed_settings
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import parse_frames, select_frames
+from nbtrack.experiments import IMPORTED
 from nbtrack.experiments.output import check_no_recording
 from nbtrack.experiments.presets import PRESETS, SIZES, Preset
 from nbtrack.experiments.quality import score_map
@@ -399,6 +400,7 @@ class TrackJob(Job):
             settings["scenes"] = {name: getattr(made, name) for name in SIZES}
         words = [f"--set={text}" for text in changed_settings(settings, replace(PRESETS[_PLAIN]))]
         words += [f"--{name}={value}" for name, value in options.items() if value is not None]
+        words += [f"--import={source}" for source in IMPORTED]
         words = ["python", "-m", "nbtrack", "track", sequence, *words]
         return shlex.join([*words, "--out", f"again_{self.name}"])
 
