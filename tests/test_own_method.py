@@ -13,17 +13,22 @@ from types import ModuleType
 import cloudpickle
 import nbformat
 import pytest
+import torch
 from nbconvert.preprocessors import ExecutePreprocessor
 from tiny import TINY, tiny_words
 
+import nbtrack
 from nbtrack.cli import main
+from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError
 from nbtrack.core.files import foreign_source
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments import presets
 from nbtrack.experiments.methods import METHODS, Method
 from nbtrack.experiments.presets import load_preset
-from nbtrack.fields import FIELDS, NeusMapping, field_class
+from nbtrack.fields import FIELDS, NetworkSettings, NeusMapping, field_class
+from nbtrack.fields.mlp import FourierMlp
+from nbtrack.mapping.files import write_map
 from nbtrack.tracking import TRACKERS, tracker_class
 
 OWN = '''
@@ -167,7 +172,9 @@ def test_a_file_joins_by_an_option_of_every_command(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     assert f"--import={far / 'my-method.py'}" in metrics["command"]
-    done = nbtrack_there(far, "export", str(made), "--to", "ply", "room.ply", "--import", "my-method")
+    done = nbtrack_there(
+        far, "export", str(made), "--to", "ply", "room.ply", "--import", "my-method"
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -345,7 +352,7 @@ def test_settings_of_a_field_whenever_it_is_registered(
     settings = preset.mapping_of("mine")
     assert (settings.iterations, settings.n_rays, settings.n_surface) == (1200, 96, 5)
     assert preset.network_of("mine").width == 96
-    with pytest.raises(ConfigError, match="of 'tanh', but of imap, neus, .*mine") as caught:
+    with pytest.raises(ConfigError, match=r"of 'tanh', but of imap, neus, .*mine") as caught:
         with_settings(preset, "network.tanh.width=3")
     assert "did you mean" not in str(caught.value)
 
@@ -364,6 +371,49 @@ def test_a_class_is_registered_by_its_own_name(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setitem(FIELDS, "tanh", FIELDS["neus"])
     with pytest.raises(ConfigError, match="calls itself 'neus'"):
         field_class("tanh")
+
+
+def test_what_an_own_class_needs_is_public() -> None:
+    """Catches a class of one's own that must look into modules, or set up what only a private
+    function can: a field with another network starts as the distance inside its room."""
+
+    class Mine(FIELDS["neus"]):
+        name = "mine"
+
+        def make_network(self, settings, generator):
+            self.made = FourierMlp(settings, self.bounds, torch.relu, generator)
+            return self.made
+
+    assert issubclass(Mine, nbtrack.LearnedField)
+    assert issubclass(nbtrack.LearnedField, nbtrack.Field)
+    assert issubclass(TRACKERS["sdf"], nbtrack.AdamTracker)
+    assert (nbtrack.FIELDS, nbtrack.TRACKERS) == (FIELDS, TRACKERS)
+    assert nbtrack.write_map is write_map
+    box = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    mine = Mine(NetworkSettings(width=64), box, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        distance = mine(torch.tensor([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]]))[1]
+    assert mine.mlp is mine.made
+    assert distance[0] > 0.3
+    assert abs(distance[1] - 0.1) < 0.15
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"rates_hz": 10}, "rates_hz = 10 is no list"), ({"seeds": 3}, "seeds = 3 is no list"),
+        ({"methods": "huber"}, "methods = 'huber' is no list"), ({"frames": 30}, "frames = 30"),
+        ({"scenes": "office"}, "scenes = 'office' is no list"),
+        ({"methods": METHODS["sdf"]}, "is no list"),
+    ],
+)  # fmt: skip
+def test_one_thing_in_place_of_several(wrong: dict, says: str) -> None:
+    """Catches a number that cannot be looped over, and letters taken for names of methods."""
+    right = {"scenes": [], "methods": ["sdf"], "preset": load_preset("smoke")}
+    with pytest.raises(ConfigError) as caught:
+        nbtrack.track_scenes(**right | wrong)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_method_in_a_notebook(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """One exception family. A message says what was found, what is allowed and what to do next."""
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
 Entry = TypeVar("Entry")
@@ -36,6 +36,13 @@ def look_up(what: str, name: str, known: Mapping[str, Entry]) -> Entry:
     if name not in known:
         raise ConfigError(f"unknown {what} {name[:40]!r}: {nearest_name(name, [*known])}")
     return known[name]
+
+
+def check_lists(**arguments: object) -> None:
+    """Raises ConfigError for an argument that is one thing, where several are asked for."""
+    for name, value in arguments.items():
+        if isinstance(value, str) or not isinstance(value, Iterable):
+            raise ConfigError(f"{name} = {value!r:.80} is no list: write {name}=[...] around it")
 
 
 def look_up_kind(what: str, name: str, known: Mapping[str, type]) -> type:
