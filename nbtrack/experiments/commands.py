@@ -122,7 +122,7 @@ def track_command(options: Namespace) -> None:
         if not given:
             _map(job)
         run = replace(run, out=run.folder)  # made anew, whatever the cache holds
-        (metrics,) = run_jobs([run], f"tracking {scene.name}")
+        (metrics,) = run_jobs([run])
         _draw_overview(run)
     print(f"{run.folder}: {method.tracker} in {job.map().field.label}, {budget}")
     _print_numbers(metrics)
@@ -177,7 +177,7 @@ def _map(job: MapJob) -> None:
     has_pose = job.scene.recording.has_pose[parse_frames(job.frames)]
     if not has_pose.all():
         tell(f"nbtrack: {(~has_pose).sum()} of {len(has_pose)} frames have no pose: not mapped")
-    run_jobs([job], f"mapping {job.scene.name}")
+    run_jobs([job])
 
 
 def _print_numbers(results: dict[str, Any]) -> None:

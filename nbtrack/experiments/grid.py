@@ -68,7 +68,7 @@ class Execution:
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
     """The map of a scene, from the cache or made now."""
     job = MapJob.of(scene, field, preset, seed=seed)
-    run_jobs([job], f"mapping {job.name}")
+    run_jobs([job])
     return job.map()
 
 
@@ -83,7 +83,7 @@ def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -
     return pd.DataFrame(
         {"field": job.field, "scene": job.scene.name, "seed": job.seed}
         | {"seconds": record["seconds"], **record["quality"]}
-        for job, record in zip(jobs, run_jobs(jobs, "mapping"), strict=True)
+        for job, record in zip(jobs, run_jobs(jobs), strict=True)
     )
 
 
@@ -143,9 +143,9 @@ def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[An
     for warning in reach_warnings(missing):
         tell(f"nbtrack: warning: {warning}")
     if clock:
-        run_jobs([job.needs for job in missing], "mapping", execution)
+        run_jobs([job.needs for job in missing], execution)
         execution = replace(execution, workers=1, dask=None)
-    return run_jobs(jobs, "by the clock" if clock else "tracking", execution)
+    return run_jobs(jobs, execution)
 
 
 def _row_of(
@@ -165,22 +165,25 @@ def read_run(name: str | Path) -> Trajectory:
     return read_trajectory(Path(name) if Path(name).is_dir() else runs_folder() / "tracks" / name)
 
 
-def run_jobs(jobs: Sequence[Job], title: str, execution: Execution | None = None) -> list[Any]:
+def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[Any]:
     """The results of all jobs, in order; those that are missing, and what they need, are made.
 
     Unless it is to keep going, it raises what the first failing job raised, and drops the others.
     """
     execution, results = execution or Execution(), {}
     missing = {part.folder: part for job in jobs for part in _missing(job)}
-    done = dict.fromkeys(missing, 0.0)  # shares: each job counts as one, however long it takes
+    done = dict.fromkeys(missing, 0.0)  # shares of each job's own work
+    work = {folder: job.work for folder, job in missing.items()}
 
     def show(folder: Path, share: float, status: str) -> None:
         done[folder] = max(share, done[folder])  # news of a worker may come late
         ended = f"{len(results)} of {len(missing)} done"
-        bar.move_to(sum(done.values()), f"{ended}, {missing[folder].name}: {status}")
+        bar.set_description_str(missing[folder].doing, refresh=False)
+        worked = sum(share * work[folder] for folder, share in done.items())
+        bar.move_to(worked, f"{ended}, {missing[folder].name}: {status}")
 
     with (
-        ProgressBar(title, len(missing)) as bar,
+        ProgressBar(Job.doing, sum(work.values())) as bar,
         contextlib.closing(_outcomes(missing, results, show, execution)) as outcomes,
     ):
         for folder, outcome in outcomes:

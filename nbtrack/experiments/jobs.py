@@ -1,6 +1,8 @@
 """Jobs, each named by all that it depends on and made once: maps, and runs tracked in them."""
 
+import contextlib
 import shlex
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -42,6 +44,9 @@ _OTHER_WORLD = (
 OF_MAPS = ("network.", "mapping.", "correction.")
 """How keys of settings begin that only matter where a map is made."""
 _MAP_SETTINGS = ("network", "settings", "correction")  # in the record of a map
+# For the work of jobs, measured with `smoke` on one core: queries of a network in a second; those
+# in the time of a map's scores, or of its correction; the share of one that asks a grid or points.
+_QUERIES_A_SECOND, _AROUND_MAPS, _NO_NETWORK = 60_000, 1e6, 0.05
 _PLAIN = "synthetic"  # the preset whose settings are the classes' own
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""
@@ -53,6 +58,8 @@ class Job:
     kind: str  # the part of the cache where it is kept
     name: str  # for readers
     key: str  # changes with everything that the result depends on
+    doing: str = "computing"  # what its progress is called
+    work: float = 1.0  # queries of a field, about, for the time that is left
     out: Path | None = None  # where to keep it instead of in the cache
     needs: "Job | None"
     is_done: bool
@@ -100,7 +107,7 @@ class MapJob(Job):
     correction: float = 0.0  # cells (m) in which the fitted map is corrected; 0: it is not
     out: Path | None = None
 
-    kind = "maps"
+    kind, doing = "maps", "mapping"
 
     @classmethod
     def of(
@@ -137,6 +144,13 @@ class MapJob(Job):
         if not (self.folder / MAP_FILE).is_file():
             return False
         return self.out is None or self._stored().record.get("key") == self.key
+
+    @property
+    def work(self) -> float:
+        """Iterations x (rays x samples, and surface points); a correction and scores have none."""
+        own = Counter() if self.correction else Counter(vars(self.settings))
+        a_batch = own["n_rays"] * (own["n_stratified"] + own["n_surface"]) + own["n_surface_points"]
+        return _AROUND_MAPS + own["iterations"] * a_batch
 
     def setting_tree(self) -> dict[str, Any]:
         """Its settings where a preset has them."""
@@ -236,7 +250,7 @@ class TrackJob(Job):
     n_threads: int | None = None  # CPU threads to track with; by default the process's
     start: str = "given"  # the first frame's true pose, where known; or "unknown"
 
-    kind = "tracks"
+    kind, doing = "tracks", "tracking"
 
     @cached_property
     def key(self) -> str:
@@ -256,6 +270,18 @@ class TrackJob(Job):
         elsewhere = "-unmapped" if self.is_elsewhere else ""
         name = f"{self.scene.name}-{self.needs.field}-{self.tracker}{elsewhere}-{budget}"
         return f"{name}-seed{self.seed}" if self.seed else name
+
+    @property
+    def work(self) -> float:
+        """Frames x steps x pixels x samples of a ray; by the clock, its seconds."""
+        n_frames, own = 1, Counter(vars(self.settings))
+        with contextlib.suppress(NbtrackError):  # the run itself will say what is wrong
+            n_frames = self.scene.count(self.frames, needs_poses=False)
+        if self.rate_hz:
+            return n_frames / self.rate_hz * _QUERIES_A_SECOND
+        a_step = own["n_pixels"] * max(1, own["n_stratified"] + own["n_importance"])
+        price = _NO_NETWORK if tracker_class(self.tracker).converges else 1.0
+        return n_frames * self.steps * a_step * price
 
     @property
     def is_elsewhere(self) -> bool:
