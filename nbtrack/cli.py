@@ -63,7 +63,7 @@ OPTIONS = {
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from": _option("track in this map of the room: its folder or file", a_path),
     "--start": _option("given: its own pose, if any (default); unknown: found first", **_STARTS),
-    "--to!": _option("kitti: trajectory; gif: movie; ply, glb: mesh", required=True),
+    "--to!": _option("kitti: trajectory; gif: movie; rrd: Rerun; ply, glb: mesh", required=True),
     "--budget": _option("steps: the paper's counts (default); clock: this machine's", **_BUDGETS),
     "--scenes": _option("only these scenes of the preset's kind", metavar="A,B"),
     "--seeds": _option("so many maps and runs a cell: mean ± std", some_seeds, default=1),
