@@ -20,8 +20,8 @@ from tiny import TINY, tiny_words
 import nbtrack
 from nbtrack.cli import main
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.errors import ConfigError
-from nbtrack.core.files import foreign_source
+from nbtrack.core.errors import ConfigError, NbtrackError
+from nbtrack.core.files import foreign_source, runs_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments import presets
 from nbtrack.experiments.methods import METHODS, Method
@@ -181,12 +181,13 @@ def test_a_file_joins_by_an_option_of_every_command(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "says"),
     [
-        ("own.py", None, "no file own.py"),
+        ("own.py", None, "No module named 'own'"),
         ("own.py", "x = 1\n1 / 0\n", "own.py, line 2 (ZeroDivisionError: division by zero)"),
         ("own.py", "x = (\n", "own.py, line 1"),
         ("own.py", "import nbtrack_nowhere\n", "line 1 (ModuleNotFoundError: No module named"),
         ("nbtrack_nowhere", None, "No module named 'nbtrack_nowhere'"),
         ("json.py", "", "rename"),
+        ("json.py", None, "mend the path"),
     ],
 )
 def test_a_file_that_cannot_be_imported(
@@ -402,16 +403,18 @@ def test_what_an_own_class_needs_is_public() -> None:
     ("wrong", "says"),
     [
         ({"rates_hz": 10}, "rates_hz = 10 is no list"), ({"seeds": 3}, "seeds = 3 is no list"),
-        ({"methods": "huber"}, "methods = 'huber' is no list"), ({"frames": 30}, "frames = 30"),
+        ({"methods": "huber"}, "methods = 'huber' is no list"), ({"frames": 30}, "'30' is no"),
         ({"scenes": "office"}, "scenes = 'office' is no list"),
         ({"methods": METHODS["sdf"]}, "is no list"),
     ],
 )  # fmt: skip
 def test_one_thing_in_place_of_several(wrong: dict, says: str) -> None:
     """Catches a number that cannot be looped over, and letters taken for names of methods."""
-    right = {"scenes": [], "methods": ["sdf"], "preset": load_preset("smoke")}
-    with pytest.raises(ConfigError) as caught:
+    preset = load_preset(settings=[*TINY, "scenes.names=['office']"])
+    right = {"scenes": nbtrack.open_scenes(preset), "methods": ["sdf"], "preset": preset}
+    with pytest.raises(NbtrackError) as caught:
         nbtrack.track_scenes(**right | wrong)
+    assert not (runs_folder() / "maps").exists()
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
 

@@ -2,6 +2,7 @@
 
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,11 +63,10 @@ def test_points_and_a_verdict(finished: Path, tmp_path: Path) -> None:
     tracked = read_trajectory(finished / "run")
     recording = read_sequence(tracked.metrics["recording"])
     points = trimesh.PointCloud(np.eye(3), np.full((3, 4), 255, np.uint8))
-    frames = tracked.frames.assign(lost=True)
-    seen = recording.select(slice(1, 3))
-    content = rerun_bytes(points, seen, frames, {"tracked": tracked.T_estimated}, "points")
+    run = replace(tracked, frames=tracked.frames.assign(lost=True))
+    content = rerun_bytes(points, recording.select(slice(1, 3)), run, "points")
     (tmp_path / "points.rrd").write_bytes(content)
     rows = rows_of(tmp_path / "points.rrd")
     assert rows["/world/camera/color", False] == 2
-    assert rows["/lost", False] == len(frames)
+    assert rows["/lost", False] == len(run.frames)
     assert rows["/world/map", True] == 1

@@ -12,7 +12,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import nbtrack.beyond  # registers its fields and trackers
-from nbtrack.core.errors import ConfigError, MissingError
+from nbtrack.core.errors import ConfigError
 
 for plugin in entry_points(group="nbtrack"):
     plugin.load()
@@ -24,13 +24,11 @@ IMPORTED: list[str] = []
 def import_own(source: str) -> None:
     """Import a user's file, or a module by its name, that adds fields, trackers or methods.
 
-    The file's folder is searched for modules from then on. Raises MissingError if there is no such
-    file, ConfigError for whatever the import raises.
+    The file's folder is searched for modules from then on. Raises ConfigError for whatever the
+    import raises, and where another module has the file's name.
     """
     file, name = Path(source).resolve(), source
     if file.suffix == ".py":
-        if not file.is_file():
-            raise MissingError(f"no file {source} to import: give a Python file or a module")
         sys.path.insert(0, str(file.parent))
         name = file.stem
     try:
@@ -42,5 +40,5 @@ def import_own(source: str) -> None:
         reason = f"{type(error).__name__}: {error}"
         raise ConfigError(f"importing {source} failed{where} ({reason}): mend it") from error
     if name != source and Path(module.__file__ or "") != file:
-        raise ConfigError(f"{source} has the name of another module, {name}: rename the file")
+        raise ConfigError(f"module {name} is {module}, not {source}: mend the path, or rename it")
     IMPORTED.append(source if name == source else str(file))

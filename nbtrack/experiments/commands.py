@@ -1,5 +1,6 @@
 """What each command does; `tables` and `bench` stand in `bench.py`."""
 
+import importlib.util
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 import trimesh
 
 from nbtrack.beyond import PointCloud
-from nbtrack.core.errors import ConfigError, DataError, look_up
+from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import read_setting, with_values
@@ -36,8 +37,8 @@ from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
-from nbtrack.plots.meshes import Mesh, extract_mesh
-from nbtrack.plots.rerun_file import import_rerun, rerun_bytes
+from nbtrack.plots.meshes import extract_mesh
+from nbtrack.plots.rerun_file import rerun_bytes
 from nbtrack.recordings.check import check_recording, quick_warning
 from nbtrack.recordings.writer import convert_sequence
 from nbtrack.tracking import Trajectory, make_budget
@@ -244,49 +245,29 @@ def _export_map(source: Path, format_name: str, out: Path) -> str:
     return f"{len(mesh.vertices)} coloured vertices of {'what was seen' if is_seen else 'all'}"
 
 
-def _shown(source: Path, n_frames: int) -> tuple[Trajectory, np.ndarray, RgbdSequence, Mesh, str]:
-    """A run, some of its rows and what they saw, and the map's surface there, with a title.
-
-    Its recording and map must still be where they were.
-    """
+def _export_run(source: Path, format_name: str, out: Path) -> str:
+    """A movie of a run or a recording for Rerun; its recording and map must be where they were."""
+    if format_name == "rrd" and importlib.util.find_spec("rerun") is None:
+        raise MissingError("--to rrd needs Rerun: pip install 'nbtrack[rerun]'")
     tracked = read_trajectory(source)
     metrics, last = tracked.metrics, len(tracked.frames) - 1
     stored = read_map(metrics["map"])
     if metrics.get("map_key") != stored.key:
         raise DataError(f"{metrics['map']} is not the map of this run any more: track again")
     field = stored.field
-    rows = np.unique(np.linspace(0, last, n_frames).round().astype(int))
-    seen = _seen(tracked, rows, open_recording(metrics["recording"], metrics["format"]))
+    shown = np.unique(np.linspace(0, last, _MOVIE_FRAMES).round().astype(int))
+    seen = _seen(tracked, shown, open_recording(metrics["recording"], metrics["format"]))
     surface = extract_mesh(field, seen, voxel=_cell_of(field) / 2)
-    return (
-        tracked,
-        rows,
-        seen,
-        surface,
-        f"{metrics['scene']}: {metrics['tracker']} in {field.label}",
-    )
-
-
-def _export_movie(source: Path, format_name: str, out: Path) -> str:
-    tracked, rows, seen, surface, title = _shown(source, _MOVIE_FRAMES)
-    with ProgressBar(f"movie of {seen.name}", len(rows)) as bar:
-        of_run = tracked.frames.iloc[rows], seen.T_world_camera, title
-        pictures = movie_pictures(surface, seen, *of_run, bar.move_to)
-        content = movie_bytes(pictures)
-    return _write_shown(out, content, tracked, rows)
-
-
-def _export_rerun(source: Path, format_name: str, out: Path) -> str:
-    import_rerun()
-    tracked, rows, seen, surface, title = _shown(source, _MOVIE_FRAMES)
-    paths = {"tracked": tracked.T_estimated, "true": tracked.T_true}
-    content = rerun_bytes(surface, seen, tracked.frames, paths, title)
-    return _write_shown(out, content, tracked, rows)
-
-
-def _write_shown(out: Path, content: bytes, tracked: Trajectory, rows: np.ndarray) -> str:
+    title = f"{metrics['scene']}: {metrics['tracker']} in {field.label}"
+    if format_name == "rrd":
+        content = rerun_bytes(surface, seen, tracked, title)
+    else:
+        with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
+            of_run = tracked.frames.iloc[shown], seen.T_world_camera, title
+            pictures = movie_pictures(surface, seen, *of_run, bar.move_to)
+            content = movie_bytes(pictures)
     write_atomic(out, content)
-    return f"{len(rows)} of {len(tracked.frames)} frames, {len(content) / 1e6:.1f} MB"
+    return f"{len(shown)} of {last + 1} frames, {len(content) / 1e6:.1f} MB"
 
 
 def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
@@ -298,8 +279,7 @@ def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
 _EXPORTS = {
     "kitti": _export_trajectory,
     **dict.fromkeys(("ply", "glb"), _export_map),
-    "gif": _export_movie,
-    "rrd": _export_rerun,
+    **dict.fromkeys(("gif", "rrd"), _export_run),
 }
 
 

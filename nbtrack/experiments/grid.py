@@ -20,7 +20,7 @@ import pandas as pd
 import torch
 
 from nbtrack.core.device import choose_device, threads
-from nbtrack.core.errors import ConfigError, MissingError, NbtrackError, check_lists
+from nbtrack.core.errors import MissingError, NbtrackError, check_lists
 from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.interrupts import interrupts_put_off
 from nbtrack.core.progress import ProgressBar, tell
@@ -110,14 +110,14 @@ def track_scenes(
 
     Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), ate_m (NaN
     where it failed, or no true pose is known), failure (why) and the other metrics. Raises
-    ConfigError where an argument is no list or text, and what the first failing job raised.
+    ConfigError where an argument is no list, and what the first failing job raised.
     """
     execution = execution or Execution()
     check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
     rates = [None] if steps else rates_hz or preset.tables.rates_hz
     # By the clock, how far a run comes depends on its threads.
     n_threads = execution.threads or (torch.get_num_threads() if clock else None)
-    how = {"frames": _as_text(frames or preset.scenes.track_frames), "n_threads": n_threads}
+    how = {"frames": str(frames or preset.scenes.track_frames), "n_threads": n_threads}
     pairs, jobs, rows = list(zip(scenes, tracked or scenes, strict=True)), [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
@@ -127,12 +127,6 @@ def track_scenes(
         jobs.append(TrackJob(*what, n_steps, rate_hz if clock else None, seed=seed, **how))
         rows.append({"rate_hz": rate_hz, "steps": n_steps, "method": method.label})
     return pd.DataFrame(map(_row_of, rows, jobs, _run(jobs, clock, execution)))
-
-
-def _as_text(frames: str) -> str:
-    if not isinstance(frames, str):
-        raise ConfigError(f"frames = {frames!r} is no text: write frames='A:B:S', a Python slice")
-    return frames
 
 
 def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:

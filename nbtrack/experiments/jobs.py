@@ -1,6 +1,5 @@
 """Jobs, each named by all that it depends on and made once: maps, and runs tracked in them."""
 
-import contextlib
 import shlex
 from collections import Counter
 from collections.abc import Callable
@@ -274,9 +273,8 @@ class TrackJob(Job):
     @property
     def work(self) -> float:
         """Frames x steps x pixels x samples of a ray; by the clock, its seconds."""
-        n_frames, own = 1, Counter(vars(self.settings))
-        with contextlib.suppress(NbtrackError):  # the run itself will say what is wrong
-            n_frames = self.scene.count(self.frames, needs_poses=False)
+        own = Counter(vars(self.settings))
+        n_frames = len(self.scene.recording.times[parse_frames(self.frames)])
         if self.rate_hz:
             return n_frames / self.rate_hz * _QUERIES_A_SECOND
         a_step = own["n_pixels"] * max(1, own["n_stratified"] + own["n_importance"])
