@@ -399,6 +399,21 @@ def test_what_an_own_class_needs_is_public() -> None:
     assert abs(distance[1] - 0.1) < 0.15
 
 
+def test_a_loss_without_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches torch's words about sparse tensors where a field returns the sum of its terms."""
+
+    class Mine(FIELDS["neus"]):
+        name = "mine"
+
+        def mapping_losses(self, draw, settings, generator):
+            return sum(super().mapping_losses(draw, settings, generator).values())
+
+    monkeypatch.setitem(FIELDS, "mine", Mine)
+    preset = load_preset(settings=[*TINY, "scenes.names=['office']"])
+    with pytest.raises(ConfigError, match="mapping_losses of mine gave no dict"):
+        nbtrack.map_scene(nbtrack.open_scenes(preset)[0], "mine", preset)
+
+
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
