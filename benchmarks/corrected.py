@@ -199,7 +199,7 @@ def ablation(recordings) -> pd.DataFrame:
 def _corrected_now(scene, field, preset):
     """A field corrected by the constants of this moment, which no cache knows; and its seconds."""
     made = MapJob.of(scene, field, preset)
-    run_jobs([made.needs], f"mapping {scene.name}", ALONE)
+    run_jobs([made.needs], ALONE)
     base, sequence, began = made.needs.map(), scene.read(), time.perf_counter()
     return correct_map(base, sequence, made.correction).field, time.perf_counter() - began
 
@@ -264,7 +264,7 @@ def _held_out(scene, preset, seed: int) -> pd.DataFrame:
         made = MapJob.of(scene, method.field, changed, "::2", seed)
         settings = changed.tracking_of(method.tracker)
         job = TrackJob(made, scene, method.tracker, settings, 30, frames="1::2", seed=seed)
-        (found,) = run_jobs([job], f"tracking {scene.name}", ALONE)
+        (found,) = run_jobs([job], ALONE)
         row = {name: found[name] for name in COLUMNS if name in found}
         row |= {"ate_m": found["ate_rmse_m"], "method": method.label}
         row |= {"n_pixels": settings.n_pixels, **_judged(job.folder.name, WRONG_IN_RECORDING_M)}

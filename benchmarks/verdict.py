@@ -76,7 +76,7 @@ def part_of(scene: Scene, field: str, preset: Preset) -> Field:
     """The map of its first frames: a third of a recording, a quarter of a room's path."""
     frames = ":60" if scene.room else ":40"
     job = MapJob.of(scene, field, preset, frames)
-    run_jobs([job], f"mapping a part of {scene.name}")
+    run_jobs([job])
     return job.map().field
 
 

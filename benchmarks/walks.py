@@ -54,7 +54,7 @@ def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
     settings = preset.tracking_of(method.tracker)
     made = MapJob.of(room, method.field, preset, MAPPED)
     job = TrackJob(made, room, method.tracker, settings, steps, frames=frames, n_threads=1)
-    found = run_jobs([job], f"{room.name}, {method.label}", Execution(workers=1))[0]
+    found = run_jobs([job], Execution(workers=1))[0]
     tracked = read_run(job.folder.name).frames
     is_wrong = (tracked["translation_error_m"] > WRONG_M).to_numpy()
     width, _, depth = room.room.parts[0].solid.size

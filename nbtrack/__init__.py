@@ -13,8 +13,9 @@ _MODULES = {
     "experiments.presets": ["claim", "load_preset"],
     "experiments.grid": ["map_scene", "map_scenes", "read_run", "track_scenes"],
     "experiments.scenes": ["open_scene", "open_scenes"],
-    "mapping.files": ["read_map"],
-    "tracking": ["make_tracker"],
+    "fields": ["FIELDS", "Field", "LearnedField"],
+    "mapping.files": ["Map", "read_map", "write_map"],
+    "tracking": ["TRACKERS", "AdamTracker", "Tracker", "make_tracker"],
 }
 _FACE = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = [*_FACE]

@@ -45,6 +45,7 @@ some_seeds = partial(a_count, maximum=1000)
 _STARTS = {"choices": ("given", "unknown"), "default": "given"}
 _BUDGETS = {"choices": ("steps", "clock"), "default": "steps"}
 _SETTINGS = {"action": "append", "default": [], "dest": "settings", "metavar": "KEY=VALUE"}
+_IMPORTS = {"action": "append", "default": [], "dest": "imports", "metavar": "FILE.py"}
 # By name; with ! where it must be given.
 OPTIONS = {
     "sequence": _option("a folder, or the name of a room or dataset scene"),
@@ -62,7 +63,7 @@ OPTIONS = {
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from": _option("track in this map of the room: its folder or file", a_path),
     "--start": _option("given: its own pose, if any (default); unknown: found first", **_STARTS),
-    "--to!": _option("kitti: trajectory; gif: movie; ply, glb: mesh", required=True),
+    "--to!": _option("kitti: trajectory; gif: movie; rrd: Rerun; ply, glb: mesh", required=True),
     "--budget": _option("steps: the paper's counts (default); clock: this machine's", **_BUDGETS),
     "--scenes": _option("only these scenes of the preset's kind", metavar="A,B"),
     "--seeds": _option("so many maps and runs a cell: mean ± std", some_seeds, default=1),
@@ -82,6 +83,7 @@ OPTIONS = {
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
     "--config": _option("TOML file of settings", a_path),
     "--set": _option("one setting, as mapping.neus.iterations=500; may be repeated", **_SETTINGS),
+    "--import": _option("your file or module of fields, trackers, methods first", **_IMPORTS),
 }
 _PRESET = " --preset --config --set"
 _RUN = " --device --threads" + _PRESET
@@ -130,6 +132,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             import torch
 
             torch.set_num_threads(options.threads)
+        experiments = importlib.import_module("nbtrack.experiments")
+        for source in options.imports:
+            experiments.import_own(source)
         module = "bench" if options.command in ("tables", "bench") else "commands"
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)
@@ -187,7 +192,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     for name, (about, options) in COMMANDS.items():
         group, last = actions if name.startswith("data ") else commands, name.split()[-1]
         command = group.add_parser(last, help=about, description=about)
-        for word in options.split():
+        for word in [*options.split(), "--import"]:
             command.add_argument(word.rstrip("!"), **OPTIONS[word])
         command.set_defaults(command=last, parser=command, device=None, threads=None)
     options, unknown = parser.parse_known_args(arguments)

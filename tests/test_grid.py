@@ -13,7 +13,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from glob import glob
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,11 @@ from tiny import tiny_words
 
 from nbtrack.cli import main
 from nbtrack.core.errors import DataError, NbtrackError
+from nbtrack.core.progress import ProgressBar
 from nbtrack.experiments.grid import Execution, run_jobs
-from nbtrack.experiments.jobs import Job, Report
+from nbtrack.experiments.jobs import Job, MapJob, Report, TrackJob
+from nbtrack.experiments.presets import load_preset
+from nbtrack.experiments.scenes import open_scene
 from nbtrack.mapping.files import MAP_FILE, read_map
 from nbtrack.tracking.trajectories import read_tum
 
@@ -88,7 +91,7 @@ def execution(request: pytest.FixtureRequest, address: str) -> dict[str, Any]:
 def test_results_come_in_order(execution: dict, capsys: pytest.CaptureFixture) -> None:
     """Catches results in the order of their completion, twins computed twice, and early noise."""
     jobs = [Square(3), Square(1, needs=Square(4)), Square(3), Square(5, is_done=True)]
-    assert run_jobs(jobs, "squares", Execution(**execution)) == [9, 1, 9, 25]
+    assert run_jobs(jobs, Execution(**execution)) == [9, 1, 9, 25]
     if execution == {"workers": 1}:
         assert capsys.readouterr().err == ""
 
@@ -99,8 +102,8 @@ def test_a_users_mistake_comes_through_and_others_go_on(execution: dict) -> None
     bad = Square(7, "badly")
     jobs = [bad, Square(2, needs=bad), Square(3)]
     with pytest.raises(DataError, match=r"depth7.png is empty"):
-        run_jobs(jobs, "mixed", Execution(**execution))
-    results = run_jobs(jobs, "mixed", Execution(**execution, keep_going=True))
+        run_jobs(jobs, Execution(**execution))
+    results = run_jobs(jobs, Execution(**execution, keep_going=True))
     assert isinstance(results[0], DataError)
     assert str(results[1]) == "not run, because square 7 failed: depth7.png is empty"
     assert results[2] == 9
@@ -109,7 +112,7 @@ def test_a_users_mistake_comes_through_and_others_go_on(execution: dict) -> None
 def test_a_worker_that_dies_is_explained(address: str) -> None:
     """Catches a traceback, or waiting for ever, where the system took a worker away."""
     with pytest.raises(NbtrackError, match="a worker process died at square 7") as caught:
-        run_jobs([Square(7, "deadly"), Square(2)], "dying", Execution(dask=address))
+        run_jobs([Square(7, "deadly"), Square(2)], Execution(dask=address))
     assert "\n" not in str(caught.value)
 
 
@@ -120,9 +123,41 @@ def test_the_bar_moves_within_a_job(monkeypatch: pytest.MonkeyPatch, execution: 
         "nbtrack.core.progress.ProgressBar.move_to",
         lambda bar, done, status="": seen.append((done, status)),
     )
-    run_jobs([Square(1, "slowly"), Square(2, "slowly")], "slow", Execution(**execution))
+    run_jobs([Square(1, "slowly"), Square(2, "slowly")], Execution(**execution))
     assert any(0 < done < 2 and "half" in status for done, status in seen)
     assert max(done for done, _ in seen) == 2
+
+
+def test_the_bar_weighs_jobs_by_their_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches an ETA off by a factor, where a run of LM counts as much as a map, and a bar that
+    says tracking while it maps. By hand: 1,200 iterations of 96 rays with 44 samples; 119 frames of
+    15 steps with 64 pixels of 44 samples."""
+    preset = load_preset("smoke", settings=["scenes.n_frames=120", "scenes.width=16"])
+    scene = open_scene("office", preset)
+    made = MapJob.of(scene, "imap", preset)
+    vr, lm = (TrackJob(made, scene, name, preset.tracking_of(name), 15) for name in ("vr", "lm"))
+    assert 1200 * 96 * 44 < made.work < 1.5 * 1200 * 96 * 44
+    assert vr.work == 120 * 15 * 64 * 44
+    assert lm.work < vr.work / 2
+    clock = [replace(vr, steps=None, rate_hz=rate).work for rate in (2, 10)]
+    assert clock[0] == 5 * clock[1]
+    seen = []
+
+    class Noted(ProgressBar):
+        def set_description_str(self, doing: str, refresh: bool = True) -> None:
+            seen.append(doing)
+
+        def move_to(self, done: float, status: str = "") -> None:
+            seen.append(done / self.total)
+
+    monkeypatch.setattr("nbtrack.experiments.grid.ProgressBar", Noted)
+    small = replace(made, settings=replace(made.settings, iterations=6, n_rays=8))
+    job = replace(vr, needs=small, frames=":3")
+    run_jobs([job], Execution(workers=1))
+    mapped = seen.index("tracking")
+    assert seen[0] == "mapping"
+    assert seen[mapped - 1] == pytest.approx(job.needs.work / (job.needs.work + job.work))
+    assert seen[-1] == pytest.approx(1)
 
 
 def words(folder: Path, *options: str) -> list[str]:

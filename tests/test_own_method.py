@@ -1,28 +1,35 @@
 """Adding a field or a tracker: a short file or cell registers it, and it has rows in the tables."""
 
 import importlib
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
 import cloudpickle
 import nbformat
 import pytest
+import torch
 from nbconvert.preprocessors import ExecutePreprocessor
 from tiny import TINY, tiny_words
 
+import nbtrack
 from nbtrack.cli import main
-from nbtrack.core.errors import ConfigError
-from nbtrack.core.files import foreign_source
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.errors import ConfigError, NbtrackError
+from nbtrack.core.files import foreign_source, runs_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments import presets
 from nbtrack.experiments.methods import METHODS, Method
 from nbtrack.experiments.presets import load_preset
-from nbtrack.fields import FIELDS, field_class
-from nbtrack.tracking import TRACKERS
+from nbtrack.fields import FIELDS, NetworkSettings, NeusMapping, field_class
+from nbtrack.fields.mlp import FourierMlp
+from nbtrack.mapping.files import write_map
+from nbtrack.tracking import TRACKERS, tracker_class
 
 OWN = '''
 """A field whose distances fade, and a tracker that only looks at distances."""
@@ -127,11 +134,80 @@ def test_an_installed_package_joins_by_its_entry_point(tmp_path: Path) -> None:
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: own-method\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[nbtrack]\nmine = own_method\n")
-    command = [sys.executable, "-m", "nbtrack", "methods"]
-    found = subprocess.run(
-        command, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True
-    )
+    found = nbtrack_there(tmp_path, "methods")
     assert "Mine" in found.stdout, found.stderr
+
+
+def nbtrack_there(folder: Path, *words: str) -> subprocess.CompletedProcess:
+    """The command in a process of its own, which starts anew."""
+    command = [sys.executable, "-m", "nbtrack", *words]
+    package = str(Path(__file__).parents[1])
+    environment = os.environ | {"PYTHONPATH": package, "NBTRACK_RUNS": str(folder / "runs")}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+
+
+def test_a_file_joins_by_an_option_of_every_command(tmp_path: Path) -> None:
+    """Catches a user's file that some command, or a worker process, does not know; a map of its
+    field that can be read only where it was made, and a command that does not make a run again."""
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own/my-method.py").write_text("from helper import *\n" + OWN)
+    (tmp_path / "own/helper.py").write_text("")
+    own, far = ["--import", "own/my-method.py"], tmp_path / "own"
+    words = [
+        *tiny_words("tables.rates_hz=[10]", "mapping.fading.iterations=6", "scenes.n_frames=3"),
+        "--set", "mapping.fading.n_rays=8", "--set", "network.neus.width=16",
+    ]  # fmt: skip
+    grid = ["--method", "mine", "--workers", "2", "--scenes", "office,bedroom", "--out", "out"]
+    done = nbtrack_there(tmp_path, "tables", *own, *grid, *words)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out/table_1.csv").read_text().count("Mine,") == 2
+    (made,) = (tmp_path / "runs/maps").glob("office-fading-*")
+    run = ["track", "office", "--map-from", str(made), "--steps", "1", "--out", "run", *words]
+    refused = nbtrack_there(tmp_path, *run)
+    assert refused.returncode == 2
+    assert "'fading', which is not registered" in refused.stderr
+    assert "--import" in refused.stderr
+    assert refused.stderr.count("\n") == 1
+    done = nbtrack_there(tmp_path, *run, "--tracker", "distance", *own)
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert f"--import={far / 'my-method.py'}" in metrics["command"]
+    done = nbtrack_there(
+        far, "export", str(made), "--to", "ply", "room.ply", "--import", "my-method"
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("own.py", None, "No module named 'own'"),
+        ("own.py", "x = 1\n1 / 0\n", "own.py, line 2 (ZeroDivisionError: division by zero)"),
+        ("own.py", "x = (\n", "own.py, line 1"),
+        ("own.py", "import nbtrack_nowhere\n", "line 1 (ModuleNotFoundError: No module named"),
+        ("nbtrack_nowhere", None, "No module named 'nbtrack_nowhere'"),
+        ("json.py", "", "rename"),
+        ("json.py", None, "mend the path"),
+    ],
+)
+def test_a_file_that_cannot_be_imported(
+    name: str, text: str | None, says: str, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture,
+) -> None:  # fmt: skip
+    """Catches a traceback, an error that does not say where the file is wrong, and a file that is
+    passed over in silence for a module of its name."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "own", raising=False)
+    if text is not None:
+        Path(name).write_text(text)
+    assert main(["methods", "--import", name]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    monkeypatch.setenv("NBTRACK_DEBUG", "1")
+    assert main(["methods", "--import", name]) == 2
+    assert "Traceback" in capsys.readouterr().err
 
 
 # What a notebook's cells may hold: constants and helpers, a base class, decorators, settings.
@@ -226,7 +302,7 @@ def test_settings_of_what_is_registered_later(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setitem(TRACKERS, "mine", in_a_cell(CELL))
     once = with_settings(preset, "tracking.mine.n_pixels=7")
     assert once.tracking_of("mine").n_pixels == 7
-    assert once.tracking_of("mine").lambda_sdf == 3.0
+    assert once.tracking_of("mine").lambda_sdf == 1.0  # the user's value is of `sdf` alone
     more = "class Settings(SdfSettings):\n        extra: float = 0.5"
     more = CELL.replace('name = "mine"', f'name = "mine"\n    @dataclass(frozen=True)\n    {more}')
     monkeypatch.setitem(TRACKERS, "mine", in_a_cell("from dataclasses import dataclass\n" + more))
@@ -249,11 +325,113 @@ def test_settings_do_not_depend_on_when_a_class_is_registered(
         assert (settings.n_pixels, settings.motion_model) == (512, "constant_velocity")
 
 
+@pytest.mark.parametrize("when", ["with the package", "before", "after"])
+def test_settings_of_a_field_whenever_it_is_registered(
+    when: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches another map of one field in a file, in a notebook and in an installed package: the
+    defaults of its classes, with what smoke changes in NeuS, and without a user's values of NeuS;
+    and a key of a field that shares a network, whose nearest would change another field."""
+
+    @dataclass(frozen=True)
+    class Network:
+        width: int = 48
+
+    @dataclass(frozen=True)
+    class Settings(NeusMapping):
+        n_surface: int = 5
+
+    kinds = {"name": "mine", "Network": Network, "Settings": Settings}
+    mine = type("Mine", (FIELDS["neus"],), kinds)
+    if when != "after":
+        monkeypatch.setitem(FIELDS, "mine", mine)
+    if when == "with the package":
+        monkeypatch.setitem(presets.PRESETS, "smoke", presets._from_file("smoke"))
+    chosen = ["mapping.neus.iterations=7", "mapping.neus.n_surface=9", "network.neus.width=33"]
+    preset = load_preset("smoke", settings=chosen)
+    monkeypatch.setitem(FIELDS, "mine", mine)
+    settings = preset.mapping_of("mine")
+    assert (settings.iterations, settings.n_rays, settings.n_surface) == (1200, 96, 5)
+    assert preset.network_of("mine").width == 96
+    with pytest.raises(ConfigError, match=r"of 'tanh', but of imap, neus, .*mine") as caught:
+        with_settings(preset, "network.tanh.width=3")
+    assert "did you mean" not in str(caught.value)
+
+
+@pytest.mark.parametrize("registry", [FIELDS, TRACKERS])
+def test_a_class_without_a_name(registry: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a traceback where a class says no name."""
+    monkeypatch.setitem(registry, "mine", type("Mine", (), {}))
+    look_up_class = field_class if registry is FIELDS else tracker_class
+    with pytest.raises(ConfigError, match="'mine' calls itself None"):
+        look_up_class("mine")
+
+
 def test_a_class_is_registered_by_its_own_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a subclass without a name of its own: its map would be read as its base's."""
     monkeypatch.setitem(FIELDS, "tanh", FIELDS["neus"])
     with pytest.raises(ConfigError, match="calls itself 'neus'"):
         field_class("tanh")
+
+
+def test_what_an_own_class_needs_is_public() -> None:
+    """Catches a class of one's own that must look into modules, or set up what only a private
+    function can: a field with another network starts as the distance inside its room."""
+
+    class Mine(FIELDS["neus"]):
+        name = "mine"
+
+        def make_network(self, settings, generator):
+            self.made = FourierMlp(settings, self.bounds, torch.relu, generator)
+            return self.made
+
+    assert issubclass(Mine, nbtrack.LearnedField)
+    assert issubclass(nbtrack.LearnedField, nbtrack.Field)
+    assert issubclass(TRACKERS["sdf"], nbtrack.AdamTracker)
+    assert (nbtrack.FIELDS, nbtrack.TRACKERS) == (FIELDS, TRACKERS)
+    assert nbtrack.write_map is write_map
+    box = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    mine = Mine(NetworkSettings(width=64), box, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        distance = mine(torch.tensor([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]]))[1]
+    assert mine.mlp is mine.made
+    assert distance[0] > 0.3
+    assert abs(distance[1] - 0.1) < 0.15
+
+
+def test_a_loss_without_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches torch's words about sparse tensors where a field returns the sum of its terms."""
+
+    class Mine(FIELDS["neus"]):
+        name = "mine"
+
+        def mapping_losses(self, draw, settings, generator):
+            return sum(super().mapping_losses(draw, settings, generator).values())
+
+    monkeypatch.setitem(FIELDS, "mine", Mine)
+    preset = load_preset(settings=[*TINY, "scenes.names=['office']"])
+    with pytest.raises(ConfigError, match="mapping_losses of mine gave no dict"):
+        nbtrack.map_scene(nbtrack.open_scenes(preset)[0], "mine", preset)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"rates_hz": 10}, "rates_hz = 10 is no list"), ({"seeds": 3}, "seeds = 3 is no list"),
+        ({"methods": "huber"}, "methods = 'huber' is no list"), ({"frames": 30}, "'30' is no"),
+        ({"scenes": "office"}, "scenes = 'office' is no list"),
+        ({"methods": METHODS["sdf"]}, "is no list"),
+    ],
+)  # fmt: skip
+def test_one_thing_in_place_of_several(wrong: dict, says: str) -> None:
+    """Catches a number that cannot be looped over, and letters taken for names of methods."""
+    preset = load_preset(settings=[*TINY, "scenes.names=['office']"])
+    right = {"scenes": nbtrack.open_scenes(preset), "methods": ["sdf"], "preset": preset}
+    with pytest.raises(NbtrackError) as caught:
+        nbtrack.track_scenes(**right | wrong)
+    assert not (runs_folder() / "maps").exists()
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_method_in_a_notebook(tmp_path: Path) -> None:

@@ -206,8 +206,9 @@ def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield from leaves(value, f"{prefix}{name}.") if is_tree else [(f"{prefix}{name}", value)]
 
 
-NO_SETTINGS = ("name", "chosen")
-EVERY_KEY = {k: v for k, v in leaves(as_dict(PRESETS["smoke"])) if k not in NO_SETTINGS}
+NO_SETTINGS = ("name", "chosen", "usual")
+PARTS = {k: v for k, v in as_dict(PRESETS["smoke"]).items() if k not in NO_SETTINGS}
+EVERY_KEY = dict(leaves(PARTS))
 # Of each kind: the least, what casts, sums and casts of sums fail on, what is no value at all.
 TRIED = {
     bool: ["true", "false"],

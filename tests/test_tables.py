@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from nbtrack import tables
-from nbtrack.core.errors import DataError
+from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.data.formats import DATASET_SCENES
 from nbtrack.tables import (
     STANDING_STILL,
@@ -128,7 +128,7 @@ def test_transcription_matches_the_paper() -> None:
 def test_red_and_bold_together() -> None:
     """Catches mark-up where one hides the other, and emphasis lost among labels in bold anyway."""
     styler = style_table_1(published_table_1())
-    assert r"& \color{red} \bfseries 0.215 &" in latex(styler)
+    assert r"& \color{red} \bfseries 0.215\rlap{$^\dagger$} &" in latex(styler)
     assert re.search(r"row1_col2 \{\s*color: red;\s*font-weight: bold;", styler.to_html())
     html = style_table_2(published_table_2()).to_html()
     bold = re.search(r"([^}]*)\{\s*font-weight: bold;", html).group(1)
@@ -176,7 +176,7 @@ def test_marks_and_gaps_by_hand() -> None:
     head, *rows = tabular_rows(text)
     assert head == ["", "", "room b", "room a"]
     # At 10 Hz A and B both print 0.300; at 5 Hz C wins; room_a has one value, so no comparison.
-    both = r"\color{red} \bfseries 0.300"
+    both = r"\color{red} \bfseries 0.300\rlap{$^\dagger$}"
     assert rows == [
         [r"\multirow{3}{*}{$r=\SI{10}{Hz}$}", "A", both, "0.200"],
         ["", "B", both, "--"],
@@ -300,7 +300,29 @@ def test_written_files(tmp_path: Path) -> None:
     assert [path.name for path in paths if "By the clock." in path.read_text()] == ["table_2.tex"]
     _, third = write_table_3(tmp_path / "smoke", ours.assign(n_pixels=512), NOTE)
     assert r"\label{tab:beyond-smoke}" in third.read_text()
-    assert "C, n = 512 &" in third.read_text()
+    assert "C, $n = 512$ &" in third.read_text()
+
+
+def test_millimetres_where_metres_tie(tmp_path: Path) -> None:
+    """Catches rows that tie in metres, marks that follow another unit than the digits, a caption
+    that names the wrong one, a mark that black and white printing loses, and n named twice."""
+    ate_m = [0.00141, 0.00062, 0.2004, 0.20006]
+    cells = pd.DataFrame({"rate_hz": 10, "method": ["ICP, 64", "LM"] * 2, "ate_m": ate_m})
+    cells = cells.assign(scene=["a", "a", "b", "b"], n_pixels=64)
+    styler = style_table_1(tables.naming_points(cells), unit="mm")
+    assert styler.data.loc[10].to_dict("index") == {
+        "ICP, n = 64": {"a": "1.4", "b": "200.4"}, "LM, n = 64": {"a": "0.6", "b": "200.1"},
+    }  # fmt: skip
+    spread = style_table_1(SEEDS, unit="mm")
+    assert spread.data["x"].tolist() == ["200.0 ± 100.0", "1000.0 ± 0.0"]
+    assert r"\pm0.0}$\rlap{$^\dagger$} \\" in latex(spread)
+    _, path = write_table_3(tmp_path, cells, NOTE)
+    _, icp, lm = tabular_rows(text := path.read_text())
+    assert icp[1:] == ["ICP, $n = 64$", "1.4", r"\color{red} 200.4\rlap{$^\dagger$}"]
+    assert lm[2:] == [r"\bfseries 0.6", r"\color{red} \bfseries 200.1\rlap{$^\dagger$}"]
+    assert r"trajectory error in \si{mm} (\textcolor{red}{red}$^\dagger$: above" in text
+    with pytest.raises(ConfigError, match="unknown unit 'cm'"):
+        style_table_1(cells, unit="cm")
 
 
 def test_means_over_rooms() -> None:

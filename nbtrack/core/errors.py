@@ -1,7 +1,7 @@
 """One exception family. A message says what was found, what is allowed and what to do next."""
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
 Entry = TypeVar("Entry")
@@ -38,11 +38,18 @@ def look_up(what: str, name: str, known: Mapping[str, Entry]) -> Entry:
     return known[name]
 
 
+def check_lists(**arguments: object) -> None:
+    """Raises ConfigError for an argument that is one thing, where several are asked for."""
+    for name, value in arguments.items():
+        if isinstance(value, str) or not isinstance(value, Iterable):
+            raise ConfigError(f"{name} = {value!r:.80} is no list: write {name}=[...] around it")
+
+
 def look_up_kind(what: str, name: str, known: Mapping[str, type]) -> type:
     """A class by the name that it calls itself. Raises ConfigError for another, or an unknown."""
     kind = look_up(what, name, known)
-    if kind.name != name:
-        raise ConfigError(f"{what} {name!r} calls itself {kind.name!r}: give the class this name")
+    if (own := getattr(kind, "name", None)) != name:
+        raise ConfigError(f"{what} {name!r} calls itself {own!r}: give the class this name")
     return kind
 
 

@@ -76,6 +76,10 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     config = dataclasses.replace(config)  # a class may take up what was added since it was made
     valid = flat(config)
     for key, value in flat(dict(values)).items():
+        part, name, *_ = f"{key}.".split(".")
+        known = getattr(config, part, None)
+        if isinstance(known, dict) and name not in known:  # the nearest is something else's
+            raise ConfigError(f"{key:.80}: no {part} of {name[:40]!r}, but of {', '.join(known)}")
         look_up("config key", key, valid)
         config = _replaced(config, key.split("."), key, value, {})
     return config

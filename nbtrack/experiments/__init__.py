@@ -2,11 +2,43 @@
 
 Here what goes beyond the paper is registered, and so are installed packages that have an entry
 point of the group `nbtrack`: a module that adds to FIELDS, TRACKERS or METHODS when imported.
+A user's own file joins in the same way by `import_own`, which `--import` of every command calls.
 """
 
+import importlib
+import sys
+import traceback
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import nbtrack.beyond  # registers its fields and trackers
+from nbtrack.core.errors import ConfigError
 
 for plugin in entry_points(group="nbtrack"):
     plugin.load()
+
+IMPORTED: list[str] = []
+"""What `import_own` has imported, for workers, and for the command that makes a run again."""
+
+
+def import_own(source: str) -> None:
+    """Import a user's file, or a module by its name, that adds fields, trackers or methods.
+
+    The file's folder is searched for modules from then on. Raises ConfigError for whatever the
+    import raises, and where another module has the file's name.
+    """
+    file, name = Path(source).resolve(), source
+    if file.suffix == ".py":
+        sys.path.insert(0, str(file.parent))
+        name = file.stem
+    try:
+        module = importlib.import_module(name)
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        is_in_file = not place.filename.startswith("<frozen")
+        where = f" at {place.filename}, line {place.lineno}" * is_in_file
+        reason = f"{type(error).__name__}: {error}"
+        raise ConfigError(f"importing {source} failed{where} ({reason}): mend it") from error
+    if name != source and Path(module.__file__ or "") != file:
+        raise ConfigError(f"module {name} is {module}, not {source}: mend the path, or rename it")
+    IMPORTED.append(source if name == source else str(file))

@@ -56,9 +56,9 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
     name = f"{preset.name}_clock" if clock else preset.name
     folder = options.out or runs_folder() / "tables" / name
     note = f"{camera_motion(preset, results)}; {_note(preset, clock)}"
-    print(f"Table {'III' if options.beyond else 'I'}: ATE (m), {note}")
+    print(f"Table {'III: ATE (mm)' if options.beyond else 'I: ATE (m)'}, {note}")
     if options.beyond:
-        print(tables.style_table_1(tables.naming_points(results)))
+        print(tables.style_table_1(tables.naming_points(results), unit="mm"))
         paths = tables.write_table_3(folder, results, note)
     else:
         print(tables.style_table_1(results))

@@ -1,5 +1,6 @@
 """What each command does; `tables` and `bench` stand in `bench.py`."""
 
+import importlib.util
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 import trimesh
 
 from nbtrack.beyond import PointCloud
-from nbtrack.core.errors import ConfigError, DataError, look_up
+from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import read_setting, with_values
@@ -37,6 +38,7 @@ from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh
+from nbtrack.plots.rerun_file import rerun_bytes
 from nbtrack.recordings.check import check_recording, quick_warning
 from nbtrack.recordings.writer import convert_sequence
 from nbtrack.tracking import Trajectory, make_budget
@@ -122,7 +124,7 @@ def track_command(options: Namespace) -> None:
         if not given:
             _map(job)
         run = replace(run, out=run.folder)  # made anew, whatever the cache holds
-        (metrics,) = run_jobs([run], f"tracking {scene.name}")
+        (metrics,) = run_jobs([run])
         _draw_overview(run)
     print(f"{run.folder}: {method.tracker} in {job.map().field.label}, {budget}")
     _print_numbers(metrics)
@@ -177,7 +179,7 @@ def _map(job: MapJob) -> None:
     has_pose = job.scene.recording.has_pose[parse_frames(job.frames)]
     if not has_pose.all():
         tell(f"nbtrack: {(~has_pose).sum()} of {len(has_pose)} frames have no pose: not mapped")
-    run_jobs([job], f"mapping {job.scene.name}")
+    run_jobs([job])
 
 
 def _print_numbers(results: dict[str, Any]) -> None:
@@ -243,8 +245,10 @@ def _export_map(source: Path, format_name: str, out: Path) -> str:
     return f"{len(mesh.vertices)} coloured vertices of {'what was seen' if is_seen else 'all'}"
 
 
-def _export_movie(source: Path, format_name: str, out: Path) -> str:
-    """A movie of a run, whose recording and map must still be where they were."""
+def _export_run(source: Path, format_name: str, out: Path) -> str:
+    """A movie of a run or a recording for Rerun; its recording and map must be where they were."""
+    if format_name == "rrd" and importlib.util.find_spec("rerun") is None:
+        raise MissingError("--to rrd needs Rerun: pip install 'nbtrack[rerun]'")
     tracked = read_trajectory(source)
     metrics, last = tracked.metrics, len(tracked.frames) - 1
     stored = read_map(metrics["map"])
@@ -255,10 +259,13 @@ def _export_movie(source: Path, format_name: str, out: Path) -> str:
     seen = _seen(tracked, shown, open_recording(metrics["recording"], metrics["format"]))
     surface = extract_mesh(field, seen, voxel=_cell_of(field) / 2)
     title = f"{metrics['scene']}: {metrics['tracker']} in {field.label}"
-    with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
-        of_run = tracked.frames.iloc[shown], seen.T_world_camera, title
-        pictures = movie_pictures(surface, seen, *of_run, bar.move_to)
-        content = movie_bytes(pictures)
+    if format_name == "rrd":
+        content = rerun_bytes(surface, seen, tracked, title)
+    else:
+        with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
+            of_run = tracked.frames.iloc[shown], seen.T_world_camera, title
+            pictures = movie_pictures(surface, seen, *of_run, bar.move_to)
+            content = movie_bytes(pictures)
     write_atomic(out, content)
     return f"{len(shown)} of {last + 1} frames, {len(content) / 1e6:.1f} MB"
 
@@ -272,7 +279,7 @@ def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
 _EXPORTS = {
     "kitti": _export_trajectory,
     **dict.fromkeys(("ply", "glb"), _export_map),
-    "gif": _export_movie,
+    **dict.fromkeys(("gif", "rrd"), _export_run),
 }
 
 

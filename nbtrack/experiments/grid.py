@@ -20,10 +20,11 @@ import pandas as pd
 import torch
 
 from nbtrack.core.device import choose_device, threads
-from nbtrack.core.errors import MissingError, NbtrackError
+from nbtrack.core.errors import MissingError, NbtrackError, check_lists
 from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.interrupts import interrupts_put_off
 from nbtrack.core.progress import ProgressBar, tell
+from nbtrack.experiments import IMPORTED, import_own
 from nbtrack.experiments.jobs import Job, MapJob, TrackJob
 from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.presets import Preset
@@ -67,20 +68,22 @@ class Execution:
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
     """The map of a scene, from the cache or made now."""
     job = MapJob.of(scene, field, preset, seed=seed)
-    run_jobs([job], f"mapping {job.name}")
+    run_jobs([job])
     return job.map()
 
 
 def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -> pd.DataFrame:
     """Scores of the maps of some scenes; those that are not cached are made, side by side.
 
-    A row is a map: field, scene, seed, seconds, and the scores, `SCORES`.
+    A row is a map: field, scene, seed, seconds, and the scores, `SCORES`. Raises ConfigError where
+    scenes or fields are no lists.
     """
+    check_lists(scenes=scenes, fields=fields)
     jobs = [MapJob.of(scene, field, preset) for field, scene in product(fields, scenes)]
     return pd.DataFrame(
         {"field": job.field, "scene": job.scene.name, "seed": job.seed}
         | {"seconds": record["seconds"], **record["quality"]}
-        for job, record in zip(jobs, run_jobs(jobs, "mapping"), strict=True)
+        for job, record in zip(jobs, run_jobs(jobs), strict=True)
     )
 
 
@@ -106,21 +109,22 @@ def track_scenes(
         tracked: other recordings of the same rooms, in the same order, which no map has seen.
 
     Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), ate_m (NaN
-    where it failed, or no true pose is known), failure (why) and the other metrics.
+    where it failed, or no true pose is known), failure (why) and the other metrics. Raises
+    ConfigError where an argument is no list, and what the first failing job raised.
     """
     execution = execution or Execution()
+    check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
     rates = [None] if steps else rates_hz or preset.tables.rates_hz
     # By the clock, how far a run comes depends on its threads.
     n_threads = execution.threads or (torch.get_num_threads() if clock else None)
-    how = {"frames": frames or preset.scenes.track_frames, "n_threads": n_threads}
+    how = {"frames": str(frames or preset.scenes.track_frames), "n_threads": n_threads}
     pairs, jobs, rows = list(zip(scenes, tracked or scenes, strict=True)), [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
         made = MapJob.of(scene, method.field, own, seed=seed)
         what = made, seen, method.tracker, own.tracking_of(method.tracker)
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
-        budget = n_steps, rate_hz if clock else None
-        jobs.append(TrackJob(*what, *budget, seed=seed, **how))
+        jobs.append(TrackJob(*what, n_steps, rate_hz if clock else None, seed=seed, **how))
         rows.append({"rate_hz": rate_hz, "steps": n_steps, "method": method.label})
     return pd.DataFrame(map(_row_of, rows, jobs, _run(jobs, clock, execution)))
 
@@ -133,9 +137,9 @@ def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[An
     for warning in reach_warnings(missing):
         tell(f"nbtrack: warning: {warning}")
     if clock:
-        run_jobs([job.needs for job in missing], "mapping", execution)
+        run_jobs([job.needs for job in missing], execution)
         execution = replace(execution, workers=1, dask=None)
-    return run_jobs(jobs, "by the clock" if clock else "tracking", execution)
+    return run_jobs(jobs, execution)
 
 
 def _row_of(
@@ -155,22 +159,25 @@ def read_run(name: str | Path) -> Trajectory:
     return read_trajectory(Path(name) if Path(name).is_dir() else runs_folder() / "tracks" / name)
 
 
-def run_jobs(jobs: Sequence[Job], title: str, execution: Execution | None = None) -> list[Any]:
+def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[Any]:
     """The results of all jobs, in order; those that are missing, and what they need, are made.
 
     Unless it is to keep going, it raises what the first failing job raised, and drops the others.
     """
     execution, results = execution or Execution(), {}
     missing = {part.folder: part for job in jobs for part in _missing(job)}
-    done = dict.fromkeys(missing, 0.0)  # shares: each job counts as one, however long it takes
+    done = dict.fromkeys(missing, 0.0)  # shares of each job's own work
+    work = {folder: job.work for folder, job in missing.items()}
 
     def show(folder: Path, share: float, status: str) -> None:
         done[folder] = max(share, done[folder])  # news of a worker may come late
         ended = f"{len(results)} of {len(missing)} done"
-        bar.move_to(sum(done.values()), f"{ended}, {missing[folder].name}: {status}")
+        bar.set_description_str(missing[folder].doing, refresh=False)
+        worked = sum(share * work[folder] for folder, share in done.items())
+        bar.move_to(worked, f"{ended}, {missing[folder].name}: {status}")
 
     with (
-        ProgressBar(title, len(missing)) as bar,
+        ProgressBar(Job.doing, sum(work.values())) as bar,
         contextlib.closing(_outcomes(missing, results, show, execution)) as outcomes,
     ):
         for folder, outcome in outcomes:
@@ -223,6 +230,8 @@ def _on_workers(
         client.subscribe_topic(topic, lambda event: show(Path(event[1][0]), *event[1][1:]))
         settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
         settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
+        for source in IMPORTED:
+            client.run(import_own, source)
         how = topic, settings, n_threads, (FIELDS, TRACKERS)
         futures: dict[Path, Any] = {}
         for folder, job in jobs.items():

@@ -1,6 +1,7 @@
 """Jobs, each named by all that it depends on and made once: maps, and runs tracked in them."""
 
 import shlex
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -17,6 +18,7 @@ from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.settings import as_dict, changed_settings
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import parse_frames, select_frames
+from nbtrack.experiments import IMPORTED
 from nbtrack.experiments.output import check_no_recording
 from nbtrack.experiments.presets import PRESETS, SIZES, Preset
 from nbtrack.experiments.quality import score_map
@@ -41,6 +43,9 @@ _OTHER_WORLD = (
 OF_MAPS = ("network.", "mapping.", "correction.")
 """How keys of settings begin that only matter where a map is made."""
 _MAP_SETTINGS = ("network", "settings", "correction")  # in the record of a map
+# For the work of jobs, measured with `smoke` on one core: queries of a network in a second; those
+# in the time of a map's scores, or of its correction; the share of one that asks a grid or points.
+_QUERIES_A_SECOND, _AROUND_MAPS, _NO_NETWORK = 60_000, 1e6, 0.05
 _PLAIN = "synthetic"  # the preset whose settings are the classes' own
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""
@@ -52,6 +57,8 @@ class Job:
     kind: str  # the part of the cache where it is kept
     name: str  # for readers
     key: str  # changes with everything that the result depends on
+    doing: str = "computing"  # what its progress is called
+    work: float = 1.0  # queries of a field, about, for the time that is left
     out: Path | None = None  # where to keep it instead of in the cache
     needs: "Job | None"
     is_done: bool
@@ -99,7 +106,7 @@ class MapJob(Job):
     correction: float = 0.0  # cells (m) in which the fitted map is corrected; 0: it is not
     out: Path | None = None
 
-    kind = "maps"
+    kind, doing = "maps", "mapping"
 
     @classmethod
     def of(
@@ -136,6 +143,13 @@ class MapJob(Job):
         if not (self.folder / MAP_FILE).is_file():
             return False
         return self.out is None or self._stored().record.get("key") == self.key
+
+    @property
+    def work(self) -> float:
+        """Iterations x (rays x samples, and surface points); a correction and scores have none."""
+        own = Counter() if self.correction else Counter(vars(self.settings))
+        a_batch = own["n_rays"] * (own["n_stratified"] + own["n_surface"]) + own["n_surface_points"]
+        return _AROUND_MAPS + own["iterations"] * a_batch
 
     def setting_tree(self) -> dict[str, Any]:
         """Its settings where a preset has them."""
@@ -235,7 +249,7 @@ class TrackJob(Job):
     n_threads: int | None = None  # CPU threads to track with; by default the process's
     start: str = "given"  # the first frame's true pose, where known; or "unknown"
 
-    kind = "tracks"
+    kind, doing = "tracks", "tracking"
 
     @cached_property
     def key(self) -> str:
@@ -255,6 +269,17 @@ class TrackJob(Job):
         elsewhere = "-unmapped" if self.is_elsewhere else ""
         name = f"{self.scene.name}-{self.needs.field}-{self.tracker}{elsewhere}-{budget}"
         return f"{name}-seed{self.seed}" if self.seed else name
+
+    @property
+    def work(self) -> float:
+        """Frames x steps x pixels x samples of a ray; by the clock, its seconds."""
+        own = Counter(vars(self.settings))
+        n_frames = len(self.scene.recording.times[parse_frames(self.frames)])
+        if self.rate_hz:
+            return n_frames / self.rate_hz * _QUERIES_A_SECOND
+        a_step = own["n_pixels"] * max(1, own["n_stratified"] + own["n_importance"])
+        price = _NO_NETWORK if tracker_class(self.tracker).converges else 1.0
+        return n_frames * self.steps * a_step * price
 
     @property
     def is_elsewhere(self) -> bool:
@@ -399,6 +424,7 @@ class TrackJob(Job):
             settings["scenes"] = {name: getattr(made, name) for name in SIZES}
         words = [f"--set={text}" for text in changed_settings(settings, replace(PRESETS[_PLAIN]))]
         words += [f"--{name}={value}" for name, value in options.items() if value is not None]
+        words += [f"--import={source}" for source in IMPORTED]
         words = ["python", "-m", "nbtrack", "track", sequence, *words]
         return shlex.join([*words, "--out", f"again_{self.name}"])
 

@@ -50,20 +50,22 @@ class TablesConfig:
     )
 
 
+# A density gains from finer detail; a distance must start smooth, or ripples satisfy the
+# eikonal term: at 4 rad/m in place of 2.5 it was off by 19 cm in free space, not by 5.
+_NETWORKS = {
+    "imap": NetworkSettings(embedding_sigma=4.0),
+    "neus": NetworkSettings(),
+    "occupancy": NetworkSettings(embedding_sigma=4.0),
+}
+
+
 @dataclass(frozen=True)
 class Preset:
     """Everything that a run depends on, apart from the data and the seed."""
 
     name: str = field(metadata={"is_setting": False})  # no `key=value` reaches it
-    # A density gains from finer detail; a distance must start smooth, or ripples satisfy the
-    # eikonal term: at 4 rad/m in place of 2.5 it was off by 19 cm in free space, not by 5.
-    network: dict[str, Any] = field(
-        default_factory=lambda: {
-            "imap": NetworkSettings(embedding_sigma=4.0),
-            "neus": NetworkSettings(),
-            "occupancy": NetworkSettings(embedding_sigma=4.0),
-        }
-    )
+    # Fields without a `Network` class of their own, as NeuS+, have the network of NeuS.
+    network: dict[str, Any] = field(default_factory=_NETWORKS.copy)
     # Of every field and tracker; of those that are not given, the defaults of their classes.
     mapping: dict[str, Any] = field(default_factory=dict)
     # Cells (m) in which the finished map of a field with a distance is corrected; 0: it is not.
@@ -73,10 +75,15 @@ class Preset:
     tables: TablesConfig = TablesConfig()
     # Dotted keys of the user's own values, which a method does not change.
     chosen: tuple[str, ...] = field(default=(), metadata={"is_setting": False})
+    # Settings of NeuS and of SDF tracking, by part, as the preset has them.
+    usual: dict[str, Any] = field(default_factory=dict, metadata={"is_setting": False})
 
     def __post_init__(self) -> None:
-        """Add settings of what is registered and has none; one without its own takes what was
-        changed in those of NeuS or of SDF tracking."""
+        """Add settings of what is registered and has none.
+
+        They are the defaults of its class, with what the preset changes in those of NeuS or of SDF
+        tracking, whenever it is registered. A user's values change only what they name.
+        """
         learned = {n: kind for n, kind in FIELDS.items() if issubclass(kind, LearnedField)}
         networks = {n: k.Network for n, k in learned.items() if k.Network is not NetworkSettings}
         self._complete("network", networks, "neus")
@@ -87,7 +94,8 @@ class Preset:
 
     def _complete(self, part: str, kinds: dict[str, type], usual: str) -> None:
         known = getattr(self, part)
-        found = {n: _like(known.get(n, known.get(usual)), kind) for n, kind in kinds.items()}
+        other = self.usual.setdefault(part, known.get(usual))
+        found = {n: _like(known.get(n, other), kind) for n, kind in kinds.items()}
         object.__setattr__(self, part, known | found)
 
     @property
@@ -134,9 +142,10 @@ def _like(other: Any, kind: type) -> Any:
 def _from_file(name: str) -> Preset:
     """A preset of this folder; what it does not name follows what it does, whenever registered."""
     said = read_object(Path(__file__).with_name(f"{name}.toml"))
+    network = {n: with_values(k, said["network"].get(n, {})) for n, k in _NETWORKS.items()}
     mapping = {f: with_values(field_class(f).Settings(), v) for f, v in said["mapping"].items()}
     tracking = {t: with_values(tracker_class(t).Settings(), v) for t, v in said["tracking"].items()}
-    return with_values(Preset(name, mapping=mapping, tracking=tracking), said)
+    return with_values(Preset(name, network, mapping, tracking=tracking), said)
 
 
 _SMALL = _from_file("smoke")

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import MissingError
+from nbtrack.core.errors import ConfigError, MissingError
 from nbtrack.core.files import naming_damaged, write_together
 from nbtrack.fields import FIELDS, Field
 
@@ -79,7 +79,8 @@ def read_map(path: Path | str) -> Map:
     """A map from the folder that `map` has written, or from a single file, on the CPU.
 
     A single file comes without a history. Raises MissingError where there is no finished map, and
-    DataError where a file is damaged, of another format version, or no map at all.
+    DataError where a file is damaged, of another format version, or no map at all; ConfigError
+    where its field is not registered.
     """
     path = Path(path)
     file, history = path / MAP_FILE if path.is_dir() else path, path / HISTORY_FILE
@@ -111,7 +112,8 @@ def _read_file(file: Path) -> Map:
     corners = (tuple(map(float, corner)) for corner in header["bounds"])
     bounds = SceneBounds(*corners, header.get("declared_unit"))
     if name not in FIELDS:
-        raise ValueError(f"this nbtrack has no field {name!r}")
+        advice = "import the file of its class first (--import FILE.py)"
+        raise ConfigError(f"{file} is a map of field {name!r}, which is not registered: {advice}")
     kind = FORMS[header["form"]] if header["form"] else FIELDS[name]
     mapped = kind.from_state(tensors, record, bounds)
     return Map(mapped, Intrinsics(**header["camera"]), record)

@@ -12,7 +12,7 @@ import pandas as pd
 import torch
 
 from nbtrack.core.device import advise_on_memory, device_name, suitable_threads
-from nbtrack.core.errors import DataError, NumericalError
+from nbtrack.core.errors import ConfigError, DataError, NumericalError
 from nbtrack.core.files import code_fingerprint, loaded_checkpoint, save_checkpoint, versions
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
@@ -51,7 +51,8 @@ def map_sequence(
 
     A `checkpoint` is written every few seconds and, where it exists, resumed from with the batches
     of an uninterrupted run. Who has written the finished map removes it. Raises DataError where no
-    pixel has a depth, or the checkpoint is of another map; NumericalError; OutOfMemory.
+    pixel has a depth, or the checkpoint is of another map; ConfigError where a field's losses are
+    no dictionary; NumericalError; OutOfMemory.
     """
     recipe = recipe_of(field_name, sequence, network, settings, seed)
     start, device = time.perf_counter(), device or torch.device("cpu")
@@ -138,6 +139,10 @@ class _Fit:
         for iteration in iterations:
             self.optimizer.param_groups[0]["lr"] = learning_rate(self.settings, iteration)
             terms = self.field.mapping_losses(draw, self.settings, self.generator)
+            if not isinstance(terms, dict):
+                raise ConfigError(
+                    f"mapping_losses of {self.field.name} gave no dict: give terms by name"
+                )
             losses = torch.stack(list(terms.values()))
             self.optimizer.zero_grad()
             losses.sum().backward()

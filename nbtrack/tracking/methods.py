@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from nbtrack.core.errors import look_up
+from nbtrack.core.errors import check_lists, look_up
 from nbtrack.tracking import check_pair, paper_steps, tracker_class
 
 
@@ -55,9 +55,11 @@ A method of your own joins by `METHODS["mine"] = Method(...)`."""
 def find_methods(methods: Methods) -> list[Method]:
     """The methods of these names; a `Method` stands for itself.
 
-    Raises ConfigError if a name is unknown, or its field and tracker do not go together.
+    Raises ConfigError if they are no list, a name is unknown, or a field and a tracker do not go
+    together.
     """
     chosen = []
+    check_lists(methods=methods)
     for method in dict.fromkeys(methods):
         chosen.append(look_up("method", method, METHODS) if isinstance(method, str) else method)
         check_pair(chosen[-1].tracker, chosen[-1].field)
