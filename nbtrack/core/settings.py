@@ -78,8 +78,9 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     for key, value in flat(dict(values)).items():
         part, name, *_ = f"{key}.".split(".")
         known = getattr(config, part, None)
-        if isinstance(known, dict) and name not in known:  # the nearest is something else's
-            raise ConfigError(f"{key:.80}: no {part} of {name[:40]!r}, but of {', '.join(known)}")
+        if isinstance(known, dict) and name and name not in known:
+            found = f"unknown config key {key[:80]!r}"  # the nearest one is something else's
+            raise ConfigError(f"{found}: no {part} of {name[:40]!r}, but of {', '.join(known)}")
         look_up("config key", key, valid)
         config = _replaced(config, key.split("."), key, value, {})
     return config
