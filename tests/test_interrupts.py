@@ -15,6 +15,8 @@ IMPORTING = """
 import os, signal, sys
 from nbtrack.cli import main
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+
 class Swallowing:
     def find_spec(self, name, *more):
         try:
