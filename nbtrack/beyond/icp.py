@@ -18,11 +18,12 @@ from nbtrack.tracking.tracker import Tracker, TrackerSettings
 # How far from the map a point may be to have a partner there, m: first wide, to get home from
 # where the motion model errs, then so narrow that what was not mapped pulls no more.
 _MAX_CORRESPONDENCE_DISTANCES = (0.3, 0.1)
-FAR_APART = 0.06  # m, rad; of starts, as LM has it
-_EDGE_JUMP = np.inf
+_FAR_APART = 0.06  # m, rad; starts that differ by less are taken for one, as by LM
+_EDGE_JUMP = np.inf  # points at depth edges are taken too (docs/tried.md)
 _SOURCE_VOXEL = 0.01  # m: points that are closer count once
 _NEIGHBOURS = 20  # points that tell a point's plane
-_MIN_POINTS, _MIN_INLIERS = 20, 0.5  # a number and a share; below, a frame is lost
+_MIN_POINTS = 20  # with fewer a frame keeps its start
+_MIN_INLIERS = 0.5  # share of the points; below, a frame is lost
 # A move of less than the epsilons (rad, m) ends a search.
 _OPTIONS = {"registration_type": "GICP", "num_threads": 1, "max_iterations": 30}
 _OPTIONS |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}
@@ -97,7 +98,7 @@ class IcpTracker(Tracker):
         starts = [T for T in self.T_starts if self._is_near(T)]
         if not starts:
             return float("nan")  # of points so far away the tree finds no partner, in seconds
-        if np.abs(self.T_starts - self.T_starts[0]).max() < FAR_APART:
+        if np.abs(self.T_starts - self.T_starts[0]).max() < _FAR_APART:
             starts = starts[:1]
         wide, narrow = _MAX_CORRESPONDENCE_DISTANCES
         found = max((self._align(T, wide) for T in starts), key=lambda result: result.num_inliers)
