@@ -12,7 +12,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import nbtrack.beyond  # registers its fields and trackers
-from nbtrack.core.errors import ConfigError
+from nbtrack.core.errors import ConfigError, MissingError
 
 for plugin in entry_points(group="nbtrack"):
     plugin.load()
@@ -24,11 +24,16 @@ IMPORTED: list[str] = []
 def import_own(source: str) -> None:
     """Import a user's file, or a module by its name, that adds fields, trackers or methods.
 
-    The file's folder is searched for modules from then on. Raises ConfigError for whatever the
-    import raises, and where another module has the file's name.
+    The file's folder is searched for modules from then on. Raises MissingError where there is no
+    such file, and ConfigError for whatever the import raises, and where another module has the
+    file's name.
     """
     file, name = Path(source).resolve(), source
     if file.suffix == ".py":
+        if not file.is_file():
+            raise MissingError(
+                f"no file {source} to import: give a Python file, or a module's name"
+            )
         sys.path.insert(0, str(file.parent))
         name = file.stem
     try:
