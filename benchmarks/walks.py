@@ -21,9 +21,10 @@ from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.grid import Execution, run_jobs
-from nbtrack.experiments.jobs import MapJob, TrackJob
+from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.scenes import Scene
+from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.tables import write_csv
 
 PRESET = load_preset(

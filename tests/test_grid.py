@@ -31,9 +31,11 @@ from nbtrack.cli import main
 from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.progress import ProgressBar
 from nbtrack.experiments.grid import Execution, run_jobs
-from nbtrack.experiments.jobs import Job, MapJob, Report, TrackJob
+from nbtrack.experiments.jobs import Job, Report
+from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import open_scene
+from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.mapping.files import MAP_FILE, read_map
 from nbtrack.tracking.trajectories import read_tum
 

@@ -23,12 +23,13 @@ from tiny import tiny_words
 from nbtrack.cli import main
 from nbtrack.core import files
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments import jobs
+from nbtrack.experiments import map_jobs
 from nbtrack.experiments.grid import Execution, track_scenes
-from nbtrack.experiments.jobs import MapJob, TrackJob
+from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.output import LOCK_FILE
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
+from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.synthetic import make, room
 from nbtrack.tracking.trajectories import read_tum
 
@@ -37,8 +38,8 @@ PROJECT = Path(__file__).parents[1]
 
 def test_a_map_is_read_once(work: Path) -> None:
     """Catches a command that reads its map again and again: a corrected one takes seconds."""
-    jobs._read.cache_clear()
-    with mock.patch.object(jobs, "read_map", wraps=jobs.read_map) as read:
+    map_jobs._read.cache_clear()
+    with mock.patch.object(map_jobs, "read_map", wraps=map_jobs.read_map) as read:
         assert main([*OWN, "--seed", "0"]) == 0
     assert read.call_count == 1
 

@@ -7,10 +7,11 @@ import pytest
 
 from nbtrack.core import files
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments import jobs
-from nbtrack.experiments.jobs import MapJob, TrackJob
+from nbtrack.experiments import map_jobs, track_jobs
+from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.scenes import Scene
+from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.synthetic import make_room
 
 
@@ -81,10 +82,11 @@ def test_keys_hold_all_that_makes_a_result(tmp_path: Path, monkeypatch: pytest.M
     before = keys()
     assert keys() == before
     assert keys(with_settings(preset, "network.neus.width=7"))[2] == before[2]
-    changed = {"make_field": 0, "make_tracker": 1, "_scores": 1}
-    for name, place in changed.items():
+    of_map, of_run = (map_jobs, 0), (track_jobs, 1)
+    changed = {"make_field": of_map, "make_tracker": of_run, "_scores": of_run}
+    for name, (module, place) in changed.items():
         with monkeypatch.context() as patch:
-            patch.setattr(jobs, name, _other)
+            patch.setattr(module, name, _other)
             assert keys()[place] != before[place], name
     monkeypatch.setattr(files, "versions", lambda: {"torch": "another"})
     assert all(a != b for a, b in zip(keys(), before, strict=True))

@@ -26,7 +26,7 @@ from nbtrack.core.files import runs_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.bench import default_pixels, measure_steps
 from nbtrack.experiments.grid import Execution, map_scene, map_scenes, read_run, track_scenes
-from nbtrack.experiments.jobs import MapJob
+from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, Method
 from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scenes
@@ -79,8 +79,8 @@ def test_table_1_is_complete_cached_and_repeatable(
     assert run.T_estimated.shape == run.T_true.shape == (4, 4, 4)
     assert len(run.frames) == 4
     with monkeypatch.context() as patch:
-        for name in ("map_sequence", "track_sequence"):
-            patch.delattr(f"nbtrack.experiments.jobs.{name}")
+        for made in ("map_jobs.map_sequence", "track_jobs.track_sequence"):
+            patch.delattr(f"nbtrack.experiments.{made}")
         again = track_scenes(open_scenes(preset), TABLE_1, preset)
     pd.testing.assert_frame_equal(again, cells)
     monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path))

@@ -23,7 +23,7 @@ from nbtrack.data.sequence import (
     without_outliers,
 )
 from nbtrack.experiments.grid import run_jobs
-from nbtrack.experiments.jobs import OF_MAPS, GivenMap, MapJob, TrackJob
+from nbtrack.experiments.map_jobs import OF_MAPS, GivenMap, MapJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
 from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.output import (
@@ -35,6 +35,7 @@ from nbtrack.experiments.output import (
 )
 from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
+from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh

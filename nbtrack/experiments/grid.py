@@ -25,10 +25,12 @@ from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.interrupts import interrupts_put_off
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.experiments import IMPORTED, import_own
-from nbtrack.experiments.jobs import Job, MapJob, TrackJob
+from nbtrack.experiments.jobs import Job
+from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
+from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.fields import FIELDS
 from nbtrack.mapping.files import Map
 from nbtrack.tracking import TRACKERS

@@ -8,8 +8,9 @@ import numpy as np
 
 from nbtrack.core.errors import NbtrackError
 from nbtrack.data.sequence import observed_bounds, parse_frames, read_frames, select_frames
-from nbtrack.experiments.jobs import GivenMap, MapJob, TrackJob
+from nbtrack.experiments.map_jobs import GivenMap, MapJob
 from nbtrack.experiments.scenes import Scene
+from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.tracking.reach import reach_metrics
 
 _FRAMES_LOOKED_AT = 20  # that tell a map's unit before there is a map

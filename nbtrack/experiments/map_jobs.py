@@ -1,0 +1,164 @@
+"""Maps as jobs: made from a scene, or given."""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+from nbtrack.beyond.correct import correct_map
+from nbtrack.core import files
+from nbtrack.core.device import choose_device
+from nbtrack.experiments.jobs import Job, Report
+from nbtrack.experiments.presets import PRESETS, Preset
+from nbtrack.experiments.quality import score_map
+from nbtrack.experiments.scenes import Scene
+from nbtrack.fields import field_class, make_field
+from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
+from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
+
+OF_MAPS = ("network.", "mapping.", "correction.")
+"""How keys of settings begin that only matter where a map is made."""
+PLAIN_PRESET = "synthetic"
+"""The preset whose settings are the classes' own."""
+_AROUND_MAPS = 1e6  # queries of a network in the time of a map's scores, or of its correction
+
+
+@dataclass(frozen=True)
+class MapJob(Job):
+    """One map: a field fitted to some frames of a scene, and perhaps corrected by them."""
+
+    scene: Scene
+    field: str
+    network: Any  # settings of the field's network; None where it has none
+    settings: Any  # of the mapping
+    frames: str = ":"
+    seed: int = 0
+    correction: float = 0.0  # cells (m) in which the fitted map is corrected; 0: it is not
+    out: Path | None = None
+
+    kind, doing = "maps", "mapping"
+
+    @classmethod
+    def of(
+        cls, scene: Scene, field: str, preset: Preset, frames: str = ":", seed: int = 0
+    ) -> "MapJob":
+        """The map of a scene with the settings of a preset."""
+        settings = preset.network_of(field), preset.mapping_of(field)
+        return cls(scene, field, *settings, frames, seed, preset.correction.get(field, 0.0))
+
+    @cached_property
+    def key(self) -> str:
+        """A digest of code, device, data, settings and seed."""
+        correction = ["nbtrack.beyond.correct"] if self.correction else []
+        code = field_class(self.field), "nbtrack.mapping.fit", make_field, type(self).compute
+        settings = self.field, self.network, self.settings, self.correction
+        what = self.scene.fingerprint, self.frames, self.seed
+        how = files.code_fingerprint(*code, *correction), files.versions(), choose_device().type
+        return files.fingerprint(*how, *settings, *what)
+
+    @property
+    def name(self) -> str:
+        """Scene and field, and the seed if it is not the first."""
+        name = f"{self.scene.name}-{self.field}{'-corrected' if self.correction else ''}"
+        return f"{name}-seed{self.seed}" if self.seed else name
+
+    @cached_property
+    def needs(self) -> "MapJob | None":
+        """The map that this one corrects, if it is a corrected one."""
+        return replace(self, correction=0.0, out=None) if self.correction else None
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the map is finished and scored; in a folder of the user's, whether it is this."""
+        if not (self.folder / MAP_FILE).is_file():
+            return False
+        return self.out is None or self._stored().record.get("key") == self.key
+
+    @property
+    def work(self) -> float:
+        """Iterations x (rays x samples, and surface points); a correction and scores have none."""
+        own = Counter() if self.correction else Counter(vars(self.settings))
+        a_batch = own["n_rays"] * (own["n_stratified"] + own["n_surface"]) + own["n_surface_points"]
+        return _AROUND_MAPS + own["iterations"] * a_batch
+
+    def setting_tree(self) -> dict[str, Any]:
+        """Its settings where a preset has them."""
+        network = self.field if self.field in replace(PRESETS[PLAIN_PRESET]).network else "neus"
+        return {
+            "network": {network: self.network} if self.network else {},
+            "mapping": {self.field: self.settings},
+            "correction": {self.field: self.correction} if self.correction else {},
+        }
+
+    def result(self) -> dict[str, Any]:
+        """How the finished map was made, and its scores."""
+        return self._stored().record
+
+    def map(self) -> Map:
+        """The finished map, ready for tracking."""
+        finished = self._stored()
+        return replace(finished, field=finished.field.to(choose_device()))
+
+    def _stored(self) -> Map:
+        return _read(self.folder, (self.folder / MAP_FILE).stat().st_mtime_ns)
+
+    def compute(self, report: Report) -> dict[str, Any]:
+        """Map and score, or resume; write the map's files."""
+        path, checkpoint = self.folder / MAP_FILE, self.folder / CHECKPOINT_FILE
+
+        def tell(share: float, losses: dict[str, float | int]) -> None:
+            report(share, " ".join(f"{name} {loss:.3f}" for name, loss in losses.items()))
+
+        sequence = self.scene.read(self.frames)
+        parts = self.field, sequence, self.network, self.settings, self.seed
+        if path.is_file():  # a folder of the user's, with another finished map
+            recipe = recipe_of(*parts) | {"correction": self.correction}
+            check_recipe(path, self._stored().record, recipe)
+        if self.needs:
+            finished = correct_map(self.needs.map(), sequence, self.correction)
+        else:
+            finished = map_sequence(*parts, choose_device(), checkpoint, tell)
+        record = {"quality": score_map(finished, sequence, self.scene.room)}
+        record |= {"frames": self.frames, "key": self.key, "correction": self.correction}
+        finished = replace(finished, record=finished.record | record)
+        write_map(path, finished)
+        checkpoint.unlink(missing_ok=True)
+        return finished.record
+
+
+@dataclass(frozen=True, eq=False)
+class GivenMap(Job):
+    """A map that was made before, and is only read."""
+
+    finished: Map
+    out: Path  # its folder, or its file
+
+    needs = None
+    is_done = True
+
+    @cached_property
+    def key(self) -> str:
+        """A digest of the map, its field's code and the device."""
+        code = files.code_fingerprint(type(self.finished.field))
+        return files.fingerprint(self.finished.key, code, choose_device().type)
+
+    @property
+    def field(self) -> str:
+        """The name of its field."""
+        return self.finished.field.name
+
+    @property
+    def correction(self) -> float:
+        """Cells (m) in which it was corrected; 0: it was not."""
+        return self.finished.record.get("correction", 0.0)
+
+    def map(self) -> Map:
+        """The map, ready for tracking."""
+        return replace(self.finished, field=self.finished.field.to(choose_device()))
+
+
+@lru_cache(maxsize=4)
+def _read(folder: Path, modified_ns: int) -> Map:
+    """Read once for all runs in a map: a corrected one samples its network, which takes seconds."""
+    return read_map(folder)
