@@ -46,7 +46,6 @@ _STARTS = {"choices": ("given", "unknown"), "default": "given"}
 _BUDGETS = {"choices": ("steps", "clock"), "default": "steps"}
 _SETTINGS = {"action": "append", "default": [], "dest": "settings", "metavar": "KEY=VALUE"}
 _IMPORTS = {"action": "append", "default": [], "dest": "imports", "metavar": "FILE.py"}
-# By name; with ! where it must be given.
 OPTIONS = {
     "sequence": _option("a folder, or the name of a room or dataset scene"),
     "folder": _option("a recording", a_path),
@@ -63,7 +62,7 @@ OPTIONS = {
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from": _option("track in this map of the room: its folder or file", a_path),
     "--start": _option("given: its own pose, if any (default); unknown: found first", **_STARTS),
-    "--to!": _option("kitti: trajectory; gif: movie; rrd: Rerun; ply, glb: mesh", required=True),
+    "--to": _option("kitti: trajectory; gif: movie; rrd: Rerun; ply, glb: mesh", required=True),
     "--budget": _option("steps: the paper's counts (default); clock: this machine's", **_BUDGETS),
     "--scenes": _option("only these scenes of the preset's kind", metavar="A,B"),
     "--seeds": _option("so many maps and runs a cell: mean ± std", some_seeds, default=1),
@@ -77,7 +76,6 @@ OPTIONS = {
     "--poses": _option("pose file (default: the format's)", metavar="FILE"),
     "--seed": _option("of all random numbers (default: 0)", partial(a_count, minimum=0), default=0),
     "--out": _option("where to write (default: in runs/)", a_path),
-    "--out!": _option("where to write", a_path, required=True),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
     "--threads": _option("CPU threads (default: all cores)", some_threads),
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
@@ -97,9 +95,9 @@ COMMANDS = {
     "map": ("fit a field to a sequence with known poses", "sequence" + _MADE),
     "track": ("track a camera; maps first where no map fits", "sequence" + _MADE + _TRACKED),
     "methods": ("list what --method takes", ""),
-    "export": ("a run's trajectory or a map elsewhere", "source out --to!"),
+    "export": ("a run's trajectory or a map elsewhere", "source out --to"),
     "tables": ("the paper's tables, and one beyond, CSV and LaTeX", _CELLS + _RUN),
-    "data make": ("write a synthetic room", "room --out! --motion --n-frames --width --seed"),
+    "data make": ("write a synthetic room", "room --out --motion --n-frames --width --seed"),
     "data check": ("what is wrong with a recording", "folder --out" + _PARTS),
     "data convert": ("write a recording as the dataset is", "folder out --frames" + _PARTS),
     "bench": ("Table II on this machine, full-size networks", "--out" + _RUN),
@@ -190,14 +188,16 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     data = commands.add_parser("data", help="make rooms; check or convert a recording")
     actions = data.add_subparsers(required=True, metavar="ACTION")
     for name, (about, options) in COMMANDS.items():
-        group, last = actions if name.startswith("data ") else commands, name.split()[-1]
+        group = actions if name.startswith("data ") else commands
+        last = name.split()[-1]
         command = group.add_parser(last, help=about, description=about)
         for word in [*options.split(), "--import"]:
-            command.add_argument(word.rstrip("!"), **OPTIONS[word])
+            command.add_argument(word, **OPTIONS[word])
         command.set_defaults(command=last, parser=command, device=None, threads=None)
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
-        name, known = unknown[0].partition("=")[0], [*options.parser._option_string_actions]
+        name = unknown[0].partition("=")[0]
+        known = [*options.parser._option_string_actions]
         advice = nearest_name(name, [option for option in known if option[:2] == "--"])
         options.parser.error(f"unknown argument {unknown[0]!r}: {advice}")
     return options

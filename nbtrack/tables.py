@@ -25,10 +25,13 @@ PAPER_PIXELS = {"VR": 512, "SDF": 4096}
 """The n that the paper's Table II prints in bold: the one used for Table I."""
 STANDING_STILL = "standing still"
 """The row of a camera that stays at its first pose, the dullest alternative to any tracker."""
-_CELL_1, _CELL_2 = ["rate_hz", "method", "scene"], ["tracker", "n_pixels", "budget_ms"]
+_CELL_1 = ["rate_hz", "method", "scene"]
+_CELL_2 = ["tracker", "n_pixels", "budget_ms"]
 _MISSING = "–"
 _MANY_COLUMNS = 6
-_RED, _BOLD, _PLAIN = "color: red;", "font-weight: bold;", "font-weight: normal;"
+_RED = "color: red;"
+_BOLD = "font-weight: bold;"
+_PLAIN = "font-weight: normal;"
 # What the marks mean, for the caption: they stand in the cells too, because pages that do not trust
 # a notebook drop its style sheets.
 _LEGEND = f"bold: best at this rate; † and red: above {LOST_THRESHOLD_M:g} m"
@@ -248,7 +251,9 @@ def latex_file(styler: TableStyler, path: Path, note: str) -> str:
     The file's name, `table_1`, `table_2` or `table_3`, chooses the caption; its folder's name goes
     into the label; a plain note tells how the numbers came about.
     """
-    table, kind, note = styler.data, _KINDS[path.stem], " ".join(note.split())
+    table = styler.data
+    kind = _KINDS[path.stem]
+    note = " ".join(note.split())
     caption = _CAPTIONS[kind].replace(r"\si{m}", rf"\si{{{styler.unit}}}")
     has_steps = "n_pixels" in table.index.names
     has_std = table.map(lambda text: "±" in text).any(axis=None)
@@ -328,7 +333,8 @@ def write_tables(
 
 def write_table_1(folder: Path, results: pd.DataFrame, note: str) -> list[Path]:
     """Writes Table I alone as CSV, LaTeX, and beside the paper's; see `write_tables`."""
-    cells, compared = average_over_seeds(results), beside_published(results)
+    cells = average_over_seeds(results)
+    compared = beside_published(results)
     return _write_table(folder / "table_1", cells, style_table_1(results), note, compared)
 
 

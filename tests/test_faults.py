@@ -231,6 +231,7 @@ ARGUMENTS = {
     "unknown format": (["export", "map", "--to", "gltf", "x"], "did you mean 'glb'"),
     "no format": (["export", "map", "x"], "--to"),
     "no output": (["export", "map", "--to", "glb"], "out"),
+    "no folder to make": (["data", "make", "office"], "--out"),
     "empty output": (["export", "map", "--to", "glb", ""], "the path is empty"),
     "onto itself": (["export", "room", "--to", "ply", "room"], "room exists: choose another"),
     "a method and a field": ([*OWN, "--method", "sdf"], "leave --field and --tracker out"),

@@ -342,3 +342,9 @@ def test_claims_of_results(capsys: pytest.CaptureFixture) -> None:
             claim(preset, False, "it is sharp")
     with pytest.raises(AssertionError, match="it is sharp"):
         claim(load_preset(), False, "it is sharp")
+    own = ["scenes.motion=handheld", "mapping.imap.iterations=600"]  # of the notebook itself
+    with pytest.raises(AssertionError, match="it is sharp"):
+        claim(load_preset(settings=own), False, "it is sharp", own)
+    other = load_preset(settings=[*own, "mapping.imap.iterations=300"])
+    with pytest.warns(UserWarning, match="it is sharp"):
+        claim(other, False, "it is sharp", own)

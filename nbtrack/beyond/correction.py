@@ -77,7 +77,8 @@ class CorrectedField(BakedField):
     """
 
     form = "corrected"
-    inlier_distance, min_inliers = 0.025, 0.8
+    inlier_distance = 0.025
+    min_inliers = 0.8
 
     def __init__(self, source: Field, voxel: float) -> None:
         """Sample a field as `BakedField` does; `add` then corrects it."""
@@ -265,7 +266,8 @@ def _solve(
     """
     solution = np.zeros((len(slots), equations[2].shape[1]))
     for _ in range(rounds):
-        matrix, vectors = stiffness.copy(), np.zeros_like(solution)
+        matrix = stiffness.copy()
+        vectors = np.zeros_like(solution)
         _add_equations(*equations, huber, solution, slots, matrix.data, vectors)
         scaling = sparse.dia_array((1 / matrix.diagonal()[None], 0), shape=matrix.shape)
         for column, vector in enumerate(vectors.T):
@@ -292,7 +294,8 @@ def _add_equations(
             largest = max(largest, abs(residual))
         weight = reliability[equation] * huber / largest
         for corner in range(8):
-            row, weighted = columns[equation, corner], weight * weights[equation, corner]
+            row = columns[equation, corner]
+            weighted = weight * weights[equation, corner]
             for other in range(8):
                 slot = slots[row, _TO_CORNER[corner, other]]
                 matrix_data[slot] += weighted * weights[equation, other]

@@ -39,9 +39,11 @@ class BakedField(Field):
         or the grid would exceed 0.5 GB.
         """
         super().__init__(source.bounds)
-        self.label, self.is_distance = f"{source.label} baked", source.is_distance
+        self.label = f"{source.label} baked"
+        self.is_distance = source.is_distance
         self.surface_level = float(source.surface_level)
-        self.voxel, self.n_vertices = float(voxel), _checked_size(source, voxel)
+        self.voxel = float(voxel)
+        self.n_vertices = _checked_size(source, voxel)
         # The first vertex lies one cell below the bounds; they are listed with z fastest.
         low = torch.tensor([x - voxel for x in self.bounds.minimum]).to(source.device)
         axes = (torch.arange(n, dtype=torch.int32, device=low.device) for n in self.n_vertices)

@@ -81,7 +81,8 @@ class IcpTracker(Tracker):
         self.T_starts = T_starts.double().numpy()
         self.T_world_camera = T_starts[0]
         self.source = None
-        self.is_converged, self.inlier_ratio = False, 0.0
+        self.is_converged = False
+        self.inlier_ratio = 0.0
         points = draw_points(frame, self.settings.n_pixels, self.generator, _EDGE_JUMP)[0]
         if len(points):
             thinned = self.small_gicp.voxelgrid_sampling(points, _SOURCE_VOXEL)

@@ -48,19 +48,26 @@ from nbtrack.beyond.observed import Observed, compiled
 from nbtrack.core.arrays import Pose
 from nbtrack.fields.base import intensity_of
 
-G_MIN, G_MAX, G_SCALE = 0.3, 2.0, 0.5
+G_MIN = 0.3
+G_MAX = 2.0
+G_SCALE = 0.5
 MARGIN = 0.3  # m beyond a field's bounds, where walls lie if the pose is off
 # So weak that it decides only where the frame says nothing, as along a corridor: one point's worth
 # at a twist of 0.5 rad or 0.5 m (our choice).
 PRIOR_WEIGHT = 1 / 0.5**2
 # A point fits if it lies as near to the surface as the field says, and is so like it in luma.
 _INLIER_INTENSITY = 0.25
-_FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e-9, 1e3
-_DAMPING_UP, _DAMPING_DOWN = 10.0, 0.2
-_MIN_RATIO, _MAX_RATIO = 0.5, 0.9  # of two steps' lengths: creeping; the limit is tried up to
+_FIRST_DAMPING = 1e-4
+_MIN_DAMPING = 1e-9
+_MAX_DAMPING = 1e3
+_DAMPING_UP = 10.0
+_DAMPING_DOWN = 0.2
+_MIN_RATIO = 0.5  # of two steps' lengths, from which on they creep
+_MAX_RATIO = 0.9  # of theirs, up to which the limit of the series is tried
 # The coarse stage may lead away from a good start: the better of both goes on, at these scales.
 NEAR_SCALES = np.array([0.02, 0.05])
-_ONE, _ZERO = np.float32(1), np.float32(0)
+_ONE = np.float32(1)
+_ZERO = np.float32(0)
 
 
 class Stage(NamedTuple):
@@ -73,7 +80,8 @@ class Stage(NamedTuple):
 
 # From afar distances say where the camera is; intensities mislead: their basin is as wide as the
 # texture. 3 medians are two standard deviations, were residuals normal.
-COARSE, FINE = Stage(False, 10.0, 1e-2), Stage(True, 3.0, 3e-4)
+COARSE = Stage(False, 10.0, 1e-2)
+FINE = Stage(True, 3.0, 3e-4)
 _SIGMAS = 0.6745 * FINE.mad_factor
 
 
@@ -85,7 +93,8 @@ class Grid:
         low, high = np.array(field.bounds.minimum), np.array(field.bounds.maximum)
         usable = low - MARGIN, high + MARGIN
         place = np.concatenate([field.low.double().numpy(), [field.voxel], *usable])
-        intensity, (value, confidence) = intensity_of(field.volume[:3].T), field.volume[3:]
+        intensity = intensity_of(field.volume[:3].T)
+        value, confidence = field.volume[3:]
         vertices = torch.stack([value, intensity, confidence], dim=-1).numpy()
         # Vertices as (distance, intensity, confidence), their numbers along x, y and z, and their
         # place: the first vertex, the voxel, and both corners of the box whose points are usable.
@@ -107,7 +116,9 @@ class Descent:
         self, grid: Grid, some: Observed, all: Observed, lambda_intensity: float, T_start: Pose
     ) -> None:
         """Begin with some points, for the coarse stage, and all, for the fine one."""
-        self.grid, self.points, self.lambda_intensity = grid, (some, all), lambda_intensity
+        self.grid = grid
+        self.points = some, all
+        self.lambda_intensity = lambda_intensity
         self.T_start = self.T_world_camera = T_start
         self.last_step = np.inf  # rad or m, whichever is more
         self._begin(COARSE)
@@ -179,16 +190,20 @@ class Descent:
         }
 
     def _begin(self, stage: Stage) -> None:
-        self.stage, self.damping, self.is_ended = stage, _FIRST_DAMPING, False
+        self.stage = stage
+        self.damping = _FIRST_DAMPING
+        self.is_ended = False
         self.twist = np.zeros(6)  # of the step before
         self.weight = self.lambda_intensity if stage.is_fine else 0.0
-        observed, T = self.points[stage.is_fine], self.T_world_camera
+        observed = self.points[stage.is_fine]
+        T = self.T_world_camera
         self.terms = residual_terms(observed, T, self.grid.arrays, stage.is_fine)
         self.scales = np.full(2, np.inf)
         self._narrow()
 
     def _narrow(self) -> None:
-        residual_sigma, factor = self.grid.residual_sigma, self.stage.mad_factor
+        residual_sigma = self.grid.residual_sigma
+        factor = self.stage.mad_factor
         self.scales = scales_of(self.terms, self.scales, residual_sigma, factor)
 
 

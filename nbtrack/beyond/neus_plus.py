@@ -18,9 +18,9 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Draw, Losses, measured_mean, rendered_losses
 from nbtrack.fields.neus import NeuSField, NeusMapping, guided_depths
 
-# Distances are kept at corners so far apart (m), unless there would be more of them a side, and
-# measured from the mean points of cells half as wide, of three or more: single ones are noise.
-_MIN_VOXEL, _MAX_CELLS_A_SIDE, _MIN_POINTS = 0.05, 128, 3
+_MIN_VOXEL = 0.05  # m between the corners at which distances are kept
+_MAX_CELLS_A_SIDE = 128  # larger scenes have larger voxels
+_MIN_POINTS = 3  # of a cell whose mean counts as a point of the surface: single ones are noise
 _POINTS_PER_FRAME = 10_000  # about, on a regular grid of its pixels
 # How much the distances to a tangent plane and to the nearest point may differ for the plane to be
 # believed (m): by half a point voxel, and the cells' rounding of distances near the surface.
@@ -97,9 +97,12 @@ def distance_targets(
     """
     behind = (rays.depth[:, None] - depths).neg()
     cosine = (rays.normals_world * rays.directions_world).sum(dim=-1).abs()[:, None]
-    plane, has_depth, has_plane = -behind * cosine, rays.depth[:, None] > 0, cosine > 0
+    plane = -behind * cosine
+    has_depth = rays.depth[:, None] > 0
+    has_plane = cosine > 0
     is_plane_nearest = has_plane & ((plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
-    in_front, just_behind = behind < 0, (behind >= 0) & (plane > -settings.behind_band)
+    in_front = behind < 0
+    just_behind = (behind >= 0) & (plane > -settings.behind_band)
     target = torch.where(is_plane_nearest, plane, nearest)
     in_front &= is_plane_nearest | (-behind > settings.surface_band)
     known = has_depth & (in_front | (just_behind & is_plane_nearest & ~is_free))
@@ -135,7 +138,8 @@ class ObservedDistance:
         corners = torch.from_numpy(corners.reshape(-1, 3)).float()
         is_free = min_depth_behind(corners, sequence, frames) < -_FREE_IN_FRONT
         values = torch.from_numpy(distance).float(), is_free.view(distance.shape).float()
-        self.values, self.low = torch.stack(values).to(device), corners[0].to(device)
+        self.values = torch.stack(values).to(device)
+        self.low = corners[0].to(device)
 
     def __call__(self, points_world: Float[Tensor, "rays samples 3"]) -> tuple[RaySamples, Flags]:
         """Distance (m) and whether it is free at points (m); outside those of the border."""

@@ -11,12 +11,12 @@ from nbtrack.data.frame import MILLIMETRE, Frame
 from nbtrack.data.pixels import PLANE_JUMP, PLANE_REACH
 from nbtrack.fields.base import LUMA
 
-# Points to track: a neighbouring depth that differs by more, as a share, marks an edge. So many
-# pixels are looked at for every point that is wanted.
-_EDGE_JUMP, _DRAWN_PER_POINT = 0.05, 4
+_EDGE_JUMP = 0.05  # a neighbouring depth that differs by a larger share marks an edge
+_DRAWN_PER_POINT = 4  # pixels that are looked at for every point that is wanted
 # Pixels are spread evenly: of the sequence R2 (Roberts 2018), the fractions of n g and n g^2 with
 # g^3 + g^2 = 1, every beginning is. In units of 1 / _MODULUS; down and across.
-_EVEN_STEPS, _MODULUS = (0xC13FA9A9, 0x91E10DA5), 2**32
+_EVEN_STEPS = (0xC13FA9A9, 0x91E10DA5)
+_MODULUS = 2**32
 _RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
 # Sums may be reordered, so that they fill vector registers; NaN stays NaN.
 _JIT = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}

@@ -33,7 +33,9 @@ class PointMapping:
 class PointCloud(Field):
     """Measured points with their colours, one a voxel. Made by `fuse_points`."""
 
-    name, label, is_distance = "points", "Points", False
+    name = "points"
+    label = "Points"
+    is_distance = False
     Settings = PointMapping
 
     def __init__(self, points: Points, colors: Colors, voxel: float, bounds: SceneBounds) -> None:
@@ -86,7 +88,8 @@ def fuse_points(
     where they are. Memory grows with the surface that was seen, not with the frames.
     Raises ConfigError for a voxel that is not positive, far too fine, or longer than the scene.
     """
-    low, extent = np.array(bounds.minimum), np.subtract(bounds.maximum, bounds.minimum)
+    low = np.array(bounds.minimum)
+    extent = np.subtract(bounds.maximum, bounds.minimum)
     if not extent.max() / _MAX_CELLS_A_SIDE <= voxel <= extent.max():
         raise ConfigError(
             f"voxel is {voxel:g} m: the scene is {extent.max():.3g} m long, so allowed are "
@@ -96,7 +99,8 @@ def fuse_points(
     # For each voxel's number the sums of x, y, z (m), red, green, blue, and one a pixel.
     parts = []
     for count, index in enumerate(frames.tolist(), start=1):
-        frame, T_world_camera = sequence[index], sequence.T_world_camera[index]
+        frame = sequence[index]
+        T_world_camera = sequence.T_world_camera[index]
         rows, columns = frame.measured_pixels(stride)
         points_camera = frame.points(rows, columns)[0].double().numpy()
         points = points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]

@@ -13,7 +13,8 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-WRONG_M, WRONG_DEG = 0.05, 3.0
+WRONG_M = 0.05
+WRONG_DEG = 3.0
 _LEAST_SHARE = 0.01  # of points; shares of none and of all would be infinitely telling
 _INTERCEPT = 2.01
 _COEFFICIENTS = np.array([-2.06, -0.28, 2.8, 1.39])

@@ -15,13 +15,15 @@ from torch.nn.functional import adaptive_avg_pool2d, grid_sample
 from nbtrack.core.arrays import Poses
 from nbtrack.data.frame import MILLIMETRE, Frame
 
-# Directions x / z and y / z of a view: so many columns and rows, so far apart; 53 by 41 degrees.
-_COLUMNS, _ROWS, _STEP = 20, 15, 0.05
+_COLUMNS = 20
+_ROWS = 15
+_STEP = 0.05  # between directions x / z and y / z of a view, which spans 53 by 41 degrees
 _DEPTH_UNIT = 0.05  # m; depths are kept in a byte, 0 where less than half of a cell was measured
 _MAX_VIEWS = 150  # 90 kB
 _RADIAN = 1.0  # m; poses whose optical axes differ by it are as far apart as if moved by so much
 # A camera may be turned against a view: by so many columns and rows, tried in steps of so many.
-_TURNS_ACROSS, _TURNS_DOWN = np.arange(-6, 7, 3), np.arange(-3, 4, 3)
+_TURNS_ACROSS = np.arange(-6, 7, 3)
+_TURNS_DOWN = np.arange(-3, 4, 3)
 _MAX_LOG_RATIO = 0.3  # of depths; those that differ by more are of other surfaces
 _DEPTH_WEIGHT = 2.0  # of the depths' unlikeness against the luma's
 _MIN_OVERLAP = 30  # cells with both depths; below, they say nothing
@@ -56,7 +58,8 @@ def spread_out(T_world_camera: Poses) -> Int[np.ndarray, "_"]:
     """
     axes = _RADIAN * T_world_camera[:, :3, 2]
     places = np.concatenate([T_world_camera[:, :3, 3], axes], axis=1)
-    chosen, apart = [0], np.full(len(places), np.inf)
+    chosen = [0]
+    apart = np.full(len(places), np.inf)
     while len(chosen) < min(_MAX_VIEWS, len(places)):
         apart = np.minimum(apart, np.linalg.norm(places - places[chosen[-1]], axis=1))
         chosen.append(int(apart.argmax()))
@@ -68,7 +71,10 @@ def likeliest(view: View, views: Views, T_world_camera: Poses, n: int) -> Poses:
 
     Each is turned about the camera's x and y as it fits best.
     """
-    seen, known, unlikeness, turns = view.float(), views.float(), [], []
+    seen = view.float()
+    known = views.float()
+    unlikeness = []
+    turns = []
     for across in _TURNS_ACROSS:
         for down in _TURNS_DOWN:
             here = _moved(seen, down, across)

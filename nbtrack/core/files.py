@@ -98,7 +98,8 @@ def sources_fingerprint(*modules: str) -> str:
     `__init__` do not count, nor do modules that read settings, write files or word messages, nor
     comments, docstrings and layout.
     """
-    modules_read, waiting = {}, [*modules]
+    modules_read = {}
+    waiting = [*modules]
     while waiting:
         name = waiting.pop()
         path = PACKAGE / f"{name.replace('.', '/')}.py"
@@ -152,7 +153,8 @@ def _compiled(thing: Any, home: str, names: dict[str, Any], seen: list[int]) -> 
         if isinstance(thing, type):
             thing = {n: v for n, v in vars(thing).items() if callable(v) or n[:2] != "__"}
         elif isinstance(thing, FunctionType):
-            names, cells = thing.__globals__, thing.__closure__ or ()
+            names = thing.__globals__
+            cells = thing.__closure__ or ()
             thing = [thing.__code__, thing.__defaults__, thing.__kwdefaults__]
             thing += [cell.cell_contents for cell in cells]
     if isinstance(thing, dict | set | frozenset):  # whose order changes from process to process

@@ -45,8 +45,9 @@ def matrix_to_quaternion(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor,
     Every row of 4 q qᵀ is a multiple of q. The one whose own component is the largest is taken, so
     that no rotation angle divides by a small number.
     """
-    m, difference, total = rotation, rotation - rotation.mT, rotation + rotation.mT
-    xx, yy, zz = (m[..., i, i] for i in range(3))
+    difference = rotation - rotation.mT
+    total = rotation + rotation.mT
+    xx, yy, zz = (rotation[..., i, i] for i in range(3))
     wx, wy, wz = difference[..., 2, 1], difference[..., 0, 2], difference[..., 1, 0]
     xy, xz, yz = total[..., 0, 1], total[..., 0, 2], total[..., 1, 2]
     entries = [

@@ -18,7 +18,8 @@ from nbtrack.data.text_files import Calibration, read_object
 
 DECLARATION_FILE = "sequence.toml"
 _IMAGES = (".png", ".jpg", ".jpeg")
-CAMERA_TO_WORLD, WORLD_TO_CAMERA = "camera-to-world", "world-to-camera"
+CAMERA_TO_WORLD = "camera-to-world"
+WORLD_TO_CAMERA = "world-to-camera"
 SPELLED_AXES = {"opencv": "right down forward", "opengl": "right up backward"}
 # Where an axis may point, seen from behind the camera, in OpenCV's x, y and z.
 _DIRECTIONS = dict(zip(("right", "down", "forward"), np.eye(3), strict=True))

@@ -39,7 +39,8 @@ class Frame:
                 floating point in metres, kept to the millimetre. 0, NaN, infinite and negative ones
                 are none, and so are masked ones.
         """
-        size, metres = (camera.height, camera.width), "uint16 in mm, or floating point in metres"
+        size = camera.height, camera.width
+        metres = "uint16 in mm, or floating point in metres"
         _check("color", color, (*size, 3), UInt8, asked="uint8")
         _check("depth", depth, size, UInt16, Float, asked=metres)
         if np.ma.is_masked(color):

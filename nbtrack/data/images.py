@@ -84,7 +84,8 @@ def _in_millimetres(
     depth: np.ndarray, recording: Recording, camera: Intrinsics, file: Path
 ) -> np.ndarray:
     """Millimetres along the optical axis."""
-    scale, along_ray = recording.declared.depth_scale, recording.declared.depth_along == "ray"
+    scale = recording.declared.depth_scale
+    along_ray = recording.declared.depth_along == "ray"
     if scale == 1000 and not along_ray:
         return depth
     depth_mm = depth * (1000 / scale)

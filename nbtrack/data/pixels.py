@@ -14,7 +14,8 @@ from nbtrack.data.sequence import RgbdSequence
 
 # Tangent planes: how far away neighbours are, as a share of the image's width, and by how much of
 # the depth they may differ, which cuts off edges and incidences above some 75 degrees (our choice).
-PLANE_REACH, PLANE_JUMP = 1 / 64, 0.1
+PLANE_REACH = 1 / 64
+PLANE_JUMP = 0.1
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ class PixelSampler:
 
     def __init__(self, sequence: RgbdSequence, device: torch.device) -> None:
         n_bytes = sequence.colors.nbytes + sequence.depths_mm.nbytes
-        self.device, self.intrinsics = device, sequence.intrinsics
+        self.device = device
+        self.intrinsics = sequence.intrinsics
         images_device = device if has_room_for(device, n_bytes) else torch.device("cpu")
         self.colors = torch.from_numpy(sequence.colors).to(images_device)
         # Few torch kernels know unsigned 16 bit: the same bits travel as signed.
@@ -67,7 +69,8 @@ class PixelSampler:
         _, height, width = self.depths_mm.shape
         reach = max(1, round(width * PLANE_REACH))
         depth = self.measurements(frames, rows, columns)[1]
-        points, is_whole = [], depth > 0
+        points = []
+        is_whole = depth > 0
         for down, right in ((0, -reach), (0, reach), (-reach, 0), (reach, 0)):
             row, column = rows + down, columns + right
             is_whole &= (row >= 0) & (row < height) & (column >= 0) & (column < width)

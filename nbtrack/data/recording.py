@@ -114,7 +114,8 @@ def open_recording(
     The format is told by the files, unless named; a depth folder or a pose file replaces its own.
     Raises MissingError, DataError or ConfigError if something is not there, wrong or unknown.
     """
-    folder, notes = Path(folder), []
+    folder = Path(folder)
+    notes = []
     declared = declaration(folder, format)
     layout = FORMATS[declared.format]
     depth = [f"{depth_folder}/{Path(p).name}" if depth_folder else p for p in layout.depth]
@@ -128,9 +129,11 @@ def open_recording(
     camera = _calibration(folder, layout, notes)
     if camera.depth_scale and not is_declared(folder, "depth_scale"):
         declared = replace(declared, depth_scale=camera.depth_scale)
-    numbers, rate_hz = frame_numbers(colors), declared.frame_rate
+    numbers = frame_numbers(colors)
+    rate_hz = declared.frame_rate
     moments = Moments(len(colors), own_times, numbers, rate_hz, layout.counts_from_0)
-    images, no_poses = (colors, depths, moments.times), np.full((len(colors), 4, 4), np.nan)
+    images = colors, depths, moments.times
+    no_poses = np.full((len(colors), 4, 4), np.nan)
     name = folder.resolve().name
     recording = Recording(folder, name, layout, declared, *images, camera, notes, no_poses)
     return _with_poses(recording, moments, pose_file)
@@ -165,7 +168,9 @@ def _calibration(folder: Path, layout: Format, notes: list[str]) -> Calibration:
 
 def _with_poses(recording: Recording, moments: Moments, pose_file: str | None) -> Recording:
     """The recording with a pose a frame, where there is a file of poses."""
-    folder, colors, declared = recording.folder, recording.color_files, recording.declared
+    folder = recording.folder
+    colors = recording.color_files
+    declared = recording.declared
     names = (pose_file,) if pose_file else recording.format.poses
     there = [name for name in names if files_of(folder, name)]
     if len(there) > 1:
@@ -175,9 +180,11 @@ def _with_poses(recording: Recording, moments: Moments, pose_file: str | None) -
         recording.notes.append("no poses")
         return recording
     files = recording.format.files(folder, names, "poses")
-    path, times = folder / there[0], recording.times
+    path = folder / there[0]
+    times = recording.times
     tables = [read_poses(file, declared.quaternion) for file in files]
-    poses, stamps = checked_poses(np.concatenate([T for T, _ in tables]), path), tables[0][1]
+    poses = checked_poses(np.concatenate([T for T, _ in tables]), path)
+    stamps = tables[0][1]
     if "*" in path.name:
         _check_paired(colors, files)
     else:

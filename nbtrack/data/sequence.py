@@ -20,7 +20,8 @@ from nbtrack.data.recording import Recording, open_recording
 
 # Of bounds (our choice): pixels looked at in each frame, on a regular grid, and the share of points
 # cut off at either end of each axis, so that a few wild depths do not stretch the box.
-_POINTS_PER_FRAME, _CUT_OFF = 2000, 0.002
+_POINTS_PER_FRAME = 2000
+_CUT_OFF = 0.002
 # Beyond so many times the distance that nine in ten depths lie within, they are no measurement: of
 # eleven rooms and two real recordings the farthest was 2.1 times as far (our choice).
 FAR = 5.0

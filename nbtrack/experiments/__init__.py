@@ -28,7 +28,8 @@ def import_own(source: str) -> None:
     such file, and ConfigError for whatever the import raises, and where another module has the
     file's name.
     """
-    file, name = Path(source).resolve(), source
+    file = Path(source).resolve()
+    name = source
     if file.suffix == ".py":
         if not file.is_file():
             raise MissingError(

@@ -49,7 +49,8 @@ def tables_command(options: Namespace) -> None:
 
 def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
     execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
-    scenes, clock = open_scenes(preset), options.budget == "clock"
+    scenes = open_scenes(preset)
+    clock = options.budget == "clock"
     rates_hz = RATES_3_HZ if options.beyond else None
     how = {"clock": clock, "seeds": range(options.seeds), "execution": execution}
     results = track_scenes(scenes, methods, preset, rates_hz, **how)
@@ -64,7 +65,8 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
         print(tables.style_table_1(results))
         print("Table I beside the paper's")
         print(tables.beside_published(results).to_string(float_format="%.3f", na_rep="–"))
-        steps, pixels = _table_2(preset, scenes[0], methods), default_pixels(preset, methods)
+        steps = _table_2(preset, scenes[0], methods)
+        pixels = default_pixels(preset, methods)
         by_clock = _note(preset, clock=True)
         paths = tables.write_tables(folder, results, steps, note, pixels, steps_note=by_clock)
     cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
@@ -92,7 +94,8 @@ def bench_command(options: Namespace) -> None:
 
 def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
     """Measure and print it."""
-    steps, pixels = measure_steps(preset, scene, methods), default_pixels(preset, methods)
+    steps = measure_steps(preset, scene, methods)
+    pixels = default_pixels(preset, methods)
     machine = f"{device_name(choose_device())}, {torch.get_num_threads()} threads"
     print(f"Table II: steps, {preset.name} networks, on {machine}")
     print(tables.style_table_2(steps, default_pixels=pixels))
@@ -111,7 +114,8 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     firsts = {}
     for method in find_methods(methods):
         firsts.setdefault(method.tracker, method)
-    pixels, rows = preset.tables.pixels, []
+    pixels = preset.tables.pixels
+    rows = []
     plan = [(m, n) for m in firsts.values() for n in pixels.get(m.tracker, pixels["sdf"])]
     recording = scene.recording
     sequence = read_frames(recording, np.flatnonzero(recording.has_pose)[:1])
@@ -126,7 +130,8 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
                 field = map_scene(scene, method.field, own).field
                 tracker = make_tracker(name, field, T_first, StepBudget(1), settings)
                 for budget_ms in preset.tables.budgets_ms:
-                    tracker.budget, counts = ClockBudget(1000 / budget_ms), []
+                    tracker.budget = ClockBudget(1000 / budget_ms)
+                    counts = []
                     for _ in range(1 + _FRAMES_A_CELL):
                         tracker.restart(T_first)
                         counts.append(tracker.track(sequence[0]).steps)

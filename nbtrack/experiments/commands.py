@@ -55,7 +55,8 @@ _MEANINGS = {
     "frames_without_depth": "frames without any depth, not searched",
 }
 _FRAMES_APART = 10  # of a mesh: neighbours see the same
-_FRAMES_SHOWN, _CELLS = 20, 120  # of an overview: frames that tell what was seen; cells across
+_FRAMES_SHOWN = 20  # of an overview: they tell what was seen
+_CELLS = 120  # across an overview
 _MOVIE_FRAMES = 100
 
 
@@ -156,7 +157,9 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
 
 def _check_fits(given: Map, method: Method, preset: Preset, options: Namespace) -> None:
     """Raises ConfigError where a given map is of another field or other settings than asked for."""
-    name, record, path = given.field.name, given.record, options.map_from
+    name = given.field.name
+    record = given.record
+    path = options.map_from
     if options.map_frames is not None:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
     if method.field != name:
@@ -192,8 +195,10 @@ def _print_numbers(results: dict[str, Any]) -> None:
 
 def _draw_overview(run: TrackJob) -> None:
     """A picture of a finished run, beside its files: the path in what was seen of the map."""
-    tracked, field = read_trajectory(run.folder), run.needs.map().field
-    n_frames, metrics = len(tracked.frames), tracked.metrics
+    tracked = read_trajectory(run.folder)
+    field = run.needs.map().field
+    n_frames = len(tracked.frames)
+    metrics = tracked.metrics
     shown = np.arange(0, n_frames, max(1, n_frames // _FRAMES_SHOWN))
     try:
         seen = _seen(tracked, shown, run.scene.recording)
@@ -237,7 +242,8 @@ def export_command(options: Namespace) -> None:
 
 
 def _export_map(source: Path, format_name: str, out: Path) -> str:
-    finished, seen = read_map(source), source / MESH_FILE
+    finished = read_map(source)
+    seen = source / MESH_FILE
     is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
     with naming_damaged(seen, "mesh", "remove it and map again"):
         mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)
@@ -251,7 +257,8 @@ def _export_run(source: Path, format_name: str, out: Path) -> str:
     if format_name == "rrd" and importlib.util.find_spec("rerun") is None:
         raise MissingError("--to rrd needs Rerun: pip install 'nbtrack[rerun]'")
     tracked = read_trajectory(source)
-    metrics, last = tracked.metrics, len(tracked.frames) - 1
+    metrics = tracked.metrics
+    last = len(tracked.frames) - 1
     stored = read_map(metrics["map"])
     if metrics.get("map_key") != stored.key:
         raise DataError(f"{metrics['map']} is not the map of this run any more: track again")
@@ -285,7 +292,9 @@ _EXPORTS = {
 
 
 def make_command(options: Namespace) -> None:
-    """Write a synthetic room as a sequence folder."""
+    """Write a synthetic room as a sequence folder; ConfigError where none is named."""
+    if options.out is None:
+        raise ConfigError(f"where shall {options.room} be written? Give a folder with --out")
     config = with_values(ScenesConfig(), {name: getattr(options, name) for name in SIZES})
     check_no_recording(options.out)
     write_room(options.room, options.out, config)

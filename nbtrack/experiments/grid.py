@@ -120,7 +120,9 @@ def track_scenes(
     # By the clock, how far a run comes depends on its threads.
     n_threads = execution.threads or (torch.get_num_threads() if clock else None)
     how = {"frames": str(frames or preset.scenes.track_frames), "n_threads": n_threads}
-    pairs, jobs, rows = list(zip(scenes, tracked or scenes, strict=True)), [], []
+    pairs = list(zip(scenes, tracked or scenes, strict=True))
+    jobs = []
+    rows = []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
         made = MapJob.of(scene, method.field, own, seed=seed)
@@ -166,7 +168,8 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
 
     Unless it is to keep going, it raises what the first failing job raised, and drops the others.
     """
-    execution, results = execution or Execution(), {}
+    execution = execution or Execution()
+    results = {}
     missing = {part.folder: part for job in jobs for part in _missing(job)}
     done = dict.fromkeys(missing, 0.0)  # shares of each job's own work
     work = {folder: job.work for folder, job in missing.items()}
@@ -263,7 +266,8 @@ def _outcome_there(
     os.environ |= settings
     FIELDS.update(known[0])
     TRACKERS.update(known[1])
-    worker, last = get_worker(), time.monotonic()
+    worker = get_worker()
+    last = time.monotonic()
 
     def report(share: float, status: str) -> None:
         nonlocal last

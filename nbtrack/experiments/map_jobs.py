@@ -105,7 +105,8 @@ class MapJob(Job):
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Map and score, or resume; write the map's files."""
-        path, checkpoint = self.folder / MAP_FILE, self.folder / CHECKPOINT_FILE
+        path = self.folder / MAP_FILE
+        checkpoint = self.folder / CHECKPOINT_FILE
 
         def tell(share: float, losses: dict[str, float | int]) -> None:
             report(share, " ".join(f"{name} {loss:.3f}" for name, loss in losses.items()))

@@ -17,7 +17,8 @@ _FRAMES_LOOKED_AT = 20  # that tell a map's unit before there is a map
 # A user is told where even the best follower has a larger error (m), or the camera moves farther
 # than a search reaches in a larger share of the frames: hands start and stop, and the search
 # catches up (our choice).
-_LEAST_ATE, _SHARE = 0.01, 0.5
+_LEAST_ATE = 0.01
+_SHARE = 0.5
 
 
 def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
@@ -44,7 +45,8 @@ def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
 
 
 def _is_short(reach: dict[str, float]) -> bool:
-    least_m, share = reach.get("least_ate_m", 0.0), reach.get("beyond_reach_share", 0.0)
+    least_m = reach.get("least_ate_m", 0.0)
+    share = reach.get("beyond_reach_share", 0.0)
     return least_m > _LEAST_ATE or share > _SHARE
 
 

@@ -34,7 +34,8 @@ def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -
 
     Only what the mapped frames have seen counts. The truth is known of synthetic rooms only.
     """
-    field, scores = finished.field, dict.fromkeys(SCORES)
+    field = finished.field
+    scores = dict.fromkeys(SCORES)
     mapped, held_out = split_holdout(len(sequence), finished.record["settings"]["holdout_every"])
     if len(held_out) and isinstance(field, LearnedField):
         scores |= _score_images(field, sequence, held_out, room)
@@ -82,7 +83,8 @@ def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room)
     depths = torch.where(is_in_front, rays.depth * offsets, around)
     points = rays.points(depths[:, None])[:, 0][rays.depth > 0].double().numpy()
     true_sdf = room.sdf(points)
-    error, is_near = np.abs(query_field(field, points)[1] - true_sdf), np.abs(true_sdf) < NEAR
+    error = np.abs(query_field(field, points)[1] - true_sdf)
+    is_near = np.abs(true_sdf) < NEAR
     is_free = ~is_near & (true_sdf > 0)
     return {"sdf_near_m": float(error[is_near].mean()), "sdf_free_m": float(error[is_free].mean())}
 

@@ -74,7 +74,8 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     format of a folder is by default told by its files. Raises ConfigError where there is no such
     folder, room or scene; MissingError where the scene of the dataset was not downloaded.
     """
-    text, folder = str(sequence), Path(sequence)
+    text = str(sequence)
+    folder = Path(sequence)
     if text in _KNOWN and folder.is_dir() and not is_own_output(folder):
         tell(f"{text}: the folder {folder.resolve()} is read, not the room or scene of that name")
     elif text in ROOMS:
@@ -101,7 +102,8 @@ def open_scenes(preset: Preset) -> list[Scene]:
     if not names or len({resolved(name).name for name in names}) < len(names):
         given = ", ".join(names) or "(none)"
         raise ConfigError(f"scenes {given}: give at least one, and of one name only one")
-    scenes, missing = [], {}
+    scenes = []
+    missing = {}
     for name in names:
         try:
             scene = open_scene(name, preset)

@@ -38,9 +38,9 @@ _OTHER_WORLD = (
     "rigid motion that explains the difference, and errors are those that remain"
 )
 _MAP_SETTINGS = ("network", "settings", "correction")  # in the record of a map
-# For the work of runs, measured with `smoke` on one core: queries of a network in a second, and
-# the share of one that asks a grid or points.
-_QUERIES_A_SECOND, _NO_NETWORK = 60_000, 0.05
+# For the work of runs, measured with `smoke` on one core.
+_QUERIES_A_SECOND = 60_000  # of a network
+_NO_NETWORK = 0.05  # of a query's time: where a grid or points are asked
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,8 @@ class TrackJob(Job):
             tracked, is_explained = in_world_of_map(tracked)
             notes["map_warning"] = _OTHER_WORLD if is_explained else None
         metrics = _scores(tracked) | self._provenance(n_threads) | notes
-        times, origin = tracked.frames["time"].to_numpy(), np.array(notes["origin"])
+        times = tracked.frames["time"].to_numpy()
+        origin = np.array(notes["origin"])
         texts = {
             "trajectory.txt": tum_text(times, shifted(tracked.T_estimated, origin)),
             "groundtruth.txt": tum_text(times, shifted(tracked.T_true, origin)),
@@ -149,7 +150,8 @@ class TrackJob(Job):
 
     def _tracked(self, report: Report) -> tuple[Trajectory, dict[str, Any]]:
         """The trajectory, and what is to be said of the run beside its errors."""
-        finished_map, budget = self.needs.map(), make_budget(self.steps, self.rate_hz)
+        finished_map = self.needs.map()
+        budget = make_budget(self.steps, self.rate_hz)
         origin = np.array(finished_map.record["origin"])
         sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
         notes = {"map_seconds": finished_map.record["seconds"], "budget": str(budget)}
@@ -230,7 +232,8 @@ class TrackJob(Job):
             settings |= self.needs.setting_tree()
         sequence = str(self.scene.folder)
         if self.scene.made and not self.is_elsewhere:
-            sequence, made = self.scene.name, self.scene.made
+            sequence = self.scene.name
+            made = self.scene.made
             settings["scenes"] = {name: getattr(made, name) for name in SIZES}
         plain = replace(PRESETS[PLAIN_PRESET])
         words = [f"--set={text}" for text in changed_settings(settings, plain)]
@@ -249,7 +252,8 @@ def _scores(tracked: Trajectory) -> dict[str, Any]:
         errors_m = rated["translation_error_m"].to_numpy()
         metrics["flagged_frames"] = int(rows["lost"].sum())
         metrics |= score_detection(rated["lost"].to_numpy(dtype=bool), errors_m)
-    steps, seconds = int(rows["steps"].sum()), rows["seconds"]
+    steps = int(rows["steps"].sum())
+    seconds = rows["seconds"]
     return {
         **metrics,
         "frames_without_depth": int(rows["without_depth"].sum()),

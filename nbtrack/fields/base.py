@@ -31,7 +31,9 @@ NEAR = 0.05  # m, z-depth before which nothing is looked for: closer than any de
 
 # Samples a ray in pictures: twice those of mapping, and in fixed places, so that an image shows the
 # field and not the luck of the draw.
-_N_STRATIFIED, _N_IMPORTANCE, _RAYS_AT_ONCE = 48, 24, 4096
+_N_STRATIFIED = 48
+_N_IMPORTANCE = 24
+_RAYS_AT_ONCE = 4096
 
 Losses = dict[str, Scalar]
 State = dict[str, Tensor]

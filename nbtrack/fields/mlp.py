@@ -42,7 +42,8 @@ class FourierMlp(nn.Module):
         self, settings: NetworkSettings, bounds: SceneBounds, act: Activation, generator: Generator
     ) -> None:
         super().__init__()
-        width, n_frequencies = settings.width, settings.n_frequencies
+        width = settings.width
+        n_frequencies = settings.n_frequencies
         self.activation = act
         self.register_buffer("center", torch.tensor(bounds.center, dtype=torch.float32))
         self.metres_per_unit = bounds.metres_per_unit

@@ -101,7 +101,8 @@ class NeuSField(LearnedField):
         normal.diagonal().add_(1e-3 * normal.diagonal().mean())
         moments = design.T @ (target / self.mlp.metres_per_unit).double()
         solution = torch.linalg.solve(normal, moments).float()
-        self.mlp.head.weight[3], self.mlp.head.bias[3] = solution[:-1], solution[-1]
+        self.mlp.head.weight[3] = solution[:-1]
+        self.mlp.head.bias[3] = solution[-1]
 
 
 def guided_depths(
@@ -112,7 +113,8 @@ def guided_depths(
     Nothing is known of what lies behind a surface, so no samples are spent there. Rays without a
     depth are sampled to the end of the scene. Our choice; NICE-SLAM and its followers do alike.
     """
-    far_bound, measured = base.rays_end(rays, bounds), rays.depth > 0
+    far_bound = base.rays_end(rays, bounds)
+    measured = rays.depth > 0
     far = torch.where(measured, rays.depth + settings.surface_band, far_bound)
     coarse = rendering.stratified_depths(base.NEAR, far, settings.n_stratified, generator)
     around = rendering.stratified_depths(-1.0, torch.ones_like(far), settings.n_surface, generator)

@@ -21,10 +21,12 @@ from nbtrack.core.errors import ConfigError, MissingError
 from nbtrack.core.files import naming_damaged, write_together
 from nbtrack.fields import FIELDS, Field
 
-MAP_FILE, HISTORY_FILE = "map.safetensors", "history.csv"
+MAP_FILE = "map.safetensors"
+HISTORY_FILE = "history.csv"  # losses over iterations
 MESH_FILE = "mesh.ply"  # what a map's frames have seen
 CHECKPOINT_FILE = "mapping.pt"  # of a map in the making
-_FORMAT, _VERSION = "nbtrack map", 4
+_FORMAT = "nbtrack map"
+_VERSION = 4
 FORMS: dict[str, type[Field]] = {}
 """What may be made of a finished map's field, by name; see `Field.form`."""
 _AGAIN = "map again, and give the folder or its map.safetensors; an earlier nbtrack's are none"
@@ -59,7 +61,9 @@ def write_map(path: Path, finished: Map) -> None:
 
     Weights keep every bit, so that tracking in the file gives the trajectory of the map itself.
     """
-    path, tensors, bounds = Path(path), _tensors(finished.field), finished.field.bounds
+    path = Path(path)
+    tensors = _tensors(finished.field)
+    bounds = finished.field.bounds
     header = {
         "format_version": _VERSION,
         "field": finished.field.name,
@@ -83,7 +87,8 @@ def read_map(path: Path | str) -> Map:
     where its field is not registered.
     """
     path = Path(path)
-    file, history = path / MAP_FILE if path.is_dir() else path, path / HISTORY_FILE
+    file = path / MAP_FILE if path.is_dir() else path
+    history = path / HISTORY_FILE
     if not file.is_file():
         advice = (
             "give a folder or file that it wrote, or run the `map` command of that folder again"
@@ -100,14 +105,16 @@ def read_map(path: Path | str) -> Map:
 def _read_file(file: Path) -> Map:
     """The map of a file. Raises ValueError, KeyError and others if it is not sound."""
     content = file.read_bytes()  # safetensors itself opens no path whose letters are not UTF-8
-    tensors, size = safetensors.torch.load(content), int.from_bytes(content[:8], "little")
+    tensors = safetensors.torch.load(content)
+    size = int.from_bytes(content[:8], "little")
     header = dict(json.loads(json.loads(content[8:][:size])["__metadata__"][_FORMAT]))
     if header.get("format_version") != _VERSION:
         raise ValueError(f"format {header.get('format_version')!r}; this nbtrack reads {_VERSION}")
     # A bit that flipped on a disk, or a number edited by hand, shows nowhere else.
     if header.pop("digest", None) != _digest(header, tensors):
         raise ValueError("its content is not what was written")
-    name, record = header["field"], header["made"]
+    name = header["field"]
+    record = header["made"]
     _check_content(header, tensors)
     corners = (tuple(map(float, corner)) for corner in header["bounds"])
     bounds = SceneBounds(*corners, header.get("declared_unit"))
@@ -124,7 +131,8 @@ def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
 
     Names may hold what moves a terminal's cursor, and one NaN among weights spreads to every pose.
     """
-    made, camera = header["made"], header["camera"]
+    made = header["made"]
+    camera = header["camera"]
     numbers = [made["seconds"], made["misfit_m"], made["seed"], made["n_frames"], *made["origin"]]
     numbers += [*chain(*header["bounds"]), *camera.values()]
     are_numbers = all(type(n) in (int, float) and math.isfinite(n) for n in numbers)

@@ -55,7 +55,8 @@ def map_sequence(
     no dictionary; NumericalError; OutOfMemory.
     """
     recipe = recipe_of(field_name, sequence, network, settings, seed)
-    start, device = time.perf_counter(), device or torch.device("cpu")
+    start = time.perf_counter()
+    device = device or torch.device("cpu")
     mapped, _ = split_holdout(len(sequence), settings.holdout_every)
     bounds = observed_bounds(sequence)
     kind = field_class(field_name)
@@ -66,10 +67,12 @@ def map_sequence(
             with suitable_threads(field.width):
                 fit = _Fit(recipe, settings, field, sequence, mapped)
                 fit.run(checkpoint, on_iteration)
-        history, seconds = fit.history, fit.seconds
+        history = fit.history
+        seconds = fit.seconds
     else:
         field = kind.from_frames(sequence, mapped, bounds, settings).to(device)
-        history, seconds = [field.diagnostics()], time.perf_counter() - start
+        history = [field.diagnostics()]
+        seconds = time.perf_counter() - start
         on_iteration(1.0, history[0])
     misfit_m = usual_depth_residual(field, sequence, mapped)
     record = {**recipe, "seconds": seconds, "misfit_m": misfit_m, "mapped_frames": len(mapped)}
@@ -111,19 +114,22 @@ class _Fit:
         # Each device draws other numbers, and batches go on only under the code they began with.
         code = code_fingerprint(type(field), "nbtrack.mapping.fit", make_field)
         self.recipe = {**recipe, "device": field.device.type, "code": code}
-        self.settings, self.field = settings, field
+        self.settings = settings
+        self.field = field
         self.optimizer = torch.optim.Adam(field.parameters(), lr=settings.learning_rate)
         self.generator = torch.Generator(field.device).manual_seed(recipe["seed"])
         self.sampler = PixelSampler(sequence, field.device)
         self.frames = torch.from_numpy(mapped).to(field.device)
         field.prepare(sequence, mapped)
-        self.seconds, self.history = 0.0, []
+        self.seconds = 0.0
+        self.history = []
 
     def run(self, checkpoint: Path | None, on_iteration: OnIteration) -> None:
         """From the checkpoint, where there is one, to the last iteration."""
         if checkpoint and checkpoint.exists():
             self._load(checkpoint)
-        last_saved, end = time.perf_counter(), self.settings.iterations
+        last_saved = time.perf_counter()
+        end = self.settings.iterations
         while (done := len(self.history)) < end:
             self._advance(range(done, min(end, done + _PENDING)))
             on_iteration(len(self.history) / end, self.history[-1])
@@ -134,7 +140,8 @@ class _Fit:
         self.field.eval().requires_grad_(False)
 
     def _advance(self, iterations: range) -> None:
-        start, pending = time.perf_counter(), []
+        start = time.perf_counter()
+        pending = []
         draw = partial(self.sampler.draw, generator=self.generator, frames=self.frames)
         for iteration in iterations:
             self.optimizer.param_groups[0]["lr"] = learning_rate(self.settings, iteration)
@@ -170,4 +177,5 @@ class _Fit:
             self.field.load_state_dict(state["field"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.generator.set_state(state["generator"])
-            self.seconds, self.history = state["seconds"], state["history"]
+            self.seconds = state["seconds"]
+            self.history = state["history"]

@@ -10,7 +10,8 @@ from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField
 
-_MISFIT_PIXELS, _MISFIT_FRAMES = 500, 10
+_MISFIT_PIXELS = 500  # of a frame
+_MISFIT_FRAMES = 10
 
 
 def split_holdout(n_frames: int, every: int) -> tuple[Frames, Frames]:

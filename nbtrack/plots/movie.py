@@ -22,7 +22,8 @@ _WIDTH = 240  # pixels of the map's view
 _NEAR = 0.1  # m; nearer surfaces are not drawn
 _POINT_SIZE = 0.02  # m, of a map of points
 _DPI = 72
-_RATE_HZ, _GIF_COLORS = 10, 64
+_RATE_HZ = 10
+_GIF_COLORS = 64
 
 
 @styled

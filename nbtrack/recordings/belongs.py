@@ -15,7 +15,8 @@ from nbtrack.tracking.trajectories import Trajectory
 
 # A map is refused where its misfit exceeds both. Measured on nine maps of three rooms (one a real
 # recording): frames of the same room 0.024 m at most, of other rooms 0.095 m at least.
-MISFIT_FACTOR, MISFIT_ALLOWED = 3.0, 0.05  # times what is usual in the map's own frames; m
+MISFIT_FACTOR = 3.0  # times what is usual in the map's own frames
+MISFIT_ALLOWED = 0.05  # m
 
 
 def check_belongs(finished: Map, frame: Frame) -> str | None:
@@ -24,7 +25,8 @@ def check_belongs(finished: Map, frame: Frame) -> str | None:
     The rule: its misfit is at most 5 cm, or three times what is usual in the map's own frames.
     Raises DataError if it is more.
     """
-    name, usual = f"the map of {finished.record['scene']}", finished.record["misfit_m"]
+    name = f"the map of {finished.record['scene']}"
+    usual = finished.record["misfit_m"]
     misfit_m = depth_residual_of(finished.field, frame)
     if np.isnan(misfit_m):
         return f"{frame.name} has no depth: whether {name} belongs to it cannot be told"

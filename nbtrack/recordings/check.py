@@ -22,8 +22,9 @@ from nbtrack.recordings.readings import FramePairs, Reading, on_grid
 _FRAMES_AT_ONCE = 32  # 50 MB at 640x480
 _CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
-# Of frames that are compared: for conventions, in a quick look, and for small misfits.
-_N_PAIRS, _QUICK_PAIRS, _FIT_PAIRS = 20, 6, 60
+_N_PAIRS = 20  # of frames that are compared for conventions
+_QUICK_PAIRS = 6  # the same in a quick look
+_FIT_PAIRS = 60  # the same for small misfits
 _GAPS = (5, 10, 20, 40)  # frames between the two: they moved, and still see the same,
 _TURNED_DEG = 60  # which they do where the camera has not turned by more in between
 _CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
@@ -31,12 +32,14 @@ _FLICKER = 0.35  # share by which brightness may change between frames (our choi
 _SAME_VIEW_DEG = 10  # where they are turned by no more
 # A pose so far (m) from the middle of its neighbours, and so many usual steps: real recordings, and
 # rooms thinned to every twentieth frame, have 1.1. Half as far is a pose before or after a jump.
-_OFF, _OFF_STEPS = 0.05, 2.5
+_OFF = 0.05
+_OFF_STEPS = 2.5
 _MIN_REPEATED = 0.05  # share of frames whose depth is that of the frame before, though they moved
 _MAX_STEP = 0.01  # share of the depth between depths that a camera can tell (our choice)
 _BLACK = 0.02  # brightness, in [0, 1]
 _PRINTED = ["measured", "brightness", "moved_mm", "turned_deg", "flicker"]
-_XYZ, _RGB = ["x", "y", "z"], ["red", "green", "blue"]
+_XYZ = ["x", "y", "z"]
+_RGB = ["red", "green", "blue"]
 
 
 @dataclass(frozen=True, eq=False)

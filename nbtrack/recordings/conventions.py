@@ -19,9 +19,10 @@ _MIN_GAIN = 5e-4  # of the depth: 1 mm at 2 m, depth's resolution on disk
 PLAUSIBLE_DEPTH = (0.2, 20.0)  # m, of a depth camera's median: units in doubt are told by it
 _FAR_APART = 0.05  # m, median distance above which a map of the scene would be blurred (our choice)
 _FAR_APART_OF_FEW = 0.15  # the same where less than the first share overlaps (our choice)
-# Shares of points below which a median tells nothing, and below which not even a large one does: of
-# a right recording hardly a point lies in front of what another frame sees there (our choice).
-_MIN_OVERLAP, _MIN_CONTRADICTION = 0.15, 0.02
+_MIN_OVERLAP = 0.15  # share of points below which a median tells nothing (our choice)
+# Share below which not even a large median tells anything: of a right recording hardly a point lies
+# in front of what another frame sees there (our choice).
+_MIN_CONTRADICTION = 0.02
 # Those that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1 mm, SUN3D's
 # millimetres and tenths times 8; and metres and micrometres, which 16 bits hold badly.
 _SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 8000.0, 80_000.0, 256.0, 100.0, 1.0, 1e6)

@@ -17,13 +17,16 @@ from nbtrack.core.arrays import Pose, Poses, WorldPoints
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 
-# Measured points of a frame; those farther than the second (m) from any surface tell nothing.
-_N_POINTS, _MAX_DISTANCE = 500, 0.1
-_N_FRAMES, _MIN_FRAMES, _MIN_POINTS = 40, 8, 50  # looked at, and what an estimate needs
+_N_POINTS = 500  # measured ones of a frame
+_MAX_DISTANCE = 0.1  # m; points farther from any surface tell nothing
+_N_FRAMES = 40  # looked at
+_MIN_FRAMES = 8  # that an estimate needs
+_MIN_POINTS = 50  # the same, of each frame
 _MOSTLY = 0.5  # share of a frame's points outside of the map's bounds, where the frame lies outside
 _TINY = 1e-12
 _NEGLIGIBLE = 0.01  # share by which depths may misfit (our choice)
-_RESAMPLED, _INTERVAL = 200, [0.025, 0.975]
+_RESAMPLED = 200  # draws of a bootstrap
+_INTERVAL = [0.025, 0.975]  # its quantiles
 _EXPLANATIONS = {  # how a point changes with each: factors of its x, y and z
     "depths": np.array([1.0, 1.0, 1.0]),
     "focal lengths": np.array([-1.0, -1.0, 0.0]),
@@ -37,7 +40,8 @@ def look_in_map(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> dic
     Returns `outside_map_share`, that of the frames that saw little of what was mapped, and
     `map_misfit`, a sentence, which is empty where nothing misfits.
     """
-    outside, sums = [], []
+    outside = []
+    sums = []
     low, high = np.array([field.bounds.minimum, field.bounds.maximum])
     for index in range(0, len(sequence), math.ceil(len(sequence) / _N_FRAMES)):
         frame = sequence[index]

@@ -28,10 +28,12 @@ _FRAMES = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
 _NO_YES = np.array([0, 1])
 _SCATTER = np.linspace(-0.02, 0.04, 13)  # m, by which positions may scatter; below 0 for symmetry
 _GAIN = 0.98  # share of the cost as declared, above which an estimate tells nothing (our choice)
-_MIN_OVERLAP, _MIN_PAIRS = 0.1, 8  # a share of points, and pairs with as many, as an estimate needs
+_MIN_OVERLAP = 0.1  # share of a pair's points that an estimate needs
+_MIN_PAIRS = 8  # with as many points
 MIN_CORRELATION = 0.75  # of intensities that pairs of a right recording have (our choice)
 _MIN_CONTRAST = 0.02  # standard deviation of intensities in [0, 1], below which nothing is seen
-_RESAMPLED, _INTERVAL = 200, [0.025, 0.975]
+_RESAMPLED = 200  # draws of a bootstrap
+_INTERVAL = [0.025, 0.975]  # its quantiles
 
 
 class Parameter(NamedTuple):

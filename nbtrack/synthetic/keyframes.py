@@ -19,21 +19,29 @@ from nbtrack.synthetic.room import Room
 
 MEAN_STEP = np.array([5.7e-3, 0.45])  # translation (units of the scene), rotation (degrees)
 _FASTEST = np.array([8.5e-3, 0.95])  # the dataset's path: 7.8e-3 and 0.92
-_FRAMES_A_PIECE, _SHORTEST, _LONGEST = 83, 46, 130  # in the mean, and our limits
-_SPEEDS, _RATES = (0.85, 1.2), (0.5, 1.9)  # of pieces, over the mean speed and turning rate
+_FRAMES_A_PIECE = 83  # in the mean
+_SHORTEST = 46  # frames of a piece (our choice, as the longest)
+_LONGEST = 130
+_SPEEDS = (0.85, 1.2)  # of pieces, over the mean speed
+_RATES = (0.5, 1.9)  # the same of turning
 _TURNS_BACK = 0.25  # share of the joins where the camera goes back to where it came from
 _HEIGHTS = (1.25, 1.7)  # m above the floor, at the key poses
-_AROUND, _ASTRAY = 0.5, 0.8  # m, rad: how far from the middle and the view of a room's walk
+_AROUND = 0.5  # m; how far a key pose is from the middle of a room's walk
+_ASTRAY = 0.8  # rad; how far it is turned from the view there
 # A camera that stands still should be off by so much (m), where a room allows it: at the key poses,
 # and after a seed has moved them.
-_MIN_STILL, _MIN_STILL_MOVED = 1.2, 1.0
+_MIN_STILL = 1.2
+_MIN_STILL_MOVED = 1.0
 _CALIBRATION_FRAMES = 240  # shorter paths are the beginning of one of this length
 _ATTEMPTS = 600
 # How far a seed moves the key poses (m, along x, y, z) and turns them (rad): the paths of two seeds
 # pass the same things.
-_SHIFTED, _TURNED = (0.2, 0.1, 0.2), 0.12
-_ACROSS, _DOWN = np.linspace(-0.55, 0.55, 7), np.linspace(-0.4, 0.4, 5)  # rays through an image
-_NEAR, _MARGIN = 0.8, 0.1  # m; a quarter of an image at most is so near; of a scene's bounds
+_SHIFTED = (0.2, 0.1, 0.2)
+_TURNED = 0.12
+_ACROSS = np.linspace(-0.55, 0.55, 7)  # rays through an image
+_DOWN = np.linspace(-0.4, 0.4, 5)
+_NEAR = 0.8  # m; a quarter of an image at most is so near
+_MARGIN = 0.1  # m; of a scene's bounds
 
 
 @dataclass(frozen=True)

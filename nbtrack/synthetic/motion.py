@@ -23,7 +23,8 @@ _KNOT_SPACING = 0.35  # rad of turning between knots of a glance around, about 3
 _CALIBRATION_FRAMES = 120  # shorter trajectories are the beginning of one of this length
 # How far a seed moves the center of a path (m, along x and z) and turns its start (rad): paths of
 # two seeds cross each other and see the same side of the room.
-_CENTER_REACH, _HEADING_REACH = 0.3, 0.25
+_CENTER_REACH = 0.3
+_HEADING_REACH = 0.25
 _FLATTENING = 0.25  # width of the path's ellipse over its length
 _ATTEMPTS = 400
 _NO_TREMOR = np.zeros((1, 6))

@@ -39,7 +39,8 @@ def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Inte
 
 def _round_interval(offsets: Origins, directions: Points, radius: float) -> Interval:
     """Where |offset + t direction| <= radius (none: near = inf, far = -inf)."""
-    a, b = row_dot(directions, directions), row_dot(offsets, directions)
+    a = row_dot(directions, directions)
+    b = row_dot(offsets, directions)
     c = row_dot(offsets, offsets) - radius**2
     moving = a > 1e-24
     a = np.where(moving, a, 1.0)

@@ -34,7 +34,8 @@ class ClockBudget:
 
     def __init__(self, rate_hz: Number, clock: Callable[[], float] = time.perf_counter) -> None:
         """Take frames a second and a clock (s); ConfigError if the rate is not 0.001 to 1e6."""
-        self.rate_hz, self._clock = _positive("rate_hz", rate_hz), clock
+        self.rate_hz = _positive("rate_hz", rate_hz)
+        self._clock = clock
         self.memory: float | None = None  # mean seconds of a step in the last frame
 
     def __str__(self) -> str:
@@ -53,7 +54,8 @@ class ClockBudget:
 
     def _steps(self, start: float, device: torch.device) -> Iterator[int]:
         prepared = now = self._now(device)
-        mean, self.memory = self.memory, None
+        mean = self.memory
+        self.memory = None
         step = 0
         while mean is None or start + 1 / self.rate_hz - now >= mean:
             yield step

@@ -55,7 +55,8 @@ class AdamTracker(Tracker):
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Take up a frame; of several starts, that with the lowest loss on the same pixels."""
-        self.frame, self.measured = frame, frame.measured_pixels()
+        self.frame = frame
+        self.measured = frame.measured_pixels()
         T_starts = T_starts.to(self.device, torch.float32)
         T_start = T_starts[0]
         if len(T_starts) > 1:
@@ -82,7 +83,8 @@ class AdamTracker(Tracker):
 
     def _draw(self) -> tuple[Points, Colors, Values]:
         """Rays, colours and depths of random measured pixels."""
-        shape, like = (self.settings.n_pixels,), {"device": self.device}
+        shape = (self.settings.n_pixels,)
+        like = {"device": self.device}
         drawn = torch.randint(self.measured.shape[1], shape, generator=self.generator, **like)
         rows, columns = self.measured[:, drawn]
         return pixel_directions(self.frame.camera, columns, rows), *self.frame.at(rows, columns)

@@ -84,7 +84,8 @@ class Tracker(abc.ABC):
         self.settings = settings or self.Settings()
         with_values(self.settings, {"n_pixels": int(self.settings.n_pixels)})  # within its limits
         self.field = self.prepare(field).eval().requires_grad_(False)
-        self.device, self.budget = self.field.device, budget
+        self.device = self.field.device
+        self.budget = budget
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self._is_warm = False
         self.restart(T_world_camera)
@@ -177,17 +178,21 @@ class Tracker(abc.ABC):
     def _search(self, frame: Frame, T_starts: Poses, budget: Budget) -> Estimate:
         if not self._is_warm and frame.has_depth:
             # A step that counts nowhere: first calls load and allocate for a second or more.
-            state, self._is_warm = self.state(), True
+            state = self.state()
+            self._is_warm = True
             self._begin(frame, T_starts[:1])
             self.step()
             self.report()
             self.restore(state)
             synchronize(self.device)
-        began, allowed = time.perf_counter(), budget.frame(self.device)
+        began = time.perf_counter()
+        allowed = budget.frame(self.device)
         self._begin(frame, T_starts)
-        steps, loss = 0, float("nan")
+        steps = 0
+        loss = float("nan")
         for step in allowed:
-            loss, steps = self.step(), step + 1
+            loss = self.step()
+            steps = step + 1
             if self.is_converged:
                 break
         synchronize(self.device)

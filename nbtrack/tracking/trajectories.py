@@ -54,7 +54,8 @@ def track_sequence(
     DataError if there are fewer than two frames, or none of them has a measured depth.
     """
     _check_trackable(sequence)
-    first, rows = int(is_start_known), []
+    first = int(is_start_known)
+    rows = []
     if is_start_known:
         tracker.restart(sequence.T_world_camera[0])
     else:
@@ -95,7 +96,8 @@ def read_trajectory(folder: Path) -> Trajectory:
     if not (folder / METRICS_FILE).is_file():
         raise MissingError(f"no finished run in {folder}: give a folder that `track` wrote")
     times, T_estimated = read_tum(folder / "trajectory.txt")
-    T_true, truth = np.full_like(T_estimated, np.nan), folder / "groundtruth.txt"
+    T_true = np.full_like(T_estimated, np.nan)
+    truth = folder / "groundtruth.txt"
     if truth.is_file():
         known, poses = read_tum(truth)
         T_true[np.searchsorted(times, known)] = poses
