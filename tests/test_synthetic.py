@@ -263,6 +263,16 @@ def test_key_frames_move_as_the_dataset_does(room, n_frames, seed):
 
 
 @each_room
+def test_a_long_path_of_key_frames_goes_to_and_fro(room):
+    """Catches rooms that are refused, as they are too small for a longer path, and jumps at its
+    ends: it passes its poses again in the opposite order."""
+    poses = keyframes_of(room, 700, 0)
+    np.testing.assert_array_equal(poses[:300], keyframes_of(room, 300, 0))
+    np.testing.assert_array_equal(poses[299:598], poses[299::-1][:299])
+    np.testing.assert_array_equal(poses[598:], poses[:102])
+
+
+@each_room
 def test_two_paths_of_key_frames_see_the_same(room):
     """Catches seeds that give one path, and a second path that looks where no map of the first
     knows anything: nine in ten of its points were seen from the first."""

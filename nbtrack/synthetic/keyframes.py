@@ -33,6 +33,7 @@ _ASTRAY = 0.8  # rad; how far it is turned from the view there
 _MIN_STILL = 1.2
 _MIN_STILL_MOVED = 1.0
 _CALIBRATION_FRAMES = 240  # shorter paths are the beginning of one of this length
+_WALK_FRAMES = 300  # longer paths go to and fro on one of this length: every room has one
 _ATTEMPTS = 600
 # How far a seed moves the key poses (m, along x, y, z) and turns them (rad): the paths of two seeds
 # pass the same things.
@@ -59,9 +60,10 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
 
     Its mean speeds, over 240 frames where it is shorter, are `MEAN_STEP`, in the unit of a map of
     what the camera sees. The key poses belong to the room; a seed moves and turns them a little.
+    A path of more than 300 frames turns back at both ends of one of that length (our choice).
     Raises `NumericalError` where no path keeps `CLEARANCE`: the room is too full.
     """
-    length = max(n_frames, _CALIBRATION_FRAMES)
+    length = min(max(n_frames, _CALIBRATION_FRAMES), _WALK_FRAMES)
     keys = _keys_of_room(room, length)
     least = min(_MIN_STILL_MOVED, 0.8 * _still(_calibrated_path(room, keys, length)))
     for attempt in range(_ATTEMPTS):
@@ -71,7 +73,9 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
         moved = _Keys(keys.places + shift, keys.yaw + turn, keys.pitch, keys.times)
         poses = _calibrated_path(room, moved, length)
         if _still(poses) > least and _is_fit(room, poses):
-            return poses[:n_frames]
+            period = 2 * (length - 1)
+            to_and_fro = np.abs((np.arange(n_frames) + length - 1) % period - (length - 1))
+            return poses[to_and_fro]
     raise too_full(room)
 
 
