@@ -294,7 +294,7 @@ _EXPORTS = {
 def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder; ConfigError where none is named."""
     if options.out is None:
-        raise ConfigError(f"where shall {options.room} be written? Give a folder with --out")
+        raise ConfigError(f"--out is missing: name the folder that {options.room} is written to")
     config = with_values(ScenesConfig(), {name: getattr(options, name) for name in SIZES})
     check_no_recording(options.out)
     write_room(options.room, options.out, config)
