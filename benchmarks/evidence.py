@@ -50,14 +50,14 @@ NINE = load_preset("nine_rooms")
 THREE_ROOMS = [*NINE.scenes.names[:3]]  # the first of the nine, whatever was found in them
 THREE = with_settings(NINE, f"scenes.names={THREE_ROOMS}")
 # The paper's sizes: 640 x 480 pixels, 256 units, 512 and 4,096 pixels a step. Both maps together
-# have three hours of a core (3.3 s an iteration of both).
+# have one hour of a core (3.3 s an iteration of both).
 FULL = load_preset(
     "synthetic",
     settings=[
         f"scenes.names={THREE_ROOMS[:1]}",
         "scenes.n_frames=240",
-        "mapping.imap.iterations=3300",
-        "mapping.neus.iterations=3300",
+        "mapping.imap.iterations=1100",
+        "mapping.neus.iterations=1100",
     ],
 )
 HELD = with_settings(NINE, *HAND_HELD)
@@ -148,7 +148,7 @@ def nine_rooms(seed: int) -> Iterator[Chunk]:
 
 
 def full_size(seed: int) -> Iterator[Chunk]:
-    """Table I at the paper's sizes in one room, with one seed. It takes some six core-hours."""
+    """Table I at the paper's sizes in one room, with one seed. It takes some three core-hours."""
     for scene in open_scenes(FULL):
         yield {"scene": scene.name}, partial(_full_size, scene, seed)
 
