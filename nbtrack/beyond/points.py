@@ -88,7 +88,6 @@ def fuse_points(
     where they are. Memory grows with the surface that was seen, not with the frames.
     Raises ConfigError for a voxel that is not positive, far too fine, or longer than the scene.
     """
-    low = np.array(bounds.minimum)
     extent = np.subtract(bounds.maximum, bounds.minimum)
     if not extent.max() / _MAX_CELLS_A_SIDE <= voxel <= extent.max():
         raise ConfigError(
@@ -105,7 +104,7 @@ def fuse_points(
         points_camera = frame.points(rows, columns)[0].double().numpy()
         points = points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
         colors = frame.color[rows, columns].numpy() / 255.0
-        voxels, inside = cells_of(points, low, shape, voxel)
+        voxels, inside = cells_of(points, np.array(bounds.minimum), shape, voxel)
         values = np.concatenate([points, colors, np.ones((len(points), 1))], axis=1)[inside]
         parts.append(pd.DataFrame(values, voxels))
         if count % _FRAMES_AT_ONCE == 0 or count == len(frames):

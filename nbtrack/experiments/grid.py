@@ -110,9 +110,8 @@ def track_scenes(
         seeds: of map and run together: their spread is that of the method.
         tracked: other recordings of the same rooms, in the same order, which no map has seen.
 
-    Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), ate_m (NaN
-    where it failed, or no true pose is known), failure (why) and the other metrics. Raises
-    ConfigError where an argument is no list, and what the first failing job raised.
+    Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), the metrics,
+    ate_m and why it is NaN (failure). Raises ConfigError for no list, and what a job raised first.
     """
     execution = execution or Execution()
     check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
@@ -121,14 +120,13 @@ def track_scenes(
     n_threads = execution.threads or (torch.get_num_threads() if clock else None)
     how = {"frames": str(frames or preset.scenes.track_frames), "n_threads": n_threads}
     pairs = list(zip(scenes, tracked or scenes, strict=True))
-    jobs = []
-    rows = []
+    jobs, rows = [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
-        made = MapJob.of(scene, method.field, own, seed=seed)
-        what = made, seen, method.tracker, own.tracking_of(method.tracker)
+        what = seen, method.tracker, own.tracking_of(method.tracker)
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
-        jobs.append(TrackJob(*what, n_steps, rate_hz if clock else None, seed=seed, **how))
+        made = MapJob.of(scene, method.field, own, seed=seed)
+        jobs.append(TrackJob(made, *what, n_steps, rate_hz if clock else None, seed=seed, **how))
         rows.append({"rate_hz": rate_hz, "steps": n_steps, "method": method.label})
     return pd.DataFrame(map(_row_of, rows, jobs, _run(jobs, clock, execution)))
 

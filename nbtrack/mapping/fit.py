@@ -48,7 +48,6 @@ def map_sequence(
     """Fit a field to a sequence with known poses; one that learns nothing is made from its frames.
 
     Settings are those of the field's `Network`, None where it has none, and of its `Settings`.
-
     A `checkpoint` is written every few seconds and, where it exists, resumed from with the batches
     of an uninterrupted run. Who has written the finished map removes it. Raises DataError where no
     pixel has a depth, or the checkpoint is of another map; ConfigError where a field's losses are
@@ -67,12 +66,10 @@ def map_sequence(
             with suitable_threads(field.width):
                 fit = _Fit(recipe, settings, field, sequence, mapped)
                 fit.run(checkpoint, on_iteration)
-        history = fit.history
-        seconds = fit.seconds
+        history, seconds = fit.history, fit.seconds
     else:
         field = kind.from_frames(sequence, mapped, bounds, settings).to(device)
-        history = [field.diagnostics()]
-        seconds = time.perf_counter() - start
+        history, seconds = [field.diagnostics()], time.perf_counter() - start
         on_iteration(1.0, history[0])
     misfit_m = usual_depth_residual(field, sequence, mapped)
     record = {**recipe, "seconds": seconds, "misfit_m": misfit_m, "mapped_frames": len(mapped)}
