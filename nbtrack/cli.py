@@ -75,7 +75,7 @@ OPTIONS = {
     "--depth-folder": _option("default: the format's; filtered before raw depth"),
     "--poses": _option("pose file (default: the format's)", metavar="FILE"),
     "--seed": _option("of all random numbers (default: 0)", partial(a_count, minimum=0), default=0),
-    "--out": _option("where to write (default: in runs/)", a_path),
+    "--out": _option("where to write (default: in runs/; data make needs it)", a_path),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
     "--threads": _option("CPU threads (default: all cores)", some_threads),
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),

@@ -111,7 +111,7 @@ def track_scenes(
         tracked: other recordings of the same rooms, in the same order, which no map has seen.
 
     Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), the metrics,
-    ate_m and why it is NaN (failure). Raises ConfigError for no list, and what a job raised first.
+    ate_m (NaN where not known), failure (why). Raises ConfigError for no list; what a job raised.
     """
     execution = execution or Execution()
     check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
