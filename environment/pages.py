@@ -62,7 +62,9 @@ def read_source(path: Path, execute: bool) -> nbformat.NotebookNode:
         return nbformat.v4.new_notebook(cells=[nbformat.v4.new_markdown_cell(text)])
     notebook = nbformat.read(path, as_version=4)
     if execute:
-        runner = ExecutePreprocessor(timeout=None)
+        # Else each kernel warns that its port of this machine is not encrypted.
+        errors_only = ["--log-level=ERROR"]
+        runner = ExecutePreprocessor(timeout=None, extra_arguments=errors_only)
         runner.preprocess(notebook, {"metadata": {"path": path.parent}})
         notebook.metadata.pop("widgets", None)  # a page has no kernel that would move them
     return notebook
