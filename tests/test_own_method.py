@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from unittest import mock
 
 import cloudpickle
 import nbformat
@@ -146,7 +147,9 @@ def nbtrack_there(folder: Path, *words: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
 
-def test_a_file_joins_by_an_option_of_every_command(tmp_path: Path) -> None:
+def test_a_file_joins_by_an_option_of_every_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
     """Catches a user's file that some command, or a worker process, does not know; a map of its
     field that can be read only where it was made, and a command that does not make a run again."""
     (tmp_path / "own").mkdir()
@@ -163,13 +166,15 @@ def test_a_file_joins_by_an_option_of_every_command(tmp_path: Path) -> None:
     assert (tmp_path / "out/table_1.csv").read_text().count("Mine,") == 2
     (made,) = (tmp_path / "runs/maps").glob("office-fading-*")
     run = ["track", "office", "--map-from", str(made), "--steps", "1", "--out", "run", *words]
-    refused = nbtrack_there(tmp_path, *run)
-    assert refused.returncode == 2
-    assert "'fading', which is not registered" in refused.stderr
-    assert "--import" in refused.stderr
-    assert refused.stderr.count("\n") == 1
-    done = nbtrack_there(tmp_path, *run, "--tracker", "distance", *own)
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(tmp_path)
+    assert main(run) == 2
+    refused = capsys.readouterr().err
+    assert "'fading', which is not registered" in refused
+    assert "--import" in refused
+    assert refused.count("\n") == 1
+    with mock.patch.dict(FIELDS), mock.patch.dict(TRACKERS), mock.patch.dict(METHODS):
+        monkeypatch.setattr(sys, "path", [*sys.path])
+        assert main([*run, "--tracker", "distance", *own]) == 0
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     assert f"--import={far / 'my-method.py'}" in metrics["command"]
     done = nbtrack_there(
