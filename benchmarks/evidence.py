@@ -277,7 +277,8 @@ DEPTHS = {"exact": "depth", "filtered": "depth_filtered", "noisy": "depth_with_n
 
 
 def oracle(seed: int) -> Iterator[Chunk]:
-    """LM without colour in ever poorer distances, with three qualities of tracked depth."""
+    """LM in ever poorer distances, with three qualities of tracked depth, all without colour and,
+    where the map has one, with it."""
     for scene, name in product(open_scenes(PRESET), ORACLES):
         yield {"field": name, "scene": scene.name}, partial(_on_each_depth, scene, name, seed)
 
@@ -294,9 +295,10 @@ def _on_each_depth(scene: Scene, name: str, seed: int) -> pd.DataFrame:
             field = BakedField(ExactDistance(bounds, scene.room), 0.02)
         else:
             field = BakedField(FusedDistance(whole, mapped, bounds), 0.05)  # its own voxels
-    settings = replace(PRESET.tracking_of("lm"), n_pixels=2048, lambda_intensity=0.0)
+    weights = (0.0, 1.0) if name in LEARNED else (0.0,)
     rows = []
-    for depth, folder in DEPTHS.items():
+    for (depth, folder), weight in product(DEPTHS.items(), weights):
+        settings = replace(PRESET.tracking_of("lm"), n_pixels=2048, lambda_intensity=weight)
         sequence = OtherDepth(scene.name, scene.folder, depth_folder=folder).read()
         T_first = sequence.T_world_camera[0]
         with threads(1):
@@ -304,8 +306,9 @@ def _on_each_depth(scene: Scene, name: str, seed: int) -> pd.DataFrame:
             tracked = track_sequence(tracker, sequence)
         metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
         metrics |= still_metrics(sequence.T_world_camera)
-        rows.append({"depth": depth, **metrics, "ate_m": metrics["ate_rmse_m"]})
-    return pd.DataFrame(rows)[["depth", *(c for c in KEPT[3:] if c in rows[0])]]
+        what = {"depth": depth, "lambda_intensity": weight}
+        rows.append({**what, **metrics, "ate_m": metrics["ate_rmse_m"]})
+    return pd.DataFrame(rows)[[*what, *(c for c in KEPT[3:] if c in rows[0])]]
 
 
 def choices(seed: int) -> Iterator[Chunk]:
