@@ -32,7 +32,7 @@ _N_POINTS = 300_000  # measured points
 # Where along their normals (m) the distance is that offset: within a voxel, as planes end.
 _OFFSETS = (0.0, -0.03, -0.015, 0.015, 0.03)
 # A larger place takes more points, so that a frame sees no cells in which none lies. Rooms have so
-# many a cell anyway; an office of 15 by 17 m had 3 (docs/tried.md).
+# many a cell anyway; an office of 10 by 11 m had 3 (docs/tried.md).
 _POINTS_A_CELL = 10
 _MAX_TIMES = 4  # as many points at most
 _HUBER = 0.01  # m; a larger residual counts less
