@@ -186,9 +186,15 @@ def read_calibration(path: Path) -> Calibration:
     # NaN fails both: numpy's minimum keeps it, unlike Python's.
     is_camera = np.min([fx, fy]) >= _MIN_FOCAL and np.abs([fx, fy, cx, cy]).max() < _LARGEST
     if not (is_matrix and is_camera):
+        advice = "calibrate anew"
+        if fy < 0:  # as in ICL-NUIM
+            advice = (
+                "a negative fy is that of a camera whose y axis points up: write it positive, and "
+                "if `data check` then finds other axes, the camera_axes that it names"
+            )
         raise DataError(
             f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
-            "pixels, without skew, the focal lengths positive, all finite; calibrate anew"
+            f"pixels, without skew, the focal lengths positive, all finite; {advice}"
         )
     return Calibration(path, fx, fy, **{"principal_point": (cx + 0.5, cy + 0.5), **others})
 
