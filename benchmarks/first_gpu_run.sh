@@ -8,7 +8,7 @@ OUT=${OUT:-runs/first_gpu_run}
 mkdir -p "$OUT"
 OUT=$(cd "$OUT" && pwd)
 exec > >(tee "$OUT/log.txt") 2>&1
-export OUT PYTHONPATH=$PWD NBTRACK_RUNS=$OUT/cache PYTHONUNBUFFERED=1
+export OUT PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH} NBTRACK_RUNS=$OUT/cache PYTHONUNBUFFERED=1
 echo "results in $OUT"
 
 python3 - <<'PYTHON' || exit 1
@@ -43,6 +43,9 @@ part 110 python3 benchmarks/step_times.py steps
 part 110 python3 benchmarks/step_times.py mapping
 part 60 python3 -m pytest -q -p no:cacheprovider --noconftest -W default -m gpu \
   tests/test_gpu.py tests/test_sampling.py
+sizes=(--preset synthetic)
+[ "$NBTRACK_DEVICE" = cpu ] && sizes=(--preset smoke "${small[@]}")
+part 120 python3 -m nbtrack bench "${sizes[@]}" --out "$OUT/bench"
 track() { # seconds, its name, the options
   local seconds=$1 name=$2; shift 2
   part "$seconds" python3 -m nbtrack track living_room "$@" --preset smoke --frames :60 \
@@ -51,8 +54,6 @@ track() { # seconds, its name, the options
 track 70 sdf --field neus --tracker sdf --rate 30
 track 40 vr --field imap --tracker vr --rate 10
 track 40 lm --field neus --tracker lm --steps 20
+track 60 corrected
 track 40 icp --field points --tracker icp --steps 30
-sizes=(--preset synthetic)
-[ "$NBTRACK_DEVICE" = cpu ] && sizes=(--preset smoke "${small[@]}")
-part 120 python3 -m nbtrack bench "${sizes[@]}" --out "$OUT/bench"
 echo "=== $(date +%T) done: $OUT"

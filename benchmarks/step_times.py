@@ -18,12 +18,13 @@ import numpy as np
 import pandas as pd
 import torch
 
+from nbtrack import TRACKERS, Tracker, make_tracker
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.device import choose_device, device_name, synchronize
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, field_class, make_field
-from nbtrack.tracking import TRACKERS, StepBudget, Tracker, make_tracker
+from nbtrack.tracking import StepBudget
 
 DEVICE = choose_device()
 IS_GPU = DEVICE.type == "cuda"

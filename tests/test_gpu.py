@@ -8,13 +8,14 @@ import pytest
 import torch
 from box_room import walk
 
+from nbtrack import TRACKERS, make_tracker
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.device import choose_device, named_device
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import naming_damaged
 from nbtrack.fields import NetworkSettings, field_class, make_field
 from nbtrack.mapping.fit import _Fit
-from nbtrack.tracking import TRACKERS, StepBudget, make_tracker, track_sequence
+from nbtrack.tracking import StepBudget, track_sequence
 
 BOUNDS = SceneBounds((-1.2, -1.0, -1.4), (1.2, 1.0, 1.4))
 SEQUENCE = walk(4)
