@@ -100,15 +100,16 @@ def steps(cells: pd.DataFrame) -> pd.DataFrame:
     cells = cells.query("budget_ms == 500")
     cells.index = cells["tracker"] + " " + cells["n_pixels"].astype(str)
     table = pd.DataFrame({"steps in 500 ms": cells["steps"].map("{:.1f}".format)})
-    return table.assign(**{"ms a step": (500 / cells["steps"]).map("{:.0f}".format)}).T
+    return table.assign(**{"ms a step": (500 / cells["steps"]).map("{:.3g}".format)}).T
 
 
 def mapping(times: pd.DataFrame) -> pd.DataFrame:
-    """Seconds of a mapping iteration by field, and by the eikonal term's share of the samples."""
+    """Time of a mapping iteration by field, and by the eikonal term's share of the samples."""
+    times = times.query("precision == 'float32'")
     share = times["eikonal_share"].map(", eikonal term on {:g} of the samples".format)
     times.index = times["field"] + share.where(times["eikonal_share"].notna(), "")
-    seconds = (times["ms"] / 1000).map("{:.2f}".format)
-    return pd.DataFrame({"rays": times["n_rays"].astype(str), "s an iteration": seconds})
+    ms = times["ms"].map("{:,.1f}".format)
+    return pd.DataFrame({"rays": times["n_rays"].astype(str), "ms an iteration": ms})
 
 
 def convergence(scores: pd.DataFrame) -> pd.DataFrame:
@@ -181,6 +182,8 @@ def _over_rooms(ratios: pd.Series) -> pd.Series:
 TABLES = {
     "steps": (steps, "benchmarks/cpu/table_2.csv"),
     "mapping": (mapping, "benchmarks/cpu/mapping.csv"),
+    "gpu_steps": (steps, "benchmarks/gpu/table_2.csv"),
+    "gpu_mapping": (mapping, "benchmarks/gpu/mapping.csv"),
     "convergence": (convergence, "paper_tables/beyond/convergence.csv"),
     "tracking": (tracking, "paper_tables/corrected/tracking.csv"),
     "recordings": (recordings, "paper_tables/corrected/tracking.csv"),

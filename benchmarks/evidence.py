@@ -4,11 +4,10 @@
 
 EXPERIMENT is one of nine_rooms, full_size, scores, dataset_path, readings, speeds, more_steps,
 cheap_queries, by_the_clock (as the dataset moves), steps, factors, oracle, choices, basin
-(hand-held). Rows are added to a CSV
-under paper_tables/ as they are finished, the first seed first; those that are there are not made
-again, whatever has changed since: remove the file to begin anew. Maps and runs are kept with all
-others (`NBTRACK_RUNS`), so that a killed experiment goes on where it was. nine_rooms and full_size
-use all cores: run others side by side.
+(hand-held). Rows are added to a CSV under paper_tables/ as they are finished, the first seed first;
+those that are there are not made again, whatever has changed since: remove the file to begin anew.
+Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed experiment goes on where
+it was. nine_rooms uses all cores, full_size is for a GPU: run others side by side.
 """
 
 import sys
