@@ -1,6 +1,6 @@
 """`python -m nbtrack`."""
 
-from nbtrack.core.interrupts import heed_interrupts
+from nbtrack.interrupts import heed_interrupts
 
 heed_interrupts()
 from nbtrack.cli import main  # noqa: E402, only now: it takes a while

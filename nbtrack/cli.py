@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 from nbtrack import __version__
 from nbtrack.core.errors import ConfigError, NbtrackError, nearest_name
-from nbtrack.core.interrupts import INTERRUPTED, STATUS, heed_interrupts
+from nbtrack.interrupts import INTERRUPTED, STATUS, heed_interrupts
 
 _MAX_COUNT = 2**31 - 1  # what every random generator takes
 _MAX_THREADS = 1024  # OpenMP ends the process where it cannot start them

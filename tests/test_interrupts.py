@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tiny import tiny_words
 
-from nbtrack.core.interrupts import interrupts_put_off
+from nbtrack.interrupts import interrupts_put_off
 
 # As libraries do that try what else there is: an import that takes Ctrl-C for a failure of its own.
 IMPORTING = """

@@ -1,7 +1,8 @@
-"""The formats of recordings: one table of layouts and conventions. data/README.md describes them.
+"""The format of the dataset, and how any format is told and read; data/README.md describes them.
 
-A format of one's own is one more entry. What a recording does otherwise than its format, it says
-in `sequence.toml`: any field of `Declaration`.
+`FORMATS` is one table of layouts and conventions. A format of one's own is one more entry, as those
+of `recordings/formats.py` are. What a recording does otherwise than its format, it says in
+`sequence.toml`: any field of `Declaration`.
 """
 
 from collections.abc import Sequence
@@ -115,14 +116,6 @@ def files_of(folder: Path, pattern: str) -> list[Path]:
     return sorted(files, key=lambda path: (keys[path], path.name))
 
 
-_VGA = (640, 480)
-# The benchmark's own calibrations of its three cameras. Their lenses are not corrected: its page on
-# the Kinect's calibration says that the driver has done so, and laid depth on colour by the pixel.
-_TUM_CAMERAS = (
-    Calibration(Path("freiburg1"), 517.3, 516.5, (319.1, 255.8), _VGA),
-    Calibration(Path("freiburg2"), 520.9, 521.0, (325.6, 250.2), _VGA),
-    Calibration(Path("freiburg3"), 535.4, 539.2, (320.6, 248.1), _VGA),
-)  # fmt: skip
 FORMATS: dict[str, Format] = {
     # Azinovic et al. 2022. Filtered depth is what the dataset's own loader takes; intrinsics.txt
     # is an addition of this package.
@@ -131,40 +124,6 @@ FORMATS: dict[str, Format] = {
         depth=("depth_filtered/*", "depth/*", "depth_with_noise/*"), poses=("poses.txt",),
         cameras=("intrinsics.txt", "focal.txt", "K.txt"),
         declared=Declaration(camera_axes="opengl"), counts_from_0=True,
-    ),
-    # Sturm et al. 2012. The depth maps carry their scale correction already.
-    "tum": Format(
-        "TUM RGB-D", color=("rgb.txt",), depth=("depth.txt",), poses=("groundtruth.txt",),
-        cameras=("intrinsics.json", "intrinsics.txt", "calibration.txt"),
-        known_cameras=_TUM_CAMERAS, declared=Declaration(depth_scale=5000.0),
-    ),
-    # As rendered for iMAP and shared with NICE-SLAM, whose loader turns the y and z axes of these
-    # poses to reach OpenGL's.
-    "replica": Format(
-        "Replica (NICE-SLAM)", color=("results/frame*",), depth=("results/depth*",),
-        poses=("traj.txt",), cameras=("cam_params.json", "../cam_params.json"),
-        declared=Declaration(depth_scale=6553.5), counts_from_0=True,
-    ),
-    # Shotton et al. 2013. Colour and depth come from two cameras 25 mm apart that the dataset does
-    # not register. Its page states the focal length and the principal point (320, 240), taken here
-    # as the middle of the image.
-    "7scenes": Format(
-        "7-Scenes", color=("*.color.*",), depth=("*.depth.*",), poses=("*.pose.txt",),
-        cameras=("intrinsics.txt", "camera-intrinsics.txt", "../camera-intrinsics.txt"),
-        declared=Declaration(no_depth=65535),
-        known_cameras=(Calibration(Path(), 585.0, 585.0, None, _VGA),),
-    ),
-    # Dai et al. 2017, as SensReader exports a scan: one view, colour larger than depth.
-    "scannet": Format(
-        "ScanNet export", color=("color/*",), depth=("depth/*",), poses=("pose/*.txt",),
-        cameras=("intrinsic/intrinsic_depth.txt",), resize_color=True,
-    ),
-    # A folder of an own recording, or of Open3D's: image/, .log and the last three cameras.
-    "plain": Format(
-        "plain folder", color=("color/*", "image/*"), depth=("depth/*",),
-        poses=("trajectory.txt", "poses.txt", "poses/*.txt", "trajectory.log"),
-        cameras=("intrinsics.json", "intrinsics.txt", "K.txt",
-                 "intrinsic.json", "camera_intrinsic.json", "camera_primesense.json"),
     ),
 }  # fmt: skip
 DATASET_SCENES = {

@@ -22,7 +22,6 @@ import torch
 from nbtrack.core.device import choose_device, threads
 from nbtrack.core.errors import MissingError, NbtrackError, check_lists
 from nbtrack.core.files import data_folder, runs_folder
-from nbtrack.core.interrupts import interrupts_put_off
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.experiments import IMPORTED, import_own
 from nbtrack.experiments.jobs import Job
@@ -32,6 +31,7 @@ from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.fields import FIELDS
+from nbtrack.interrupts import interrupts_put_off
 from nbtrack.mapping.files import Map
 from nbtrack.tracking import TRACKERS
 from nbtrack.tracking.methods import Methods, find_methods
