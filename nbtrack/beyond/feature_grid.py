@@ -34,15 +34,15 @@ class GridPlusMapping(NeusPlusMapping):
     n_stratified: int = limited(8, 1, 1024)
     n_surface: int = limited(8, 0, 1024)
     n_surface_points: int = limited(1024, 1, 65536)
-    learning_rate: float = 0.01  # a feature is seen by few rays
-    lambda_eikonal: float = limited(0.0, 0.0, 0.0)  # grids have no second derivative; see `sdf`
+    learning_rate: float = 0.01
+    lambda_eikonal: float = limited(0.0, 0.0, 0.0)  # not tried in grids
 
 
 class FeatureGrid(nn.Module):
     """Colour logits and one value at points, of features that are interpolated in some grids.
 
     Source: the dense levels of Instant-NGP (Müller et al. 2022), without its hash table: a room has
-    few vertices. The interpolation has no second derivative here.
+    few vertices.
     """
 
     def __init__(self, settings: GridNetwork, bounds: SceneBounds, generator: Generator) -> None:
