@@ -84,6 +84,12 @@ def test_files_of_others_stay(work: Path, capsys: pytest.CaptureFixture) -> None
     for _ in range(2):  # what it wrote itself, it replaces
         assert main([*OWN, "--out", "mine"]) == 0
     assert (work / "mine/notes.txt").read_text() == "0 1 2 3 0 0 0 1\n"
+    (work / "paper").mkdir()
+    for name in ("table_1.tex", "table_3_cells.csv"):
+        (work / "paper" / name).write_text("mine\n")
+        says = f"paper has a {name} that nbtrack did not write"
+        assert_refused(work, capsys, ["tables", "--out", "paper"], says)
+        (work / "paper" / name).unlink()
 
 
 def test_one_command_at_a_time_writes_to_a_folder(

@@ -53,7 +53,7 @@ class Execution:
     """How jobs are run; of all this only the threads may change last digits of a result."""
 
     # Processes; by default one a core, or this process alone where a GPU does the work: there jobs
-    # side by side gain little (benchmarks/README.md) and share its memory.
+    # share its memory, and side by side gain less (benchmarks/README.md).
     workers: int | None = None
     threads: int | None = None  # of each job; by default this process's, divided by the workers
     dask: str | None = None  # address of a Dask scheduler whose workers run the jobs instead

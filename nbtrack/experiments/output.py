@@ -20,7 +20,7 @@ OVERVIEW_FILE = "overview.png"
 # What the folders of runs, maps and tables may hold.
 _RUN_FILES = ("trajectory.txt", "groundtruth.txt", "frames.csv", METRICS_FILE, OVERVIEW_FILE)
 _MAP_FILES = (MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE)
-_TABLE_FILES = ("table_1.csv", "table_2.csv", "table_3.csv")
+_TABLE_FILES = ("table_[123]*",)  # in every form
 _SOFTWARE = "nbtrack"
 LOCK_FILE = ".nbtrack.lock"
 """It stays in every folder that was given with --out, and tells that nbtrack wrote there."""
@@ -70,7 +70,7 @@ def output_folder(folder: Path | None) -> Iterator[None]:
         return
     check_no_recording(folder)
     names = _RUN_FILES + _MAP_FILES + _TABLE_FILES
-    foreign = [name for name in names if (folder / name).exists()]
+    foreign = [path.name for name in names for path in sorted(folder.glob(name))]
     if foreign and not is_own_output(folder):
         raise ConfigError(f"{folder} has a {foreign[0]} that nbtrack did not write: move it away")
     try:
