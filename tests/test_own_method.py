@@ -22,7 +22,7 @@ import nbtrack
 from nbtrack.cli import main
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError, NbtrackError
-from nbtrack.core.files import foreign_source, runs_folder
+from nbtrack.core.files import runs_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments import presets
 from nbtrack.experiments.methods import METHODS, Method
@@ -30,6 +30,7 @@ from nbtrack.experiments.presets import load_preset
 from nbtrack.fields import FIELDS, NetworkSettings, NeusMapping, field_class
 from nbtrack.fields.mlp import FourierMlp
 from nbtrack.mapping.files import write_map
+from nbtrack.provenance import foreign_source
 from nbtrack.tracking import TRACKERS, tracker_class
 
 OWN = '''
@@ -268,7 +269,7 @@ def test_code_without_a_file_is_the_same_in_every_process(tmp_path: Path) -> Non
     kernel started again, or a worker, would make everything anew."""
     kind = in_a_cell(CELL)
     (tmp_path / "kind").write_bytes(cloudpickle.dumps(kind))
-    read = "import pickle, sys; from nbtrack.core.files import foreign_source as source; "
+    read = "import pickle, sys; from nbtrack.provenance import foreign_source as source; "
     read += f"sys.stdout.write(source(pickle.load(open({str(tmp_path / 'kind')!r}, 'rb'))))"
     command, environment = [sys.executable, "-c", read], os.environ | {"PYTHONHASHSEED": "1"}
     found = subprocess.run(command, env=environment, capture_output=True)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from nbtrack import provenance
 from nbtrack.core import files
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments import map_jobs, track_jobs
@@ -19,14 +20,14 @@ from nbtrack.synthetic import make_room
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the package's sources, to be edited."""
     copy = tmp_path / "nbtrack"
-    shutil.copytree(files.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setattr(files, "PACKAGE", copy)
+    shutil.copytree(provenance.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(provenance, "PACKAGE", copy)
     return copy
 
 
 def key() -> str:
-    files.sources_fingerprint.cache_clear()
-    return files.sources_fingerprint("fields.neus", "mapping.fit")
+    provenance.sources_fingerprint.cache_clear()
+    return provenance.sources_fingerprint("fields.neus", "mapping.fit")
 
 
 @pytest.mark.parametrize(
@@ -57,9 +58,9 @@ def test_what_changes_a_key(package: Path, file: str, old: str, new: str, counts
 def test_what_else_counts() -> None:
     """Catches a tracker or field outside the package whose edit is answered from the cache, and
     results that do not tell the torch they were made with."""
-    assert files.foreign_source(files.DataError) == ""
-    assert "speed" in files.foreign_source(Mine)
-    assert {"nbtrack", "torch", "python", "numba", "scipy"} <= set(files.versions())
+    assert provenance.foreign_source(files.DataError) == ""
+    assert "speed" in provenance.foreign_source(Mine)
+    assert {"nbtrack", "torch", "python", "numba", "scipy"} <= set(provenance.versions())
 
 
 def test_numbers_count_by_their_value() -> None:
@@ -88,7 +89,7 @@ def test_keys_hold_all_that_makes_a_result(tmp_path: Path, monkeypatch: pytest.M
         with monkeypatch.context() as patch:
             patch.setattr(module, name, _other)
             assert keys()[place] != before[place], name
-    monkeypatch.setattr(files, "versions", lambda: {"torch": "another"})
+    monkeypatch.setattr(provenance, "versions", lambda: {"torch": "another"})
     assert all(a != b for a, b in zip(keys(), before, strict=True))
 
 

@@ -1,14 +1,16 @@
 """Maps as jobs: made from a scene, or given."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+from nbtrack import provenance
 from nbtrack.beyond.correct import correct_map
-from nbtrack.core import files
 from nbtrack.core.device import choose_device
+from nbtrack.core.files import fingerprint
 from nbtrack.experiments.jobs import Job, Report
 from nbtrack.experiments.presets import PRESETS, Preset
 from nbtrack.experiments.quality import score_map
@@ -51,11 +53,19 @@ class MapJob(Job):
     def key(self) -> str:
         """A digest of code, device, data, settings and seed."""
         correction = ["nbtrack.beyond.correct"] if self.correction else []
-        code = field_class(self.field), "nbtrack.mapping.fit", make_field, type(self).compute
+        code = *self._mapping_code, type(self).compute
         settings = self.field, self.network, self.settings, self.correction
         what = self.scene.fingerprint, self.frames, self.seed
-        how = files.code_fingerprint(*code, *correction), files.versions(), choose_device().type
-        return files.fingerprint(*how, *settings, *what)
+        how = (
+            provenance.code_fingerprint(*code, *correction),
+            provenance.versions(),
+            choose_device().type,
+        )
+        return fingerprint(*how, *settings, *what)
+
+    @property
+    def _mapping_code(self) -> tuple[type | str | Callable, ...]:
+        return field_class(self.field), "nbtrack.mapping.fit", make_field
 
     @property
     def name(self) -> str:
@@ -119,9 +129,11 @@ class MapJob(Job):
         if self.needs:
             finished = correct_map(self.needs.map(), sequence, self.correction)
         else:
-            finished = map_sequence(*parts, choose_device(), checkpoint, tell)
+            code = provenance.code_fingerprint(*self._mapping_code)
+            finished = map_sequence(*parts, choose_device(), checkpoint, tell, code)
         record = {"quality": score_map(finished, sequence, self.scene.room)}
         record |= {"frames": self.frames, "key": self.key, "correction": self.correction}
+        record |= {"versions": provenance.versions()}
         finished = replace(finished, record=finished.record | record)
         write_map(path, finished)
         checkpoint.unlink(missing_ok=True)
@@ -141,8 +153,8 @@ class GivenMap(Job):
     @cached_property
     def key(self) -> str:
         """A digest of the map, its field's code and the device."""
-        code = files.code_fingerprint(type(self.finished.field))
-        return files.fingerprint(self.finished.key, code, choose_device().type)
+        code = provenance.code_fingerprint(type(self.finished.field))
+        return fingerprint(self.finished.key, code, choose_device().type)
 
     @property
     def field(self) -> str:

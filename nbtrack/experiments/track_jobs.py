@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nbtrack import provenance
 from nbtrack.core import files
 from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.errors import DataError
@@ -66,11 +67,11 @@ class TrackJob(Job):
         """A digest of code, map, tracker, budget, threads, frames, seed; by the clock, machine."""
         kinds = tracker_class(self.tracker), field_class(self.needs.field)
         own = type(self).compute, type(self)._tracked, _scores, make_tracker
-        code = files.code_fingerprint(*kinds, "nbtrack.tracking.trajectories", *own)
+        code = provenance.code_fingerprint(*kinds, "nbtrack.tracking.trajectories", *own)
         clock = None if self.rate_hz is None else (self.rate_hz, device_name(choose_device()))
         how = self.tracker, self.settings, self.steps, clock, self.n_threads, self.start
         what = self.frames, self.seed, self.scene.fingerprint
-        return files.fingerprint(code, files.versions(), self.needs.key, *how, *what)
+        return files.fingerprint(code, provenance.versions(), self.needs.key, *how, *what)
 
     @property
     def name(self) -> str:
@@ -208,7 +209,7 @@ class TrackJob(Job):
             "tracker": self.tracker,
             "seed": self.seed,
             "key": self.key,
-            "versions": files.versions(),
+            "versions": provenance.versions(),
             "command": self._command(),
             "recording": str(self.scene.folder.resolve()),
             "format": self.scene.format,

@@ -13,7 +13,7 @@ import torch
 
 from nbtrack.core.device import advise_on_memory, device_name, suitable_threads
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
-from nbtrack.core.files import code_fingerprint, loaded_checkpoint, save_checkpoint, versions
+from nbtrack.core.files import loaded_checkpoint, save_checkpoint
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import LearnedField, MappingSettings, field_class, make_field
@@ -44,14 +44,15 @@ def map_sequence(
     device: torch.device | None = None,
     checkpoint: Path | None = None,
     on_iteration: OnIteration = lambda done, losses: None,
+    code: str = "",
 ) -> Map:
     """Fit a field to a sequence with known poses; one that learns nothing is made from its frames.
 
-    Settings are those of the field's `Network`, None where it has none, and of its `Settings`.
-    A `checkpoint` is written every few seconds and, where it exists, resumed from with the batches
-    of an uninterrupted run. Who has written the finished map removes it. Raises DataError where no
-    pixel has a depth, or the checkpoint is of another map; ConfigError where a field's losses are
-    no dictionary; NumericalError; OutOfMemory.
+    Settings are those of the field's `Network`, None where it has none, and of its `Settings`. A
+    `checkpoint` is written every few seconds, and resumed from, if it is of the same `code`, with
+    the batches of an uninterrupted run; who has written the finished map removes it. Raises
+    DataError where no pixel has a depth, or the checkpoint is of another map; ConfigError where a
+    field's losses are no dictionary; NumericalError; OutOfMemory.
     """
     recipe = recipe_of(field_name, sequence, network, settings, seed)
     start = time.perf_counter()
@@ -64,16 +65,15 @@ def map_sequence(
             with suitable_threads(0):
                 field = make_field(field_name, network, bounds, seed).to(device)
             with suitable_threads(field.width):
-                fit = _Fit(recipe, settings, field, sequence, mapped)
+                fit = _Fit(recipe | {"code": code}, settings, field, sequence, mapped)
                 fit.run(checkpoint, on_iteration)
         history, seconds = fit.history, fit.seconds
     else:
         field = kind.from_frames(sequence, mapped, bounds, settings).to(device)
         history, seconds = [field.diagnostics()], time.perf_counter() - start
         on_iteration(1.0, history[0])
-    misfit_m = usual_depth_residual(field, sequence, mapped)
-    record = {**recipe, "seconds": seconds, "misfit_m": misfit_m, "mapped_frames": len(mapped)}
-    record |= {"device": device_name(device), "versions": versions()}
+    made = {"seconds": seconds, "mapped_frames": len(mapped), "device": device_name(device)}
+    record = recipe | made | {"misfit_m": usual_depth_residual(field, sequence, mapped)}
     return Map(field, sequence.intrinsics, record, pd.DataFrame(history).rename_axis("iteration"))
 
 
@@ -108,9 +108,7 @@ class _Fit:
     """All that changes while a field is fitted, and what its batches are drawn from."""
 
     def __init__(self, recipe: dict, settings, field: LearnedField, sequence, mapped) -> None:
-        # Each device draws other numbers, and batches go on only under the code they began with.
-        code = code_fingerprint(type(field), "nbtrack.mapping.fit", make_field)
-        self.recipe = {**recipe, "device": field.device.type, "code": code}
+        self.recipe = {**recipe, "device": field.device.type}  # each draws other numbers
         self.settings = settings
         self.field = field
         self.optimizer = torch.optim.Adam(field.parameters(), lr=settings.learning_rate)

@@ -11,7 +11,8 @@ import numpy as np
 
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError, look_up
-from nbtrack.core.files import fingerprint, json_text, naming_damaged, sources_fingerprint
+from nbtrack.core.files import fingerprint, json_text, naming_damaged
+from nbtrack.provenance import sources_fingerprint
 from nbtrack.recordings.writer import WrittenFrame, write_sequence
 from nbtrack.synthetic.keyframes import keyframe_trajectory
 from nbtrack.synthetic.motion import handheld_trajectory, tour
