@@ -89,7 +89,7 @@ FACTS = {
     "2,048": "points a frame of LM, nbtrack/beyond/methods.py",
     "30": "steps a frame of LM at most, benchmarks/corrected.py",
     "120": "frames of Red Kitchen, paper_tables/README.md",
-    "372": "frames of an office, as above",
+    "373": "frames of an office, as above",
     "4.6": "degrees a frame of this office, as above",
     "1,200": "frames of a walk, benchmarks/walks.py",
     "06": "a notebook's number",
