@@ -111,6 +111,7 @@ def test_maps_and_their_scores(preset: Preset, scenes: list[Scene]) -> None:
     assert scores[["seconds", "sdf_near_m", "sdf_free_m"]].notna().all().all()
     found = map_scene(scenes[1], "neus", preset)
     assert found.record["seconds"] == scores["seconds"][0]
+    assert {"torch", "nbtrack"} <= set(found.record["versions"])  # where it comes from
     assert len(found.history) == 6
 
 
