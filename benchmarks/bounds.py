@@ -17,7 +17,8 @@ import pandas as pd
 from scipy.optimize import lsq_linear
 
 from nbtrack.core.files import data_folder, tables_folder
-from nbtrack.data.formats import DATASET_SCENES, DATASET_UNITS, Declaration
+from nbtrack.data.dataset import DATASET_SCENES, DATASET_UNITS
+from nbtrack.recordings.formats import Declaration
 from nbtrack.tables import published_table_1, write_csv
 from nbtrack.tracking import SdfSettings, paper_steps
 from nbtrack.tracking.metrics import still_metrics

@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import NumericalError
 from nbtrack.core.files import data_folder
-from nbtrack.data.formats import DATASET_UNITS, Declaration
+from nbtrack.data.dataset import DATASET_UNITS
+from nbtrack.recordings.formats import Declaration
 from nbtrack.synthetic import Room
 from nbtrack.synthetic.make import MOTIONS
 

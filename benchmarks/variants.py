@@ -13,12 +13,13 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, silu
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
+from nbtrack.beyond.points import depth_behind
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.data.recording import Recording, open_recording
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import FIELDS, Field, IMapField
+from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.synthetic import Room
 from nbtrack.tracking import TRACKERS, AdamTracker, SdfTracker, VrTracker
 
@@ -195,7 +196,7 @@ class FusedDistance(_Uncoloured):
         corners = torch.cartesian_prod(*axes)
         total, count = torch.zeros(2, len(corners))
         for index in frames.tolist():
-            in_front = -sequence[index].depth_behind(corners)
+            in_front = -depth_behind(sequence[index], corners)
             seen = in_front > -truncation
             total[seen] += in_front[seen].clamp(max=truncation)
             count += seen

@@ -8,7 +8,7 @@ __version__ = "0.1.0"
 # Loaded when they are first used, so that `--help` needs no torch.
 _MODULES = {
     "data.frame": ["Frame"],
-    "data.sequence": ["read_sequence"],
+    "recordings.reading": ["read_sequence"],
     "tracking.methods": ["METHODS", "Method"],
     "experiments.presets": ["claim", "load_preset"],
     "experiments.grid": ["map_scene", "map_scenes", "read_run", "track_scenes"],

@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 
 from nbtrack.core.errors import DataError, look_up
 from nbtrack.core.files import fingerprint, write_atomic
-from nbtrack.data.formats import DATASET_SCENES
+from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 PAPER_PIXELS = {"VR": 512, "SDF": 4096}

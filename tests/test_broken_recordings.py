@@ -15,8 +15,8 @@ from recordings import N_FRAMES, WRITERS, write_recording
 
 from nbtrack.cli import main
 from nbtrack.core.errors import DataError, NbtrackError
-from nbtrack.data.recording import open_recording
-from nbtrack.data.sequence import read_sequence
+from nbtrack.recordings.reading import read_sequence
+from nbtrack.recordings.recording import open_recording
 
 Damage = Callable[[Path], object]
 

@@ -20,7 +20,7 @@ import nbtrack
 from nbtrack.cli import main
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import naming_damaged
-from nbtrack.data.recording import open_recording
+from nbtrack.recordings.recording import open_recording
 from nbtrack.tracking.trajectories import read_tum
 
 TINY = tiny_words("scenes.n_frames=6", "tracking.sdf.n_pixels=32")

@@ -28,18 +28,19 @@ from recordings import (
 from scipy.spatial.transform import Rotation
 from tiny import TINY
 
+from nbtrack.checks import check as check_module
+from nbtrack.checks.check import DataReport, check_recording, quick_warning
+from nbtrack.checks.conventions import CONVENTIONS
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.settings import with_settings
-from nbtrack.data.formats import WORLD_TO_CAMERA
-from nbtrack.data.recording import open_recording
-from nbtrack.data.sequence import observed_bounds, read_sequence
+from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene
-from nbtrack.recordings import check as check_module
-from nbtrack.recordings.check import DataReport, check_recording, quick_warning
-from nbtrack.recordings.conventions import CONVENTIONS
+from nbtrack.recordings.formats import WORLD_TO_CAMERA
+from nbtrack.recordings.reading import read_sequence
+from nbtrack.recordings.recording import open_recording
 
 REAL_ROOM = Path(__file__).resolve().parents[2] / "shared/data/real_room"
 NEEDS_REAL = pytest.mark.skipif(not REAL_ROOM.is_dir(), reason="no real recording here")
@@ -204,7 +205,7 @@ def test_no_memory_is_told_in_a_line(box: Path, capsys, monkeypatch) -> None:
     def full(*arguments, **options):
         raise MemoryError
 
-    monkeypatch.setattr("nbtrack.data.images.np.empty", full)
+    monkeypatch.setattr("nbtrack.recordings.images.np.empty", full)
     assert main(["data", "convert", str(box), str(box.parent / "new")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "--frames ::2" in line

@@ -28,9 +28,10 @@ from recordings import (
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError, DataError, MissingError
-from nbtrack.data.formats import FORMATS
-from nbtrack.data.recording import open_recording
-from nbtrack.data.sequence import RgbdSequence, observed_bounds, parse_frames, read_sequence
+from nbtrack.data.sequence import RgbdSequence, observed_bounds
+from nbtrack.recordings.formats import FORMATS
+from nbtrack.recordings.reading import parse_frames, read_sequence
+from nbtrack.recordings.recording import open_recording
 from nbtrack.recordings.writer import convert_sequence
 
 LOSSY = ("replica", "scannet")  # colour is JPEG

@@ -8,9 +8,9 @@ import pytest
 from box_room import BoxRoom, box_sequence
 from scipy.spatial.transform import Rotation
 
+from nbtrack.checks.in_map import look_in_map
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.recordings.in_map import look_in_map
 
 ROOM = BoxRoom(half=(1.5, 1.2, 2.0))
 

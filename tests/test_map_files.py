@@ -22,6 +22,7 @@ from safetensors.torch import save
 from test_mapping import NETWORK, finished_wall, map_wall, wall_sequence
 
 from nbtrack.beyond import PointMapping
+from nbtrack.checks.belongs import check_belongs
 from nbtrack.cli import main
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError, DataError
@@ -30,7 +31,6 @@ from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.mapping.files import MAP_FILE, Map, _digest, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.mapping.holdout import depth_residual_of
-from nbtrack.recordings.belongs import check_belongs
 from nbtrack.tracking.trajectories import read_tum
 
 

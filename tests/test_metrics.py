@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from nbtrack.checks.belongs import other_world
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import json_text, write_atomic
-from nbtrack.recordings.belongs import other_world
 from nbtrack.tracking.metrics import (
     align_rigidly,
     pose_errors,

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from recordings import Source, camera_matrix, matrix_text, source, with_noise, write_images
 
-from nbtrack.data.recording import open_recording
-from nbtrack.data.sequence import read_sequence
+from nbtrack.checks.check import DataReport, check_recording
 from nbtrack.experiments.presets import load_preset
-from nbtrack.recordings.check import DataReport, check_recording
+from nbtrack.recordings.reading import read_sequence
+from nbtrack.recordings.recording import open_recording
 
 DATA = Path(__file__).resolve().parents[2] / "shared/data"
 REAL = {"real_room": "opengl", "real_office": "opencv"}  # and the axes of their cameras

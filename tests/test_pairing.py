@@ -9,9 +9,9 @@ from recordings import N_FRAMES, START, matrix_text, source, tum_lines, write_re
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.errors import DataError
-from nbtrack.data.recording import Recording, open_recording
-from nbtrack.data.sequence import read_sequence
 from nbtrack.data.text_files import read_poses
+from nbtrack.recordings.reading import read_sequence
+from nbtrack.recordings.recording import Recording, open_recording
 
 RUN = tuple(range(N_FRAMES))
 

@@ -8,7 +8,7 @@ import pytest
 from tiny import TINY
 
 from nbtrack.cli import main
-from nbtrack.data.formats import DATASET_SCENES
+from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.text_files import read_poses
 from nbtrack.recordings.writer import write_sequence
 from nbtrack.synthetic import build_room, room_frames, room_intrinsics

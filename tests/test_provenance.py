@@ -39,8 +39,7 @@ def key() -> str:
         ("fields/rendering.py", "import torch\n", "import torch  # a comment\n\n", False),
         ("core/errors.py", "did you mean", "perhaps", False),
         ("tracking/budget.py", "yield", "return", False),
-        ("data/images.py", "INTER_NEAREST", "INTER_LINEAR", True),
-        ("recordings/check.py", "a metre, in sequence.toml", "a metre", False),
+        ("checks/check.py", "a metre, in sequence.toml", "a metre", False),
         ("beyond/neus_plus.py", "class", "clas", False),
         ("fields/__init__.py", "NeuSField, ", "", False),
         ("beyond/correction.py", "300_000", "30", False),
@@ -53,6 +52,18 @@ def test_what_changes_a_key(package: Path, file: str, old: str, new: str, counts
     assert old in text
     (package / file).write_text(text.replace(old, new))
     assert (key() != before) == counts
+
+
+def test_reading_counts(package: Path, tmp_path: Path) -> None:
+    """Catches frames that are decoded otherwise, and whose results come from the cache."""
+    folder = make_room("office", tmp_path / "office", 2, 16, 12)
+    before = Scene("office", folder).fingerprint
+    provenance.sources_fingerprint.cache_clear()
+    assert Scene("office", folder).fingerprint == before
+    file = package / "recordings/images.py"
+    file.write_text(file.read_text().replace("INTER_NEAREST", "INTER_LINEAR"))
+    provenance.sources_fingerprint.cache_clear()
+    assert Scene("office", folder).fingerprint != before
 
 
 def test_what_else_counts() -> None:

@@ -10,13 +10,15 @@ from box_room import BoxRoom, box_sequence, walk
 from numpy.testing import assert_allclose
 
 from nbtrack.core.files import tables_folder
-from nbtrack.data.formats import DATASET_UNITS, declaration
-from nbtrack.data.sequence import observed_bounds, read_sequence
+from nbtrack.data.dataset import DATASET_UNITS
+from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.outlook import expected_reach, reach_warnings
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob
+from nbtrack.recordings.formats import declaration
+from nbtrack.recordings.reading import read_sequence
 from nbtrack.synthetic import make_room
 from nbtrack.tables import published_table_1
 from nbtrack.tracking import SdfSettings, StepBudget, VrSettings, make_tracker, paper_steps

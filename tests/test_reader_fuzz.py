@@ -19,10 +19,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from recordings import WRITERS, source, write_recording
 
+from nbtrack.checks.check import check_recording
 from nbtrack.core.errors import NbtrackError
-from nbtrack.data.recording import open_recording
-from nbtrack.data.sequence import read_sequence
-from nbtrack.recordings.check import check_recording
+from nbtrack.recordings.reading import read_sequence
+from nbtrack.recordings.recording import open_recording
 
 EXAMPLES = int(os.environ.get("NBTRACK_FUZZ_EXAMPLES", "100"))
 TEXTS = {

@@ -10,8 +10,8 @@ import pytest
 import trimesh
 
 from nbtrack.cli import main
-from nbtrack.data.sequence import read_sequence
 from nbtrack.plots.rerun_file import rerun_bytes
+from nbtrack.recordings.reading import read_sequence
 from nbtrack.tracking.trajectories import read_trajectory
 
 

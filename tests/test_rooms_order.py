@@ -8,8 +8,8 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "nbtrack"
 ORDER = [
     *("core", "data", "fields", "mapping", "tracking", "tables"),  # what the paper needs
-    *("beyond", "recordings", "provenance", "synthetic", "plots", "interrupts", "experiments"),
-    *("cli", "__main__"),
+    *("recordings", "checks", "beyond", "provenance", "synthetic", "plots", "interrupts"),
+    *("experiments", "cli", "__main__"),
 ]  # fmt: skip
 MODULES = {
     ".".join(["nbtrack", *path.relative_to(PACKAGE).with_suffix("").parts]): path

@@ -15,7 +15,6 @@ from nbtrack.beyond.correct import correct_map
 from nbtrack.core.errors import ConfigError, NbtrackError
 from nbtrack.core.files import fingerprint
 from nbtrack.core.settings import as_dict, changed_settings, with_settings
-from nbtrack.data.sequence import parse_frames
 from nbtrack.experiments.bench import measure_steps
 from nbtrack.experiments.commands import _preset_of
 from nbtrack.experiments.methods import METHODS, TABLE_1
@@ -24,6 +23,7 @@ from nbtrack.experiments.scenes import open_scene, open_scenes
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import learning_rate, map_sequence
+from nbtrack.recordings.reading import parse_frames
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.synthetic.make import MOTIONS, room_intrinsics
 from nbtrack.synthetic.motion import tour

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from nbtrack.core.errors import ConfigError, DataError
-from nbtrack.data.sequence import read_sequence
+from nbtrack.recordings.reading import read_sequence
 from nbtrack.synthetic import make_room, room_frames, room_intrinsics, room_of
 from nbtrack.synthetic.keyframes import keyframe_trajectory
 from nbtrack.synthetic.motion import handheld_trajectory, steps_between, tour

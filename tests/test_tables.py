@@ -10,7 +10,7 @@ import pytest
 
 from nbtrack import tables
 from nbtrack.core.errors import ConfigError, DataError
-from nbtrack.data.formats import DATASET_SCENES
+from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.tables import (
     STANDING_STILL,
     average_over_seeds,

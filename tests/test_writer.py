@@ -13,7 +13,7 @@ from recordings import source, write_recording
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
-from nbtrack.data.sequence import read_sequence
+from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.writer import WrittenFrame, write_sequence
 
 CAMERA = Intrinsics(12, 8, 10.123456789012345, 10.123456789012345, 6.0, 4.0)

@@ -12,8 +12,10 @@ from scipy.spatial import cKDTree
 
 from nbtrack.core.arrays import Colors, Frames, Points, Values, WorldPoints
 from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import project
 from nbtrack.core.errors import ConfigError
 from nbtrack.core.settings import may_be_zero
+from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Field, State
 
@@ -124,12 +126,26 @@ def cells_of(
     return np.ravel_multi_index(tuple(cells[inside].T), tuple(shape)), inside
 
 
-def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frames) -> Values:
-    """The minimum over frames of how far (z-depth, m) points (m) lie behind what was measured.
+def depth_behind(frame: Frame, points_world: Points) -> Values:
+    """How far (z-depth, m) points (m) lie behind what a posed frame measured in their direction.
 
-    The minimum of `Frame.depth_behind`, of every fifth of the frames: neighbours see the same.
+    Negative in front of it; infinite out of view and where nothing was measured.
     """
+    T_world_camera = torch.from_numpy(frame.T_world_camera).to(points_world)
+    points_camera = (points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    columns, rows, depth = project(frame.camera, points_camera)
+    columns, rows = columns.round(), rows.round()
+    inside = (depth > 0) & (columns >= 0) & (rows >= 0)
+    inside &= (columns < frame.camera.width) & (rows < frame.camera.height)
+    _, measured = frame.at(rows[inside].long(), columns[inside].long())
+    behind = torch.full_like(depth, torch.inf)
+    behind[inside] = torch.where(measured > 0, depth[inside] - measured, torch.inf)
+    return behind
+
+
+def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frames) -> Values:
+    """The minimum of `depth_behind` over every fifth of the frames: neighbours see the same."""
     minimum = torch.full_like(points_world[:, 0], torch.inf)
     for index in frames[::_ASKED_EVERY].tolist():
-        minimum = torch.minimum(minimum, sequence[index].depth_behind(points_world))
+        minimum = torch.minimum(minimum, depth_behind(sequence[index], points_world))
     return minimum

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt8, UInt16
 from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values
-from nbtrack.core.camera import Intrinsics, backproject, project
+from nbtrack.core.camera import Intrinsics, backproject
 from nbtrack.core.errors import DataError
 
 MILLIMETRE = 1e-3
@@ -77,22 +77,6 @@ class Frame:
         """Points (m, camera frame) observed at pixels, and their colours in [0, 1]."""
         color, depth = self.at(rows, columns)
         return backproject(self.camera, columns, rows, depth), color
-
-    def depth_behind(self, points_world: Points) -> Values:
-        """How far (z-depth, m) points (m) lie behind what was measured in their direction.
-
-        Negative in front of it; infinite out of view and where nothing was measured.
-        """
-        T_world_camera = torch.from_numpy(self.T_world_camera).to(points_world)
-        points_camera = (points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-        columns, rows, depth = project(self.camera, points_camera)
-        columns, rows = columns.round(), rows.round()
-        inside = (depth > 0) & (columns >= 0) & (rows >= 0)
-        inside &= (columns < self.camera.width) & (rows < self.camera.height)
-        measured = self.at(rows[inside].long(), columns[inside].long())[1]
-        behind = torch.full_like(depth, torch.inf)
-        behind[inside] = torch.where(measured > 0, depth[inside] - measured, torch.inf)
-        return behind
 
 
 def _check(what: str, image: np.ndarray, shape: tuple[int, ...], *kinds: Any, asked: str) -> None:

@@ -1,22 +1,18 @@
-"""RGB-D sequences with known camera poses, whatever format they are stored in."""
+"""RGB-D sequences with known camera poses, in memory."""
 
 import hashlib
-import re
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8, UInt16
 
-from nbtrack.core.arrays import Frames, Poses, Position
+from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError, MissingError
+from nbtrack.core.errors import DataError
 from nbtrack.data.frame import MILLIMETRE, Frame
-from nbtrack.data.images import decode
-from nbtrack.data.recording import Recording, open_recording
 
 # Of bounds (our choice): pixels looked at in each frame, on a regular grid, and the share of points
 # cut off at either end of each axis, so that a few wild depths do not stretch the box.
@@ -26,7 +22,6 @@ _CUT_OFF = 0.002
 # eleven rooms and two real recordings the farthest was 2.1 times as far (our choice).
 FAR = 5.0
 _ARRAYS = "colors", "depths_mm", "T_world_camera", "frame_ids", "times"  # a row a frame
-_SLICE = r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?"
 
 
 @dataclass(frozen=True)
@@ -89,75 +84,6 @@ def joined(parts: list[RgbdSequence]) -> RgbdSequence:
     """Parts of one sequence, at least one, in the order given."""
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
     return replace(parts[0], **arrays)
-
-
-def parse_frames(text: str) -> slice:
-    """A Python slice written `A:B:S` with S > 0; every part may be missing. Or raises DataError.
-
-    >>> parse_frames("10:50:2"), parse_frames(":100")
-    (slice(10, 50, 2), slice(None, 100, None))
-    """
-    match = re.fullmatch(_SLICE, text.replace(" ", ""))
-    if not match:
-        raise DataError(f"frames {text!r} is no slice: write A:B, or A:B:S with S above 0")
-    return slice(*(int(part) if part else None for part in match.groups()))
-
-
-def read_sequence(
-    folder: Path | str,
-    frames: slice = slice(None),
-    depth_folder: str | None = None,
-    pose_file: str | None = None,
-    progress: bool = False,
-    format: str | None = None,
-) -> RgbdSequence:
-    """Read a recording; arguments and errors are those of `open_recording` and `read_frames`.
-
-    A Neural RGB-D scene also has depth in `depth` and `depth_with_noise`, and poses in
-    `trainval_poses.txt` (BundleFusion's, in another world frame).
-    """
-    return read_frames(open_recording(folder, format, depth_folder, pose_file), frames, progress)
-
-
-def read_frames(
-    recording: Recording,
-    frames: slice | Frames = slice(None),
-    progress: bool = False,
-    needs_poses: bool = True,
-    origin: Position | None = None,
-) -> RgbdSequence:
-    """The frames of an opened recording of some numbers, or that a slice selects and, where needed,
-    that have a pose. Poses are relative to an origin (m), by default the recording's.
-
-    Raises MissingError or DataError if an image cannot be read, or no frame is left.
-    """
-    is_slice = isinstance(frames, slice)
-    frame_ids = select_frames(recording, frames, needs_poses) if is_slice else frames
-    if needs_poses:
-        frame_ids = frame_ids[recording.has_pose[frame_ids]]
-    images = decode(recording, frame_ids, progress)
-    poses, times = recording.T_world_camera[frame_ids], recording.times[frame_ids]
-    origin = recording.origin if origin is None else origin
-    poses[:, :3, 3] -= origin
-    unit = recording.declared.metres_per_unit or None
-    return RgbdSequence(recording.name, *images, poses, frame_ids, times, origin, unit)
-
-
-def select_frames(recording: Recording, frames: slice, needs_poses: bool = True) -> Frames:
-    """Numbers of the selected frames. Raises DataError if there is none, or none with a pose."""
-    frame_ids = np.arange(len(recording))[frames]
-    if needs_poses and recording.pose_file is None:
-        raise MissingError(
-            f"no poses in {recording.folder}: {recording.format.label} needs "
-            f"{' or '.join(recording.format.poses)}; add it, or track in a map of the same place "
-            "with --map-from"
-        )
-    if not (recording.has_pose[frame_ids].any() if needs_poses else len(frame_ids)):
-        raise DataError(
-            f"{len(frame_ids)} of the {len(recording)} frames in {recording.folder} are selected, "
-            f"but no pose in {recording.pose_file} that is not NaN: choose others, or other poses"
-        )
-    return frame_ids
 
 
 def without_outliers(sequence: RgbdSequence) -> RgbdSequence:

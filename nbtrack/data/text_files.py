@@ -1,13 +1,8 @@
-"""Texts of recordings, read strictly: objects, tables of numbers, poses, calibration.
-
-In calibration files, pixel centres lie at whole numbers, as OpenCV's calibration and all supported
-datasets have it: the middle of 640 pixels is 319.5. Inside the package they lie at integer + 0.5.
-"""
+"""Text files, read strictly: objects, tables of numbers, poses."""
 
 import json
 import re
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +11,6 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Poses
-from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import naming_damaged
 
@@ -24,18 +18,10 @@ Times = Float[np.ndarray, "_"]  # s
 _TOLERANT = {"encoding": "utf-8-sig", "errors": "replace"}  # of a byte-order mark, and of any bytes
 _DECIMAL_COMMA = re.compile(r"(?<!\S)[-+]?\d+,\d+(e[-+]?\d+)?(?!\S)")
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
-_CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
 _FARTHEST = 1e7  # m from the origin: beyond map coordinates, within what floats can square
 _ALONE = 1000.0  # m from the middle, and so many times as far as nine in ten: no camera went there
 _LATEST = 1e12  # s: no timestamp is larger, and larger numbers overflow
 _RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
-_LARGEST = 1e6  # pixels: no image is so wide
-_LENS = ("k1", "k2", "p1", "p2", "k3")  # in OpenCV's order
-# Entries of a camera's JSON file, and how many numbers each may have.
-_COUNTS = dict.fromkeys(("fx", "fy", "cx", "cy", "width", "height", *_LENS), (1,))
-_COUNTS |= {"depth_scale": (1,), "scale": (1,), "intrinsic_matrix": (9,)}
-_COUNTS |= {"distortion": (0, 4, 5, 8), "coeffs": (0, 4, 5, 8)}
-_MIN_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -139,114 +125,3 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
             "other frames', and 0 0 0 1; write nan for a frame that is lost"
         )
     return np.where(is_known[:, None, None], poses, np.nan)
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """A camera, before the size of its images is known; pixel centres at integer + 0.5."""
-
-    source: Path  # where it was found, for messages; of an assumed one, words for it
-    fx: float
-    fy: float
-    principal_point: tuple[float, float] | None = None  # None: the middle of the image
-    size: tuple[int, int] | None = None  # width, height that the numbers hold for; None: any
-    distortion: tuple[float, ...] = ()  # OpenCV's coefficients k1 k2 p1 p2 k3 ...; empty: none
-    depth_scale: float | None = None  # depth values a metre, where the file says it
-    unused: tuple[str, ...] = ()  # what else the file says
-
-    def for_size(self, width: int, height: int, image: Path) -> Intrinsics:
-        """The camera of images of a size: scaled where the calibration is for another one.
-
-        Raises DataError, which names `image`, if the proportions are others.
-        """
-        factor = width / self.size[0] if self.size else 1.0
-        if self.size and abs(factor * self.size[1] - height) > 1:
-            raise DataError(
-                f"{image} is {width}x{height} but {self.source} is for {self.size[0]}x"
-                f"{self.size[1]}: images may be resized but not cropped; give their calibration"
-            )
-        cx, cy = self.principal_point or (width / factor / 2, height / factor / 2)
-        in_pixels = (factor * length for length in (self.fx, self.fy, cx, cy))
-        return Intrinsics(width, height, *in_pixels)
-
-
-def read_calibration(path: Path) -> Calibration:
-    """A camera from a text or a JSON file.
-
-    Text holds `fx fy cx cy` in a line, OpenCV's 3x3 camera matrix, that within a 4x4 matrix, or
-    one focal length. JSON holds an object with fx, fy, cx, cy or Open3D's `intrinsic_matrix` (nine
-    numbers column by column) and, if known, width and height (or w and h), a lens as `distortion`,
-    `coeffs` or k1, k2, p1, p2, k3, and `depth_scale` or `scale`: depth values a metre, or, below 1,
-    metres a value. It may be the value of `camera`, as in Replica's files. Raises DataError if
-    something is missing, no number, or impossible.
-    """
-    K, others = _from_json(path) if path.suffix.lower() == ".json" else _from_text(path)
-    fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    is_matrix = np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6)
-    # NaN fails both: numpy's minimum keeps it, unlike Python's.
-    is_camera = np.min([fx, fy]) >= _MIN_FOCAL and np.abs([fx, fy, cx, cy]).max() < _LARGEST
-    if not (is_matrix and is_camera):
-        advice = "calibrate anew"
-        if fy < 0:  # as in ICL-NUIM
-            advice = (
-                "a negative fy is that of a camera whose y axis points up: write it positive, and "
-                "if `data check` then finds other axes, the camera_axes that it names"
-            )
-        raise DataError(
-            f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
-            f"pixels, without skew, the focal lengths positive, all finite; {advice}"
-        )
-    return Calibration(path, fx, fy, **{"principal_point": (cx + 0.5, cy + 0.5), **others})
-
-
-def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
-    """OpenCV's camera matrix, as `read_calibration` takes it."""
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
-
-
-def _from_text(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
-    numbers = read_numbers(path, (1, 3, 4, 9, 16), _CAMERA_LINE)
-    if numbers.size == 1:
-        focal = numbers.item()
-        return camera_matrix(focal, focal, 0.0, 0.0), {"principal_point": None}
-    if numbers.size == 4:
-        return camera_matrix(*numbers.flat), {}
-    columns = {9: 3, 12: 4, 16: 4}.get(numbers.size)
-    if not columns:
-        raise DataError(f"{path} holds {numbers.size} numbers: every line holds {_CAMERA_LINE}")
-    return numbers.reshape(-1, columns)[:3, :3], {}
-
-
-def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
-    content = read_object(path)
-    camera = content["camera"] if isinstance(content.get("camera"), dict) else content
-    camera = {{"w": "width", "h": "height"}.get(key, key): camera[key] for key in camera}
-    others: dict[str, Any] = {"unused": tuple(sorted(camera.keys() - _COUNTS.keys()))}
-    found = {}
-    for key in camera.keys() & _COUNTS.keys():
-        values = camera[key] if isinstance(camera[key], list) else [camera[key]]
-        # NaN is not below anything, and True is no number here.
-        are_numbers = all(type(v) in (int, float) and abs(v) < _LARGEST for v in values)
-        if not are_numbers or len(values) not in _COUNTS[key]:
-            counts = " or ".join(map(str, _COUNTS[key]))
-            said = f"{path}: {key} is {str(camera[key])[:40]!r}"
-            raise DataError(f"{said}: write {counts} finite number(s)")
-        found[key] = [float(value) for value in values]
-    if found.keys() & _LENS:
-        others["distortion"] = tuple(found.get(key, [0.0])[0] for key in _LENS)
-    for key in found.keys() & {"distortion", "coeffs"}:
-        others["distortion"] = tuple(found[key])
-    for key in found.keys() & {"depth_scale", "scale"}:
-        (value,) = found[key]
-        if value <= 0:
-            raise DataError(f"{path}: {key} is {value:g}: write how many depth values make a metre")
-        others["depth_scale"] = value if value >= 1 else 1 / value
-    if found.keys() & {"width", "height"}:
-        size = [*found.get("width", []), *found.get("height", [])]
-        if len(size) < 2 or min(size) < 1 or any(side % 1 for side in size):
-            raise DataError(f"{path} gives the size {size}: write width and height, whole pixels")
-        others["size"] = tuple(map(int, size))
-    if "intrinsic_matrix" in found:
-        return np.array(found["intrinsic_matrix"]).reshape(3, 3).T, others
-    named = (found.get(key, [np.nan])[0] for key in ("fx", "fy", "cx", "cy"))
-    return camera_matrix(*named), others

@@ -1,9 +1,9 @@
 """Experiments: methods, presets, jobs, and the commands that run them.
 
-Here what goes beyond the paper is registered, with the formats of recordings that are not the
-dataset's, and so are installed packages that have an entry point of the group `nbtrack`: a module
-that adds to FIELDS, TRACKERS, METHODS or FORMATS when imported. A user's own file joins in the same
-way by `import_own`, which `--import` of every command calls.
+Here what goes beyond the paper is registered, and so are installed packages that have an entry
+point of the group `nbtrack`: a module that adds to FIELDS, TRACKERS, METHODS or FORMATS when
+imported. A user's own file joins in the same way by `import_own`, which `--import` of every command
+calls.
 """
 
 import importlib
@@ -13,7 +13,6 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import nbtrack.beyond  # registers its fields and trackers
-import nbtrack.recordings.formats
 from nbtrack.core.errors import ConfigError, MissingError
 
 for plugin in entry_points(group="nbtrack"):

@@ -14,12 +14,12 @@ from nbtrack.core.errors import NbtrackError
 from nbtrack.core.files import runs_folder
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings
-from nbtrack.data.sequence import read_frames
 from nbtrack.experiments.grid import Execution, map_scene, track_scenes
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
 from nbtrack.experiments.output import output_folder
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
+from nbtrack.recordings.reading import read_frames
 from nbtrack.synthetic import ROOMS
 from nbtrack.tracking import ClockBudget, StepBudget, make_tracker
 from nbtrack.tracking.methods import Methods, find_methods

@@ -10,18 +10,12 @@ import numpy as np
 import trimesh
 
 from nbtrack.beyond import PointCloud
+from nbtrack.checks.check import check_recording, quick_warning
 from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import read_setting, with_values
-from nbtrack.data.recording import Recording, open_recording
-from nbtrack.data.sequence import (
-    RgbdSequence,
-    parse_frames,
-    read_frames,
-    select_frames,
-    without_outliers,
-)
+from nbtrack.data.sequence import RgbdSequence, without_outliers
 from nbtrack.experiments.grid import run_jobs
 from nbtrack.experiments.map_jobs import OF_MAPS, GivenMap, MapJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
@@ -40,7 +34,8 @@ from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh
 from nbtrack.plots.rerun_file import rerun_bytes
-from nbtrack.recordings.check import check_recording, quick_warning
+from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
+from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.recordings.writer import convert_sequence
 from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.methods import METHODS, Method

@@ -7,10 +7,11 @@ from functools import lru_cache
 import numpy as np
 
 from nbtrack.core.errors import NbtrackError
-from nbtrack.data.sequence import observed_bounds, parse_frames, read_frames, select_frames
+from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.map_jobs import GivenMap, MapJob
 from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob
+from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
 from nbtrack.tracking.reach import reach_metrics
 
 _FRAMES_LOOKED_AT = 20  # that tell a map's unit before there is a map

@@ -11,9 +11,9 @@ from PIL import Image
 
 from nbtrack.core.errors import ConfigError
 from nbtrack.core.files import locked, resolved, write_atomic
-from nbtrack.data.formats import holds_recording
 from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, MESH_FILE
 from nbtrack.plots.style import in_house_style
+from nbtrack.recordings.formats import holds_recording
 from nbtrack.tracking.trajectories import METRICS_FILE
 
 OVERVIEW_FILE = "overview.png"

@@ -21,7 +21,7 @@ from nbtrack.core.settings import (
     with_settings,
     with_values,
 )
-from nbtrack.data.formats import DATASET_SCENES
+from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
 from nbtrack.synthetic import REPORTED_ROOMS

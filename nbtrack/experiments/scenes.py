@@ -14,17 +14,13 @@ from nbtrack.core.files import (
     runs_folder,
 )
 from nbtrack.core.progress import ProgressBar, tell
-from nbtrack.data.formats import DATASET_SCENES
-from nbtrack.data.recording import Recording, open_recording
-from nbtrack.data.sequence import (
-    RgbdSequence,
-    parse_frames,
-    read_frames,
-    select_frames,
-    without_outliers,
-)
+from nbtrack.data.dataset import DATASET_SCENES
+from nbtrack.data.sequence import RgbdSequence, without_outliers
 from nbtrack.experiments.output import check_no_recording, is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
+from nbtrack.provenance import sources_fingerprint
+from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
+from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
 from nbtrack.synthetic.make import MOTIONS
 
@@ -52,8 +48,9 @@ class Scene:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Changes with what is read."""
-        return fingerprint(*self.recording.contents())
+        """Changes with what is read, and with the code that reads it."""
+        code = sources_fingerprint("recordings.reading")
+        return fingerprint(*self.recording.contents(), code)
 
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
         """The frames of a slice such as `10:50:2`, `without_outliers`; more options and errors: see

@@ -11,12 +11,13 @@ import numpy as np
 import torch
 
 from nbtrack import provenance
+from nbtrack.checks.belongs import check_belongs, in_world_of_map
+from nbtrack.checks.in_map import look_in_map
 from nbtrack.core import files
 from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.errors import DataError
 from nbtrack.core.settings import as_dict, changed_settings
 from nbtrack.data.frame import Frame
-from nbtrack.data.sequence import parse_frames, select_frames
 from nbtrack.experiments import IMPORTED
 from nbtrack.experiments.jobs import Job, Report
 from nbtrack.experiments.map_jobs import PLAIN_PRESET, GivenMap, MapJob
@@ -24,8 +25,7 @@ from nbtrack.experiments.presets import PRESETS, SIZES
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
 from nbtrack.mapping.files import Map
-from nbtrack.recordings.belongs import check_belongs, in_world_of_map
-from nbtrack.recordings.in_map import look_in_map
+from nbtrack.recordings.reading import parse_frames, select_frames
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
 from nbtrack.tracking.reach import reach_metrics

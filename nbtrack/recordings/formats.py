@@ -1,12 +1,121 @@
-"""Formats of recordings besides the dataset's: they join as one of your own does.
+"""Formats of recordings, and which one a folder has; data/README.md describes them.
 
-data/README.md describes them all.
+`FORMATS` is one table of layouts and conventions. A format of one's own is one more entry. What a
+recording does otherwise than its format, it says in `sequence.toml`: any field of `Declaration`.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from nbtrack.data.formats import FORMATS, Declaration, Format
-from nbtrack.data.text_files import Calibration
+import numpy as np
+
+from nbtrack.core.arrays import Poses
+from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
+from nbtrack.core.settings import limited, one_of, with_values
+from nbtrack.data.dataset import DATASET_UNITS
+from nbtrack.data.text_files import read_object
+from nbtrack.recordings.calibration import Calibration
+from nbtrack.recordings.names import frame_keys
+
+DECLARATION_FILE = "sequence.toml"
+_IMAGES = (".png", ".jpg", ".jpeg")
+CAMERA_TO_WORLD = "camera-to-world"
+WORLD_TO_CAMERA = "world-to-camera"
+SPELLED_AXES = {"opencv": "right down forward", "opengl": "right up backward"}
+# Where an axis may point, seen from behind the camera, in OpenCV's x, y and z.
+_DIRECTIONS = dict(zip(("right", "down", "forward"), np.eye(3), strict=True))
+_DIRECTIONS |= dict(zip(("left", "up", "backward"), 0 - np.eye(3), strict=True))
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """How the numbers of a recording are meant; limits are far beyond any camera's."""
+
+    format: str = ""  # empty: told by the files
+    depth_scale: float = limited(1000.0, 1e-8, 1e8)  # depth values a metre
+    no_depth: int = limited(0, 0, 65535)  # a value that means "not measured", besides 0
+    depth_along: str = one_of("axis", "ray")  # the optical axis (z-depth), or the ray (distance)
+    camera_axes: str = "opencv"  # or "opengl", or where x, y, z point: "right up forward"
+    poses: str = one_of(CAMERA_TO_WORLD, WORLD_TO_CAMERA)
+    quaternion: str = one_of("xyzw", "wxyz")  # the order in pose files with quaternions
+    frame_rate: float = limited(30.0, 1e-8, 1e8)  # Hz
+    metres_per_unit: float = limited(0.0, 0.0, 1e8)  # of the map; 0: half its longest side
+
+    def __post_init__(self) -> None:
+        if len(self._axes) != 3 or not np.linalg.det(self._axes):
+            raise ConfigError(
+                f"camera_axes = {self.camera_axes!r}: write 'opencv', 'opengl', or where x, y and "
+                "z point, as in 'right up forward' (of right/left, up/down, forward/backward)"
+            )
+
+    @property
+    def _axes(self) -> np.ndarray:
+        """The file's x, y and z axes with OpenCV's, one a row; zeros for unknown words."""
+        words = SPELLED_AXES.get(self.camera_axes, self.camera_axes).split()
+        return np.array([_DIRECTIONS.get(word, np.zeros(3)) for word in words])
+
+    def poses_to_opencv(self, file_poses: Poses) -> Poses:
+        """Camera-to-world poses with OpenCV's camera axes, of a file's; NaN poses stay NaN."""
+        axes = self._axes
+        T = inverse(file_poses) if self.poses == WORLD_TO_CAMERA else file_poses.copy()
+        T[:, :3, :3] = T[:, :3, :3] @ axes
+        T[:, 2] *= np.linalg.det(axes)  # left-handed cameras come with a mirrored world
+        return T
+
+
+def inverse(poses: Poses) -> Poses:
+    """World-to-camera of camera-to-world poses, and the other way round; NaN stays NaN."""
+    T = poses.copy()
+    # A transpose, unlike a solver, takes NaN and never fails.
+    T[:, :3, :3] = poses[:, :3, :3].mT
+    T[:, :3, 3:] = -T[:, :3, :3] @ poses[:, :3, 3:]
+    return T
+
+
+@dataclass(frozen=True)
+class Format:
+    """One layout of recordings on disk. Paths are patterns within the recording's folder."""
+
+    label: str  # for people
+    # Image files, the first whose folder is there; or a .txt with `timestamp file` a line.
+    color: tuple[str, ...]
+    depth: tuple[str, ...]  # the same
+    poses: tuple[str, ...]  # a file of all poses, or with `*` one a frame
+    cameras: tuple[str, ...]  # calibration files; the first that is there
+    known_cameras: tuple[Calibration, ...] = ()  # without a file; `source` is in the folder's name
+    declared: Declaration = Declaration()  # what its numbers mean
+    counts_from_0: bool = False  # a number is the place of the frame's pose in a list
+    resize_color: bool = False  # colour has another size than depth and shows the same view
+
+    @property
+    def needs(self) -> tuple[tuple[str, ...], ...]:
+        """Groups of patterns; one of each group must be there."""
+        cameras = () if self.known_cameras else (self.cameras,)
+        return self.color, self.depth, self.poses, *cameras
+
+    def files(self, folder: Path, patterns: Sequence[str], what: str) -> list[Path]:
+        """Files of the first pattern that has any, or raises MissingError."""
+        for pattern in patterns:
+            if files := files_of(folder, pattern):
+                return files
+        raise MissingError(
+            f"no {what} in {folder}: {self.label} needs {' or '.join(patterns)}; add it, or name "
+            "another format with --format"
+        )
+
+
+def files_of(folder: Path, pattern: str) -> list[Path]:
+    """Files that a pattern names, texts or images as it says, `img2` before `img10`."""
+    if (folder / pattern).is_file():
+        return [folder / pattern]
+    suffixes = (".txt",) if pattern.endswith(".txt") else _IMAGES
+    paths = (folder / pattern).parent.glob(Path(pattern).name)
+    # Hidden files are the system's.
+    files = [p for p in paths if p.suffix.lower() in suffixes and p.name[0] != "." and p.is_file()]
+    keys = dict(zip(files, frame_keys(files), strict=True))
+    return sorted(files, key=lambda path: (keys[path], path.name))
+
 
 _VGA = (640, 480)
 # The benchmark's own calibrations of its three cameras. Their lenses are not corrected: its page on
@@ -16,7 +125,15 @@ _TUM_CAMERAS = (
     Calibration(Path("freiburg2"), 520.9, 521.0, (325.6, 250.2), _VGA),
     Calibration(Path("freiburg3"), 535.4, 539.2, (320.6, 248.1), _VGA),
 )  # fmt: skip
-FORMATS |= {
+FORMATS: dict[str, Format] = {
+    # Azinovic et al. 2022. Filtered depth is what the dataset's own loader takes; intrinsics.txt
+    # is an addition of this package.
+    "neural_rgbd": Format(
+        "Neural RGB-D", color=("images/*",),
+        depth=("depth_filtered/*", "depth/*", "depth_with_noise/*"), poses=("poses.txt",),
+        cameras=("intrinsics.txt", "focal.txt", "K.txt"),
+        declared=Declaration(camera_axes="opengl"), counts_from_0=True,
+    ),
     # Sturm et al. 2012. The depth maps carry their scale correction already.
     "tum": Format(
         "TUM RGB-D", color=("rgb.txt",), depth=("depth.txt",), poses=("groundtruth.txt",),
@@ -52,3 +169,60 @@ FORMATS |= {
                  "intrinsic.json", "camera_intrinsic.json", "camera_primesense.json"),
     ),
 }  # fmt: skip
+
+
+def declaration(folder: Path, format: str | None = None) -> Declaration:
+    """What a recording's numbers mean, with its format: named, declared, or told by the files.
+
+    Where files are missing, the format that the most are left of; reading says what is missing.
+    Raises MissingError, ConfigError or DataError for what it cannot tell.
+    """
+    if not folder.is_dir():
+        raise MissingError(f"no folder {folder}: give a recording's, or a synthetic room's name")
+    path = folder / DECLARATION_FILE
+    said = read_object(path) if path.is_file() else {}
+    try:
+        own_format = with_values(Declaration(), said).format
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from None
+    format = format or own_format or _told_by_files(folder)
+    usual = look_up("format", format, FORMATS).declared
+    if format == "neural_rgbd":
+        unit = DATASET_UNITS.get(folder.resolve().name, usual.metres_per_unit)
+        usual = replace(usual, metres_per_unit=unit)
+    return replace(with_values(usual, said), format=format)
+
+
+def is_declared(folder: Path, key: str) -> bool:
+    """Whether the folder's own file declares something."""
+    path = folder / DECLARATION_FILE
+    return path.is_file() and key in read_object(path)
+
+
+def _told_by_files(folder: Path) -> str:
+    """The format with the largest share of what it needs."""
+    shares = {
+        name: np.mean([_is_there(folder, patterns) for patterns in layout.needs])
+        for name, layout in FORMATS.items()
+    }
+    maximum = max(shares.values())
+    best = [name for name, share in shares.items() if share == maximum]
+    if maximum == 0:
+        files = (f"{name} ({', '.join(p[0] for p in FORMATS[name].needs)})" for name in best)
+        raise MissingError(f"{folder} is no recording: it needs the files of {'; '.join(files)}")
+    if len(best) > 1 and maximum == 1:
+        raise DataError(
+            f"{folder} can be read as {' or '.join(best)}: choose with --format, or by "
+            f'format = "{best[0]}" in {DECLARATION_FILE}'
+        )
+    return best[0]
+
+
+def holds_recording(folder: Path) -> bool:
+    """Whether a folder has both colour and depth of a known format."""
+    layouts = FORMATS.values()
+    return any(_is_there(folder, f.color) and _is_there(folder, f.depth) for f in layouts)
+
+
+def _is_there(folder: Path, patterns: tuple[str, ...]) -> bool:
+    return any(any(folder.glob(pattern)) for pattern in patterns)

@@ -18,11 +18,11 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import locked, write_atomic
 from nbtrack.core.progress import ProgressBar
-from nbtrack.data.formats import FORMATS
-from nbtrack.data.images import decode
-from nbtrack.data.recording import TIMES_FILE, Recording
-from nbtrack.data.sequence import select_frames
-from nbtrack.data.text_files import camera_matrix
+from nbtrack.recordings.calibration import camera_matrix
+from nbtrack.recordings.formats import FORMATS
+from nbtrack.recordings.images import decode
+from nbtrack.recordings.reading import select_frames
+from nbtrack.recordings.recording import TIMES_FILE, Recording
 
 # RGB colour, depth maps (mm) by depth folder, and pose with OpenCV camera axes.
 WrittenFrame = tuple[ColorImage, dict[str, DepthImage], Pose]

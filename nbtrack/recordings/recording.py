@@ -16,7 +16,9 @@ from jaxtyping import Bool
 from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.errors import DataError, MissingError
 from nbtrack.core.files import naming_damaged
-from nbtrack.data.formats import (
+from nbtrack.data.text_files import Times, checked_poses, read_lines, read_numbers, read_poses
+from nbtrack.recordings.calibration import Calibration, read_calibration
+from nbtrack.recordings.formats import (
     FORMATS,
     WORLD_TO_CAMERA,
     Declaration,
@@ -26,17 +28,8 @@ from nbtrack.data.formats import (
     inverse,
     is_declared,
 )
-from nbtrack.data.moments import TOLERANCE, Moments, nearest
-from nbtrack.data.names import frame_keys, frame_numbers, stamp_in
-from nbtrack.data.text_files import (
-    Calibration,
-    Times,
-    checked_poses,
-    read_calibration,
-    read_lines,
-    read_numbers,
-    read_poses,
-)
+from nbtrack.recordings.moments import TOLERANCE, Moments, nearest
+from nbtrack.recordings.names import frame_keys, frame_numbers, stamp_in
 
 _END_OF_PNG = 64  # bytes: the checksum of all pixels, and the marker of the end
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm

@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Float
 from torch.nn.functional import grid_sample
 
+from nbtrack.checks.readings import FramePairs, Reading
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.recordings.readings import FramePairs, Reading
 
 MAX_SHIFT = 3  # frames by which depth or colours may be late or early (our choice)
 _SHARES = np.linspace(-0.15, 0.15, 13)  # by which lengths may be off

@@ -12,8 +12,8 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import naming_damaged
 from nbtrack.core.progress import ProgressBar
-from nbtrack.data.recording import Recording
-from nbtrack.data.text_files import camera_matrix
+from nbtrack.recordings.calibration import camera_matrix
+from nbtrack.recordings.recording import Recording
 
 _FARTHEST_MM = _SATURATED = 65535  # what 16 bits hold; a camera's "farther than I can say"
 

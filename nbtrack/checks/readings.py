@@ -16,9 +16,9 @@ from torch.nn.functional import grid_sample
 
 from nbtrack.core.arrays import Frames, Poses
 from nbtrack.core.camera import Intrinsics, pixel_directions, project
-from nbtrack.data.formats import Declaration
-from nbtrack.data.recording import Recording
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.recordings.formats import Declaration
+from nbtrack.recordings.recording import Recording
 
 _HIDDEN_BEHIND = 0.25  # m behind a surface points are hidden: several times a camera's noise
 _SAME_SURFACE = 0.025  # of the depth: where neighbours blend to more, they lie on two surfaces

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from nbtrack.checks.readings import FramePairs, Reading
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.settings import changed_settings
-from nbtrack.data.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA, Declaration
-from nbtrack.data.recording import Recording
-from nbtrack.recordings.readings import FramePairs, Reading
+from nbtrack.recordings.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA, Declaration
+from nbtrack.recordings.recording import Recording
 
 _CLEARLY_BETTER = 0.5  # of the distance as declared (our choice)
 _MIN_GAIN = 5e-4  # of the depth: 1 mm at 2 m, depth's resolution on disk

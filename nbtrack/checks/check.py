@@ -10,14 +10,15 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from nbtrack.checks.conventions import PLAUSIBLE_DEPTH, Convention, diagnosis, fit_all
+from nbtrack.checks.misfits import MAX_SHIFT, MIN_CORRELATION, Misfit, find_misfits, told_misfit
+from nbtrack.checks.readings import FramePairs, Reading, on_grid
 from nbtrack.core.arrays import Frames, Poses
 from nbtrack.core.errors import DataError
 from nbtrack.core.progress import ProgressBar
-from nbtrack.data.recording import Recording
-from nbtrack.data.sequence import FAR, RgbdSequence, far_limit, joined, read_frames, select_frames
-from nbtrack.recordings.conventions import PLAUSIBLE_DEPTH, Convention, diagnosis, fit_all
-from nbtrack.recordings.misfits import MAX_SHIFT, MIN_CORRELATION, Misfit, find_misfits, told_misfit
-from nbtrack.recordings.readings import FramePairs, Reading, on_grid
+from nbtrack.data.sequence import FAR, RgbdSequence, far_limit, joined
+from nbtrack.recordings.reading import read_frames, select_frames
+from nbtrack.recordings.recording import Recording
 
 _FRAMES_AT_ONCE = 32  # 50 MB at 640x480
 _CLOUD_FRAMES = 60  # spread over the sequence
