@@ -1,6 +1,7 @@
 """Keys follow the code: what changes a result changes its key, what does not leaves it alone."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,12 +18,13 @@ from nbtrack.synthetic import make_room
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A copy of the package's sources, to be edited."""
     copy = tmp_path / "nbtrack"
     shutil.copytree(provenance.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(provenance, "PACKAGE", copy)
-    return copy
+    yield copy
+    provenance.sources_fingerprint.cache_clear()
 
 
 def key() -> str:
