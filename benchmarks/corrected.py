@@ -1,10 +1,10 @@
-"""Tracking in corrected maps: accuracy, time, basin, and cameras without a start.
+"""Tracking in corrected maps: accuracy and time.
 
     python benchmarks/corrected.py [RECORDING ...]
     python benchmarks/corrected.py ablation [RECORDING]
     python benchmarks/corrected.py fast
 
-Writes tracking, times, searches and agreement.csv, ablation.csv, or fast.csv and reliability.csv to
+Writes tracking, times and agreement.csv, ablation.csv, or fast.csv and reliability.csv to
 paper_tables/corrected.
 RECORDING is a folder in the dataset's layout; the paper's methods and `agreement` are asked for the
 first alone. Times count: run nothing else.
@@ -19,10 +19,8 @@ from unittest import mock
 import numpy as np
 import pandas as pd
 import torch
-from basin import find_from_afar
 from mistakes import mistakes
 from motions import HAND_HELD
-from scipy.spatial.transform import Rotation
 from turns import in_turns
 
 from nbtrack import (
@@ -106,18 +104,6 @@ def main() -> None:
             runs.append(_track(rooms, COMPARED, preset, frames, path, tracked))
     write_rows("tracking.csv", pd.concat(runs))
     write_rows("times.csv", frame_times(rooms, preset))
-    searches = []
-    for room, other in zip(rooms, elsewhere, strict=True):
-        for n_restarts, steps in ((0, 60), (8, 1000)):
-            how = {"corrected_dense": steps}, preset, [(20, 15)], 100
-            afar = find_from_afar(room, *how, n_restarts=n_restarts)
-            told = afar["offset"] + (", with restarts" if n_restarts else "")
-            searches.append(afar.assign(offset=told, scene=room.name))
-        for name, told in (("corrected_dense", ""), ("grid_corrected", ", map on grids")):
-            afar = _without_a_start(room, other, preset, METHODS[name])
-            searches.append(afar.assign(offset=f"no start{told}"))
-    found = pd.concat(searches)
-    write_rows("searches.csv", found)
     for recording in recordings:
         for frames in (":", "::2", "::4"):
             how = preset, frames, "mapped"
@@ -130,10 +116,6 @@ def main() -> None:
     if recordings:
         write_rows("agreement.csv", agreement(recordings[0], preset))
     print(pd.concat(runs).to_string(index=False))
-    print(found.groupby(["scene", "offset"])[["recovered", "seconds"]].mean().to_string())
-    is_wrong = (found["error_m"] > WRONG_M) | (found["error_deg"] > WRONG_DEG)
-    verdicts = pd.crosstab(found["lost"], is_wrong.rename("wrong"))
-    print("verdicts, wrong by 5 cm or 3 degrees", verdicts, sep="\n")
 
 
 def _track(scenes, methods, preset, frames, path, tracked=None, steps=30) -> pd.DataFrame:
@@ -271,28 +253,6 @@ def _held_out(scene, preset, seed: int) -> pd.DataFrame:
         row |= {"n_pixels": settings.n_pixels, **_judged(job.folder.name, WRONG_IN_RECORDING_M)}
         rows.append({**row, "scene": scene.name, "frames": "1::2", "path": "odd, mapped even"})
     return pd.DataFrame(rows)[COLUMNS]
-
-
-def _without_a_start(room, elsewhere, preset, method, n_views: int = 50) -> pd.DataFrame:
-    """Views of an unmapped path; the tracker is told a pose at the other end of the mapped one."""
-    changed = with_settings(preset, *method.settings)
-    field, sequence = map_scene(room, method.field, changed).field, elsewhere.read()
-    told = room.read().T_world_camera[-1]
-    views, rows = np.linspace(0, len(sequence) - 1, n_views).round().astype(int), []
-    settings = changed.tracking_of(method.tracker)
-    for view in views.tolist():
-        frame = sequence[view]
-        tracker = make_tracker(method.tracker, field, told, StepBudget(1000), settings)
-        start = time.perf_counter()
-        found = tracker.track(frame)
-        seconds = time.perf_counter() - start
-        off = np.linalg.inv(frame.T_world_camera) @ found.T_world_camera
-        error_m = float(np.linalg.norm(off[:3, 3]))
-        error_deg = float(np.degrees(Rotation.from_matrix(off[:3, :3]).magnitude()))
-        is_found = error_m < WRONG_M and error_deg < WRONG_DEG
-        rows.append((method.label, error_m, error_deg, is_found, found.lost, seconds))
-    columns = ["method", "error_m", "error_deg", "recovered", "lost", "seconds"]
-    return pd.DataFrame(rows, columns=columns).assign(scene=room.name)
 
 
 def write_rows(name: str, rows: pd.DataFrame) -> None:
