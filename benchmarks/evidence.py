@@ -2,12 +2,13 @@
 
     python benchmarks/evidence.py EXPERIMENT [SEEDS]
 
-EXPERIMENT is one of nine_rooms, full_size, scores, dataset_path, readings, speeds, more_steps,
+EXPERIMENT is one of paper_rooms, nine_rooms, full_size, scores, dataset_path, readings, speeds, more_steps,
 cheap_queries, by_the_clock (as the dataset moves), steps, factors, oracle, choices, basin
 (hand-held). Rows are added to a CSV under paper_tables/ as they are finished, the first seed first;
 those that are there are not made again, whatever has changed since: remove the file to begin anew.
 Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed experiment goes on where
-it was. nine_rooms uses all cores, full_size is for a GPU: run others side by side.
+it was. nine_rooms and paper_rooms use all cores, full_size is for a GPU: run others side by side.
+paper_rooms needs the rooms as the dataset has them, below `NBTRACK_DATA` (data/README.md).
 """
 
 import sys
@@ -36,7 +37,7 @@ from nbtrack.experiments.bench import camera_motion
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.presets import Preset
-from nbtrack.experiments.scenes import Scene
+from nbtrack.experiments.scenes import Scene, open_scene
 from nbtrack.mapping.holdout import split_holdout
 from nbtrack.tables import write_table_1
 from nbtrack.tracking import StepBudget, track_sequence
@@ -58,6 +59,8 @@ FULL = load_preset(
         "mapping.neus.iterations=10_000",
     ],
 )
+# Five of the paper's rooms, at the sizes of the file beside the results.
+PAPER_ROOMS = load_preset("paper", tables_folder() / "paper_rooms" / "settings.toml")
 HELD = with_settings(NINE, *HAND_HELD)
 PRESET = with_variants(load_preset("smoke", settings=[f"scenes.names={THREE_ROOMS}", *HAND_HELD]))
 KEPT = [
@@ -94,6 +97,8 @@ def main(experiment: str, seeds: int) -> None:
         write_atomic(path.parent / "verdicts.csv", judged)
     elif experiment == "full_size":
         write_table(path.parent, FULL, rows)
+    elif experiment == "paper_rooms":
+        write_table(path.parent, PAPER_ROOMS, rows)
 
 
 def write_table(folder: Path, preset: Preset, rows: pd.DataFrame) -> None:
@@ -151,14 +156,26 @@ def full_size(seed: int) -> Iterator[Chunk]:
     scenes = open_scenes(FULL)
     track(scenes, TABLE_1, FULL, _SIDE_BY_SIDE, seeds=[seed])
     for scene in scenes:
-        yield {"scene": scene.name}, partial(_full_size, scene, seed)
+        yield {"scene": scene.name}, partial(_with_maps, scene, FULL, seed)
 
 
-def _full_size(scene: Scene, seed: int) -> pd.DataFrame:
-    rows = track([scene], TABLE_1, FULL, seeds=[seed])
+def paper_rooms(seed: int) -> Iterator[Chunk]:
+    """Table I in five of the paper's rooms. A seed takes hours on two cores."""
+    for name in PAPER_ROOMS.scenes.names:
+        scene = open_scene(name, PAPER_ROOMS)
+        yield {"scene": name}, partial(_with_maps, scene, PAPER_ROOMS, seed, None)
+
+
+def _with_maps(scene: Scene, preset: Preset, seed: int, workers: int | None = 1) -> pd.DataFrame:
+    """Rows of both methods in a scene, with sizes and with the scores of their maps."""
+    rows = track([scene], TABLE_1, preset, workers, seeds=[seed])
+    rows["reach_over_motion"] = rows["reach_m"] / (rows["path_m"] / rows["frames"])
+    rows["image_width"] = scene.read(":1").camera.width
     for name in TABLE_1:
-        made = map_scene(scene, METHODS[name].field, FULL, seed).record
+        made = map_scene(scene, METHODS[name].field, preset, seed).record
         own = rows["method"] == METHODS[name].label
+        rows.loc[own, "units"] = made["network"]["width"]
+        rows.loc[own, "n_pixels"] = preset.tracking_of(METHODS[name].tracker).n_pixels
         rows.loc[own, "iterations"] = made["settings"]["iterations"]
         rows.loc[own, "mapping_seconds"] = made["seconds"]
         for score, value in made["quality"].items():
@@ -342,6 +359,7 @@ def basin(seed: int) -> Iterator[Chunk]:
 EXPERIMENTS = {
     "nine_rooms": (nine_rooms, "nine_rooms/table_1_cells.csv"),
     "full_size": (full_size, "full_size/table_1_cells.csv"),
+    "paper_rooms": (paper_rooms, "paper_rooms/table_1_cells.csv"),
     **{
         f.__name__: (f, f"evidence/{f.__name__}.csv")
         for f in (
