@@ -1,4 +1,4 @@
-"""The tables of README.md, benchmarks/README.md and docs/choices.md, made of the committed CSV files.
+"""The tables of the README, of benchmarks/README.md and docs/choices.md, made of committed CSV files.
 
     python benchmarks/documents.py
 

@@ -2,10 +2,11 @@
 
     python benchmarks/evidence.py EXPERIMENT [SEEDS]
 
-EXPERIMENT is one of paper_rooms, nine_rooms, full_size, scores, dataset_path, readings, speeds, more_steps,
-cheap_queries, by_the_clock (as the dataset moves), steps, factors, oracle, choices, basin
-(hand-held). Rows are added to a CSV under paper_tables/ as they are finished, the first seed first;
-those that are there are not made again, whatever has changed since: remove the file to begin anew.
+EXPERIMENT is one of paper_rooms, vr_at_5_hz, nine_rooms, full_size, scores, dataset_path, readings,
+speeds, more_steps, cheap_queries, by_the_clock (as the dataset moves), steps, factors, oracle,
+choices, basin (hand-held). Rows are added to a CSV under paper_tables/ as they are finished, the
+first seed first; those that are there are not made again, whatever has changed since: remove the
+file to begin anew.
 Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed experiment goes on where
 it was. nine_rooms and paper_rooms use all cores, full_size is for a GPU: run others side by side.
 paper_rooms needs the rooms as the dataset has them, below `NBTRACK_DATA` (data/README.md).
@@ -164,6 +165,34 @@ def paper_rooms(seed: int) -> Iterator[Chunk]:
     for name in PAPER_ROOMS.scenes.names:
         scene = open_scene(name, PAPER_ROOMS)
         yield {"scene": name}, partial(_with_maps, scene, PAPER_ROOMS, seed, None)
+
+
+FASTEST = "860:1000"  # of breakfast_room: most frames move farther than VR's reach at 5 Hz
+STEPS_5_HZ = VR.paper_steps(5)
+ONE_THING = {  # changed at a time: steps a frame, settings, the tracked depth
+    "as in Table I": (STEPS_5_HZ, (), None),
+    "128 pixels": (STEPS_5_HZ, ("tracking.vr.n_pixels=128",), None),
+    "512 pixels": (STEPS_5_HZ, ("tracking.vr.n_pixels=512",), None),
+    "exact depth": (STEPS_5_HZ, (), "exact"),
+    "16 steps": (16, (), None),
+    "18 steps": (18, (), None),
+    "constant velocity": (STEPS_5_HZ, ("tracking.vr.motion_model=constant_velocity",), None),
+    "8,000 iterations": (STEPS_5_HZ, ("mapping.imap.iterations=8000",), None),
+}
+
+
+def vr_at_5_hz(seed: int) -> Iterator[Chunk]:
+    """What makes VR lose the camera at 5 Hz where breakfast_room's path is fastest."""
+    scene = open_scene("breakfast_room", PAPER_ROOMS)
+    for changed, (n_steps, settings, depth) in ONE_THING.items():
+        tracked = scene if depth is None else _with_depth(scene, depth)
+        method = replace(VR, settings=settings)
+        there = {"steps": n_steps, "frames": FASTEST, "seeds": [seed], "tracked": [tracked]}
+        yield {"changed": changed}, partial(track, [scene], [method], PAPER_ROOMS, **there)
+
+
+def _with_depth(scene: Scene, depth: str) -> OtherDepth:
+    return OtherDepth(scene.name, scene.folder, depth_folder=DEPTHS[depth])
 
 
 def _with_maps(scene: Scene, preset: Preset, seed: int, workers: int | None = 1) -> pd.DataFrame:
@@ -332,7 +361,7 @@ def _on_each_depth(scene: Scene, name: str, seed: int) -> pd.DataFrame:
 def choices(seed: int) -> Iterator[Chunk]:
     """Table I with each of `CHOICES`; those that need new maps come last."""
     filtered = open_scenes(HELD)
-    noisy = [OtherDepth(s.name, s.folder, depth_folder=DEPTHS["noisy"]) for s in filtered]
+    noisy = [_with_depth(scene, "noisy") for scene in filtered]
     # The rates matter with few steps; all else is asked at 2 Hz, where the paper has VR ahead.
     places = [*product(("ours", FASTER), (10,)), *product(CHOICES, (2,))]
     for choice, rate_hz in places:
@@ -360,6 +389,7 @@ EXPERIMENTS = {
     "nine_rooms": (nine_rooms, "nine_rooms/table_1_cells.csv"),
     "full_size": (full_size, "full_size/table_1_cells.csv"),
     "paper_rooms": (paper_rooms, "paper_rooms/table_1_cells.csv"),
+    "vr_at_5_hz": (vr_at_5_hz, "paper_rooms/vr_at_5_hz.csv"),
     **{
         f.__name__: (f, f"evidence/{f.__name__}.csv")
         for f in (
