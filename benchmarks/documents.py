@@ -1,4 +1,4 @@
-"""The tables of the README, of benchmarks/README.md and docs/choices.md, made of committed CSV files.
+"""The tables of README.md, benchmarks/README.md and docs/choices.md, from committed CSV files.
 
     python benchmarks/documents.py
 
