@@ -36,6 +36,7 @@ CUBE = SceneBounds((-2.0,) * 3, (2.0,) * 3)
 
 # A hollow sphere around the origin: the distance, positive inside, and a density (1/m).
 SPHERE = Formula(lambda points: 1.5 - points.norm(dim=-1), CUBE)
+NEAR = Formula(lambda points: 1.05 - points.norm(dim=-1), CUBE)  # its front is what is measured
 FOG = Formula(lambda p: 20 * torch.exp(5 * (p.norm(dim=-1) - 1.5)), CUBE)
 FOG.surface_level = 20.0
 SWEEP = pd.DataFrame({"time (ms)": [1.0, 9.0], "ATE (cm)": [2.0, 0.5], "method": ["VR", "SDF"]})
@@ -92,6 +93,9 @@ FIGURES = {
     "density": lambda s: plots.plot_slice(FOG, s, 0.0, title="round"),
     "points": lambda s: plots.plot_points({"before": cloud(0.05), "after": cloud(0.02)}, "closer"),
     "mesh": lambda s: plots.plot_mesh(room_mesh(), {"SDF": s.T_world_camera}, "room"),
+    "figure 1": lambda s: plots.plot_map_and_slice(
+        NEAR, s, {"true": s.T_world_camera}, "round", voxel=0.1
+    ),
     "paths": lambda s: plots.plot_trajectories(s.T_world_camera, {"SDF": s.T_world_camera}, "near"),
     "recording": lambda s: plots.plot_overview(CLOUD, {"true": s.T_world_camera}, None, "thin"),
     "overview": lambda s: plots.plot_overview(CLOUD, {"SDF": s.T_world_camera}, FRAMES, "near"),
@@ -262,6 +266,22 @@ def test_one_looks_into_the_doll_house(inverted, sequence) -> None:
     assert screen @ screen.T == pytest.approx(np.eye(3), abs=1e-12)
     assert np.linalg.det(screen) == pytest.approx(1)
     assert screen[:, 2] == pytest.approx([0, -(0.5**0.5), -(0.5**0.5)])
+
+
+def test_the_slice_stands_beside_the_room_in_its_projection(sequence, tmp_path) -> None:
+    """Catches a path that is drawn elsewhere in the slice than in the room, a slice that covers
+    the room, and a figure that cannot be printed."""
+    paths = {"true": sequence.T_world_camera, "tracked": sequence.T_world_camera + 0.0}
+    figure = plots.plot_map_and_slice(NEAR, sequence, paths, voxel=0.1)
+    lines = [line.get_xydata() for line in figure.axes[0].lines if line.get_label() == "true"]
+    in_room, in_slice = lines
+    assert np.ptp(in_slice - in_room, axis=0) == pytest.approx([0, 0], abs=1e-9)
+    mesh, colors = figure.axes[0].collections[:2]
+    corners = np.concatenate([path.vertices for path in mesh.get_paths()])
+    assert colors.get_coordinates()[..., 0].min() > corners[:, 0].max()
+    for suffix in ("pdf", "png"):
+        figure.savefig(tmp_path / f"figure_1.{suffix}")
+    assert (tmp_path / "figure_1.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_the_viewer_holds_mesh_and_paths_and_stays_small(sequence) -> None:

@@ -16,6 +16,7 @@ from nbtrack.plots.figures import (
 from nbtrack.plots.movie import cloud_of, movie_bytes, movie_pictures
 from nbtrack.plots.rooms import (
     mesh_viewer,
+    plot_map_and_slice,
     plot_mesh,
     plot_overview,
     plot_points,

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import trimesh
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
@@ -20,7 +21,7 @@ from trimesh.viewer.notebook import scene_to_notebook
 from nbtrack.core.arrays import Points, Poses, Transform, Values
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
-from nbtrack.plots.meshes import query_field, seen_by
+from nbtrack.plots.meshes import extract_mesh, query_field, seen_by
 from nbtrack.plots.style import DOTTED, log_axes, method_colors, new_axes, styled
 from nbtrack.synthetic import Room
 from nbtrack.tables import STANDING_STILL
@@ -170,32 +171,99 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
     projection is parallel; lengths across the picture are true (m). The camera-to-world poses by
     label are drawn on top, and larger beside it; "true" is green, "tracked" red.
     """
-    up = up_of(*T_paths.values())
-    side = _inward_side(mesh)
+    to_screen = _best_view(mesh, up_of(*T_paths.values()))
+    room, enlarged = new_axes(title, 5.0, 1, 2, width_ratios=[2, 1])[0]
+    _draw_mesh(room, mesh, to_screen)
+    for axes in (room, enlarged):
+        _draw_paths(axes, T_paths, to_screen[:2])
+        _look_through(axes)
+    enlarged.set_title("The path, larger")
+    room.figure.legend_below()
+    return room.figure
+
+
+@styled
+def plot_map_and_slice(
+    field: Field,
+    sequence: RgbdSequence,
+    T_paths: Mapping[str, Poses],
+    title: str = "",
+    voxel: float = 0.04,
+) -> Figure:
+    """A map as in the paper's Figure 1: its surface, a slice through its signed distance, paths.
+
+    The surface is drawn as `plot_mesh` draws it, from a grid of `voxel` metres. The slice lies at
+    the cameras' mean height and is drawn beside the room, in the same projection; thin lines are
+    0.25 m apart. What no frame of `sequence` has seen is pale. The camera-to-world poses (m) by
+    label are drawn in both.
+    """
+    mesh = extract_mesh(field, sequence, voxel=voxel)
+    up = up_of(sequence.T_world_camera)
+    to_screen = _best_view(mesh, up)
+    axes = new_axes(title, 4.6)[0, 0]
+    _draw_mesh(axes, mesh, to_screen)
+    page = [axis for axis in range(3) if up[axis] == 0]
+    low, high = mesh.bounds[:, page]
+    sides = [np.arange(a, b, voxel) for a, b in zip(low, high, strict=True)]
+    height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
+    points = np.empty((len(sides[0]), len(sides[1]), 3)) + height * up
+    points[..., page] = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
+    flat = points.reshape(-1, 3)
+    values = query_field(field, flat)[1].reshape(points.shape[:2])
+    unseen = ~seen_by(flat, sequence).reshape(values.shape)
+    colors = ScalarMappable(*_scale_of(field, values))
+    # From the room to where the slice is drawn; it is above the middle of the room's height.
+    corners = mesh.vertices @ to_screen.T
+    aside = 1.04 * np.ptp(corners[:, 0]) * to_screen[0]
+    aside -= (height - (mesh.vertices @ up).mean()) * up
+    right, ahead = np.moveaxis((points + aside) @ to_screen[:2].T, -1, 0)
+    rgb = colors.to_rgba(values)[..., :3]
+    rgb[unseen] += _DIMMED * (1 - rgb[unseen])
+    axes.pcolormesh(right, ahead, rgb[:-1, :-1], rasterized=True)
+    look = {"colors": "0.35", "linewidths": 0.4, "linestyles": "-"}
+    axes.contour(right, ahead, values, np.arange(-1.0, 1.01, 0.25), **look)
+    axes.contour(right, ahead, values, [field.surface_level], colors="black", linewidths=1.4)
+    axes.figure.colorbar(colors, ax=axes, label=field.value_label, extend="both", shrink=0.6)
+    _draw_paths(axes, T_paths, to_screen[:2], width=0.5)
+    moved = {label: path.copy() for label, path in T_paths.items()}
+    for path in moved.values():
+        path[:, :3, 3] += aside
+    axes.figure.legend_below()
+    _draw_paths(axes, moved, to_screen[:2], width=0.5)
+    _look_through(axes)
+    axes.set_axis_off()
+    return axes.figure
+
+
+def _best_view(mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
+    """The `screen_axes` from which most surface of a room shows its front."""
     # None of the azimuths looks along the walls of a room aligned to the axes.
     screens = np.stack([screen_axes(up, azimuth) for azimuth in np.arange(15.0, 360.0, 30.0)])
-    fronts = side * mesh.face_normals @ screens[:, 2].T
-    best = (mesh.area_faces @ fronts.clip(0)).argmax()
-    to_screen = screens[best]
-    faces = mesh.faces[fronts[:, best] > 0]
+    fronts = _inward_side(mesh) * mesh.face_normals @ screens[:, 2].T
+    return screens[(mesh.area_faces @ fronts.clip(0)).argmax()]
+
+
+def _draw_mesh(axes: Axes, mesh: trimesh.Trimesh, to_screen: np.ndarray) -> None:
+    """The faces of a mesh that show their front, shaded, the nearest on top."""
+    side = _inward_side(mesh)
+    faces = mesh.faces[side * mesh.face_normals @ to_screen[2] > 0]
     corners = (mesh.vertices @ to_screen.T)[faces]
     # Smoothed normals: those of single marching-cubes faces flicker.
     normals = side * mesh.vertex_normals[faces].mean(axis=1)
+    up = (to_screen[1] + to_screen[2]) / np.sqrt(2)  # one looks down at 45 degrees
     light = to_screen[2] + 0.5 * to_screen[0] + 0.6 * up
     shade = _AMBIENT + (1 - _AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)
     colors = mesh.visual.vertex_colors[faces, :3].mean(axis=1) / 255 * shade[:, None]
     order = corners[..., 2].mean(axis=1).argsort()  # from the farthest to the nearest
-    room, enlarged = new_axes(title, 5.0, 1, 2, width_ratios=[2, 1])[0]
     look = {"edgecolors": "face", "linewidths": 0.4, "rasterized": True}
-    room.add_collection(PolyCollection(corners[order, :, :2], facecolors=colors[order], **look))
-    for axes in (room, enlarged):
-        _draw_paths(axes, T_paths, to_screen[:2])
-        axes.set(aspect="equal", xlabel="across the picture (m)", yticks=[])
-        axes.spines["left"].set_visible(False)
-        axes.grid(False)
-    enlarged.set_title("The path, larger")
-    room.figure.legend_below()
-    return room.figure
+    axes.add_collection(PolyCollection(corners[order, :, :2], facecolors=colors[order], **look))
+
+
+def _look_through(axes: Axes) -> None:
+    """Axes of a parallel projection: lengths across the picture are true."""
+    axes.set(aspect="equal", xlabel="across the picture (m)", yticks=[])
+    axes.spines["left"].set_visible(False)
+    axes.grid(False)
 
 
 def _make_unlit(tree: dict) -> None:
@@ -297,17 +365,22 @@ def _draw_from_above(
     return up, page
 
 
-def _draw_paths(axes: Axes, T_paths: Mapping[str, Poses], to_page: np.ndarray) -> None:
+def _draw_paths(
+    axes: Axes, T_paths: Mapping[str, Poses], to_page: np.ndarray, width: float = 1.0
+) -> None:
     """Trajectories by label on a page, (2, 3), with a dot at the start of each."""
     starts = []
     styles = cycle(("--", "-.", ":"))
     for label, color in method_colors(T_paths).items():
         path = T_paths[label][:, :3, 3] @ to_page.T
         # The true path is wide, so that the others do not hide it.
-        look = ("-", 4.0) if label == "true" else (next(styles), 1.6)
-        axes.plot(*path.T, look[0], linewidth=look[1], color=color, label=label, zorder=3)
+        dashes, own = ("-", 4.0) if label == "true" else (next(styles), 1.6)
+        look = {"linewidth": own * width, "color": color, "label": label, "zorder": 3}
+        axes.plot(*path.T, dashes, **look)
         starts.append(path[0])
-    axes.plot(*np.transpose(starts), "o", color="black", markersize=5, zorder=4, label="start")
+    axes.plot(
+        *np.transpose(starts), "o", color="black", markersize=5 * width, zorder=4, label="start"
+    )
 
 
 def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
