@@ -44,6 +44,22 @@ def test_frames_of_equal_steps(fault: str) -> None:
     assert [clock.steps(duration) for duration in durations] == counts
 
 
+def test_a_converged_step_counts() -> None:
+    """Catches a search that ends in its first step, as ICP's does, and is never charged for it: of
+    50 ms a step at 1,000 Hz every other frame has none, as where nothing converges."""
+    clock = FakeClock(1000)
+    counts = []
+    for _ in range(5):
+        frame = clock.budget.frame()
+        counts.append(0)
+        for step in frame:
+            clock.seconds += 1 / 16
+            counts[-1] = step + 1
+            break
+        frame.close()
+    assert counts == [1, 0, 1, 0, 1]
+
+
 def test_mean_is_over_the_whole_frame() -> None:
     """Catches stopping by the last step's time, and a resumed frame that starts although the mean
     does not fit. Steps of 1/2, 1/8, 1/8, ... s.

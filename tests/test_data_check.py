@@ -155,6 +155,13 @@ def test_one_warning(tmp_path: Path, poses: np.ndarray, scale: float, says: str)
     assert re.search(f"  warning: .*{says}", str(report))
 
 
+def test_lone_outliers_are_counted(tmp_path: Path) -> None:
+    """Catches outliers far apart that are told as one."""
+    poses = walk(N_FRAMES)
+    poses[[3, 8, 12], :3, 3] += [0.0, 0.4, 0.0]
+    assert "warning: 3 of 16 poses lie up to" in str(check(write_box(tmp_path / "box", poses)))
+
+
 def test_frames_without_pose(box: Path) -> None:
     """Catches a motion measured across a gap, and frames that slip against their depth."""
     poses = as_written(walk(N_FRAMES), "opengl")

@@ -1,6 +1,7 @@
 """Every format is read back as it was written: poses, depth, colour, camera."""
 
 import json
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +32,7 @@ from nbtrack.core.errors import ConfigError, DataError, MissingError
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.recordings.formats import FORMATS
 from nbtrack.recordings.reading import parse_frames, read_sequence
-from nbtrack.recordings.recording import open_recording
+from nbtrack.recordings.recording import image_digest, open_recording
 from nbtrack.recordings.writer import convert_sequence
 
 LOSSY = ("replica", "scannet")  # colour is JPEG
@@ -433,3 +434,19 @@ def test_times_are_those_of_names_and_stamps(plain: Path) -> None:
     lines = tum_lines(times, data.poses).splitlines()
     path.write_text("\n".join(lines[:3] + lines[4:]))
     assert np.flatnonzero(~open_recording(plain).has_pose).tolist() == [3]
+
+
+def test_images_content_behind_their_pixels_differ(tmp_path: Path) -> None:
+    """Catches a changed image that the cache takes for the old one, where a PNG ends with text."""
+    digests = set()
+    for depth_mm in (1000, 2000):
+        file = tmp_path / f"{depth_mm}.png"
+        image = Image.fromarray(np.full((4, 4), depth_mm, np.uint16))
+        image.save(file)
+        content = file.read_bytes()
+        chunk = b"tEXt" + b"note\0" + b"x" * 200
+        length, checksum = (n.to_bytes(4, "big") for n in (len(chunk) - 4, zlib.crc32(chunk)))
+        end = content.rindex(b"IEND") - 4
+        file.write_bytes(content[:end] + length + chunk + checksum + content[end:])
+        digests.add(image_digest(file))
+    assert len(digests) == 2

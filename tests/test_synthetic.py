@@ -378,7 +378,7 @@ def test_rooms_are_bit_identical_for_a_seed(tmp_path, monkeypatch):
     reader does not take, and lost exactness of poses."""
     seen = []
     first = make_room("office", tmp_path / "a", 3, 16, 12, 7, progress=seen.append)
-    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    monkeypatch.setattr("nbtrack.synthetic.make.usable_cores", lambda: 1)
     again = make_room("office", tmp_path / "b", 3, 16, 12, 7)
     other = make_room("office", tmp_path / "c", 3, 16, 12, 8)
     assert seen == [1, 2, 3]

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond.grid import BakedField
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
+from nbtrack.core.settings import with_values
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.tracking import (
@@ -53,6 +54,41 @@ def test_a_known_offset_shrinks_and_the_true_pose_stays(name: str) -> None:
     frames = track(name, box_sequence([[0.1, 0.0, -0.1]] * 2), 20).frames
     assert frames["translation_error_m"].iloc[0] < 0.008
     assert frames["rotation_error_deg"].iloc[0] < 0.5
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+@pytest.mark.parametrize("name", ["vr", "sdf"])
+def test_a_programs_modes_are_its_own(name: str, mode: type) -> None:
+    """Catches a tracker that fails, or finds other poses, in a program that has switched gradients
+    off or computes in double precision, and one that leaves modes of its own behind."""
+    sequence = box_sequence([[0.0, 0.0, 0.0], [0.02, -0.01, 0.015]])
+    field = BoxRoom(as_density=name == "vr")
+
+    def found() -> np.ndarray:
+        tracker = make_tracker(name, field, np.eye(4), StepBudget(3), SETTINGS[name])
+        return track_sequence(tracker, sequence).T_estimated
+
+    expected = found()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with mode():
+            assert np.array_equal(found(), expected)
+            assert not torch.is_grad_enabled()
+        assert torch.get_default_dtype() == torch.float64
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize("n_samples", [(2, 0), (2, 12)])
+def test_the_fewest_samples_move_the_camera(n_samples: tuple[int, int]) -> None:
+    """Catches a tracker that stands still in silence: of one sample alone, which is refused, the
+    rendered depth has no gradient."""
+    few = dict(zip(("n_stratified", "n_importance"), n_samples, strict=True))
+    tracker = tracker_of("vr", 5, replace(SETTINGS["vr"], **few))
+    found = track_sequence(tracker, box_sequence([[0.0, 0.0, 0.0], [0.02, -0.01, 0.015]]))
+    assert np.abs(found.T_estimated[0, :3, 3]).max() > 1e-3
+    with pytest.raises(ConfigError, match="n_stratified"):
+        with_values(SETTINGS["vr"], {"n_stratified": 1})
 
 
 def test_one_step_of_adam_moves_by_the_learning_rates() -> None:

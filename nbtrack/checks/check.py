@@ -108,8 +108,9 @@ class DataReport:
 
 def _pose_warnings(report: DataReport) -> Iterator[str]:
     off = report.frames.off_mm / 1e3
-    odd = off[off > max(_OFF, _OFF_STEPS * report.frames.moved_mm.median() / 1e3)]
-    odd = odd[odd == odd.rolling(3, 1, center=True).max()]  # its neighbours are off by half
+    is_odd = off > max(_OFF, _OFF_STEPS * report.frames.moved_mm.median() / 1e3)
+    # The neighbours of a pose that is off are off by half.
+    odd = off[is_odd & (off == off.rolling(3, 1, center=True).max())]
     if len(odd):
         yield (
             f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path of "

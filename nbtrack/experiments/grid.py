@@ -19,7 +19,7 @@ from typing import Any
 import pandas as pd
 import torch
 
-from nbtrack.core.device import choose_device, threads
+from nbtrack.core.device import choose_device, threads, usable_cores
 from nbtrack.core.errors import MissingError, NbtrackError, check_lists
 from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.progress import ProgressBar, tell
@@ -200,7 +200,7 @@ def _outcomes(
     jobs: dict[Path, Job], results: dict[Path, Any], show: Callable, execution: Execution
 ) -> Iterator[tuple[Path, Any]]:
     """What becomes of each job, as they end; what a job needs comes before it."""
-    usual = os.cpu_count() or 1 if _has_dask() and choose_device().type == "cpu" else 1
+    usual = usable_cores() if _has_dask() and choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, len(jobs))
     if jobs and (execution.dask is not None or workers > 1):
         share = 1 if execution.dask else max(1, torch.get_num_threads() // workers)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
+from nbtrack.core.device import usual_modes
 from nbtrack.core.errors import ConfigError, MissingError
 from nbtrack.core.files import naming_damaged, write_together
 from nbtrack.fields import FIELDS, Field
@@ -79,6 +80,7 @@ def write_map(path: Path, finished: Map) -> None:
     write_together(path.parent, {**history, path.name: content})
 
 
+@usual_modes()
 def read_map(path: Path | str) -> Map:
     """A map from the folder that `map` has written, or from a single file, on the CPU.
 

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 import torch
 
-from nbtrack.core.device import advise_on_memory, device_name, suitable_threads
+from nbtrack.core.device import advise_on_memory, device_name, suitable_threads, usual_modes
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
 from nbtrack.core.files import loaded_checkpoint, save_checkpoint
 from nbtrack.data.pixels import PixelSampler
@@ -35,6 +35,7 @@ def learning_rate(settings: MappingSettings, iteration: int) -> float:
     return settings.learning_rate * share
 
 
+@usual_modes()
 def map_sequence(
     field_name: str,
     sequence: RgbdSequence,

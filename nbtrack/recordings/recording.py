@@ -31,7 +31,6 @@ from nbtrack.recordings.formats import (
 from nbtrack.recordings.moments import TOLERANCE, Moments, nearest
 from nbtrack.recordings.names import frame_keys, frame_numbers, stamp_in
 
-_END_OF_PNG = 64  # bytes: the checksum of all pixels, and the marker of the end
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
 
@@ -87,13 +86,17 @@ class Recording:
 def image_digest(file: Path) -> str:
     """A digest of an image file that is cheap for long recordings.
 
-    A PNG ends with checksums of all its pixels, so that its size and its end tell; other files are
-    read whole.
+    Each chunk of a PNG has its length, its name and a checksum, which are read alone; other files
+    are read whole.
     """
     with file.open("rb") as opened:
-        size = opened.seek(0, os.SEEK_END)
-        opened.seek(max(0, size - _END_OF_PNG) if file.suffix.lower() == ".png" else 0)
-        return hashlib.blake2b(opened.read() + str(size).encode(), digest_size=8).hexdigest()
+        digest = hashlib.blake2b(opened.read(8), digest_size=8)
+        if file.suffix.lower() != ".png":
+            digest.update(opened.read())
+        while head := opened.read(8):
+            opened.seek(int.from_bytes(head[:4], "big"), os.SEEK_CUR)
+            digest.update(head + opened.read(4))
+        return digest.hexdigest()
 
 
 def open_recording(

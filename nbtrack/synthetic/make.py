@@ -1,7 +1,6 @@
 """Make a synthetic scene on disk, in the Neural RGB-D layout, and find its exact room again."""
 
 import json
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nbtrack.core.camera import Intrinsics
+from nbtrack.core.device import usable_cores
 from nbtrack.core.errors import DataError, look_up
 from nbtrack.core.files import fingerprint, json_text, naming_damaged
 from nbtrack.provenance import sources_fingerprint
@@ -53,7 +53,7 @@ def room_frames(
         return color, depths_mm, poses[number]
 
     # NumPy releases the interpreter lock, so threads suffice.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         for start in range(0, n_frames, _FRAMES_AT_ONCE):
             yield from pool.map(make_frame, range(n_frames)[start : start + _FRAMES_AT_ONCE])
 

@@ -5,7 +5,7 @@ leave to the next one, so every trajectory needs a budget of its own.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from fractions import Fraction
 from math import floor
 
@@ -41,10 +41,10 @@ class ClockBudget:
     def __str__(self) -> str:
         return f"wall clock, {1000 / self.rate_hz:g} ms per frame"
 
-    def frame(self, device: torch.device = _HOST) -> Iterator[int]:
+    def frame(self, device: torch.device = _HOST) -> Generator[int, None, None]:
         """Starts the next frame of a tracker on a device.
 
-        Gives 0, 1, 2, ... as long as another step is allowed.
+        Gives 0, 1, 2, ... as long as another step is allowed. Who ends before, closes it.
         """
         return self._steps(self._now(device), device)
 
@@ -52,16 +52,18 @@ class ClockBudget:
         synchronize(device)
         return self._clock()
 
-    def _steps(self, start: float, device: torch.device) -> Iterator[int]:
+    def _steps(self, start: float, device: torch.device) -> Generator[int, None, None]:
         prepared = now = self._now(device)
         mean = self.memory
         self.memory = None
         step = 0
         while mean is None or start + 1 / self.rate_hz - now >= mean:
-            yield step
-            step += 1
-            now = self._now(device)
-            mean = self.memory = (now - prepared) / step
+            try:
+                yield step
+            finally:  # a search that has converged closes the frame at its last step
+                step += 1
+                now = self._now(device)
+                mean = self.memory = (now - prepared) / step
 
 
 class StepBudget:
@@ -81,7 +83,7 @@ class StepBudget:
     def __str__(self) -> str:
         return f"{self.steps_per_frame:g} steps per frame"
 
-    def frame(self, device: torch.device = _HOST) -> Iterator[int]:
+    def frame(self, device: torch.device = _HOST) -> Generator[int, None, None]:
         """Starts the next frame, on any device; yields 0, 1, ... while another step is allowed."""
         done = floor(self.memory * self._exact)
         self.memory += 1

@@ -103,7 +103,8 @@ class VrSettings(AdamSettings):
     n_pixels: int = limited(512, 1, 65536)  # (paper)
     lambda_color: float = 5.0  # (iMAP)
     lambda_depth: float = 1.0  # 0: by colour alone, of the same pixels (iNeRF)
-    n_stratified: int = limited(32, 1, 1024)  # samples of the first pass (iMAP)
+    # Samples of the first pass (iMAP); the rendered depth of a single one has no gradient.
+    n_stratified: int = limited(32, 2, 1024)
     n_importance: int = limited(12, 0, 1024)  # of the second pass (iMAP)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
-from nbtrack.core.device import suitable_threads, synchronize
+from nbtrack.core.device import suitable_threads, synchronize, usual_modes
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
 from nbtrack.core.settings import with_values
 from nbtrack.data.frame import Frame
@@ -68,6 +68,7 @@ class Tracker(abc.ABC):
     is_converged: bool = False  # whether further steps would change nothing: the rest is spared
     T_world_camera: Transform
 
+    @usual_modes()
     def __init__(
         self,
         field: Field,
@@ -113,6 +114,7 @@ class Tracker(abc.ABC):
         """What it says about its estimate, by column name; `lost`, where given, is its verdict."""
         return {}
 
+    @usual_modes()
     def track(self, frame: Frame, budget: Budget | None = None) -> Estimate:
         """The camera's pose at the next frame; NumericalError if it is not finite.
 
@@ -196,6 +198,7 @@ class Tracker(abc.ABC):
             if self.is_converged:
                 break
         synchronize(self.device)
+        allowed.close()
         seconds = time.perf_counter() - began
         pose = self.T_world_camera.detach().cpu().double().numpy().copy()
         if not np.isfinite(pose).all():
