@@ -20,6 +20,7 @@ from recordings import (
     camera_matrix,
     matrix_text,
     source,
+    write_neural_rgbd,
     tum_lines,
     write_image,
     write_images,
@@ -31,7 +32,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError, DataError, MissingError
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.recordings.formats import FORMATS
-from nbtrack.recordings.reading import parse_frames, read_sequence
+from nbtrack.recordings.reading import parse_frames, read_frames, read_sequence, select_frames
 from nbtrack.recordings.recording import image_digest, open_recording
 from nbtrack.recordings.writer import convert_sequence
 
@@ -450,3 +451,17 @@ def test_images_content_behind_their_pixels_differ(tmp_path: Path) -> None:
         file.write_bytes(content[:end] + length + chunk + checksum + content[end:])
         digests.add(image_digest(file))
     assert len(digests) == 2
+
+
+def test_poses_of_key_frames_only(tmp_path: Path) -> None:
+    """Catches frames without a pose among those that were asked for with one: every second of them
+    had none, and nothing was left to tell the unit of a map from."""
+    data = source(n_frames=8)
+    poses = data.poses.copy()
+    poses[::2] = np.nan
+    write_neural_rgbd(tmp_path / "keys", data._replace(poses=poses))
+    recording = open_recording(tmp_path / "keys")
+    ids = select_frames(recording, slice(None))
+    assert ids.tolist() == [1, 3, 5, 7]
+    assert read_frames(recording, ids[::2]).frame_ids.tolist() == [1, 5]
+    assert len(select_frames(recording, slice(None), needs_poses=False)) == 8

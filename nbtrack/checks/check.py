@@ -186,7 +186,6 @@ def check_recording(
     DataError where the whole has no depth.
     """
     ids = select_frames(recording, slice(None))
-    ids = ids[recording.has_pose[ids]]
     poses = recording.T_world_camera[ids]
     poses[:, :3, 3] -= recording.origin
     pairs = _pairs(poses, _N_PAIRS if is_whole else _QUICK_PAIRS)

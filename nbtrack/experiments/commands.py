@@ -82,8 +82,7 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
     """The mesh of what was seen, beside a map."""
     try:
         recording = job.scene.recording
-        frame_ids = select_frames(recording, parse_frames(job.frames))
-        mapped = frame_ids[recording.has_pose[frame_ids]]
+        mapped = select_frames(recording, parse_frames(job.frames))
         seen = without_outliers(read_frames(recording, mapped[::_FRAMES_APART]))
         mesh = extract_mesh(finished.field, seen)
     except DataError as error:

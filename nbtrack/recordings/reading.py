@@ -56,8 +56,6 @@ def read_frames(
     """
     is_slice = isinstance(frames, slice)
     frame_ids = select_frames(recording, frames, needs_poses) if is_slice else frames
-    if needs_poses:
-        frame_ids = frame_ids[recording.has_pose[frame_ids]]
     images = decode(recording, frame_ids, progress)
     poses, times = recording.T_world_camera[frame_ids], recording.times[frame_ids]
     origin = recording.origin if origin is None else origin
@@ -67,17 +65,22 @@ def read_frames(
 
 
 def select_frames(recording: Recording, frames: slice, needs_poses: bool = True) -> Frames:
-    """Numbers of the selected frames. Raises DataError if there is none, or none with a pose."""
-    frame_ids = np.arange(len(recording))[frames]
+    """Numbers of the selected frames, where needed of those that have a pose.
+
+    Raises DataError if there is none.
+    """
+    selected = frame_ids = np.arange(len(recording))[frames]
     if needs_poses and recording.pose_file is None:
         raise MissingError(
             f"no poses in {recording.folder}: {recording.format.label} needs "
             f"{' or '.join(recording.format.poses)}; add it, or track in a map of the same place "
             "with --map-from"
         )
-    if not (recording.has_pose[frame_ids].any() if needs_poses else len(frame_ids)):
+    if needs_poses:
+        frame_ids = selected[recording.has_pose[selected]]
+    if not len(frame_ids):
         raise DataError(
-            f"{len(frame_ids)} of the {len(recording)} frames in {recording.folder} are selected, "
+            f"{len(selected)} of the {len(recording)} frames in {recording.folder} are selected, "
             f"but no pose in {recording.pose_file} that is not NaN: choose others, or other poses"
         )
     return frame_ids

@@ -99,7 +99,8 @@ def convert_sequence(
     `intrinsics.txt`. Frames without a pose keep their number, with a NaN pose.
     Raises as `read_frames` does, and DataError if `out` exists; it appears when it is complete.
     """
-    numbers = select_frames(recording, frames)
+    select_frames(recording, frames)  # raises where none has a pose
+    numbers = select_frames(recording, frames, needs_poses=False)
     camera, _, _ = decode(recording, numbers[:1])
     with ProgressBar("converting", len(numbers), progress) as bar:
         times = {TIMES_FILE: _text(recording.times[numbers, None])}
