@@ -22,10 +22,10 @@ _MAX_THREADS = 1024  # OpenMP ends the process where it cannot start them
 
 
 def a_path(text: str) -> Path:
-    """A path; an empty one would be the working folder by accident."""
+    """A path, from `~` on too; an empty one would be the working folder by accident."""
     if not text.strip():
         raise argparse.ArgumentTypeError("the path is empty")
-    return Path(text)
+    return Path(text).expanduser()
 
 
 def a_count(text: str, minimum: int = 1, maximum: int = _MAX_COUNT) -> int:
@@ -47,7 +47,7 @@ _BUDGETS = {"choices": ("steps", "clock"), "default": "steps"}
 _SETTINGS = {"action": "append", "default": [], "dest": "settings", "metavar": "KEY=VALUE"}
 _IMPORTS = {"action": "append", "default": [], "dest": "imports", "metavar": "FILE.py"}
 OPTIONS = {
-    "sequence": _option("a folder, or the name of a room or dataset scene"),
+    "sequence": _option("a folder, or the name of a room or dataset scene", os.path.expanduser),
     "folder": _option("a recording", a_path),
     "room": _option("its name"),
     "source": _option("folder of a run or a map, or a map file", a_path),

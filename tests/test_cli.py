@@ -19,7 +19,9 @@ from tiny import tiny_words
 import nbtrack
 from nbtrack.cli import main
 from nbtrack.core.errors import DataError
-from nbtrack.core.files import naming_damaged
+from nbtrack.core.files import naming_damaged, runs_folder
+from nbtrack.experiments.presets import load_preset
+from nbtrack.experiments.scenes import open_scene
 from nbtrack.recordings.recording import open_recording
 from nbtrack.tracking.trajectories import read_tum
 
@@ -255,3 +257,16 @@ def test_names_that_are_no_text(
     assert main(["export", run, "--to", "gif", f"{run}.gif"]) == 0
     assert main(["data", "check", folder, "--out", run]) == 0
     assert (tmp_path / run / "check.png").is_file()
+
+
+def test_the_home_folder_is_meant_by_its_sign(tmp_path: Path, monkeypatch) -> None:
+    """Catches a folder called `~` where a shell leaves it as it is, after `=` and in variables."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("NBTRACK_RUNS", "~/runs")
+    monkeypatch.chdir(tmp_path)
+    made = ["data", "make", "living_room", "--out=~/room", "--n-frames=2", "--width=16"]
+    assert main(made) == 0
+    assert (tmp_path / "room" / "poses.txt").is_file()
+    assert open_scene("~/room", load_preset("smoke")).folder == (tmp_path / "room").resolve()
+    assert runs_folder() == (tmp_path / "runs").resolve()
+    assert not (tmp_path / "~").exists()

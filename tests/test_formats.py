@@ -20,10 +20,10 @@ from recordings import (
     camera_matrix,
     matrix_text,
     source,
-    write_neural_rgbd,
     tum_lines,
     write_image,
     write_images,
+    write_neural_rgbd,
     write_recording,
 )
 

@@ -44,8 +44,8 @@ def project_folder() -> Path:
 
 
 def resolved(path: Path | str) -> Path:
-    """An absolute path without links. Where these form a loop, whoever opens it is told."""
-    return Path(os.path.realpath(path))
+    """An absolute path without links or `~`. Where links form a loop, whoever opens it is told."""
+    return Path(os.path.realpath(os.path.expanduser(path)))
 
 
 def runs_folder() -> Path:

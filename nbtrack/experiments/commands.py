@@ -275,7 +275,8 @@ def _export_run(source: Path, format_name: str, out: Path) -> str:
 def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
     n_poses = len(read_trajectory(source).frames)
     write_kitti(out, read_tum(source / "trajectory.txt")[1])
-    return f"{n_poses} poses, KITTI: three rows of the matrix (m), no time stamps"
+    what = "KITTI: three rows of the matrix (m), no time stamps"
+    return f"{n_poses} poses, {what}; the first frame's, which was given, is not among them"
 
 
 _EXPORTS = {

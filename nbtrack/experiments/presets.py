@@ -177,9 +177,10 @@ def load_preset(
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
     layers = []
     if config_file := config_file or os.environ.get("NBTRACK_CONFIG"):
-        if not Path(config_file).is_file():
+        config_file = Path(config_file).expanduser()
+        if not config_file.is_file():
             raise MissingError(f"no config file {config_file}: give a TOML file of settings")
-        layers.append(flat(read_object(Path(config_file))))
+        layers.append(flat(read_object(config_file)))
     try:
         before = shlex.split(os.environ.get("NBTRACK_SET", ""))
     except ValueError as error:

@@ -72,7 +72,7 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     folder, room or scene; MissingError where the scene of the dataset was not downloaded.
     """
     text = str(sequence)
-    folder = Path(sequence)
+    folder = Path(sequence).expanduser()
     if text in _KNOWN and folder.is_dir() and not is_own_output(folder):
         tell(f"{text}: the folder {folder.resolve()} is read, not the room or scene of that name")
     elif text in ROOMS:
