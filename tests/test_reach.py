@@ -15,7 +15,7 @@ from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.outlook import expected_reach, reach_warnings
 from nbtrack.experiments.presets import load_preset
-from nbtrack.experiments.scenes import Scene
+from nbtrack.experiments.scenes import Scene, open_scene
 from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.recordings.formats import declaration
 from nbtrack.recordings.reading import read_sequence
@@ -73,6 +73,20 @@ def test_units_of_the_dataset(tmp_path: Path) -> None:
     assert observed_bounds(read_sequence(tmp_path / "kitchen")).metres_per_unit == 3.0
     bounds = observed_bounds(read_sequence(tmp_path / "my_kitchen"))
     assert bounds.metres_per_unit == bounds.half_longest_side
+
+
+def test_a_link_has_the_name_that_it_is_given(tmp_path: Path, monkeypatch) -> None:
+    """Catches a scene of the dataset that loses its unit where a data manager keeps it under a
+    digest, by path, by scene name, and in a folder that it is called from."""
+    make_room("office", tmp_path / "3f9a81c0", 2, 16, 12)
+    (tmp_path / "kitchen").symlink_to(tmp_path / "3f9a81c0")
+    monkeypatch.setenv("NBTRACK_DATA", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    for given in (tmp_path / "kitchen", "kitchen", "./kitchen", "kitchen/../kitchen"):
+        scene = open_scene(given, load_preset("paper"))
+        assert scene.name == scene.recording.name == "kitchen"
+        assert scene.recording.declared.metres_per_unit == 4.0
+    assert observed_bounds(read_sequence("kitchen")).metres_per_unit == 4.0
 
 
 def test_reach_by_hand() -> None:

@@ -43,6 +43,11 @@ def project_folder() -> Path:
     return PACKAGE.parent if is_checkout else Path.cwd()
 
 
+def absolute(path: Path | str) -> Path:
+    """An absolute path without `~` and `..`, in which links stay: a recording has their names."""
+    return Path(os.path.abspath(os.path.expanduser(path)))
+
+
 def resolved(path: Path | str) -> Path:
     """An absolute path without links or `~`. Where links form a loop, whoever opens it is told."""
     return Path(os.path.realpath(os.path.expanduser(path)))

@@ -7,10 +7,10 @@ from typing import Any
 
 from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up, nearest_name
 from nbtrack.core.files import (
+    absolute,
     data_folder,
     fingerprint,
     locked,
-    resolved,
     runs_folder,
 )
 from nbtrack.core.progress import ProgressBar, tell
@@ -72,9 +72,9 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     folder, room or scene; MissingError where the scene of the dataset was not downloaded.
     """
     text = str(sequence)
-    folder = Path(sequence).expanduser()
+    folder = absolute(sequence)
     if text in _KNOWN and folder.is_dir() and not is_own_output(folder):
-        tell(f"{text}: the folder {folder.resolve()} is read, not the room or scene of that name")
+        tell(f"{text}: the folder {folder} is read, not the room or scene of that name")
     elif text in ROOMS:
         return _room(text, preset.scenes)
     elif text in DATASET_SCENES:
@@ -83,7 +83,7 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
         advice = f"see data/README.md, or use a room, which needs no download: {', '.join(ROOMS)}"
         raise MissingError(f"no folder {folder} of the Neural RGB-D dataset: {advice}")
     if folder.is_dir():
-        return Scene(folder.resolve().name, folder.resolve(), format)
+        return Scene(folder.name, folder, format)
     advice = nearest_name(text, _KNOWN)
     raise ConfigError(f"no sequence {text!r}: it is neither a folder nor a known scene; {advice}")
 
@@ -96,7 +96,7 @@ def open_scenes(preset: Preset) -> list[Scene]:
     scene is whole, what is wrong with the first.
     """
     names = preset.scenes.names
-    if not names or len({resolved(name).name for name in names}) < len(names):
+    if not names or len({absolute(name).name for name in names}) < len(names):
         given = ", ".join(names) or "(none)"
         raise ConfigError(f"scenes {given}: give at least one, and of one name only one")
     scenes = []

@@ -211,7 +211,7 @@ class TrackJob(Job):
             "key": self.key,
             "versions": provenance.versions(),
             "command": self._command(),
-            "recording": str(self.scene.folder.resolve()),
+            "recording": str(self.scene.folder),
             "format": self.scene.format,
             "map": str(self.needs.folder.resolve()),
             "map_key": finished.key,

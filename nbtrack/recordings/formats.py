@@ -12,6 +12,7 @@ import numpy as np
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
+from nbtrack.core.files import absolute
 from nbtrack.core.settings import limited, one_of, with_values
 from nbtrack.data.dataset import DATASET_UNITS
 from nbtrack.data.text_files import read_object
@@ -188,7 +189,7 @@ def declaration(folder: Path, format: str | None = None) -> Declaration:
     format = format or own_format or _told_by_files(folder)
     usual = look_up("format", format, FORMATS).declared
     if format == "neural_rgbd":
-        unit = DATASET_UNITS.get(folder.resolve().name, usual.metres_per_unit)
+        unit = DATASET_UNITS.get(absolute(folder).name, usual.metres_per_unit)
         usual = replace(usual, metres_per_unit=unit)
     return replace(with_values(usual, said), format=format)
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool
 
 from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.errors import DataError, MissingError
-from nbtrack.core.files import naming_damaged
+from nbtrack.core.files import absolute, naming_damaged
 from nbtrack.data.text_files import Times, checked_poses, read_lines, read_numbers, read_poses
 from nbtrack.recordings.calibration import Calibration, read_calibration
 from nbtrack.recordings.formats import (
@@ -110,7 +110,7 @@ def open_recording(
     The format is told by the files, unless named; a depth folder or a pose file replaces its own.
     Raises MissingError, DataError or ConfigError if something is not there, wrong or unknown.
     """
-    folder = Path(folder)
+    folder = absolute(folder)
     notes = []
     declared = declaration(folder, format)
     layout = FORMATS[declared.format]
@@ -130,7 +130,7 @@ def open_recording(
     moments = Moments(len(colors), own_times, numbers, rate_hz, layout.counts_from_0)
     images = colors, depths, moments.times
     no_poses = np.full((len(colors), 4, 4), np.nan)
-    name = folder.resolve().name
+    name = folder.name
     recording = Recording(folder, name, layout, declared, *images, camera, notes, no_poses)
     return _with_poses(recording, moments, pose_file)
 
@@ -151,7 +151,7 @@ def _own_times(folder: Path, colors: list[Path]) -> Times | None:
 
 def _calibration(folder: Path, layout: Format, notes: list[str]) -> Calibration:
     """The folder's own calibration, else one that is assumed by the folder's name."""
-    known = [c for c in layout.known_cameras if c.source.name in folder.resolve().name]
+    known = [c for c in layout.known_cameras if c.source.name in folder.name]
     if known and not any((folder / name).is_file() for name in layout.cameras):
         assumed = f"the camera assumed for {layout.label}"
         notes.append(f"{assumed}, {known[0].fx:g} px at 640x480: no {layout.cameras[0]}")
