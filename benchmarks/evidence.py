@@ -175,7 +175,8 @@ ONE_THING = {  # changed at a time: steps a frame, settings, the tracked depth
     "512 pixels": (STEPS_5_HZ, ("tracking.vr.n_pixels=512",), None),
     "exact depth": (STEPS_5_HZ, (), "exact"),
     "16 steps": (16, (), None),
-    "18 steps": (18, (), None),
+    "20 steps": (20, (), None),
+    "20 steps, 512 pixels": (20, ("tracking.vr.n_pixels=512",), None),
     "constant velocity": (STEPS_5_HZ, ("tracking.vr.motion_model=constant_velocity",), None),
     "8,000 iterations": (STEPS_5_HZ, ("mapping.imap.iterations=8000",), None),
 }
@@ -186,9 +187,9 @@ def vr_at_5_hz(seed: int) -> Iterator[Chunk]:
     scene = open_scene("breakfast_room", PAPER_ROOMS)
     for changed, (n_steps, settings, depth) in ONE_THING.items():
         tracked = scene if depth is None else _with_depth(scene, depth)
-        method = replace(VR, settings=settings)
+        preset = with_settings(PAPER_ROOMS, *settings)
         there = {"steps": n_steps, "frames": FASTEST, "seeds": [seed], "tracked": [tracked]}
-        yield {"changed": changed}, partial(track, [scene], [method], PAPER_ROOMS, **there)
+        yield {"changed": changed}, partial(track, [scene], ["vr"], preset, **there)
 
 
 def _with_depth(scene: Scene, depth: str) -> OtherDepth:
