@@ -2,11 +2,11 @@
 
     python benchmarks/evidence.py EXPERIMENT [SEEDS]
 
-EXPERIMENT is one of paper_rooms, vr_at_5_hz, nine_rooms, full_size, scores, dataset_path, readings,
-speeds, more_steps, cheap_queries, by_the_clock (as the dataset moves), steps, factors, oracle,
-choices, basin (hand-held). Rows are added to a CSV under paper_tables/ as they are finished, the
-first seed first; those that are there are not made again, whatever has changed since: remove the
-file to begin anew.
+EXPERIMENT is one of paper_rooms, vr_at_5_hz, errors, nine_rooms, full_size, scores, dataset_path,
+readings, speeds, more_steps, cheap_queries, by_the_clock (as the dataset moves), steps, factors,
+oracle, choices, basin (hand-held). Rows are added to a CSV under paper_tables/ as they are
+finished, the first seed first; those that are there are not made again, whatever has changed since:
+remove the file to begin anew.
 Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed experiment goes on where
 it was. nine_rooms and paper_rooms use all cores, full_size is for a GPU: run others side by side.
 paper_rooms needs the rooms as the dataset has them, below `NBTRACK_DATA` (data/README.md).
@@ -28,7 +28,15 @@ from motions import HAND_HELD, paced, placed
 from scipy.stats import binomtest, bootstrap
 from variants import ExactDistance, FusedDistance, OtherDepth, with_variants
 
-from nbtrack import METHODS, load_preset, make_tracker, map_scene, open_scenes, track_scenes
+from nbtrack import (
+    METHODS,
+    load_preset,
+    make_tracker,
+    map_scene,
+    open_scenes,
+    read_run,
+    track_scenes,
+)
 from nbtrack.beyond.grid import BakedField
 from nbtrack.core.device import choose_device, device_name, threads
 from nbtrack.core.files import tables_folder, write_atomic
@@ -190,6 +198,20 @@ def vr_at_5_hz(seed: int) -> Iterator[Chunk]:
         preset = with_settings(PAPER_ROOMS, *settings)
         there = {"steps": n_steps, "frames": FASTEST, "seeds": [seed], "tracked": [tracked]}
         yield {"changed": changed}, partial(track, [scene], ["vr"], preset, **there)
+
+
+def errors(seed: int) -> Iterator[Chunk]:
+    """Errors of every eighth frame of breakfast_room, whose runs are those of `paper_rooms`."""
+    scene = open_scene("breakfast_room", PAPER_ROOMS)
+    yield {"scene": scene.name}, partial(_errors, scene, seed)
+
+
+def _errors(scene: Scene, seed: int) -> pd.DataFrame:
+    found = []
+    for run in track_scenes([scene], TABLE_1, PAPER_ROOMS, seeds=[seed]).itertuples():
+        frames = read_run(run.run).frames[["frame_id", "translation_error_m"]][::8]
+        found.append(frames.assign(rate_hz=run.rate_hz, method=run.method))
+    return pd.concat(found)
 
 
 def _with_depth(scene: Scene, depth: str) -> OtherDepth:
@@ -391,6 +413,7 @@ EXPERIMENTS = {
     "full_size": (full_size, "full_size/table_1_cells.csv"),
     "paper_rooms": (paper_rooms, "paper_rooms/table_1_cells.csv"),
     "vr_at_5_hz": (vr_at_5_hz, "paper_rooms/vr_at_5_hz.csv"),
+    "errors": (errors, "paper_rooms/errors.csv"),
     **{
         f.__name__: (f, f"evidence/{f.__name__}.csv")
         for f in (
