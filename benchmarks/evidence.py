@@ -222,7 +222,7 @@ def _with_maps(scene: Scene, preset: Preset, seed: int, workers: int | None = 1)
     """Rows of both methods in a scene, with sizes and with the scores of their maps."""
     rows = track([scene], TABLE_1, preset, workers, seeds=[seed])
     rows["reach_over_motion"] = rows["reach_m"] / (rows["path_m"] / rows["frames"])
-    rows["image_width"] = scene.read(":1").camera.width
+    rows["image_width"] = scene.read(":1").intrinsics.width
     for name in TABLE_1:
         made = map_scene(scene, METHODS[name].field, preset, seed).record
         own = rows["method"] == METHODS[name].label
