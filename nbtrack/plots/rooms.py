@@ -202,28 +202,15 @@ def plot_map_and_slice(
     to_screen = _best_view(mesh, up)
     axes = new_axes(title, 4.6)[0, 0]
     _draw_mesh(axes, mesh, to_screen)
-    page = [axis for axis in range(3) if up[axis] == 0]
-    low, high = mesh.bounds[:, page]
-    sides = [np.arange(a, b, voxel) for a, b in zip(low, high, strict=True)]
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
+    # From the room to where the slice is drawn; it is above the middle of the room's height.
+    aside = 1.04 * np.ptp(mesh.vertices @ to_screen[0]) * to_screen[0]
+    aside -= (height - (mesh.vertices @ up).mean()) * up
+    page = [axis for axis in range(3) if up[axis] == 0]
+    sides = [np.arange(low, high, voxel) for low, high in mesh.bounds[:, page].T]
     points = np.empty((len(sides[0]), len(sides[1]), 3)) + height * up
     points[..., page] = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
-    flat = points.reshape(-1, 3)
-    values = query_field(field, flat)[1].reshape(points.shape[:2])
-    unseen = ~seen_by(flat, sequence).reshape(values.shape)
-    colors = ScalarMappable(*_scale_of(field, values))
-    # From the room to where the slice is drawn; it is above the middle of the room's height.
-    corners = mesh.vertices @ to_screen.T
-    aside = 1.04 * np.ptp(corners[:, 0]) * to_screen[0]
-    aside -= (height - (mesh.vertices @ up).mean()) * up
-    right, ahead = np.moveaxis((points + aside) @ to_screen[:2].T, -1, 0)
-    rgb = colors.to_rgba(values)[..., :3]
-    rgb[unseen] += _DIMMED * (1 - rgb[unseen])
-    axes.pcolormesh(right, ahead, rgb[:-1, :-1], rasterized=True)
-    look = {"colors": "0.35", "linewidths": 0.4, "linestyles": "-"}
-    axes.contour(right, ahead, values, np.arange(-1.0, 1.01, 0.25), **look)
-    axes.contour(right, ahead, values, [field.surface_level], colors="black", linewidths=1.4)
-    axes.figure.colorbar(colors, ax=axes, label=field.value_label, extend="both", shrink=0.6)
+    _draw_slice(axes, field, sequence, points, (points + aside) @ to_screen[:2].T)
     _draw_paths(axes, T_paths, to_screen[:2], width=0.5)
     moved = {label: path.copy() for label, path in T_paths.items()}
     for path in moved.values():
@@ -233,6 +220,27 @@ def plot_map_and_slice(
     _look_through(axes)
     axes.set_axis_off()
     return axes.figure
+
+
+def _draw_slice(
+    axes: Axes, field: Field, sequence: RgbdSequence, points: np.ndarray, places: np.ndarray
+) -> None:
+    """A field's values at a grid of points (rows, columns, 3; m), drawn at places on the page.
+
+    What no frame has seen is pale. The surface is black, other lines are 0.25 m apart.
+    """
+    flat = points.reshape(-1, 3)
+    values = query_field(field, flat)[1].reshape(points.shape[:2])
+    unseen = ~seen_by(flat, sequence).reshape(values.shape)
+    colors = ScalarMappable(*_scale_of(field, values))
+    right, ahead = np.moveaxis(places, -1, 0)
+    rgb = colors.to_rgba(values)[..., :3]
+    rgb[unseen] += _DIMMED * (1 - rgb[unseen])
+    axes.pcolormesh(right, ahead, rgb[:-1, :-1], rasterized=True)
+    look = {"colors": "0.35", "linewidths": 0.4, "linestyles": "-"}
+    axes.contour(right, ahead, values, np.arange(-1.0, 1.01, 0.25), **look)
+    axes.contour(right, ahead, values, [field.surface_level], colors="black", linewidths=1.4)
+    axes.figure.colorbar(colors, ax=axes, label=field.value_label, extend="both", shrink=0.6)
 
 
 def _best_view(mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
