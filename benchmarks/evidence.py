@@ -175,7 +175,7 @@ def paper_rooms(seed: int) -> Iterator[Chunk]:
         yield {"scene": name}, partial(_with_maps, scene, PAPER_ROOMS, seed, None)
 
 
-FASTEST = "860:1000"  # of breakfast_room: most frames move farther than VR's reach at 5 Hz
+FASTEST = "860:1000"  # of breakfast_room: half of the frames move farther than VR's reach at 5 Hz
 STEPS_5_HZ = VR.paper_steps(5)
 ONE_THING = {  # changed at a time: steps a frame, settings, the tracked depth
     "as in Table I": (STEPS_5_HZ, (), None),

@@ -47,7 +47,7 @@ _BUDGETS = {"choices": ("steps", "clock"), "default": "steps"}
 _SETTINGS = {"action": "append", "default": [], "dest": "settings", "metavar": "KEY=VALUE"}
 _IMPORTS = {"action": "append", "default": [], "dest": "imports", "metavar": "FILE.py"}
 OPTIONS = {
-    "sequence": _option("a folder, or the name of a room or dataset scene", os.path.expanduser),
+    "sequence": _option("a folder, or the name of a room or dataset scene"),
     "folder": _option("a recording", a_path),
     "room": _option("its name"),
     "source": _option("folder of a run or a map, or a map file", a_path),

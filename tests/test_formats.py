@@ -438,7 +438,8 @@ def test_times_are_those_of_names_and_stamps(plain: Path) -> None:
 
 
 def test_images_content_behind_their_pixels_differ(tmp_path: Path) -> None:
-    """Catches a changed image that the cache takes for the old one, where a PNG ends with text."""
+    """Catches a changed image that the cache takes for the old one, where a PNG ends with text, or
+    is none."""
     digests = set()
     for depth_mm in (1000, 2000):
         file = tmp_path / f"{depth_mm}.png"
@@ -450,7 +451,9 @@ def test_images_content_behind_their_pixels_differ(tmp_path: Path) -> None:
         end = content.rindex(b"IEND") - 4
         file.write_bytes(content[:end] + length + chunk + checksum + content[end:])
         digests.add(image_digest(file))
-    assert len(digests) == 2
+        cv2.imwrite(str(tmp_path / "image.jpg"), np.full((64, 64), depth_mm // 20, np.uint8))
+        digests.add(image_digest((tmp_path / "image.jpg").rename(tmp_path / "image.png")))
+    assert len(digests) == 4
 
 
 def test_poses_of_key_frames_only(tmp_path: Path) -> None:

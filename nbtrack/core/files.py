@@ -50,7 +50,7 @@ def absolute(path: Path | str) -> Path:
 
 def resolved(path: Path | str) -> Path:
     """An absolute path without links or `~`. Where links form a loop, whoever opens it is told."""
-    return Path(os.path.realpath(os.path.expanduser(path)))
+    return Path(os.path.realpath(absolute(path)))
 
 
 def runs_folder() -> Path:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from nbtrack.core.errors import ConfigError, MissingError, look_up
+from nbtrack.core.files import absolute
 from nbtrack.core.settings import (
     changed_settings,
     flat,
@@ -177,7 +178,7 @@ def load_preset(
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
     layers = []
     if config_file := config_file or os.environ.get("NBTRACK_CONFIG"):
-        config_file = Path(config_file).expanduser()
+        config_file = absolute(config_file)
         if not config_file.is_file():
             raise MissingError(f"no config file {config_file}: give a TOML file of settings")
         layers.append(flat(read_object(config_file)))

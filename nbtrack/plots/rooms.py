@@ -171,9 +171,10 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
     projection is parallel; lengths across the picture are true (m). The camera-to-world poses by
     label are drawn on top, and larger beside it; "true" is green, "tracked" red.
     """
-    to_screen = _best_view(mesh, up_of(*T_paths.values()))
+    up = up_of(*T_paths.values())
+    to_screen = _best_view(mesh, up)
     room, enlarged = new_axes(title, 5.0, 1, 2, width_ratios=[2, 1])[0]
-    _draw_mesh(room, mesh, to_screen)
+    _draw_mesh(room, mesh, to_screen, up)
     for axes in (room, enlarged):
         _draw_paths(axes, T_paths, to_screen[:2])
         _look_through(axes)
@@ -201,7 +202,7 @@ def plot_map_and_slice(
     up = up_of(sequence.T_world_camera)
     to_screen = _best_view(mesh, up)
     axes = new_axes(title, 4.6)[0, 0]
-    _draw_mesh(axes, mesh, to_screen)
+    _draw_mesh(axes, mesh, to_screen, up)
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
     # From the room to where the slice is drawn; it is above the middle of the room's height.
     aside = 1.04 * np.ptp(mesh.vertices @ to_screen[0]) * to_screen[0]
@@ -251,14 +252,13 @@ def _best_view(mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
     return screens[(mesh.area_faces @ fronts.clip(0)).argmax()]
 
 
-def _draw_mesh(axes: Axes, mesh: trimesh.Trimesh, to_screen: np.ndarray) -> None:
+def _draw_mesh(axes: Axes, mesh: trimesh.Trimesh, to_screen: np.ndarray, up: np.ndarray) -> None:
     """The faces of a mesh that show their front, shaded, the nearest on top."""
     side = _inward_side(mesh)
     faces = mesh.faces[side * mesh.face_normals @ to_screen[2] > 0]
     corners = (mesh.vertices @ to_screen.T)[faces]
     # Smoothed normals: those of single marching-cubes faces flicker.
     normals = side * mesh.vertex_normals[faces].mean(axis=1)
-    up = (to_screen[1] + to_screen[2]) / np.sqrt(2)  # one looks down at 45 degrees
     light = to_screen[2] + 0.5 * to_screen[0] + 0.6 * up
     shade = _AMBIENT + (1 - _AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)
     colors = mesh.visual.vertex_colors[faces, :3].mean(axis=1) / 255 * shade[:, None]

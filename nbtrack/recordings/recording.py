@@ -31,6 +31,7 @@ from nbtrack.recordings.formats import (
 from nbtrack.recordings.moments import TOLERANCE, Moments, nearest
 from nbtrack.recordings.names import frame_keys, frame_numbers, stamp_in
 
+_PNG = b"\x89PNG\r\n\x1a\n"  # how its files begin
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
 
@@ -86,12 +87,13 @@ class Recording:
 def image_digest(file: Path) -> str:
     """A digest of an image file that is cheap for long recordings.
 
-    Each chunk of a PNG has its length, its name and a checksum, which are read alone; other files
-    are read whole.
+    Each chunk of a PNG has its length, its name and a checksum, which are read alone; what does not
+    begin as a PNG, whatever it is called, is read whole.
     """
     with file.open("rb") as opened:
-        digest = hashlib.blake2b(opened.read(8), digest_size=8)
-        if file.suffix.lower() != ".png":
+        signature = opened.read(len(_PNG))
+        digest = hashlib.blake2b(signature, digest_size=8)
+        if signature != _PNG:
             digest.update(opened.read())
         while head := opened.read(8):
             opened.seek(int.from_bytes(head[:4], "big"), os.SEEK_CUR)
