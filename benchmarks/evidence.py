@@ -70,6 +70,7 @@ FULL = load_preset(
 )
 # Five of the paper's rooms, at the sizes of the file beside the results.
 PAPER_ROOMS = load_preset("paper", tables_folder() / "paper_rooms" / "settings.toml")
+PAPER_SIZES = load_preset("paper", tables_folder() / "paper_rooms_gpu" / "settings.toml")
 HELD = with_settings(NINE, *HAND_HELD)
 PRESET = with_variants(load_preset("smoke", settings=[f"scenes.names={THREE_ROOMS}", *HAND_HELD]))
 KEPT = [
@@ -106,8 +107,9 @@ def main(experiment: str, seeds: int) -> None:
         write_atomic(path.parent / "verdicts.csv", judged)
     elif experiment == "full_size":
         write_table(path.parent, FULL, rows)
-    elif experiment == "paper_rooms":
-        write_table(path.parent, PAPER_ROOMS, rows)
+    elif experiment in ("paper_rooms", "paper_rooms_gpu"):
+        preset = PAPER_ROOMS if experiment == "paper_rooms" else PAPER_SIZES
+        write_table(path.parent, preset, rows)
 
 
 def write_table(folder: Path, preset: Preset, rows: pd.DataFrame) -> None:
@@ -168,11 +170,11 @@ def full_size(seed: int) -> Iterator[Chunk]:
         yield {"scene": scene.name}, partial(_with_maps, scene, FULL, seed)
 
 
-def paper_rooms(seed: int) -> Iterator[Chunk]:
+def paper_rooms(seed: int, preset: Preset = PAPER_ROOMS) -> Iterator[Chunk]:
     """Table I in five of the paper's rooms. A seed takes hours on two cores."""
-    for name in PAPER_ROOMS.scenes.names:
-        scene = open_scene(name, PAPER_ROOMS)
-        yield {"scene": name}, partial(_with_maps, scene, PAPER_ROOMS, seed, None)
+    for name in preset.scenes.names:
+        scene = open_scene(name, preset)
+        yield {"scene": name}, partial(_with_maps, scene, preset, seed, None)
 
 
 FASTEST = "860:1000"  # of breakfast_room: half of the frames move farther than VR's reach at 5 Hz
@@ -412,6 +414,10 @@ EXPERIMENTS = {
     "nine_rooms": (nine_rooms, "nine_rooms/table_1_cells.csv"),
     "full_size": (full_size, "full_size/table_1_cells.csv"),
     "paper_rooms": (paper_rooms, "paper_rooms/table_1_cells.csv"),
+    "paper_rooms_gpu": (
+        partial(paper_rooms, preset=PAPER_SIZES),
+        "paper_rooms_gpu/table_1_cells.csv",
+    ),
     "vr_at_5_hz": (vr_at_5_hz, "paper_rooms/vr_at_5_hz.csv"),
     "errors": (errors, "paper_rooms/errors.csv"),
     **{

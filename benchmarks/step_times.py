@@ -1,9 +1,9 @@
-"""Times of steps, on a GPU in single precision and in TF32; and of mapping.
+"""Times of steps and of mapping iterations; on a GPU recorded and not, in float32 and in TF32.
 
-`python benchmarks/step_times.py steps` or `mapping`, CSV files into the folder $OUT. Of untrained
-networks of full size and an image of noise before a wall: a step costs the same whatever they show.
-On a CPU everything is small, which only says that the script runs; unless `full` follows, which
-takes minutes.
+`python benchmarks/step_times.py steps`, `mapping`, `kernels` or `compiled`, CSV files into the
+folder $OUT. Of untrained networks of full size and an image of noise before a wall: a step costs
+the same whatever they show. On a CPU everything is small, which only says that the script runs;
+unless `full` follows, which takes minutes.
 """
 
 import os
@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.device import choose_device, device_name, synchronize
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, field_class, make_field
+from nbtrack.mapping.fit import _Fit
 from nbtrack.tracking import StepBudget
 
 DEVICE = choose_device()
@@ -31,6 +33,8 @@ IS_GPU = DEVICE.type == "cuda"
 IS_FULL = IS_GPU or "full" in sys.argv
 WIDTH, HEIGHT = (640, 480) if IS_FULL else (64, 48)
 N_TIMED, N_WARM = (200, 30) if IS_GPU else (10, 2)
+N_PROFILED = 20
+PAIRS = ("sdf", "neus"), ("vr", "imap")
 NETWORK = NetworkSettings() if IS_FULL else NetworkSettings(width=32)
 BOUNDS = SceneBounds((-3.0, -3.0, -1.0), (3.0, 3.0, 3.0))
 PRECISIONS = {"float32": "highest", "TF32": "high"} if IS_GPU else {"float32": "highest"}
@@ -51,14 +55,29 @@ def noise(n_frames: int) -> RgbdSequence:
 SEQUENCE = noise(20)
 
 
-def warm_tracker(name: str, field_name: str) -> Tracker:
+def warm_tracker(name: str, field_name: str, is_compiled: bool = False) -> Tracker:
     """At the start of a frame, after all that counts nowhere."""
     field = make_field(field_name, NETWORK, BOUNDS, seed=0).to(DEVICE)
-    settings = TRACKERS[name].Settings() if IS_FULL else TRACKERS[name].Settings(n_pixels=32)
+    if is_compiled:
+        field.mlp.features = torch.compile(field.mlp.features)
+    settings = TRACKERS[name].Settings(tf32=torch.get_float32_matmul_precision() == "high")
+    settings = settings if IS_FULL else replace(settings, n_pixels=32)
     tracker = make_tracker(name, field, np.eye(4), StepBudget(1), settings)
     tracker.track(SEQUENCE[0])
     tracker.begin(SEQUENCE[1].to(DEVICE), torch.eye(4, device=DEVICE)[None])
     return tracker
+
+
+def warm_fit(name: str, share: float | None = None) -> _Fit:
+    """A map after its first iterations; of NeuS with another share for the eikonal term, if any."""
+    field = make_field(name, NETWORK, BOUNDS, seed=0).to(DEVICE)
+    settings = field_class(name).Settings()
+    if share is not None:
+        settings = replace(settings, eikonal_share=float(share))
+    settings = settings if IS_FULL else replace(settings, n_rays=16)
+    fit = _Fit({"seed": 0}, settings, field, SEQUENCE, np.arange(len(SEQUENCE)))
+    fit._advance(range(N_WARM))
+    return fit
 
 
 def milliseconds(call: Callable[[], object], waits: bool) -> tuple[float, float, float]:
@@ -79,37 +98,33 @@ def milliseconds(call: Callable[[], object], waits: bool) -> tuple[float, float,
     return median, low, high
 
 
-def step_rows() -> Iterator[dict]:
+def step_rows(is_compiled: bool = False) -> Iterator[dict]:
     """Step times of the paper's trackers in its fields."""
-    for name, field_name in (("sdf", "neus"), ("vr", "imap")):
-        tracker = warm_tracker(name, field_name)
-        for waits in (True, False):
+    for name, field_name in PAIRS:
+        tracker = warm_tracker(name, field_name, is_compiled)
+        is_recordable = tracker.recording.is_recordable
+        for is_recorded, waits in product({is_recordable, False}, (True, False)):
+            tracker.recording.is_recordable = is_recorded
             median, low, high = milliseconds(tracker.step, waits)
-            yield {"tracker": name, "waits": waits, "ms": median, "ms_low": low, "ms_high": high}
+            times = {"ms": median, "ms_low": low, "ms_high": high}
+            yield {"tracker": name, "recorded": is_recorded, "waits": waits, **times}
+
+
+def compiled_rows() -> Iterator[dict]:
+    """The same, with the network compiled by Inductor."""
+    return step_rows(is_compiled=True)
 
 
 def mapping_rows() -> Iterator[dict]:
     """Time of a mapping iteration, in turns after a warm-up; NeuS also with the eikonal term on one
     sample only and on all of them."""
-    from nbtrack.mapping.fit import _Fit
-
+    shares = ("imap", None), ("neus", 0), ("neus", None), ("neus", 1), ("neus_plus", None)
     fits = {}
-    for name, share in [
-        ("imap", None),
-        ("neus", 0),
-        ("neus", None),
-        ("neus", 1),
-        ("neus_plus", None),
-    ]:
-        field = make_field(name, NETWORK, BOUNDS, seed=0).to(DEVICE)
-        settings = field_class(name).Settings()
-        if share is not None:
-            settings = replace(settings, eikonal_share=float(share))
-        settings = settings if IS_FULL else replace(settings, n_rays=16)
-        shown = getattr(settings, "eikonal_share", None)
-        fit = _Fit({"seed": 0}, settings, field, SEQUENCE, np.arange(len(SEQUENCE)))
-        fits[name, settings.n_rays, shown] = fit
-        fit._advance(range(N_WARM))
+    for (name, share), is_recorded in product(shares, {IS_GPU, False}):
+        fit = warm_fit(name, share)
+        fit.recording.is_recordable &= is_recorded
+        shown = getattr(fit.settings, "eikonal_share", None)
+        fits[name, fit.settings.n_rays, shown, fit.recording.is_recordable] = fit
     seconds = dict.fromkeys(fits, 0.0)
     for first, (key, fit) in product(range(0, N_TIMED, 2), fits.items()):
         synchronize(DEVICE)
@@ -117,9 +132,45 @@ def mapping_rows() -> Iterator[dict]:
         fit._advance(range(first, first + 2))
         synchronize(DEVICE)
         seconds[key] += time.perf_counter() - start
-    for (name, n_rays, share), total in seconds.items():
-        ms = 1e3 * total / N_TIMED
-        yield {"field": name, "n_rays": n_rays, "eikonal_share": share, "ms": ms}
+    for (name, n_rays, share, is_recorded), total in seconds.items():
+        what = {"field": name, "n_rays": n_rays, "eikonal_share": share, "recorded": is_recorded}
+        yield what | {"ms": 1e3 * total / N_TIMED}
+
+
+def kernel_rows() -> Iterator[dict]:
+    """The ten kernels that take longest in a step or an iteration, and what lies between all."""
+    activity = torch.profiler.ProfilerActivity.CUDA if IS_GPU else None
+    calls = {name: warm_tracker(name, field).step for name, field in PAIRS}
+    for name in ("imap", "neus"):
+        fit = warm_fit(name)
+        calls[name] = partial(fit.recording.run, fit._descend)
+    for name, call in calls.items():
+        call()
+        synchronize(DEVICE)
+        with torch.profiler.profile(activities=[activity] if IS_GPU else None) as profile:
+            start = time.perf_counter()
+            for _ in range(N_PROFILED):
+                call()
+            synchronize(DEVICE)
+            us = 1e6 * (time.perf_counter() - start)
+        rows = [
+            (event.key, event.count, event.self_device_time_total if IS_GPU else 0.0)
+            for event in profile.key_averages()
+        ]
+        rows.sort(key=lambda row: -row[2])
+        busy = sum(row[2] for row in rows)
+        rows = [("all", sum(row[1] for row in rows), busy), ("gaps", 0, us - busy), *rows[:10]]
+        for kernel, count, total in rows:
+            of_one = {"count": count / N_PROFILED, "us": total / N_PROFILED}
+            yield {"of": name, "kernel": kernel[:120], **of_one}
+
+
+PARTS = {
+    "steps": step_rows,
+    "mapping": mapping_rows,
+    "kernels": kernel_rows,
+    "compiled": compiled_rows,
+}
 
 
 def main(part: str) -> None:
@@ -130,7 +181,7 @@ def main(part: str) -> None:
     about = {"device": device_name(DEVICE), "torch": torch.__version__}
     for precision, word in PRECISIONS.items():
         torch.set_float32_matmul_precision(word)
-        for row in {"steps": step_rows, "mapping": mapping_rows}[part]():
+        for row in PARTS[part]():
             found.append({**row, "precision": precision, **about})
             print(found[-1], flush=True)
             pd.DataFrame(found).to_csv(out / f"{part}.csv", index=False, float_format="%.6g")

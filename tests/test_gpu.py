@@ -9,6 +9,7 @@ import torch
 from box_room import walk
 
 from nbtrack import TRACKERS, make_tracker
+from nbtrack.core import launches
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.device import choose_device, named_device
 from nbtrack.core.errors import DataError
@@ -55,6 +56,33 @@ def test_tracking_on_a_device(name: str, field_name: str, device: torch.device) 
     a few steps of Adam from the start can reach."""
     expected, found = poses(name, field_name, CPU), poses(name, field_name, device)
     np.testing.assert_allclose(found, expected, atol=0.02)  # each device draws other pixels
+
+
+@pytest.mark.parametrize("device", [cuda], indirect=True)
+@pytest.mark.parametrize(("name", "field_name"), [("sdf", "neus"), ("vr", "imap"), ("vr", "neus")])
+def test_recorded_steps_are_the_steps(
+    name: str, field_name: str, device: torch.device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches recorded steps that draw other numbers, or keep what changes."""
+    recorded = poses(name, field_name, device)
+    monkeypatch.setattr(launches, "CALLS_BEFORE_RECORDING", 1_000_000)
+    np.testing.assert_allclose(recorded, poses(name, field_name, device), atol=1e-5)
+
+
+@pytest.mark.parametrize("device", [cuda], indirect=True)
+@pytest.mark.parametrize("name", ["imap", "neus", "neus_plus"])
+def test_recorded_iterations_are_the_iterations(
+    name: str, device: torch.device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches recorded iterations that draw other numbers, or keep what changes."""
+    totals = []
+    for calls in (launches.CALLS_BEFORE_RECORDING, 1_000_000):
+        monkeypatch.setattr(launches, "CALLS_BEFORE_RECORDING", calls)
+        fit = fit_on(device, name)
+        fit._advance(range(15))
+        assert (fit.recording.replay is None) == (calls > 15)
+        totals.append([row["total"] for row in fit.history])
+    np.testing.assert_allclose(*totals, rtol=1e-3)
 
 
 @pytest.mark.parametrize("device", [cuda], indirect=True)

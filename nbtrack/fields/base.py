@@ -53,6 +53,7 @@ class MappingSettings:
     learning_rate: float = 1e-3  # Adam's, at the start; falls to a twentieth along a cosine (NeuS)
     lambda_color: float = 5.0  # iMAP's, whose depth errors are relative to their std
     holdout_every: int = may_be_zero(10)  # every n-th frame is only scored
+    tf32: bool = False  # matrix products in TF32, on NVIDIA's GPUs
 
 
 class Field(nn.Module, abc.ABC):

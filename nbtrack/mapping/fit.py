@@ -10,10 +10,18 @@ from typing import Any
 
 import pandas as pd
 import torch
+from torch import Tensor
 
-from nbtrack.core.device import advise_on_memory, device_name, suitable_threads, usual_modes
+from nbtrack.core.device import (
+    advise_on_memory,
+    device_name,
+    matrix_products,
+    suitable_threads,
+    usual_modes,
+)
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
 from nbtrack.core.files import loaded_checkpoint, save_checkpoint
+from nbtrack.core.launches import Recording, make_adam
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import LearnedField, MappingSettings, field_class, make_field
@@ -65,7 +73,7 @@ def map_sequence(
         with advise_on_memory(f"mapping.{field_name}.n_rays={settings.n_rays}"):
             with suitable_threads(0):
                 field = make_field(field_name, network, bounds, seed).to(device)
-            with suitable_threads(field.width):
+            with suitable_threads(field.width), matrix_products(settings.tf32):
                 fit = _Fit(recipe | {"code": code}, settings, field, sequence, mapped)
                 fit.run(checkpoint, on_iteration)
         history, seconds = fit.history, fit.seconds
@@ -112,10 +120,13 @@ class _Fit:
         self.recipe = {**recipe, "device": field.device.type}  # each draws other numbers
         self.settings = settings
         self.field = field
-        self.optimizer = torch.optim.Adam(field.parameters(), lr=settings.learning_rate)
+        parameters = {"params": [*field.parameters()], "lr": settings.learning_rate}
+        self.optimizer = make_adam([parameters], field.device)
+        self.rate = self.optimizer.param_groups[0]["lr"]
         self.generator = torch.Generator(field.device).manual_seed(recipe["seed"])
         self.sampler = PixelSampler(sequence, field.device)
         self.frames = torch.from_numpy(mapped).to(field.device)
+        self.recording = Recording(f"mapping {field.name}", self.generator)
         field.prepare(sequence, mapped)
         self.seconds = 0.0
         self.history = []
@@ -138,22 +149,12 @@ class _Fit:
     def _advance(self, iterations: range) -> None:
         start = time.perf_counter()
         pending = []
-        draw = partial(self.sampler.draw, generator=self.generator, frames=self.frames)
         for iteration in iterations:
-            self.optimizer.param_groups[0]["lr"] = learning_rate(self.settings, iteration)
-            terms = self.field.mapping_losses(draw, self.settings, self.generator)
-            if not isinstance(terms, dict):
-                raise ConfigError(
-                    f"mapping_losses of {self.field.name} gave no dict: give terms by name"
-                )
-            losses = torch.stack(list(terms.values()))
-            self.optimizer.zero_grad()
-            losses.sum().backward()
-            self.optimizer.step()
-            pending.append(losses.detach())
+            self.rate.fill_(learning_rate(self.settings, iteration))
+            pending.append(self.recording.run(self._descend))
         diagnostics = self.field.diagnostics()
         for iteration, row in zip(iterations, torch.stack(pending).tolist(), strict=True):
-            values = dict(zip(terms, row, strict=True))
+            values = dict(zip(self.terms, row, strict=True))
             if not all(map(math.isfinite, row)):
                 raise NumericalError(
                     f"losses {values} at mapping iteration {iteration}: lower the learning rate "
@@ -161,6 +162,20 @@ class _Fit:
                 )
             self.history.append({**values, "total": sum(row), **diagnostics})
         self.seconds += time.perf_counter() - start
+
+    def _descend(self) -> Tensor:
+        draw = partial(self.sampler.draw, generator=self.generator, frames=self.frames)
+        terms = self.field.mapping_losses(draw, self.settings, self.generator)
+        if not isinstance(terms, dict):
+            raise ConfigError(
+                f"mapping_losses of {self.field.name} gave no dict: give terms by name"
+            )
+        self.terms = [*terms]
+        losses = torch.stack([*terms.values()])
+        self.optimizer.zero_grad()
+        losses.sum().backward()
+        self.optimizer.step()
+        return losses.detach()
 
     def _save(self, checkpoint: Path) -> None:
         state = {name: getattr(self, name) for name in ("recipe", "seconds", "history")}
@@ -172,6 +187,7 @@ class _Fit:
             check_recipe(checkpoint, state["recipe"], self.recipe)
             self.field.load_state_dict(state["field"])
             self.optimizer.load_state_dict(state["optimizer"])
+            self.optimizer.param_groups[0]["lr"] = self.rate  # the loaded one lies on the host
             self.generator.set_state(state["generator"])
             self.seconds = state["seconds"]
             self.history = state["history"]

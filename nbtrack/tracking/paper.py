@@ -1,13 +1,14 @@
 """The paper's two trackers on one optimiser; a tracker of one's own needs a `loss` only."""
 
 import abc
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from nbtrack.core import geometry
 from nbtrack.core.arrays import Colors, Points, Scalar, Transform, Transforms, Values
 from nbtrack.core.camera import pixel_directions
+from nbtrack.core.launches import Recording, make_adam
 from nbtrack.core.settings import limited, one_of
 from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
@@ -46,47 +47,77 @@ class AdamTracker(Tracker):
     """
 
     Settings = AdamSettings
+    frame: Frame | None = None  # its images lie where those of the frame before lay
 
     @abc.abstractmethod
     def loss(
         self, T_world_camera: Transform, directions_camera: Points, color: Colors, depth: Values
     ) -> Scalar:
-        """The loss of some pixels at a pose: rays (z = 1), colours in [0, 1] and z-depths (m)."""
+        """The loss of some pixels at a pose: rays (z = 1), colours in [0, 1] and z-depths (m).
+
+        On CUDA it is recorded at the third step: what it depends on besides must be tensors.
+        """
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Take up a frame; of several starts, that with the lowest loss on the same pixels."""
-        self.frame = frame
+        if self.frame is None or self.frame.camera != frame.camera:
+            self._allocate(frame)
+        self.frame.color.copy_(frame.color)
+        self.frame.depth_mm.copy_(frame.depth_mm)
         self.measured = frame.measured_pixels()
         T_starts = T_starts.to(self.device, torch.float32)
         T_start = T_starts[0]
-        if len(T_starts) > 1:
-            drawn = self._draw()
-            with torch.no_grad():
+        with torch.no_grad():
+            if len(T_starts) > 1:
+                self._draw()
+                drawn = self._drawn()
                 losses = torch.stack([self.loss(T, *drawn) for T in T_starts])
-            T_start = T_starts[losses.argmin()]
-        self.position = T_start[:3, 3].clone().requires_grad_()
-        self.q_wxyz = geometry.matrix_to_quaternion(T_start[:3, :3]).requires_grad_()
-        position_rate = self.settings.position_rate_m(self.field.bounds.metres_per_unit)
-        position = {"params": [self.position], "lr": position_rate}
-        orientation = {"params": [self.q_wxyz], "lr": self.settings.orientation_rate}
-        self.optimizer = torch.optim.Adam([position, orientation])
+                T_start = T_starts[losses.argmin()]
+            self.position.copy_(T_start[:3, 3])
+            self.q_wxyz.copy_(geometry.matrix_to_quaternion(T_start[:3, :3]))
+            for moments in self.optimizer.state.values():
+                for value in moments.values():
+                    value.zero_()
 
     def step(self) -> Scalar:
         """Draw pixels, lower their loss by one step of Adam, renormalise the quaternion."""
+        self._draw()
+        return self.recording.run(self._descend)
+
+    def _allocate(self, frame: Frame) -> None:
+        """Make room for all that a step reads and changes, for frames of one size."""
+        color, depth_mm = torch.empty_like(frame.color), torch.empty_like(frame.depth_mm)
+        self.frame = replace(frame, color=color, depth_mm=depth_mm)
+        like = {"device": self.device}
+        self.drawn = torch.empty(self.settings.n_pixels, dtype=torch.int64, **like)
+        self.pixels = torch.empty(2, self.settings.n_pixels, dtype=torch.int64, **like)
+        self.position = torch.zeros(3, **like).requires_grad_()
+        self.q_wxyz = torch.zeros(4, **like).requires_grad_()
+        position_rate = self.settings.position_rate_m(self.field.bounds.metres_per_unit)
+        position = {"params": [self.position], "lr": position_rate}
+        orientation = {"params": [self.q_wxyz], "lr": self.settings.orientation_rate}
+        self.optimizer = make_adam([position, orientation], self.device)
+        self.recording = Recording(f"tracker {self.name}", self.generator)
+
+    def _descend(self) -> Scalar:
         self.optimizer.zero_grad()
-        loss = self.loss(self.T_world_camera, *self._draw())
+        loss = self.loss(self.T_world_camera, *self._drawn())
         loss.backward()
         self.optimizer.step()
         with torch.no_grad():
             self.q_wxyz.div_(self.q_wxyz.norm(dim=-1, keepdim=True))
         return loss.detach()
 
-    def _draw(self) -> tuple[Points, Colors, Values]:
-        """Rays, colours and depths of random measured pixels."""
-        shape = (self.settings.n_pixels,)
-        like = {"device": self.device}
-        drawn = torch.randint(self.measured.shape[1], shape, generator=self.generator, **like)
-        rows, columns = self.measured[:, drawn]
+    def _draw(self) -> None:
+        """Choose random measured pixels; how many there are changes, so it is not recorded."""
+        n_measured = self.measured.shape[1]
+        shape = self.drawn.shape
+        torch.randint(n_measured, shape, generator=self.generator, out=self.drawn)
+        torch.index_select(self.measured, 1, self.drawn, out=self.pixels)
+
+    def _drawn(self) -> tuple[Points, Colors, Values]:
+        """Rays, colours and depths of the chosen pixels."""
+        rows, columns = self.pixels
         return pixel_directions(self.frame.camera, columns, rows), *self.frame.at(rows, columns)
 
     @property

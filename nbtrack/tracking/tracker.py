@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
-from nbtrack.core.device import suitable_threads, synchronize, usual_modes
+from nbtrack.core.device import matrix_products, suitable_threads, synchronize, usual_modes
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
+from nbtrack.core.launches import CALLS_BEFORE_RECORDING
 from nbtrack.core.settings import with_values
 from nbtrack.data.frame import Frame
 from nbtrack.data.text_files import checked_poses
@@ -27,6 +28,7 @@ class TrackerSettings:
 
     n_pixels: int = 4096  # random pixels a step, or a frame where they are drawn once
     motion_model: str = "previous_pose"  # see `expected_poses`
+    tf32: bool = False  # matrix products in TF32, on NVIDIA's GPUs
 
     def reach(self, steps: float, metres_per_unit: float) -> Reach | None:
         """How far so many steps can move the camera; None where no step is bounded."""
@@ -125,7 +127,7 @@ class Tracker(abc.ABC):
         T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
         estimate = Estimate(T_starts[0], without_depth=True)
         if self.copes_without_depth or frame.has_depth:
-            with suitable_threads(self.field.width):
+            with suitable_threads(self.field.width), matrix_products(self.settings.tf32):
                 estimate = self._search(frame, T_starts, budget or self.budget)
         self.estimates.append(estimate.T_world_camera.copy())  # the other one is the user's
         return estimate
@@ -179,11 +181,13 @@ class Tracker(abc.ABC):
 
     def _search(self, frame: Frame, T_starts: Poses, budget: Budget) -> Estimate:
         if not self._is_warm and frame.has_depth:
-            # A step that counts nowhere: first calls load and allocate for a second or more.
+            # Steps that count nowhere: first calls load, allocate and record for a second or more.
             state = self.state()
             self._is_warm = True
             self._begin(frame, T_starts[:1])
-            self.step()
+            for _ in range(CALLS_BEFORE_RECORDING + 1):
+                if not self.is_converged:
+                    self.step()
             self.report()
             self.restore(state)
             synchronize(self.device)

@@ -1,0 +1,87 @@
+"""Work that is repeated on tensors which keep their place: launched on a GPU in one go.
+
+A step of tracking or mapping consists of a hundred kernels and more, each of some microseconds.
+Launched from Python one by one they keep a GPU waiting. CUDA records them once, as a graph.
+"""
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nbtrack.core.progress import tell
+
+CALLS_BEFORE_RECORDING = 2
+"""The first call loads and allocates; the second one is watched for what cannot be recorded."""
+
+_WAITS = "called a synchronizing CUDA operation"  # how PyTorch warns of it
+
+
+class Recording:
+    """Calls work; on CUDA a few times, after which it is recorded, and replayed from then on.
+
+    The work always reads and writes the same tensors, and draws from one generator. Anything else
+    that it depends on counts as it was at the recording. Work that waits for a value of the device,
+    as shapes that depend on values do, is called each time, which is told once.
+    """
+
+    def __init__(self, name: str, generator: torch.Generator) -> None:
+        self.name = name
+        self.generator = generator
+        self.is_recordable = can_record(generator.device)
+        self.n_calls = 0
+        self.replay: Callable[[], None] | None = None
+
+    def run(self, work: Callable[[], Tensor]) -> Tensor:
+        """What the work returns."""
+        if not self.is_recordable:
+            return work()
+        self.n_calls += 1
+        if self.n_calls <= CALLS_BEFORE_RECORDING:
+            return self._watch(work)
+        if self.replay is None:
+            self.replay, self.result = record(work, self.generator)
+        self.replay()
+        return self.result.clone()  # the next replay writes over it
+
+    def _watch(self, work: Callable[[], Tensor]) -> Tensor:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            torch.cuda.set_sync_debug_mode("warn")
+            try:
+                result = work()
+            finally:
+                torch.cuda.set_sync_debug_mode("default")
+        waits = [warning for warning in told if _WAITS in str(warning.message)]
+        if waits and self.n_calls == CALLS_BEFORE_RECORDING:
+            self.is_recordable = False
+            where = f"{waits[0].filename}:{waits[0].lineno}"
+            tell(f"nbtrack: {self.name} waits for a value of the GPU ({where}): not recorded, slow")
+        return result
+
+
+def can_record(device: torch.device) -> bool:
+    """Whether launches on a device can be recorded."""
+    return device.type == "cuda"
+
+
+def record(work: Callable[[], Tensor], generator: torch.Generator) -> tuple[Callable, Tensor]:
+    """What does the work again, and where its result then lies."""
+    graph = torch.cuda.CUDAGraph()
+    graph.register_generator_state(generator)
+    with torch.cuda.graph(graph):
+        result = work()
+    return graph.replay, result
+
+
+def make_adam(groups: list[dict[str, Any]], device: torch.device) -> torch.optim.Adam:
+    """Adam whose state and learning rates are tensors that keep their place.
+
+    On a CPU in double precision, as numbers would be; CUDA's kernel takes single ones.
+    """
+    is_recorded = can_record(device)
+    like = {"dtype": torch.float32 if is_recorded else torch.float64, "device": device}
+    groups = [{**group, "lr": torch.tensor(group["lr"], **like)} for group in groups]
+    return torch.optim.Adam(groups, fused=is_recorded, capturable=is_recorded)

@@ -1,0 +1,177 @@
+"""Steps that are recorded and replayed, without a GPU: a tape stands in for its graph.
+
+The tape keeps the operations of one call and does them again into the same memory, so that whatever
+a step takes from elsewhere, or reads on the host, is seen here as on a GPU.
+"""
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from box_room import walk
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from nbtrack.core import launches
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.launches import Recording
+from nbtrack.fields import NetworkSettings, field_class, make_field
+from nbtrack.mapping.fit import _Fit
+from nbtrack.tracking import AdamTracker, SdfTracker, StepBudget, VrTracker
+from nbtrack.tracking.paper import AdamSettings
+
+BOUNDS = SceneBounds((-1.2, -1.0, -1.4), (1.2, 1.0, 1.4))
+WAITS = "_local_scalar_dense", "nonzero", "masked_select", "is_nonzero"
+SEQUENCE = walk(5)
+SEQUENCE.depths_mm[2, :20] = 0  # frames differ in what they measure
+SEQUENCE.depths_mm[3, :, 9:] = 0
+
+
+class Tape(TorchDispatchMode):
+    """The operations of a call."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = []
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        assert not any(name in str(operation) for name in WAITS), f"{operation} waits"
+        result = operation(*args, **(kwargs or {}))
+        self.calls.append((operation, args, kwargs or {}, result))
+        return result
+
+    @torch.no_grad()
+    def replay(self) -> None:
+        """Do them again, into the memory of their results."""
+        for operation, args, kwargs, result in self.calls:
+            again = operation(*args, **kwargs)
+            for old, new in zip(tree_leaves(result), tree_leaves(again), strict=True):
+                if isinstance(old, torch.Tensor) and not shares_memory(old, new):
+                    old.detach().copy_(new)
+
+
+def shares_memory(a: torch.Tensor, b: torch.Tensor) -> bool:
+    return a.untyped_storage().data_ptr() == b.untyped_storage().data_ptr()
+
+
+class Waits(TorchDispatchMode):
+    """Warns of what would wait for a GPU, as PyTorch does."""
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        if any(name in str(operation) for name in WAITS):
+            warnings.warn("called a synchronizing CUDA operation", stacklevel=2)
+        return operation(*args, **(kwargs or {}))
+
+
+def on_tape(work: Callable, generator: torch.Generator) -> tuple[Callable, torch.Tensor]:
+    state, optimizer = generator.get_state(), work.__self__.optimizer
+    parameters = [group["params"] for group in optimizer.param_groups]
+    changed = tree_leaves([parameters, *optimizer.state.values()])
+    kept = [(tensor, tensor.detach().clone()) for tensor in changed]
+    with Tape() as tape:
+        result = work()
+    with torch.no_grad():  # a graph that is recorded does nothing yet
+        for tensor, before in kept:
+            tensor.copy_(before)
+    generator.set_state(state)
+    return tape.replay, result
+
+
+def by_calls(work: Callable, generator: torch.Generator) -> tuple[Callable, torch.Tensor]:
+    result = torch.empty(())
+    return lambda: result.set_(work()), result
+
+
+@pytest.fixture(autouse=True)
+def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    watching = []
+
+    def set_sync_debug_mode(mode: str) -> None:
+        if mode == "warn":
+            watching.append(Waits())
+            watching[-1].__enter__()
+        else:
+            watching.pop().__exit__(None, None, None)
+
+    monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", set_sync_debug_mode)
+    monkeypatch.setattr(launches, "can_record", lambda device: True)
+
+
+class Own(AdamTracker):
+    """What a user may write: distances alone, in quarters of a metre."""
+
+    name = "own"
+    Settings = AdamSettings
+
+    def loss(self, T_world_camera, directions_camera, color, depth):
+        points_camera = directions_camera * depth[:, None]
+        points_world = points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+        return (4 * self.field(points_world)[1]).square().mean()
+
+
+class Choosy(Own):
+    """Looks at values on the host: near points alone, however many they are."""
+
+    def loss(self, T_world_camera, directions_camera, color, depth):
+        near = (depth < 1.2).nonzero()[:, 0]
+        return super().loss(T_world_camera, directions_camera[near], color[near], depth[near])
+
+
+def tracked(kind: type[AdamTracker], field_name: str) -> np.ndarray:
+    field = make_field(field_name, NetworkSettings(width=16), BOUNDS, seed=3)
+    settings = kind.Settings(n_pixels=24)
+    tracker = kind(field, SEQUENCE.T_world_camera[0], StepBudget(4), settings)
+    poses = [tracker.track(SEQUENCE[index]).T_world_camera for index in (1, 2, 3, 4)]
+    assert tracker.recording.is_recordable == (kind is not Choosy)
+    return np.stack(poses)
+
+
+PAIRS = (SdfTracker, "neus"), (VrTracker, "imap"), (VrTracker, "neus"), (Own, "neus")
+
+
+@pytest.mark.parametrize(("kind", "field_name"), PAIRS)
+def test_a_replayed_step_is_the_step(
+    kind: type[AdamTracker], field_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a step that keeps the pixels, images, moments or random numbers of the recording, and
+    one that reads a value on the host."""
+    found = []
+    for record in (on_tape, by_calls):
+        monkeypatch.setattr(launches, "record", record)
+        found.append(tracked(kind, field_name))
+    np.testing.assert_array_equal(*found)
+    assert np.abs(np.diff(found[0], axis=0)).max(axis=(1, 2)).min() > 1e-4  # each frame moves
+
+
+@pytest.mark.parametrize("name", ["imap", "neus", "neus_plus"])
+def test_a_replayed_iteration_is_the_iteration(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a batch or a learning rate that stays, and values read on the host."""
+    found = []
+    for record in (on_tape, by_calls):
+        monkeypatch.setattr(launches, "record", record)
+        extra = {"n_surface_points": 8} if name == "neus_plus" else {}
+        settings = field_class(name).Settings(iterations=12, n_rays=16, **extra)
+        field = make_field(name, NetworkSettings(width=16), BOUNDS, seed=3)
+        fit = _Fit({"seed": 0}, settings, field, SEQUENCE, np.arange(5))
+        fit._advance(range(12))
+        found.append([row["total"] for row in fit.history])
+    assert found[0] == found[1]
+    assert len(set(found[0])) == 12
+
+
+def test_what_waits_is_called(capsys: pytest.CaptureFixture, monkeypatch) -> None:
+    """Catches a loss that cannot be recorded and is; and one that is told of at every step."""
+    monkeypatch.setattr(launches, "record", None)
+    tracked(Choosy, "neus")
+    assert capsys.readouterr().err.count("tracker own waits for a value of the GPU") == 1
+
+
+def test_results_are_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a loss that the next replay writes over."""
+    monkeypatch.setattr(launches, "record", by_calls)
+    recording, count = Recording("counter", torch.Generator()), torch.zeros(())
+    results = [recording.run(partial(torch.add, count, step, out=count)) for step in range(1, 6)]
+    assert results[-1] is not results[-2]
