@@ -106,11 +106,37 @@ def steps(cells: pd.DataFrame) -> pd.DataFrame:
 
 def mapping(times: pd.DataFrame) -> pd.DataFrame:
     """Time of a mapping iteration by field, and by the eikonal term's share of the samples."""
-    times = times.query("precision == 'float32'")
+    times = times[times["precision"] == "float32"]
     share = times["eikonal_share"].map(", eikonal term on {:g} of the samples".format)
-    times.index = times["field"] + share.where(times["eikonal_share"].notna(), "")
-    ms = times["ms"].map("{:,.1f}".format)
-    return pd.DataFrame({"rays": times["n_rays"].astype(str), "ms an iteration": ms})
+    what = times["field"] + share.where(times["eikonal_share"].notna(), "")
+    times = times.assign(what=what, rays=times["n_rays"].astype(str))
+    if "recorded" not in times:
+        times["recorded"] = "an iteration"
+    ms = times.pivot_table(index=["what", "rays"], columns="recorded", values="ms", sort=False)
+    names = {False: "ms, called", True: "ms, recorded", "an iteration": "ms an iteration"}
+    return ms.map("{:,.1f}".format).reset_index("rays").rename(columns=names)
+
+
+def recorded(times: pd.DataFrame) -> pd.DataFrame:
+    """Milliseconds a step, queued one behind the other, by precision: called and recorded."""
+    times = times[~times["waits"]]
+    precision = times["precision"].replace({"float32": "", "TF32": ", TF32"})
+    times = times.assign(how=times["recorded"].map({False: "called", True: "recorded"}) + precision)
+    ms = times.pivot_table(index="tracker", columns="how", values="ms", sort=False)
+    return ms.map("{:.2f}".format).rename(index=str.upper)
+
+
+def kernels(rows: pd.DataFrame) -> pd.DataFrame:
+    """Where the time of a recorded step or iteration goes (microseconds; counts of kernels).
+
+    Of the ten kernels that take longest, those that multiply matrices.
+    """
+    rows = rows[rows["precision"] == "float32"]
+    products = rows[rows["kernel"].str.contains("gemm")].groupby("of", sort=False)["us"].sum()
+    of_all = rows[rows["kernel"] == "all"].set_index("of")
+    gaps = rows[rows["kernel"] == "gaps"].set_index("of")["us"]
+    columns = {"kernels": of_all["count"], "busy": of_all["us"], "matrix products": products}
+    return pd.DataFrame({**columns, "gaps": gaps}).map("{:.0f}".format)
 
 
 def convergence(scores: pd.DataFrame) -> pd.DataFrame:
@@ -196,6 +222,8 @@ TABLES = {
     "mapping": (mapping, "benchmarks/cpu/mapping.csv"),
     "gpu_steps": (steps, "benchmarks/gpu/table_2.csv"),
     "gpu_mapping": (mapping, "benchmarks/gpu/mapping.csv"),
+    "gpu_recorded": (recorded, "benchmarks/gpu/steps.csv"),
+    "gpu_kernels": (kernels, "benchmarks/gpu/kernels.csv"),
     "convergence": (convergence, "paper_tables/beyond/convergence.csv"),
     "tracking": (tracking, "paper_tables/corrected/tracking.csv"),
     "recordings": (recordings, "paper_tables/corrected/tracking.csv"),
