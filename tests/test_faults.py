@@ -101,8 +101,8 @@ SET_TEXTS = {
 ENVIRONMENT = {
     "unclosed quote": ("SET", "'a=3", "cannot be split"),
     "preset": ("PRESET", "smok", "did you mean 'smoke'"),
-    "no config": ("CONFIG", "none.toml", "no config file none.toml"),
-    "config folder": ("CONFIG", "map", "no config file map"),
+    "no config": ("CONFIG", "none.toml", "none.toml: give a TOML file"),
+    "config folder": ("CONFIG", "map", "map: give a TOML file"),
     "device": ("DEVICE", "gpu7", "no device 'gpu7': this machine"),
     "no memory": ("DEVICE", "meta", "no device 'meta': this machine"),
     "no module": ("DEVICE", "hpu", "no device 'hpu': this machine"),

@@ -31,7 +31,9 @@ def test_links_lead_somewhere(pages: dict[Path, bs4.BeautifulSoup]) -> None:
             if url.startswith(("http", "data:")):
                 continue
             assert not url or (path.parent / url).is_file(), (path, url)
-            assert not heading or page.find(id=heading), (path, heading)
+            if heading:
+                target = pages[(path.parent / url).resolve()] if url else page
+                assert target.find(id=heading), (path, url, heading)
 
 
 def test_a_page_loads_nothing_and_tells_what_it_is(pages: dict[Path, bs4.BeautifulSoup]) -> None:
