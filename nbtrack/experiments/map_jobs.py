@@ -1,7 +1,6 @@
 """Maps as jobs: made from a scene, or given."""
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -15,7 +14,7 @@ from nbtrack.experiments.jobs import Job, Report
 from nbtrack.experiments.presets import PRESETS, Preset
 from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import field_class, make_field
+from nbtrack.fields import field_class
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
 
@@ -52,20 +51,14 @@ class MapJob(Job):
     @cached_property
     def key(self) -> str:
         """A digest of code, device, data, settings and seed."""
-        correction = ["nbtrack.beyond.correct"] if self.correction else []
-        code = *self._mapping_code, type(self).compute
         settings = self.field, self.network, self.settings, self.correction
         what = self.scene.fingerprint, self.frames, self.seed
         how = (
-            provenance.code_fingerprint(*code, *correction),
+            provenance.code_fingerprint(field_class(self.field)),
             provenance.versions(),
             choose_device().type,
         )
         return fingerprint(*how, *settings, *what)
-
-    @property
-    def _mapping_code(self) -> tuple[type | str | Callable, ...]:
-        return field_class(self.field), "nbtrack.mapping.fit", make_field
 
     @property
     def name(self) -> str:
@@ -129,8 +122,7 @@ class MapJob(Job):
         if self.needs:
             finished = correct_map(self.needs.map(), sequence, self.correction)
         else:
-            code = provenance.code_fingerprint(*self._mapping_code)
-            finished = map_sequence(*parts, choose_device(), checkpoint, tell, code)
+            finished = map_sequence(*parts, choose_device(), checkpoint, tell, self.key)
         record = {"quality": score_map(finished, sequence, self.scene.room)}
         record |= {"frames": self.frames, "key": self.key, "correction": self.correction}
         record |= {"versions": provenance.versions()}

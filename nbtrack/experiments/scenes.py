@@ -18,7 +18,7 @@ from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.sequence import RgbdSequence, without_outliers
 from nbtrack.experiments.output import check_no_recording, is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
-from nbtrack.provenance import sources_fingerprint
+from nbtrack.provenance import package_code
 from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
@@ -49,8 +49,7 @@ class Scene:
     @cached_property
     def fingerprint(self) -> str:
         """Changes with what is read, and with the code that reads it."""
-        code = sources_fingerprint("recordings.reading")
-        return fingerprint(*self.recording.contents(), code)
+        return fingerprint(*self.recording.contents(), package_code("data", "recordings"))
 
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
         """The frames of a slice such as `10:50:2`, `without_outliers`; more options and errors: see

@@ -66,8 +66,7 @@ class TrackJob(Job):
     def key(self) -> str:
         """A digest of code, map, tracker, budget, threads, frames, seed; by the clock, machine."""
         kinds = tracker_class(self.tracker), field_class(self.needs.field)
-        own = type(self).compute, type(self)._tracked, _scores, make_tracker
-        code = provenance.code_fingerprint(*kinds, "nbtrack.tracking.trajectories", *own)
+        code = provenance.code_fingerprint(*kinds)
         clock = None if self.rate_hz is None else (self.rate_hz, device_name(choose_device()))
         how = self.tracker, self.settings, self.steps, clock, self.n_threads, self.start
         what = self.frames, self.seed, self.scene.fingerprint

@@ -12,7 +12,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.core.device import usable_cores
 from nbtrack.core.errors import DataError, look_up
 from nbtrack.core.files import fingerprint, json_text, naming_damaged
-from nbtrack.provenance import sources_fingerprint
+from nbtrack.provenance import package_code
 from nbtrack.recordings.writer import WrittenFrame, write_sequence
 from nbtrack.synthetic.keyframes import keyframe_trajectory
 from nbtrack.synthetic.motion import handheld_trajectory, tour
@@ -88,7 +88,7 @@ def room_version(name: str) -> str:
 
     Raises ConfigError for an unknown room.
     """
-    return fingerprint(description(name), sources_fingerprint("synthetic.make"))
+    return fingerprint(description(name), package_code("synthetic"))
 
 
 def room_of(folder: Path) -> Room | None:
