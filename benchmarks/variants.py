@@ -150,6 +150,21 @@ class OtherDepth(Scene):
         return open_recording(self.folder, self.format, self.depth_folder)
 
 
+@dataclass(frozen=True)
+class Backwards(Scene):
+    """A recording whose last frame comes first."""
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Another than that of the recording."""
+        return f"{Scene(self.name, self.folder).fingerprint} backwards"
+
+    def read(self, frames: str = ":", **options) -> RgbdSequence:
+        """Its frames, with their times in the order of time."""
+        forwards = super().read(frames, **options)
+        return replace(forwards.select(slice(None, None, -1)), times=forwards.times)
+
+
 class _Uncoloured(Field):
     """A signed distance (m) alone: grey everywhere."""
 

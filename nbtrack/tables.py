@@ -265,12 +265,12 @@ def latex_file(styler: TableStyler, path: Path, note: str) -> str:
             styler.format_index(_LATEX_LABELS.get(level, _escape), axis=axis, level=level)
         styler.hide(axis=axis, names=True)
     styler.set_table_styles([{"selector": s, "props": ":;"} for s in ("smallskip", "scriptsize")])
-    label = f"tab:{kind}-{_label_of(path.resolve().parent.name)}"
+    folder = re.sub(r"[^\w.-]", "_", path.resolve().parent.name)  # labels hold no special character
     text = styler.to_latex(
         column_format=f"@{{}}l{'c' if has_steps else 'l'}{'r' * len(table.columns)}@{{}}",
         environment="table" if has_steps else "table*", position_float="centering", hrules=True,
         clines="skip-last;data", multirow_align="c", convert_css=True,
-        label=label, caption=f"{caption} {_escape(note)}",
+        label=f"tab:{kind}-{folder}", caption=f"{caption} {_escape(note)}",
     )  # fmt: skip
     text = re.sub(r"(\\color\{red\} .*?) (&|\\\\)", r"\1\\rlap{$^\\dagger$} \2", text)
     # Pandas writes clines only, and puts the head of row labels into a line of its own.
@@ -281,11 +281,6 @@ def latex_file(styler: TableStyler, path: Path, note: str) -> str:
     if has_std and len(table.columns) > _MANY_COLUMNS:  # else they run off the page
         text = text.replace("\\scriptsize\n", "\\scriptsize\n\\setlength{\\tabcolsep}{2.2pt}\n", 1)
     return _PREAMBLE.format(note=note, name=path.stem) + text
-
-
-def _label_of(folder: str) -> str:
-    """A folder's name as part of a label, which holds no special character."""
-    return re.sub(r"[^\w.-]", "_", folder)
 
 
 def _escape(text: object) -> str:

@@ -17,10 +17,9 @@ from nbtrack.beyond.lm_solver import (
     robust_cost,
     scales_of,
 )
-from nbtrack.beyond.observed import draw_points, with_normals
+from nbtrack.beyond.observed import LUMA, draw_points, with_normals
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.fields import NetworkSettings, make_field
-from nbtrack.fields.base import LUMA
 
 BOX = SceneBounds((-1.0, -1.2, -0.8), (1.0, 1.2, 0.8))
 ROOM = BakedField(BoxRoom(), 0.05)  # known better here, worse there, as corrected grids are

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from nbtrack.beyond.verdict import score_detection
 from nbtrack.checks.belongs import other_world
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import json_text, write_atomic
 from nbtrack.tracking.metrics import (
     align_rigidly,
     pose_errors,
-    score_detection,
     still_metrics,
     trajectory_metrics,
 )

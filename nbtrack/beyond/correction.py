@@ -17,7 +17,7 @@ from scipy.sparse.linalg import cg
 from torch import Tensor
 
 from nbtrack.beyond.grid import BakedField
-from nbtrack.beyond.observed import compiled
+from nbtrack.beyond.observed import LUMA, compiled
 from nbtrack.beyond.views import Views, spread_out, view_of
 from nbtrack.core.arrays import Frames, WorldPoints
 from nbtrack.core.bounds import SceneBounds
@@ -25,7 +25,7 @@ from nbtrack.core.errors import DataError
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, field_class
-from nbtrack.fields.base import LUMA, State
+from nbtrack.fields.base import State
 
 # All our choice, tried in the two rooms for tuning.
 _N_POINTS = 300_000  # measured points
@@ -78,7 +78,6 @@ class CorrectedField(BakedField):
 
     form = "corrected"
     inlier_distance = 0.025
-    min_inliers = 0.8
 
     def __init__(self, source: Field, voxel: float) -> None:
         """Sample a field as `BakedField` does; `add` then corrects it."""

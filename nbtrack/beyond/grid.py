@@ -29,6 +29,12 @@ class BakedField(Field):
 
     name = "baked"
     width = 0  # one thread serves a grid, even one that keeps the network it was made from
+    # By how much its distance (m) and intensity are off at surfaces, together with depth cameras:
+    # larger residuals are down-weighted in second-order tracking. Our choice, for small networks.
+    residual_sigma: tuple[float, float] = (0.02, 0.05)
+    inlier_distance: float = 0.05  # m from its surface within which a point fits
+    intensity_mad: float = np.inf  # median residual of luma at what was mapped, where known
+    T_world_cameras: Float[Tensor, "cameras 4 4"] | None = None  # some that mapped it
 
     @torch.no_grad()
     def __init__(self, source: Field, voxel: float | int) -> None:

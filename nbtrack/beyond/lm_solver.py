@@ -44,9 +44,8 @@ import torch
 from jaxtyping import Float
 
 from nbtrack.beyond.grid import BakedField
-from nbtrack.beyond.observed import Observed, compiled
+from nbtrack.beyond.observed import LUMA, Observed, compiled
 from nbtrack.core.arrays import Pose
-from nbtrack.fields.base import intensity_of
 
 G_MIN = 0.3
 G_MAX = 2.0
@@ -93,7 +92,7 @@ class Grid:
         low, high = np.array(field.bounds.minimum), np.array(field.bounds.maximum)
         usable = low - MARGIN, high + MARGIN
         place = np.concatenate([field.low.double().numpy(), [field.voxel], *usable])
-        intensity = intensity_of(field.volume[:3].T)
+        intensity = field.volume[:3].T @ torch.tensor(LUMA)
         value, confidence = field.volume[3:]
         vertices = torch.stack([value, intensity, confidence], dim=-1).numpy()
         # Vertices as (distance, intensity, confidence), their numbers along x, y and z, and their

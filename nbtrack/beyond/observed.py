@@ -9,7 +9,6 @@ from numba import njit
 
 from nbtrack.data.frame import MILLIMETRE, Frame
 from nbtrack.data.pixels import PLANE_JUMP, PLANE_REACH
-from nbtrack.fields.base import LUMA
 
 _EDGE_JUMP = 0.05  # a neighbouring depth that differs by a larger share marks an edge
 _DRAWN_PER_POINT = 4  # pixels that are looked at for every point that is wanted
@@ -17,6 +16,8 @@ _DRAWN_PER_POINT = 4  # pixels that are looked at for every point that is wanted
 # g^3 + g^2 = 1, every beginning is. In units of 1 / _MODULUS; down and across.
 _EVEN_STEPS = (0xC13FA9A9, 0x91E10DA5)
 _MODULUS = 2**32
+LUMA = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in the intensity that trackers compare (ITU-R BT.601)."""
 _RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
 # Sums may be reordered, so that they fill vector registers; NaN stays NaN.
 _JIT = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}

@@ -11,7 +11,9 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+
+from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 WRONG_M = 0.05
 WRONG_DEG = 3.0
@@ -53,3 +55,17 @@ def p_lost(said: Mapping[str, float]) -> float:
     spread = math.hypot(_CORRELATED * said["position_std_m"], said["last_step"])
     is_held = math.erf(WRONG_M / math.sqrt(2) / spread)
     return 1 - is_right * is_held
+
+
+def score_detection(
+    called_lost: Bool[np.ndarray, "n"], errors_m: Float[np.ndarray, "n"]
+) -> dict[str, float | None]:
+    """Precision and recall of verdicts against `LOST_THRESHOLD_M`; None is a share of nothing.
+
+    >>> score_detection(np.array([True, True, False]), np.array([0.3, 0.1, 0.5]))
+    {'lost_precision': 0.5, 'lost_recall': 0.5}
+    """
+    is_lost = errors_m > LOST_THRESHOLD_M
+    both = int((called_lost & is_lost).sum())
+    counts = {"lost_precision": int(called_lost.sum()), "lost_recall": int(is_lost.sum())}
+    return {name: both / count if count else None for name, count in counts.items()}

@@ -16,8 +16,8 @@ from nbtrack.checks.readings import FramePairs, Reading, on_grid
 from nbtrack.core.arrays import Frames, Poses
 from nbtrack.core.errors import DataError
 from nbtrack.core.progress import ProgressBar
-from nbtrack.data.sequence import FAR, RgbdSequence, far_limit, joined
-from nbtrack.recordings.reading import read_frames, select_frames
+from nbtrack.data.sequence import ARRAYS, RgbdSequence
+from nbtrack.recordings.reading import FAR, far_limit, read_frames, select_frames
 from nbtrack.recordings.recording import Recording
 
 _FRAMES_AT_ONCE = 32  # 50 MB at 640x480
@@ -256,7 +256,7 @@ def _read(
             bar.move_to(first + len(part))
     frames = pd.DataFrame(rows, looked_at)
     frames["is_repeated"] = frames.digest.diff() == 0
-    return joined(parts), frames.join(_changes(frames, recording.T_world_camera[looked_at]))
+    return _joined(parts), frames.join(_changes(frames, recording.T_world_camera[looked_at]))
 
 
 def _facts(depth: np.ndarray, color: np.ndarray) -> dict[str, float]:
@@ -296,3 +296,9 @@ def _cloud(own: Reading, sequence: RgbdSequence) -> pd.DataFrame:
     cloud = np.concatenate([world, colors, points[..., 2:]], axis=-1).reshape(-1, 7)
     cloud = pd.DataFrame(cloud, columns=[*_XYZ, *_RGB, "depth"])
     return cloud[cloud.depth > 0]
+
+
+def _joined(parts: list[RgbdSequence]) -> RgbdSequence:
+    """Parts of one sequence, at least one, in the order given."""
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
+    return replace(parts[0], **arrays)

@@ -6,25 +6,20 @@ file, so every result is written to a temporary file, which is then moved into p
 
 import contextlib
 import dataclasses
-import errno
 import hashlib
 import io
 import json
 import os
 import tempfile
-import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock
 
 import nbtrack
 from nbtrack.core.errors import DataError, NbtrackError
-from nbtrack.core.progress import tell
 from nbtrack.core.settings import as_dict
 
 PACKAGE = Path(nbtrack.__file__).resolve().parent
@@ -34,7 +29,6 @@ _NOT_BY_CONTENT = (
     NbtrackError, MemoryError, torch.OutOfMemoryError, torch.AcceleratorError, NameError,
     AttributeError, AssertionError,
 )  # fmt: skip
-_NO_LOCKS = errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP  # what their lack is called
 
 
 def project_folder() -> Path:
@@ -127,34 +121,6 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
                 os.replace(Path(aside, name), folder / name)
     except OSError as error:  # a write that finds the disk full has no name of its own
         raise OSError(error.errno, error.strerror or str(error), str(folder / last)) from None
-
-
-@contextlib.contextmanager
-def locked(path: Path, timeout: float = -1) -> Iterator[bool]:
-    """Keep other processes out of a block by a lock file, and tell whether that was possible.
-
-    The system frees the lock when this process ends, however it ends. Where the file system knows
-    none, that is said once. Raises filelock's Timeout where others keep it for `timeout` s; less
-    than 0 waits as long as they do.
-    """
-    lock = FileLock(path, timeout=timeout)
-    try:
-        # It warns before it takes another kind, which would wait for files that locks have left.
-        with warnings.catch_warnings(action="error"):
-            lock.acquire()
-    except (OSError, UserWarning) as error:
-        if getattr(error, "errno", errno.ENOSYS) not in _NO_LOCKS:
-            raise
-        _tell_of_no_locks()
-    try:
-        yield lock.is_locked
-    finally:
-        lock.release()
-
-
-@cache
-def _tell_of_no_locks() -> None:
-    tell("nbtrack: warning: no locks on this file system: run one command at a time in a folder")
 
 
 def json_text(content: Any) -> str:

@@ -18,10 +18,7 @@ from nbtrack.data.frame import MILLIMETRE, Frame
 # cut off at either end of each axis, so that a few wild depths do not stretch the box.
 _POINTS_PER_FRAME = 2000
 _CUT_OFF = 0.002
-# Beyond so many times the distance that nine in ten depths lie within, they are no measurement: of
-# eleven rooms and two real recordings the farthest was 2.1 times as far (our choice).
-FAR = 5.0
-_ARRAYS = "colors", "depths_mm", "T_world_camera", "frame_ids", "times"  # a row a frame
+ARRAYS = "colors", "depths_mm", "T_world_camera", "frame_ids", "times"  # a row a frame
 
 
 @dataclass(frozen=True)
@@ -77,27 +74,7 @@ class RgbdSequence:
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
         """The sequence of some of the frames, in the order given; slices copy nothing."""
-        return replace(self, **{name: getattr(self, name)[indices] for name in _ARRAYS})
-
-
-def joined(parts: list[RgbdSequence]) -> RgbdSequence:
-    """Parts of one sequence, at least one, in the order given."""
-    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
-    return replace(parts[0], **arrays)
-
-
-def without_outliers(sequence: RgbdSequence) -> RgbdSequence:
-    """Without depths farther than `far_limit`; a sequence that has none is returned as it is."""
-    sample = sequence.depths_mm[:, ::4, ::4]
-    is_far = sequence.depths_mm > far_limit(sample[sample > 0])
-    if not is_far.any():
-        return sequence
-    return replace(sequence, depths_mm=np.where(is_far, np.uint16(0), sequence.depths_mm))
-
-
-def far_limit(depths: np.ndarray) -> float:
-    """The distance, in the unit of some measured depths, beyond which they are outliers."""
-    return FAR * float(np.quantile(depths, 0.9)) if len(depths) else np.inf
+        return replace(self, **{name: getattr(self, name)[indices] for name in ARRAYS})
 
 
 def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:

@@ -15,7 +15,7 @@ from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import read_setting, with_values
-from nbtrack.data.sequence import RgbdSequence, without_outliers
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.grid import run_jobs
 from nbtrack.experiments.map_jobs import OF_MAPS, GivenMap, MapJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
@@ -34,13 +34,18 @@ from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh
 from nbtrack.plots.rerun_file import rerun_bytes
-from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
+from nbtrack.recordings.reading import (
+    parse_frames,
+    read_frames,
+    select_frames,
+    without_outliers,
+)
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.recordings.writer import convert_sequence
 from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.methods import METHODS, Method
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
-from nbtrack.tracking.trajectories import read_trajectory, read_tum, write_kitti
+from nbtrack.tracking.trajectories import number_lines, read_trajectory, read_tum
 
 # What is printed in place of names in metrics.json that say too little.
 _MEANINGS = {
@@ -274,7 +279,8 @@ def _export_run(source: Path, format_name: str, out: Path) -> str:
 
 def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
     n_poses = len(read_trajectory(source).frames)
-    write_kitti(out, read_tum(source / "trajectory.txt")[1])
+    T_world_camera = read_tum(source / "trajectory.txt")[1]
+    write_atomic(out, number_lines(T_world_camera[:, :3].reshape(-1, 12)))
     what = "KITTI: three rows of the matrix (m), no time stamps"
     return f"{n_poses} poses, {what}; the first frame's, which was given, is not among them"
 

@@ -8,6 +8,7 @@ from nbtrack.core import files
 from nbtrack.core.device import advise_on_memory
 from nbtrack.core.errors import NbtrackError
 from nbtrack.experiments.output import check_no_recording
+from nbtrack.locks import locked
 
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""
@@ -49,7 +50,7 @@ class Job:
         report(0.0, "begins, or waits for another process that makes the same")
         try:
             check_no_recording(path)
-            with files.locked(path), advise_on_memory(f"the frames and settings of {self.name}"):
+            with locked(path), advise_on_memory(f"the frames and settings of {self.name}"):
                 return self.result() if self.is_done else self.compute(report)
         except NbtrackError as error:
             return error

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from nbtrack.core.errors import ConfigError
-from nbtrack.core.files import locked, resolved, write_atomic
+from nbtrack.core.files import resolved, write_atomic
+from nbtrack.locks import locked
 from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, MESH_FILE
 from nbtrack.plots.style import in_house_style
 from nbtrack.recordings.formats import holds_recording

@@ -10,16 +10,21 @@ from nbtrack.core.files import (
     absolute,
     data_folder,
     fingerprint,
-    locked,
     runs_folder,
 )
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.dataset import DATASET_SCENES
-from nbtrack.data.sequence import RgbdSequence, without_outliers
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.output import check_no_recording, is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
+from nbtrack.locks import locked
 from nbtrack.provenance import package_code
-from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
+from nbtrack.recordings.reading import (
+    parse_frames,
+    read_frames,
+    select_frames,
+    without_outliers,
+)
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
 from nbtrack.synthetic.make import MOTIONS

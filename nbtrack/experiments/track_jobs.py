@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from nbtrack import provenance
+from nbtrack.beyond.verdict import score_detection
 from nbtrack.checks.belongs import check_belongs, in_world_of_map
 from nbtrack.checks.in_map import look_in_map
 from nbtrack.core import files
@@ -27,7 +28,7 @@ from nbtrack.fields import field_class
 from nbtrack.mapping.files import Map
 from nbtrack.recordings.reading import parse_frames, select_frames
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
-from nbtrack.tracking.metrics import score_detection, still_metrics, trajectory_metrics
+from nbtrack.tracking.metrics import still_metrics, trajectory_metrics
 from nbtrack.tracking.reach import reach_metrics
 from nbtrack.tracking.starts import expected_poses
 from nbtrack.tracking.tracker import TrackerSettings

@@ -14,7 +14,6 @@ from torch import Generator, Tensor, nn
 from nbtrack.core.arrays import Colors, Frames, Points, Pose, RayColors, RaySamples, Scalar, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
-from nbtrack.core.device import constant
 from nbtrack.core.settings import limited, may_be_zero
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
@@ -22,8 +21,6 @@ from nbtrack.fields import rendering
 from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.rendering import Rendering, Weights
 
-LUMA = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in the intensity that trackers compare (ITU-R BT.601)."""
 # Minimum standard deviation (m) that a depth error is divided by: a perfectly sharp ray would
 # otherwise outweigh all others (our choice; depth noise is of this size).
 MIN_STD = 0.02
@@ -64,15 +61,8 @@ class Field(nn.Module, abc.ABC):
     is_distance: bool = True  # whether its value is a signed distance (m)
     value_label: str = "signed distance (m)"  # on axes
     surface_level: float  # the value whose isosurface is drawn as the scene's surface
-    # By how much its distance (m) and intensity are off at surfaces, together with depth cameras:
-    # larger residuals are down-weighted in second-order tracking. Our choice, for small networks.
-    residual_sigma: tuple[float, float] = (0.02, 0.05)
-    inlier_distance: float = 0.05  # m from its surface within which a point fits
-    intensity_mad: float = np.inf  # median residual of luma at what was mapped, where known
-    min_inliers: float = 0.6  # share of a frame's points that fit where the camera is not lost
     Settings: type = MappingSettings  # of mapping
     form: str = ""  # what a finished map was made of the field as mapped, by its name in map files
-    T_world_cameras: Float[Tensor, "cameras 4 4"] | None = None  # some that mapped it, where kept
 
     def __init__(self, bounds: SceneBounds) -> None:
         super().__init__()
@@ -210,11 +200,6 @@ class LearnedField(Field):
                 weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
             fine = rendering.importance_depths(coarse, weights, n_importance, generator)
         return coarse, answers, fine
-
-
-def intensity_of(color: Colors) -> Values:
-    """Luma of colours, in [0, 1]."""
-    return color @ constant(LUMA, color.device, color.dtype)
 
 
 def rays_end(rays: Rays, bounds: SceneBounds) -> Values:

@@ -10,7 +10,6 @@ from typing import Any
 
 import pandas as pd
 import torch
-from torch import Tensor
 
 from nbtrack.core.device import (
     advise_on_memory,
@@ -163,7 +162,7 @@ class _Fit:
             self.history.append({**values, "total": sum(row), **diagnostics})
         self.seconds += time.perf_counter() - start
 
-    def _descend(self) -> Tensor:
+    def _descend(self) -> torch.Tensor:
         draw = partial(self.sampler.draw, generator=self.generator, frames=self.frames)
         terms = self.field.mapping_losses(draw, self.settings, self.generator)
         if not isinstance(terms, dict):

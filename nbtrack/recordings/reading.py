@@ -1,6 +1,7 @@
 """Recordings on disk as sequences in memory, whatever format they are stored in."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ from nbtrack.recordings.images import decode
 from nbtrack.recordings.recording import Recording, open_recording
 
 _SLICE = r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?"
+# Beyond so many times the distance that nine in ten depths lie within, they are no measurement: of
+# eleven rooms and two real recordings the farthest was 2.1 times as far (our choice).
+FAR = 5.0
 
 
 def parse_frames(text: str) -> slice:
@@ -84,3 +88,17 @@ def select_frames(recording: Recording, frames: slice, needs_poses: bool = True)
             f"but no pose in {recording.pose_file} that is not NaN: choose others, or other poses"
         )
     return frame_ids
+
+
+def without_outliers(sequence: RgbdSequence) -> RgbdSequence:
+    """Without depths farther than `far_limit`; a sequence that has none is returned as it is."""
+    sample = sequence.depths_mm[:, ::4, ::4]
+    is_far = sequence.depths_mm > far_limit(sample[sample > 0])
+    if not is_far.any():
+        return sequence
+    return replace(sequence, depths_mm=np.where(is_far, np.uint16(0), sequence.depths_mm))
+
+
+def far_limit(depths: np.ndarray) -> float:
+    """The distance, in the unit of some measured depths, beyond which they are outliers."""
+    return FAR * float(np.quantile(depths, 0.9)) if len(depths) else np.inf

@@ -1,14 +1,13 @@
 """How far a tracked trajectory is from the true one: the paper's error and its companions."""
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Pose, Poses
 from nbtrack.core.errors import DataError
 
 Errors = Float[np.ndarray, "frames"]
-Flags = Bool[np.ndarray, "frames"]
 Positions = Float[np.ndarray, "frames 3"]
 
 LOST_THRESHOLD_M = 0.2
@@ -57,18 +56,6 @@ def still_metrics(T_true: Poses) -> dict[str, float]:
     distances = np.linalg.norm(positions[1:] - positions[0], axis=1)
     path_m = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
     return {"still_ate_m": _root_mean_square(distances), "path_m": float(path_m)}
-
-
-def score_detection(called_lost: Flags, errors_m: Errors) -> dict[str, float | None]:
-    """Precision and recall of verdicts against `LOST_THRESHOLD_M`; None is a share of nothing.
-
-    >>> score_detection(np.array([True, True, False]), np.array([0.3, 0.1, 0.5]))
-    {'lost_precision': 0.5, 'lost_recall': 0.5}
-    """
-    is_lost = errors_m > LOST_THRESHOLD_M
-    both = int((called_lost & is_lost).sum())
-    counts = {"lost_precision": int(called_lost.sum()), "lost_recall": int(is_lost.sum())}
-    return {name: both / count if count else None for name, count in counts.items()}
 
 
 def pose_errors(T_estimated: Poses, T_true: Poses) -> tuple[Errors, Errors]:

@@ -86,10 +86,8 @@ class AdamTracker(Tracker):
 
     def _allocate(self, frame: Frame) -> None:
         """Make room for all that a step reads and changes, for frames of one size."""
-        color, depth_mm = torch.empty_like(frame.color), torch.empty_like(frame.depth_mm)
-        self.frame = replace(frame, color=color, depth_mm=depth_mm)
+        self.frame = replace(frame, color=frame.color.clone(), depth_mm=frame.depth_mm.clone())
         like = {"device": self.device}
-        self.drawn = torch.empty(self.settings.n_pixels, dtype=torch.int64, **like)
         self.pixels = torch.empty(2, self.settings.n_pixels, dtype=torch.int64, **like)
         self.position = torch.zeros(3, **like).requires_grad_()
         self.q_wxyz = torch.zeros(4, **like).requires_grad_()
@@ -110,10 +108,9 @@ class AdamTracker(Tracker):
 
     def _draw(self) -> None:
         """Choose random measured pixels; how many there are changes, so it is not recorded."""
-        n_measured = self.measured.shape[1]
-        shape = self.drawn.shape
-        torch.randint(n_measured, shape, generator=self.generator, out=self.drawn)
-        torch.index_select(self.measured, 1, self.drawn, out=self.pixels)
+        how = {"generator": self.generator, "device": self.device}
+        drawn = torch.randint(self.measured.shape[1], (self.settings.n_pixels,), **how)
+        torch.index_select(self.measured, 1, drawn, out=self.pixels)
 
     def _drawn(self) -> tuple[Points, Colors, Values]:
         """Rays, colours and depths of the chosen pixels."""

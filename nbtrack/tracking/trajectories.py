@@ -145,18 +145,12 @@ def tum_text(times: Float[np.ndarray, "n"], T_world_camera: Poses) -> str:
     known = np.isfinite(T_world_camera).all(axis=(1, 2))
     times, T_world_camera = np.asarray(times)[known], T_world_camera[known]
     q_xyzw = Rotation.from_matrix(T_world_camera[:, :3, :3]).as_quat(canonical=True)
-    return f"# {_COLUMNS}\n" + _lines(np.column_stack([times, T_world_camera[:, :3, 3], q_xyzw]))
+    rows = np.column_stack([times, T_world_camera[:, :3, 3], q_xyzw])
+    return f"# {_COLUMNS}\n{number_lines(rows)}"
 
 
-def write_kitti(path: Path, T_world_camera: Poses) -> None:
-    """Writes camera-to-world poses (m, OpenCV camera axes) as rows of 3 x 4 matrices, untimed.
-
-    Source: KITTI odometry benchmark, whose files begin at the identity; ours keep the world frame.
-    """
-    files.write_atomic(path, _lines(T_world_camera[:, :3].reshape(-1, 12)))
-
-
-def _lines(rows: Float[np.ndarray, "n numbers"]) -> str:
+def number_lines(rows: Float[np.ndarray, "n numbers"]) -> str:
+    """Rows of numbers as text, with the digits that restore the same double."""
     # Adding zero turns -0.0 into 0.0.
     return "".join(" ".join(map(repr, row)) + "\n" for row in (rows + 0.0).tolist())
 
