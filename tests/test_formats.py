@@ -354,6 +354,17 @@ def test_what_a_camera_file_says_counts(plain: Path) -> None:
         path.write_text(json.dumps({**words, **lens}))
         seen.append(read_sequence(plain).depths_mm)
     assert (seen[0] != as_written.depths_mm).any()
+    rational = [0.5, -2.7, 0.001, -0.002, 1.6, 0.4, -2.5, 1.5]
+    named = zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), rational, strict=True)
+    of_both = []
+    for lens in (
+        {"distortion": rational},
+        {**dict(named), "distortion_model": "rational_polynomial"},
+    ):
+        path.write_text(json.dumps({**words, **lens, "skew": 0}))
+        of_both.append(read_sequence(plain).depths_mm)
+    assert (of_both[0] == of_both[1]).all()
+    assert (of_both[0] != seen[0]).any()
     assert all((depths == seen[0]).all() for depths in seen)
     for scale in ({"depth_scale": 4000}, {"scale": 4000.0}, {"depth_scale": 0.00025}):
         path.write_text(json.dumps({**words, **scale, "serial": "17"}))

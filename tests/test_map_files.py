@@ -31,6 +31,7 @@ from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.mapping.files import MAP_FILE, Map, _digest, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.mapping.holdout import depth_residual_of
+from nbtrack.plots.meshes import mesh_bytes
 from nbtrack.tracking.trajectories import read_tum
 
 
@@ -273,6 +274,28 @@ def test_meshes_keep_their_colours(work: Path, source: str, kind: str) -> None:
     bounds = read_map("room").field.bounds
     assert (mesh.bounds[0] > np.array(bounds.minimum) - 0.1).all()
     assert (mesh.bounds[1] < np.array(bounds.maximum) + 0.1).all()
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb"])
+def test_map_coordinates(kind: str) -> None:
+    """Catches meshes near 0 beside trajectories in map coordinates, and lost decimetres there."""
+    mesh, origin = trimesh.creation.icosphere(1), np.array([500_000.0, 4_649_000.0, 0.0])
+    mesh.visual.vertex_colors = [10, 20, 30, 255]
+    content = trimesh.util.wrap_as_stream(mesh_bytes(mesh, kind, origin))
+    read = trimesh.load(content, file_type=kind, process=False)
+    read = read.to_mesh() if isinstance(read, trimesh.Scene) else read
+    np.testing.assert_allclose(read.vertices, mesh.vertices + origin, rtol=0, atol=1e-6)
+    assert (read.faces == mesh.faces).all()
+    assert (np.asarray(read.visual.vertex_colors)[:, :3] == [10, 20, 30]).all()
+
+
+def test_a_record_that_could_not_be_read_is_not_written(work: Path, tmp_path: Path) -> None:
+    """Catches a map that is written and lost, since `read_map` refuses it."""
+    stored = read_map("map")
+    for record in ({**stored.record, "seconds": float("nan")}, {"network": {}}):
+        with pytest.raises(DataError, match="give its record what `map_sequence` does"):
+            write_map(tmp_path / MAP_FILE, replace(stored, record=record))
+    assert not (tmp_path / MAP_FILE).exists()
 
 
 def test_tracking_in_the_map_of_another_room(work: Path, capsys: pytest.CaptureFixture) -> None:

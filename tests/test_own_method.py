@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from unittest import mock
 
 import nbformat
@@ -18,13 +18,14 @@ from nbconvert.preprocessors import ExecutePreprocessor
 from tiny import TINY, tiny_words
 
 import nbtrack
+from nbtrack import experiments
 from nbtrack.cli import main
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError, NbtrackError
 from nbtrack.core.files import runs_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments import presets
-from nbtrack.experiments.methods import METHODS, Method
+from nbtrack.experiments.methods import METHODS, Method, method_of
 from nbtrack.experiments.presets import load_preset
 from nbtrack.fields import FIELDS, NetworkSettings, NeusMapping, field_class
 from nbtrack.fields.mlp import FourierMlp
@@ -313,7 +314,7 @@ def test_a_class_without_a_name(registry: dict, monkeypatch: pytest.MonkeyPatch)
     """Catches a traceback where a class says no name."""
     monkeypatch.setitem(registry, "mine", type("Mine", (), {}))
     look_up_class = field_class if registry is FIELDS else tracker_class
-    with pytest.raises(ConfigError, match="'mine' calls itself None"):
+    with pytest.raises(ConfigError, match="'mine' lacks name"):
         look_up_class("mine")
 
 
@@ -347,6 +348,56 @@ def test_what_an_own_class_needs_is_public() -> None:
     assert mine.mlp is mine.made
     assert distance[0] > 0.3
     assert abs(distance[1] - 0.1) < 0.15
+
+
+def test_classes_that_lack_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches an AttributeError in the middle of a command, and a StopIteration where no tracker of
+    the package's works in an own field."""
+
+    class Nameless(nbtrack.LearnedField):
+        name = "nameless"
+
+    class Blank(nbtrack.Field):
+        name, label, surface_level, is_distance = "blank", "Blank", 0.0, False
+
+        def forward(self, points_world):
+            return points_world, points_world[:, 0]
+
+    monkeypatch.setitem(FIELDS, "nameless", Nameless)
+    monkeypatch.setitem(FIELDS, "blank", Blank)
+    lacks = "'nameless' lacks label, forward, mapping_losses, weights: give them to"
+    with pytest.raises(ConfigError, match=lacks):
+        field_class("nameless")
+    with pytest.raises(ConfigError, match="no tracker works on field 'blank'"):
+        method_of(None, "blank", None)
+
+
+def test_a_broken_plug_in(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """Catches a traceback from every command because of somebody else's package."""
+    broken = SimpleNamespace(value="broken.module", load=lambda: 1 / 0)
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [broken])
+    monkeypatch.setattr(experiments, "IMPORTED", [])
+    importlib.reload(experiments)
+    said = "plug-in broken.module is left out (ZeroDivisionError: division by zero)"
+    assert said in capsys.readouterr().err
+
+
+def test_terms_that_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches torch's words about sizes where a loss has a term only now and then."""
+
+    class Mine(FIELDS["neus"]):
+        name, calls = "mine", 0
+
+        def mapping_losses(self, draw, settings, generator):
+            self.calls += 1
+            terms = super().mapping_losses(draw, settings, generator)
+            return terms if self.calls < 4 else {"color": terms["color"]}
+
+    monkeypatch.setitem(FIELDS, "mine", Mine)
+    preset = load_preset(settings=[*TINY, "scenes.names=['office']"])
+    (scene,) = nbtrack.open_scenes(preset)
+    with pytest.raises(ConfigError, match="gave color after depth, color, eikonal: give the same"):
+        nbtrack.map_scene(scene, "mine", preset)
 
 
 def test_a_loss_without_a_name(monkeypatch: pytest.MonkeyPatch) -> None:

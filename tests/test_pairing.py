@@ -175,6 +175,24 @@ def test_times_of_images_settle_it(tmp_path: Path) -> None:
         np.testing.assert_allclose(own.T_world_camera[1:], source().poses[1:])
 
 
+@pytest.mark.parametrize("per_second", [1, 10**3, 10**6, 10**9])
+def test_one_unit_of_times_wherever_they_stand(plain: Path, per_second: int) -> None:
+    """Catches nanoseconds that are taken for seconds, in files of times and of poses, and a time
+    beyond all others, which only the last command would refuse."""
+    seconds = 1403636579.0 + np.arange(N_FRAMES) / 4
+    lines = [str(round(s * per_second)) if per_second > 1 else f"{s}" for s in seconds]
+    (plain / "timestamps.txt").write_text("\n".join(lines))
+    rows = tum_lines(seconds, source().poses).splitlines()
+    stamped = [f"{t} {row.split(maxsplit=1)[1]}" for t, row in zip(lines, rows, strict=True)]
+    (plain / "trajectory.txt").write_text("\n".join(stamped))
+    recording = open_recording(plain)
+    np.testing.assert_allclose(recording.times, seconds, atol=1e-3)
+    np.testing.assert_allclose(recording.T_world_camera, source().poses, atol=1e-9)
+    (plain / "timestamps.txt").write_text("\n".join([*lines[:-1], "1e30"]))
+    with pytest.raises(DataError, match="one each, rising, in seconds, or since 1970 in milli-"):
+        open_recording(plain)
+
+
 def test_times_in_names(plain: Path) -> None:
     """Catches times in the order of their digits, .175304 behind .2, and times from 0 for images
     that are named after theirs, whatever the poses are stamped with."""

@@ -10,9 +10,9 @@ import pytest
 import trimesh
 
 from nbtrack.cli import main
+from nbtrack.experiments.runs import read_trajectory
 from nbtrack.plots.rerun_file import rerun_bytes
 from nbtrack.recordings.reading import read_sequence
-from nbtrack.tracking.trajectories import read_trajectory
 
 
 def rows_of(file: Path) -> Counter[tuple[str, bool]]:

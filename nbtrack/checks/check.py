@@ -200,8 +200,10 @@ def check_recording(
     sequence, frames = _read(in_files, ids if is_whole else kept, kept, progress)
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
+    bar = ProgressBar("comparing frames", 2, progress)
     compared = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(compared, recording.declared, sequence.intrinsics)
+    bar.move_to(1)
     own = conventions[0].reading
     cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))
     is_far = cloud.depth > far_limit(cloud.depth)
@@ -210,6 +212,8 @@ def check_recording(
     if best is conventions[0] and fitted.size:
         compared = FramePairs(recording, ids, sequence, fitted)
         found, correlation = find_misfits(compared, sequence, own)
+    bar.move_to(2)
+    bar.close()
     of_points = cloud[~is_far], cloud[is_far]
     agreement = conventions, best, found, correlation
     return DataReport(recording, frames, poses, *of_points, *agreement, is_whole)

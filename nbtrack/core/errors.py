@@ -1,7 +1,7 @@
 """One exception family. A message says what was found, what is allowed and what to do next."""
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeVar
 
 Entry = TypeVar("Entry")
@@ -45,9 +45,15 @@ def check_lists(**arguments: object) -> None:
             raise ConfigError(f"{name} = {value!r:.80} is no list: write {name}=[...] around it")
 
 
-def look_up_kind(what: str, name: str, known: Mapping[str, type]) -> type:
-    """A class by the name that it calls itself. Raises ConfigError for another, or an unknown."""
+def look_up_kind(what: str, name: str, known: Mapping[str, type], needed: Sequence[str]) -> type:
+    """A class by the name that it calls itself, with all that its kind needs.
+
+    Raises ConfigError for another name, an unknown one, and for attributes that it lacks.
+    """
     kind = look_up(what, name, known)
+    lacks = [word for word in needed if not hasattr(kind, word)]
+    if lacks := [*lacks, *sorted(getattr(kind, "__abstractmethods__", ()))]:
+        raise ConfigError(f"{what} {name!r} lacks {', '.join(lacks)}: give them to {kind.__name__}")
     if (own := getattr(kind, "name", None)) != name:
         raise ConfigError(f"{what} {name!r} calls itself {own!r}: give the class this name")
     return kind

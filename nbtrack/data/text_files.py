@@ -20,7 +20,7 @@ _DECIMAL_COMMA = re.compile(r"(?<!\S)[-+]?\d+,\d+(e[-+]?\d+)?(?!\S)")
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
 _FARTHEST = 1e7  # m from the origin: beyond map coordinates, within what floats can square
 _ALONE = 1000.0  # m from the middle, and so many times as far as nine in ten: no camera went there
-_LATEST = 1e12  # s: no timestamp is larger, and larger numbers overflow
+_LATEST = 1e11  # s: no timestamp is larger; since 1970 even milliseconds are
 _RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 
 
@@ -57,6 +57,21 @@ def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np
     return numbers
 
 
+def in_seconds(times: Times) -> Times:
+    """Times in seconds, also where a file has them in milli-, micro- or nanoseconds since 1970.
+
+    The median tells the unit. A time beyond `_LATEST` is none: NaN.
+
+    >>> in_seconds(np.array([1403636579763555584.0, 1403636579796888917.0])).round(2).tolist()
+    [1403636579.76, 1403636579.8]
+    >>> in_seconds(np.array([0.5, 1e13])).tolist()
+    [0.5, nan]
+    """
+    usual = np.nanmedian(np.abs(times)) if np.isfinite(times).any() else 0.0
+    unit = next((unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if usual * unit < _LATEST), 1.0)
+    return np.where(np.abs(times * unit) < _LATEST, times * unit, np.nan)
+
+
 def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | None]:
     """Poses as they stand in a file, checked, and their timestamps (s) where it has quaternions.
 
@@ -65,8 +80,7 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
     """
     numbers = read_numbers(path, (4, 8, 12, 16), _POSE_LINE)
     if numbers.shape[1] == 8:
-        stamps = np.where(np.abs(numbers[:, 0]) < _LATEST, numbers[:, 0], np.nan)
-        return _from_quaternions(numbers, quaternion, path), stamps
+        return _from_quaternions(numbers, quaternion, path), in_seconds(numbers[:, 0])
     if numbers.shape == (3, 4):
         numbers = numbers.reshape(1, 12)
     if numbers.shape[1] == 12:
@@ -76,23 +90,23 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
     return checked_poses(numbers.reshape(-1, 4, 4), path), None
 
 
-def _from_quaternions(numbers: Float[np.ndarray, "n 8"], order: str, path: Path) -> Poses:
+def _from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> Poses:
     """Poses of rows with a timestamp, a position and a quaternion.
 
     NaN for a frame if a number is none, or its quaternion is zero, as tools write a lost frame.
     """
-    is_known = np.isfinite(numbers[:, 1:]).all(axis=1) & (numbers[:, 4:] != 0).any(axis=1)
-    values = np.where(is_known[:, None], numbers, 4 * [np.nan] + 4 * [0.5])
+    times = in_seconds(rows[:, 0])
+    is_known = np.isfinite(rows[:, 1:]).all(axis=1) & (rows[:, 4:] != 0).any(axis=1)
+    values = np.where(is_known[:, None], rows, 4 * [np.nan] + 4 * [0.5])
     # Clipped, so that absurd numbers are refused and overflow nothing here.
     norms = np.linalg.norm(values[:, 4:].clip(-1e6, 1e6), axis=1)
-    is_timed = np.abs(numbers[:, 0]) < _LATEST
-    for i in np.flatnonzero((np.abs(norms - 1) > _RIGID) | (is_known & ~is_timed)):
+    for i in np.flatnonzero((np.abs(norms - 1) > _RIGID) | (is_known & np.isnan(times))):
         raise DataError(
-            f"{path} pose {i} has the time {numbers[i, 0]:.13g} and a quaternion of norm "
+            f"{path} pose {i} has the time {rows[i, 0]:.13g} and a quaternion of norm "
             f"{norms[i]:.3g}: columns must be finite timestamps (s), tx ty tz and a unit "
             f"quaternion ({' '.join('q' + axis for axis in order)})"
         )
-    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
     q_xyzw = values[:, [4 + order.index(axis) for axis in "xyzw"]]
     poses[:, :3, :3] = Rotation.from_quat(q_xyzw).as_matrix()
     poses[:, :3, 3] = values[:, 1:4]

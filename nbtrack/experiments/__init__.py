@@ -14,9 +14,14 @@ from pathlib import Path
 
 import nbtrack.beyond  # registers its fields and trackers
 from nbtrack.core.errors import ConfigError, MissingError
+from nbtrack.core.progress import tell
 
 for plugin in entry_points(group="nbtrack"):
-    plugin.load()
+    try:
+        plugin.load()
+    except Exception as error:  # of somebody else's package, without which all others still work
+        reason = f"{type(error).__name__}: {error}"
+        tell(f"nbtrack: warning: plug-in {plugin.value} is left out ({reason}): mend or remove it")
 
 IMPORTED: list[str] = []
 """What `import_own` has imported, for workers, and for the command that makes a run again."""

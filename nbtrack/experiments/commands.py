@@ -28,11 +28,12 @@ from nbtrack.experiments.output import (
     save_picture,
 )
 from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
+from nbtrack.experiments.runs import read_trajectory
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
-from nbtrack.plots.meshes import extract_mesh
+from nbtrack.plots.meshes import extract_mesh, mesh_bytes
 from nbtrack.plots.rerun_file import rerun_bytes
 from nbtrack.recordings.reading import (
     parse_frames,
@@ -45,7 +46,7 @@ from nbtrack.recordings.writer import convert_sequence
 from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.methods import METHODS, Method
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
-from nbtrack.tracking.trajectories import number_lines, read_trajectory, read_tum
+from nbtrack.tracking.trajectories import number_lines, read_tum
 
 # What is printed in place of names in metrics.json that say too little.
 _MEANINGS = {
@@ -93,10 +94,9 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
     except DataError as error:
         print(f"  no mesh: {error}")
         return
-    write_atomic(job.folder / MESH_FILE, mesh.export(file_type="ply"))
-    origin = finished.record["origin"]
-    where = f", relative to {origin} m" if any(origin) else ""
-    print(f"  mesh of what was seen: {job.folder / MESH_FILE}{where}")
+    origin = np.array(finished.record["origin"])
+    write_atomic(job.folder / MESH_FILE, mesh_bytes(mesh, "ply", origin))
+    print(f"  mesh of what was seen: {job.folder / MESH_FILE}")
 
 
 def track_command(options: Namespace) -> None:
@@ -246,7 +246,9 @@ def _export_map(source: Path, format_name: str, out: Path) -> str:
     is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
     with naming_damaged(seen, "mesh", "remove it and map again"):
         mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)
-        content = mesh.export(file_type=format_name)
+        origin = np.array(finished.record["origin"])
+        mesh.vertices -= origin * is_seen  # the file stands in the world of the recording
+        content = mesh_bytes(mesh, format_name, origin)
     write_atomic(out, content)
     return f"{len(mesh.vertices)} coloured vertices of {'what was seen' if is_seen else 'all'}"
 

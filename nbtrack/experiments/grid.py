@@ -28,6 +28,7 @@ from nbtrack.experiments.jobs import Job
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.presets import Preset
+from nbtrack.experiments.runs import read_trajectory
 from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.fields import FIELDS
@@ -35,7 +36,7 @@ from nbtrack.interrupts import interrupts_put_off
 from nbtrack.mapping.files import Map
 from nbtrack.tracking import TRACKERS
 from nbtrack.tracking.methods import Methods, find_methods
-from nbtrack.tracking.trajectories import Trajectory, read_trajectory
+from nbtrack.tracking.trajectories import Trajectory
 
 _REPORT_SECONDS = 0.3  # between two reports of a worker
 _SECONDS_TO_CONNECT = 10

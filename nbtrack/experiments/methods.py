@@ -2,7 +2,7 @@
 
 from nbtrack.core.errors import ConfigError
 from nbtrack.fields import field_class
-from nbtrack.tracking import TRACKERS
+from nbtrack.tracking import TRACKERS, tracker_class
 from nbtrack.tracking.methods import METHODS, Method, find_methods
 
 DEFAULT_METHOD = "corrected"
@@ -31,7 +31,12 @@ def method_of(name: str | None, field: str | None, tracker: str | None) -> Metho
     if field is None and tracker is None:
         return find_methods([name or DEFAULT_METHOD])[0]
     if tracker is None:
-        tracker = next(t for t in ("lm", "icp", "vr") if TRACKERS[t].works_in(field_class(field)))
+        kind = field_class(field)
+        fits = [name for name in ("lm", "icp", "vr") if TRACKERS[name].works_in(kind)]
+        own = [name for name in TRACKERS if tracker_class(name).works_in(kind)]
+        if not fits + own:
+            raise ConfigError(f"no tracker works on field {field!r}: register one of your own")
+        tracker = (fits + own)[0]
     if field is None:
         field = next((row.field for row in METHODS.values() if row.tracker == tracker), "neus")
     return find_methods([Method(f"{field_class(field).label} with {tracker}", field, tracker)])[0]

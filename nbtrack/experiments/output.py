@@ -11,11 +11,11 @@ from PIL import Image
 
 from nbtrack.core.errors import ConfigError
 from nbtrack.core.files import resolved, write_atomic
+from nbtrack.experiments.runs import METRICS_FILE
 from nbtrack.locks import locked
 from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, MESH_FILE
 from nbtrack.plots.style import in_house_style
 from nbtrack.recordings.formats import holds_recording
-from nbtrack.tracking.trajectories import METRICS_FILE
 
 OVERVIEW_FILE = "overview.png"
 # What the folders of runs, maps and tables may hold.

@@ -23,6 +23,7 @@ from nbtrack.experiments import IMPORTED
 from nbtrack.experiments.jobs import Job, Report
 from nbtrack.experiments.map_jobs import PLAIN_PRESET, GivenMap, MapJob
 from nbtrack.experiments.presets import PRESETS, SIZES
+from nbtrack.experiments.runs import METRICS_FILE
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
 from nbtrack.mapping.files import Map
@@ -32,7 +33,7 @@ from nbtrack.tracking.metrics import still_metrics, trajectory_metrics
 from nbtrack.tracking.reach import reach_metrics
 from nbtrack.tracking.starts import expected_poses
 from nbtrack.tracking.tracker import TrackerSettings
-from nbtrack.tracking.trajectories import METRICS_FILE, shifted, tum_text
+from nbtrack.tracking.trajectories import shifted, tum_text
 
 RUN_FILE = "run.pt"
 _OTHER_WORLD = (

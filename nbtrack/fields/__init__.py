@@ -15,7 +15,7 @@ FIELDS: dict[str, type[Field]] = {kind.name: kind for kind in (IMapField, NeuSFi
 
 def field_class(name: str) -> type[Field]:
     """The field of a name. Raises ConfigError, naming the nearest, for any other."""
-    return look_up_kind("field", name, FIELDS)
+    return look_up_kind("field", name, FIELDS, ("name", "label"))
 
 
 def make_field(name: str, network: NetworkSettings, bounds: SceneBounds, seed: int) -> Field:

@@ -74,6 +74,8 @@ def write_map(path: Path, finished: Map) -> None:
         "camera": asdict(finished.camera),
         "made": finished.record,
     }
+    with naming_damaged(path, "map", "give its record what `map_sequence` does"):
+        _check_content(header, tensors)
     header["digest"] = _digest(header, tensors)
     content = safetensors.torch.save(tensors, {_FORMAT: json.dumps(header, allow_nan=False)})
     history = {} if finished.history.empty else {HISTORY_FILE: finished.history.to_csv().encode()}

@@ -129,6 +129,7 @@ class _Fit:
         field.prepare(sequence, mapped)
         self.seconds = 0.0
         self.history = []
+        self.terms: list[str] = []
 
     def run(self, checkpoint: Path | None, on_iteration: OnIteration) -> None:
         """From the checkpoint, where there is one, to the last iteration."""
@@ -168,6 +169,11 @@ class _Fit:
         if not isinstance(terms, dict):
             raise ConfigError(
                 f"mapping_losses of {self.field.name} gave no dict: give terms by name"
+            )
+        if [*terms] != (self.terms or [*terms]):
+            raise ConfigError(
+                f"mapping_losses of {self.field.name} gave {', '.join(terms)} after "
+                f"{', '.join(self.terms)}: give the same terms every time, 0 where one is not used"
             )
         self.terms = [*terms]
         losses = torch.stack([*terms.values()])

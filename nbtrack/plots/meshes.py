@@ -1,5 +1,7 @@
 """Surfaces of maps as coloured meshes, and which part of them was seen."""
 
+import re
+
 import numpy as np
 import torch
 import trimesh
@@ -8,7 +10,7 @@ from skimage.measure import marching_cubes
 
 from nbtrack.beyond import PointCloud
 from nbtrack.beyond.points import min_depth_behind
-from nbtrack.core.arrays import Frames, WorldPoints
+from nbtrack.core.arrays import Frames, Position, WorldPoints
 from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
@@ -52,6 +54,30 @@ def extract_mesh(
     if not len(mesh.faces):
         raise DataError(f"no frame saw the surface of the {field.label} map: map for longer")
     return mesh
+
+
+def mesh_bytes(mesh: Mesh, kind: str, origin: Position) -> bytes:
+    """A mesh as a file, "ply" or "glb", in the world of the recording: moved by its origin (m).
+
+    Single precision resolves decimetres in map coordinates. There a PLY file gets double precision;
+    a GLB file knows none, and says by how much its node is moved.
+    """
+    if kind == "glb":
+        scene = trimesh.Scene()
+        scene.add_geometry(mesh, transform=trimesh.transformations.translation_matrix(origin))
+        return scene.export(file_type=kind)
+    content = mesh.export(file_type=kind)
+    if not origin.any():
+        return content
+    head, end, body = content.partition(b"end_header\n")
+    columns = re.findall(r"property (float|uchar) (\w+)", head.split(b"element face")[0].decode())
+    single = np.dtype([(name, "<f4" if kind == "float" else "u1") for kind, name in columns])
+    double = np.dtype([(name, "<f8" if kind == "float" else "u1") for kind, name in columns])
+    vertices = np.frombuffer(body, single, len(mesh.vertices)).astype(double)
+    for name, values in zip("xyz", (mesh.vertices + origin).T, strict=True):
+        vertices[name] = values
+    head = head.replace(b"property float", b"property double")
+    return head + end + vertices.tobytes() + body[len(vertices) * single.itemsize :]
 
 
 @torch.no_grad()

@@ -4,6 +4,7 @@ In calibration files, pixel centres lie at whole numbers, as OpenCV's calibratio
 datasets have it: the middle of 640 pixels is 319.5. Inside the package they lie at integer + 0.5.
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,17 @@ from nbtrack.data.text_files import read_numbers, read_object
 
 _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
 _LARGEST = 1e6  # pixels: no image is so wide
-_LENS = ("k1", "k2", "p1", "p2", "k3")  # in OpenCV's order
+_LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
 # Entries of a camera's JSON file, and how many numbers each may have.
 _COUNTS = dict.fromkeys(("fx", "fy", "cx", "cy", "width", "height", *_LENS), (1,))
 _COUNTS |= {"depth_scale": (1,), "scale": (1,), "intrinsic_matrix": (9,)}
-_COUNTS |= {"distortion": (0, 4, 5, 8), "coeffs": (0, 4, 5, 8)}
+_COUNTS |= dict.fromkeys(("distortion", "coeffs"), (0, 4, 5, 8, 12, 14))
+# Other entries that tell of the camera, and the words that say what holds anyway.
+_TELLING = re.compile(
+    r"([kpsb]\d+|tau.*|xi|alpha|skew|gamma)$|.*(radial|tangential|dist|lens|fish|model|unit)", re.I
+)
+_USUAL = ("", "none", "px", "pixel", "pixels", "pinhole", "simple_pinhole", "perspective")
+_USUAL += ("opencv", "full_opencv", "radtan", "plumb_bob", "brown_conrady", "rational_polynomial")
 _MIN_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 
 
@@ -41,7 +48,8 @@ class Calibration:
     def for_size(self, width: int, height: int, image: Path) -> Intrinsics:
         """The camera of images of a size: scaled where the calibration is for another one.
 
-        Raises DataError, which names `image`, if the proportions are others.
+        Raises DataError, which names `image`, if the proportions are others, or the principal
+        point lies outside.
         """
         factor = width / self.size[0] if self.size else 1.0
         if self.size and abs(factor * self.size[1] - height) > 1:
@@ -50,8 +58,14 @@ class Calibration:
                 f"{self.size[1]}: images may be resized but not cropped; give their calibration"
             )
         cx, cy = self.principal_point or (width / factor / 2, height / factor / 2)
-        in_pixels = (factor * length for length in (self.fx, self.fy, cx, cy))
-        return Intrinsics(width, height, *in_pixels)
+        fx, fy, cx, cy = (factor * length for length in (self.fx, self.fy, cx, cy))
+        if not (0 <= cx <= width and 0 <= cy <= height):
+            raise DataError(
+                f"{self.source} has its cx, cy at ({cx:.0f}, {cy:.0f}), outside of {image} of "
+                f"{width}x{height} pixels: it is another camera's, or for images of about "
+                f"{2 * cx:.0f}x{2 * cy:.0f}, whose width and height are then to be given with it"
+            )
+        return Intrinsics(width, height, fx, fy, cx, cy)
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -60,9 +74,9 @@ def read_calibration(path: Path) -> Calibration:
     Text holds `fx fy cx cy` in a line, OpenCV's 3x3 camera matrix, that within a 4x4 matrix, or
     one focal length. JSON holds an object with fx, fy, cx, cy or Open3D's `intrinsic_matrix` (nine
     numbers column by column) and, if known, width and height (or w and h), a lens as `distortion`,
-    `coeffs` or k1, k2, p1, p2, k3, and `depth_scale` or `scale`: depth values a metre, or, below 1,
+    `coeffs` or k1 to k6, p1, p2, and `depth_scale` or `scale`: depth values a metre, or, below 1,
     metres a value. It may be the value of `camera`, as in Replica's files. Raises DataError if
-    something is missing, no number, or impossible.
+    something is missing, no number, or impossible, or tells of another lens or unit.
     """
     K, others = _from_json(path) if path.suffix.lower() == ".json" else _from_text(path)
     fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
@@ -106,6 +120,14 @@ def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     camera = content["camera"] if isinstance(content.get("camera"), dict) else content
     camera = {{"w": "width", "h": "height"}.get(key, key): camera[key] for key in camera}
     others: dict[str, Any] = {"unused": tuple(sorted(camera.keys() - _COUNTS.keys()))}
+    for key in filter(_TELLING.match, others["unused"]):
+        value = camera[key]
+        is_usual = value.lower() in _USUAL if isinstance(value, str) else not np.any(value)
+        if not is_usual:
+            raise DataError(
+                f"{path}: {key} is {str(value)[:40]!r}, which is not used: undistort the images, "
+                f"and describe a pinhole camera, or OpenCV's lens by {', '.join(_LENS)}"
+            )
     found = {}
     for key in camera.keys() & _COUNTS.keys():
         values = camera[key] if isinstance(camera[key], list) else [camera[key]]

@@ -16,7 +16,14 @@ from jaxtyping import Bool
 from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.errors import DataError, MissingError
 from nbtrack.core.files import absolute, naming_damaged
-from nbtrack.data.text_files import Times, checked_poses, read_lines, read_numbers, read_poses
+from nbtrack.data.text_files import (
+    Times,
+    checked_poses,
+    in_seconds,
+    read_lines,
+    read_numbers,
+    read_poses,
+)
 from nbtrack.recordings.calibration import Calibration, read_calibration
 from nbtrack.recordings.formats import (
     FORMATS,
@@ -67,12 +74,13 @@ class Recording:
 
     @cached_property
     def origin(self) -> Position:
-        """Where (m) sequences have their origin: whole metres near the cameras of a recording that
-        is far from zero, as in map coordinates, since single precision would lose them; else 0."""
+        """Where (m) sequences have their origin: 0, or, of a recording that is far from it, as in
+        map coordinates, whole kilometres near its cameras, since single precision would lose them.
+        Recordings of one place so have one origin, that of its map."""
         if not self.has_pose.any():
             return np.zeros(3)
         center = np.median(self.T_world_camera[self.has_pose, :3, 3], axis=0)
-        return np.round(center) if np.abs(center).max() > _FAR_FROM_ZERO else np.zeros(3)
+        return np.round(center, -3) if np.abs(center).max() > _FAR_FROM_ZERO else np.zeros(3)
 
     def contents(self) -> tuple[list[tuple[str, str, str]], str, Declaration]:
         """What changes when a recording does: of every image its name and a digest, one of times,
@@ -143,10 +151,11 @@ def _own_times(folder: Path, colors: list[Path]) -> Times | None:
     if not path.is_file():
         stamps = [stamp_in(file) for file in colors]
         return None if None in stamps or (np.diff(stamps) <= 0).any() else np.array(stamps)
-    times = read_numbers(path, (1,), "the time (s) of a frame").ravel()
+    times = in_seconds(read_numbers(path, (1,), "the time (s) of a frame").ravel())
     if len(times) != len(colors) or not (np.diff(times) > 0).all():
         raise DataError(
-            f"{path} has {len(times)} times for {len(colors)} images: write one each (s), rising"
+            f"{path} has {len(times)} times for {len(colors)} images: write one each, rising, in "
+            "seconds, or since 1970 in milli-, micro- or nanoseconds"
         )
     return times
 
@@ -241,7 +250,7 @@ def _read_list(path: Path) -> tuple[Times, list[Path]]:
     advice = "every line holds 'timestamp file', such as '1305031102.175 rgb/1305031102.175.png'"
     with naming_damaged(path, "list", advice):
         rows = sorted((float(time), name) for time, name in rows)
-        times = np.array([time for time, _ in rows])
+        times = in_seconds(np.array([time for time, _ in rows]))
         if not np.isfinite(times).all():
             raise ValueError("a time is not finite")
     files = [path.parent / name for _, name in rows]

@@ -16,7 +16,7 @@ TRACKERS: dict[str, type[Tracker]] = {"vr": VrTracker, "sdf": SdfTracker}
 
 def tracker_class(name: str) -> type[Tracker]:
     """The tracker of a name. Raises ConfigError, naming the nearest, for any other."""
-    return look_up_kind("tracker", name, TRACKERS)
+    return look_up_kind("tracker", name, TRACKERS, ["name"])
 
 
 def check_pair(tracker_name: str, field: str | type) -> None:

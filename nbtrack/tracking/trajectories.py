@@ -23,7 +23,6 @@ from nbtrack.tracking.tracker import Estimate, Tracker
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 STEPS_TO_FIND = 1000  # a few dozen descents
-METRICS_FILE = "metrics.json"  # written last: where it stands, a run is complete
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 
@@ -67,7 +66,7 @@ def track_sequence(
                 tracker.restore(state["tracker"])
                 rows = state["rows"]
         for index in range(first + len(rows), len(sequence)):
-            is_found = is_start_known or not all(row["lost"] for row in rows)
+            is_found = is_start_known or not all(row.get("lost", False) for row in rows)
             budget = None if is_found else StepBudget(STEPS_TO_FIND)
             rows.append(_row(sequence, index, tracker.track(sequence[index], budget)))
             on_frame(index, rows[-1]["translation_error_m"])
@@ -86,28 +85,6 @@ def _check_trackable(sequence: RgbdSequence) -> None:
             f"no frame of {sequence.name} has a measured depth: check the depth folder and its "
             "unit (uint16 millimetres), or choose other --frames"
         )
-
-
-def read_trajectory(folder: Path) -> Trajectory:
-    """A finished run from its folder, its poses relative to the map's origin as in tracking.
-
-    Raises MissingError if there is none.
-    """
-    if not (folder / METRICS_FILE).is_file():
-        raise MissingError(f"no finished run in {folder}: give a folder that `track` wrote")
-    times, T_estimated = read_tum(folder / "trajectory.txt")
-    T_true = np.full_like(T_estimated, np.nan)
-    truth = folder / "groundtruth.txt"
-    if truth.is_file():
-        known, poses = read_tum(truth)
-        T_true[np.searchsorted(times, known)] = poses
-    metrics = files.read_json(folder / METRICS_FILE)
-    with files.naming_damaged(folder / "frames.csv", "table of frames", "track again"):
-        frames = pd.read_csv(folder / "frames.csv")
-        if len(frames) != len(T_estimated):
-            raise ValueError(f"{len(frames)} rows for {len(T_estimated)} poses")
-    back = -np.array(metrics.get("origin", [0, 0, 0]))
-    return Trajectory(shifted(T_estimated, back), shifted(T_true, back), frames, metrics)
 
 
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:

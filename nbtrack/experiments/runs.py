@@ -1,0 +1,34 @@
+"""Finished runs, read from their folders."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from nbtrack.core import files
+from nbtrack.core.errors import MissingError
+from nbtrack.tracking.trajectories import Trajectory, read_tum, shifted
+
+METRICS_FILE = "metrics.json"  # written last: where it stands, a run is complete
+
+
+def read_trajectory(folder: Path) -> Trajectory:
+    """A finished run from its folder, its poses relative to the map's origin as in tracking.
+
+    Raises MissingError if there is none.
+    """
+    if not (folder / METRICS_FILE).is_file():
+        raise MissingError(f"no finished run in {folder}: give a folder that `track` wrote")
+    times, T_estimated = read_tum(folder / "trajectory.txt")
+    T_true = np.full_like(T_estimated, np.nan)
+    truth = folder / "groundtruth.txt"
+    if truth.is_file():
+        known, poses = read_tum(truth)
+        T_true[np.searchsorted(times, known)] = poses
+    metrics = files.read_json(folder / METRICS_FILE)
+    with files.naming_damaged(folder / "frames.csv", "table of frames", "track again"):
+        frames = pd.read_csv(folder / "frames.csv")
+        if len(frames) != len(T_estimated):
+            raise ValueError(f"{len(frames)} rows for {len(T_estimated)} poses")
+    back = -np.array(metrics.get("origin", [0, 0, 0]))
+    return Trajectory(shifted(T_estimated, back), shifted(T_true, back), frames, metrics)
