@@ -17,7 +17,8 @@ import pytest
 from finished import GIVEN, MAP, OWN
 
 from nbtrack.cli import main
-from nbtrack.core.files import _tell_of_no_locks, loaded_checkpoint, save_checkpoint
+from nbtrack.core.files import loaded_checkpoint, save_checkpoint
+from nbtrack.locks import _tell_of_no_locks
 
 CHECKPOINT = "map/mapping.pt"
 

@@ -136,7 +136,7 @@ def test_a_field_is_asked_on_a_grid_of_the_voxel_that_is_set() -> None:
     tracker = LmTracker(narrow_room(), T_TRUE, StepBudget(1), LmSettings(voxel=0.1))
     assert isinstance(tracker.field, BakedField)
     assert tracker.field.voxel == 0.1
-    with pytest.raises(ConfigError, match=r"^voxel is 0.0 m, .* set .* m or more"):
+    with pytest.raises(ConfigError, match=r"^voxel is 0.0 m, .* set voxel=.* or more"):
         LmTracker(narrow_room(), T_TRUE, StepBudget(1), LmSettings(voxel=0.0))
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nbtrack.core.arrays import Colors, Points, Values
+from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.device import constant
 from nbtrack.core.errors import ConfigError
 from nbtrack.fields.base import Field
@@ -49,7 +50,7 @@ class BakedField(Field):
         self.is_distance = source.is_distance
         self.surface_level = float(source.surface_level)
         self.voxel = float(voxel)
-        self.n_vertices = _checked_size(source, voxel)
+        self.n_vertices = checked_size(source.bounds, voxel)
         # The first vertex lies one cell below the bounds; they are listed with z fastest.
         low = torch.tensor([x - voxel for x in self.bounds.minimum]).to(source.device)
         axes = (torch.arange(n, dtype=torch.int32, device=low.device) for n in self.n_vertices)
@@ -97,9 +98,11 @@ def trilinear(
     return nn.functional.grid_sample(volume[None], normalized, **options)[0, :, 0, 0]
 
 
-def _checked_size(field: Field, voxel: float | int) -> tuple[int, int, int]:
-    """Vertices along x, y and z, if the grid is allowed. Raises ConfigError otherwise."""
-    extent = np.subtract(field.bounds.maximum, field.bounds.minimum)
+def checked_size(
+    bounds: SceneBounds, voxel: float | int, setting: str = "voxel"
+) -> tuple[int, int, int]:
+    """Vertices along x, y and z, if the grid is allowed. Raises ConfigError, naming the setting."""
+    extent = np.subtract(bounds.maximum, bounds.minimum)
     # Stays floating-point until it is known to be small: 1e-300 m is a positive length.
     with np.errstate(all="ignore"):
         n_vertices = np.ceil(extent / voxel) + 3
@@ -108,8 +111,8 @@ def _checked_size(field: Field, voxel: float | int) -> tuple[int, int, int]:
         # The smallest that fits, with 5 % for the cells to spare and for rounding.
         enough = 1.05 * (float(np.prod(extent)) * _BYTES_PER_VERTEX / _MAX_BYTES) ** (1 / 3)
         raise ConfigError(
-            f"voxel is {voxel} m, of a scene of {' x '.join(f'{x:.3g}' for x in extent)} m: the "
-            f"grid of a baked field may take {_MAX_BYTES / 1e9:g} GB; set {enough:.2g} m or more; "
+            f"{setting} is {voxel} m, of a scene of {' x '.join(f'{x:.3g}' for x in extent)} m: the "
+            f"grid may take {_MAX_BYTES / 1e9:g} GB; set {setting}={enough:.2g} or more; "
             "is the scene smaller than that, `data check` may tell which depths or poses are wrong"
         )
     return tuple(n_vertices.astype(int).tolist())

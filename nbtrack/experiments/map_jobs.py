@@ -1,15 +1,17 @@
 """Maps as jobs: made from a scene, or given."""
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 from nbtrack import provenance
 from nbtrack.beyond.correct import correct_map
+from nbtrack.beyond.grid import checked_size
 from nbtrack.core.device import choose_device
 from nbtrack.core.files import fingerprint
+from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.jobs import Job, Report
 from nbtrack.experiments.presets import PRESETS, Preset
 from nbtrack.experiments.quality import score_map
@@ -37,6 +39,9 @@ class MapJob(Job):
     seed: int = 0
     correction: float = 0.0  # cells (m) in which the fitted map is corrected; 0: it is not
     out: Path | None = None
+    is_corrected_in: float = field(
+        default=0.0, compare=False
+    )  # cells (m), by the job that needs it
 
     kind, doing = "maps", "mapping"
 
@@ -69,7 +74,9 @@ class MapJob(Job):
     @cached_property
     def needs(self) -> "MapJob | None":
         """The map that this one corrects, if it is a corrected one."""
-        return replace(self, correction=0.0, out=None) if self.correction else None
+        if not self.correction:
+            return None
+        return replace(self, correction=0.0, out=None, is_corrected_in=self.correction)
 
     @property
     def is_done(self) -> bool:
@@ -115,6 +122,9 @@ class MapJob(Job):
             report(share, " ".join(f"{name} {loss:.3f}" for name, loss in losses.items()))
 
         sequence = self.scene.read(self.frames)
+        if self.is_corrected_in:  # what would fail after minutes of mapping is told now
+            setting = f"correction.{self.field}"
+            checked_size(observed_bounds(sequence), self.is_corrected_in, setting)
         parts = self.field, sequence, self.network, self.settings, self.seed
         if path.is_file():  # a folder of the user's, with another finished map
             recipe = recipe_of(*parts) | {"correction": self.correction}

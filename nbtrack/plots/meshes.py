@@ -1,5 +1,6 @@
 """Surfaces of maps as coloured meshes, and which part of them was seen."""
 
+import math
 import re
 
 import numpy as np
@@ -38,8 +39,13 @@ def extract_mesh(
         return trimesh.PointCloud(field.points.cpu().numpy(), colors.cpu().numpy())
     low, high = np.array([field.bounds.minimum, field.bounds.maximum])
     axes = [np.arange(a, b + voxel, voxel) for a, b in zip(low, high, strict=True)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    values = query_field(field, points)[1].reshape([len(axis) for axis in axes])
+    shape = tuple(map(len, axes))
+    parts = []
+    for first in range(0, math.prod(shape), _POINTS_AT_ONCE):  # of a large place all are gigabytes
+        numbers = np.arange(first, min(first + _POINTS_AT_ONCE, math.prod(shape)))
+        places = zip(axes, np.unravel_index(numbers, shape), strict=True)
+        parts.append(query_field(field, np.stack([axis[i] for axis, i in places], axis=-1))[1])
+    values = np.concatenate(parts).reshape(shape)
     if not values.min() < field.surface_level < values.max():
         raise DataError(
             f"the {field.label} map has no surface: its values lie in [{values.min():.3g}, "
