@@ -101,6 +101,6 @@ def test_voxels_that_are_refused(voxel: float) -> None:
         ConfigError, match=r"^voxel is .* m, of a .* m: .* may take .*; set "
     ) as error:
         BakedField(never, voxel)
-    advice = float(str(error.value).split("; set ")[1].split(" m")[0])
-    n_x, n_y, n_z = grid._checked_size(never, advice)
+    advice = float(str(error.value).split("; set voxel=")[1].split(" or")[0])
+    n_x, n_y, n_z = grid.checked_size(never.bounds, advice)
     assert n_x * n_y * n_z < 25e6  # or it takes many minutes

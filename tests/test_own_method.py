@@ -400,6 +400,16 @@ def test_terms_that_change(monkeypatch: pytest.MonkeyPatch) -> None:
         nbtrack.map_scene(scene, "mine", preset)
 
 
+def test_a_place_too_large_for_a_correction() -> None:
+    """Catches a refusal after minutes of mapping, and one that names no setting."""
+    settings = [*TINY, "scenes.names=['office']", "correction.neus_plus=0.001"]
+    preset = load_preset(settings=settings)
+    (scene,) = nbtrack.open_scenes(preset)
+    with pytest.raises(ConfigError, match=r"correction.neus_plus is 0.001 m.* set correction.neus"):
+        nbtrack.map_scene(scene, "neus_plus", preset)
+    assert not [*(runs_folder() / "maps").glob("*/map*")]
+
+
 def test_a_loss_without_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches torch's words about sparse tensors where a field returns the sum of its terms."""
 

@@ -111,7 +111,7 @@ def checked_size(
         # The smallest that fits, with 5 % for the cells to spare and for rounding.
         enough = 1.05 * (float(np.prod(extent)) * _BYTES_PER_VERTEX / _MAX_BYTES) ** (1 / 3)
         raise ConfigError(
-            f"{setting} is {voxel} m, of a scene of {' x '.join(f'{x:.3g}' for x in extent)} m: the "
+            f"{setting} is {voxel} m, of a scene of {' x '.join(f'{x:.3g}' for x in extent)} m: a "
             f"grid may take {_MAX_BYTES / 1e9:g} GB; set {setting}={enough:.2g} or more; "
             "is the scene smaller than that, `data check` may tell which depths or poses are wrong"
         )

@@ -39,9 +39,8 @@ class MapJob(Job):
     seed: int = 0
     correction: float = 0.0  # cells (m) in which the fitted map is corrected; 0: it is not
     out: Path | None = None
-    is_corrected_in: float = field(
-        default=0.0, compare=False
-    )  # cells (m), by the job that needs it
+    # Cells (m) in which the job that needs this map will correct it.
+    is_corrected_in: float = field(default=0.0, compare=False)
 
     kind, doing = "maps", "mapping"
 
