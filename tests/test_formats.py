@@ -377,6 +377,28 @@ def test_what_a_camera_file_says_counts(plain: Path) -> None:
         open_recording(plain)
 
 
+def test_colour_larger_than_depth(plain: Path) -> None:
+    """Catches the refusal of what LiDAR phones record, a calibration that is taken for the other
+    size, and one of no size that is taken for any."""
+    before = read_sequence(plain)
+    for file in (plain / "color").iterdir():
+        image = cv2.imread(str(file))
+        cv2.imwrite(str(file), cv2.resize(image, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST))
+    path = plain / "intrinsics.json"
+    words = json.loads(path.read_text())
+    large = {name: 4 * words[name] for name in ("fx", "fy", "width", "height")}
+    large |= {name: 4 * words[name] + 1.5 for name in ("cx", "cy")}
+    path.write_text(json.dumps(words | large))
+    recording = open_recording(plain)
+    sequence = read_frames(recording)
+    assert sequence.intrinsics == before.intrinsics
+    assert np.array_equal(sequence.colors, before.colors)
+    assert "colour is made as small as depth: 192x144 and 48x36" in recording.notes
+    path.write_text(json.dumps({name: words[name] for name in ("fx", "fy", "cx", "cy")}))
+    with pytest.raises(DataError, match=r"192x144 and 48x36, and .* does not say which"):
+        read_sequence(plain)
+
+
 def test_images_as_cameras_write_them(plain: Path) -> None:
     """Catches colours that a viewer's mark turns against their depth, a JPEG that is called damaged
     for what a camera has appended, and saturated depth that is taken for a wall 65 m away."""

@@ -26,7 +26,7 @@ def decode(
     Raises DataError if a file is damaged, of another kind or size, or holds depths over 65.535 m.
     """
     files = [(recording.color_files[i], recording.depth_files[i]) for i in frame_ids]
-    resize = recording.format.resize_color
+    resize = recording.format.resize_color or _is_larger(*files[0], recording)
     first = files[0][1 if resize else 0]  # the size is its
     height, width = _read_image(first, is_color=not resize).shape[:2]
     camera = recording.calibration.for_size(width, height, first)
@@ -70,6 +70,29 @@ def _read_image(path: Path, is_color: bool) -> Shaped[np.ndarray, "height width 
         with Image.open(path) as image:
             is_8_bit = not image.mode.startswith("I")
             return np.array(image.convert("RGB") if is_color and is_8_bit else image)
+
+
+def _is_larger(color_file: Path, depth_file: Path, recording: Recording) -> bool:
+    """Whether colour is larger than depth, in the same proportions, as phones with LiDAR give it.
+
+    It is then made as small, and a note says so. Raises DataError where the calibration does not
+    say which of both it is for.
+    """
+    of_color = _read_image(color_file, is_color=True).shape[1::-1]
+    of_depth = _read_image(depth_file, is_color=False).shape[1::-1]
+    factor = of_color[0] / of_depth[0]
+    if factor <= 1 or abs(factor * of_depth[1] - of_color[1]) > 1:
+        return False
+    sizes = " and ".join("x".join(map(str, size)) for size in (of_color, of_depth))
+    camera = recording.calibration
+    if not camera.size:
+        raise DataError(
+            f"colour and depth are {sizes}, and {camera.source} does not say which of both it is "
+            "for: write a JSON file with fx, fy, cx, cy and their width and height"
+        )
+    note = f"colour is made as small as depth: {sizes}"
+    recording.notes.extend([note] * (note not in recording.notes))
+    return True
 
 
 def _check(path: Path, image: np.ndarray, wanted: np.ndarray, first: Path) -> None:
