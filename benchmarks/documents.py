@@ -220,7 +220,6 @@ TABLES = {
     "breakfast": (breakfast, "paper_tables/paper_rooms/table_1_cells.csv"),
     "steps": (steps, "benchmarks/cpu/table_2.csv"),
     "mapping": (mapping, "benchmarks/cpu/mapping.csv"),
-    "gpu_steps": (steps, "benchmarks/gpu/table_2.csv"),
     "gpu_mapping": (mapping, "benchmarks/gpu/mapping.csv"),
     "gpu_recorded": (recorded, "benchmarks/gpu/steps.csv"),
     "gpu_kernels": (kernels, "benchmarks/gpu/kernels.csv"),
