@@ -212,7 +212,6 @@ def check_recording(
     if best is conventions[0] and fitted.size:
         compared = FramePairs(recording, ids, sequence, fitted)
         found, correlation = find_misfits(compared, sequence, own)
-    bar.move_to(2)
     bar.close()
     of_points = cloud[~is_far], cloud[is_far]
     agreement = conventions, best, found, correlation

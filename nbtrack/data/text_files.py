@@ -64,8 +64,8 @@ def in_seconds(times: Times) -> Times:
 
     >>> in_seconds(np.array([1403636579763555584.0, 1403636579796888917.0])).round(2).tolist()
     [1403636579.76, 1403636579.8]
-    >>> in_seconds(np.array([0.5, 1e13])).tolist()
-    [0.5, nan]
+    >>> in_seconds(np.array([0.5, 0.6, 1e13])).tolist()
+    [0.5, 0.6, nan]
     """
     usual = np.nanmedian(np.abs(times)) if np.isfinite(times).any() else 0.0
     unit = next((unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if usual * unit < _LATEST), 1.0)

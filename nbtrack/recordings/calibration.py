@@ -120,14 +120,7 @@ def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     camera = content["camera"] if isinstance(content.get("camera"), dict) else content
     camera = {{"w": "width", "h": "height"}.get(key, key): camera[key] for key in camera}
     others: dict[str, Any] = {"unused": tuple(sorted(camera.keys() - _COUNTS.keys()))}
-    for key in filter(_TELLING.match, others["unused"]):
-        value = camera[key]
-        is_usual = value.lower() in _USUAL if isinstance(value, str) else not np.any(value)
-        if not is_usual:
-            raise DataError(
-                f"{path}: {key} is {str(value)[:40]!r}, which is not used: undistort the images, "
-                f"and describe a pinhole camera, or OpenCV's lens by {', '.join(_LENS)}"
-            )
+    _check_unused(path, {key: camera[key] for key in others["unused"]})
     found = {}
     for key in camera.keys() & _COUNTS.keys():
         values = camera[key] if isinstance(camera[key], list) else [camera[key]]
@@ -156,3 +149,14 @@ def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
         return np.array(found["intrinsic_matrix"]).reshape(3, 3).T, others
     named = (found.get(key, [np.nan])[0] for key in ("fx", "fy", "cx", "cy"))
     return camera_matrix(*named), others
+
+
+def _check_unused(path: Path, entries: dict[str, Any]) -> None:
+    """Raises DataError where entries that are not used tell of another lens or unit."""
+    for key, value in entries.items():
+        is_usual = value.lower() in _USUAL if isinstance(value, str) else not np.any(value)
+        if _TELLING.match(key) and not is_usual:
+            raise DataError(
+                f"{path}: {key} is {str(value)[:40]!r}, which is not used: undistort the images, "
+                f"and describe a pinhole camera, or OpenCV's lens by {', '.join(_LENS)}"
+            )
