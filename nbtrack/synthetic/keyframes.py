@@ -6,16 +6,20 @@ position a piece, a constant turning rate in each that jumps at the joins, no tr
 motion where the camera turns back. Its 14.2 mm a frame are 5.7e-3 of the scene's unit of 2.5 m.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterable
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
+from jaxtyping import Float
+from scipy.interpolate import CubicHermiteSpline, PPoly
 from scipy.spatial.transform import Rotation, Slerp
 
 from nbtrack.core.arrays import Poses
-from nbtrack.synthetic.motion import CLEARANCE, camera_poses, steps_between, too_full
+from nbtrack.synthetic.motion import camera_poses, has_speed, is_clear, steps_between, too_full
 from nbtrack.synthetic.primitives import Points, Values
 from nbtrack.synthetic.room import Room
+from nbtrack.tracking.metrics import still_metrics
+
+Keys = Float[np.ndarray, "n 7"]  # as `camera_poses` takes them, and the frame that is there
 
 MEAN_STEP = np.array([5.7e-3, 0.45])  # translation (units of the scene), rotation (degrees)
 _FASTEST = np.array([8.5e-3, 0.95])  # the dataset's path: 7.8e-3 and 0.92
@@ -45,16 +49,6 @@ _NEAR = 0.8  # m; a quarter of an image at most is so near
 _MARGIN = 0.1  # m; of a scene's bounds
 
 
-@dataclass(frozen=True)
-class _Keys:
-    """Key poses, and the frames between them."""
-
-    places: Points  # m, world
-    yaw: Values  # rad; 0 looks along -z, positive turns left
-    pitch: Values  # rad; negative looks down
-    times: Values  # frames
-
-
 def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     """Camera-to-world poses (OpenCV axes) of an animated camera in a room.
 
@@ -64,39 +58,41 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     Raises `NumericalError` where no path keeps `CLEARANCE`: the room is too full.
     """
     length = min(max(n_frames, _CALIBRATION_FRAMES), _WALK_FRAMES)
-    keys = _keys_of_room(room, length)
-    least = min(_MIN_STILL_MOVED, 0.8 * _still(_calibrated_path(room, keys, length)))
-    for attempt in range(_ATTEMPTS):
-        rng = np.random.default_rng([seed, attempt, room.number])
-        shift = rng.uniform(-1, 1, keys.places.shape) * _SHIFTED
-        turn = rng.uniform(-_TURNED, _TURNED, len(keys.yaw))
-        moved = _Keys(keys.places + shift, keys.yaw + turn, keys.pitch, keys.times)
-        poses = _calibrated_path(room, moved, length)
-        if _still(poses) > least and _is_fit(room, poses):
-            period = 2 * (length - 1)
-            to_and_fro = np.abs((np.arange(n_frames) + length - 1) % period - (length - 1))
-            return poses[to_and_fro]
-    raise too_full(room)
+    seeds = [[attempt, room.number] for attempt in range(_ATTEMPTS)]
+    drawn = (_drawn_keys(room, length, np.random.default_rng(numbers)) for numbers in seeds)
+    keys, poses = _first_fit(room, length, drawn, _MIN_STILL)
+    moved = (_moved(keys, np.random.default_rng([seed, *numbers])) for numbers in seeds)
+    _, poses = _first_fit(room, length, moved, min(_MIN_STILL_MOVED, 0.8 * _still(poses)))
+    return poses[np.pad(np.arange(length), (0, n_frames), mode="reflect")[:n_frames]]
 
 
-def _keys_of_room(room: Room, length: int) -> _Keys:
-    """The first drawn key poses whose path leaves its start by enough, else by the most."""
+def _first_fit(
+    room: Room, length: int, candidates: Iterable[Keys], least: float
+) -> tuple[Keys, Poses]:
+    """The first keys whose path leaves its start by more than that (m), else by the most."""
     best = None
     farthest = 0.0
-    for attempt in range(_ATTEMPTS):
-        keys = _drawn_keys(room, length, np.random.default_rng([attempt, room.number]))
+    for keys in candidates:
         poses = _calibrated_path(room, keys, length)
         if _still(poses) > farthest and _is_fit(room, poses):
-            best = keys
+            best = keys, poses
             farthest = _still(poses)
-        if farthest > _MIN_STILL:
+        if farthest > least:
             break
     if best is None:
         raise too_full(room)
     return best
 
 
-def _drawn_keys(room: Room, length: int, rng: np.random.Generator) -> _Keys:
+def _moved(keys: Keys, rng: np.random.Generator) -> Keys:
+    """Key poses near others."""
+    moved = keys.copy()
+    moved[:, :3] += rng.uniform(-1, 1, (len(keys), 3)) * _SHIFTED
+    moved[:, 4] += rng.uniform(-_TURNED, _TURNED, len(keys))
+    return moved
+
+
+def _drawn_keys(room: Room, length: int, rng: np.random.Generator) -> Keys:
     """Random key poses: legs of a walk whose heading, height, speed and turning rate vary."""
     size = np.array(room.parts[0].solid.size)
     n_pieces = max(2, round(length / _FRAMES_A_PIECE))
@@ -107,63 +103,59 @@ def _drawn_keys(room: Room, length: int, rng: np.random.Generator) -> _Keys:
     heading = rng.uniform(-np.pi, np.pi) + np.cumsum(bend)
     legs = (frames * rng.uniform(*_SPEEDS, n_pieces))[:, None] * MEAN_STEP[0] * size.max() / 2
     legs = legs * np.stack([np.sin(heading), np.cos(heading)], axis=1)
-    places = np.empty((n_pieces + 1, 3))
-    places[:, 1] = rng.uniform(*_HEIGHTS, n_pieces + 1)
-    level = np.concatenate([np.zeros((1, 2)), np.cumsum(legs, axis=0)])
+    height = rng.uniform(*_HEIGHTS, n_pieces + 1)
+    level = np.cumsum([np.zeros(2), *legs], axis=0)
     middle = np.array(room.walk.center) + rng.uniform(-_AROUND, _AROUND, 2)
-    places[:, ::2] = middle + level - level.mean(axis=0)
+    x, z = (middle + level - level.mean(axis=0)).T
     turned = frames * rng.uniform(*_RATES, n_pieces) * rng.choice([-1, 1], n_pieces)
     yaw = room.walk.start_yaw + rng.uniform(-_ASTRAY, _ASTRAY)
     yaw = yaw + np.radians(MEAN_STEP[1]) * np.cumsum([0, *turned])
     pitch = room.walk.pitch + rng.uniform(-0.1, 0.1, n_pieces + 1)
-    return _Keys(places, yaw, pitch, np.concatenate([[0.0], np.cumsum(frames)]))
+    times = np.cumsum([0, *frames])
+    return np.stack([x, height, z, pitch, yaw, np.zeros_like(yaw), times], axis=1)
 
 
-def _calibrated_path(room: Room, keys: _Keys, length: int) -> Poses:
+def _calibrated_path(room: Room, keys: Keys, length: int) -> Poses:
     """The path through key poses, which are moved together and turned until speeds are right."""
-    places = keys.places
-    yaw = keys.yaw
+    keys = keys.copy()
+    columns = [0, 1, 2, 4]  # x, y, z, yaw
     unit = np.max(room.parts[0].solid.size) / 2
     for _ in range(4):
-        poses = _path(_Keys(places, yaw, keys.pitch, keys.times), length)
-        step_mm, step_deg = steps_between(poses).mean(axis=1)
+        poses = _path(keys, length)
         unit = _unit_of_view(room, poses) if room.sdf(poses[:, :3, 3]).min() > 0 else unit
-        ratio = np.clip(MEAN_STEP * [1e3 * unit, 1.0] / [step_mm, step_deg], 0.5, 2.0)
-        places = places.mean(axis=0) + (places - places.mean(axis=0)) * [ratio[0], 1, ratio[0]]
-        yaw = yaw.mean() + (yaw - yaw.mean()) * ratio[1]
-    return _path(_Keys(places, yaw, keys.pitch, keys.times), length)
+        wanted = MEAN_STEP * [1e3 * unit, 1.0]
+        farther, faster = np.clip(wanted / steps_between(poses).mean(axis=1), 0.5, 2.0)
+        middle = keys[:, columns].mean(axis=0)
+        away = keys[:, columns] - middle
+        keys[:, columns] = middle + away * [farther, 1, farther, faster]
+    return _path(keys, length)
 
 
-def _path(keys: _Keys, length: int) -> Poses:
+def _path(keys: Keys, length: int) -> Poses:
     """One cubic of the position and one turning rate between two key poses.
 
     At a join the camera keeps its direction, and is the slower the more the direction bends.
     """
-    legs = np.diff(keys.places, axis=0)
-    frames = np.diff(keys.times)[:, None]
+    places = keys[:, :3]
+    times = keys[:, 6]
+    legs = np.diff(places, axis=0)
     towards = legs / np.linalg.norm(legs, axis=1, keepdims=True)
     along = np.concatenate([towards[:1], (towards[1:] + towards[:-1]) / 2, towards[-1:]])
-    speed = np.linalg.norm(legs, axis=1, keepdims=True) / frames
+    speed = np.linalg.norm(legs, axis=1) / np.diff(times)
+    pieces = []
+    for k in range(len(legs)):
+        ends = slice(k, k + 2)
+        pieces.append(CubicHermiteSpline(times[ends], places[ends], along[ends] * speed[k]).c)
     at = np.arange(length)
-    piece = np.minimum(np.searchsorted(keys.times, at, side="right") - 1, len(legs) - 1)
-    places = np.empty((length, 3))
-    for k, (start, end) in enumerate(zip(keys.times, keys.times[1:], strict=False)):
-        ends = keys.places[k : k + 2]
-        velocities = along[k : k + 2] * speed[k]
-        places[piece == k] = CubicHermiteSpline([start, end], ends, velocities)(at[piece == k])
-    level = np.zeros(len(keys.yaw))
-    turned = camera_poses(tuple(keys.places.T), keys.yaw, keys.pitch, level)[:, :3, :3]
+    turning = Slerp(times, Rotation.from_matrix(camera_poses(keys[:, :6])[:, :3, :3]))
     poses = np.tile(np.eye(4), (length, 1, 1))
-    turning = Slerp(keys.times, Rotation.from_matrix(turned))
-    poses[:, :3, :3] = turning(at.clip(max=keys.times[-1])).as_matrix()
-    poses[:, :3, 3] = places
+    poses[:, :3, :3] = turning(at.clip(max=times[-1])).as_matrix()
+    poses[:, :3, 3] = PPoly(np.concatenate(pieces, axis=1), times)(at)
     return poses
 
 
 def _still(poses: Poses) -> float:
-    """The ATE (m) of a camera that stays at the first pose."""
-    away = np.linalg.norm(poses[1:, :3, 3] - poses[0, :3, 3], axis=1)
-    return float(np.sqrt(np.mean(away**2)))
+    return still_metrics(poses)["still_ate_m"]
 
 
 def _views(room: Room, poses: Poses) -> tuple[Points, Values]:
@@ -182,11 +174,10 @@ def _unit_of_view(room: Room, poses: Poses) -> float:
 
 
 def _is_fit(room: Room, poses: Poses) -> bool:
-    """Whether a path is at the right speed, free of obstacles, and looks at things far enough."""
-    if room.sdf(poses[:, :3, 3]).min() < CLEARANCE:
+    """Whether a path is free of obstacles, at the right speed, and looks at things far enough."""
+    if not is_clear(room, poses):
         return False
-    steps = steps_between(poses) / [[1e3 * _unit_of_view(room, poses)], [1.0]]
-    is_calm = (steps.max(axis=1) <= _FASTEST).all()
-    is_calm &= (np.abs(steps.mean(axis=1) / MEAN_STEP - 1) < 0.03).all()
+    unit = [1e3 * _unit_of_view(room, poses), 1.0]
     depths = _views(room, poses)[1].reshape(-1, len(_ACROSS) * len(_DOWN))
-    return bool(is_calm and np.quantile(depths, 0.25, axis=1).min() > _NEAR)
+    is_far = np.quantile(depths, 0.25, axis=1).min() > _NEAR
+    return bool(is_far and has_speed(poses, MEAN_STEP * unit, _FASTEST * unit, 0.03))

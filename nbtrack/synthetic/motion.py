@@ -14,6 +14,8 @@ from nbtrack.core.errors import NumericalError
 from nbtrack.synthetic.primitives import Points, Values
 from nbtrack.synthetic.room import Room, Walk
 
+Placed = Float[np.ndarray, "n 6"]  # x, y, z (m, world), pitch, yaw, roll (rad); see `camera_poses`
+
 # Translation (mm) and rotation (degrees) a frame; hand-held recordings at 30 Hz have 5 to 7 and 0.5
 # to 0.8.
 MEAN_STEP = np.array([6.0, 0.65])
@@ -27,7 +29,6 @@ _CENTER_REACH = 0.3
 _HEADING_REACH = 0.25
 _FLATTENING = 0.25  # width of the path's ellipse over its length
 _ATTEMPTS = 400
-_NO_TREMOR = np.zeros((1, 6))
 _CELL = 0.1  # m, of a tour's plan of free space
 _MARGIN = 0.1  # m that the plan keeps in addition to the clearance, since the path is smoothed
 _COVERED = 2.0  # m: the tour passes so near to every free place
@@ -52,15 +53,18 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     length = max(n_frames, _CALIBRATION_FRAMES)
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([seed, attempt, room.number])
-        poses = _calibrated_path(room.walk, length, rng)
-        steps = steps_between(poses)
+        poses = _glance_around(room.walk, length, rng)
         height = poses[:, 1, 3]
-        calm = (steps.max(axis=1) < 3 * MEAN_STEP).all()
-        calm &= (np.abs(steps.mean(axis=1) / MEAN_STEP - 1) < 0.05).all()
-        upright = height.min() >= HEIGHTS[0] and height.max() <= HEIGHTS[1]
-        if calm and upright and room.sdf(poses[:, :3, 3]).min() >= CLEARANCE:
+        is_upright = height.min() >= HEIGHTS[0] and height.max() <= HEIGHTS[1]
+        is_steady = has_speed(poses, MEAN_STEP, 3 * MEAN_STEP, 0.05)
+        if is_steady and is_upright and is_clear(room, poses):
             return poses[:n_frames]
     raise too_full(room)
+
+
+def is_clear(room: Room, poses: Poses) -> bool:
+    """Whether a path keeps `CLEARANCE`."""
+    return bool(room.sdf(poses[:, :3, 3]).min() >= CLEARANCE)
 
 
 def too_full(room: Room) -> NumericalError:
@@ -70,7 +74,7 @@ def too_full(room: Room) -> NumericalError:
     )
 
 
-def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
+def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
     """Draw a path and its speed; adjust radius and turning rate until mean speeds are as wanted."""
     knots = np.arange(-2.0, 1.6 * length * np.radians(MEAN_STEP[1]) / _KNOT_SPACING + 4.0)
     # Radius (relative), side (rad), yaw (rad), pitch (rad), roll (rad), height (m).
@@ -78,8 +82,8 @@ def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses
     values = spread * np.clip(rng.normal(size=(len(knots), 6)), -2.0, 2.0)
     values[:, 3] += walk.pitch
     values[:, 5] = np.clip(values[:, 5] + rng.uniform(1.3, 1.5), 1.15, 1.65)
-    path = CubicSpline(knots * _KNOT_SPACING, values)  # over the angle turned
-    speed = _relative_speed(length, rng)
+    wandering = CubicSpline(knots * _KNOT_SPACING, values)  # over the angle turned
+    covered = _before(_relative_speed(length, rng))
     trembling = _tremor(length, rng)
     center = np.asarray(walk.center) + rng.uniform(-_CENTER_REACH, _CENTER_REACH, 2)
     heading = walk.start_yaw + rng.uniform(-_HEADING_REACH, _HEADING_REACH)
@@ -87,16 +91,14 @@ def _calibrated_path(walk: Walk, length: int, rng: np.random.Generator) -> Poses
     radius = 0.7
     rate = np.radians(0.5)
     for _ in range(12):
-        angle = rate * np.concatenate([[0.0], np.cumsum(speed)[:-1]])
-        relative_radius, side, yaw_offset, pitch, roll, height = path(angle).T
+        angle = rate * covered
+        stretch, side, glance, pitch, roll, height = wandering(angle).T
         turned = walk.turn * angle
         # Opposite to the direction of view, so that the room lies before the camera.
-        along = -np.cos(turned + side)
-        across = -_FLATTENING * np.sin(turned + side)
-        reach = radius * (1.0 + relative_radius[:, None])
-        x, z = (center + reach * (np.stack([along, across], axis=1) @ axes)).T
-        yaw = heading + turned + yaw_offset
-        poses = camera_poses((x, height, z), yaw, pitch, roll, trembling)
+        ellipse = np.stack([-np.cos(turned + side), -_FLATTENING * np.sin(turned + side)], axis=1)
+        x, z = (center + radius * (1.0 + stretch[:, None]) * (ellipse @ axes)).T
+        yaw = heading + turned + glance
+        poses = camera_poses(np.stack([x, height, z, pitch, yaw, roll], axis=1) + trembling)
         slower = np.clip(MEAN_STEP / steps_between(poses).mean(axis=1), 0.7, 1.4)
         radius *= slower[0]
         rate *= slower[1]
@@ -110,6 +112,16 @@ def steps_between(T_world_camera: Poses) -> Float[np.ndarray, "2 n"]:
     # |R1 - R0| (Frobenius) = 2 sqrt(2) sin(angle / 2): accurate for the small angles here.
     step_deg = np.degrees(2 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0)))
     return np.stack([step_mm, step_deg])
+
+
+def has_speed(poses: Poses, mean: Values, largest: Values, tolerance: float) -> bool:
+    """Whether no step (mm, degrees) is larger than allowed, and the mean is off by little.
+
+    The tolerance is a share of the mean.
+    """
+    steps = steps_between(poses)
+    is_mean_right = np.abs(steps.mean(axis=1) / mean - 1) < tolerance
+    return bool((is_mean_right & (steps.max(axis=1) <= largest)).all())
 
 
 def tour(room: Room, n_frames: int, seed: int) -> Poses:
@@ -127,11 +139,9 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     around = _closed_walk(room, rng)
     length = np.linalg.norm(np.diff(around, axis=0, append=around[:1]), axis=1)
     # Three rounds, so that smoothing and interpolation meet no end in the middle one.
-    covered = np.concatenate([[0.0], np.cumsum(np.tile(length, 3))[:-1]])
-    curve = CubicSpline(covered, np.tile(around, (3, 1)))
+    curve = CubicSpline(_before(np.tile(length, 3)), np.tile(around, (3, 1)))
     speed = _relative_speed(n_frames, rng)
-    share = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) / speed.sum()
-    at = length.sum() * (1 + share)
+    at = length.sum() * (1 + _before(speed) / speed.sum())
     x, z = curve(at).T
     forward = curve(np.concatenate([at - length.sum(), at, at + length.sum()]), 1)
     yaw = np.unwrap(np.arctan2(-forward[:, 0], -forward[:, 1]))
@@ -139,8 +149,9 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     height = rng.uniform(1.3, 1.5) + _wander(n_frames, rng, 0.05)
     pitch = room.walk.pitch + _wander(n_frames, rng, 0.09)
     roll = _wander(n_frames, rng, 0.025)
-    poses = camera_poses((x, height, z), yaw, pitch, roll, _tremor(n_frames, rng))
-    if room.sdf(poses[:, :3, 3]).min() < CLEARANCE:
+    placed = np.stack([x, height, z, pitch, yaw, roll], axis=1)
+    poses = camera_poses(placed + _tremor(n_frames, rng))
+    if not is_clear(room, poses):
         raise too_full(room)
     return poses
 
@@ -194,11 +205,13 @@ def _relative_speed(n_frames: int, rng: np.random.Generator) -> Values:
     return speed / speed.mean()
 
 
-def _tremor(n_frames: int, rng: np.random.Generator) -> Float[np.ndarray, "n 6"]:
-    """A hand's tremor: translation (m) and rotation (pitch, yaw, roll; rad).
+def _before(steps: Values) -> Values:
+    """What was covered before each step."""
+    return np.concatenate([[0.0], np.cumsum(steps)[:-1]])
 
-    Four sines of 1.5 to 5 Hz each.
-    """
+
+def _tremor(n_frames: int, rng: np.random.Generator) -> Placed:
+    """A hand's tremor: four sines of 1.5 to 5 Hz for each number."""
     cycles_per_frame = rng.uniform(1.5, 5.0, (4, 6)) / 30
     phases = rng.uniform(0, 2 * np.pi, (4, 6))
     amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / 2.0
@@ -206,24 +219,20 @@ def _tremor(n_frames: int, rng: np.random.Generator) -> Float[np.ndarray, "n 6"]
     return amplitude * waves.sum(axis=1)
 
 
-def camera_poses(
-    places: tuple[Values, ...], yaw: Values, pitch: Values, roll: Values, trembling=_NO_TREMOR
-) -> Poses:
-    """Poses (OpenCV axes) at places (x, y and z, m) with angles (rad), and a tremor on top.
+def camera_poses(placed: Placed) -> Poses:
+    """Camera-to-world poses (OpenCV axes) at places with angles.
 
     Yaw 0 looks along -z and positive turns left; positive pitch looks up.
     """
-    yaw = yaw + trembling[:, 4]
-    pitch = pitch + trembling[:, 3]
-    roll = (roll + trembling[:, 5])[:, None]
+    pitch, yaw, roll = placed[:, 3:].T
     forward = [-np.sin(yaw) * np.cos(pitch), np.sin(pitch), -np.cos(yaw) * np.cos(pitch)]
     forward = np.stack(forward, axis=-1)
     right = np.stack([np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)], axis=-1)
     down = np.cross(forward, right)
-    cosine = np.cos(roll)
-    sine = np.sin(roll)
-    poses = np.tile(np.eye(4), (len(yaw), 1, 1))
-    poses[:, :3, 3] = np.stack(places, axis=1) + trembling[:, :3]
+    cosine = np.cos(roll)[:, None]
+    sine = np.sin(roll)[:, None]
+    poses = np.tile(np.eye(4), (len(placed), 1, 1))
+    poses[:, :3, 3] = placed[:, :3]
     axes = [cosine * right + sine * down, cosine * down - sine * right, forward]
     poses[:, :3, :3] = np.stack(axes, axis=-1)
     return poses
