@@ -26,8 +26,9 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.output import save_picture
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.plots.movie import view_of
-from nbtrack.plots.rooms import screen_axes, viewer_scene
+from nbtrack.plots.projection import screen_axes
 from nbtrack.plots.style import PALETTE, method_colors
+from nbtrack.plots.viewer import viewer_scene
 from nbtrack.synthetic import build_room
 from nbtrack.tables import published_table_1
 

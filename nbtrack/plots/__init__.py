@@ -15,7 +15,6 @@ from nbtrack.plots.figures import (
 )
 from nbtrack.plots.movie import cloud_of, movie_bytes, movie_pictures
 from nbtrack.plots.rooms import (
-    mesh_viewer,
     plot_map_and_slice,
     plot_mesh,
     plot_overview,
@@ -23,3 +22,4 @@ from nbtrack.plots.rooms import (
     plot_slice,
     plot_trajectories,
 )
+from nbtrack.plots.viewer import mesh_viewer

@@ -1,27 +1,24 @@
-"""Rooms: values, points and paths from above; meshes to look into, and to turn by hand.
+"""Rooms: values, points and paths from above; meshes to look into.
 
 Up is the axis of the world that the cameras' own up is nearest to: they are mostly held upright.
 """
 
 from collections.abc import Mapping
-from functools import partial
 from itertools import cycle
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import trimesh
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from trimesh.viewer.notebook import scene_to_notebook
 
 from nbtrack.core.arrays import Points, Poses, Transform, Values
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.plots.meshes import extract_mesh, query_field, seen_by
+from nbtrack.plots.projection import best_view, draw_mesh, up_of
 from nbtrack.plots.style import DOTTED, log_axes, method_colors, new_axes, styled
 from nbtrack.synthetic import Room
 from nbtrack.tables import STANDING_STILL
@@ -29,11 +26,7 @@ from nbtrack.tables import STANDING_STILL
 _POINTS_ALONG = 240  # grid points along the longer side of a slice
 _DIMMED = 0.72  # how white the unseen becomes
 _CUT = 0.01  # share of a recording's points cut off at either end: wild depths hide the room
-_MAX_FACES_TO_TURN = 10_000  # more are merged for the viewer
-_MAX_TUBES = 80  # straight pieces of a path in the viewer
-_ELEVATION = np.radians(45)  # of the viewer of a mesh
 _GREEN = method_colors(["true"])["true"]
-_AMBIENT = 0.55  # share of the light on a mesh that comes from everywhere
 
 
 @styled
@@ -172,9 +165,9 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
     label are drawn on top, and larger beside it; "true" is green, "tracked" red.
     """
     up = up_of(*T_paths.values())
-    to_screen = _best_view(mesh, up)
+    to_screen = best_view(mesh, up)
     room, enlarged = new_axes(title, 5.0, 1, 2, width_ratios=[2, 1])[0]
-    _draw_mesh(room, mesh, to_screen, up)
+    draw_mesh(room, mesh, to_screen, up)
     for axes in (room, enlarged):
         _draw_paths(axes, T_paths, to_screen[:2])
         _look_through(axes)
@@ -200,17 +193,16 @@ def plot_map_and_slice(
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = up_of(sequence.T_world_camera)
-    to_screen = _best_view(mesh, up)
+    to_screen = best_view(mesh, up)
     axes = new_axes(title, 4.6)[0, 0]
-    _draw_mesh(axes, mesh, to_screen, up)
+    draw_mesh(axes, mesh, to_screen, up)
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
     # From the room to where the slice is drawn; it is above the middle of the room's height.
     aside = 1.04 * np.ptp(mesh.vertices @ to_screen[0]) * to_screen[0]
     aside -= (height - (mesh.vertices @ up).mean()) * up
     page = [axis for axis in range(3) if up[axis] == 0]
     sides = [np.arange(low, high, voxel) for low, high in mesh.bounds[:, page].T]
-    points = np.empty((len(sides[0]), len(sides[1]), 3)) + height * up
-    points[..., page] = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
+    points = np.stack(np.meshgrid(*sides), axis=-1) @ np.eye(3)[page] + height * up
     _draw_slice(axes, field, sequence, points, (points + aside) @ to_screen[:2].T)
     _draw_paths(axes, T_paths, to_screen[:2], width=0.5)
     moved = {label: path.copy() for label, path in T_paths.items()}
@@ -244,113 +236,11 @@ def _draw_slice(
     axes.figure.colorbar(colors, ax=axes, label=field.value_label, extend="both", shrink=0.6)
 
 
-def _best_view(mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
-    """The `screen_axes` from which most surface of a room shows its front."""
-    # None of the azimuths looks along the walls of a room aligned to the axes.
-    screens = np.stack([screen_axes(up, azimuth) for azimuth in np.arange(15.0, 360.0, 30.0)])
-    fronts = _inward_side(mesh) * mesh.face_normals @ screens[:, 2].T
-    return screens[(mesh.area_faces @ fronts.clip(0)).argmax()]
-
-
-def _draw_mesh(axes: Axes, mesh: trimesh.Trimesh, to_screen: np.ndarray, up: np.ndarray) -> None:
-    """The faces of a mesh that show their front, shaded, the nearest on top."""
-    side = _inward_side(mesh)
-    faces = mesh.faces[side * mesh.face_normals @ to_screen[2] > 0]
-    corners = (mesh.vertices @ to_screen.T)[faces]
-    # Smoothed normals: those of single marching-cubes faces flicker.
-    normals = side * mesh.vertex_normals[faces].mean(axis=1)
-    light = to_screen[2] + 0.5 * to_screen[0] + 0.6 * up
-    shade = _AMBIENT + (1 - _AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)
-    colors = mesh.visual.vertex_colors[faces, :3].mean(axis=1) / 255 * shade[:, None]
-    order = corners[..., 2].mean(axis=1).argsort()  # from the farthest to the nearest
-    look = {"edgecolors": "face", "linewidths": 0.4, "rasterized": True}
-    axes.add_collection(PolyCollection(corners[order, :, :2], facecolors=colors[order], **look))
-
-
 def _look_through(axes: Axes) -> None:
     """Axes of a parallel projection: lengths across the picture are true."""
     axes.set(aspect="equal", xlabel="across the picture (m)", yticks=[])
     axes.spines["left"].set_visible(False)
     axes.grid(False)
-
-
-def _make_unlit(tree: dict) -> None:
-    """One material for all meshes of a scene that shows their colours as they are."""
-    tree["materials"] = [{"extensions": {"KHR_materials_unlit": {}}}]
-    tree["extensionsUsed"] = ["KHR_materials_unlit"]
-    for mesh in tree["meshes"]:
-        for primitive in mesh["primitives"]:
-            primitive["material"] = 0
-
-
-def mesh_viewer(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses]) -> Any:
-    """The same, to be turned by hand: HTML for a notebook. The mouse wheel scrolls the page.
-
-    It adds 1.2 MB to the notebook, 0.7 MB of it the viewer's own.
-    """
-    viewer = scene_to_notebook(viewer_scene(mesh, T_paths))
-    quiet = "<script>addEventListener('wheel', e => e.stopImmediatePropagation(), true)</script>"
-    viewer.data = viewer.data.replace("<body>", f"<body>{quiet}", 1)
-    return viewer
-
-
-def viewer_scene(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses]) -> trimesh.Scene:
-    """What it shows: the mesh, made coarser, and a tube for each path.
-
-    A tube ends in a pyramid, which opens where the last camera looks.
-    """
-    room = mesh.copy()
-    if len(room.faces) > _MAX_FACES_TO_TURN:  # vertices of a grid cell merge
-        cell = np.sqrt(2.2 * room.area / _MAX_FACES_TO_TURN)
-        room.apply_scale(1 / cell)
-        room.merge_vertices(digits_vertex=0, merge_tex=True, merge_norm=True)
-        room.update_faces(room.nondegenerate_faces() & room.unique_faces())
-        room.apply_scale(cell)
-    if _inward_side(room) < 0:
-        room.faces = room.faces[:, ::-1]  # the viewer leaves out faces that show their back
-    scene = trimesh.Scene({"mesh": room})
-    # The viewer's one light leaves sides black: it is switched off (glTF's KHR_materials_unlit).
-    scene.export = partial(scene.export, tree_postprocessor=_make_unlit)
-    for label, color in method_colors(T_paths).items():
-        path = _path_mesh(T_paths[label], 0.004 * mesh.scale)
-        path.visual.face_colors = trimesh.visual.color.hex_to_rgba(color)
-        scene.add_geometry(path, geom_name=label)
-    view = np.eye(4)
-    view[:3, :3] = screen_axes(up_of(*T_paths.values()), 15.0).T
-    scene.camera = trimesh.scene.Camera(name="viewer", fov=(60, 45))
-    scene.camera_transform = scene.camera.look_at(room.vertices, rotation=view)
-    return scene
-
-
-def _inward_side(mesh: trimesh.Trimesh) -> float:
-    """1 where the normals of a room's shell point inwards, else -1.
-
-    Marching cubes orients faces by the sign of the field, which differs between densities and
-    distances. The sign is that of the sum over the area, since a room's shell is larger than what
-    stands in it.
-    """
-    inwards = mesh.bounds.mean(axis=0) - mesh.triangles_center
-    return np.sign((inwards * mesh.face_normals).sum(axis=1) @ mesh.area_faces)
-
-
-def _path_mesh(T_world_camera: Poses, radius: float) -> trimesh.Trimesh:
-    """A tube along camera positions, and a pyramid from the last one to where that camera looks."""
-    places = T_world_camera[:, :3, 3]
-    corners = places[np.linspace(0, len(places) - 1, _MAX_TUBES + 1).astype(int)]
-    segments = np.stack([corners[:-1], corners[1:]], axis=1)
-    moved = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > 1e-6
-    parts = [trimesh.creation.cylinder(radius, segment=s, sections=6) for s in segments[moved]]
-    image = np.array([[-1.0, -0.75], [1.0, -0.75], [1.0, 0.75], [-1.0, 0.75]])
-    pyramid = 6 * radius * np.vstack([np.zeros(3), np.column_stack([image, np.full(4, 1.5)])])
-    pyramid = pyramid @ T_world_camera[-1, :3, :3].T + places[-1]
-    return trimesh.util.concatenate([*parts, trimesh.convex.convex_hull(pyramid)])
-
-
-def up_of(*T_paths: Poses) -> np.ndarray:
-    """The world's axis, with its sign, that is nearest to the mean up of cameras."""
-    above = -np.concatenate(T_paths)[:, :3, 1].mean(axis=0)
-    axis = np.abs(above).argmax()
-    return np.sign(above[axis]) * np.eye(3)[axis]
 
 
 def _draw_from_above(
@@ -389,13 +279,3 @@ def _draw_paths(
     axes.plot(
         *np.transpose(starts), "o", color="black", markersize=5 * width, zorder=4, label="start"
     )
-
-
-def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
-    """Rows: the picture's right, its upward direction, and the way to the viewer (world frame)."""
-    side = np.roll(up, 1)  # any horizontal axis is azimuth 0
-    azimuth = np.radians(azimuth_deg)
-    level = np.cos(azimuth) * side + np.sin(azimuth) * np.cross(up, side)
-    viewer = np.cos(_ELEVATION) * level + np.sin(_ELEVATION) * up
-    right = np.cross(up, level)
-    return np.stack([right, np.cross(viewer, right), viewer])

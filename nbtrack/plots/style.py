@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from matplotlib.transforms import Bbox
+from PIL import Image
 
 PALETTE = (
     "#3b6fb6", "#e08214", "#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d4d4d", "#a6911a",
@@ -49,13 +50,21 @@ class NotebookFigure(Figure):
     """A figure that is shown once where a cell ends with it; it is not registered with pyplot."""
 
     def _repr_mimebundle_(self, **chosen: object) -> tuple[dict, dict]:
-        """The picture's title describes it where it cannot be seen, whichever way it is drawn."""
-        return {}, {"image/png": {"alt": self.get_suptitle().replace("\n", " ")}}
+        """The picture's title describes it where it cannot be seen, whichever way it is drawn.
+
+        It is shown at the figure's own size (pixels), at half that of the picture.
+        """
+        width, height = (round(pixels) for pixels in self.bbox.size)
+        alt = self.get_suptitle().replace("\n", " ")
+        return {}, {"image/png": {"alt": alt, "width": width, "height": height}}
 
     def _repr_png_(self) -> bytes:
-        buffer = io.BytesIO()
-        self.savefig(buffer, format="png", pil_kwargs={"optimize": True})  # notebooks stay small
-        return buffer.getvalue()
+        """A picture for dense screens, without transparency: notebooks stay small."""
+        drawn = io.BytesIO()
+        self.savefig(drawn, dpi=2 * self.dpi)
+        picture = io.BytesIO()
+        Image.open(drawn).convert("RGB").save(picture, "PNG", optimize=True)
+        return picture.getvalue()
 
     def legend_below(self) -> None:
         """The first panel's legend for the whole figure."""
