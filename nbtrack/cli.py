@@ -52,7 +52,7 @@ OPTIONS = {
     "room": _option("its name"),
     "source": _option("folder of a run or a map, or a map file", a_path),
     "out": _option("file or folder to write", a_path),
-    "--format": _option("neural_rgbd, tum, replica, 7scenes, scannet, plain (default: found)"),
+    "--format": _option("a format's name, as in data/README.md (default: told by the files)"),
     "--method": _option("one of `nbtrack methods` (default: corrected); tables take vr,sdf"),
     "--field": _option("in place of a method: imap, neus, neus_plus or another field"),
     "--tracker": _option("in place of a method: vr, sdf, lm or another tracker"),

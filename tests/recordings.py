@@ -176,6 +176,39 @@ def write_plain(folder: Path, data: Source) -> None:
     (folder / "trajectory.txt").write_text(tum_lines(np.arange(len(data.poses)) / 30, data.poses))
 
 
+def write_record3d(folder: Path, data: Source) -> None:
+    """An unpacked .r3d file: colour four times as large as depth, which is not packed."""
+    K = camera_matrix(data.camera)
+    K[:2] *= 4
+    K[:2, 2] += 2  # from the image's corner, as Apple counts
+    for i, (color, depth_mm) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
+        write_image(folder / f"rgbd/{i}.jpg", color.repeat(4, axis=0).repeat(4, axis=1))
+        (folder / f"rgbd/{i}.depth").write_bytes((depth_mm / 1000).astype("<f4").tobytes())
+    T = data.poses @ np.diag([1.0, -1, -1, 1])
+    rows = np.hstack([Rotation.from_matrix(T[:, :3, :3]).as_quat(), T[:, :3, 3]])
+    size = {"w": 4 * data.camera.width, "h": 4 * data.camera.height, "fps": 60}
+    content = {"K": K.T.ravel().tolist(), "poses": rows.tolist(), **size}
+    (folder / "metadata").write_text(json.dumps(content))
+
+
+def write_polycam(folder: Path, data: Source) -> None:
+    """Named in microseconds; the app's first estimates of the poses must not be taken."""
+    size = data.camera.width * 4, data.camera.height * 4
+    K = camera_matrix(data.camera)
+    K[:2] *= 4
+    camera = {"width": size[0], "height": size[1], "fx": K[0, 0], "fy": K[1, 1]}
+    camera |= {"cx": K[0, 2] + 2, "cy": K[1, 2] + 2, "blur_score": 99.0}
+    for i, T in enumerate(data.poses @ np.diag([1.0, -1, -1, 1])):
+        name = 638443502 + 33333 * i
+        large = data.colors[i].repeat(4, axis=0).repeat(4, axis=1)
+        write_image(folder / f"keyframes/corrected_images/{name}.jpg", large)
+        write_image(folder / f"keyframes/depth/{name}.png", data.depths_mm[i])
+        for kind, pose in (("cameras", np.eye(4)), ("corrected_cameras", T)):
+            t = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+            (folder / "keyframes" / kind).mkdir(exist_ok=True)
+            (folder / f"keyframes/{kind}/{name}.json").write_text(json.dumps(camera | t))
+
+
 WRITERS: dict[str, Callable[[Path, Source], None]] = {
     "neural_rgbd": write_neural_rgbd,
     "tum": write_tum,
@@ -183,6 +216,8 @@ WRITERS: dict[str, Callable[[Path, Source], None]] = {
     "7scenes": write_seven_scenes,
     "scannet": write_scannet,
     "plain": write_plain,
+    "record3d": write_record3d,
+    "polycam": write_polycam,
 }
 
 

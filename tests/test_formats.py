@@ -1,10 +1,12 @@
 """Every format is read back as it was written: poses, depth, colour, camera."""
 
 import json
+import sys
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -36,7 +38,7 @@ from nbtrack.recordings.reading import parse_frames, read_frames, read_sequence,
 from nbtrack.recordings.recording import image_digest, open_recording
 from nbtrack.recordings.writer import convert_sequence
 
-LOSSY = ("replica", "scannet")  # colour is JPEG
+LOSSY = ("replica", "scannet", "record3d", "polycam")  # colour is JPEG
 
 
 def check_equal(sequence: RgbdSequence, data: Source, lossy: bool = False) -> None:
@@ -92,6 +94,39 @@ def test_round_trip(tmp_path: Path, format: str) -> None:
     seen = {str(replace(recording, **change).contents()) for change in changes}
     seen |= {str(open_recording(folder).contents()), str(recording.contents())}
     assert len(seen) == len(changes) + 1
+
+
+@pytest.mark.parametrize(("format", "step"), [("record3d", 1 / 60), ("polycam", 0.033333)])
+def test_of_a_phone(tmp_path: Path, format: str, step: float) -> None:
+    """Catches ARKit's axes taken for OpenCV's, a principal point counted from a pixel's centre, and
+    times of another clock: points of one frame must lie on the surface that another sees."""
+    recording = open_recording(write_recording(format, tmp_path / "r"))
+    assert np.diff(recording.times) == pytest.approx(step)
+    sequence = read_frames(recording)
+    camera, (T_first, T_last) = sequence.intrinsics, sequence.T_world_camera[[0, 3]]
+    rows, columns = np.nonzero(sequence.depths_mm[0])
+    z = sequence.depth(0)[rows, columns]
+    x, y = (columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z
+    T_last_first = np.linalg.inv(T_last) @ T_first
+    x, y, z = T_last_first[:3, :3] @ [x, y, z] + T_last_first[:3, 3:]
+    u = np.floor(camera.fx * x / z + camera.cx).astype(int)
+    v = np.floor(camera.fy * y / z + camera.cy).astype(int)
+    is_seen = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    assert is_seen.mean() > 0.5
+    assert np.median(np.abs(sequence.depth(3)[v[is_seen], u[is_seen]] - z[is_seen])) < 0.01
+
+
+def test_compressed_depth_of_a_phone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches compressed depth that is read as numbers, or refused without a way out."""
+    folder = write_recording("record3d", tmp_path / "r")
+    for path in (folder / "rgbd").glob("*.depth"):
+        path.write_bytes(b"bvx2" + path.read_bytes())
+    monkeypatch.setitem(sys.modules, "liblzfse", None)
+    with pytest.raises(MissingError, match=r"LZFSE.*pip install pyliblzfse.* 16-bit PNG"):
+        read_sequence(folder)
+    reader = SimpleNamespace(decompress=lambda content: content[4:])
+    monkeypatch.setitem(sys.modules, "liblzfse", reader)
+    assert np.array_equal(read_sequence(folder).depths_mm, source().depths_mm)
 
 
 def test_natural_order_with_unpadded_and_padded_numbers(tmp_path: Path) -> None:

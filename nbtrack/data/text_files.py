@@ -24,9 +24,9 @@ _LATEST = 1e11  # s: no timestamp is larger; since 1970 even milliseconds are
 _RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 
 
-def read_object(path: Path) -> dict[str, Any]:
-    """A JSON or TOML file, by its name, that holds an object. Raises DataError otherwise."""
-    kind = "JSON" if path.suffix.lower() == ".json" else "TOML"
+def read_object(path: Path, kind: str = "") -> dict[str, Any]:
+    """A JSON or TOML file, by its name if not said, of an object. Raises DataError otherwise."""
+    kind = kind or ("JSON" if path.suffix.lower() == ".json" else "TOML")
     with naming_damaged(path, f"{kind} file of names and values", "correct it or write it anew"):
         text = path.read_text(**_TOLERANT)
         return {**(tomllib.loads(text) if kind == "TOML" else json.loads(text))}

@@ -80,21 +80,34 @@ def read_calibration(path: Path) -> Calibration:
     """
     K, others = _from_json(path) if path.suffix.lower() == ".json" else _from_text(path)
     fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    is_matrix = np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6)
+    if not np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6):
+        raise _no_camera(path, K)
+    camera = Calibration(path, fx, fy, **{"principal_point": (cx + 0.5, cy + 0.5), **others})
+    return checked_camera(camera)
+
+
+def checked_camera(camera: Calibration) -> Calibration:
+    """The camera, or raises DataError where its numbers are none's."""
+    fx, fy = camera.fx, camera.fy
+    cx, cy = camera.principal_point or (0.0, 0.0)
     # NaN fails both: numpy's minimum keeps it, unlike Python's.
     is_camera = np.min([fx, fy]) >= _MIN_FOCAL and np.abs([fx, fy, cx, cy]).max() < _LARGEST
-    if not (is_matrix and is_camera):
-        advice = "calibrate anew"
-        if fy < 0:  # as in ICL-NUIM
-            advice = (
-                "a negative fy is that of a camera whose y axis points up: write it positive, and "
-                "if `data check` then finds other axes, the camera_axes that it names"
-            )
-        raise DataError(
-            f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
-            f"pixels, without skew, the focal lengths positive, all finite; {advice}"
+    if not (is_camera and min(camera.size or (1,)) >= 1):
+        raise _no_camera(camera.source, camera_matrix(fx, fy, cx - 0.5, cy - 0.5))
+    return camera
+
+
+def _no_camera(path: Path, K: Float[np.ndarray, "3 3"]) -> DataError:
+    advice = "calibrate anew"
+    if K[1, 1] < 0:  # as in ICL-NUIM
+        advice = (
+            "a negative fy is that of a camera whose y axis points up: write it positive, and "
+            "if `data check` then finds other axes, the camera_axes that it names"
         )
-    return Calibration(path, fx, fy, **{"principal_point": (cx + 0.5, cy + 0.5), **others})
+    return DataError(
+        f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
+        f"pixels, without skew, the focal lengths positive, all finite; {advice}"
+    )
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:

@@ -4,23 +4,23 @@
 recording does otherwise than its format, it says in `sequence.toml`: any field of `Declaration`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from nbtrack.core.arrays import Poses
+from nbtrack.core.arrays import DepthImage, Poses
 from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.core.files import absolute
 from nbtrack.core.settings import limited, one_of, with_values
 from nbtrack.data.dataset import DATASET_UNITS
-from nbtrack.data.text_files import read_object
-from nbtrack.recordings.calibration import Calibration
+from nbtrack.data.text_files import Times, read_object, read_poses
+from nbtrack.recordings.calibration import Calibration, read_calibration
 from nbtrack.recordings.names import frame_keys
 
 DECLARATION_FILE = "sequence.toml"
-_IMAGES = (".png", ".jpg", ".jpeg")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 CAMERA_TO_WORLD = "camera-to-world"
 WORLD_TO_CAMERA = "world-to-camera"
 SPELLED_AXES = {"opencv": "right down forward", "opengl": "right up backward"}
@@ -87,7 +87,13 @@ class Format:
     known_cameras: tuple[Calibration, ...] = ()  # without a file; `source` is in the folder's name
     declared: Declaration = Declaration()  # what its numbers mean
     counts_from_0: bool = False  # a number is the place of the frame's pose in a list
+    poses_in_order: bool = False  # the first pose of a list is the first image's, and so on
     resize_color: bool = False  # colour has another size than depth and shows the same view
+    # Own readers: of a file of poses, their quaternions' order given, with times (s) where it says
+    # them; of a calibration; of a depth map in `depth_scale`, where that is no PNG or JPEG file.
+    read_poses: Callable[[Path, str], tuple[Poses, Times | None]] = read_poses
+    read_camera: Callable[[Path], Calibration] = read_calibration
+    read_depth: Callable[[Path, Calibration], DepthImage] | None = None
 
     @property
     def needs(self) -> tuple[tuple[str, ...], ...]:
@@ -107,10 +113,11 @@ class Format:
 
 
 def files_of(folder: Path, pattern: str) -> list[Path]:
-    """Files that a pattern names, texts or images as it says, `img2` before `img10`."""
+    """Files of the suffix that a pattern names, else images; `img2` before `img10`."""
     if (folder / pattern).is_file():
         return [folder / pattern]
-    suffixes = (".txt",) if pattern.endswith(".txt") else _IMAGES
+    suffix = Path(pattern).suffix
+    suffixes = IMAGE_SUFFIXES if suffix in ("", ".*") else (suffix,)
     paths = (folder / pattern).parent.glob(Path(pattern).name)
     # Hidden files are the system's.
     files = [p for p in paths if p.suffix.lower() in suffixes and p.name[0] != "." and p.is_file()]

@@ -13,6 +13,7 @@ from nbtrack.core.errors import DataError
 from nbtrack.core.files import naming_damaged
 from nbtrack.core.progress import ProgressBar
 from nbtrack.recordings.calibration import camera_matrix
+from nbtrack.recordings.formats import IMAGE_SUFFIXES
 from nbtrack.recordings.recording import Recording
 
 _FARTHEST_MM = _SATURATED = 65535  # what 16 bits hold; a camera's "farther than I can say"
@@ -28,7 +29,8 @@ def decode(
     files = [(recording.color_files[i], recording.depth_files[i]) for i in frame_ids]
     resize = recording.format.resize_color or _is_larger(*files[0], recording)
     first = files[0][1 if resize else 0]  # the size is its
-    height, width = _read_image(first, is_color=not resize).shape[:2]
+    image = _read_depth(first, recording) if resize else _read_image(first, is_color=True)
+    height, width = image.shape[:2]
     camera = recording.calibration.for_size(width, height, first)
     maps = _undistortion(camera, recording.calibration.distortion)
     colors = np.empty((len(files), height, width, 3), np.uint8)
@@ -37,7 +39,7 @@ def decode(
     def read(index: int) -> None:
         color_file, depth_file = files[index]
         color = _read_image(color_file, is_color=True)
-        depth = _read_image(depth_file, is_color=False)
+        depth = _read_depth(depth_file, recording)
         if resize:
             color = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
         _check(color_file, color, colors[index], first)
@@ -72,6 +74,13 @@ def _read_image(path: Path, is_color: bool) -> Shaped[np.ndarray, "height width 
             return np.array(image.convert("RGB") if is_color and is_8_bit else image)
 
 
+def _read_depth(path: Path, recording: Recording) -> Shaped[np.ndarray, "height width *channels"]:
+    """A depth map's values as they are stored, or as its format has them."""
+    if recording.format.read_depth and path.suffix.lower() not in IMAGE_SUFFIXES:
+        return recording.format.read_depth(path, recording.calibration)
+    return _read_image(path, is_color=False)
+
+
 def _is_larger(color_file: Path, depth_file: Path, recording: Recording) -> bool:
     """Whether colour is larger than depth, in the same proportions, as phones with LiDAR give it.
 
@@ -79,7 +88,7 @@ def _is_larger(color_file: Path, depth_file: Path, recording: Recording) -> bool
     say which of both it is for.
     """
     of_color = _read_image(color_file, is_color=True).shape[1::-1]
-    of_depth = _read_image(depth_file, is_color=False).shape[1::-1]
+    of_depth = _read_depth(depth_file, recording).shape[1::-1]
     factor = of_color[0] / of_depth[0]
     if factor <= 1 or abs(factor * of_depth[1] - of_color[1]) > 1:
         return False

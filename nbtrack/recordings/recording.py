@@ -22,9 +22,8 @@ from nbtrack.data.text_files import (
     in_seconds,
     read_lines,
     read_numbers,
-    read_poses,
 )
-from nbtrack.recordings.calibration import Calibration, read_calibration
+from nbtrack.recordings.calibration import Calibration
 from nbtrack.recordings.formats import (
     FORMATS,
     WORLD_TO_CAMERA,
@@ -167,7 +166,7 @@ def _calibration(folder: Path, layout: Format, notes: list[str]) -> Calibration:
         assumed = f"the camera assumed for {layout.label}"
         notes.append(f"{assumed}, {known[0].fx:g} px at 640x480: no {layout.cameras[0]}")
         return replace(known[0], source=folder / assumed)
-    camera = read_calibration(layout.files(folder, layout.cameras, "calibration")[0])
+    camera = layout.read_camera(layout.files(folder, layout.cameras, "calibration")[0])
     if camera.unused:
         notes.append(f"not used of {camera.source.name}: {', '.join(camera.unused)}")
     return camera
@@ -189,12 +188,14 @@ def _with_poses(recording: Recording, moments: Moments, pose_file: str | None) -
     files = recording.format.files(folder, names, "poses")
     path = folder / there[0]
     times = recording.times
-    tables = [read_poses(file, declared.quaternion) for file in files]
+    tables = [recording.format.read_poses(file, declared.quaternion) for file in files]
     poses = checked_poses(np.concatenate([T for T, _ in tables]), path)
-    stamps = tables[0][1]
+    has_stamps = all(times is not None for _, times in tables)
+    stamps = np.concatenate([times for _, times in tables]) if has_stamps else None
+    is_in_order = recording.format.poses_in_order and len(poses) == len(colors)
     if "*" in path.name:
         _check_paired(colors, files)
-    else:
+    elif not is_in_order:
         flip = inverse if declared.poses == WORLD_TO_CAMERA else np.copy
         matched = moments.matched(poses, stamps, flip)
         if matched is None:
@@ -206,9 +207,9 @@ def _with_poses(recording: Recording, moments: Moments, pose_file: str | None) -
             )
         poses, note = matched
         recording.notes.extend([f"{path.name}: {note}"] * bool(note))
-        # Frames without times of their own have those of the poses, if there is one for each.
-        is_whole = moments.own is None and stamps is not None and len(stamps) == len(colors)
-        times = stamps if is_whole and (np.diff(stamps) > 0).all() else times
+    # Frames without times of their own have those of the poses, if there is one for each.
+    is_whole = moments.own is None and stamps is not None and len(stamps) == len(colors)
+    times = stamps if is_whole and (np.diff(stamps) > 0).all() else times
     return replace(recording, times=times, file_poses=poses, pose_file=path)
 
 
