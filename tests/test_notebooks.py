@@ -104,7 +104,7 @@ def test_numbers_in_prose_are_computed(
     """Catches a sentence whose number is no longer what the cells of its notebook hold or print:
     each with a decimal, or of two digits and more, is that of a cell, rounded, or one in m that
     the sentence has in cm or mm."""
-    if request.node.callspec.id[:2] not in ("05", "06", "07", "A1", "A2", "A3"):
+    if request.node.callspec.id[:2] not in ("05", "06", "07", "A1", "A2", "A3", "A5"):
         pytest.skip("what this notebook says is computed by hand in its cells")
     shown = ""
     for cell in cells:
