@@ -16,6 +16,7 @@ from nbtrack.plots.style import new_axes, styled
 
 _STEP = 0.02  # m, between the grid points of a slice
 _N_STRATIFIED, _N_IMPORTANCE = 32, 12  # samples a ray (iMAP)
+_DOT = {"edgecolors": "black", "linewidths": 0.5, "zorder": 4}
 
 
 @styled
@@ -44,22 +45,14 @@ def plot_idea(
     rays = Rays(pose[None, :3, 3], ray @ pose[:3, :3].T, unknown, unknown[:, 0])
     depths = density.hierarchical_depths(rays, _N_STRATIFIED, _N_IMPORTANCE)
     weights = density.render(rays, depths).weights[0].detach()
-    look = {"color": "#3b6fb6", "edgecolors": "black", "linewidths": 0.5, "zorder": 4}
     x, z = depths[0] * ray[0, 0], depths[0]
-    left.scatter(x, z, s=8 + 400 * weights, label=f"{len(z)} samples, by weight", **look)
-    depth = frame.at(torch.tensor([row]), torch.tensor([column]))[1]
-    point_camera = depth * ray[0]
-    point_world = (pose[:3, :3] @ point_camera + pose[:3, 3])[None].requires_grad_()
-    d = distance(point_world)[1]
-    (gradient,) = torch.autograd.grad(d.sum(), point_world)
-    foot = point_camera - d.detach() * (pose[:3, :3].T @ gradient[0])
-    start, end = (point[[0, 2]].tolist() for point in (point_camera, foot))
-    arrow = {"arrowstyle": "-|>", "linewidth": 2, "shrinkA": 0, "shrinkB": 0}
-    right.annotate("", end, start, arrowprops=arrow, zorder=5)
-    label = f"one query: d = {100 * d.item():.0f} cm"
-    right.scatter(*start, s=25, label=label, **look | {"color": "#e08214"})
+    left.scatter(
+        x, z, s=8 + 400 * weights, label=f"{len(z)} samples, by weight", color="#3b6fb6", **_DOT
+    )
+    point_camera = _draw_query(right, distance, frame, T_world_camera, row, column)
+    x, z = point_camera[0], point_camera[2]
     for axes in (left, right):
-        axes.plot([0, start[0]], [0, start[1]], color="0.2", linewidth=0.8)
+        axes.plot([0, x], [0, z], color="0.2", linewidth=0.8)
         axes.legend(loc="upper left", frameon=True)
     return left.figure
 
@@ -87,4 +80,22 @@ def _draw_row(axes: Axes, field: Field, frame: Frame, T_world_camera: Pose, row:
     axes.plot(0, 0, "k^", markersize=9)
     axes.set_ylim(bottom=-0.2)
     axes.set(xlabel="to the right of the camera (m)", ylabel="ahead (m)", aspect="equal")
-    axes.set_title(f"{field.label}: black its surface, green what was measured")
+    axes.set_title(f"{field.label}")
+
+
+def _draw_query(
+    axes: Axes, field: Field, frame: Frame, T_world_camera: Pose, row: int, column: int
+) -> list[float]:
+    """The measured point, its distance and the arrow; returns the point (m, camera frame)."""
+    pose = torch.from_numpy(T_world_camera).float()
+    point_camera = frame.points(torch.tensor([row]), torch.tensor([column]))[0][0]
+    point_world = (pose[:3, :3] @ point_camera + pose[:3, 3])[None].requires_grad_()
+    d = field(point_world)[1]
+    (gradient,) = torch.autograd.grad(d.sum(), point_world)
+    foot = point_camera - d.detach() * (pose[:3, :3].T @ gradient[0])
+    start, end = (point[[0, 2]].tolist() for point in (point_camera, foot))
+    arrow = {"arrowstyle": "-|>", "linewidth": 2, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", end, start, arrowprops=arrow, zorder=5)
+    label = f"one query: d = {100 * d.item():.0f} cm"
+    axes.scatter(*start, s=25, label=label, color="#e08214", **_DOT)
+    return point_camera.tolist()
