@@ -202,7 +202,7 @@ def check_recording(
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     bar = ProgressBar("comparing frames", 2, progress)
     compared = FramePairs(recording, ids, sequence, pairs)
-    conventions, best = fit_all(compared, recording.declared, sequence.intrinsics)
+    conventions, best = fit_all(compared, Reading(recording.declared, sequence.intrinsics))
     bar.move_to(1)
     own = conventions[0].reading
     cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))

@@ -1,44 +1,26 @@
-"""Conventions under which a recording can be read: of poses, depth and calibration.
+"""Hypotheses of how a recording is to be read: conventions of poses, depth and calibration.
 
-Under the right convention the surfaces that two frames both see coincide.
+Under the right one the surfaces that two frames both see coincide.
 """
 
-import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-
-import numpy as np
+from itertools import product
 
 from nbtrack.checks.readings import FramePairs, Reading
-from nbtrack.core.camera import Intrinsics
 from nbtrack.core.settings import changed_settings
-from nbtrack.recordings.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA, Declaration
+from nbtrack.recordings.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA
 from nbtrack.recordings.recording import Recording
 
 _CLEARLY_BETTER = 0.5  # of the distance as declared (our choice)
 _MIN_GAIN = 5e-4  # of the depth: 1 mm at 2 m, depth's resolution on disk
 PLAUSIBLE_DEPTH = (0.2, 20.0)  # m, of a depth camera's median: units in doubt are told by it
 _FAR_APART = 0.05  # m, median distance above which a map of the scene would be blurred (our choice)
-_FAR_APART_OF_FEW = 0.15  # the same where less than the first share overlaps (our choice)
 _MIN_OVERLAP = 0.15  # share of points below which a median tells nothing (our choice)
-# Share below which not even a large median tells anything: of a right recording hardly a point lies
-# in front of what another frame sees there (our choice).
-_MIN_CONTRADICTION = 0.02
-# Those that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1 mm, SUN3D's
-# millimetres and tenths times 8; and metres and micrometres, which 16 bits hold badly.
-_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 8000.0, 80_000.0, 256.0, 100.0, 1.0, 1e6)
-_DEPTHS = {f"{scale:g} depth values a metre": {"depth_scale": scale} for scale in _SCALES}
-_DEPTHS["depth along the optical axis"] = {"depth_along": "axis"}
-_DEPTHS["distances along the ray, not z-depth"] = {"depth_along": "ray"}
-_CALIBRATIONS = {  # factors of focal lengths
-    "one with its principal point in the middle of the image": 1.0,
-    "one for images twice as large": 0.5,
-    "one for images half as large": 2.0,
-}
-_UNITS = {"ones in millimetres": 1e-3, "ones in centimetres": 1e-2, "ones in kilometres": 1e3}
 # The common camera axes first: where several fit alike, the first is named.
-_USUAL = {
-    "right up backward": "OpenGL axes",
-    "right down forward": "OpenCV axes",
+AXES = {
+    "opengl": "OpenGL axes",
+    "opencv": "OpenCV axes",
     "forward left up": "robot axes",
     "right up forward": "left-handed axes",
     "left up forward": "PyTorch3D axes",
@@ -47,20 +29,15 @@ _USUAL = {
     "left up backward": "left-handed axes",
     "right down backward": "left-handed axes",
 }
-
-
-def _convention_name(camera_axes: str, poses: str) -> str:
-    """For people: `OpenGL axes (x right, y up, z backward), camera-to-world`."""
-    words = SPELLED_AXES.get(camera_axes, camera_axes)
-    return "{} (x {}, y {}, z {}), {}".format(_USUAL.get(words, "axes"), *words.split(), poses)
-
-
-_SHORT = {words: name for name, words in SPELLED_AXES.items()}
-CONVENTIONS = {  # by name: what `sequence.toml` says of it
-    _convention_name(axes, poses): {"camera_axes": _SHORT.get(axes, axes), "poses": poses}
-    for poses in (CAMERA_TO_WORLD, WORLD_TO_CAMERA)
-    for axes in _USUAL
+# Those that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1 mm, SUN3D's
+# millimetres and tenths times 8; and metres and micrometres, which 16 bits hold badly.
+_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 8000.0, 80_000.0, 256.0, 100.0, 1.0, 1e6)
+_CALIBRATIONS = {  # factors of focal lengths
+    "one with its principal point in the middle of the image": 1.0,
+    "one for images twice as large": 0.5,
+    "one for images half as large": 2.0,
 }
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
 
 
 @dataclass(frozen=True)
@@ -75,78 +52,90 @@ class Convention:
     depth_m: float  # their median depth
     overlap: float  # share of all points that fall onto a measured, not nearer, surface
 
+    def is_clearly_better(self, other: "Convention") -> bool:
+        """Whether surfaces are at most half as far apart as in the other."""
+        return self.relative <= min(_CLEARLY_BETTER * other.relative, other.relative - _MIN_GAIN)
 
-def fit_all(
-    pairs: FramePairs, declared: Declaration, camera: Intrinsics
-) -> tuple[list[Convention], Convention]:
+
+def fit_all(pairs: FramePairs, own: Reading) -> tuple[list[Convention], Convention]:
     """All conventions, the declared one first, with how well pairs of frames agree under each; and
     the best: the declared one, unless another is clearly better."""
     conventions = []
-    for subject, name, reading in _candidates(declared, camera):
-        apart, measured, counts, _ = pairs.differences(reading)
-        apart = apart.abs()[counts]
-        measured = measured[counts]
-        numbers = apart.median(), (apart / measured).median(), measured.median()
-        overlap = counts.sum() / (pairs.values > 0).sum().clamp(1)
-        conventions.append(Convention(subject, name, reading, *map(float, (*numbers, overlap))))
+    short = {words: axes for axes, words in SPELLED_AXES.items()}
+    axes = short.get(own.declared.camera_axes, own.declared.camera_axes)
+    own = replace(own, declared=replace(own.declared, camera_axes=axes))
+    declared = "poses", axes_name(own.declared.camera_axes, own.declared.poses), own
+    for subject, name, reading in (declared, *_hypotheses(own)):
+        if conventions and reading == own:
+            continue
+        residual, measured, is_valid, _ = pairs.compare(reading)
+        apart, depth = residual[is_valid].abs(), measured[is_valid]
+        overlap = is_valid.sum() / (pairs.values > 0).sum().clamp(1)
+        numbers = apart.median(), (apart / depth).median(), depth.median(), overlap
+        conventions.append(Convention(subject, name, reading, *map(float, numbers)))
     return conventions, _best_of(conventions)
 
 
-def _candidates(declared: Declaration, camera: Intrinsics) -> list[tuple[str, str, Reading]]:
-    """Subject, name and reading: as declared, then the usual mistakes, common ones first."""
-    name = _convention_name(declared.camera_axes, declared.poses)
-    declared = replace(declared, **CONVENTIONS.get(name, {}))  # `opencv` for `right down forward`
-    own = Reading(declared, camera)
-    order = "wxyz" if declared.quaternion == "xyzw" else "xyzw"
-    orders = {f"quaternions in the order {order}": {"quaternion": order}}
-    table = [
-        (subject, name, replace(own, declared=replace(declared, **keys)))
-        for subject, named in (("poses", CONVENTIONS | orders), ("depth", _DEPTHS))
-        for name, keys in named.items()
-    ]
-    lengths = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+def axes_name(camera_axes: str, poses: str) -> str:
+    """For people: `OpenGL axes (x right, y up, z backward), camera-to-world`."""
+    words = SPELLED_AXES.get(camera_axes, camera_axes).split()
+    return "{} (x {}, y {}, z {}), {}".format(AXES.get(camera_axes, "axes"), *words, poses)
+
+
+def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
+    """Subject, name and reading of the usual mistakes, common ones first."""
+
+    def declared(**keys: str | float) -> Reading:
+        return replace(own, declared=replace(own.declared, **keys))
+
+    for poses, axes in product((CAMERA_TO_WORLD, WORLD_TO_CAMERA), AXES):
+        yield "poses", axes_name(axes, poses), declared(camera_axes=axes, poses=poses)
+    for order in ("wxyz", "xyzw"):
+        yield "poses", f"quaternions in the order {order}", declared(quaternion=order)
+    for scale in _SCALES:
+        yield "depth", f"{scale:g} depth values a metre", declared(depth_scale=scale)
+    yield "depth", "depth along the optical axis", declared(depth_along="axis")
+    yield "depth", "distances along the ray, not z-depth", declared(depth_along="ray")
+    camera = own.camera
     for label, factor in _CALIBRATIONS.items():
+        scaled = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
         # The principal point scales with the rest, or is in the middle of any image.
-        scaled = Intrinsics(camera.width, camera.height, *(factor * lengths).tolist())
-        middle = replace(scaled, cx=camera.width / 2, cy=camera.height / 2)
-        table += [("calibration", label, replace(own, camera=c)) for c in (scaled, middle)]
-    table += [("poses", label, replace(own, metres=metres)) for label, metres in _UNITS.items()]
-    return [("poses", name, own), *(row for row in table if row[2] != own)]
+        for cx, cy in (
+            (factor * camera.cx, factor * camera.cy),
+            (camera.width / 2, camera.height / 2),
+        ):
+            yield "calibration", label, replace(own, camera=replace(scaled, cx=cx, cy=cy))
+    for unit, metres in _UNITS.items():
+        yield "poses", f"ones in {unit}", replace(own, metres=metres)
 
 
-def _best_of(results: list[Convention]) -> Convention:
+def _best_of(conventions: list[Convention]) -> Convention:
     """The declared convention (the first), unless another fits clearly better.
 
-    Another fits clearly better if its surfaces are at most half as far apart and overlap at least
-    half as much. The second condition is needed because cameras that are turned away from each
-    other may agree on the few points that remain. Its median depth is that of a depth camera, since
+    Surfaces must overlap at least half as much, since cameras that are turned away from each other
+    may agree on the few points that remain. The median depth must be that of a depth camera, since
     no other number tells a unit of depth from one of positions.
     """
-    own = results[0]
-    half = max(convention.overlap / 2 for convention in results)
-    enough = max(_MIN_OVERLAP, half)
+    own = conventions[0]
+    half = max(convention.overlap for convention in conventions) / 2
     near, far = PLAUSIBLE_DEPTH
-    meeting = [r for r in results if r.overlap >= enough and r.median_m < _FAR_APART]
-    meeting = [r for r in meeting if near <= r.depth_m <= far]
-    minimum = min((convention.relative for convention in meeting), default=math.inf)
-    if own.overlap >= half and not _is_clearly_less(minimum, own.relative):
+    meeting = [c for c in conventions if c.overlap >= half and c.median_m < _FAR_APART]
+    rivals = [c for c in meeting if c.overlap >= _MIN_OVERLAP and near <= c.depth_m <= far]
+    closest = min(rivals, key=lambda c: c.relative, default=own)
+    if own.overlap >= half and not closest.is_clearly_better(own):
         return own
-    alike = max(1.1 * minimum, minimum + _MIN_GAIN)  # the common ones come first
-    return next((convention for convention in meeting if convention.relative <= alike), own)
-
-
-def _is_clearly_less(relative: float, other: float) -> bool:
-    return relative <= min(_CLEARLY_BETTER * other, other - _MIN_GAIN)
+    alike = max(1.1 * closest.relative, closest.relative + _MIN_GAIN)
+    return next((c for c in rivals if c.relative <= alike), own)
 
 
 def diagnosis(
-    results: list[Convention], best: Convention, recording: Recording, needs_proof: bool
+    conventions: list[Convention], best: Convention, recording: Recording, needs_proof: bool
 ) -> str:
     """What is wrong with how the numbers are read, in a sentence; empty where nothing is.
 
     Where proof is needed, a camera that moves too little to tell conventions apart is wrong too.
     """
-    own = results[0]
+    own, *others = conventions
     file = recording.pose_file.name
     apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
     if best is not own:
@@ -159,22 +148,19 @@ def diagnosis(
             f"(surfaces that two frames see then lie {1e3 * best.median_m:.0f} mm apart; as "
             f"declared they {apart}){turned}"
         )
-    # Of few points, such as key frames share, not even a right convention's lie close.
-    few = own.overlap < _MIN_OVERLAP
-    is_far = own.median_m > (_FAR_APART_OF_FEW if few else _FAR_APART)
-    if own.overlap < (_MIN_CONTRADICTION if is_far else _MIN_OVERLAP):
+    if own.overlap < _MIN_OVERLAP:
         return (
             f"{file} is not proved: two frames see too little of the same ({own.overlap:.0%} of "
             f"the points, whose surfaces {apart}): check it, and a piece with smaller steps"
         )
-    if is_far:
+    if own.median_m > _FAR_APART:
         return (
             f"surfaces that two frames see {apart} (median, {own.overlap:.0%} of the points "
             f"overlap) and no other convention fits: check {recording.calibration.source.name}, "
             f"the depth unit and {file}, and that image, depth and pose belong to one moment"
         )
-    poses = [r for r in results[1:] if r.subject == "poses" and r.overlap >= own.overlap / 2]
-    alike = [r.name for r in poses if not _is_clearly_less(own.relative, r.relative)]
+    poses = [c for c in others if c.subject == "poses" and c.overlap >= own.overlap / 2]
+    alike = [c.name for c in poses if not own.is_clearly_better(c)]
     if not (needs_proof and alike):
         return ""
     little = f"{file} is not proved: the camera moves too little to tell {len(alike)} other"

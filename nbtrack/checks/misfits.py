@@ -132,14 +132,14 @@ class _Costs:
         """See `find_misfits`."""
         self.pairs = pairs
         self.colors = sequence.colors
-        apart, measured, counts, self.seen_at = pairs.differences(own)
+        apart, measured, counts, self.seen_at = pairs.compare(own)
         relative = (apart / measured).abs()
         self.scale = 3 * relative[counts].median()
         self.agree = counts & (relative < self.scale)
 
     def of_depth(self, reading: Reading) -> Float[np.ndarray, "pairs"]:
         """Geman-McClure's of the differences; NaN of pairs that see little of the same."""
-        apart, measured, counts, _ = self.pairs.differences(reading)
+        apart, measured, counts, _ = self.pairs.compare(reading)
         square = (apart / measured / self.scale) ** 2
         total = torch.where(counts, square / (1 + square), 0.0).sum(dim=1)
         enough = counts.sum(dim=1) >= _MIN_OVERLAP * counts.shape[1]

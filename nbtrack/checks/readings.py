@@ -5,6 +5,7 @@ Read rightly, the surfaces that two frames both see coincide.
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -63,10 +64,8 @@ class Reading:
         """Camera-to-world poses with OpenCV axes, of a file read with this order of quaternions."""
         T = file_poses.copy()
         if self.declared.quaternion != order:
-            rotations = Rotation.from_matrix(T[:, :3, :3])
-            numbers = rotations.as_quat(scalar_first=order == "wxyz")
-            rotations = Rotation.from_quat(numbers, scalar_first=order == "xyzw")
-            T[:, :3, :3] = rotations.as_matrix()
+            numbers = Rotation.from_matrix(T[:, :3, :3]).as_quat(scalar_first=order == "wxyz")
+            T[:, :3, :3] = Rotation.from_quat(numbers, scalar_first=order == "xyzw").as_matrix()
         T[:, :3, 3] *= self.metres
         T = self.declared.poses_to_opencv(T)
         drift = [self.drift_x, self.drift_y, self.drift_z]
@@ -84,6 +83,15 @@ def on_grid(values: UInt16[np.ndarray, "frames h w"], stride: int) -> tuple[Tens
     return columns, rows, some.flatten(1)
 
 
+class Comparison(NamedTuple):
+    """Points of first frames beside what the second ones measured: (pairs, points) each."""
+
+    residual: Tensor  # m, by which points lie behind the surface that was measured
+    measured: Tensor  # m, the depth of that surface
+    is_valid: Tensor  # False where hidden, outside, or between two surfaces
+    seen_at: Tensor  # (pairs, 1, points, 2): -1 at the first pixel, 1 at the last
+
+
 class FramePairs:
     """Pairs of frames that see much the same, to be read in one way or another."""
 
@@ -99,19 +107,17 @@ class FramePairs:
         self.pairs = pairs
         self.file_poses = recording.file_poses[ids]
         self.order = recording.declared.quaternion
+        self.colors = sequence.colors
         self.places = np.searchsorted(sequence.frame_ids, ids[pairs])
         first, second = sequence.depths_mm[self.places]
         stride = math.ceil((math.prod(first.shape[1:]) / _POINTS_PER_FRAME) ** 0.5)
         self.columns, self.rows, self.values = on_grid(first, stride)
         self.inverse = 1 / torch.from_numpy(second[:, None].astype(np.float32))
 
-    def differences(self, reading: Reading) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """How far (m) points of first frames lie behind the surface that the second ones measured.
+    def compare(self, reading: Reading) -> Comparison:
+        """Points of first frames, seen from the second ones.
 
-        Also the depth (m) measured there, whether a point counts, each (pairs, points), and where
-        the second frames see it: (pairs, 1, points, 2), -1 at the first pixel, 1 at the last. Depth
-        is interpolated between four pixels, in 1/z, which is exact for planes. Points do not count
-        where the four lie on different surfaces, and where they are hidden.
+        Depth is interpolated between four pixels, in 1/z, which is exact for planes.
         """
         growth = reading.depth_growth * (self.pairs / len(self.file_poses) - 0.5)
         longer_a, longer_b = torch.from_numpy(1 + growth[..., None]).float()
@@ -128,7 +134,7 @@ class FramePairs:
             for mode in ("bilinear", "nearest")
         )
         measured = reading.points(columns, rows, blended / longer_b)[..., 2]
-        counts = (self.values > 0) & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
-        counts &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
-        counts &= depth - measured < _HIDDEN_BEHIND  # but in front is a contradiction, however far
-        return depth - measured, measured, counts, at
+        valid = (self.values > 0) & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
+        valid &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
+        valid &= depth - measured < _HIDDEN_BEHIND  # but in front is a contradiction, however far
+        return Comparison(depth - measured, measured, valid, at)
