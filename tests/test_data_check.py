@@ -30,7 +30,7 @@ from tiny import TINY
 
 from nbtrack.checks import check as check_module
 from nbtrack.checks.check import DataReport, check_recording, quick_warning
-from nbtrack.checks.conventions import CONVENTIONS
+from nbtrack.checks.conventions import AXES, axes_name
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
@@ -113,7 +113,12 @@ def test_facts(box: Path) -> None:
 JUMPING = walk(N_FRAMES)
 JUMPING[8:, 0, 3] += 0.5
 UNITS = [(f"{s:g} depth values a metre", {"camera_axes": "opengl"}, s) for s in (1e4, 5e3, 1e2)]
-MISREAD = [(name, keys, 1e3) for name, keys in list(CONVENTIONS.items())[1:]] + UNITS
+AXES_AND_WAYS = [
+    {"camera_axes": axes, "poses": way}
+    for way in ("camera-to-world", WORLD_TO_CAMERA)
+    for axes in AXES
+]
+MISREAD = [(axes_name(**keys), keys, 1e3) for keys in AXES_AND_WAYS[1:]] + UNITS
 
 
 @pytest.mark.parametrize(("name", "keys", "scale"), MISREAD, ids=[case[0] for case in MISREAD])
