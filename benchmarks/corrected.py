@@ -75,8 +75,8 @@ ABLATION = [
     ("30,000 points", (), {"_N_POINTS": 30_000, "_MAX_TIMES": 1}),
     ("every point alike", (), {"_UNMEASURED": 1.0}),  # confidence is 1 everywhere
     ("cells of 8 cm", ("correction.neus_plus=0.08",), {}),
-    ("colours as the network has them", (), {"_COLOR_STIFFNESS": 1e9}),
-    ("colours as stiff as distances", (), {"_COLOR_STIFFNESS": 1.0}),
+    ("colours as the network has them", (), {"_COLOR_REGULARISATION": 1e9}),
+    ("colours as stiff as distances", (), {"_COLOR_REGULARISATION": 1.0}),
     ("colours of outliers count", (), {"_COLOR_ROUNDS": 1, "_COLOR_HUBER": 1e9}),
     ("fixed scales, 1 cm and 0.1", (), {"_MEDIANS": np.zeros(2), "_MIN_SCALES": [0.01, 0.1]}),
     ("without colour in tracking", ("tracking.lm.lambda_intensity=0",), {}),

@@ -11,16 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond import LmSettings, LmTracker
 from nbtrack.beyond.correct import correct_map
-from nbtrack.beyond.correction import (
-    CorrectedField,
-    _add_equations,
-    _stiffness,
-    _to_be_corrected,
-    corrected,
-    interpolation,
-)
+from nbtrack.beyond.correction import CorrectedField, corrected
 from nbtrack.beyond.grid import BakedField
-from nbtrack.beyond.views import likeliest, spread_out, view_of
+from nbtrack.beyond.least_squares import (
+    Equations,
+    add_equations,
+    corrected_vertices,
+    interpolation,
+    regularisation_of,
+)
+from nbtrack.beyond.views import retrieve, spread_out, view_of
 from nbtrack.core.errors import DataError
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
@@ -116,27 +116,27 @@ def test_equations_are_summed_as_sparse_products() -> None:
     corners = np.array([*np.ndindex(2, 2, 2)])
     cells = np.vstack([rng.integers(0, [4, 3, 5], size=(40, 3)), [[0, 0, 0], [3, 2, 4]]])
     vertices = np.ravel_multi_index((cells[:, None] + corners).transpose(2, 0, 1), shape)
-    numbers, columns = _to_be_corrected(vertices, shape)
-    stiffness, slots = _stiffness(numbers, shape)
-    np.testing.assert_allclose(stiffness.toarray(), stiffness.toarray().T)
+    numbers, columns = corrected_vertices(vertices, shape)
+    springs, slots = regularisation_of(numbers, shape)
+    np.testing.assert_allclose(springs.toarray(), springs.toarray().T)
     dense, weights = np.zeros((42, len(numbers))), rng.random((42, 8))
     np.put_along_axis(dense, columns, weights, axis=1)
     wanted, reliability = rng.normal(size=(42, 2)), rng.random(42)
     solution = rng.normal(size=(len(numbers), 2))
-    matrix, vectors = stiffness.copy(), np.zeros_like(solution)
-    equations = columns, weights, wanted, reliability
-    _add_equations(*equations, huber, solution, slots, matrix.data, vectors)
+    matrix, vectors = springs.copy(), np.zeros_like(solution)
+    equations = Equations(columns, weights, wanted, reliability)
+    add_equations(equations, huber, solution, slots, matrix.data, vectors)
     largest = np.abs(wanted - dense @ solution).max(axis=1)
     weighted = dense * (reliability * huber / largest.clip(huber))[:, None]
-    np.testing.assert_allclose(matrix.toarray(), dense.T @ weighted + stiffness.toarray())
+    np.testing.assert_allclose(matrix.toarray(), dense.T @ weighted + springs.toarray())
     np.testing.assert_allclose(vectors, weighted.T @ wanted)
 
 
-def test_stiffness_by_hand() -> None:
+def test_regularisation_by_hand() -> None:
     """Catches springs across edges and corners of cells: two vertices of a row, one of another."""
-    stiffness, _ = _stiffness(np.array([0, 1, 7]), (2, 2, 2))
+    springs, _ = regularisation_of(np.array([0, 1, 7]), (2, 2, 2))
     expected = [[0.7, -0.1, 0.0], [-0.1, 0.7, 0.0], [0.0, 0.0, 0.7]]
-    np.testing.assert_allclose(stiffness.toarray(), expected)
+    np.testing.assert_allclose(springs.toarray(), expected)
 
 
 def test_a_file_keeps_it_whole(
@@ -217,7 +217,7 @@ def test_views_are_told_apart_and_spread(found: CorrectedField, sequence: RgbdSe
     off = np.eye(4)
     off[:3, :3] = Rotation.from_rotvec([0.0, 0.12, 0.0]).as_matrix()
     turned = box_sequence((sequence.T_world_camera[2] @ off)[None], ROOM, 96)[0]
-    (guess,) = likeliest(view_of(turned), found.views, cameras, 1)
+    (guess,) = retrieve(view_of(turned), found.views, cameras, 1)
     angle = Rotation.from_matrix(guess[:3, :3].T @ turned.T_world_camera[:3, :3]).magnitude()
     assert angle < 0.06
     still = np.concatenate([np.tile(np.eye(4), (500, 1, 1)), sequence.T_world_camera])

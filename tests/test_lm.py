@@ -155,7 +155,7 @@ def test_a_fast_camera_that_stops_is_found() -> None:
     tracker = begun(n_restarts=0)
     ahead = retract(T_TRUE, np.array([0.0, 0.5, 0.0, 0.3, 0.0, 0.5]))
     tracker.begin(FRAME, torch.from_numpy(np.stack([ahead, T_TRUE])))
-    np.testing.assert_array_equal(tracker.best.T_start, T_TRUE)
+    np.testing.assert_array_equal(tracker.best.problem.T_start, T_TRUE)
     assert abs(tracker.T_world_camera.numpy() - T_TRUE).max() < 0.01
 
 

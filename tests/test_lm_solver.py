@@ -6,18 +6,16 @@ import torch
 from box_room import BoxRoom, Formula, narrow_room, walk
 
 from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.lm_optimizer import COARSE, LmOptimizer
+from nbtrack.beyond.lm_residuals import Grid, Problem, Terms, grid_of, residual_terms
 from nbtrack.beyond.lm_solver import (
-    COARSE,
-    Descent,
-    Grid,
     damped_step,
     normal_equations,
-    residual_terms,
     retract,
     robust_cost,
-    scales_of,
+    robust_scales,
 )
-from nbtrack.beyond.observed import LUMA, draw_points, with_normals
+from nbtrack.beyond.observed import LUMA, Observed, draw_points, with_normals
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.fields import NetworkSettings, make_field
 
@@ -42,16 +40,20 @@ def asked(field: BakedField, points: np.ndarray) -> list[np.ndarray]:
     return [part.detach().numpy() for part in (*parts, *gradients)]
 
 
+def terms_at(grid: Grid, points, lumas, normals=NONE, T=ORIGIN, is_fine: bool = False) -> Terms:
+    return residual_terms(Problem(Observed(points, lumas, normals), grid, is_fine, 1.0, ORIGIN), T)
+
+
 def wall(slope: float = 1.0) -> Grid:
     """The plane z = 0.5 seen from below, as a distance that grows `slope` times too fast."""
     gray = torch.tensor([[0.2] * 3, [0.0] * 3, [0.0] * 3])
     field = Formula(lambda p: slope * (0.5 - p[:, 2]), BOX, lambda p: 0.5 + p @ gray)
-    return Grid(BakedField(field, 0.1))
+    return grid_of(BakedField(field, 0.1))
 
 
-def at_wall(grid: Grid, depths: list[float], normals: np.ndarray = NONE, T=ORIGIN) -> np.ndarray:
+def at_wall(grid: Grid, depths: list[float], normals: np.ndarray = NONE, T=ORIGIN) -> Terms:
     points = np.array([[0.0, 0.0, depth] for depth in depths])
-    return residual_terms((points, np.full(len(points), 0.5), normals), T, grid.arrays, False)
+    return terms_at(grid, points, np.full(len(points), 0.5), normals, T)
 
 
 @pytest.mark.parametrize("field", [ROOM, NETWORK], ids=["room", "network"])
@@ -59,8 +61,9 @@ def at_wall(grid: Grid, depths: list[float], normals: np.ndarray = NONE, T=ORIGI
 def test_terms_and_sums_are_the_formulas(field: BakedField, is_fine: bool) -> None:
     """Catches a swapped axis or channel, points outside that pull, another weight, scale, cost or
     prior than the module states; once with normals, once with confidences."""
-    normals, weight, grid = NONE if is_fine else NORMALS, 0.7, Grid(field)
-    terms = residual_terms((POINTS, LUMAS, normals), POSE, grid.arrays, is_fine)
+    normals, weight, grid = NONE if is_fine else NORMALS, 0.7, grid_of(field)
+    problem = Problem(Observed(POINTS, LUMAS, normals), grid, is_fine, weight, ORIGIN)
+    terms = residual_terms(problem, POSE)
     R, t = POSE[:3, :3], POSE[:3, 3]
     a = POINTS @ R.T
     x = a + t
@@ -76,13 +79,14 @@ def test_terms_and_sums_are_the_formulas(field: BakedField, is_fine: bool) -> No
         w = w * ((normals @ R.T * df).sum(axis=1) / np.maximum(g, 0.3)).clip(0) ** 2
     g = np.maximum(g, 0.3)[:, None]
     r, q = np.stack([f / g[:, 0], intensity - LUMAS]), np.stack([df / g, di])
-    np.testing.assert_allclose(terms[:3], [*r, w], atol=2e-5)
-    scales = scales_of(terms, np.full(2, np.inf), grid.residual_sigma, 3.0)
+    np.testing.assert_allclose([*terms.residuals, terms.reliability], [*r, w], atol=2e-5)
+    scales = robust_scales(terms.residuals, np.full(2, np.inf), grid.residual_sigma, 3.0)
     np.testing.assert_allclose(scales, 3 * np.median(abs(r), axis=1), rtol=0.02)
     square = (r / scales[:, None]) ** 2
     rho = square / (1 + square)
     cost = (w * (rho[0] + weight * rho[1]) + (1 - w) * (1 + weight)).mean()
-    assert robust_cost(terms, scales, weight) == pytest.approx(cost, rel=1e-5)
+    found = robust_cost(terms.residuals, terms.reliability, scales, weight)
+    assert found == pytest.approx(cost, rel=1e-5)
     J = np.concatenate([np.cross(a, q), q], axis=-1)  # of both residuals, n x 6
     W = w * np.array([[1], [weight]]) / (scales[:, None] * (1 + square)) ** 2
     H, b = np.einsum("kna,kn,knb->ab", J, W, J), np.einsum("kna,kn,kn->a", J, W, r)
@@ -91,20 +95,18 @@ def test_terms_and_sums_are_the_formulas(field: BakedField, is_fine: bool) -> No
     sines = (R - R.T)[[2, 0, 1], [1, 2, 0]] / 2
     A = H + 4 * np.eye(6) + 0.1 * np.diag(H.diagonal())
     twist = -np.linalg.solve(A, b + 4 * np.concatenate([sines, t]))
-    np.testing.assert_allclose(
-        damped_step(terms, scales, weight, ORIGIN, POSE, 0.1), twist, atol=1e-4
-    )
+    np.testing.assert_allclose(damped_step(problem, POSE, terms, scales, 0.1), twist, atol=1e-4)
 
 
 def test_derivatives_against_finite_differences() -> None:
     """Catches a wrong lever arm, order or sign of the twist, and gradients that are not those of
     the grid's own interpolant: residuals of torch's interpolation at poses a little to either
     side, with the gradient norm held fixed, as the derivative is defined."""
-    terms = residual_terms((POINTS, LUMAS, NONE), POSE, Grid(NETWORK).arrays, False)
-    usable, step = terms[2] > 0, 1e-6
+    terms = terms_at(grid_of(NETWORK), POINTS, LUMAS, T=POSE)
+    usable, step = terms.reliability > 0, 1e-6
     norm = np.linalg.norm(asked(NETWORK, POINTS @ POSE[:3, :3].T + POSE[:3, 3])[2], axis=1)
-    gradients = terms[6:].reshape(2, 3, -1).swapaxes(1, 2)
-    jacobian = np.concatenate([np.cross(terms[3:6].T, gradients), gradients], axis=-1)
+    gradients = terms.gradients.swapaxes(1, 2)
+    jacobian = np.concatenate([np.cross(terms.lever_arms.T, gradients), gradients], axis=-1)
     for axis, twist in enumerate(step * np.eye(6)):
         poses = retract(POSE, twist), retract(POSE, -twist)
         after, before = (asked(NETWORK, POINTS @ T[:3, :3].T + T[:3, 3]) for T in poses)
@@ -116,28 +118,32 @@ def test_derivatives_against_finite_differences() -> None:
 
 def test_a_field_that_grows_too_fast_is_corrected() -> None:
     """Catches distances taken as they are: with gradient norm 1.3 a step would be 30 % too long."""
-    terms = at_wall(wall(1.3), [0.2])[:, 0]
-    assert terms[:3].tolist() == pytest.approx([0.3, 0, (1 + 0.6**2) ** -2], abs=1e-5)
-    assert terms[6:9].tolist() == pytest.approx([0, 0, -1], abs=1e-5)
+    terms = at_wall(wall(1.3), [0.2])
+    assert terms.residuals[:, 0].tolist() == pytest.approx([0.3, 0], abs=1e-5)
+    assert terms.reliability.tolist() == pytest.approx([(1 + 0.6**2) ** -2], abs=1e-5)
+    assert terms.gradients[0, :, 0].tolist() == pytest.approx([0, 0, -1], abs=1e-5)
 
 
 def test_points_count_by_how_far_their_normals_agree() -> None:
     """Catches points that pull towards a surface that faces elsewhere, normals that do not turn
     with the camera, and unknown ones that count: cosines of 1, 1/2, -1, and none."""
     normals = np.array([[0.0, 0.0, -1.0], [0.75**0.5, 0.0, -0.5], [0.0, 0.0, 1.0], [0, 0, 0]])
-    assert at_wall(wall(), [0.2] * 4, normals)[2].tolist() == pytest.approx([1, 0.25, 0, 0])
+    reliability = at_wall(wall(), [0.2] * 4, normals).reliability
+    assert reliability.tolist() == pytest.approx([1, 0.25, 0, 0])
     upside_down = np.diag([1.0, -1.0, -1.0, 1.0])
     terms = at_wall(wall(), [0.2] * 4, normals, upside_down)
-    assert terms[2].tolist() == pytest.approx([0, 0, 1, 0])
+    assert terms.reliability.tolist() == pytest.approx([0, 0, 1, 0])
 
 
 def test_points_out_of_bounds_cost_the_most_and_pull_nowhere() -> None:
     """Catches a pose that gets cheaper by carrying points out of the map."""
     terms, scales = at_wall(wall(), [0.4, 5.0]), np.array([0.1, 1.0])
-    assert terms[2].tolist() == pytest.approx([1, 0])
+    assert terms.reliability.tolist() == pytest.approx([1, 0])
     # First point: one scale off, cost 1/2; second: the worst, 1; intensities: 0 and the worst, 1.
-    assert robust_cost(terms, scales, 1.0) == pytest.approx((0.5 + 2) / 2, abs=1e-5)
-    both, one = (normal_equations(part.copy(), scales, 1.0) for part in (terms, terms[:, :1]))
+    cost = robust_cost(terms.residuals, terms.reliability, scales, 1.0)
+    assert cost == pytest.approx((0.5 + 2) / 2, abs=1e-5)
+    alone = at_wall(wall(), [0.4])
+    both, one = (normal_equations(part, scales, 1.0) for part in (terms, alone))
     np.testing.assert_allclose(both[0], one[0])
     # Worked by hand: weight 1/4, derivative 1 along z, scale 0.1.
     assert both[0][5, 5] == pytest.approx(0.25 / 0.01, rel=1e-4)
@@ -146,10 +152,11 @@ def test_points_out_of_bounds_cost_the_most_and_pull_nowhere() -> None:
 
 def test_scales_only_fall() -> None:
     """Catches scales that widen again, which would let outliers back in, or shrink to nothing."""
-    terms, accuracy = np.array([[0.01, -0.04, 0.5], [0, 0, 0]]), np.array([0.02, 0.05])
-    found = scales_of(terms, np.full(2, np.inf), accuracy, 3.0)
+    residuals, accuracy = np.array([[0.01, -0.04, 0.5], [0, 0, 0]]), np.array([0.02, 0.05])
+    found = robust_scales(residuals, np.full(2, np.inf), accuracy, 3.0)
     np.testing.assert_allclose(found, [0.12, 0.05])
-    np.testing.assert_allclose(scales_of(terms, np.full(2, 0.06), accuracy, 3.0), [0.06, 0.05])
+    found = robust_scales(residuals, np.full(2, 0.06), accuracy, 3.0)
+    np.testing.assert_allclose(found, [0.06, 0.05])
 
 
 def test_retract_turns_about_the_camera_and_is_finite_at_zero() -> None:
@@ -164,15 +171,16 @@ def test_the_pose_prior_goes_back_to_the_start() -> None:
     """Catches a prior that enters the curvature alone: where the frame says nothing, a step must
     undo turn and offset from the start, but for the sine of the angle."""
     twist = np.array([0.0, 0.0, 0.2, 0.1, -0.3, 0.0])
-    nothing = np.zeros((12, 1), np.float32)
-    found = damped_step(nothing, np.ones(2), 1.0, POSE, retract(POSE, twist), 0.0)
+    problem = Problem(Observed(POINTS[:1], LUMAS[:1], NONE), wall(), False, 1.0, POSE)
+    nothing = Terms(*(0 * part for part in residual_terms(problem, POSE)))
+    found = damped_step(problem, retract(POSE, twist), nothing, np.ones(2), 0.0)
     np.testing.assert_allclose(found, -np.array([0, 0, np.sin(0.2), 0.1, -0.3, 0]), atol=1e-9)
 
 
 def test_a_single_plane_leaves_three_directions_open() -> None:
     """Catches a covariance or condition that hides a slide along the only wall in view."""
-    seen = 0.6 * POINTS, LUMAS, NONE
-    found = Descent(wall(), seen, seen, 0.0, POSE).certainty()
+    seen = Observed(0.6 * POINTS, LUMAS, NONE)
+    found = LmOptimizer(wall(), seen, seen, 0.0, POSE).certainty()
     assert found["condition_number"] > 1e6
     # Along the wall the position is as uncertain as the prior allows.
     assert found["position_std_m"] == pytest.approx(0.5 / (3 * 0.6745), rel=0.01)
@@ -181,27 +189,28 @@ def test_a_single_plane_leaves_three_directions_open() -> None:
 def test_a_rejected_step_leaves_the_pose_unchanged() -> None:
     """Catches steps that are taken although the cost rises: at the optimum every step is one."""
     seen = draw_points(walk(1, narrow_room())[0], 300, torch.Generator().manual_seed(0))
-    descent = Descent(Grid(BakedField(narrow_room(), 0.05)), seen, seen, 1.0, ORIGIN)
+    grid = grid_of(BakedField(narrow_room(), 0.05))
+    optimizer = LmOptimizer(grid, seen, seen, 1.0, ORIGIN)
     for is_fine in (False, True):
-        while not descent.is_ended:
-            T, damping = descent.T_world_camera, descent.damping
-            descent.step()
-            assert (descent.damping > damping) == (descent.T_world_camera is T)
-        assert descent.stage.is_fine is is_fine
-        descent.refine()
-    assert abs(descent.T_world_camera - ORIGIN).max() < 2e-3
+        while not optimizer.is_ended:
+            T, damping = optimizer.T_world_camera, optimizer.damping
+            optimizer.step()
+            assert (optimizer.damping > damping) == (optimizer.T_world_camera is T)
+        assert optimizer.stage.is_fine is is_fine
+        optimizer.refine()
+    assert abs(optimizer.T_world_camera - ORIGIN).max() < 2e-3
 
 
 def test_a_coarse_stage_that_leads_astray_is_undone() -> None:
     """Catches a good start that is given up for a worse pose."""
     seen = draw_points(walk(1, narrow_room())[0], 300, torch.Generator().manual_seed(0))
-    grid = Grid(BakedField(narrow_room(), 0.05))
-    descent = Descent(grid, seen, seen, 1.0, ORIGIN)
-    assert descent.stage is COARSE
-    descent.T_world_camera = POSE
-    descent.terms = residual_terms(seen, POSE, grid.arrays, False)
-    descent.refine()
-    assert descent.T_world_camera is ORIGIN
+    grid = grid_of(BakedField(narrow_room(), 0.05))
+    optimizer = LmOptimizer(grid, seen, seen, 1.0, ORIGIN)
+    assert optimizer.stage is COARSE
+    optimizer.T_world_camera = POSE
+    optimizer.terms = residual_terms(optimizer.problem, POSE)
+    optimizer.refine()
+    assert optimizer.T_world_camera is ORIGIN
 
 
 def test_normals_of_planes() -> None:
@@ -219,11 +228,12 @@ def test_normals_of_planes() -> None:
 
 def test_what_is_no_number_stays_none() -> None:
     """Catches compiled sums that turn NaN into a pose, and reads outside of the grid."""
-    grid = Grid(ROOM)
-    terms = residual_terms((POINTS, LUMAS, NONE), np.full((4, 4), np.nan), grid.arrays, True)
-    assert np.isnan(robust_cost(terms, grid.residual_sigma, 1.0)) or not terms[2].any()
+    grid = grid_of(ROOM)
+    terms = terms_at(grid, POINTS, LUMAS, T=np.full((4, 4), np.nan), is_fine=True)
+    cost = robust_cost(terms.residuals, terms.reliability, grid.residual_sigma, 1.0)
+    assert np.isnan(cost) or not terms.reliability.any()
     sums = normal_equations(terms, grid.residual_sigma, 1.0)
-    assert np.isnan(sums[0]).any() or not terms[2].any()
+    assert np.isnan(sums[0]).any() or not terms.reliability.any()
 
 
 def test_points_are_drawn_away_from_borders_and_edges() -> None:

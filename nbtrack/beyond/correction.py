@@ -6,20 +6,25 @@ eight vertices. What the network says away from surfaces stays.
 """
 
 import copy
-from typing import Any, no_type_check
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from scipy import sparse
-from scipy.ndimage import binary_dilation
-from scipy.sparse.linalg import cg
+from jaxtyping import Float
 from torch import Tensor
 
 from nbtrack.beyond.grid import BakedField
-from nbtrack.beyond.observed import LUMA, compiled
+from nbtrack.beyond.least_squares import (
+    Equations,
+    corrected_vertices,
+    interpolated,
+    interpolation,
+    regularisation_of,
+    solve,
+)
+from nbtrack.beyond.observed import LUMA
 from nbtrack.beyond.views import Views, spread_out, view_of
-from nbtrack.core.arrays import Frames, WorldPoints
+from nbtrack.core.arrays import Frames
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import DataError
 from nbtrack.data.pixels import PixelSampler
@@ -37,12 +42,7 @@ _POINTS_A_CELL = 10
 _MAX_TIMES = 4  # as many points at most
 _HUBER = 0.01  # m; a larger residual counts less
 _ROUNDS = 4  # how often that is judged anew
-# What a difference between neighbouring corrections, and a correction itself, cost, in points seen
-# from the mean distance.
-_SMOOTHNESS = 0.1
-_PULL = 0.1
-_FADE = 1  # vertices beyond those that points touch, over which corrections fade out
-_COLOR_STIFFNESS = 0.1  # of that stiffness, since colours change faster than distances
+_COLOR_REGULARISATION = 0.1  # of that regularisation, since colours change faster than distances
 _COLOR_HUBER = 0.05
 _COLOR_ROUNDS = 3
 # The least scales of a tracker's residuals (distance, luma): so many medians of what the measured
@@ -54,15 +54,6 @@ _UNMEASURED = 0.1  # confidence where nothing was measured, and the network inte
 CORRECTIONS = ("numbers", "corrections", "cameras", "views", "residual_medians")
 """What a file keeps of a correction, besides the field: see `CorrectedField`."""
 _SOURCE = "source."  # how names of the field as mapped begin
-Columns = Float[np.ndarray, "rows columns"]
-Vertices = Int[np.ndarray, "points 8"]
-Corners = Float[np.ndarray, "points 8"]
-_CORNERS = np.stack(np.meshgrid(*3 * [[0, 1]], indexing="ij"), -1).reshape(8, 3)
-# A vertex is coupled to the 27 around it, itself the middle one; and which of them, seen from one
-# corner of a cell, is another corner.
-_AROUND = np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), -1).reshape(27, 3)
-_ITSELF = 13
-_TO_CORNER = (_CORNERS[None] - _CORNERS[:, None] + 1) @ [9, 3, 1]
 
 
 class CorrectedField(BakedField):
@@ -126,36 +117,37 @@ def corrected(
     At a measured point p with normal n the interpolated distance at p + s n shall be s, at five
     offsets s, and the colour at p that of the pixel, but at the surface alone: off it a camera saw
     none. These equations, weighted by 1 / depth^2, are linear in the corrections of the vertices
-    around; see `_solve`. Raises DataError where no frame shows a plane.
+    around; see `solve`. Raises DataError where no frame shows a plane.
     """
     field = CorrectedField(copy.deepcopy(source).cpu(), voxel)
     points, normals, depth, color = _enough_planes(sequence, frames, field)
     asked = np.concatenate([points + offset * normals for offset in _OFFSETS])
     vertices, weights = interpolation(asked, field)
-    numbers, columns = _to_be_corrected(vertices, field.n_vertices)
-    stiffness, slots = _stiffness(numbers, field.n_vertices)
+    numbers, columns = corrected_vertices(vertices, field.n_vertices)
+    regularisation, slots = regularisation_of(numbers, field.n_vertices)
     values = field.volume[:4].T.double().numpy()[numbers]
     reliability = (depth.mean() / depth) ** 2
 
     offsets = np.repeat(_OFFSETS, len(points))[:, None]
-    missing = offsets - _interpolated(columns, weights, values[:, 3:])
-    equations = columns, weights, missing, np.tile(reliability, len(_OFFSETS))
-    distance, diagonal = _solve(equations, stiffness, slots, _HUBER, _ROUNDS)
-    # The share of measurements, not stiffness, in a vertex's diagonal.
-    confidence = (1 - _UNMEASURED) * (1 - stiffness.diagonal() / diagonal)
+    missing = offsets - interpolated(columns, weights, values[:, 3:])
+    equations = Equations(columns, weights, missing, np.tile(reliability, len(_OFFSETS)))
+    distance, diagonal = solve(equations, regularisation, slots, _HUBER, _ROUNDS)
+    # The share of measurements, not regularisation, in a vertex's diagonal.
+    confidence = (1 - _UNMEASURED) * (1 - regularisation.diagonal() / diagonal)
 
-    columns, weights, missing = (part[: len(points)] for part in equations[:3])
-    missing_color = color - _interpolated(columns, weights, values[:, :3])
-    equations = columns, weights, missing_color, reliability
-    stiffness = _COLOR_STIFFNESS * stiffness
-    colors, _ = _solve(equations, stiffness, slots, _COLOR_HUBER, _COLOR_ROUNDS)
+    columns, weights, missing = (part[: len(points)] for part in (columns, weights, missing))
+    missing_color = color - interpolated(columns, weights, values[:, :3])
+    equations = Equations(columns, weights, missing_color, reliability)
+    regularisation = _COLOR_REGULARISATION * regularisation
+    colors, _ = solve(equations, regularisation, slots, _COLOR_HUBER, _COLOR_ROUNDS)
 
-    left = missing - _interpolated(columns, weights, distance)
-    left_luma = (missing_color - _interpolated(columns, weights, colors)) @ LUMA
+    left = missing - interpolated(columns, weights, distance)
+    left_luma = (missing_color - interpolated(columns, weights, colors)) @ LUMA
     medians = [float(np.median(np.abs(residual))) for residual in (left, left_luma)]
     corrections = torch.from_numpy(np.column_stack([colors, distance, confidence])).float().half()
-    kept = torch.from_numpy(numbers).int(), corrections, *_views(sequence, frames)
-    field.add(dict(zip(CORRECTIONS, (*kept, torch.tensor(medians)), strict=True)))
+    cameras, views = _views(sequence, frames)
+    kept = torch.from_numpy(numbers).int(), corrections, cameras, views, torch.tensor(medians)
+    field.add(dict(zip(CORRECTIONS, kept, strict=True)))
     return field
 
 
@@ -196,107 +188,3 @@ def _measured_planes(
     parts = [part[has_plane].double().numpy() for part in parts]
     order = np.argsort(interpolation(parts[0], grid)[0][:, 0], kind="stable")
     return tuple(part[order] for part in parts)
-
-
-def interpolation(points_world: WorldPoints, grid: BakedField) -> tuple[Vertices, Corners]:
-    """Numbers of the eight vertices around points (m), and their weights in the interpolation."""
-    shape = np.array(grid.n_vertices)
-    scaled = (points_world - grid.low.double().numpy()) / grid.voxel
-    cells = np.clip(np.floor(scaled).astype(np.int64), 0, shape - 2)
-    x, y, z = np.moveaxis(np.stack([1 - (scaled - cells), scaled - cells], axis=-1), 1, 0)
-    weights = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
-    strides = np.array([shape[1] * shape[2], shape[2], 1])
-    return (cells @ strides)[:, None] + _CORNERS @ strides, weights.reshape(-1, 8)
-
-
-def _interpolated(columns: Vertices, weights: Corners, values: Columns) -> Columns:
-    """Weighted means of the values of eight vertices."""
-    return np.einsum("ij,ijc->ic", weights, values[columns])
-
-
-def _to_be_corrected(
-    vertices: Vertices, shape: tuple[int, int, int]
-) -> tuple[Int[np.ndarray, "_"], Vertices]:
-    """The vertices to correct, which are those near points, and their numbers among these."""
-    is_touched = np.zeros(shape, dtype=bool)
-    is_touched.flat[vertices] = True
-    numbers = np.flatnonzero(binary_dilation(is_touched, iterations=_FADE))
-    column = np.empty(is_touched.size, dtype=np.int32)
-    column[numbers] = np.arange(len(numbers), dtype=np.int32)
-    return numbers, column[vertices]
-
-
-def _stiffness(
-    numbers: Int[np.ndarray, "n"], shape: tuple[int, int, int]
-) -> tuple[sparse.csr_array, Int[np.ndarray, "n 27"]]:
-    """The stiffness of corrections as a matrix, with an entry for each two vertices of a cell; and
-    where these entries stand among its data, by vertex and neighbour (`_AROUND`).
-
-    It is that of springs between neighbours and to zero; neighbours that are not corrected stand at
-    zero, so that corrections fade out.
-    """
-    column = np.full([n + 2 for n in shape], -1)  # with a border that is never corrected
-    column[1:-1, 1:-1, 1:-1].flat[numbers] = np.arange(len(numbers))
-    places = np.stack(np.unravel_index(numbers, shape), axis=-1)[:, None] + 1 + _AROUND
-    neighbours = column[tuple(np.moveaxis(places, -1, 0))]
-    is_corrected = neighbours >= 0
-    slots = np.where(is_corrected, is_corrected.cumsum().reshape(is_corrected.shape) - 1, -1)
-    distances = np.abs(_AROUND).sum(axis=1)
-    springs = np.where(distances == 1, -_SMOOTHNESS, 0.0)
-    springs[_ITSELF] = _PULL + 6 * _SMOOTHNESS
-    data = np.broadcast_to(springs, slots.shape)[is_corrected]
-    rows = np.concatenate([[0], is_corrected.sum(axis=1).cumsum()])
-    size = len(numbers), len(numbers)
-    return sparse.csr_array((data, neighbours[is_corrected], rows), shape=size), slots
-
-
-def _solve(
-    equations: tuple[Vertices, Corners, Columns, np.ndarray],
-    stiffness: sparse.csr_array,
-    slots: Int[np.ndarray, "n 27"],
-    huber: float,
-    rounds: int,
-) -> tuple[Columns, np.ndarray]:
-    """Minimise |W^(1/2) (A x - wanted)|^2 + x' stiffness x; and the diagonal of its matrix.
-
-    An equation is a row of A, eight columns and their weights, what is wanted, and a reliability. W
-    holds the reliability, times huber / |residual| where the largest residual of an equation's
-    columns is above that; it is judged anew in every round.
-    """
-    solution = np.zeros((len(slots), equations[2].shape[1]))
-    for _ in range(rounds):
-        matrix = stiffness.copy()
-        vectors = np.zeros_like(solution)
-        _add_equations(*equations, huber, solution, slots, matrix.data, vectors)
-        scaling = sparse.dia_array((1 / matrix.diagonal()[None], 0), shape=matrix.shape)
-        for column, vector in enumerate(vectors.T):
-            start = solution[:, column].copy()
-            solution[:, column], _ = cg(matrix, vector, start, rtol=1e-3, M=scaling)
-    return solution, matrix.diagonal()
-
-
-@no_type_check
-@compiled
-def _add_equations(
-    columns, weights, wanted, reliability, huber, solution, slots, matrix_data, vectors
-):
-    """Add A' W A to the entries of a matrix, and A' W wanted to some vectors; see `_solve`.
-
-    The pattern of the matrix never changes: an equation adds 8 x 8 products to it, in place.
-    """
-    for equation in range(len(columns)):
-        largest = huber
-        for channel in range(wanted.shape[1]):
-            residual = wanted[equation, channel]
-            for corner in range(8):
-                residual -= weights[equation, corner] * solution[columns[equation, corner], channel]
-            largest = max(largest, abs(residual))
-        weight = reliability[equation] * huber / largest
-        for corner in range(8):
-            row = columns[equation, corner]
-            weighted = weight * weights[equation, corner]
-            for other in range(8):
-                slot = slots[row, _TO_CORNER[corner, other]]
-                matrix_data[slot] += weighted * weights[equation, other]
-            for channel in range(wanted.shape[1]):
-                vectors[row, channel] += weighted * wanted[equation, channel]

@@ -10,10 +10,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond.grid import BakedField
-from nbtrack.beyond.lm_solver import NEAR_SCALES, Descent, Grid, retract
+from nbtrack.beyond.lm_optimizer import NEAR_SCALES, LmOptimizer
+from nbtrack.beyond.lm_residuals import grid_of
+from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.observed import draw_points, with_normals
 from nbtrack.beyond.verdict import p_lost
-from nbtrack.beyond.views import likeliest, view_of
+from nbtrack.beyond.views import retrieve, view_of
 from nbtrack.core.arrays import Pose, Poses, Transform, Transforms
 from nbtrack.core.settings import limited
 from nbtrack.data.frame import Frame
@@ -37,9 +39,8 @@ _LOST = 0.5  # a pose is lost from this probability on that it is wrong
 _DOUBTFUL = 0.1  # from this one on another is looked for
 # What a descent needs beyond so many steps counts as one step, and so does a descent elsewhere.
 _MAX_FOLLOWING = 20
-_MAX_STEPS = 60  # of each of a descent's two stages
 _SAME = 0.01  # rad, m; another descent that ends so near a pose confirms it
-_SURPRISE = 1.0  # rad, m; of a pose where the frame before led to none
+_LARGEST_INNOVATION = 1.0  # rad, m; of a pose where the frame before led to none
 _ROUNDING = 0.25 / 255  # median that 256 grey levels leave; no intensity is more accurate
 _UNKNOWN_MAD = 0.02  # of intensities, where the map does not say how accurate they are
 _MIN_CONTRAST = 0.01  # standard deviation of a picture that is not dark, covered or overexposed
@@ -100,7 +101,7 @@ class LmTracker(Tracker):
         """The map as a grid on the host; ConfigError where it would be too large."""
         grid = field if isinstance(field, BakedField) else BakedField(field, self.settings.voxel)
         grid = grid if grid.device.type == "cpu" else deepcopy(grid).cpu()
-        self.grid = Grid(grid)
+        self.grid = grid_of(grid)
         return grid
 
     def restart_anywhere(self) -> None:
@@ -146,7 +147,7 @@ class LmTracker(Tracker):
         descents = [self._descent_from(T) for T in starts]
         if np.abs(starts - starts[0]).max() > _FAR_APART:
             for descent in descents:
-                _take_steps(descent, _MAX_COARSE_STEPS)
+                descent.run_stage(_MAX_COARSE_STEPS)
         self.best = _by_cost(descents)[0]
 
     @property
@@ -160,12 +161,12 @@ class LmTracker(Tracker):
             return float("nan")
         if self.search is Search.LOOKING:
             before = self.best.cost(NEAR_SCALES)
-            self._look_elsewhere()
+            self.relocalise()
             return before
         before = self.best.step()
         self.steps += 1
         if self.steps == _MAX_FOLLOWING:
-            _descend(self.best)
+            self.best.run()
         elif self.best.is_ended and not self.best.is_finished:
             self.best.refine()
         if self.best.is_finished or self.steps == _MAX_FOLLOWING:
@@ -185,32 +186,32 @@ class LmTracker(Tracker):
             return {"inlier_ratio": 0.0, "p_lost": 1.0, "lost": True}
         return self._judge(self.best) if self.search is Search.FOLLOWING else self.verdict
 
-    def _judge(self, descent: Descent) -> dict[str, float | bool]:
+    def _judge(self, descent: LmOptimizer) -> dict[str, float | bool]:
         """What a descent says of its pose, and how likely that makes it a wrong one."""
         said = descent.certainty()
         mad = self.field.intensity_mad
         usual_mad = max(mad if np.isfinite(mad) else _UNKNOWN_MAD, _ROUNDING)
         changes = np.linalg.inv(self.trusted) @ descent.T_world_camera - np.eye(4)
-        surprise = np.abs(changes).max(axis=(1, 2)).min(initial=_SURPRISE)
+        innovation = np.abs(changes).max(axis=(1, 2)).min(initial=_LARGEST_INNOVATION)
         said |= {
             "intensity_ratio": said["intensity_mad"] / usual_mad if self.weight else 1.0,
             "last_step": 0.0 if descent.is_finished else float(descent.last_step),
-            "surprise": float(surprise),
+            "innovation": float(innovation),
         }
         probability = p_lost(said)
         return {**said, "p_lost": probability, "lost": probability >= _LOST}
 
-    def _descent_from(self, T_start: Pose) -> Descent:
-        return Descent(self.grid, *self.points, self.weight, T_start)
+    def _descent_from(self, T_start: Pose) -> LmOptimizer:
+        return LmOptimizer(self.grid, *self.points, self.weight, T_start)
 
-    def _look_elsewhere(self) -> None:
+    def relocalise(self) -> None:
         """One more descent; what it finds takes over if it is clearly better."""
         if self.others is None:
             others = self._other_starts()  # all are tried where nothing is known of the camera
             self.others = others[: self.settings.n_restarts] if len(self.trusted) else others
         descent = self._descent_from(self.others.pop(0))
-        _descend(descent)
-        is_confirmed = _apart(descent, self.best) < _SAME
+        descent.run()
+        is_confirmed = _distance(descent, self.best) < _SAME
         if descent.cost(NEAR_SCALES) < _CLEARLY * self.best.cost(NEAR_SCALES):
             self.best = descent
         self.verdict = self._judge(self.best)
@@ -229,11 +230,11 @@ class LmTracker(Tracker):
             twists = [np.zeros(6), *(_RESTART_ANGLE * np.array(wider))]
             return [retract(anchor, twist) for twist in twists]
         cameras = self.field.T_world_cameras.double().numpy()
-        alike = likeliest(view_of(self.frame), self.field.views, cameras, _ALIKE)
+        alike = retrieve(view_of(self.frame), self.field.views, cameras, _ALIKE)
         random = [self._descent_from(T) for T in self._random_poses(cameras)]
         tried = [self._descent_from(T) for T in (anchor, *alike)] + _by_cost(random)[:_TRIED]
         for descent in tried:
-            _take_steps(descent, _TRIED_STEPS)
+            descent.run_stage(_TRIED_STEPS)
         return [descent.T_world_camera for descent in _by_cost(tried)]
 
     def _random_poses(self, T_world_cameras: Poses) -> Poses:
@@ -248,28 +249,12 @@ class LmTracker(Tracker):
         return poses
 
 
-def _by_cost(descents: Sequence[Descent]) -> list[Descent]:
-    """Descents in the order of their robust costs, all at equal scales."""
+def _by_cost(descents: Sequence[LmOptimizer]) -> list[LmOptimizer]:
+    """LmOptimizers in the order of their robust costs, all at equal scales."""
     return sorted(descents, key=lambda d: d.cost(_WIDE_SCALES)) if descents[1:] else [*descents]
 
 
-def _apart(first: Descent, second: Descent) -> float:
+def _distance(first: LmOptimizer, second: LmOptimizer) -> float:
     """How far two descents' poses are apart (rad or m, whichever is more)."""
     change = np.linalg.inv(first.T_world_camera) @ second.T_world_camera - np.eye(4)
     return float(np.abs(change).max())
-
-
-def _descend(descent: Descent) -> None:
-    """The rest of a descent."""
-    _take_steps(descent, _MAX_STEPS)
-    if not descent.stage.is_fine:
-        descent.refine()
-        _take_steps(descent, _MAX_STEPS)
-
-
-def _take_steps(descent: Descent, max_steps: int) -> None:
-    """Steps of the stage that a descent is in."""
-    for _ in range(max_steps):
-        if descent.is_ended:
-            return
-        descent.step()

@@ -1,7 +1,7 @@
 """Points that a frame observed, as LM and ICP take them: evenly spread, and away from edges."""
 
 from collections.abc import Callable
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 import torch
@@ -22,8 +22,13 @@ _RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
 # Sums may be reordered, so that they fill vector registers; NaN stays NaN.
 _JIT = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 
-# Points (n x 3, m, camera frame), their intensities, and normals (n x 3) or none (0 x 3).
-Observed = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+class Observed(NamedTuple):
+    """Points that a frame observed."""
+
+    points: np.ndarray  # n x 3, m, camera frame
+    intensity: np.ndarray  # n, luma in [0, 1]
+    normals: np.ndarray  # n x 3, camera frame, towards it, 0 where not known; or none (0 x 3)
 
 
 def compiled(function: Callable) -> Callable:
@@ -47,13 +52,13 @@ def draw_points(
     starts = torch.randint(_MODULUS, (2,), generator=generator).numpy()
     images = frame.depth_mm.numpy(), frame.color.numpy()
     drawn = _drawn_points(*images, _pinhole(frame), n_points, starts, edge_jump)
-    return *drawn, np.empty((0, 3))
+    return Observed(*drawn, normals=np.empty((0, 3)))
 
 
 def with_normals(frame: Frame, observed: Observed, n_points: int) -> Observed:
     """The first points with unit normals (camera frame, towards it); 0 where not known."""
-    points, intensity = observed[0][:n_points], observed[1][:n_points]
-    return points, intensity, _normals(frame.depth_mm.numpy(), _pinhole(frame), points)
+    points, intensity = observed.points[:n_points], observed.intensity[:n_points]
+    return Observed(points, intensity, _normals(frame.depth_mm.numpy(), _pinhole(frame), points))
 
 
 def _pinhole(frame: Frame) -> tuple[float, float, float, float]:

@@ -26,9 +26,9 @@ _CORRELATED = 2.0  # by how much stds that take errors for independent are too s
 def features(said: Mapping[str, float]) -> Float[np.ndarray, "4"]:
     """Numbers that grow about linearly with the log odds of a wrong pose.
 
-    Of what a tracker says: `fitting_ratio`, `known_ratio` (see `Descent.certainty`),
-    `intensity_ratio` (median difference over the usual one) and `surprise` (how far from where the
-    frames before led to, rad or m).
+    Of what a tracker says: `fitting_ratio`, `known_ratio` (see `LmOptimizer.certainty`),
+    `intensity_ratio` (median difference over the usual one) and `innovation` (how far from where
+    the frames before led to, rad or m).
     """
     fitting = _within(said["fitting_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
     known = _within(said["known_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
@@ -37,7 +37,7 @@ def features(said: Mapping[str, float]) -> Float[np.ndarray, "4"]:
             math.log(fitting / (1 - fitting)),
             math.log(known / (1 - known)),
             math.log(_within(said["intensity_ratio"], 0.5, 10)),
-            math.log(_within(said["surprise"], 0.02, 1)),
+            math.log(_within(said["innovation"], 0.02, 1)),
         ]
     )
 

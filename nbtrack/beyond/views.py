@@ -66,7 +66,7 @@ def spread_out(T_world_camera: Poses) -> Int[np.ndarray, "_"]:
     return np.array(chosen)
 
 
-def likeliest(view: View, views: Views, T_world_camera: Poses, n: int) -> Poses:
+def retrieve(view: View, views: Views, T_world_camera: Poses, n: int) -> Poses:
     """Where a camera may be that saw a view: the poses of the `n` views most like it, in order.
 
     Each is turned about the camera's x and y as it fits best.

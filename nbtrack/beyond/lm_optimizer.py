@@ -1,0 +1,164 @@
+"""The search for a frame's pose from one start: steps of Levenberg-Marquardt in two stages."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nbtrack.beyond.lm_residuals import Grid, Problem, residual_terms
+from nbtrack.beyond.lm_solver import (
+    PRIOR_WEIGHT,
+    normal_equations,
+    robust_cost,
+    robust_scales,
+    try_step,
+)
+from nbtrack.beyond.observed import Observed
+from nbtrack.core.arrays import Pose
+
+# A point fits if it lies as near to the surface as the field says, and is so like it in luma.
+_INLIER_INTENSITY = 0.25
+_FIRST_DAMPING = 1e-4
+_MIN_DAMPING = 1e-9
+_MAX_DAMPING = 1e3
+_DAMPING_UP = 10.0
+_DAMPING_DOWN = 0.2
+_MAX_STEPS = 60  # of a stage
+# The coarse stage may lead away from a good start: the better of both goes on, at these scales.
+NEAR_SCALES = np.array([0.02, 0.05])
+
+
+class Stage(NamedTuple):
+    """Which residuals count in a part of a search, and when it ends."""
+
+    is_fine: bool  # all points, both residuals and confidence; else some points' distances, normals
+    mad_factor: float  # medians of |r| in a robust scale
+    min_step: float  # rad and m: a shorter twist ends the stage
+
+
+# From afar distances say where the camera is; intensities mislead: their basin is as wide as the
+# texture. 3 medians are two standard deviations, were residuals normal.
+COARSE = Stage(False, 10.0, 1e-2)
+FINE = Stage(True, 3.0, 3e-4)
+_SIGMAS = 0.6745 * FINE.mad_factor
+
+
+class LmOptimizer:
+    """A search from a start, on some of a frame's points, then on all, in double precision.
+
+    The caller takes steps until `is_ended`, refines, and takes steps until `is_ended` again.
+
+    A step is taken only if it lowers the robust cost; else the damping grows. Robust scales follow
+    the residuals down, so that far-off starts converge and outliers are down-weighted in the end.
+    """
+
+    def __init__(
+        self, grid: Grid, some: Observed, all: Observed, lambda_intensity: float, T_start: Pose
+    ) -> None:
+        """Begin with some points, for the coarse stage, and all, for the fine one."""
+        self.lambda_intensity = lambda_intensity
+        self.T_world_camera = T_start
+        self.last_step = np.inf  # rad or m, whichever is more
+        self.fine_problem = Problem(all, grid, True, lambda_intensity, T_start)
+        self._begin(COARSE, Problem(some, grid, False, 0.0, T_start))
+        self._start_cost = self.cost(NEAR_SCALES)
+
+    def step(self) -> float:
+        """One step, taken or refused; returns the robust cost before it."""
+        step = try_step(
+            self.problem, self.T_world_camera, self.terms, self.scales, self.damping, self.twist
+        )
+        self.T_world_camera, self.terms, self.twist = step.T_world_camera, step.terms, step.twist
+        self.last_step = step.length
+        if step.is_better:
+            self._narrow()
+            self.damping = max(self.damping * _DAMPING_DOWN, _MIN_DAMPING)
+        else:
+            self.damping *= _DAMPING_UP
+        self.is_ended = step.length < self.stage.min_step or self.damping > _MAX_DAMPING
+        return step.cost_before
+
+    def run_stage(self, max_steps: int = _MAX_STEPS) -> None:
+        """Steps of the stage that it is in, until that ends."""
+        for _ in range(max_steps):
+            if self.is_ended:
+                return
+            self.step()
+
+    def refine(self) -> None:
+        """Go on with all points from where the coarse stage ended, or from the start if better."""
+        if self.cost(NEAR_SCALES) > self._start_cost:
+            self.T_world_camera = self.problem.T_start
+        self._begin(FINE, self.fine_problem)
+
+    def run(self) -> None:
+        """The rest of the search."""
+        self.run_stage()
+        if self.stage is COARSE:
+            self.refine()
+            self.run_stage()
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether further steps would change nothing."""
+        return self.is_ended and self.stage is FINE
+
+    def cost(self, scales: Float[np.ndarray, "2"]) -> float:
+        """The robust cost of both residuals at given scales, by which searches are compared.
+
+        Intensities have the weight of the fine stage, in the coarse one too.
+        """
+        residuals, reliability = self.terms.residuals, self.terms.reliability
+        return robust_cost(residuals, reliability, scales, self.lambda_intensity)
+
+    def certainty(self) -> dict[str, float]:
+        """The share of points that fit, and how well the curvature of their cost holds the pose.
+
+        `known_ratio` is the mean reliability of the points, `fitting_ratio` the share of those that
+        fit, each counted by its reliability: where little was mapped, few can fit at any pose.
+        Intensities count by their differences from the median of all; `intensity_mad` is the median
+        of those (MAD), 0 where they have no weight. Standard deviations are along the least certain
+        direction, the condition number without the pose prior, rotations at a lever arm of 1 m.
+        Errors of the map are not independent, as residuals are here taken to be: these are lower
+        bounds, good for telling poses apart, not for error bars.
+        """
+        distance, intensity = self.terms.residuals
+        reliability = self.terms.reliability
+        # A picture that is darker as a whole says nothing against a pose.
+        off = np.abs(intensity - _median(intensity)) * (self.lambda_intensity > 0)
+        is_inlier = (np.abs(distance) < self.problem.grid.inlier_distance) & (reliability > 0)
+        is_inlier &= off < _INLIER_INTENSITY
+        known_ratio = float(reliability.mean())
+        fitting = float((reliability * is_inlier).mean())
+        H, _ = normal_equations(self.terms, self.scales, self.problem.lambda_intensity)
+        values = np.linalg.eigvalsh(H)
+        covariance = np.linalg.inv(H + PRIOR_WEIGHT * np.eye(6)) / _SIGMAS**2  # rad, m
+        blocks = np.stack([covariance[:3, :3], covariance[3:, 3:]])
+        rotation, position = np.linalg.eigvalsh(blocks)[:, -1] ** 0.5
+        return {
+            "inlier_ratio": float(is_inlier.mean()),
+            "known_ratio": known_ratio,
+            "fitting_ratio": fitting / max(known_ratio, 1e-6),
+            "intensity_mad": float(_median(off)),
+            "position_std_m": float(position),
+            "rotation_std_deg": float(np.rad2deg(rotation)),
+            "condition_number": float(values[-1] / max(values[0], 1e-9)),
+        }
+
+    def _begin(self, stage: Stage, problem: Problem) -> None:
+        self.stage = stage
+        self.problem = problem
+        self.damping = _FIRST_DAMPING
+        self.is_ended = False
+        self.twist = np.zeros(6)  # of the step before
+        self.terms = residual_terms(problem, self.T_world_camera)
+        self.scales = np.full(2, np.inf)
+        self._narrow()
+
+    def _narrow(self) -> None:
+        sigma = self.problem.grid.residual_sigma
+        self.scales = robust_scales(self.terms.residuals, self.scales, sigma, self.stage.mad_factor)
+
+
+def _median(values: Float[np.ndarray, "n"]) -> float:
+    return np.partition(values, len(values) // 2)[len(values) // 2]

@@ -1,0 +1,175 @@
+"""Residuals of a frame's points at a pose in a grid, with derivatives and reliabilities; compiled.
+
+A point p of the frame (m, camera frame) has an intensity c (luma, in [0, 1]) and perhaps a unit
+normal n. At the pose (R, t) it lies at x = R p + t, with the lever arm a = x - t. The grid
+interpolates the signed distance f(x) (m), the intensity I(x) and the confidence k(x). With the
+gradient norm g = |grad f(x)|, never below G_MIN where it divides, a point has two residuals and
+their derivatives with respect to a twist (omega, v):
+
+    r_d = f / g,   q_d = grad f / g,   J_d = [(a x q_d)', q_d']
+    r_i = I - c,   q_i = grad I,       J_i = [(a x q_i)', q_i']
+
+g is held fixed in J_d. Dividing by it corrects distances that grow too fast or too slowly to first
+order. Source: paper, Eq. 2; f / |grad f| is an option in PIN-SLAM (Pan et al. 2024).
+
+A twist changes the pose about the camera's centre, with world axes: x -> t + v + exp(omega) a.
+
+The reliability w of a point, in [0, 1], is 0 outside of the bounds and their margin, and where
+g <= G_MIN or g >= G_MAX (PIN-SLAM: 0.5 to 2); elsewhere
+
+    w = (1 + ((g - 1) / G_SCALE)^2)^-2 * max(0, (R n)' grad f / g)^2 * k
+
+The factor of the normal counts where one is given (coarse stage): the nearest surface is not the
+observed one if it faces elsewhere. That of k counts in the fine stage: from afar, where no point
+lies at its surface, none would count.
+"""
+
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+import torch
+
+from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.observed import LUMA, Observed, compiled
+from nbtrack.core.arrays import Pose
+
+G_MIN = 0.3
+G_MAX = 2.0
+G_SCALE = 0.5
+MARGIN = 0.3  # m beyond a field's bounds, where walls lie if the pose is off
+_ONE = np.float32(1)
+_ZERO = np.float32(0)
+
+
+class Grid(NamedTuple):
+    """A baked field as the compiled functions take it. Lengths in m."""
+
+    vertices: np.ndarray  # n x 3: distance, intensity, confidence; z is fastest
+    n_vertices: np.ndarray  # 3, along x, y and z
+    low: np.ndarray  # 3, the first vertex
+    voxel: float
+    usable_low: np.ndarray  # 3, corners of the box whose points are usable
+    usable_high: np.ndarray
+    residual_sigma: np.ndarray  # 2, of distance and intensity
+    inlier_distance: float
+
+
+class Problem(NamedTuple):
+    """What the points of a frame ask of its pose: the cost and the prior of `lm_solver`."""
+
+    observed: Observed
+    grid: Grid
+    is_fine: bool  # whether confidences count
+    lambda_intensity: float
+    T_start: Pose
+
+
+class Terms(NamedTuple):
+    """What the cost needs of n points at a pose, in single precision. Distances come first."""
+
+    residuals: np.ndarray  # 2 x n: r_d (m) and r_i
+    reliability: np.ndarray  # n: w
+    lever_arms: np.ndarray  # 3 x n: a (m)
+    gradients: np.ndarray  # 2 x 3 x n: q_d and q_i
+
+
+def grid_of(field: BakedField) -> Grid:
+    """The grid of a field on the host."""
+    intensity = field.volume[:3].T @ torch.tensor(LUMA)
+    value, confidence = field.volume[3:]
+    return Grid(
+        vertices=torch.stack([value, intensity, confidence], dim=-1).numpy(),
+        n_vertices=np.array(field.n_vertices),
+        low=field.low.double().numpy(),
+        voxel=field.voxel,
+        usable_low=np.array(field.bounds.minimum) - MARGIN,
+        usable_high=np.array(field.bounds.maximum) + MARGIN,
+        residual_sigma=np.array(field.residual_sigma),
+        inlier_distance=field.inlier_distance,
+    )
+
+
+@no_type_check
+@compiled
+def residual_terms(problem, T):
+    """The terms of all points at a pose.
+
+    Loops are plain, which numba compiles soonest; no result depends on the number of threads.
+    """
+    points, grid = problem.observed.points, problem.grid
+    n_points = len(points)
+    residuals = np.empty((2, n_points), np.float32)
+    gradients = np.empty((2, 3, n_points), np.float32)
+    lever_arms, reliability, cells, in_cell, per_metre = _locate(points, T, grid)
+    vertices, one = grid.vertices, np.uintp(1)
+    step_x, step_y = np.uintp(grid.n_vertices[1] * grid.n_vertices[2]), np.uintp(grid.n_vertices[2])
+    for i in range(n_points):
+        v, x, y, z = np.uintp(cells[i]), in_cell[0, i], in_cell[1, i], in_cell[2, i]
+        for k in range(3 if problem.is_fine else 2):
+            # Eight corners of the cell: a, b are neighbours along z, ab and cd along y, the rest
+            # along x.
+            a, b = vertices[v, k], vertices[v + one, k]
+            c, d = vertices[v + step_y, k], vertices[v + step_y + one, k]
+            e, f = vertices[v + step_x, k], vertices[v + step_x + one, k]
+            g, h = vertices[v + step_x + step_y, k], vertices[v + step_x + step_y + one, k]
+            ab, cd, ef, gh = a + z * (b - a), c + z * (d - c), e + z * (f - e), g + z * (h - g)
+            low, high = ab + y * (cd - ab), ef + y * (gh - ef)
+            if k == 2:
+                reliability[i] *= low + x * (high - low)
+                break
+            low_z, high_z = b - a + y * (d - c - b + a), f - e + y * (h - g - f + e)
+            residuals[k, i] = low + x * (high - low)
+            gradients[k, 0, i] = (high - low) * per_metre[0, i]
+            gradients[k, 1, i] = (cd - ab + x * (gh - ef - cd + ab)) * per_metre[1, i]
+            gradients[k, 2, i] = (low_z + x * (high_z - low_z)) * per_metre[2, i]
+        residuals[1, i] -= problem.observed.intensity[i]
+    terms = Terms(residuals, reliability, lever_arms, gradients)
+    _weigh(terms, problem.observed.normals, T)
+    return terms
+
+
+@no_type_check
+@compiled
+def _locate(points, T, grid):
+    """Lever arms; whether points are usable (1 or 0); their cells, where in these they lie, and by
+    what derivatives along these are multiplied (1/m)."""
+    n_points, inverse = len(points), 1 / grid.voxel
+    reliability, cells = np.ones(n_points, np.float32), np.zeros(n_points, np.int64)
+    lever_arms = np.empty((3, n_points), np.float32)
+    in_cell, per_metre = np.empty((2, 3, n_points), np.float32)
+    for k in range(3):
+        last = grid.n_vertices[k] - 1.0
+        for i in range(n_points):
+            lever_arm = T[k, 0] * points[i, 0] + T[k, 1] * points[i, 1] + T[k, 2] * points[i, 2]
+            world = lever_arm + T[k, 3]
+            lever_arms[k, i] = lever_arm
+            reliability[i] *= (grid.usable_low[k] <= world) & (world <= grid.usable_high[k])
+            scaled = (world - grid.low[k]) * inverse
+            # Points outside are moved to the border, where the gradient is 0; so are NaNs.
+            per_metre[k, i] = inverse if (scaled >= 0) & (scaled <= last) else 0.0
+            scaled = min(scaled, last) if scaled > 0 else 0.0
+            cell = min(int(scaled), grid.n_vertices[k] - 2)
+            in_cell[k, i] = scaled - cell
+            cells[i] = cells[i] * grid.n_vertices[k] + cell
+    return lever_arms, reliability, cells, in_cell, per_metre
+
+
+@no_type_check
+@compiled
+def _weigh(terms, normals, T):
+    """Reliability by the gradient norm and the angle to normals, and division by the norm."""
+    gradient = terms.gradients[0]
+    for i in range(len(terms.reliability)):
+        g = np.sqrt(gradient[0, i] ** 2 + gradient[1, i] ** 2 + gradient[2, i] ** 2)
+        weight = _ONE / (_ONE + ((g - _ONE) / np.float32(G_SCALE)) ** 2)
+        terms.reliability[i] *= weight * weight if G_MIN < g < G_MAX else _ZERO
+        divisor = max(g, np.float32(G_MIN))
+        if len(normals):
+            cosine = 0.0
+            for k in range(3):
+                turned = T[k, 0] * normals[i, 0] + T[k, 1] * normals[i, 1] + T[k, 2] * normals[i, 2]
+                cosine += gradient[k, i] * turned / divisor
+            terms.reliability[i] *= max(cosine, 0.0) ** 2
+        terms.residuals[0, i] /= divisor
+        for k in range(3):
+            gradient[k, i] /= divisor
