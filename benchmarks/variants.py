@@ -15,6 +15,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from nbtrack.beyond.points import depth_behind
 from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.settings import flat
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
@@ -128,14 +129,10 @@ FIELDS[SmoothImap.name] = SmoothImap
 
 def with_variants(preset: Preset) -> Preset:
     """The preset, with settings for the variants: those of what each was made from."""
-    trackers = {kind.name: preset.tracking[kind.name.split("_")[0]] for kind in _TRACKERS}
-    fields = {"imap_silu": "imap"}
-    return replace(
-        preset,
-        tracking=preset.tracking | trackers,
-        mapping=preset.mapping | {new: preset.mapping[old] for new, old in fields.items()},
-        network=preset.network | {new: preset.network[old] for new, old in fields.items()},
-    )
+    trackers = {kind.name: preset.tracking_of(kind.name.split("_")[0]) for kind in _TRACKERS}
+    mapping, network = preset.mapping_of("imap"), preset.network_of("imap")
+    settings = {"tracking": trackers, "mapping": {"imap_silu": mapping}}
+    return preset.with_values(flat(settings | {"network": {"imap_silu": network}}))
 
 
 @dataclass(frozen=True)

@@ -470,5 +470,8 @@ def test_images_that_change(tmp_path: Path) -> None:
     assert report.frames.flicker.max() > 0.8
     (advice,) = (text for text in report.warnings if "brightness changes by" in text)
     settings = re.findall(r"tracking\.\w+\.\w+=0", advice)
-    changed = with_settings(load_preset("smoke"), *settings).tracking
-    assert (changed["lm"].lambda_intensity, changed["sdf"].lambda_color) == (0, 0)
+    changed = with_settings(load_preset("smoke"), *settings)
+    assert (
+        changed.tracking_of("lm").lambda_intensity,
+        changed.tracking_of("sdf").lambda_color,
+    ) == (0, 0)

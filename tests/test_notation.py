@@ -36,7 +36,7 @@ def test_sizes_are_those_of_the_preset() -> None:
     width, pixels = preset.scenes.width, [preset.tracking_of(t).n_pixels for t in ("vr", "sdf")]
     paper = load_preset("paper")
     assert f"| images | 640×480 | {width}×{width * 3 // 4} |" in TEXT
-    layers = NetworkSettings().width, preset.network["imap"].width
+    layers = NetworkSettings().width, preset.network_of("imap").width
     assert "| network | 4 layers of {} | 4 layers of {} |".format(*layers) in TEXT
     of_paper = [f"{paper.tracking_of(t).n_pixels:,}" for t in ("vr", "sdf")]
     row = f"| pixels a step, VR and SDF | {', '.join(of_paper)} | {pixels[0]}, {pixels[1]} |"

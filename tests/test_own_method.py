@@ -24,7 +24,6 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError, NbtrackError
 from nbtrack.core.files import runs_folder
 from nbtrack.core.settings import with_settings
-from nbtrack.experiments import presets
 from nbtrack.experiments.methods import METHODS, Method, method_of
 from nbtrack.experiments.presets import load_preset
 from nbtrack.fields import FIELDS, NetworkSettings, NeusMapping, field_class
@@ -271,12 +270,11 @@ def test_settings_do_not_depend_on_when_a_class_is_registered(
     own = own.replace("class Mine", "@dataclass(frozen=True)\nclass Own(SdfSettings):\n"
                       '    motion_model: str = "constant_velocity"\nclass Mine')  # fmt: skip
     monkeypatch.setitem(TRACKERS, "mine", in_a_cell("from dataclasses import dataclass\n" + own))
-    for preset in (presets._from_file("smoke"), load_preset("smoke")):
-        settings = preset.tracking_of("mine")
-        assert (settings.n_pixels, settings.motion_model) == (512, "constant_velocity")
+    settings = load_preset("smoke").tracking_of("mine")
+    assert (settings.n_pixels, settings.motion_model) == (512, "constant_velocity")
 
 
-@pytest.mark.parametrize("when", ["with the package", "before", "after"])
+@pytest.mark.parametrize("when", ["before", "after"])
 def test_settings_of_a_field_whenever_it_is_registered(
     when: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -294,17 +292,15 @@ def test_settings_of_a_field_whenever_it_is_registered(
 
     kinds = {"name": "mine", "Network": Network, "Settings": Settings}
     mine = type("Mine", (FIELDS["neus"],), kinds)
-    if when != "after":
+    if when == "before":
         monkeypatch.setitem(FIELDS, "mine", mine)
-    if when == "with the package":
-        monkeypatch.setitem(presets.PRESETS, "smoke", presets._from_file("smoke"))
     chosen = ["mapping.neus.iterations=7", "mapping.neus.n_surface=9", "network.neus.width=33"]
     preset = load_preset("smoke", settings=chosen)
     monkeypatch.setitem(FIELDS, "mine", mine)
     settings = preset.mapping_of("mine")
     assert (settings.iterations, settings.n_rays, settings.n_surface) == (1200, 96, 5)
     assert preset.network_of("mine").width == 96
-    with pytest.raises(ConfigError, match=r"of 'tanh', but of imap, neus, .*mine") as caught:
+    with pytest.raises(ConfigError, match=r"network of 'tanh': .*imap, neus, .*mine") as caught:
         with_settings(preset, "network.tanh.width=3")
     assert "did you mean" not in str(caught.value)
 

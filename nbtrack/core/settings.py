@@ -9,7 +9,7 @@ import dataclasses
 import json
 import math
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from nbtrack.core.errors import ConfigError, look_up
@@ -40,14 +40,14 @@ def as_dict(config: Any) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
-def with_settings(config: Config, *settings: str) -> Config:
-    """The config with some `key=value` texts applied, the last one last.
+def with_settings(preset: Any, *settings: str) -> Any:
+    """What has a method `with_values`, as presets do, with some `key=value` texts applied in order.
 
-    Raises ConfigError as `with_values` and `read_setting` do.
+    Raises ConfigError as that and `read_setting` do.
     """
     for setting in settings:
-        config = with_values(config, read_setting(setting))
-    return config
+        preset = preset.with_values(read_setting(setting))
+    return preset
 
 
 def read_setting(setting: str) -> dict[str, Any]:
@@ -69,18 +69,12 @@ def read_setting(setting: str) -> dict[str, Any]:
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
-    """The config with some values of dotted keys, or of trees of keys as TOML gives them.
+    """The dataclass, or tree of them, with some values of dotted keys, or trees as TOML has them.
 
     Raises ConfigError for an unknown key, or a value of the wrong type or range.
     """
-    config = dataclasses.replace(config)  # a class may take up what was added since it was made
     valid = flat(config)
     for key, value in flat(dict(values)).items():
-        part, name, *_ = f"{key}.".split(".")
-        known = getattr(config, part, None)
-        if isinstance(known, dict) and name and name not in known:
-            found = f"unknown config key {key[:80]!r}"  # the nearest one is something else's
-            raise ConfigError(f"{found}: no {part} of {name[:40]!r}, but of {', '.join(known)}")
         look_up("config key", key, valid)
         config = _replaced(config, key.split("."), key, value, {})
     return config
@@ -92,20 +86,14 @@ def changed_settings(config: Config, original: Config) -> list[str]:
     return [f"{k}={json.dumps(v)}" for k, v in flat(config).items() if (k, v) not in before]
 
 
-def flat(config: Any) -> dict[str, Any]:
+def flat(config: Any, prefix: str = "") -> dict[str, Any]:
     """The values of a config, or of a tree as TOML gives it, by their dotted keys."""
-    return dict(_leaves(config))
-
-
-def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    if dataclasses.is_dataclass(node):
-        fields = [f for f in dataclasses.fields(node) if f.metadata.get("is_setting", True)]
-        node = {f.name: getattr(node, f.name) for f in fields}
-    if not isinstance(node, dict) or prefix.count(".") > _DEEPEST:
-        yield prefix, node
-        return
-    for name, value in node.items():
-        yield from _leaves(value, f"{prefix}.{name}" if prefix else name)
+    if dataclasses.is_dataclass(config):
+        config = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    if not isinstance(config, dict) or prefix.count(".") > _DEEPEST:
+        return {prefix: config}
+    parts = (flat(part, f"{prefix}.{name}".lstrip(".")) for name, part in config.items())
+    return {key: value for part in parts for key, value in part.items()}
 
 
 def _replaced(node: Any, path: list[str], key: str, value: Any, allowed: Mapping) -> Any:
@@ -122,8 +110,8 @@ def _replaced(node: Any, path: list[str], key: str, value: Any, allowed: Mapping
 
 def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
     wanted = type(old)
-    if wanted is tuple and isinstance(value, list | str | int | float):
-        values = value if isinstance(value, list) else [value]
+    if wanted is tuple and isinstance(value, list | tuple | str | int | float):
+        values = value if isinstance(value, list | tuple) else [value]
         if not values:
             raise ConfigError(f"{key} = []: give at least one, for example {list(old)}")
         return tuple(_converted(key, old[0], v, allowed) if old else v for v in values)

@@ -161,7 +161,7 @@ def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
 
 def _note(preset: Preset, clock: bool) -> str:
     """How the numbers were measured, in a sentence. The columns name the scenes."""
-    changed = changed_settings(preset, PRESETS[preset.name])
+    changed = changed_settings(preset.settings, PRESETS[preset.name].settings)
     changed = ", ".join(text for text in changed if not text.startswith("scenes.names"))
     label = f"{preset.name}, with {changed}" if changed else preset.name
     budget = "wall clock" if clock else preset.step_counts

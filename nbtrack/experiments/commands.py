@@ -164,7 +164,7 @@ def _check_fits(given: Map, method: Method, preset: Preset, options: Namespace) 
     if method.field != name:
         advice = "leave --method and --field out"
         raise ConfigError(f"{path} is a map of field {name!r}, not {method.field!r}: {advice}")
-    network = name if name in preset.network else "neus"
+    network = name if name in preset.settings["network"] else "neus"
     made = {f"network.{network}.{k}": v for k, v in record["network"].items()}
     made |= {f"mapping.{name}.{k}": v for k, v in record["settings"].items()}
     made[f"correction.{name}"] = record.get("correction", 0.0)

@@ -93,7 +93,7 @@ class MapJob(Job):
 
     def setting_tree(self) -> dict[str, Any]:
         """Its settings where a preset has them."""
-        network = self.field if self.field in replace(PRESETS[PLAIN_PRESET]).network else "neus"
+        network = self.field if self.field in PRESETS[PLAIN_PRESET].settings["network"] else "neus"
         return {
             "network": {network: self.network} if self.network else {},
             "mapping": {self.field: self.settings},

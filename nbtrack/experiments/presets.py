@@ -7,7 +7,7 @@ Precedence, in every command: class defaults < preset < method < TOML file (`NBT
 import os
 import shlex
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.tables import PAPER_PIXELS
-from nbtrack.tracking import TRACKERS, TrackerSettings, tracker_class
+from nbtrack.tracking import TRACKERS, TrackerSettings
 
 
 @dataclass(frozen=True)
@@ -60,51 +60,109 @@ class TablesConfig:
 
 # A density gains from finer detail; a distance must start smooth, or ripples satisfy the
 # eikonal term: at 4 rad/m in place of 2.5 it was off by 19 cm in free space, not by 5.
+# Fields without a `Network` class of their own, as NeuS+, have the network of NeuS.
 _NETWORKS = {
     "imap": NetworkSettings(embedding_sigma=4.0),
     "neus": NetworkSettings(),
     "occupancy": NetworkSettings(embedding_sigma=4.0),
 }
+# Whose changes by a preset hold for all of a part that the preset does not name.
+_USUAL = {"network": "neus", "mapping": "neus", "tracking": "sdf"}
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Everything that a run depends on, apart from the data and the seed."""
+    """Everything that a run depends on, apart from the data and the seed.
 
-    name: str = field(metadata={"is_setting": False})  # no `key=value` reaches it
-    # Fields without a `Network` class of their own, as NeuS+, have the network of NeuS.
-    network: dict[str, Any] = field(default_factory=_NETWORKS.copy)
-    # Of every field and tracker; of those that are not given, the defaults of their classes.
-    mapping: dict[str, Any] = field(default_factory=dict)
-    # Cells (m) in which the finished map of a field with a distance is corrected; 0: it is not.
-    correction: dict[str, float] = field(default_factory=dict)
-    tracking: dict[str, TrackerSettings] = field(default_factory=dict)
-    scenes: ScenesConfig = ScenesConfig()
-    tables: TablesConfig = TablesConfig()
-    # Dotted keys of the user's own values, which a method does not change.
-    chosen: tuple[str, ...] = field(default=(), metadata={"is_setting": False})
-    # Settings of NeuS and of SDF tracking, by part, as the preset has them.
-    usual: dict[str, Any] = field(default_factory=dict, metadata={"is_setting": False})
+    It holds what is changed in the defaults of the settings classes, by dotted keys. Settings are
+    built from that when they are asked for: so what is registered later has settings too.
+    """
 
-    def __post_init__(self) -> None:
-        """Add settings of what is registered and has none.
+    name: str
+    own: dict[str, Any] = field(default_factory=dict)  # changed by the preset itself
+    of_method: dict[str, Any] = field(default_factory=dict)  # by the method that is run
+    chosen: dict[str, Any] = field(default_factory=dict)  # by the user, over both
 
-        They are the defaults of its class, with what the preset changes in those of NeuS or of SDF
-        tracking, whenever it is registered. A user's values change only what they name.
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The whole tree, with every field and tracker that is registered now.
+
+        What the preset does not name has the defaults of its class, with what the preset changes in
+        NeuS or in SDF tracking. A user's values change only what they name.
         """
         learned = {n: kind for n, kind in FIELDS.items() if issubclass(kind, LearnedField)}
-        networks = {n: k.Network for n, k in learned.items() if k.Network is not NetworkSettings}
-        self._complete("network", networks, "neus")
-        self._complete("mapping", {n: kind.Settings for n, kind in FIELDS.items()}, "neus")
-        self._complete("tracking", {n: kind.Settings for n, kind in TRACKERS.items()}, "sdf")
-        none = {name: 0.0 for name, kind in learned.items() if kind.is_distance}
-        object.__setattr__(self, "correction", none | self.correction)
+        networks = {n: k.Network() for n, k in learned.items() if k.Network is not NetworkSettings}
+        tree = {
+            "network": _NETWORKS | networks,
+            "mapping": {name: kind.Settings() for name, kind in FIELDS.items()},
+            # Cells (m) in which the finished map of a distance is corrected; 0: it is not.
+            "correction": {name: 0.0 for name, kind in learned.items() if kind.is_distance},
+            "tracking": {name: kind.Settings() for name, kind in TRACKERS.items()},
+            "scenes": ScenesConfig(),
+            "tables": TablesConfig(),
+        }
+        return with_values(tree, self._usual(tree) | self.own | self.of_method | self.chosen)
 
-    def _complete(self, part: str, kinds: dict[str, type], usual: str) -> None:
-        known = getattr(self, part)
-        other = self.usual.setdefault(part, known.get(usual))
-        found = {n: _like(known.get(n, other), kind) for n, kind in kinds.items()}
-        object.__setattr__(self, part, known | found)
+    def _usual(self, tree: dict[str, Any]) -> dict[str, Any]:
+        """By dotted keys, what the preset changes in all that it does not name."""
+        values = {}
+        for part, usual in _USUAL.items():
+            named = {key.split(".")[1] for key in self.own if key.startswith(f"{part}.")}
+            start = f"{part}.{usual}."
+            changes = {k.removeprefix(start): v for k, v in self.own.items() if k.startswith(start)}
+            for name in tree[part].keys() - named:
+                own = {k: v for k, v in changes.items() if hasattr(tree[part][name], k)}
+                values |= {f"{part}.{name}.{key}": value for key, value in own.items()}
+        return values
+
+    def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Values as their keys have them; ConfigError for unknown keys, wrong types and ranges."""
+        tree = self.settings
+        for key in values:
+            part, *names = key.split(".")
+            if names and isinstance(known := tree.get(part), dict):
+                # The nearest whole key would be something else's.
+                look_up(f"config key, {part} of", names[0], known)
+        checked = flat(with_values(tree, values))
+        return {key: checked[key] for key in values}
+
+    def with_values(self, values: Mapping[str, Any]) -> "Preset":
+        """The preset with a user's values, by dotted keys. Raises ConfigError for wrong ones."""
+        return replace(self, chosen=self.chosen | self._checked(values))
+
+    def with_method(self, settings: Sequence[str]) -> "Preset":
+        """The preset with the `key=value` texts of a method, but for what a user chose."""
+        values = {key: value for text in settings for key, value in read_setting(text).items()}
+        return replace(self, of_method=self.of_method | self._checked(values))
+
+    @property
+    def scenes(self) -> ScenesConfig:
+        """Which sequences are mapped and tracked."""
+        return self.settings["scenes"]
+
+    @property
+    def tables(self) -> TablesConfig:
+        """What the tables ask."""
+        return self.settings["tables"]
+
+    @property
+    def correction(self) -> dict[str, float]:
+        """Cells (m) in which maps are corrected, by field; 0: they are not."""
+        return self.settings["correction"]
+
+    def network_of(self, field_name: str) -> Any:
+        """Network of a field, by default that of NeuS; None of a field that learns nothing."""
+        networks = self.settings["network"]
+        is_learned = issubclass(field_class(field_name), LearnedField)
+        return networks.get(field_name, networks["neus"]) if is_learned else None
+
+    def mapping_of(self, field_name: str) -> Any:
+        """Mapping settings of a field."""
+        return look_up("field", field_name, self.settings["mapping"])
+
+    def tracking_of(self, tracker_name: str) -> TrackerSettings:
+        """Settings of a tracker."""
+        return look_up("tracker", tracker_name, self.settings["tracking"])
 
     @property
     def step_counts(self) -> str:
@@ -115,54 +173,14 @@ class Preset:
         there = f"measured there with n = {paper} and {width} units a layer"
         return f"the paper's step counts, {there}; here n = {own} and {own_width} units"
 
-    def with_method(self, settings: Sequence[str]) -> "Preset":
-        """The preset with the `key=value` texts of a method, but for what a user chose."""
-        changed = self
-        for values in map(read_setting, settings):
-            own = {key: value for key, value in values.items() if key not in self.chosen}
-            changed = with_values(changed, own)
-        return changed
 
-    def network_of(self, field_name: str) -> Any:
-        """Network of a field, by default that of NeuS; None of a field that learns nothing."""
-        known = replace(self).network  # with those of fields registered since
-        is_learned = issubclass(field_class(field_name), LearnedField)
-        return known.get(field_name, known["neus"]) if is_learned else None
-
-    def mapping_of(self, field_name: str) -> Any:
-        """Mapping settings of a field."""
-        return look_up("field", field_name, replace(self).mapping)
-
-    def tracking_of(self, tracker_name: str) -> TrackerSettings:
-        """Settings of a tracker."""
-        return look_up("tracker", tracker_name, replace(self).tracking)
-
-
-def _like(other: Any, kind: type) -> Any:
-    """Settings of a class, with what is changed in those of another where both have it."""
-    if other is None or type(other) is kind:
-        return other or kind()
-    usual = vars(type(other)())
-    changed = {name for name, value in vars(other).items() if value != usual[name]}
-    return kind(**{name: getattr(other, name) for name in changed & vars(kind()).keys()})
-
-
-def _from_file(name: str) -> Preset:
-    """A preset of this folder; what it does not name follows what it does, whenever registered."""
-    said = read_object(Path(__file__).with_name(f"{name}.toml"))
-    network = {n: with_values(k, said["network"].get(n, {})) for n, k in _NETWORKS.items()}
-    mapping = {f: with_values(field_class(f).Settings(), v) for f, v in said["mapping"].items()}
-    tracking = {t: with_values(tracker_class(t).Settings(), v) for t, v in said["tracking"].items()}
-    return with_values(Preset(name, network, mapping, tracking=tracking), said)
-
-
-_SMALL = _from_file("smoke")
-_NINE = replace(_SMALL.scenes, names=REPORTED_ROOMS, track_frames=":")
+_SMALL = flat(read_object(Path(__file__).with_name("smoke.toml")))
+_NINE = {"scenes.names": REPORTED_ROOMS, "scenes.track_frames": ":"}
 PRESETS = {
-    "smoke": _SMALL,
-    "nine_rooms": replace(_SMALL, name="nine_rooms", scenes=_NINE),
-    "synthetic": Preset("synthetic", scenes=ScenesConfig(REPORTED_ROOMS)),
-    "paper": Preset("paper", scenes=ScenesConfig(tuple(DATASET_SCENES))),
+    "smoke": Preset("smoke", _SMALL),
+    "nine_rooms": Preset("nine_rooms", _SMALL | _NINE),
+    "synthetic": Preset("synthetic", {"scenes.names": REPORTED_ROOMS}),
+    "paper": Preset("paper", {"scenes.names": tuple(DATASET_SCENES)}),
 }
 
 
@@ -176,22 +194,17 @@ def load_preset(
     wrong type; MissingError if the file does not exist, DataError if it is no TOML.
     """
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
-    layers = []
     if config_file := config_file or os.environ.get("NBTRACK_CONFIG"):
         config_file = absolute(config_file)
         if not config_file.is_file():
             raise MissingError(f"no config file {config_file}: give a TOML file of settings")
-        layers.append(flat(read_object(config_file)))
+        preset = preset.with_values(flat(read_object(config_file)))
     try:
         before = shlex.split(os.environ.get("NBTRACK_SET", ""))
     except ValueError as error:
         advice = "quote each setting as in a shell"
         raise ConfigError(f"NBTRACK_SET cannot be split ({error}): {advice}") from None
-    chosen: set[str] = set()
-    for layer in [*layers, *map(read_setting, [*before, *settings])]:
-        preset = with_values(preset, layer)  # a value that a later one replaces is checked too
-        chosen |= layer.keys()
-    return replace(preset, chosen=tuple(sorted(chosen)))
+    return with_settings(preset, *before, *settings)
 
 
 def claim(preset: Preset, holds: bool, text: str, usual: Sequence[str] = ()) -> None:
@@ -202,7 +215,7 @@ def claim(preset: Preset, holds: bool, text: str, usual: Sequence[str] = ()) -> 
     """
     if holds:
         print(text)
-    elif changed_settings(preset, with_settings(replace(PRESETS["smoke"]), *usual)):
+    elif changed_settings(preset.settings, with_settings(PRESETS["smoke"], *usual).settings):
         warnings.warn(f"with these settings it does not hold that {text}", stacklevel=2)
     else:
         raise AssertionError(f"it does not hold that {text}")

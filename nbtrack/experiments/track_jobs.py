@@ -237,7 +237,7 @@ class TrackJob(Job):
             sequence = self.scene.name
             made = self.scene.made
             settings["scenes"] = {name: getattr(made, name) for name in SIZES}
-        plain = replace(PRESETS[PLAIN_PRESET])
+        plain = PRESETS[PLAIN_PRESET].settings
         words = [f"--set={text}" for text in changed_settings(settings, plain)]
         words += [f"--{name}={value}" for name, value in options.items() if value is not None]
         words += [f"--import={source}" for source in IMPORTED]
