@@ -19,7 +19,7 @@ from nbtrack.core.settings import flat
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import FIELDS, Field, IMapField
+from nbtrack.fields import FIELDS, Field, IMapField, NetworkSettings
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.synthetic import Room
 from nbtrack.tracking import TRACKERS, AdamTracker, SdfTracker, VrTracker
@@ -112,10 +112,14 @@ class SdfFalling(_Falling, SdfTracker):
     name = "sdf_falling"
 
 
+class SmoothNetwork(NetworkSettings):
+    """A class of its own, so that presets keep it apart from the network of NeuS."""
+
+
 class SmoothImap(IMapField):
     """iMAP with the activation of NeuS."""
 
-    name = "imap_silu"
+    name, Network = "imap_silu", SmoothNetwork
 
     def __init__(self, *args) -> None:
         super().__init__(*args)

@@ -45,6 +45,8 @@ some_seeds = partial(a_count, maximum=1000)
 _STARTS = {"choices": ("given", "unknown"), "default": "given"}
 _BUDGETS = {"choices": ("steps", "clock"), "default": "steps"}
 _SETTINGS = {"action": "append", "default": [], "dest": "settings", "metavar": "KEY=VALUE"}
+_CAPTION = {"nargs": "?", "const": "", "metavar": "TEXT"}
+_FLAG = {"action": "store_true"}
 _IMPORTS = {"action": "append", "default": [], "dest": "imports", "metavar": "FILE.py"}
 OPTIONS = {
     "sequence": _option("a folder, or the name of a room or dataset scene"),
@@ -68,7 +70,10 @@ OPTIONS = {
     "--seeds": _option("so many maps and runs a cell: mean ± std", some_seeds, default=1),
     "--workers": _option("jobs side by side (default: one a core, or one on a GPU)", a_count),
     "--dask": _option("run on a Dask cluster, as tcp://HOST:8786", metavar="ADDRESS"),
-    "--beyond": {"help": "Table III: our methods too, and 30 Hz", "action": "store_true"},
+    "--beyond": {"help": "Table III: our methods too, and 30 Hz", **_FLAG},
+    "--caption": _option("of the LaTeX table; without a text: the usual one, short", **_CAPTION),
+    "--label": _option("of the LaTeX table (default: tab:ate-PRESET)"),
+    "--no-still": {"help": "without the rows of a camera that stands still", **_FLAG},
     "--n-frames": _option("how many (default: 300)", int, default=300),
     "--width": _option("pixels; the height is 3/4 of it", int, default=640),
     "--motion": _option("handheld (default), keyframes: the dataset's, tour", default="handheld"),
@@ -89,6 +94,7 @@ _MADE = " --method --field --format --frames --seed --out" + _RUN
 _PARTS = " --format --depth-folder --poses"
 _TRACKED = " --tracker --rate --steps --map-frames --map-from --start"
 _CELLS = "--budget --scenes --method --beyond --seeds --workers --dask --out"
+_CELLS += " --caption --label --no-still"
 # By name: what it does, and its options. `map` is done by the function `map_command`, `data make`
 # by `make_command`.
 COMMANDS = {

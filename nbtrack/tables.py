@@ -7,6 +7,7 @@ table. Rows follow the data: a new tracker is a new row and nothing here names a
 import copy
 import html
 import re
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -213,15 +214,16 @@ def style_table_1(
 def style_table_2(
     steps: pd.DataFrame, caption: str | None = None, default_pixels: dict[str, int] = PAPER_PIXELS
 ) -> TableStyler:
-    """Table II, mean ± std over frames, without decimals in rows of whole numbers.
+    """Table II, mean ± std over frames; rows of whole numbers without a std have no decimals.
 
     The default pixels of each tracker, the n used for Table I, are printed bold with an asterisk.
     """
     wide = table_2(steps)
-    is_whole = (wide.isna() | (wide % 1 == 0)).all(axis=1)
+    spread = table_2(steps, "steps_std")
+    is_whole = (wide.isna() | (wide % 1 == 0)).all(axis=1) & spread.isna().all(axis=1)
     texts = _texts(wide, "{:.1f}", _MISSING)
     texts[is_whole] = _texts(wide[is_whole], "{:.0f}", _MISSING)
-    texts += _texts(table_2(steps, "steps_std"), " ± {:.1f}")
+    texts += _texts(spread, " ± {:.1f}")
     styler = TableStyler(texts)
     # Notebooks show every row label in bold, so the others are set to normal weight.
     weights = [_BOLD if default_pixels.get(row[0]) == row[1] else _PLAIN for row in wide.index]
@@ -245,24 +247,34 @@ def _labelled(styler: TableStyler, caption: str | None, legend: str) -> TableSty
     return styler.set_uuid(fingerprint(styler.set_uuid("table").to_html()))
 
 
-def latex_file(styler: TableStyler, path: Path, note: str) -> str:
+def latex_file(
+    styler: TableStyler,
+    path: Path,
+    note: str,
+    caption: str | None = None,
+    label: str | None = None,
+    scenes: Mapping[str, str] | None = None,
+) -> str:
     """A styled table as the text of a `.tex` file, marked up as in the paper.
 
     The file's name, `table_1`, `table_2` or `table_3`, chooses the caption; its folder's name goes
-    into the label; a plain note tells how the numbers came about.
+    into the label; a plain note tells how the numbers came about. An empty caption is that without
+    the note; another one (LaTeX), and a label, stand as they are. Scenes may have other names.
     """
     table = styler.data
     kind = _KINDS[path.stem]
     note = " ".join(note.split())
-    caption = _CAPTIONS[kind].replace(r"\si{m}", rf"\si{{{styler.unit}}}")
+    usual = _CAPTIONS[kind].replace(r"\si{m}", rf"\si{{{styler.unit}}}")
     has_steps = "n_pixels" in table.index.names
     has_std = table.map(lambda text: "±" in text).any(axis=None)
     if has_std:
-        caption += f" Small: std over {'frames' if has_steps else 'seeds'}."
+        usual += f" Small: std over {'frames' if has_steps else 'seeds'}."
+    caption = f"{usual} {_escape(note)}" if caption is None else caption or usual
     styler = copy.deepcopy(styler).format(_latex_number)
+    forms = _LATEX_LABELS | {"scene": lambda name: _stacked((scenes or {}).get(name, name))}
     for axis, labels in enumerate(table.axes):
         for level in labels.names:
-            styler.format_index(_LATEX_LABELS.get(level, _escape), axis=axis, level=level)
+            styler.format_index(forms.get(level, _escape), axis=axis, level=level)
         styler.hide(axis=axis, names=True)
     styler.set_table_styles([{"selector": s, "props": ":;"} for s in ("smallskip", "scriptsize")])
     folder = re.sub(r"[^\w.-]", "_", path.resolve().parent.name)  # labels hold no special character
@@ -270,9 +282,11 @@ def latex_file(styler: TableStyler, path: Path, note: str) -> str:
         column_format=f"@{{}}l{'c' if has_steps else 'l'}{'r' * len(table.columns)}@{{}}",
         environment="table" if has_steps else "table*", position_float="centering", hrules=True,
         clines="skip-last;data", multirow_align="c", convert_css=True,
-        label=f"tab:{kind}-{folder}", caption=f"{caption} {_escape(note)}",
+        label=label or f"tab:{kind}-{folder}", caption=caption,
     )  # fmt: skip
-    text = re.sub(r"(\\color\{red\} .*?) (&|\\\\)", r"\1\\rlap{$^\\dagger$} \2", text)
+    # Above a std there is room for the dagger; elsewhere it stands in the gap between the columns.
+    text = re.sub(r"(\\color\{red\} [^&$]*)\$_", r"\1$^\\dagger_", text)
+    text = re.sub(r"(\\color\{red\} [^&$]*?) (&|\\\\)", r"\1\\rlap{$^\\dagger$} \2", text)
     # Pandas writes clines only, and puts the head of row labels into a line of its own.
     text = re.sub(r"\\cline\{[\d-]+\}\n(?=\\bottomrule)", "", text)
     text = re.sub(r"\\cline\{[\d-]+\}", r"\\midrule", text)
@@ -298,13 +312,12 @@ def _stacked(scene: str) -> str:
 _LATEX_LABELS = {
     "rate_hz": r"$r=\SI{{{:g}}}{{Hz}}$".format,
     "budget_ms": r"\SI{{{:g}}}{{ms}}".format,
-    "scene": _stacked,
 }
 
 
 def _latex_number(text: str) -> str:
     """A cell for LaTeX: the std small, and not bold beside a bold number."""
-    return re.sub(" ± (.+)", r"${\\scriptscriptstyle\\pm\1}$", text).replace(_MISSING, "--")
+    return re.sub(" ± (.+)", r"$_{\\pm\1}$", text).replace(_MISSING, "--")
 
 
 def write_tables(
@@ -314,38 +327,47 @@ def write_tables(
     note: str,
     default_pixels: dict[str, int] = PAPER_PIXELS,
     steps_note: str | None = None,
+    **latex: Any,
 ) -> list[Path]:
     """Writes Tables I and II as CSV (long form), LaTeX, and beside the paper's; returns the paths.
 
     The arguments are those of `table_1`, `table_2`, `latex_file` and `style_table_2`. Table II is
-    always measured by the clock and may have a note of its own.
+    always measured by the clock and may have a note of its own. Beside a caption of Table I it has
+    its usual one without the note, and beside a label the same, ending in `-steps`.
     """
     styled = style_table_2(steps, default_pixels=default_pixels)
     compared = beside(table_2(steps), table_2(published_table_2()))
-    paths = write_table_1(folder, results, note)
-    return paths + _write_table(folder / "table_2", steps, styled, steps_note or note, compared)
+    paths = write_table_1(folder, results, note, **latex)
+    note = steps_note or note
+    if latex.get("caption") is not None:
+        latex["caption"] = ""
+    if latex.get("label"):
+        latex["label"] += "-steps"
+    return paths + _write_table(folder / "table_2", steps, styled, note, compared, **latex)
 
 
-def write_table_1(folder: Path, results: pd.DataFrame, note: str) -> list[Path]:
+def write_table_1(folder: Path, results: pd.DataFrame, note: str, **latex: Any) -> list[Path]:
     """Writes Table I alone as CSV, LaTeX, and beside the paper's; see `write_tables`."""
     cells = average_over_seeds(results)
     compared = beside_published(results)
-    return _write_table(folder / "table_1", cells, style_table_1(results), note, compared)
+    return _write_table(folder / "table_1", cells, style_table_1(results), note, compared, **latex)
 
 
-def write_table_3(folder: Path, results: pd.DataFrame, note: str) -> list[Path]:
+def write_table_3(folder: Path, results: pd.DataFrame, note: str, **latex: Any) -> list[Path]:
     """Writes Table III, Table I with other rows and in mm, as CSV and LaTeX; see `write_tables`.
 
     Labels of rows contain n, since a method with more points a frame is another method.
     """
     results = naming_points(results)
     cells = average_over_seeds(results)
-    return _write_table(folder / "table_3", cells, style_table_1(results, unit="mm"), note)
+    return _write_table(folder / "table_3", cells, style_table_1(results, unit="mm"), note, **latex)
 
 
-def _write_table(stem: Path, cells: pd.DataFrame, styler, note: str, compared=None) -> list[Path]:
+def _write_table(
+    stem: Path, cells: pd.DataFrame, styler, note: str, compared=None, **latex: Any
+) -> list[Path]:
     path = stem.with_suffix(".tex")
-    write_atomic(path, latex_file(styler, path, note))
+    write_atomic(path, latex_file(styler, path, note, **latex))
     paths = [write_csv(stem.with_suffix(".csv"), cells), path]
     if compared is not None:
         paths.append(write_csv(Path(f"{stem}_vs_paper.csv"), compared, index=True))

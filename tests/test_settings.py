@@ -307,7 +307,7 @@ def test_every_key_at_its_limits(key: str, small: Small) -> None:
     old = EVERY_KEY[key]
     texts, kind = [], type(old)
     if kind is tuple:
-        texts, kind = ["[]"], type(old[0])
+        texts, kind = ["[]"], type(old[0]) if old else str
     for text in [*texts, *map(str, TOO_MUCH.get(kind, []))]:
         with pytest.raises(ConfigError):
             with_settings(small.preset, f"{key}={text}")

@@ -210,7 +210,7 @@ def test_steps_of_our_own_cells() -> None:
     ]
     spread = style_table_2(OURS_2.assign(steps_std=[0.5, 1.5, 0.25, 0.75])).data
     assert spread.loc[("LM", 64)].tolist() == ["1.0 ± 1.5", "3.0 ± 0.5"]
-    assert spread.loc[("VR", 16)].tolist() == ["4 ± 0.8", "–"]
+    assert spread.loc[("VR", 16)].tolist() == ["4.0 ± 0.8", "–"]
 
 
 @pytest.mark.parametrize(("style", "cells"), [(style_table_1, OURS_1), (style_table_2, OURS_2)])
@@ -233,7 +233,7 @@ def test_mean_and_deviation_over_seeds() -> None:
     assert cells["ate_std_m"].tolist() == pytest.approx([0.1, 0.0])
     styler = style_table_1(SEEDS)
     assert styler.data["x"].tolist() == ["0.200 ± 0.100", "1.000 ± 0.000"]
-    assert r"\bfseries 0.200${\scriptscriptstyle\pm0.100}$" in latex(styler)
+    assert r"\bfseries 0.200$_{\pm0.100}$" in latex(styler)
     assert "Small: std over seeds." in latex(styler)
     failed = SEEDS.assign(ate_m=[0.1, 1.0, None, 1.0, 0.3, 1.0])
     assert average_over_seeds(failed)["ate_m"].isna().tolist() == [True, False]
@@ -303,6 +303,18 @@ def test_written_files(tmp_path: Path) -> None:
     assert "C, $n = 512$ &" in third.read_text()
 
 
+def test_latex_for_a_paper(tmp_path: Path) -> None:
+    """Catches a caption, a label or a scene's name that is still ours, and one label for both."""
+    how = {"caption": r"My \emph{table}.", "label": "tab:mine", "scenes": {"room_a": "Mine & x"}}
+    write_tables(tmp_path, OURS_1, OURS_2, NOTE, **how)
+    first, second = ((tmp_path / f"table_{n}.tex").read_text() for n in (1, 2))
+    assert "\\caption{My \\emph{table}.}\n" in first
+    assert "\\label{tab:mine}" in first
+    assert r"\begin{tabular}{@{}r@{}}Mine\\\&\\x\end{tabular}" in first
+    assert "\\label{tab:mine-steps}" in second
+    assert "used for tracking).}\n" in second  # without the note
+
+
 def test_millimetres_where_metres_tie(tmp_path: Path) -> None:
     """Catches rows that tie in metres, marks that follow another unit than the digits, a caption
     that names the wrong one, a mark that black and white printing loses, and n named twice."""
@@ -315,7 +327,7 @@ def test_millimetres_where_metres_tie(tmp_path: Path) -> None:
     }  # fmt: skip
     spread = style_table_1(SEEDS, unit="mm")
     assert spread.data["x"].tolist() == ["200.0 ± 100.0", "1000.0 ± 0.0"]
-    assert r"\pm0.0}$\rlap{$^\dagger$} \\" in latex(spread)
+    assert r"1000.0$^\dagger_{\pm0.0}$ \\" in latex(spread)
     _, path = write_table_3(tmp_path, cells, NOTE)
     _, icp, lm = tabular_rows(text := path.read_text())
     assert icp[1:] == ["ICP, $n = 64$", "1.4", r"\color{red} 200.4\rlap{$^\dagger$}"]

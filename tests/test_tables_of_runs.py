@@ -146,9 +146,12 @@ def test_table_3(tmp_path: Path, scenes: list[Scene], monkeypatch: pytest.Monkey
         settings += ("tracking.lm.voxel=0.3",)
         monkeypatch.setitem(METHODS, name, replace(METHODS[name], settings=settings))
     words = tiny_words("scenes.names=office", "scenes.track_frames=:2")
+    words += ["--no-still", "--set", "scenes.labels=['office=Mine']", "--caption"]
     assert main(["tables", "--beyond", "--workers", "1", "--out", str(tmp_path), *words]) == 0
-    assert len(pd.read_csv(tmp_path / "table_3.csv")) == len(TABLE_3) + 1  # and standing still
-    assert (tmp_path / "table_3.tex").read_text().count("NeuS+ baked (LM)") == 1
+    assert len(pd.read_csv(tmp_path / "table_3.csv")) == len(TABLE_3)
+    latex = (tmp_path / "table_3.tex").read_text()
+    assert latex.count("NeuS+ baked (LM)") == latex.count(" & Mine ") == 1
+    assert "best at this rate).}\n" in latex
 
 
 def test_every_method_is_made_again_from_its_command(

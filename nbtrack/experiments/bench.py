@@ -10,10 +10,11 @@ import torch
 
 from nbtrack import tables
 from nbtrack.core.device import advise_on_memory, choose_device, device_name
-from nbtrack.core.errors import NbtrackError
+from nbtrack.core.errors import ConfigError, NbtrackError
 from nbtrack.core.files import runs_folder
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings
+from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.experiments.grid import Execution, map_scene, track_scenes
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
 from nbtrack.experiments.output import output_folder
@@ -48,19 +49,23 @@ def tables_command(options: Namespace) -> None:
 
 
 def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
+    labels = dict(_label_of(text) for text in preset.scenes.labels)  # a bad one is told at once
+    latex = {"caption": options.caption, "label": options.label, "scenes": labels}
     execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
     scenes = open_scenes(preset)
     clock = options.budget == "clock"
     rates_hz = RATES_3_HZ if options.beyond else None
     how = {"clock": clock, "seeds": range(options.seeds), "execution": execution}
     results = track_scenes(scenes, methods, preset, rates_hz, **how)
+    if options.no_still:
+        results = results.drop(columns="still_ate_m", errors="ignore")
     name = f"{preset.name}_clock" if clock else preset.name
     folder = options.out or runs_folder() / "tables" / name
     note = f"{camera_motion(preset, results)}; {_note(preset, clock)}"
     print(f"Table {'III: ATE (mm)' if options.beyond else 'I: ATE (m)'}, {note}")
     if options.beyond:
         print(tables.style_table_1(tables.naming_points(results), unit="mm"))
-        paths = tables.write_table_3(folder, results, note)
+        paths = tables.write_table_3(folder, results, note, **latex)
     else:
         print(tables.style_table_1(results))
         print("Table I beside the paper's")
@@ -68,7 +73,7 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
         steps = _table_2(preset, scenes[0], methods)
         pixels = default_pixels(preset, methods)
         by_clock = _note(preset, clock=True)
-        paths = tables.write_tables(folder, results, steps, note, pixels, steps_note=by_clock)
+        paths = tables.write_tables(folder, results, steps, note, pixels, by_clock, **latex)
     cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
     paths.append(tables.write_csv(cells, results.filter(_CELL_COLUMNS), float_format=None))
     print("\n".join(map(str, paths)))
@@ -77,6 +82,14 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
         first, why = failed.iloc[0][["run", "failure"]]
         cells = f"{len(failed)} cells of the table failed and are empty, the first of them {first}"
         raise NbtrackError(f"{cells}: {why}; mend the cause and run again, the rest is kept")
+
+
+def _label_of(text: str) -> tuple[str, str]:
+    """The name of a scene in tables and its label, of a `NAME=LABEL` text."""
+    name, equals, label = str(text).partition("=")
+    if not equals:
+        raise ConfigError(f"scenes.labels has {text!r}: write 'NAME=LABEL', as 'office=Office'")
+    return DATASET_SCENES.get(name, name), label
 
 
 def bench_command(options: Namespace) -> None:
@@ -162,7 +175,9 @@ def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
 def _note(preset: Preset, clock: bool) -> str:
     """How the numbers were measured, in a sentence. The columns name the scenes."""
     changed = changed_settings(preset.settings, PRESETS[preset.name].settings)
-    changed = ", ".join(text for text in changed if not text.startswith("scenes.names"))
+    changed = ", ".join(
+        text for text in changed if not text.startswith(("scenes.names", "scenes.labels"))
+    )
     label = f"{preset.name}, with {changed}" if changed else preset.name
     budget = "wall clock" if clock else preset.step_counts
     return f"Preset: {label}; budget: {budget}; device: {device_name(choose_device())}."

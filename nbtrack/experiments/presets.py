@@ -40,6 +40,7 @@ class ScenesConfig:
     width: int = limited(640, 11, 4096)  # pixels; the height is three quarters of it
     track_frames: str = ":"  # the Python slice of frames that is tracked
     seed: int = limited(0, 0, 2**31 - 1)
+    labels: tuple[str, ...] = ()  # NAME=LABEL, as LaTeX tables name a scene
 
 
 SIZES = ("motion", "n_frames", "width", "seed")
