@@ -7,7 +7,6 @@ table. Rows follow the data: a new tracker is a new row and nothing here names a
 import copy
 import html
 import re
-from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -253,36 +252,39 @@ def latex_file(
     note: str,
     caption: str | None = None,
     label: str | None = None,
-    scenes: Mapping[str, str] | None = None,
+    scenes: dict[str, str] | None = None,
 ) -> str:
     """A styled table as the text of a `.tex` file, marked up as in the paper.
 
     The file's name, `table_1`, `table_2` or `table_3`, chooses the caption; its folder's name goes
     into the label; a plain note tells how the numbers came about. An empty caption is that without
     the note; another one (LaTeX), and a label, stand as they are. Scenes may have other names.
+    Table II, written beside Table I, has the usual caption then, and the label ends in `-steps`.
     """
     table = styler.data
     kind = _KINDS[path.stem]
     note = " ".join(note.split())
     usual = _CAPTIONS[kind].replace(r"\si{m}", rf"\si{{{styler.unit}}}")
     has_steps = "n_pixels" in table.index.names
-    has_std = table.map(lambda text: "±" in text).any(axis=None)
-    if has_std:
-        usual += f" Small: std over {'frames' if has_steps else 'seeds'}."
-    caption = f"{usual} {_escape(note)}" if caption is None else caption or usual
+    has_std = bool(table.map(lambda text: "±" in text).any(axis=None))
+    usual += f" Small: std over {'frames' if has_steps else 'seeds'}." * has_std
+    usual += f" {_escape(note)}" * (caption is None)
+    caption = usual if has_steps or not caption else caption
     styler = copy.deepcopy(styler).format(_latex_number)
     forms = _LATEX_LABELS | {"scene": lambda name: _stacked((scenes or {}).get(name, name))}
     for axis, labels in enumerate(table.axes):
         for level in labels.names:
             styler.format_index(forms.get(level, _escape), axis=axis, level=level)
         styler.hide(axis=axis, names=True)
-    styler.set_table_styles([{"selector": s, "props": ":;"} for s in ("smallskip", "scriptsize")])
+    is_wide = has_std and len(table.columns) > _MANY_COLUMNS  # it would run off the page
+    sizes = ["smallskip", "scriptsize", *[r"setlength{\tabcolsep}{2.2pt}"] * is_wide]
+    styler.set_table_styles([{"selector": size, "props": ":;"} for size in sizes])
     folder = re.sub(r"[^\w.-]", "_", path.resolve().parent.name)  # labels hold no special character
     text = styler.to_latex(
         column_format=f"@{{}}l{'c' if has_steps else 'l'}{'r' * len(table.columns)}@{{}}",
         environment="table" if has_steps else "table*", position_float="centering", hrules=True,
         clines="skip-last;data", multirow_align="c", convert_css=True,
-        label=label or f"tab:{kind}-{folder}", caption=caption,
+        label=f"{label}{'-steps' * has_steps}" if label else f"tab:{kind}-{folder}", caption=caption,
     )  # fmt: skip
     # Above a std there is room for the dagger; elsewhere it stands in the gap between the columns.
     text = re.sub(r"(\\color\{red\} [^&$]*)\$_", r"\1$^\\dagger_", text)
@@ -292,8 +294,6 @@ def latex_file(
     text = re.sub(r"\\cline\{[\d-]+\}", r"\\midrule", text)
     if has_steps:
         text = text.replace(" &  & ", " & $n$ & ", 1)
-    if has_std and len(table.columns) > _MANY_COLUMNS:  # else they run off the page
-        text = text.replace("\\scriptsize\n", "\\scriptsize\n\\setlength{\\tabcolsep}{2.2pt}\n", 1)
     return _PREAMBLE.format(note=note, name=path.stem) + text
 
 
@@ -332,24 +332,18 @@ def write_tables(
     """Writes Tables I and II as CSV (long form), LaTeX, and beside the paper's; returns the paths.
 
     The arguments are those of `table_1`, `table_2`, `latex_file` and `style_table_2`. Table II is
-    always measured by the clock and may have a note of its own. Beside a caption of Table I it has
-    its usual one without the note, and beside a label the same, ending in `-steps`.
+    always measured by the clock and may have a note of its own.
     """
     styled = style_table_2(steps, default_pixels=default_pixels)
     compared = beside(table_2(steps), table_2(published_table_2()))
     paths = write_table_1(folder, results, note, **latex)
     note = steps_note or note
-    if latex.get("caption") is not None:
-        latex["caption"] = ""
-    if latex.get("label"):
-        latex["label"] += "-steps"
     return paths + _write_table(folder / "table_2", steps, styled, note, compared, **latex)
 
 
 def write_table_1(folder: Path, results: pd.DataFrame, note: str, **latex: Any) -> list[Path]:
     """Writes Table I alone as CSV, LaTeX, and beside the paper's; see `write_tables`."""
-    cells = average_over_seeds(results)
-    compared = beside_published(results)
+    cells, compared = average_over_seeds(results), beside_published(results)
     return _write_table(folder / "table_1", cells, style_table_1(results), note, compared, **latex)
 
 
@@ -363,9 +357,7 @@ def write_table_3(folder: Path, results: pd.DataFrame, note: str, **latex: Any) 
     return _write_table(folder / "table_3", cells, style_table_1(results, unit="mm"), note, **latex)
 
 
-def _write_table(
-    stem: Path, cells: pd.DataFrame, styler, note: str, compared=None, **latex: Any
-) -> list[Path]:
+def _write_table(stem: Path, cells, styler, note: str, compared=None, **latex) -> list[Path]:
     path = stem.with_suffix(".tex")
     write_atomic(path, latex_file(styler, path, note, **latex))
     paths = [write_csv(stem.with_suffix(".csv"), cells), path]

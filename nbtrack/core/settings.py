@@ -122,11 +122,10 @@ def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
         value = float(value)
     if type(value) is not wanted or (wanted is str and "\0" in value):
         raise ConfigError(f"{key} = {value!r}: it must be {wanted.__name__}, for example {old!r}")
-    if limits := allowed.get("limits", _USUAL_LIMITS.get(wanted)):
-        minimum, maximum = limits
-        if not minimum <= value <= maximum:
-            within = f"{minimum:g} to {maximum:g}"
-            raise ConfigError(f"{key} = {value!r}: it must be {within}, such as {old!r}")
+    limits = allowed.get("limits", _USUAL_LIMITS.get(wanted))
+    if limits and not limits[0] <= value <= limits[1]:
+        within = f"{limits[0]:g} to {limits[1]:g}"
+        raise ConfigError(f"{key} = {value!r}: it must be {within}, such as {old!r}")
     if value not in allowed.get("choices", [value]):
         raise ConfigError(f"{key} = {value!r}: write {' or '.join(map(repr, allowed['choices']))}")
     return value
