@@ -7,6 +7,7 @@ table. Rows follow the data: a new tracker is a new row and nothing here names a
 import copy
 import html
 import re
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -246,20 +247,21 @@ def _labelled(styler: TableStyler, caption: str | None, legend: str) -> TableSty
     return styler.set_uuid(fingerprint(styler.set_uuid("table").to_html()))
 
 
-def latex_file(
-    styler: TableStyler,
-    path: Path,
-    note: str,
-    caption: str | None = None,
-    label: str | None = None,
-    scenes: dict[str, str] | None = None,
-) -> str:
+@dataclass(frozen=True)
+class Wording:
+    """What an author's LaTeX says in place of ours."""
+
+    caption: str | None = None  # LaTeX; empty: the usual one without the note
+    label: str | None = None  # Table II beside Table I has it too, ending in `-steps`
+    scenes: dict[str, str] = field(default_factory=dict)  # labels by the names in the table
+
+
+def latex_file(styler: TableStyler, path: Path, note: str, own: Wording = Wording()) -> str:
     """A styled table as the text of a `.tex` file, marked up as in the paper.
 
     The file's name, `table_1`, `table_2` or `table_3`, chooses the caption; its folder's name goes
-    into the label; a plain note tells how the numbers came about. An empty caption is that without
-    the note; another one (LaTeX), and a label, stand as they are. Scenes may have other names.
-    Table II, written beside Table I, has the usual caption then, and the label ends in `-steps`.
+    into the label; a plain note tells how the numbers came about. A caption of the
+    author's own is that of Table I or III; Table II then has the usual one without the note.
     """
     table = styler.data
     kind = _KINDS[path.stem]
@@ -268,10 +270,10 @@ def latex_file(
     has_steps = "n_pixels" in table.index.names
     has_std = bool(table.map(lambda text: "±" in text).any(axis=None))
     usual += f" Small: std over {'frames' if has_steps else 'seeds'}." * has_std
-    usual += f" {_escape(note)}" * (caption is None)
-    caption = usual if has_steps or not caption else caption
+    usual += f" {_escape(note)}" * (own.caption is None)
+    caption = usual if has_steps or not own.caption else own.caption
     styler = copy.deepcopy(styler).format(_latex_number)
-    forms = _LATEX_LABELS | {"scene": lambda name: _stacked((scenes or {}).get(name, name))}
+    forms = _LATEX_LABELS | {"scene": lambda name: _stacked(own.scenes.get(name, name))}
     for axis, labels in enumerate(table.axes):
         for level in labels.names:
             styler.format_index(forms.get(level, _escape), axis=axis, level=level)
@@ -280,21 +282,24 @@ def latex_file(
     sizes = ["smallskip", "scriptsize", *[r"setlength{\tabcolsep}{2.2pt}"] * is_wide]
     styler.set_table_styles([{"selector": size, "props": ":;"} for size in sizes])
     folder = re.sub(r"[^\w.-]", "_", path.resolve().parent.name)  # labels hold no special character
+    label = f"{own.label}{'-steps' * has_steps}" if own.label else f"tab:{kind}-{folder}"
     text = styler.to_latex(
         column_format=f"@{{}}l{'c' if has_steps else 'l'}{'r' * len(table.columns)}@{{}}",
         environment="table" if has_steps else "table*", position_float="centering", hrules=True,
-        clines="skip-last;data", multirow_align="c", convert_css=True,
-        label=f"{label}{'-steps' * has_steps}" if label else f"tab:{kind}-{folder}", caption=caption,
+        clines="skip-last;data", multirow_align="c", convert_css=True, label=label, caption=caption,
     )  # fmt: skip
+    if has_steps:
+        text = text.replace(" &  & ", " & $n$ & ", 1)
+    return _PREAMBLE.format(note=note, name=path.stem) + _with_daggers_and_rules(text)
+
+
+def _with_daggers_and_rules(text: str) -> str:
+    """LaTeX of pandas with a dagger in red cells, and with rules in place of its clines."""
     # Above a std there is room for the dagger; elsewhere it stands in the gap between the columns.
     text = re.sub(r"(\\color\{red\} [^&$]*)\$_", r"\1$^\\dagger_", text)
     text = re.sub(r"(\\color\{red\} [^&$]*?) (&|\\\\)", r"\1\\rlap{$^\\dagger$} \2", text)
-    # Pandas writes clines only, and puts the head of row labels into a line of its own.
     text = re.sub(r"\\cline\{[\d-]+\}\n(?=\\bottomrule)", "", text)
-    text = re.sub(r"\\cline\{[\d-]+\}", r"\\midrule", text)
-    if has_steps:
-        text = text.replace(" &  & ", " & $n$ & ", 1)
-    return _PREAMBLE.format(note=note, name=path.stem) + text
+    return re.sub(r"\\cline\{[\d-]+\}", r"\\midrule", text)
 
 
 def _escape(text: object) -> str:
@@ -327,7 +332,7 @@ def write_tables(
     note: str,
     default_pixels: dict[str, int] = PAPER_PIXELS,
     steps_note: str | None = None,
-    **latex: Any,
+    own: Wording = Wording(),
 ) -> list[Path]:
     """Writes Tables I and II as CSV (long form), LaTeX, and beside the paper's; returns the paths.
 
@@ -336,30 +341,30 @@ def write_tables(
     """
     styled = style_table_2(steps, default_pixels=default_pixels)
     compared = beside(table_2(steps), table_2(published_table_2()))
-    paths = write_table_1(folder, results, note, **latex)
+    paths = write_table_1(folder, results, note, own)
     note = steps_note or note
-    return paths + _write_table(folder / "table_2", steps, styled, note, compared, **latex)
+    return paths + _write_table(folder / "table_2", steps, styled, note, own, compared)
 
 
-def write_table_1(folder: Path, results: pd.DataFrame, note: str, **latex: Any) -> list[Path]:
+def write_table_1(folder: Path, results: pd.DataFrame, note: str, own=Wording()) -> list[Path]:
     """Writes Table I alone as CSV, LaTeX, and beside the paper's; see `write_tables`."""
     cells, compared = average_over_seeds(results), beside_published(results)
-    return _write_table(folder / "table_1", cells, style_table_1(results), note, compared, **latex)
+    return _write_table(folder / "table_1", cells, style_table_1(results), note, own, compared)
 
 
-def write_table_3(folder: Path, results: pd.DataFrame, note: str, **latex: Any) -> list[Path]:
+def write_table_3(folder: Path, results: pd.DataFrame, note: str, own=Wording()) -> list[Path]:
     """Writes Table III, Table I with other rows and in mm, as CSV and LaTeX; see `write_tables`.
 
     Labels of rows contain n, since a method with more points a frame is another method.
     """
     results = naming_points(results)
     cells = average_over_seeds(results)
-    return _write_table(folder / "table_3", cells, style_table_1(results, unit="mm"), note, **latex)
+    return _write_table(folder / "table_3", cells, style_table_1(results, unit="mm"), note, own)
 
 
-def _write_table(stem: Path, cells, styler, note: str, compared=None, **latex) -> list[Path]:
+def _write_table(stem: Path, cells, styler, note: str, own: Wording, compared=None) -> list[Path]:
     path = stem.with_suffix(".tex")
-    write_atomic(path, latex_file(styler, path, note, **latex))
+    write_atomic(path, latex_file(styler, path, note, own))
     paths = [write_csv(stem.with_suffix(".csv"), cells), path]
     if compared is not None:
         paths.append(write_csv(Path(f"{stem}_vs_paper.csv"), compared, index=True))

@@ -13,6 +13,7 @@ from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.tables import (
     STANDING_STILL,
+    Wording,
     average_over_seeds,
     beside,
     beside_published,
@@ -305,8 +306,8 @@ def test_written_files(tmp_path: Path) -> None:
 
 def test_latex_for_a_paper(tmp_path: Path) -> None:
     """Catches a caption, a label or a scene's name that is still ours, and one label for both."""
-    how = {"caption": r"My \emph{table}.", "label": "tab:mine", "scenes": {"room_a": "Mine & x"}}
-    write_tables(tmp_path, OURS_1, OURS_2, NOTE, **how)
+    own = Wording(r"My \emph{table}.", "tab:mine", {"room_a": "Mine & x"})
+    write_tables(tmp_path, OURS_1, OURS_2, NOTE, own=own)
     first, second = ((tmp_path / f"table_{n}.tex").read_text() for n in (1, 2))
     assert "\\caption{My \\emph{table}.}\n" in first
     assert "\\label{tab:mine}" in first

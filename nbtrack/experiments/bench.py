@@ -50,7 +50,7 @@ def tables_command(options: Namespace) -> None:
 
 def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
     labels = dict(_label_of(text) for text in preset.scenes.labels)  # a bad one is told at once
-    latex = {"caption": options.caption, "label": options.label, "scenes": labels}
+    wording = tables.Wording(options.caption, options.label, labels)
     execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
     scenes = open_scenes(preset)
     clock = options.budget == "clock"
@@ -65,7 +65,7 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
     print(f"Table {'III: ATE (mm)' if options.beyond else 'I: ATE (m)'}, {note}")
     if options.beyond:
         print(tables.style_table_1(tables.naming_points(results), unit="mm"))
-        paths = tables.write_table_3(folder, results, note, **latex)
+        paths = tables.write_table_3(folder, results, note, wording)
     else:
         print(tables.style_table_1(results))
         print("Table I beside the paper's")
@@ -73,7 +73,7 @@ def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
         steps = _table_2(preset, scenes[0], methods)
         pixels = default_pixels(preset, methods)
         by_clock = _note(preset, clock=True)
-        paths = tables.write_tables(folder, results, steps, note, pixels, by_clock, **latex)
+        paths = tables.write_tables(folder, results, steps, note, pixels, by_clock, wording)
     cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
     paths.append(tables.write_csv(cells, results.filter(_CELL_COLUMNS), float_format=None))
     print("\n".join(map(str, paths)))
