@@ -1,9 +1,7 @@
 """The command line: options for the functions that the notebooks call."""
 
 import argparse
-import contextlib
 import importlib
-import io
 import os
 import re
 import sys
@@ -15,10 +13,9 @@ from typing import Any, NoReturn
 
 from nbtrack import __version__
 from nbtrack.core.errors import ConfigError, NbtrackError, nearest_name
-from nbtrack.interrupts import INTERRUPTED, STATUS, heed_interrupts
 
 _MAX_COUNT = 2**31 - 1  # what every random generator takes
-_MAX_THREADS = 1024  # OpenMP ends the process where it cannot start them
+_INTERRUPTED = 130  # what shells say of a command that ended by Ctrl-C
 
 
 def a_path(text: str) -> Path:
@@ -40,7 +37,6 @@ def _option(help: str, type: Any = str, **more: Any) -> dict[str, Any]:
     return {"help": help, "type": type, **more}
 
 
-some_threads = partial(a_count, maximum=_MAX_THREADS)
 some_seeds = partial(a_count, maximum=1000)
 _STARTS = {"choices": ("given", "unknown"), "default": "given"}
 _BUDGETS = {"choices": ("steps", "clock"), "default": "steps"}
@@ -82,14 +78,13 @@ OPTIONS = {
     "--seed": _option("of all random numbers (default: 0)", partial(a_count, minimum=0), default=0),
     "--out": _option("where to write (default: in runs/; data make needs it)", a_path),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
-    "--threads": _option("CPU threads (default: all cores)", some_threads),
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
     "--config": _option("TOML file of settings", a_path),
     "--set": _option("one setting, as mapping.neus.iterations=500; may be repeated", **_SETTINGS),
     "--import": _option("your file or module of fields, trackers, methods first", **_IMPORTS),
 }
 _PRESET = " --preset --config --set"
-_RUN = " --device --threads" + _PRESET
+_RUN = " --device" + _PRESET
 _MADE = " --method --field --format --frames --seed --out" + _RUN
 _PARTS = " --format --depth-folder --poses"
 _TRACKED = " --tracker --rate --steps --map-frames --map-from --start"
@@ -126,28 +121,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     With `NBTRACK_DEBUG` set, the traceback of whatever ended it is printed too.
     """
-    _open_streams()
-    heed_interrupts()
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # its encoding may lack letters of a path
+            stream.reconfigure(errors="backslashreplace")
     try:
         options = _parsed(arguments)
         if options.device:
             os.environ["NBTRACK_DEVICE"] = options.device
-        if options.threads:
-            import torch
-
-            torch.set_num_threads(options.threads)
         experiments = importlib.import_module("nbtrack.experiments")
         for source in options.imports:
             experiments.import_own(source)
         module = "bench" if options.command in ("tables", "bench") else "commands"
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)
+        print(end="", flush=True)
         return 0
+    except BrokenPipeError:  # whoever read the output, as `head` does, has enough
+        for stream in (1, 2):  # what Python flushes at its end goes nowhere
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+        return 1
     except (NbtrackError, OSError, MemoryError, KeyboardInterrupt) as error:
         if os.environ.get("NBTRACK_DEBUG"):
             traceback.print_exception(error)
         print(f"nbtrack: {_message_of(error)}", file=sys.stderr)
-        return STATUS if isinstance(error, KeyboardInterrupt) else 2
+        return _INTERRUPTED if isinstance(error, KeyboardInterrupt) else 2
 
 
 def _message_of(error: BaseException) -> str:
@@ -159,32 +156,7 @@ def _message_of(error: BaseException) -> str:
         return f"{where}: {error.strerror or error}; mend it and run again"
     if isinstance(error, MemoryError):  # where no job says what needs it
         return "out of memory: take fewer frames, as with --frames ::2"
-    return INTERRUPTED
-
-
-class _Pipe(io.FileIO):
-    """A stream whose reader may leave, as `head` does: what nobody reads is dropped."""
-
-    def write(self, content: Any) -> int:
-        with contextlib.suppress(BrokenPipeError):
-            return super().write(content)
-        return len(content)
-
-
-def _open_streams() -> None:
-    """Let nothing that is printed end a command: a daemon's streams are closed, a pipe's reader may
-    be gone, and a terminal's encoding may lack letters of a path."""
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
-            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
-        stream = getattr(sys, name)
-        if stream is getattr(sys, f"__{name}__") and not stream.isatty():
-            pipe = io.BufferedWriter(_Pipe(stream.fileno(), "w", closefd=False))
-            in_lines = stream.line_buffering or stream.write_through
-            stream = io.TextIOWrapper(pipe, stream.encoding, line_buffering=in_lines)
-            setattr(sys, name, stream)
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
+    return "interrupted; run the same command again to go on"
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -199,7 +171,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
         command = group.add_parser(last, help=about, description=about)
         for word in [*options.split(), "--import"]:
             command.add_argument(word, **OPTIONS[word])
-        command.set_defaults(command=last, parser=command, device=None, threads=None)
+        command.set_defaults(command=last, parser=command, device=None)
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         name = unknown[0].partition("=")[0]

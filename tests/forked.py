@@ -1,19 +1,23 @@
 """Processes that start at once, forked from one that has imported everything."""
 
+import multiprocessing
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest import mock
 
 import dask
-from distributed.utils import get_mp_context
 
 IMPORTED = ["torch._dynamo", "trimesh", "pytest", "distributed", "nbtrack.experiments.bench"]
 
 
 @contextmanager
 def forking() -> Iterator[Any]:
-    """The context of `multiprocessing` that starts them; Dask's workers are such ones too."""
-    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
-        context = get_mp_context()
-        context.set_forkserver_preload(IMPORTED)
+    """The context of `multiprocessing` that starts them; workers, also Dask's, are such ones."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(IMPORTED)
+    with (
+        dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
+        mock.patch("nbtrack.experiments.grid._START", "forkserver"),
+    ):
         yield context

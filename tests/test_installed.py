@@ -36,7 +36,6 @@ def test_folders(elsewhere: Path) -> None:
 @pytest.mark.parametrize(
     ("missing", "arguments", "message"),
     [
-        ("distributed", ["tables", "--workers", "2"], "pip install 'nbtrack[cluster]'"),
         ("distributed", ["tables", "--dask", "tcp://h:1"], "pip install 'nbtrack[cluster]'"),
         ("small_gicp", ["track", "office", "--field", "points", "--tracker", "icp", "--steps", "1"],
          "pip install 'nbtrack[icp]'"),

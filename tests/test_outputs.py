@@ -23,14 +23,13 @@ from tiny import tiny_words
 
 from nbtrack.cli import main
 from nbtrack.core import files
+from nbtrack.core.device import threads
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments import map_jobs
 from nbtrack.experiments.grid import Execution, track_scenes
-from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.output import LOCK_FILE
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
-from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.recordings.recording import open_recording
 from nbtrack.synthetic import make, room
 from nbtrack.tracking.trajectories import read_tum
@@ -264,17 +263,14 @@ def test_rows_say_which_scene_was_mapped(work: Path) -> None:
     assert runs["scene"].tolist() == ["living_room"]
 
 
-def test_threads_belong_to_a_run_and_its_key(work: Path) -> None:
+def test_threads_belong_to_a_run_by_the_clock_and_its_key(work: Path) -> None:
     """Catches seconds a frame of two threads that are given out as those of one."""
     preset = load_preset(settings=[*SET[1::2], "scenes.names=['living_room']"])
     scenes = open_scenes(preset)
-    made = MapJob.of(scenes[0], "neus", preset)
-    job = TrackJob(made, scenes[0], "sdf", preset.tracking_of("sdf"), 2)
-    assert job.key != replace(job, n_threads=2).key
-    found = [
-        track_scenes(scenes, ["sdf"], preset, [30], clock=True, execution=Execution(threads=n))
-        for n in (1, 2)
-    ]
+    found = []
+    for n_threads in (1, 2):
+        with threads(n_threads):
+            found.append(track_scenes(scenes, ["sdf"], preset, [30], clock=True))
     assert [runs["threads"][0] for runs in found] == [1, 2]
     assert found[0]["run"][0] != found[1]["run"][0]
 

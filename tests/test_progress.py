@@ -23,6 +23,21 @@ def test_a_line_now_and_then(monkeypatch, capsys: pytest.CaptureFixture) -> None
     assert re.fullmatch(r"mapping: 100 %, 00:01 gone, 00:00 left", last)
 
 
+def test_a_warm_up_is_left_out(monkeypatch, capsys: pytest.CaptureFixture) -> None:
+    """Catches an hour that is left for half a minute, because the first frame was compiled: 58 of
+    60 parts after one in a tenth of a second leave about six seconds."""
+    monkeypatch.setattr("nbtrack.core.progress._LINE_SECONDS", 0.1)
+    with ProgressBar("tracking", 60) as bar:
+        time.sleep(1.1)
+        bar.warm_up = 1, bar.format_dict["elapsed"]
+        bar.move_to(1)
+        time.sleep(0.1)
+        bar.move_to(2)
+    first, second, *_ = capsys.readouterr().err.splitlines()
+    assert "? left" in first
+    assert re.search(r"00:0[5-9] left", second)
+
+
 def test_short_and_hidden_work_is_silent(capsys: pytest.CaptureFixture) -> None:
     """Catches noise about what takes no time, and about what nobody asked to see."""
     with ProgressBar("short", 1) as bar:

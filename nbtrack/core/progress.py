@@ -50,16 +50,24 @@ class _Line:
 class ProgressBar(tqdm):
     """Progress with an ETA over a known amount of work, to be used in a `with` block."""
 
+    warm_up = 0, 0.0  # work, and its seconds, that say nothing of the time that is left
+
     def __init__(self, title: str, total: float | int, is_shown: bool = True) -> None:
         """Begin; nothing is shown before a second has gone."""
-        options = {"file": sys.stderr, "mininterval": 0.1, "bar_format": _FORMAT}
+        options = {"file": sys.stderr, "bar_format": _FORMAT}
         if _is_notebook():  # its kernel drops messages once a thousand wait to be read
             options |= {"file": _Line(), "mininterval": 1.0}
         elif not sys.stderr.isatty():
             options |= {"file": _Line(), "mininterval": _LINE_SECONDS, "bar_format": _LINE_FORMAT}
-        # Without smoothing the ETA comes from the mean speed, not from that of the last step.
-        options |= {"disable": not is_shown, "smoothing": 0, "delay": _DELAY_SECONDS}
-        super().__init__(total=total, desc=title, ascii=False, **options)
+        how = {"disable": not is_shown, "delay": _DELAY_SECONDS, "miniters": 0, "ascii": False}
+        super().__init__(total=total, desc=title, **options, **how)
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        """What is shown; the time that is left comes from the mean speed after the warm-up."""
+        values = super().format_dict
+        worked, seconds = self.n - self.warm_up[0], values["elapsed"] - self.warm_up[1]
+        return values | {"rate": worked / max(seconds, 1e-3)}
 
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much is done, and a word on how it goes."""

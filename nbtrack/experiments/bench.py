@@ -51,7 +51,7 @@ def tables_command(options: Namespace) -> None:
 def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
     labels = dict(_label_of(text) for text in preset.scenes.labels)  # a bad one is told at once
     wording = tables.Wording(options.caption, options.label, labels)
-    execution = Execution(options.workers, options.threads, options.dask, keep_going=True)
+    execution = Execution(options.workers, options.dask, keep_going=True)
     scenes = open_scenes(preset)
     clock = options.budget == "clock"
     rates_hz = RATES_3_HZ if options.beyond else None

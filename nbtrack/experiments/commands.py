@@ -116,7 +116,7 @@ def track_command(options: Namespace) -> None:
         job = MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
         scene.count(job.frames)
     what = job, scene, method.tracker, preset.tracking_of(method.tracker)
-    how = options.frames, options.seed, options.out, options.threads, options.start
+    how = options.frames, options.seed, options.out, options.start
     run = TrackJob(*what, steps, options.rate, *how)
     run.check()
     for warning in reach_warnings([run]):

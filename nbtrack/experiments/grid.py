@@ -1,21 +1,29 @@
 """The grid of maps and tracked runs, as DataFrames: what is not cached is computed.
 
-Jobs run side by side on Dask's workers, or one after the other in this process. Small networks gain
-nothing from a second thread, so scenes and methods share the cores instead.
+Jobs run one after the other in this process, or side by side on an executor: processes here, or a
+Dask cluster. Small networks gain nothing from a second thread, so scenes and methods share the
+cores instead.
 """
 
 import contextlib
 import importlib.util
+import multiprocessing
 import os
+import pickle
+import signal
 import sys
-import time
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
+from multiprocessing.connection import Connection
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import cloudpickle
 import pandas as pd
 import torch
 
@@ -23,7 +31,6 @@ from nbtrack.core.device import choose_device, threads, usable_cores
 from nbtrack.core.errors import MissingError, NbtrackError, check_lists
 from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.progress import ProgressBar, tell
-from nbtrack.experiments import IMPORTED, import_own
 from nbtrack.experiments.jobs import Job
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.outlook import reach_warnings
@@ -32,31 +39,23 @@ from nbtrack.experiments.runs import read_trajectory
 from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.fields import FIELDS
-from nbtrack.interrupts import interrupts_put_off
 from nbtrack.mapping.files import Map
 from nbtrack.tracking import TRACKERS
 from nbtrack.tracking.methods import Methods, find_methods
 from nbtrack.tracking.trajectories import Trajectory
 
-_REPORT_SECONDS = 0.3  # between two reports of a worker
+_START = "spawn"  # how worker processes begin: forked ones would lack the threads of libraries
+_LOOK_SECONDS = 1.0  # between two looks at jobs elsewhere, so that the bar's clock moves
 _SECONDS_TO_CONNECT = 10
-_LOCAL = {
-    # A job that kills its worker is tried once more; memory is the user's to divide.
-    "distributed.scheduler.allowed-failures": 1,
-    # Without Dask's own malloc threshold, which gives every tensor's memory back to the system:
-    # mapping then spent almost half of its time on getting it again.
-    "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1},
-}
 
 
 @dataclass(frozen=True)
 class Execution:
-    """How jobs are run; of all this only the threads may change last digits of a result."""
+    """How jobs are run."""
 
     # Processes; by default one a core, or this process alone where a GPU does the work: there jobs
-    # share its memory, and side by side gain less (benchmarks/README.md).
+    # share its memory, and side by side gain less (benchmarks/README.md). They share the threads.
     workers: int | None = None
-    threads: int | None = None  # of each job; by default this process's, divided by the workers
     dask: str | None = None  # address of a Dask scheduler whose workers run the jobs instead
     # A user's mistake in one job stands in its place among the results, as the exception, and so
     # does one for every job that needs it; the others still run.
@@ -64,8 +63,8 @@ class Execution:
 
     def __post_init__(self) -> None:
         """Raises MissingError, before any work, if Dask is needed and not there."""
-        if (self.dask is not None or (self.workers or 1) > 1) and not _has_dask():
-            raise MissingError("workers need Dask: pip install 'nbtrack[cluster]', or --workers 1")
+        if self.dask is not None and not importlib.util.find_spec("distributed"):
+            raise MissingError("--dask needs Dask: pip install 'nbtrack[cluster]', or --workers")
 
 
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
@@ -117,9 +116,7 @@ def track_scenes(
     execution = execution or Execution()
     check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
     rates = [None] if steps else rates_hz or preset.tables.rates_hz
-    # By the clock, how far a run comes depends on its threads.
-    n_threads = execution.threads or (torch.get_num_threads() if clock else None)
-    how = {"frames": str(frames or preset.scenes.track_frames), "n_threads": n_threads}
+    frames = str(frames or preset.scenes.track_frames)
     pairs = list(zip(scenes, tracked or scenes, strict=True))
     jobs, rows = [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
@@ -127,7 +124,7 @@ def track_scenes(
         what = seen, method.tracker, own.tracking_of(method.tracker)
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
         made = MapJob.of(scene, method.field, own, seed=seed)
-        jobs.append(TrackJob(made, *what, n_steps, rate_hz if clock else None, seed=seed, **how))
+        jobs.append(TrackJob(made, *what, n_steps, rate_hz if clock else None, frames, seed))
         rows.append({"rate_hz": rate_hz, "steps": n_steps, "method": method.label})
     return pd.DataFrame(map(_row_of, rows, jobs, _run(jobs, clock, execution)))
 
@@ -168,27 +165,26 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
     Unless it is to keep going, it raises what the first failing job raised, and drops the others.
     """
     execution = execution or Execution()
-    results = {}
     missing = {part.folder: part for job in jobs for part in _missing(job)}
-    done = dict.fromkeys(missing, 0.0)  # shares of each job's own work
-    work = {folder: job.work for folder, job in missing.items()}
+    results: dict[Path, Any] = {}
 
-    def show(folder: Path, share: float, status: str) -> None:
-        done[folder] = max(share, done[folder])  # news of a worker may come late
-        ended = f"{len(results)} of {len(missing)} done"
-        bar.set_description_str(missing[folder].doing, refresh=False)
-        worked = sum(share * work[folder] for folder, share in done.items())
-        bar.move_to(worked, f"{ended}, {missing[folder].name}: {status}")
+    def show(job: Job, share: float = 0.0, status: str = "running") -> None:
+        """Where the work is: `share` of a job that runs in this process, and all that ended."""
+        bar.set_description_str(job.doing, refresh=False)
+        worked = sum(missing[folder].work for folder in results) + share * job.work
+        if 0 < share < 1 and not bar.warm_up[0]:  # a first frame waits for what is compiled
+            bar.warm_up = worked, bar.format_dict["elapsed"]
+        bar.move_to(worked, f"{len(results)} of {len(missing)} done, {job.name}: {status}")
 
     with (
-        ProgressBar(Job.doing, sum(work.values())) as bar,
+        ProgressBar(Job.doing, sum(job.work for job in missing.values())) as bar,
         contextlib.closing(_outcomes(missing, results, show, execution)) as outcomes,
     ):
         for folder, outcome in outcomes:
             if isinstance(outcome, NbtrackError) and not execution.keep_going:
                 raise outcome
             results[folder] = outcome
-            show(folder, 1.0, "done")
+            show(missing[folder], status="done")
     return [results[job.folder] if job.folder in results else job.result() for job in jobs]
 
 
@@ -198,129 +194,125 @@ def _missing(job: Job | None) -> list[Job]:
 
 
 def _outcomes(
-    jobs: dict[Path, Job], results: dict[Path, Any], show: Callable, execution: Execution
+    jobs: Mapping[Path, Job], results: Mapping[Path, Any], show: Callable, execution: Execution
 ) -> Iterator[tuple[Path, Any]]:
-    """What becomes of each job, as they end; what a job needs comes before it."""
-    usual = usable_cores() if _has_dask() and choose_device().type == "cpu" else 1
+    """What becomes of each job, as they end; each begins when what it needs is in the results."""
+    usual = usable_cores() if choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, len(jobs))
-    if jobs and (execution.dask is not None or workers > 1):
-        share = 1 if execution.dask else max(1, torch.get_num_threads() // workers)
-        yield from _on_workers(jobs, show, execution.dask, workers, execution.threads or share)
+    needs = {folder: job.needs.folder if job.needs else None for folder, job in jobs.items()}
+    if workers <= 1 and execution.dask is None:
+        for folder, job in jobs.items():
+            yield folder, job.outcome(results.get(needs[folder]), partial(show, job))
         return
-    with threads(execution.threads or torch.get_num_threads()):
-        for folder, job in jobs.items():
-            needed = results.get(job.needs.folder) if job.needs else None
-            yield folder, job.outcome(needed, partial(show, folder))
+    waiting = list(jobs)
+    running: dict[Future, Path] = {}
+    with _submitting(execution.dask, workers) as submit:
+        while waiting or running:
+            for folder in [f for f in waiting if needs[f] in results or needs[f] not in jobs]:
+                if execution.dask or len(running) < workers:
+                    running[submit(jobs[folder], results.get(needs[folder]))] = folder
+                    waiting.remove(folder)
+            show(jobs[next(iter(running.values()))])
+            ended, _ = wait(running, _LOOK_SECONDS, FIRST_COMPLETED)
+            names = " or ".join(folder.name for folder in running.values())
+            for future in ended:
+                yield running.pop(future), _result_of(future, names)
 
 
-def _has_dask() -> bool:
-    return importlib.util.find_spec("distributed") is not None
+def _result_of(future: Future, names: str) -> Any:
+    """What a job gave. Raises NbtrackError where its process died, the system's usual way to get
+    memory back, when jobs of some names were running."""
+    error = future.exception()
+    if type(error).__name__ not in ("BrokenProcessPool", "KilledWorker"):  # the latter is Dask's
+        return future.result()
+    died = f"a worker process died at {names}, perhaps for lack of memory"
+    advice = "run it again, with fewer --workers or smaller settings; what was finished is kept"
+    raise NbtrackError(f"{died}: {advice}")
 
 
-def _on_workers(
-    jobs: Mapping[Path, Job], show: Callable, address: str | None, workers: int, n_threads: int
-) -> Iterator[tuple[Path, Any]]:
-    """The same by Dask: each job begins as soon as what it needs is there.
+@contextlib.contextmanager
+def _submitting(address: str | None, workers: int) -> Iterator[Callable[[Job, Any], Future]]:
+    """A function that begins a job, given what became of the one that it needs, elsewhere.
 
-    `show` is told where a running job is. Without the address of a Dask scheduler, `workers` local
-    processes are started.
+    Its processes know the folders, the device, the search path and all fields and trackers of this
+    one. Classes of a notebook or script travel whole, those of files by the name of their module.
     """
-    import dask
-    from distributed import as_completed
-    from distributed.scheduler import KilledWorker
+    settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
+    settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
+    n_threads = 1 if address else max(1, torch.get_num_threads() // workers)
+    with _cluster(address) if address else _pool(workers) as executor:
 
-    with dask.config.set(_LOCAL), _main_kept_back(), _cluster(address, workers) as client:
-        topic = f"nbtrack-{os.getpid()}-{time.time_ns()}"
-        client.subscribe_topic(topic, lambda event: show(Path(event[1][0]), *event[1][1:]))
-        settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
-        settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
-        for source in IMPORTED:
-            client.run(import_own, source)
-        how = topic, settings, n_threads, (FIELDS, TRACKERS)
-        futures: dict[Path, Any] = {}
-        for folder, job in jobs.items():
-            needed = futures.get(job.needs.folder) if job.needs else None
-            futures[folder] = client.submit(_outcome_there, job, needed, *how, pure=False)
-        folders = {future: folder for folder, future in futures.items()}
-        for future in as_completed(folders):
-            folder = folders[future]
-            try:
-                outcome = future.result()
-            except KilledWorker:
-                died = f"a worker process died at {folder.name}, perhaps for lack of memory"
-                advice = "run it again, with fewer --workers or smaller settings"
-                outcome = NbtrackError(f"{died}: {advice}")
-            yield folder, outcome
+        def submit(job: Job, needed: Any) -> Future:
+            work = cloudpickle.dumps((FIELDS, TRACKERS, job, needed))
+            return executor.submit(_outcome_there, settings, sys.path, n_threads, work)
+
+        yield submit
 
 
 def _outcome_there(
-    job: Job, needed: Any, topic: str, settings: dict[str, str], n_threads: int, known: Any
+    settings: Mapping[str, str], search_path: Sequence[str], n_threads: int, work: bytes
 ) -> Any:
-    """Runs in a worker, which may have been started with other folders, or for another device.
-
-    Fields and trackers that were registered in the calling process may be missing in it.
-    """
-    from distributed import get_worker
-
+    """Runs in a worker, which may have been started elsewhere, or with other classes."""
     os.environ |= settings
-    FIELDS.update(known[0])
-    TRACKERS.update(known[1])
-    worker = get_worker()
-    last = time.monotonic()
-
-    def report(share: float, status: str) -> None:
-        nonlocal last
-        if time.monotonic() - last > _REPORT_SECONDS:
-            last = time.monotonic()
-            worker.log_event(topic, [str(job.folder), share, status])
-
+    sys.path += [folder for folder in search_path if folder not in sys.path]
+    fields, trackers, job, needed = pickle.loads(work)
+    FIELDS.update(fields)
+    TRACKERS.update(trackers)
     with threads(n_threads):
-        return job.outcome(needed, report)
+        return job.outcome(needed, lambda share, status: None)
 
 
 @contextlib.contextmanager
-def _main_kept_back() -> Iterator[None]:
-    """Start processes that do not run the main script once more, as those of Python do.
+def _pool(workers: int) -> Iterator[Executor]:
+    """Processes of this machine, which end with the block, or with this process if it is killed."""
+    context = multiprocessing.get_context(_START)
+    theirs, ours = context.Pipe(duplex=False)
+    with ProcessPoolExecutor(workers, context, _end_with, (theirs,)) as executor, ours:
+        with _spared():
+            for _ in range(workers):
+                executor.submit(int)  # a process is begun for each, since none is idle yet
+        yield executor
 
-    A script without a `__main__` guard would start processes from within them. They need nothing of
-    it: what a script defines travels with the jobs.
+
+def _end_with(pipe: Connection) -> None:
+    """End this worker, whatever it does, as soon as the other end of a pipe is closed."""
+
+    def watch() -> None:
+        pipe.poll(None)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def _spared() -> Iterator[None]:
+    """Spare the processes that are started in a block what is this one's business.
+
+    That is Ctrl-C, of which each would tell in a traceback; and the main script, which Python runs
+    in them once more: without a `__main__` guard it would start processes from within them.
     """
-    main = sys.modules["__main__"]
-    kept = {name: value for name, value in vars(main).items() if name in ("__file__", "__spec__")}
-    main.__dict__.pop("__file__", None)
-    main.__spec__ = None
+    script = sys.modules["__main__"]
+    is_main = threading.current_thread() is threading.main_thread()  # others have no handlers
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
+    sys.modules["__main__"] = ModuleType("__main__")
     try:
         yield
     finally:
-        vars(main).update(kept)
+        sys.modules["__main__"] = script
+        if handler is not None:
+            signal.signal(signal.SIGINT, handler)
 
 
 @contextlib.contextmanager
-def _cluster(address: str | None, workers: int) -> Iterator[Any]:
-    """A client of Dask's workers. Ctrl-C waits until they are all there, or all gone."""
-    opened = contextlib.ExitStack()
-    try:
-        with interrupts_put_off():
-            client = opened.enter_context(_client(address, workers))
-        yield client
-    finally:
-        with interrupts_put_off():
-            opened.close()
-
-
-def _client(address: str | None, workers: int) -> Any:
+def _cluster(address: str) -> Iterator[Executor]:
+    """The workers of a Dask scheduler. Raises MissingError where there are none."""
     from distributed import Client
 
-    if address is None:  # a cluster of processes here, which end with this one
-        return Client(
-            n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0,
-            silence_logs=50, local_directory=str(runs_folder() / "dask"),
-            dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},
-        )  # fmt: skip
     try:
         client = Client(address, timeout=_SECONDS_TO_CONNECT)
         client.wait_for_workers(1, timeout=_SECONDS_TO_CONNECT)
-        return client
     except (OSError, ValueError):
         advice = "start 'dask scheduler', and 'dask worker ADDRESS --nthreads 1'"
         raise MissingError(f"no Dask scheduler at {address!r} with a worker: {advice}") from None
+    with client, client.get_executor(pure=False) as executor:
+        yield executor

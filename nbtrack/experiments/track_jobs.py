@@ -15,10 +15,11 @@ from nbtrack.beyond.verdict import score_detection
 from nbtrack.checks.belongs import check_belongs, in_world_of_map
 from nbtrack.checks.in_map import look_in_map
 from nbtrack.core import files
-from nbtrack.core.device import choose_device, device_name, threads
+from nbtrack.core.arrays import Pose
+from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.errors import DataError
 from nbtrack.core.settings import as_dict, changed_settings
-from nbtrack.data.frame import Frame
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments import IMPORTED
 from nbtrack.experiments.jobs import Job, Report
 from nbtrack.experiments.map_jobs import PLAIN_PRESET, GivenMap, MapJob
@@ -47,6 +48,16 @@ _NO_NETWORK = 0.05  # of a query's time: where a grid or points are asked
 
 
 @dataclass(frozen=True)
+class _Start:
+    """Where a run begins, and what that says of a given map."""
+
+    T_world_camera: Pose  # m, the first frame's; of no meaning where it is not known
+    is_known: bool
+    warning: str | None = None
+    is_in_other_world: bool = False  # the recording, whose poses the map does not fit
+
+
+@dataclass(frozen=True)
 class TrackJob(Job):
     """One tracked run in a map, under one budget: so many steps a frame, or a rate by the clock."""
 
@@ -59,18 +70,18 @@ class TrackJob(Job):
     frames: str = ":"
     seed: int = 0
     out: Path | None = None
-    n_threads: int | None = None  # CPU threads to track with; by default the process's
     start: str = "given"  # the first frame's true pose, where known; or "unknown"
 
     kind, doing = "tracks", "tracking"
 
     @cached_property
     def key(self) -> str:
-        """A digest of code, map, tracker, budget, threads, frames, seed; by the clock, machine."""
+        """A digest of code, map, tracker, budget, frames, seed; by the clock, machine, threads."""
         kinds = tracker_class(self.tracker), field_class(self.needs.field)
         code = provenance.code_fingerprint(*kinds)
-        clock = None if self.rate_hz is None else (self.rate_hz, device_name(choose_device()))
-        how = self.tracker, self.settings, self.steps, clock, self.n_threads, self.start
+        clock = self.rate_hz, device_name(choose_device()), torch.get_num_threads()
+        budget = self.steps if self.rate_hz is None else clock
+        how = self.tracker, self.settings, budget, self.start
         what = self.frames, self.seed, self.scene.fingerprint
         return files.fingerprint(code, provenance.versions(), self.needs.key, *how, *what)
 
@@ -128,15 +139,17 @@ class TrackJob(Job):
         true pose is known there is no `groundtruth.txt`. Raises DataError where a given map does
         not fit the first frame at its given pose.
         """
-        n_threads = self.n_threads or torch.get_num_threads()
-        with threads(n_threads):
-            tracked, notes = self._tracked(report)
-        if notes["map_warning"] == _OTHER_WORLD:
+        finished = self.needs.map()
+        origin = np.array(finished.record["origin"])
+        sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
+        start = self._begin(finished, sequence)
+        tracked, device = self._track(finished, sequence, start, report)
+        notes = self._notes(finished, sequence, start, tracked) | {"device": device}
+        if start.is_in_other_world:
             tracked, is_explained = in_world_of_map(tracked)
             notes["map_warning"] = _OTHER_WORLD if is_explained else None
-        metrics = _scores(tracked) | self._provenance(n_threads) | notes
+        metrics = _scores(tracked) | self._provenance(finished) | notes
         times = tracked.frames["time"].to_numpy()
-        origin = np.array(notes["origin"])
         texts = {
             "trajectory.txt": tum_text(times, shifted(tracked.T_estimated, origin)),
             "groundtruth.txt": tum_text(times, shifted(tracked.T_true, origin)),
@@ -150,61 +163,69 @@ class TrackJob(Job):
         (self.cache / RUN_FILE).unlink(missing_ok=True)
         return metrics
 
-    def _tracked(self, report: Report) -> tuple[Trajectory, dict[str, Any]]:
-        """The trajectory, and what is to be said of the run beside its errors."""
-        finished_map = self.needs.map()
-        budget = make_budget(self.steps, self.rate_hz)
-        origin = np.array(finished_map.record["origin"])
-        sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
-        notes = {"map_seconds": finished_map.record["seconds"], "budget": str(budget)}
-        notes |= {"origin": origin.tolist(), **still_metrics(sequence.T_world_camera)}
-        metres_per_unit = finished_map.field.bounds.metres_per_unit
-        notes["metres_per_unit"] = metres_per_unit
-        if self.is_elsewhere:
-            notes["map_from"] = finished_map.record
+    def _begin(self, finished: Map, sequence: RgbdSequence) -> _Start:
+        """Where to begin. Raises DataError where a given map does not fit the pose to start from.
+
+        Where that is not used, and the map does not fit it, the recording has a world of its own.
+        """
         T_first = sequence.T_world_camera[0]
-        is_start_known = self.start == "given" and bool(np.isfinite(T_first).all())
-        notes["map_warning"] = self._map_warning(finished_map, sequence[0], is_start_known)
-        notes["start"] = "given" if is_start_known else "unknown"
-        T_start = T_first if is_start_known else np.eye(4)
-        how = T_start, budget, self.settings, self.seed
-        tracker = make_tracker(self.tracker, finished_map.field, *how)
-        notes["device"] = device_name(tracker.device)  # LM and ICP run on the host
+        is_known = self.start == "given" and bool(np.isfinite(T_first).all())
+        start = _Start(T_first if is_known else np.eye(4), is_known)
+        # Another path of a mapped room may begin where no map reaches.
+        if not isinstance(self.needs, GivenMap) or sequence[0].T_world_camera is None:
+            return start
+        try:
+            return replace(start, warning=check_belongs(finished, sequence[0]))
+        except DataError:
+            if is_known:
+                raise
+            return replace(start, is_in_other_world=True)
+
+    def _track(
+        self, finished: Map, sequence: RgbdSequence, start: _Start, report: Report
+    ) -> tuple[Trajectory, str]:
+        """The trajectory, and the name of the device that it was tracked on."""
 
         def tell(done: int, error_m: float) -> None:
             status = f"frame {done}" if np.isnan(error_m) else f"off by {100 * error_m:.1f} cm"
             report(done / len(sequence), status)
 
+        budget = make_budget(self.steps, self.rate_hz)
+        how = start.T_world_camera, budget, self.settings, self.seed
+        tracker = make_tracker(self.tracker, finished.field, *how)
         checkpoint = self.cache / RUN_FILE  # a folder of the user's holds results alone
-        tracked = track_sequence(tracker, sequence, checkpoint, tell, is_start_known)
+        tracked = track_sequence(tracker, sequence, checkpoint, tell, start.is_known)
+        return tracked, device_name(tracker.device)  # LM and ICP run on the host
+
+    def _notes(
+        self, finished: Map, sequence: RgbdSequence, start: _Start, tracked: Trajectory
+    ) -> dict[str, Any]:
+        """What is to be said of a run beside its errors."""
+        T_true = sequence.T_world_camera
+        metres_per_unit = finished.field.bounds.metres_per_unit
         reach = self.settings.reach(tracked.frames["steps"].mean(), metres_per_unit)
-        how = sequence.T_world_camera, self.settings.motion_model
+        notes = {
+            "map_seconds": finished.record["seconds"],
+            "budget": str(make_budget(self.steps, self.rate_hz)),
+            "origin": finished.record["origin"],
+            **still_metrics(T_true),
+            "metres_per_unit": metres_per_unit,
+            "map_warning": start.warning,
+            "start": "given" if start.is_known else "unknown",
+        }
+        if self.is_elsewhere:
+            notes["map_from"] = finished.record
         if isinstance(self.needs, GivenMap):
             followed = sequence.select(slice(len(sequence) - len(tracked.frames), None))
-            if notes["map_warning"] == _OTHER_WORLD:
+            if start.is_in_other_world:
                 followed = replace(followed, T_world_camera=tracked.T_estimated)
-            notes |= look_in_map(finished_map.field, followed, tracked.T_estimated)
-        return tracked, notes | reach_metrics(reach, *how)
+            notes |= look_in_map(finished.field, followed, tracked.T_estimated)
+        return notes | reach_metrics(reach, T_true, self.settings.motion_model)
 
-    def _map_warning(self, finished_map: Map, first: Frame, is_start_known: bool) -> str | None:
-        """What to say of a given map; DataError where it does not fit the pose to start from.
-
-        Where that is not used, and the map does not fit it, the recording has a world of its own.
-        """
-        if not isinstance(self.needs, GivenMap) or first.T_world_camera is None:
-            return None  # another path of a room may begin where no map reaches
-        try:
-            return check_belongs(finished_map, first)
-        except DataError:
-            if is_start_known:
-                raise
-            return _OTHER_WORLD
-
-    def _provenance(self, n_threads: int) -> dict[str, Any]:
+    def _provenance(self, finished: Map) -> dict[str, Any]:
         """Where a run comes from: data, map, method, settings, machine; how to make it again."""
-        finished = self.needs.map()
         return {
-            "threads": n_threads,
+            "threads": torch.get_num_threads(),
             "scene": self.scene.name,
             "field": self.needs.field,
             "tracker": self.tracker,
@@ -224,7 +245,7 @@ class TrackJob(Job):
         """What makes this run anew, and its map where that is not cached."""
         options = {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
         options |= {"start": self.start, "frames": self.frames, "seed": self.seed}
-        options |= {"device": choose_device().type, "threads": self.n_threads}
+        options |= {"device": choose_device().type}
         options |= {"format": self.scene.format, "preset": PLAIN_PRESET}
         settings: dict[str, Any] = {"tracking": {self.tracker: self.settings}}
         if self.is_elsewhere:
