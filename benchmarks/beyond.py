@@ -70,7 +70,7 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     note = f"Preset: smoke; budget: {preset.step_counts}; whole path; {device}."
     write_table_3(tables_folder() / "beyond", results, note)
     # Times count: one run after the other. The slice reads otherwise, so that none is cached.
-    speed = track_scenes(scenes, TABLE_3, preset, [10], frames="0:", execution=Execution(1, 1))
+    speed = track_scenes(scenes, TABLE_3, preset, [10], frames="0:", execution=Execution(workers=1))
     write("speed", speed[_COLUMNS])
     write("convergence", convergence(scenes[0], preset))
     write("points", points_time_and_bytes(scenes, preset))

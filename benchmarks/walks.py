@@ -54,7 +54,7 @@ def run(room: Scene, method: Method, frames: str, steps: float = STEPS) -> dict:
     preset = with_settings(PRESET, *method.settings)
     settings = preset.tracking_of(method.tracker)
     made = MapJob.of(room, method.field, preset, MAPPED)
-    job = TrackJob(made, room, method.tracker, settings, steps, frames=frames, n_threads=1)
+    job = TrackJob(made, room, method.tracker, settings, steps, frames=frames)
     found = run_jobs([job], Execution(workers=1))[0]
     tracked = read_run(job.folder.name).frames
     is_wrong = (tracked["translation_error_m"] > WRONG_M).to_numpy()

@@ -1,5 +1,5 @@
-"""Jobs here, in processes and on Dask: order, progress, failures that are reported, and nothing left
-running. And mapping, tracking and tables killed at any moment, then started again: the same result.
+"""Jobs here, in processes and on Dask: order, progress, failures told, nothing left running.
+And mapping, tracking and tables killed at any moment, then started again: the same result.
 
 More kills: NBTRACK_TEST_KILLS=30.
 """
