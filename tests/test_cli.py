@@ -230,18 +230,14 @@ def test_a_recording_without_poses_is_tracked_in_a_map(
     assert "cannot find a camera whose first pose is not known" in capsys.readouterr().err
 
 
-def test_a_pipe_that_nobody_reads(tmp_path: Path) -> None:
-    """Catches a traceback of a broken pipe after `map ... | true`, or nothing mapped."""
-    write_recording("plain", tmp_path / "r")
-    words = ["map", "r", "--field", "points", "--out", "m"]
+def test_a_pipe_that_nobody_reads() -> None:
+    """Catches a traceback, or a message about the output, where its reader has left."""
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "nbtrack", *words]
-    found = subprocess.run(command, cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "nbtrack", "methods"]
+    found = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
-    assert (found.returncode, "nbtrack: " in found.stderr) == (1, False)
-    assert "Error" not in found.stderr
-    assert (tmp_path / "m/map.safetensors").is_file()
+    assert (found.returncode, found.stderr) == (1, "")
 
 
 def test_names_that_are_no_text(
