@@ -80,11 +80,7 @@ def room_mesh() -> trimesh.Trimesh:
     return mesh
 
 
-def cloud(offset: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    points = torch.tensor([[0.5, 0.0, -1.0], [-0.5, 0.2, -2.0]])
-    return points, torch.tensor([offset, -0.01]), torch.diag(torch.tensor([1.0, -1, -1, 1]))
-
-
+FAR = torch.linspace(-0.05, 0.05, 12 * 16 - 1)  # m, of the measured pixels of a frame
 FIGURES = {
     "frame": lambda s: plots.plot_frame(s, 3, "one"),
     "views": lambda s: plots.plot_views(s, [0, 3], [(s.color(0), s.depth(0) + 0.02)] * 2, "x"),
@@ -92,7 +88,7 @@ FIGURES = {
     "losses": lambda s: plots.plot_losses(HISTORIES, "fall"),
     "slice": lambda s: plots.plot_slice(SPHERE, s, 0.0, title="round"),
     "density": lambda s: plots.plot_slice(FOG, s, 0.0, title="round"),
-    "points": lambda s: plots.plot_points({"before": cloud(0.05), "after": cloud(0.02)}, "closer"),
+    "distances": lambda s: plots.plot_distances(s[0], {"start": FAR, "end": FAR / 2}, "closer"),
     "mesh": lambda s: plots.plot_mesh(room_mesh(), {"SDF": s.T_world_camera}, "room"),
     "figure 1": lambda s: plots.plot_map_and_slice(
         NEAR, s, {"true": s.T_world_camera}, "round", voxel=0.1

@@ -8,6 +8,7 @@ from nbtrack.plots.figures import (
     plot_along_ray,
     plot_ate,
     plot_curves,
+    plot_distances,
     plot_errors,
     plot_frame,
     plot_losses,
@@ -18,7 +19,6 @@ from nbtrack.plots.rooms import (
     plot_map_and_slice,
     plot_mesh,
     plot_overview,
-    plot_points,
     plot_slice,
     plot_trajectories,
 )

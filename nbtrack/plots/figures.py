@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from nbtrack.core.arrays import Values
-from nbtrack.data.frame import MILLIMETRE
+from nbtrack.data.frame import MILLIMETRE, Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import View
 from nbtrack.plots import style
@@ -63,6 +63,29 @@ def plot_views(
     depth_image.figure.colorbar(depth_image, ax=grid[:, 2:4], label="depth (m)", **bars)
     error_image.figure.colorbar(error_image, ax=grid[:, 4:], label="depth error (cm)", **bars)
     return error_image.figure
+
+
+@style.styled
+def plot_distances(frame: Frame, distances: Mapping[str, Values], title: str = "") -> Figure:
+    """A frame's colour, and by label |d| (cm) of its points in a map; unmeasured pixels are grey.
+
+    The distances (m) are those of `frame.measured_pixels()`, in this order. All images share one
+    scale, cut at the 98 % quantile.
+    """
+    rows, columns = frame.measured_pixels().cpu().numpy()
+    aspect = frame.camera.height / frame.camera.width
+    height = 1.0 + aspect * style.WIDTH / (1 + len(distances))  # inches
+    color_axes, *panels = style.new_axes(title, height, 1, 1 + len(distances))[0]
+    show_image(color_axes, frame.color.cpu().numpy(), "observed colour")
+    images = np.full((len(panels), *frame.depth_mm.shape), np.nan)
+    images[:, rows, columns] = 100 * np.stack([sdf.abs().cpu().numpy() for sdf in distances.values()])
+    limit = np.nanquantile(images, 0.98)
+    for axes, label, image in zip(panels, distances, images, strict=True):
+        label = f"{label}: mean {np.nanmean(image):.1f} cm"
+        shown = show_image(axes, image, label, limit, "magma")
+    bar = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max"}
+    shown.figure.colorbar(shown, ax=panels, label="|signed distance| (cm)", **bar)
+    return shown.figure
 
 
 def show_image(

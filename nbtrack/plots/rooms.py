@@ -14,7 +14,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from nbtrack.core.arrays import Points, Poses, Transform, Values
+from nbtrack.core.arrays import Poses
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.plots.meshes import extract_mesh, query_field, seen_by
@@ -77,29 +77,6 @@ def _scale_of(field: Field, values: np.ndarray) -> tuple[Normalize, str]:
         limit = np.clip(np.quantile(np.abs(values), 0.98), 0.2, 1.5)
         return Normalize(-limit, limit), "RdBu"
     return LogNorm(field.surface_level / 200, 50 * field.surface_level, clip=True), "YlOrBr"
-
-
-@styled
-def plot_points(points: Mapping[str, tuple[Points, Values, Transform]], title: str = "") -> Figure:
-    """Observed points by their signed distance (cm) in a map, a panel a pose.
-
-    White points lie on the map's surface, blue ones in front of it, red ones behind it. All panels
-    share one scale, cut at the 95 % quantile of the first. The dot is the camera. By label, as
-    "before" and "after": points (m, world frame), their signed distances (m), and the
-    camera-to-world pose that placed them.
-    """
-    panels = new_axes(title, 4.5, 1, len(points), sharex=True, sharey=True)[0]
-    limit = 100 * float(next(iter(points.values()))[1].abs().quantile(0.95))
-    look = {"cmap": "RdBu", "s": 6, "edgecolors": "0.6", "linewidths": 0.15}
-    for axes, (label, parts) in zip(panels, points.items(), strict=True):
-        places, sdf, T_world_camera = (part.cpu().numpy() for part in parts)
-        _, page = _draw_from_above(axes, {"camera": T_world_camera[None]})
-        image = axes.scatter(*places[:, page].T, c=100 * sdf, vmin=-limit, vmax=limit, **look)
-        axes.set_title(f"{label}: mean |distance| {100 * np.abs(sdf).mean():.2f} cm")
-        axes.set_facecolor("0.93")
-    look = {"label": "signed distance (cm)", "extend": "both", "aspect": 25}
-    axes.figure.colorbar(image, ax=list(panels), **look)
-    return axes.figure
 
 
 @styled
