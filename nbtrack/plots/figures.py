@@ -78,7 +78,8 @@ def plot_distances(frame: Frame, distances: Mapping[str, Values], title: str = "
     color_axes, *panels = style.new_axes(title, height, 1, 1 + len(distances))[0]
     show_image(color_axes, frame.color.cpu().numpy(), "observed colour")
     images = np.full((len(panels), *frame.depth_mm.shape), np.nan)
-    images[:, rows, columns] = 100 * np.stack([sdf.abs().cpu().numpy() for sdf in distances.values()])
+    for image, sdf in zip(images, distances.values(), strict=True):
+        image[rows, columns] = 100 * sdf.abs().cpu().numpy()
     limit = np.nanquantile(images, 0.98)
     for axes, label, image in zip(panels, distances, images, strict=True):
         label = f"{label}: mean {np.nanmean(image):.1f} cm"
