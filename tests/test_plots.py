@@ -26,6 +26,7 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.output import save_picture
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.plots.movie import view_of
+from nbtrack.plots.pose_losses import move_sideways
 from nbtrack.plots.projection import screen_axes
 from nbtrack.plots.style import PALETTE, method_colors
 from nbtrack.plots.viewer import viewer_scene
@@ -387,3 +388,13 @@ def test_a_movie_shows_every_frame(sequence) -> None:
     with Image.open(io.BytesIO(plots.movie_bytes(pictures))) as movie:
         assert movie.n_frames == 2
         assert movie.size == pictures[0].shape[1::-1]
+
+
+def test_sliders_move_the_camera_along_its_own_axes(sequence) -> None:
+    """Catches offsets along the world's axes, in metres, and a turn about another axis."""
+    T_camera_moved = torch.from_numpy(sequence[2].T_world_camera).float().inverse() @ (
+        move_sideways(sequence[2], 10.0, 90.0)
+    )
+    assert torch.allclose(T_camera_moved[:3, 3], torch.tensor([0.1, 0, 0]), atol=1e-6)
+    ahead = T_camera_moved[:3, :3] @ torch.tensor([0.0, 0, 1])
+    assert torch.allclose(ahead, torch.tensor([1.0, 0, 0]), atol=1e-6)
