@@ -11,6 +11,7 @@ from nbtrack.beyond.lm_residuals import Grid, Problem, Terms, grid_of, residual_
 from nbtrack.beyond.lm_solver import (
     damped_step,
     normal_equations,
+    point_costs,
     retract,
     robust_cost,
     robust_scales,
@@ -184,6 +185,61 @@ def test_a_single_plane_leaves_three_directions_open() -> None:
     assert found["condition_number"] > 1e6
     # Along the wall the position is as uncertain as the prior allows.
     assert found["position_std_m"] == pytest.approx(0.5 / (3 * 0.6745), rel=0.01)
+
+
+def rippled(surface, amplitude: float) -> Grid:
+    """Surfaces by their distance, with a colour that ripples by noise, as a learned one does."""
+    field = BakedField(Formula(surface, BOX, lambda p: 0.5 + 0 * p), 0.05)
+    noise = torch.randn(field.volume[:3].shape, generator=torch.Generator().manual_seed(0))
+    field.volume[:3] += amplitude * noise
+    return grid_of(field)
+
+
+def _corridor(p: torch.Tensor) -> torch.Tensor:
+    return torch.minimum(0.5 - p[:, 2], 0.5 - p[:, 1].abs())
+
+
+def _corner(p: torch.Tensor) -> torch.Tensor:
+    return torch.minimum(_corridor(p), 0.5 - p[:, 0].abs())
+
+
+@pytest.mark.parametrize(
+    ("surface", "is_held"),
+    [
+        (lambda p: 0.5 - p[:, 2], False),
+        (lambda p: p[:, 1] + 0.5, False),
+        (_corridor, False),
+        (lambda p: 0.9 - (p + torch.tensor([0.0, 0.0, 0.5])).norm(dim=1), False),
+        (_corner, True),
+    ],
+    ids=["wall", "floor", "corridor", "sphere", "corner"],
+)
+def test_ripples_of_a_map_hold_nothing(surface, is_held: bool) -> None:
+    """Catches a standard deviation of millimetres where only the noise of the map's colours has a
+    slope along what is seen; and doubts where three planes hold the camera."""
+    rays = torch.from_numpy(RANDOM.uniform([-1, -1, 0], 1, (2000, 3)))
+    camera = torch.tensor([0.1, -0.05, 0.0])
+    near, far = torch.zeros(2000), torch.ones(2000)
+    for _ in range(40):
+        middle = (near + far) / 2
+        is_free = surface(camera + middle[:, None] * rays) > 0
+        near, far = torch.where(is_free, middle, near), torch.where(is_free, far, middle)
+    is_hit = (far < 1).numpy()
+    points = (middle[:, None] * rays).numpy()[is_hit][:500]
+    lumas = 0.5 + RANDOM.normal(scale=0.006, size=len(points))
+    seen = Observed(points, lumas, NONE)
+    T_start = np.eye(4)
+    T_start[:3, 3] = camera
+    optimizer = LmOptimizer(rippled(surface, 0.003), seen, seen, 1.0, T_start)
+    optimizer.run()
+    assert (optimizer.certainty()["position_std_m"] < 0.01) == is_held
+
+
+def test_the_costs_of_points_are_those_of_their_mean() -> None:
+    """Catches a second formula of the cost that differs from the compiled one."""
+    terms, scales = terms_at(grid_of(ROOM), POINTS, LUMAS, is_fine=True), np.array([0.1, 0.2])
+    mean = robust_cost(terms.residuals, terms.reliability, scales, 0.7)
+    assert point_costs(terms, scales, 0.7).mean() == pytest.approx(mean, rel=1e-5)
 
 
 def test_a_rejected_step_leaves_the_pose_unchanged() -> None:

@@ -67,6 +67,14 @@ def robust_cost(residuals, reliability, scales, lambda_intensity):
     return total / len(reliability)
 
 
+def point_costs(terms, scales, lambda_intensity):
+    """The cost of each point (n,), of which `robust_cost` is the mean."""
+    squares = (terms.residuals / scales[:, None]) ** 2
+    distance, intensity = squares / (1 + squares)
+    cost = distance + lambda_intensity * intensity
+    return terms.reliability * cost + (1 - terms.reliability) * (1 + lambda_intensity)
+
+
 @no_type_check
 @compiled
 def normal_equations(terms, scales, lambda_intensity):
