@@ -12,7 +12,8 @@ from pathlib import Path
 import pandas as pd
 
 from nbtrack.data.dataset import DATASET_SCENES
-from nbtrack.tables import over_rooms, published_table_1, table_1
+from nbtrack.experiments.runs import over_rooms
+from nbtrack.tables import published_table_1, table_1
 
 PROJECT = Path(__file__).parents[1]
 DOCUMENTS = [PROJECT / name for name in ("README.md", "benchmarks/README.md", "docs/choices.md")]

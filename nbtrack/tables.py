@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from pandas.io.formats.style import Styler
-from scipy.special import stdtrit
 
 from nbtrack.core.errors import DataError, look_up
 from nbtrack.core.files import fingerprint, write_atomic
@@ -121,18 +120,6 @@ def table_2(steps: pd.DataFrame, value: str = "steps") -> pd.DataFrame:
     """
     _refuse_doubles(steps, _CELL_2)
     return _wide(steps, _CELL_2, value).reindex(steps["tracker"].unique(), level="tracker")
-
-
-def over_rooms(results: pd.DataFrame, by: list[str], value: str = "ate_m") -> pd.DataFrame:
-    """Geometric mean of a positive column by groups, and its 95 % interval: columns `from`, `to`.
-
-    A room counts once, with the mean of its seeds' logarithms: rooms differ more than seeds do.
-    The interval is Student's of the rooms' logarithms, NaN for a single room (our choice).
-    """
-    of_rooms = np.log(results.set_index([*by, "scene"])[value])
-    rooms = of_rooms.groupby([*by, "scene"], sort=False).mean().groupby(by, sort=False)
-    mean, half = rooms.mean(), rooms.sem() * stdtrit(rooms.size() - 1, 0.975)
-    return np.exp(pd.DataFrame({value: mean, "from": mean - half, "to": mean + half})).reset_index()
 
 
 def beside_published(results: pd.DataFrame) -> pd.DataFrame:

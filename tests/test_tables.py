@@ -11,6 +11,7 @@ import pytest
 from nbtrack import tables
 from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.data.dataset import DATASET_SCENES
+from nbtrack.experiments.runs import over_rooms
 from nbtrack.tables import (
     STANDING_STILL,
     Wording,
@@ -18,7 +19,6 @@ from nbtrack.tables import (
     beside,
     beside_published,
     latex_file,
-    over_rooms,
     published_table_1,
     published_table_2,
     style_table_1,

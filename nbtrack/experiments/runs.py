@@ -1,9 +1,10 @@
-"""Finished runs, read from their folders."""
+"""Finished runs: read from their folders, and means of their errors over rooms."""
 
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.special import stdtrit
 
 from nbtrack.core import files
 from nbtrack.core.errors import MissingError
@@ -32,3 +33,15 @@ def read_trajectory(folder: Path) -> Trajectory:
             raise ValueError(f"{len(frames)} rows for {len(T_estimated)} poses")
     back = -np.array(metrics.get("origin", [0, 0, 0]))
     return Trajectory(shifted(T_estimated, back), shifted(T_true, back), frames, metrics)
+
+
+def over_rooms(results: pd.DataFrame, by: list[str], value: str = "ate_m") -> pd.DataFrame:
+    """Geometric mean of a positive column by groups, and its 95 % interval: columns `from`, `to`.
+
+    A room counts once, with the mean of its seeds' logarithms: rooms differ more than seeds do.
+    The interval is Student's of the rooms' logarithms, NaN for a single room (our choice).
+    """
+    of_rooms = np.log(results.set_index([*by, "scene"])[value])
+    rooms = of_rooms.groupby([*by, "scene"], sort=False).mean().groupby(by, sort=False)
+    mean, half = rooms.mean(), rooms.sem() * stdtrit(rooms.size() - 1, 0.975)
+    return np.exp(pd.DataFrame({value: mean, "from": mean - half, "to": mean + half})).reset_index()
