@@ -12,7 +12,9 @@ one() { # room, method, rate: one run, after the map that it needs
   while [ ! -f "$NBTRACK_DATA/$1/focal.txt" ]; do sleep 1; done
   python3 - "$@" <<'PYTHON' && echo "$(date +%T) done: $*"
 import sys
-from evidence import PAPER_SIZES, open_scene, track
+from evidence import PAPER_SIZES, track
+
+from nbtrack import open_scene
 room, method, rate = sys.argv[1:]
 track([open_scene(room, PAPER_SIZES)], [method], PAPER_SIZES, rates_hz=[float(rate)], seeds=[0])
 PYTHON
