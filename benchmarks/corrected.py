@@ -1,10 +1,9 @@
 """Tracking in corrected maps: accuracy and time.
 
     python benchmarks/corrected.py [RECORDING ...]
-    python benchmarks/corrected.py ablation [RECORDING]
     python benchmarks/corrected.py fast
 
-Writes tracking, times and agreement.csv, ablation.csv, or fast.csv and reliability.csv to
+Writes tracking.csv, times.csv and agreement.csv, or fast.csv and reliability.csv to
 paper_tables/corrected.
 RECORDING is a folder in the dataset's layout; the paper's methods and `agreement` are asked for the
 first alone. Times count: run nothing else.
@@ -14,14 +13,11 @@ import sys
 import time
 from datetime import UTC, datetime
 from itertools import combinations, product
-from unittest import mock
 
 import numpy as np
 import pandas as pd
 import torch
-from mistakes import mistakes
 from motions import HAND_HELD
-from turns import in_turns
 
 from nbtrack import (
     METHODS,
@@ -33,17 +29,15 @@ from nbtrack import (
     read_run,
     track_scenes,
 )
-from nbtrack.beyond import correction
-from nbtrack.beyond.correct import correct_map
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.grid import Execution, run_jobs
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.track_jobs import TrackJob
-from nbtrack.tracking import StepBudget, track_sequence
-from nbtrack.tracking.metrics import trajectory_metrics
+from nbtrack.tracking import StepBudget, Tracker
 
 ALONE = Execution(workers=1)
 COMPARED = [
@@ -68,27 +62,10 @@ P_EDGES = [0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 1]
 WRONG_M, WRONG_DEG = 0.05, 3.0  # in a room, whose truth is known
 WRONG_IN_RECORDING_M = 0.2  # there the reference is off, too
 
-# What a correction is made with, changed one at a time: settings, and constants of its module.
-ABLATION = [
-    ("as it is", (), {}),
-    ("at the surface alone", (), {"_OFFSETS": (0.0,)}),
-    ("30,000 points", (), {"_N_POINTS": 30_000, "_MAX_TIMES": 1}),
-    ("every point alike", (), {"_UNMEASURED": 1.0}),  # confidence is 1 everywhere
-    ("cells of 8 cm", ("correction.neus_plus=0.08",), {}),
-    ("colours as the network has them", (), {"_COLOR_REGULARISATION": 1e9}),
-    ("colours as stiff as distances", (), {"_COLOR_REGULARISATION": 1.0}),
-    ("colours of outliers count", (), {"_COLOR_ROUNDS": 1, "_COLOR_HUBER": 1e9}),
-    ("fixed scales, 1 cm and 0.1", (), {"_MEDIANS": np.zeros(2), "_MIN_SCALES": [0.01, 0.1]}),
-    ("without colour in tracking", ("tracking.lm.lambda_intensity=0",), {}),
-]
-
 
 def main() -> None:
     """Measure and write everything."""
     torch.set_num_threads(1)
-    if sys.argv[1:2] == ["ablation"]:
-        write_rows("ablation.csv", ablation(sys.argv[2:]))
-        return
     if sys.argv[1:] == ["fast"]:
         runs = fast()
         write_rows("fast.csv", runs)
@@ -128,10 +105,24 @@ def _track(scenes, methods, preset, frames, path, tracked=None, steps=30) -> pd.
 
 
 def _judged(run: str, wrong_m: float) -> dict[str, float]:
-    """What the frames of a run say of its errors and verdicts."""
+    """What the frames of a run say of its errors and verdicts.
+
+    A frame is wrong if it is off by more than `wrong_m`. Wrong frames that are not called lost are
+    missed; right ones that are called lost are lost in vain. The paper's methods do not judge
+    themselves.
+    """
     frames = read_run(run).frames
-    median_m = float(frames["translation_error_m"].median())
-    return {"median_error_m": median_m, **mistakes(frames, wrong_m)}
+    is_wrong = (frames["translation_error_m"] > wrong_m).to_numpy()
+    is_lost = frames["lost"].to_numpy(bool) if "lost" in frames else np.zeros_like(is_wrong)
+    stretches = np.split(is_wrong, np.flatnonzero(np.diff(is_wrong)) + 1)
+    return {
+        "median_error_m": float(frames["translation_error_m"].median()),
+        "wrong_frames": int(is_wrong.sum()),
+        "longest_wrong": max(int(stretch.sum()) for stretch in stretches),
+        "called_lost": int(is_lost.sum()),
+        "missed_frames": int((is_wrong & ~is_lost).sum()),
+        "frames_lost_in_vain": int((is_lost & ~is_wrong).sum()),
+    }
 
 
 def frame_times(rooms, preset) -> pd.DataFrame:
@@ -147,54 +138,27 @@ def frame_times(rooms, preset) -> pd.DataFrame:
             settings = changed.tracking_of(method.tracker)
             how = field, T_first, StepBudget(30), settings
             trackers[method.label] = make_tracker(method.tracker, *how), sequence
-        found = in_turns(trackers).rename(columns={"run": "method"})
-        rows.append(found.assign(scene=room.name, n_pixels=n_pixels))
+        rows.append(in_turns(trackers).assign(scene=room.name, n_pixels=n_pixels))
     kept = ["scene", "method", "n_pixels"], ["milliseconds", "error_m"]
     return pd.concat(rows).groupby(kept[0])[kept[1]].median().reset_index()
 
 
-def ablation(recordings) -> pd.DataFrame:
-    """Errors with 2,048 points, in the two rooms for tuning on the mapped and on another path, and
-    on recordings on the mapped one. One thing of `ABLATION` is changed at a time."""
-    names, rows = "scenes.names=['bedroom', 'kitchen_nook']", []
-    preset, second = (
-        load_preset("smoke", settings=[names, *HAND_HELD, f"scenes.seed={n}"]) for n in (0, 1)
-    )
-    places = [
-        (room, {"mapped": room, "second": other})
-        for room, other in zip(open_scenes(preset), open_scenes(second), strict=True)
-    ]
-    places += [(scene, {"mapped": scene}) for scene in (open_scene(r, preset) for r in recordings)]
-    for what, settings, constants in ABLATION:
-        method = METHODS["corrected"]
-        changed = with_settings(preset, *method.settings, *settings)
-        with mock.patch.dict(vars(correction), constants):
-            for mapped, paths in places:
-                field, seconds = _corrected_now(mapped, method.field, changed)
-                for (path, scene), frames in product(paths.items(), (":", "::4")):
-                    ate_m = _error(field, scene.read(frames), changed.tracking_of("lm"))
-                    place = what, mapped.name, path, frames
-                    rows.append((*place, ate_m, seconds, len(field.numbers)))
-    columns = ["changed", "scene", "path", "frames", "ate_m", "seconds", "vertices"]
-    return pd.DataFrame(rows, columns=columns)
+def in_turns(runs: dict[str, tuple[Tracker, RgbdSequence]]) -> pd.DataFrame:
+    """Every frame but the first by each tracker in its turn, on sequences of equal length, so that
+    a machine that slows down slows all of them alike.
 
-
-def _corrected_now(scene, field, preset):
-    """A field corrected by the constants of this moment, which no cache knows; and its seconds."""
-    made = MapJob.of(scene, field, preset)
-    run_jobs([made.needs], ALONE)
-    base, sequence, began = made.needs.map(), scene.read(), time.perf_counter()
-    return correct_map(base, sequence, made.correction).field, time.perf_counter() - began
-
-
-def _error(field, sequence, settings) -> float:
-    """ATE (m) of LM, a mean of three seeds."""
-    errors = []
-    for seed in range(3):
-        how = field, sequence.T_world_camera[0], StepBudget(30), settings, seed
-        tracked = track_sequence(make_tracker("lm", *how), sequence)
-        errors.append(trajectory_metrics(tracked.T_estimated, tracked.T_true)["ate_rmse_m"])
-    return float(np.mean(errors))
+    A row a frame: of which method, milliseconds with everything but the reading of files, and the
+    error of the position (m).
+    """
+    rows = []
+    n_frames = {len(sequence) for _, sequence in runs.values()}
+    for index, (name, (tracker, sequence)) in product(range(1, min(n_frames)), runs.items()):
+        frame, start = sequence[index], time.perf_counter()
+        found = tracker.track(frame)
+        milliseconds = 1000 * (time.perf_counter() - start)
+        off = found.T_world_camera[:3, 3] - sequence.T_world_camera[index, :3, 3]
+        rows.append((name, milliseconds, float(np.linalg.norm(off))))
+    return pd.DataFrame(rows, columns=["method", "milliseconds", "error_m"])
 
 
 def fast() -> pd.DataFrame:

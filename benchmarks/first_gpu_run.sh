@@ -42,7 +42,6 @@ part() { # seconds that it may take, and a command
 part 110 python3 benchmarks/step_times.py steps
 part 110 python3 benchmarks/step_times.py mapping
 part 60 python3 benchmarks/step_times.py kernels
-part 100 python3 benchmarks/step_times.py compiled
 part 60 python3 -m pytest -q -p no:cacheprovider --noconftest -W default -m gpu \
   tests/test_gpu.py tests/test_sampling.py
 sizes=(--preset synthetic)

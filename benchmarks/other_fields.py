@@ -10,19 +10,20 @@ and, where it is missing, starts.csv.
 """
 
 import sys
-from datetime import UTC, datetime
+from collections.abc import Iterator
+from functools import partial
 from itertools import product
 from pathlib import Path
 
 import pandas as pd
 import torch
 from basin import OFFSETS, find_from_afar
+from evidence import Chunk, add_rows, track
 from motions import HAND_HELD
 
-from nbtrack import load_preset, map_scene, open_scenes, track_scenes
+from nbtrack import load_preset, map_scene, open_scenes
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.data.pixels import PixelSampler
-from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import METHODS
 
 ROWS = (
@@ -31,11 +32,6 @@ ROWS = (
 )  # fmt: skip
 FURTHER = ("vr_neus", "sdf", "vr_volsdf", "sdf_volsdf")  # rows of the seeds after the first
 RATES_HZ = (10.0, 2.0)
-COLUMNS = [
-    "scene", "seed", "rate_hz", "method", "frames", "steps_per_frame",
-    "path_m", "still_ate_m", "ate_m",
-    "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "lost_frames", "device", "date",
-]  # fmt: skip
 
 
 def starts(path: Path) -> None:
@@ -66,26 +62,25 @@ def opacity(seeds: int) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def main(seeds: int) -> None:
-    """Make the rows that are missing, method by method, over whole paths."""
-    preset, folder = load_preset("smoke", settings=HAND_HELD), tables_folder() / "other_fields"
-    path, seen = folder / "table_1_cells.csv", folder / "starts.csv"
-    rows = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=COLUMNS)
+def track_rows(seeds: int) -> Iterator[Chunk]:
+    """Whole paths, method by method."""
+    preset = load_preset("smoke", settings=HAND_HELD)
     for seed, scene, name in product(range(seeds), open_scenes(preset), ROWS):
-        place = {"scene": scene.name, "seed": seed, "method": METHODS[name].label}
-        is_there = (rows[[*place]] == pd.Series(place)).all(axis=1).any()
-        if is_there or (seed and name not in FURTHER):
+        if seed and name not in FURTHER:
             continue
-        how = {"frames": ":", "seeds": [seed], "execution": Execution(workers=1)}
-        made = track_scenes([scene], [name], preset, RATES_HZ, **how)
-        made = made.assign(date=f"{datetime.now(UTC):%Y-%m-%d}")[COLUMNS]
-        rows = pd.concat([rows, made]) if len(rows) else made
-        write_atomic(path, rows.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
-        print(made.to_string(index=False, header=False), flush=True)
+        place = {"scene": scene.name, "seed": seed, "method": METHODS[name].label}
+        how = {"rates_hz": RATES_HZ, "frames": ":", "seeds": [seed]}
+        yield place, partial(track, [scene], [name], preset, 1, **how)
+
+
+def main(seeds: int) -> None:
+    """Make the rows that are missing."""
+    folder = tables_folder() / "other_fields"
+    add_rows(folder / "table_1_cells.csv", "other_fields", track_rows(seeds))
     found = opacity(seeds).to_csv(index=False, float_format="%.4g", lineterminator="\n")
     write_atomic(folder / "opacity.csv", found)
-    if not seen.exists():
-        starts(seen)
+    if not (folder / "starts.csv").exists():
+        starts(folder / "starts.csv")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """Times of steps and of mapping iterations; on a GPU recorded and not, in float32 and in TF32.
 
-`python benchmarks/step_times.py steps`, `mapping`, `kernels` or `compiled`, CSV files into the
-folder $OUT. Of untrained networks of full size and an image of noise before a wall: a step costs
-the same whatever they show. On a CPU everything is small, which only says that the script runs;
-unless `full` follows, which takes minutes.
+`python benchmarks/step_times.py steps`, `mapping` or `kernels`, CSV files into the folder $OUT. Of
+untrained networks of full size and an image of noise before a wall: a step costs the same whatever
+they show. On a CPU everything is small, which only says that the script runs; unless `full`
+follows, which takes minutes.
 """
 
 import os
@@ -55,11 +55,9 @@ def noise(n_frames: int) -> RgbdSequence:
 SEQUENCE = noise(20)
 
 
-def warm_tracker(name: str, field_name: str, is_compiled: bool = False) -> Tracker:
+def warm_tracker(name: str, field_name: str) -> Tracker:
     """At the start of a frame, after all that counts nowhere."""
     field = make_field(field_name, NETWORK, BOUNDS, seed=0).to(DEVICE)
-    if is_compiled:
-        field.mlp.features = torch.compile(field.mlp.features)
     settings = TRACKERS[name].Settings(tf32=torch.get_float32_matmul_precision() == "high")
     settings = settings if IS_FULL else replace(settings, n_pixels=32)
     tracker = make_tracker(name, field, np.eye(4), StepBudget(1), settings)
@@ -98,21 +96,16 @@ def milliseconds(call: Callable[[], object], waits: bool) -> tuple[float, float,
     return median, low, high
 
 
-def step_rows(is_compiled: bool = False) -> Iterator[dict]:
+def step_rows() -> Iterator[dict]:
     """Step times of the paper's trackers in its fields."""
     for name, field_name in PAIRS:
-        tracker = warm_tracker(name, field_name, is_compiled)
+        tracker = warm_tracker(name, field_name)
         is_recordable = tracker.recording.is_recordable
         for is_recorded, waits in product({is_recordable, False}, (True, False)):
             tracker.recording.is_recordable = is_recorded
             median, low, high = milliseconds(tracker.step, waits)
             times = {"ms": median, "ms_low": low, "ms_high": high}
             yield {"tracker": name, "recorded": is_recorded, "waits": waits, **times}
-
-
-def compiled_rows() -> Iterator[dict]:
-    """The same, with the network compiled by Inductor."""
-    return step_rows(is_compiled=True)
 
 
 def mapping_rows() -> Iterator[dict]:
@@ -165,12 +158,7 @@ def kernel_rows() -> Iterator[dict]:
             yield {"of": name, "kernel": kernel[:120], **of_one}
 
 
-PARTS = {
-    "steps": step_rows,
-    "mapping": mapping_rows,
-    "kernels": kernel_rows,
-    "compiled": compiled_rows,
-}
+PARTS = {"steps": step_rows, "mapping": mapping_rows, "kernels": kernel_rows}
 
 
 def main(part: str) -> None:

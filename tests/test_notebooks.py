@@ -91,7 +91,7 @@ FACTS = {
     "120": "frames of Red Kitchen, paper_tables/README.md",
     "373": "frames of an office, as above",
     "4.6": "degrees a frame of this office, as above",
-    "1,200": "frames of a walk, benchmarks/walks.py",
+    "1,200": "frames of a walk, paper_tables/README.md",
     "860": "first frame of a fast part of breakfast_room, benchmarks/evidence.py",
     "06": "a notebook's number",
 }

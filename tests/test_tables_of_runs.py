@@ -338,20 +338,3 @@ def test_searches_from_afar(
     assert len(found) == 2 * 2 * 2
     shares = found.groupby(["method", "offset"], sort=False)["recovered"].mean()
     assert shares.index[0] == ("NeuS with SDF", "0 cm, 0°")
-
-
-def test_variants_of_the_evidence_run(
-    preset: Preset, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches a variant that no longer fits what it is made from: the evidence would stop midway,
-    after an hour."""
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
-    with mock.patch.dict(TRACKERS), mock.patch.dict(FIELDS):
-        variants = importlib.import_module("variants")
-        names = variants.TRACKERS.keys() - {"vr", "sdf", "lm", "icp"}
-        methods = [Method(n, "imap" if n.startswith("vr") else "neus", n) for n in sorted(names)]
-        methods += [Method("smooth", "imap_silu", "vr")]
-        changed = variants.with_variants(preset)
-        runs = track_scenes(scenes[1:], methods, changed, steps=2, frames=":3")
-    assert len(runs) == 7
-    assert runs["ate_m"].notna().all()
