@@ -33,6 +33,20 @@ _HEADS = {
     "ICP, dense": "ICP 4096",
     "standing still": "still",
 }
+_COUNTS = {
+    "wrong_frames": "wrong",
+    "longest_wrong": "longest stretch",
+    "missed_frames": "missed",
+    "called_lost": "called lost",
+    "frames_lost_in_vain": "in vain",
+}
+
+
+def shown(rows: pd.DataFrame, columns: dict[str, tuple[str, str]]) -> pd.DataFrame:
+    """Some columns as text: with each name its head in the document and its format."""
+    return pd.DataFrame(
+        {head: rows[name].map(form.format) for name, (head, form) in columns.items()}
+    )
 
 
 def tracking(runs: pd.DataFrame) -> pd.DataFrame:
@@ -43,27 +57,18 @@ def tracking(runs: pd.DataFrame) -> pd.DataFrame:
     path = path.replace("odd, mapped even", ", even mapped")
     runs["place"] = runs["scene"] + path + ", `" + runs["frames"] + "`"
     cm = 100 * runs.pivot_table(index="place", columns="method", values="ate_m", sort=False)
-    return cm[[*_HEADS]].rename(columns=_HEADS).map(_number)
-
-
-def _number(value: float) -> str:
-    return "" if pd.isna(value) else f"{value:.2f}"
+    return cm[[*_HEADS]].rename(columns=_HEADS).map("{:.2f}".format, na_action="ignore").fillna("")
 
 
 def recordings(runs: pd.DataFrame) -> pd.DataFrame:
-    """Of a real recording: median error (cm) and counts of frames, means of the seeds."""
+    """Of a real recording: median error (cm), a mean of the seeds, and each seed's counts."""
     runs = runs[runs["scene"] == "real_office"].replace({"method": _HEADS})
-    runs = runs.assign(cm=100 * runs["median_error_m"])
-    columns = {
-        "cm": "median, cm", "wrong_frames": "wrong", "longest_wrong": "longest stretch",
-        "missed_frames": "missed", "called_lost": "called lost", "frames_lost_in_vain": "in vain",
-    }  # fmt: skip
     groups = runs.groupby(["frames", "method"], sort=False)
-    table = groups[["cm"]].mean().map("{:.2f}".format)
-    for name in [*columns][1:]:
+    table = (100 * groups[["median_error_m"]].mean()).map("{:.2f}".format)
+    for name in _COUNTS:
         table[name] = groups[name].agg(lambda counts: " / ".join(counts.astype(str)))
     places = [f"`{frames}`: {method}" for frames, method in table.index]
-    return table.rename(columns=columns).set_axis(places)
+    return table.rename(columns={"median_error_m": "median, cm", **_COUNTS}).set_axis(places)
 
 
 def searches(rows: pd.DataFrame) -> pd.DataFrame:
@@ -99,10 +104,9 @@ def fast(runs: pd.DataFrame) -> pd.DataFrame:
 
 def steps(cells: pd.DataFrame) -> pd.DataFrame:
     """Steps in half a second and milliseconds a step from these, by tracker and pixels."""
-    cells = cells.query("budget_ms == 500")
+    cells = cells.query("budget_ms == 500").eval("ms = 500 / steps")
     cells.index = cells["tracker"] + " " + cells["n_pixels"].astype(str)
-    table = pd.DataFrame({"steps in 500 ms": cells["steps"].map("{:.1f}".format)})
-    return table.assign(**{"ms a step": (500 / cells["steps"]).map("{:.3g}".format)}).T
+    return shown(cells, {"steps": ("steps in 500 ms", "{:.1f}"), "ms": ("ms a step", "{:.3g}")}).T
 
 
 def mapping(times: pd.DataFrame) -> pd.DataFrame:
@@ -143,43 +147,37 @@ def kernels(rows: pd.DataFrame) -> pd.DataFrame:
 def convergence(scores: pd.DataFrame) -> pd.DataFrame:
     """When the distance near surfaces is first right to 2 cm."""
     of_seeds = scores.groupby(["field", "iterations"], sort=False)[["seconds", "near_m"]]
-    means = of_seeds.mean().reset_index()
-    first = means[means["near_m"] < _RIGHT_TO].groupby("field", sort=False).first()
-    seconds = first["seconds"].map("{:.0f}".format)
-    return pd.DataFrame({"iterations": first["iterations"].astype(str), "s": seconds})
+    right = of_seeds.mean().reset_index("iterations").query("near_m < @_RIGHT_TO")
+    first = right.groupby("field", sort=False).first()
+    return shown(first, {"iterations": ("iterations", "{:.0f}"), "seconds": ("s", "{:.0f}")})
 
 
 def image_size(times: pd.DataFrame) -> pd.DataFrame:
     """Milliseconds and error of a frame by the width of its picture."""
-    times = times.set_index(times["width"].map("{:g} px wide".format))
-    error_cm = (100 * times["error_m"]).map("{:.2f}".format)
-    return pd.DataFrame(
-        {"ms a frame": times["milliseconds"].map("{:.1f}".format), "cm": error_cm}
-    ).T
+    times = times.set_index(times["width"].map("{:g} px wide".format)).eval("cm = 100 * error_m")
+    return shown(times, {"milliseconds": ("ms a frame", "{:.1f}"), "cm": ("cm", "{:.2f}")}).T
 
 
 def correction(runs: pd.DataFrame) -> pd.DataFrame:
     """What a correction takes in every scene of the ablation."""
     own = runs.query("changed == 'as it is'").groupby("scene", sort=False).first()
-    seconds, vertices = own["seconds"].map("{:.0f}".format), own["vertices"].map("{:,}".format)
-    return pd.DataFrame({"s of one core": seconds, "vertices": vertices})
+    return shown(own, {"seconds": ("s of one core", "{:.0f}"), "vertices": ("vertices", "{:,}")})
 
 
 def ten_seconds(rounds: pd.DataFrame) -> pd.DataFrame:
     """Seconds of a core from a recording to its corrected map."""
-    rounds = rounds.assign(both_s=rounds["mapping_s"] + rounds["correction_s"])
-    columns = {"mapping_s": "mapping, s", "correction_s": "correction, s", "both_s": "both, s"}
-    medians = rounds.groupby("method", sort=False)[[*columns]].median()
-    return medians.rename(columns=columns).map("{:.1f}".format)
+    rounds = rounds.eval("both_s = mapping_s + correction_s")
+    medians = rounds.groupby("method", sort=False).median(numeric_only=True)
+    names = ("mapping", "correction", "both")
+    return shown(medians, {f"{name}_s": (f"{name}, s", "{:.1f}") for name in names})
 
 
 def memory(peaks: pd.DataFrame) -> pd.DataFrame:
     """Peak memory of mapping a long sequence, and what its images take of it."""
-    pixels = peaks["frames"] * peaks["width"] * peaks["height"]
-    images_gb = (5 * pixels / 1e9).map("{:.2f}".format)  # 3 bytes of colour and 2 of depth a pixel
-    peak_gb = peaks["peak_gb"].map("{:.2f}".format)
-    table = pd.DataFrame({"peak, GB": peak_gb, "images of it, GB": images_gb})
-    return table.set_axis(peaks["field"])
+    # 3 bytes of colour and 2 of depth a pixel
+    peaks = peaks.set_index("field").eval("images_gb = 5 * frames * width * height / 1e9")
+    columns = {"peak_gb": "peak, GB", "images_gb": "images of it, GB"}
+    return shown(peaks, {name: (head, "{:.2f}") for name, head in columns.items()})
 
 
 def choices(runs: pd.DataFrame) -> pd.DataFrame:

@@ -9,7 +9,6 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from unittest import mock
 
 import cv2
 import numpy as np
@@ -30,9 +29,8 @@ from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, Method
 from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scenes
-from nbtrack.fields import FIELDS
 from nbtrack.tables import table_1
-from nbtrack.tracking import TRACKERS, make_tracker
+from nbtrack.tracking import make_tracker
 
 
 @pytest.fixture(scope="module", autouse=True)
