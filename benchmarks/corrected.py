@@ -19,21 +19,12 @@ import pandas as pd
 import torch
 from motions import HAND_HELD
 
-from nbtrack import (
-    METHODS,
-    load_preset,
-    make_tracker,
-    map_scene,
-    open_scene,
-    open_scenes,
-    read_run,
-    track_scenes,
-)
+from nbtrack import METHODS, load_preset, make_tracker, open_scene, open_scenes, read_run
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder, write_atomic
 from nbtrack.core.settings import with_settings
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.experiments.grid import Execution, run_jobs
+from nbtrack.experiments.grid import Execution, map_scene, run_jobs, track_scenes
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.track_jobs import TrackJob
@@ -41,16 +32,12 @@ from nbtrack.tracking import StepBudget, Tracker
 
 ALONE = Execution(workers=1)
 COMPARED = [
-    METHODS["baked"],
-    METHODS["corrected_sparse"],
-    METHODS["corrected"],
-    METHODS["corrected_dense"],
-    METHODS["neus_corrected"],
-    METHODS["grid_corrected"],
-    METHODS["icp"],
-    METHODS["icp_middle"],
-    METHODS["icp_dense"],
-]
+    METHODS[name]
+    for name in (
+        "baked", "corrected_sparse", "corrected", "corrected_dense", "neus_corrected",
+        "grid_corrected", "icp", "icp_middle", "icp_dense",
+    )
+]  # fmt: skip
 ON_RECORDINGS = [method for method in COMPARED if method != METHODS["neus_corrected"]]
 SEEDS = range(3)  # of map and tracker
 COLUMNS = [

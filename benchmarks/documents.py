@@ -34,12 +34,9 @@ _HEADS = {
     "standing still": "still",
 }
 _COUNTS = {
-    "wrong_frames": "wrong",
-    "longest_wrong": "longest stretch",
-    "missed_frames": "missed",
-    "called_lost": "called lost",
-    "frames_lost_in_vain": "in vain",
-}
+    "wrong_frames": "wrong", "longest_wrong": "longest stretch", "missed_frames": "missed",
+    "called_lost": "called lost", "frames_lost_in_vain": "in vain",
+}  # fmt: skip
 
 
 def shown(rows: pd.DataFrame, columns: dict[str, tuple[str, str]]) -> pd.DataFrame:

@@ -38,6 +38,7 @@ from nbtrack.tables import write_table_1
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 VR, SDF = METHODS["vr"], METHODS["sdf"]
+IN_GRIDS = "vr_grid", "sdf_grid"
 KEPT = [
     "rate_hz", "method", "scene", "frames", "steps_per_frame", "path_m", "still_ate_m", "ate_m",
     "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "lost_frames", "metres_per_unit",
@@ -63,8 +64,7 @@ class Case:
 
     place: dict[str, str | float] = field(default_factory=dict)  # columns that name its rows
     settings: tuple[str, ...] = ()
-    steps: float | None = None  # a frame; by default those of each rate
-    frames: str | None = None  # to track; by default the preset's
+    how: dict[str, Any] = field(default_factory=dict)  # arguments of `track_scenes`
     methods: Sequence[str | Method] | None = None  # by default the experiment's
     tracked: tuple[str, ...] = ()  # settings of the scenes that are tracked, and not mapped
     exact_depth: tuple[str, ...] = ()  # "mapped" and "tracked" scenes that have it
@@ -74,36 +74,28 @@ class Case:
 class Grid:
     """An experiment: cases, scenes and methods, at the rates of the preset."""
 
-    file: str  # below paper_tables/
     preset: Preset
     cases: Sequence[Case] = (Case(),)
     methods: Sequence[str | Method] = TABLE_1
-    has_maps: bool = False  # whether its rows have sizes and scores of the maps
-    has_table: bool = False  # whether Table I is made of its rows
     how: dict[str, Any] = field(default_factory=dict)  # more arguments of `track_scenes`
+    folder: str = "evidence"  # below paper_tables/
+    has_table: bool = False  # whether Table I is made of its rows, in a folder of its own
+    has_maps: bool = False  # whether its rows have sizes and scores of the maps
     workers: int | None = None  # so many runs side by side, where it is a GPU that does the work
 
 
 NINE = load_preset("nine_rooms")
-THREE_ROOMS = [*NINE.scenes.names[:3]]  # the first of the nine, whatever was found in them
-THREE = with_settings(NINE, f"scenes.names={THREE_ROOMS}")
+# The first three of the nine, whatever was found in them.
+THREE_ROOMS = f"scenes.names={[*NINE.scenes.names[:3]]}"
+THREE = with_settings(NINE, THREE_ROOMS)
+HELD = load_preset("smoke", settings=[THREE_ROOMS, *HAND_HELD])
 # The paper's sizes: 640 x 480 pixels, 256 units, 512 and 4,096 pixels a step.
-FULL = load_preset(
-    "synthetic",
-    settings=[
-        f"scenes.names={THREE_ROOMS}",
-        "scenes.n_frames=240",
-        "mapping.imap.iterations=10_000",
-        "mapping.neus.iterations=10_000",
-    ],
-)
+_FULL_MAPS = "mapping.imap.iterations=10_000", "mapping.neus.iterations=10_000"
+FULL = load_preset("synthetic", settings=[THREE_ROOMS, "scenes.n_frames=240", *_FULL_MAPS])
 # Five of the paper's rooms, at the sizes of the file beside the results.
 PAPER_ROOMS = load_preset("paper", tables_folder() / "paper_rooms" / "settings.toml")
 PAPER_SIZES = load_preset("paper", tables_folder() / "paper_rooms_gpu" / "settings.toml")
-HELD = load_preset("smoke", settings=[f"scenes.names={THREE_ROOMS}", *HAND_HELD])
 FASTEST = "860:1000"  # of breakfast_room: half of the frames move farther than VR's reach at 5 Hz
-AT_5_HZ = VR.paper_steps(5)
-N_PIXELS = [HELD.tracking_of(tracker).n_pixels for tracker in ("vr", "sdf")]
 READINGS = {
     name: METHODS[name]
     for name in ("vr_metres", "sdf_metres", "vr_velocity", "sdf_velocity", "vr_neus")
@@ -114,12 +106,8 @@ READINGS["sdf_per_unit"] = replace(
 )
 
 
-def _vr_at_5_hz(changed: str, *settings: str, steps: float = AT_5_HZ, **more: Any) -> Case:
-    return Case({"changed": changed}, settings, steps, FASTEST, **more)
-
-
-def _sdf_at_5_hz(changed: str, *settings: str, **more: Any) -> Case:
-    return Case({"changed": changed}, settings, **more)
+def _changed(name: str, *settings: str, exact_depth: tuple[str, ...] = (), **how: Any) -> Case:
+    return Case({"changed": name}, settings, how, exact_depth=exact_depth)
 
 
 def _at_speed(speed: float) -> Case:
@@ -129,105 +117,89 @@ def _at_speed(speed: float) -> Case:
     return Case({"speed": speed}, (motion, f"scenes.n_frames={n_frames}"))
 
 
-def _of_factors(n_pixels: int, steps: float) -> Case:
+def _with_steps(steps: float, n_pixels: int) -> Case:
     settings = f"tracking.vr.n_pixels={n_pixels}", f"tracking.sdf.n_pixels={n_pixels}"
-    return Case({"n_pixels": n_pixels, "steps": steps}, settings, steps, ":")
+    return Case({"n_pixels": n_pixels, "steps": steps}, settings, {"steps": steps})
 
 
 GRIDS = {
     # Table I in five of the paper's rooms; a seed takes hours on two cores.
-    "paper_rooms": Grid(
-        "paper_rooms/table_1_cells.csv", PAPER_ROOMS, has_maps=True, has_table=True
-    ),
-    "paper_rooms_gpu": Grid(
-        "paper_rooms_gpu/table_1_cells.csv", PAPER_SIZES, has_maps=True, has_table=True
-    ),
+    "paper_rooms": Grid(PAPER_ROOMS, has_table=True, has_maps=True),
+    "paper_rooms_gpu": Grid(PAPER_SIZES, has_table=True, has_maps=True),
     # What makes VR lose the camera at 5 Hz where breakfast_room's path is fastest.
     "vr_at_5_hz": Grid(
-        "paper_rooms/vr_at_5_hz.csv",
         with_settings(PAPER_ROOMS, "scenes.names=['breakfast_room']"),
         [
-            _vr_at_5_hz("as in Table I"),
-            _vr_at_5_hz("128 pixels", "tracking.vr.n_pixels=128"),
-            _vr_at_5_hz("512 pixels", "tracking.vr.n_pixels=512"),
-            _vr_at_5_hz("exact depth", exact_depth=("tracked",)),
-            _vr_at_5_hz("16 steps", steps=16),
-            _vr_at_5_hz("20 steps", steps=20),
-            _vr_at_5_hz("20 steps, 512 pixels", "tracking.vr.n_pixels=512", steps=20),
-            _vr_at_5_hz("constant velocity", "tracking.vr.motion_model=constant_velocity"),
-            _vr_at_5_hz("8,000 iterations", "mapping.imap.iterations=8000"),
+            _changed("as in Table I"),
+            _changed("128 pixels", "tracking.vr.n_pixels=128"),
+            _changed("512 pixels", "tracking.vr.n_pixels=512"),
+            _changed("exact depth", exact_depth=("tracked",)),
+            _changed("16 steps", steps=16),
+            _changed("20 steps", steps=20),
+            _changed("20 steps, 512 pixels", "tracking.vr.n_pixels=512", steps=20),
+            _changed("constant velocity", "tracking.vr.motion_model=constant_velocity"),
+            _changed("8,000 iterations", "mapping.imap.iterations=8000"),
         ],
         ["vr"],
+        {"steps": VR.paper_steps(5), "frames": FASTEST},
+        "paper_rooms",
     ),
     # What moves the error of SDF, which in our own rooms is five times smaller.
     "sdf_at_5_hz": Grid(
-        "paper_rooms/sdf_at_5_hz.csv",
         with_settings(PAPER_ROOMS, "scenes.names=['whiteroom']"),
         [
-            _sdf_at_5_hz("as in Table I"),
-            _sdf_at_5_hz("exact depth tracked", exact_depth=("tracked",)),
-            _sdf_at_5_hz("exact depth mapped and tracked", exact_depth=("mapped", "tracked")),
-            _sdf_at_5_hz("without colour", "tracking.sdf.lambda_color=0"),
-            _sdf_at_5_hz("4,096 pixels", "tracking.sdf.n_pixels=4096"),
-            _sdf_at_5_hz("8,000 iterations", "mapping.neus.iterations=8000"),
-            _sdf_at_5_hz("192 units", "network.neus.width=192"),
+            _changed("as in Table I"),
+            _changed("exact depth tracked", exact_depth=("tracked",)),
+            _changed("exact depth mapped and tracked", exact_depth=("mapped", "tracked")),
+            _changed("without colour", "tracking.sdf.lambda_color=0"),
+            _changed("4,096 pixels", "tracking.sdf.n_pixels=4096"),
+            _changed("8,000 iterations", "mapping.neus.iterations=8000"),
+            _changed("192 units", "network.neus.width=192"),
         ],
         ["sdf"],
-        how={"rates_hz": [5]},
+        {"rates_hz": [5]},
+        "paper_rooms",
     ),
     # Table I on the mapped path and on a second one; a seed takes an hour on two cores.
     "nine_rooms": Grid(
-        "nine_rooms/table_1_cells.csv",
         NINE,
         [Case({"path": "mapped"}), Case({"path": "second"}, tracked=("scenes.seed=1",))],
         has_table=True,
     ),
-    "full_size": Grid(
-        "full_size/table_1_cells.csv", FULL, has_maps=True, has_table=True, workers=9
-    ),
+    "full_size": Grid(FULL, has_table=True, has_maps=True, workers=9),
     # The true path of a scene of the dataset, placed in three rooms.
     "dataset_path": Grid(
-        "evidence/dataset_path.csv",
-        THREE,
-        [Case({"path": "breakfast_room"}, ("scenes.motion=breakfast_room",))],
+        THREE, [Case({"path": "breakfast_room"}, ("scenes.motion=breakfast_room",))]
     ),
     # Other readings of the paper: rates in metres, constant velocity; and VR in SDF's map.
     "readings": Grid(
-        "evidence/readings.csv",
-        THREE,
-        [Case({"reading": name}, methods=[method]) for name, method in READINGS.items()],
+        THREE, [Case({"reading": name}, methods=[method]) for name, method in READINGS.items()]
     ),
-    "speeds": Grid("evidence/speeds.csv", THREE, [*map(_at_speed, SPEEDS)]),
+    "speeds": Grid(THREE, [*map(_at_speed, SPEEDS)]),
     # Equal steps, more than the paper's VR has at any rate.
-    "more_steps": Grid(
-        "evidence/more_steps.csv", THREE, [Case({"steps": n}, steps=n) for n in (128, 32, 8)]
-    ),
+    "more_steps": Grid(THREE, [Case({"steps": n}, how={"steps": n}) for n in (128, 32, 8)]),
     # In grids of features, with the paper's steps; and in 1/10 s a frame.
-    "cheap_queries": Grid("evidence/cheap_queries.csv", THREE, methods=("vr_grid", "sdf_grid")),
+    "cheap_queries": Grid(THREE, methods=IN_GRIDS),
     "by_the_clock": Grid(
-        "evidence/by_the_clock.csv",
-        THREE,
-        methods=(*TABLE_1, "vr_grid", "sdf_grid"),
-        how={"rates_hz": [10], "clock": True},
+        THREE, methods=(*TABLE_1, *IN_GRIDS), how={"rates_hz": [10], "clock": True}
     ),
     # Equal steps on the whole path, hand-held; every frame and every fourth.
     "steps": Grid(
-        "evidence/steps.csv",
         HELD,
         [
-            Case({"steps": n, "every": every}, steps=n, frames=f"::{every}")
+            Case({"steps": n, "every": every}, how={"steps": n, "frames": f"::{every}"})
             for n, every in product((8, 32, 128), (1, 4))
         ],
     ),
     # Steps x pixels x method: what is left between VR and SDF in one map is the loss.
     "factors": Grid(
-        "evidence/factors.csv",
         HELD,
         [
-            _of_factors(n_pixels, method.paper_steps(10))
-            for n_pixels, method in product(N_PIXELS, (VR, SDF))
+            _with_steps(method.paper_steps(10), HELD.tracking_of(tracker).n_pixels)
+            for tracker, method in product(("vr", "sdf"), (VR, SDF))
         ],
         ["vr", "vr_neus", "sdf"],
+        {"frames": ":"},
     ),
 }
 
@@ -235,8 +207,11 @@ GRIDS = {
 def main(experiment: str, seeds: int) -> None:
     """Make the rows that are missing, and what is made of all."""
     grid = GRIDS[experiment]
-    path = tables_folder() / grid.file
-    add_rows(path, grid.file, (chunk for seed in range(seeds) for chunk in chunks_of(grid, seed)))
+    file = (
+        f"{experiment}/table_1_cells.csv" if grid.has_table else f"{grid.folder}/{experiment}.csv"
+    )
+    path = tables_folder() / file
+    add_rows(path, (chunk for seed in range(seeds) for chunk in chunks_of(grid, seed)))
     rows = pd.read_csv(path)  # as anybody has them, rounded
     if experiment == "nine_rooms":
         judged = verdicts(rows).to_csv(index=False, float_format="%.4g", lineterminator="\n")
@@ -252,14 +227,14 @@ Chunk = tuple[dict[str, str | float], Callable[[], pd.DataFrame]]
 """What names some rows, and what makes them."""
 
 
-def add_rows(path: Path, title: str, chunks: Iterator[Chunk]) -> None:
+def add_rows(path: Path, chunks: Iterator[Chunk]) -> None:
     """Add the rows that a CSV lacks, as they are finished, with machine and date."""
     rows = pd.read_csv(path) if path.exists() else pd.DataFrame()
     for place, make in chunks:
         wanted = pd.Series(place).map(str)
         if len(rows) and (rows[[*place]].astype(str) == wanted).all(axis=1).any():
             continue
-        print(title, place, flush=True)
+        print(path.name, place, flush=True)
         device = device_name(choose_device())
         made = make().assign(**place, device=device, date=f"{datetime.now(UTC):%Y-%m-%d}")
         made = made[[*place, *made.columns.difference([*place], sort=False)]]
@@ -274,7 +249,7 @@ def chunks_of(grid: Grid, seed: int) -> Iterator[Chunk]:
         scenes = open_scenes(preset)
         tracked = open_scenes(with_settings(preset, *case.tracked)) if case.tracked else scenes
         methods = case.methods or grid.methods
-        how = {"steps": case.steps, "frames": case.frames, "seeds": [seed], **grid.how}
+        how = {"seeds": [seed], **grid.how, **case.how}
         if grid.workers:  # all at once; below they are read
             track(scenes, methods, preset, grid.workers, **how)
         for mapped, seen in zip(scenes, tracked, strict=True):

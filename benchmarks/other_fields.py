@@ -76,7 +76,7 @@ def track_rows(seeds: int) -> Iterator[Chunk]:
 def main(seeds: int) -> None:
     """Make the rows that are missing."""
     folder = tables_folder() / "other_fields"
-    add_rows(folder / "table_1_cells.csv", "other_fields", track_rows(seeds))
+    add_rows(folder / "table_1_cells.csv", track_rows(seeds))
     found = opacity(seeds).to_csv(index=False, float_format="%.4g", lineterminator="\n")
     write_atomic(folder / "opacity.csv", found)
     if not (folder / "starts.csv").exists():

@@ -25,6 +25,7 @@ from nbtrack.beyond import LmSettings, verdict
 from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.verdict import WRONG_DEG, WRONG_M, features
 from nbtrack.core.settings import with_settings
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.grid import run_jobs
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.presets import Preset
@@ -60,10 +61,8 @@ def collected(fields: list[Field], paths: list[list[Scene]]) -> Iterator[pd.Data
     """What LM says of its poses, and their errors."""
     for (place, field), n_pixels in product(enumerate(fields), (512, 2048)):
         for scene, frames in product(paths[place], ("::2", "::4", "::8")):
-            sequence = scene.read(frames)
-            how = sequence.T_world_camera[0], StepBudget(30), settings(n_pixels)
-            tracked = track_sequence(make_tracker("lm", field, *how), sequence).frames
-            yield tracked.assign(kind="tracked", place=place)
+            found = tracked(field, scene.read(frames), n_pixels)
+            yield found.assign(kind="tracked", place=place)
         for scene, (cm, degrees), steps in product(paths[place], OFFSETS, (4, 60)):
             found = searched(field, scene.read("::8"), cm, degrees, n_pixels, steps)
             yield found.assign(place=place)
@@ -85,9 +84,8 @@ def in_parts(parts: list[Field], scenes: list[Scene]) -> Iterator[pd.DataFrame]:
     for (place, field), n_pixels in product(enumerate(parts), (512, 2048)):
         for frames in ("::2", "::4", "::8") if scenes[place].room else (":", "::2", "::4"):
             sequence = scenes[place].read(frames)
-            how = sequence.T_world_camera[0], StepBudget(30), settings(n_pixels)
-            tracked = track_sequence(make_tracker("lm", field, *how), sequence).frames
-            yield tracked.assign(kind="part", place=place)
+            found = tracked(field, sequence, n_pixels)
+            yield found.assign(kind="part", place=place)
             found = searched(field, sequence, 10, 8, n_pixels, 60)
             yield found.assign(kind="part", place=place)
 
@@ -95,6 +93,12 @@ def in_parts(parts: list[Field], scenes: list[Scene]) -> Iterator[pd.DataFrame]:
 def settings(n_pixels: int) -> LmSettings:
     """Without restarts, which would leave few wrong poses to learn from."""
     return LmSettings(n_pixels=n_pixels, n_restarts=0)
+
+
+def tracked(field: Field, sequence: RgbdSequence, n_pixels: int) -> pd.DataFrame:
+    """A sequence tracked from its first pose."""
+    how = sequence.T_world_camera[0], StepBudget(30), settings(n_pixels)
+    return track_sequence(make_tracker("lm", field, *how), sequence).frames
 
 
 def searched(field, sequence, cm, degrees, n_pixels, steps) -> pd.DataFrame:
@@ -135,14 +139,6 @@ def print_fit(rows: pd.DataFrame) -> None:
             f"{threshold}: {(is_wrong & ~lost).sum()} of {is_wrong.sum()} wrong ones missed, "
             f"{(~is_wrong & lost).sum()} of {lost.sum()} called lost in vain"
         )
-    edges = [0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 1]
-    part = pd.cut(probability, edges)
-    print(
-        pd.DataFrame({"p": probability, "wrong": is_wrong})
-        .groupby(part, observed=True)
-        .agg(["mean", "size"])
-        .round(3)
-    )
 
 
 if __name__ == "__main__":
