@@ -32,7 +32,6 @@ def find_from_afar(
     offsets: Sequence[tuple[int, int]] = OFFSETS,
     n_starts: int = 24,
     frames: str = "::10",
-    n_restarts: int = 0,
 ) -> pd.DataFrame:
     """Where each tracker ends, from starts that are off in random directions.
 
@@ -51,8 +50,8 @@ def find_from_afar(
     for method, steps in zip(find_methods([*methods]), methods.values(), strict=True):
         changed = with_settings(preset, *method.settings)
         settings = changed.tracking_of(method.tracker)
-        if hasattr(settings, "n_restarts"):
-            settings = replace(settings, n_restarts=n_restarts)
+        if method.tracker == "lm":  # one descent from each start
+            settings = replace(settings, n_restarts=0)
         field, T_first = map_scene(scene, method.field, changed).field, sequence.T_world_camera[0]
         tracker = make_tracker(method.tracker, field, T_first, StepBudget(steps), settings)
         with ProgressBar(f"searches, {method.label}", len(searches)) as bar:

@@ -14,11 +14,11 @@ from itertools import product
 
 import numpy as np
 import pandas as pd
-from motions import dataset_poses
 from scipy.optimize import lsq_linear
 
 from nbtrack.core.files import data_folder, tables_folder
 from nbtrack.data.dataset import DATASET_SCENES, DATASET_UNITS
+from nbtrack.recordings.formats import Declaration
 from nbtrack.tables import published_table_1, write_csv
 from nbtrack.tracking import SdfSettings, paper_steps
 from nbtrack.tracking.metrics import still_metrics
@@ -40,7 +40,8 @@ def least_of_all(T_world_camera: np.ndarray, reach_m: float) -> float:
 
 def bounds_of(scene: str) -> pd.DataFrame:
     """Rows of one scene."""
-    path = dataset_poses(scene)
+    file_poses = np.loadtxt(data_folder() / scene / "poses.txt").reshape(-1, 4, 4)
+    path = Declaration(camera_axes="opengl").poses_to_opencv(file_poses)
     published = published_table_1().set_index(["rate_hz", "method", "scene"])["ate_m"]
     known = {"scene": scene, "frames": len(path), **still_metrics(path)}
     rows = []

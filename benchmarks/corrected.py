@@ -79,7 +79,6 @@ def main() -> None:
         write_rows("tracking.csv", pd.concat(runs))
     if recordings:
         write_rows("agreement.csv", agreement(recordings[0], preset))
-    print(pd.concat(runs).to_string(index=False))
 
 
 def _track(scenes, methods, preset, frames, path, tracked=None, steps=30) -> pd.DataFrame:

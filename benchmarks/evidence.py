@@ -7,7 +7,7 @@ the first seed first; those that are there are not made again, whatever has chan
 the file to begin anew. Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed
 experiment goes on where it was. All cores are used, but for by_the_clock, beside which nothing else
 may run; full_size is for a GPU. The paper's rooms have to lie below `NBTRACK_DATA` as the dataset
-has them (data/README.md), for dataset_path the `poses.txt` of its breakfast_room.
+has them (data/README.md).
 """
 
 import sys
@@ -96,10 +96,8 @@ FULL = load_preset("synthetic", settings=[THREE_ROOMS, "scenes.n_frames=240", *_
 PAPER_ROOMS = load_preset("paper", tables_folder() / "paper_rooms" / "settings.toml")
 PAPER_SIZES = load_preset("paper", tables_folder() / "paper_rooms_gpu" / "settings.toml")
 FASTEST = "860:1000"  # of breakfast_room: half of the frames move farther than VR's reach at 5 Hz
-READINGS = {
-    name: METHODS[name]
-    for name in ("vr_metres", "sdf_metres", "vr_velocity", "sdf_velocity", "vr_neus")
-}
+_OTHERWISE = "vr_metres", "sdf_metres", "vr_velocity", "sdf_velocity", "vr_neus"
+READINGS = {name: METHODS[name] for name in _OTHERWISE}
 # A unit of the three rooms is 1.9 to 2.0 m, so that 1 a unit is about 0.5 a metre.
 READINGS["sdf_per_unit"] = replace(
     SDF, label="NeuS with SDF, distances in units", settings=("tracking.sdf.lambda_sdf=0.5",)
@@ -167,10 +165,6 @@ GRIDS = {
         has_table=True,
     ),
     "full_size": Grid(FULL, has_table=True, has_maps=True, workers=9),
-    # The true path of a scene of the dataset, placed in three rooms.
-    "dataset_path": Grid(
-        THREE, [Case({"path": "breakfast_room"}, ("scenes.motion=breakfast_room",))]
-    ),
     # Other readings of the paper: rates in metres, constant velocity; and VR in SDF's map.
     "readings": Grid(
         THREE, [Case({"reading": name}, methods=[method]) for name, method in READINGS.items()]

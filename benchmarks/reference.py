@@ -115,13 +115,10 @@ def registered_pairs(sequence) -> np.ndarray:
         points = draw_points(sequence[index], PAIR_POINTS, seeded)[0]
         clouds.append(small_gicp.preprocess_points(points, downsampling_resolution=PAIR_VOXEL))
     starts = np.linalg.inv(sequence.T_world_camera[:-GAP]) @ sequence.T_world_camera[GAP:]
+    how = {"max_correspondence_distance": PAIR_REACH, "max_iterations": 50}
     pairs = [
-        small_gicp.align(
-            before, after, tree, start, max_correspondence_distance=PAIR_REACH, max_iterations=50
-        ).T_target_source
-        for (before, tree), (after, _), start in zip(
-            clouds[:-GAP], clouds[GAP:], starts, strict=True
-        )
+        small_gicp.align(before, after, tree, start, **how).T_target_source
+        for (before, tree), (after, _), start in zip(clouds, clouds[GAP:], starts, strict=False)
     ]
     return np.stack(pairs)
 
