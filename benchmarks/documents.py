@@ -41,9 +41,8 @@ _COUNTS = {
 
 def shown(rows: pd.DataFrame, columns: dict[str, tuple[str, str]]) -> pd.DataFrame:
     """Some columns as text: with each name its head in the document and its format."""
-    return pd.DataFrame(
-        {head: rows[name].map(form.format) for name, (head, form) in columns.items()}
-    )
+    texts = {head: rows[name].map(form.format) for name, (head, form) in columns.items()}
+    return pd.DataFrame(texts)
 
 
 def tracking(runs: pd.DataFrame) -> pd.DataFrame:

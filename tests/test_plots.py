@@ -31,7 +31,6 @@ from nbtrack.plots.projection import screen_axes
 from nbtrack.plots.style import PALETTE, method_colors
 from nbtrack.plots.viewer import viewer_scene
 from nbtrack.synthetic import build_room
-from nbtrack.tables import published_table_1
 
 CUBE = SceneBounds((-2.0,) * 3, (2.0,) * 3)
 
@@ -42,10 +41,6 @@ NEAR = Formula(lambda points: 1.05 - points.norm(dim=-1), CUBE)  # its front is 
 FOG = Formula(lambda p: 20 * torch.exp(5 * (p.norm(dim=-1) - 1.5)), CUBE)
 FOG.surface_level = 20.0
 SWEEP = pd.DataFrame({"time (ms)": [1.0, 9.0], "ATE (cm)": [2.0, 0.5], "method": ["VR", "SDF"]})
-CELLS = pd.DataFrame({
-    "rate_hz": [2.0, 10.0, 2.0, 2.0], "method": ["A", "A", "B", "B"], "scene": "whiteroom",
-    "ate_m": [0.1, 0.4, 0.15, 0.25], "seed": [0, 0, 0, 1],
-})  # fmt: skip
 AT, RAY = torch.linspace(0, 2, 20), torch.linspace(1, -1, 20).requires_grad_()
 FALLING = 1 / (1 + np.arange(40.0))
 IMAP = pd.DataFrame({"depth": FALLING, "color": FALLING, "total": FALLING, "std_m": FALLING})
@@ -99,7 +94,6 @@ FIGURES = {
     "overview": lambda s: plots.plot_overview(CLOUD, {"SDF": s.T_world_camera}, FRAMES, "near"),
     "errors": lambda s: plots.plot_errors({"VR": FRAMES, "SDF": FRAMES}, "lost"),
     "curves": lambda s: plots.plot_curves(SWEEP, *SWEEP, "fast"),
-    "ate": lambda s: plots.plot_ate(published_table_1(), "rates matter"),
 }  # fmt: skip
 
 
@@ -330,23 +324,6 @@ def test_errors_run_in_seconds() -> None:
     assert line.get_ydata() == pytest.approx([1.0, 30.0])
     assert still.get_label() == "standing still"
     assert still.get_ydata() == pytest.approx([2.0, 4.0])
-
-
-def test_points_are_the_errors_of_their_cell() -> None:
-    """Catches points in the wrong group, a missing run drawn as a perfect one, seeds not averaged,
-    and methods that cover each other."""
-    (axes,) = plots.plot_ate(CELLS).axes
-    first, second = axes.containers
-    assert list(first.lines[0].get_ydata()) == [0.4, 0.1]  # 10 Hz stands left
-    assert second.lines[0].get_ydata() == pytest.approx([np.nan, 0.2], nan_ok=True)
-    spread = second.lines[2][0].get_segments()[1]
-    assert np.ptp(spread[:, 1]) == pytest.approx(2 * 0.05 * 2**0.5)
-    apart = second.lines[0].get_xdata() - first.lines[0].get_xdata()
-    assert (apart > 0.05).all()
-    assert axes.get_title(loc="left") == "Whiteroom"
-    with_still = plots.plot_ate(CELLS.assign(still_ate_m=0.3)).axes[0]
-    assert len(with_still.containers) == len(axes.containers)
-    assert {"standing still", "lost above 0.2 m"} <= {str(s.get_label()) for s in with_still.lines}
 
 
 def test_points_carry_their_labels() -> None:

@@ -6,7 +6,6 @@ paper's method names, and a title that states the finding.
 
 from nbtrack.plots.figures import (
     plot_along_ray,
-    plot_ate,
     plot_curves,
     plot_distances,
     plot_errors,

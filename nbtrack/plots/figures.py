@@ -14,7 +14,7 @@ from nbtrack.data.frame import MILLIMETRE, Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import View
 from nbtrack.plots import style
-from nbtrack.tables import STANDING_STILL, table_1
+from nbtrack.tables import STANDING_STILL
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 
@@ -215,37 +215,3 @@ def _looks(labels: Iterable[str]) -> list[tuple[str, dict[str, str], float]]:
         (label, {"label": label, "color": color, "marker": "os^Dv"[index % 5]}, offsets[index])
         for index, (label, color) in enumerate(colors.items())
     ]
-
-
-@style.styled
-def plot_ate(results: pd.DataFrame, title: str = "") -> Figure:
-    """Table I as points: mean ATE (m, logarithmic) by rate and method, a panel a scene.
-
-    `results` are as `table_1` takes them. A point above the dashed line at 0.2 m is a lost camera,
-    which the table prints red; a missing point is a run without result. Thin lines span a
-    std over seeds either way; the dotted line is a camera that stands still.
-    """
-    means = table_1(results)
-    stds = table_1(results, "ate_std_m")
-    rates, methods = (means.index.unique(level) for level in means.index.names)
-    columns = min(5, len(means.columns))
-    rows = -(-len(means.columns) // 5)
-    panels = style.new_axes(title, 0.9 + 2.1 * rows, rows, columns, sharey=True).flat
-    for axes, scene in zip(panels, means, strict=False):
-        for label, look, offset in _looks(methods.drop(STANDING_STILL, errors="ignore")):
-            ate, spread = (table.xs(label, level="method")[scene] for table in (means, stds))
-            axes.errorbar(np.arange(len(rates)) + offset, ate, spread, linestyle="none", **look)
-        if STANDING_STILL in methods:
-            still_m = means[scene][rates[0], STANDING_STILL]
-            axes.axhline(still_m, label=STANDING_STILL, **style.DOTTED)
-        axes.axhline(LOST_THRESHOLD_M, label="lost above 0.2 m", **style.DASHED)
-        axes.set(title=scene.replace("_", " "), xlabel="rate (Hz)", ylabel="ATE (m)")
-        axes.set_xticks(range(len(rates)), [f"{rate:g}" for rate in rates])
-        axes.set_xlim(-0.5, len(rates) - 0.5)
-        style.log_axes(axes, "y")
-    for axes in panels[len(means.columns) :]:
-        axes.remove()
-    tracked = means.drop(STANDING_STILL, level="method", errors="ignore")
-    panels[0].set_ylim(bottom=min(0.002, 0.7 * tracked.min(axis=None)))
-    panels[0].figure.legend_below()
-    return panels[0].figure
