@@ -121,7 +121,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     With `NBTRACK_DEBUG` set, the traceback of whatever ended it is printed too.
     """
-    for stream in (sys.stdout, sys.stderr):
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # as a daemon's, which are closed
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+        stream = getattr(sys, name)
         if hasattr(stream, "reconfigure"):  # its encoding may lack letters of a path
             stream.reconfigure(errors="backslashreplace")
     try:

@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -97,12 +98,12 @@ def grid_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     """The classes of notebook A4 as a file of one's own."""
     notebook = Path(__file__).parents[1] / "notebooks/A4_a_field_of_your_own.ipynb"
     cells = [c.source for c in nbformat.read(notebook, 4).cells if c.cell_type == "code"]
-    own = [cells[0], *(source for source in cells if "class " in source)]
+    own = [cells[0], *(source for source in cells if re.search("^(class|def) ", source, re.M))]
     (tmp_path / "own_grid.py").write_text("\n\n".join(own))
     monkeypatch.syspath_prepend(tmp_path)
     importlib.import_module("own_grid")
     yield
-    del FIELDS["neus_grid"], TRACKERS["huber"], sys.modules["own_grid"]
+    del FIELDS["neus_grid"], TRACKERS["huber"], TRACKERS["gauss_newton"], sys.modules["own_grid"]
 
 
 def test_the_field_of_the_notebook_in_every_command(grid_file: None, tmp_path: Path) -> None:
@@ -114,7 +115,7 @@ def test_the_field_of_the_notebook_in_every_command(grid_file: None, tmp_path: P
     )  # fmt: skip
     made = str(tmp_path / "map")
     assert main(["map", "office", "--field", "neus_grid", *words, "--out", made]) == 0
-    for tracker in ("sdf", "huber", "vr", "lm"):
+    for tracker in ("sdf", "huber", "gauss_newton", "vr", "lm"):
         own = ["--tracker", tracker, "--steps", "1", "--out", str(tmp_path / tracker)]
         assert main(["track", "office", "--map-from", made, *own, *words]) == 0
         assert (tmp_path / tracker / "trajectory.txt").is_file()

@@ -140,16 +140,6 @@ def test_curves_along_a_ray_share_their_depths() -> None:
         assert list(axes.lines[1].get_xdata()) == [1.2, 1.2]
 
 
-def test_points_share_one_scale_in_centimetres() -> None:
-    """Catches panels that cannot be compared, and metres called centimetres."""
-    figure = FIGURES["points"](None)
-    before, after = (axes.collections[0] for axes in figure.axes[:2])
-    assert before.get_array().tolist() == pytest.approx([5.0, -1.0])
-    assert before.get_clim() == after.get_clim()
-    assert before.get_offsets()[1].tolist() == pytest.approx([-0.5, -2.0])  # x to the right, z
-    assert figure.axes[1].get_title(loc="left") == "after: mean |distance| 1.50 cm"
-
-
 def test_curves_of_methods_and_sweeps() -> None:
     """Catches a group without its own line or colour, and text sorted by letters."""
     lines = FIGURES["curves"](None).axes[0].lines

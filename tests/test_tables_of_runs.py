@@ -163,7 +163,7 @@ def test_every_method_is_made_again_from_its_command(
     for name, method in METHODS.items():
         settings = tuple(text.replace("=0.04", "=0.3") for text in method.settings)
         monkeypatch.setitem(METHODS, name, replace(method, settings=settings))
-    how = {"steps": 2, "frames": "1:4", "seeds": [1], "execution": Execution(workers=1, threads=1)}
+    how = {"steps": 2, "frames": "1:4", "seeds": [1], "execution": Execution(workers=1)}
     runs = track_scenes(scenes[1:], [*METHODS], coarse, **how)
     assert runs["failure"].eq("").all()
     monkeypatch.chdir(tmp_path)
