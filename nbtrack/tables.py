@@ -266,7 +266,7 @@ def latex_file(styler: TableStyler, path: Path, note: str, own: Wording = Wordin
             styler.format_index(forms.get(level, _escape), axis=axis, level=level)
         styler.hide(axis=axis, names=True)
     is_wide = has_std and len(table.columns) > _MANY_COLUMNS  # it would run off the page
-    sizes = ["smallskip", "scriptsize", *[r"setlength{\tabcolsep}{2.2pt}"] * is_wide]
+    sizes = ["smallskip", "scriptsize", *[r"setlength{\tabcolsep}{2pt}"] * is_wide]
     styler.set_table_styles([{"selector": size, "props": ":;"} for size in sizes])
     folder = re.sub(r"[^\w.-]", "_", path.resolve().parent.name)  # labels hold no special character
     label = f"{own.label}{'-steps' * has_steps}" if own.label else f"tab:{kind}-{folder}"
