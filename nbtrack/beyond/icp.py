@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
+from nbtrack.beyond.lm_solver import PRIOR_WEIGHT
 from nbtrack.beyond.observed import draw_points
 from nbtrack.beyond.points import PointCloud
+from nbtrack.beyond.verdict import CORRELATED, MAD_FACTOR, p_within, std_when_moved
 from nbtrack.core.arrays import Pose, Transforms
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
@@ -24,6 +27,8 @@ _SOURCE_VOXEL = 0.01  # m: points that are closer count once
 _NEIGHBOURS = 20  # points that tell a point's plane
 _MIN_POINTS = 20  # with fewer a frame keeps its start
 _MIN_INLIERS = 0.5  # share of the points; below, a frame is lost
+_MIN_SCALE = 0.005  # m, of robust costs: what a voxel's points scatter by
+_LOST = 0.5  # a pose is lost if the probability that it is right is less
 # A move of less than the epsilons (rad, m) ends a search.
 _OPTIONS = {"registration_type": "GICP", "num_threads": 1, "max_iterations": 30}
 _OPTIONS |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}
@@ -69,6 +74,7 @@ class IcpTracker(Tracker):
         self.low = points.min(axis=0) - _MAX_CORRESPONDENCE_DISTANCES[0]
         self.high = points.max(axis=0) + _MAX_CORRESPONDENCE_DISTANCES[0]
         self.target, self.target_tree = self._with_planes(self.small_gicp.PointCloud(points))
+        self.map_points, self.map_normals = points, self.target.normals()[:, :3]
         return field
 
     @classmethod
@@ -82,7 +88,7 @@ class IcpTracker(Tracker):
         self.T_world_camera = T_starts[0]
         self.source = None
         self.is_converged = False
-        self.inlier_ratio = 0.0
+        self.found = None
         points = draw_points(frame, self.settings.n_pixels, self.generator, _EDGE_JUMP)[0]
         if len(points):
             thinned = self.small_gicp.voxelgrid_sampling(points, _SOURCE_VOXEL)
@@ -107,7 +113,7 @@ class IcpTracker(Tracker):
         if not found.num_inliers or not np.isfinite(found.T_target_source).all():
             return float("nan")
         self.T_world_camera = torch.from_numpy(found.T_target_source.copy())
-        self.inlier_ratio = found.num_inliers / self.source.size()
+        self.found = found
         return found.error / found.num_inliers
 
     def _is_near(self, T_world_camera: Pose) -> bool:
@@ -121,12 +127,45 @@ class IcpTracker(Tracker):
         map_and_frame = self.target, self.source, self.target_tree
         return self.small_gicp.align(*map_and_frame, T_start, **options)
 
+    def _distances(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
+        """How far (m) the points lie from their partners' planes; infinite where none is near."""
+        points = (self.source.points() @ T_world_camera.T)[:, :3]
+        narrow = _MAX_CORRESPONDENCE_DISTANCES[1]
+        _, partners = self.field.tree.query(points, distance_upper_bound=narrow)
+        has_partner = partners < len(self.map_points)
+        partners = partners[has_partner]
+        offsets = points[has_partner] - self.map_points[partners]
+        distances = np.full(len(points), np.inf)
+        distances[has_partner] = np.abs((offsets * self.map_normals[partners]).sum(axis=1))
+        return distances
+
     def report(self) -> dict[str, float | bool]:
-        """The share of the points that lie near the map; lost where most do not."""
-        return {"inlier_ratio": self.inlier_ratio, "lost": self.inlier_ratio < _MIN_INLIERS}
+        """The share of points near the map, the position's std, and whether the frame is lost.
+
+        It is where most points lie elsewhere, or where they fit as well at a wrong position. This
+        is no part of ICP, so that the time of a frame is without it.
+        """
+        if self.found is None:
+            return {"inlier_ratio": 0.0, "lost": True}
+        T_found = self.found.T_target_source
+        distances = self._distances(T_found)
+        usual = np.median(distances[np.isfinite(distances)])
+        scale = max(MAD_FACTOR * usual, _MIN_SCALE)
+        turn = np.kron(np.eye(2), T_found[:3, :3])  # small_gicp's twists are in the camera's frame
+        H_world = turn @ self.found.H @ turn.T
+        position_std_m = std_when_moved(
+            lambda T: 1 - 1 / (1 + (self._distances(T) / scale) ** 2),
+            T_found,
+            np.linalg.inv(H_world + PRIOR_WEIGHT * np.eye(6)),
+            n_directions=2,  # of a wall, where nothing but its planes counts
+        )
+        inlier_ratio = self.found.num_inliers / self.source.size()
+        is_held = p_within(CORRELATED * position_std_m) > _LOST
+        lost = inlier_ratio < _MIN_INLIERS or not is_held
+        return {"inlier_ratio": inlier_ratio, "position_std_m": position_std_m, "lost": lost}
 
     def _with_planes(self, cloud: Any) -> tuple[Any, Any]:
-        """A cloud of small_gicp with covariances, and its tree."""
+        """A cloud of small_gicp with normals and covariances, and its tree."""
         tree = self.small_gicp.KdTree(cloud)
-        self.small_gicp.estimate_covariances(cloud, tree, _NEIGHBOURS)
+        self.small_gicp.estimate_normals_covariances(cloud, tree, _NEIGHBOURS)
         return cloud, tree

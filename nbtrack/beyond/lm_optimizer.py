@@ -10,12 +10,12 @@ from nbtrack.beyond.lm_solver import (
     PRIOR_WEIGHT,
     normal_equations,
     point_costs,
-    retract,
     robust_cost,
     robust_scales,
     try_step,
 )
 from nbtrack.beyond.observed import Observed
+from nbtrack.beyond.verdict import MAD_FACTOR, SIGMAS, std_when_moved
 from nbtrack.core.arrays import Pose
 
 # A point fits if it lies as near to the surface as the field says, and is so like it in luma.
@@ -28,8 +28,6 @@ _DAMPING_DOWN = 0.2
 _MAX_STEPS = 60  # of a stage
 # The coarse stage may lead away from a good start: the better of both goes on, at these scales.
 NEAR_SCALES = np.array([0.02, 0.05])
-# So far off a pose is wrong (`verdict.WRONG_M`); a frame that holds the camera fits worse there.
-_PROBE_M = 0.05
 
 
 class Stage(NamedTuple):
@@ -41,10 +39,9 @@ class Stage(NamedTuple):
 
 
 # From afar distances say where the camera is; intensities mislead: their basin is as wide as the
-# texture. 3 medians are two standard deviations, were residuals normal.
+# texture.
 COARSE = Stage(False, 10.0, 1e-2)
-FINE = Stage(True, 3.0, 3e-4)
-_SIGMAS = 0.6745 * FINE.mad_factor
+FINE = Stage(True, MAD_FACTOR, 3e-4)
 
 
 class LmOptimizer:
@@ -122,8 +119,8 @@ class LmOptimizer:
         fit, each counted by its reliability: where little was mapped, few can fit at any pose.
         Intensities count by their differences from the median of all; `intensity_mad` is the median
         of those (MAD), 0 where they have no weight. Standard deviations are along the least certain
-        direction, that of the position also by `_growth`; the condition number is without the pose
-        prior, rotations are at a lever arm of 1 m.
+        direction, that of the position also by `std_when_moved`; the condition number is without
+        the pose prior, rotations are at a lever arm of 1 m.
         Errors of the map are not independent, as residuals are here taken to be: these are lower
         bounds, good for telling poses apart, not for error bars.
         """
@@ -137,11 +134,10 @@ class LmOptimizer:
         fitting = float((reliability * is_inlier).mean())
         H, _ = normal_equations(self.terms, self.scales, self.problem.lambda_intensity)
         values = np.linalg.eigvalsh(H)
-        covariance = np.linalg.inv(H + PRIOR_WEIGHT * np.eye(6)) / _SIGMAS**2  # rad, m
+        covariance = np.linalg.inv(H + PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2  # rad, m
         blocks = np.stack([covariance[:3, :3], covariance[3:, 3:]])
         rotation, position = np.linalg.eigvalsh(blocks)[:, -1] ** 0.5
-        information = self._growth(covariance) / _PROBE_M**2 + PRIOR_WEIGHT
-        position = max(position, 1 / (_SIGMAS * information**0.5))
+        position = max(position, std_when_moved(self._costs_at, self.T_world_camera, covariance))
         return {
             "inlier_ratio": float(is_inlier.mean()),
             "known_ratio": known_ratio,
@@ -152,25 +148,9 @@ class LmOptimizer:
             "condition_number": float(values[-1] / max(values[0], 1e-9)),
         }
 
-    def _growth(self, covariance: Float[np.ndarray, "6 6"]) -> float:
-        """By how much the sum of the points' costs grows `_PROBE_M` away; 0 if that is chance.
-
-        The pose moves along the position's least certain direction, the way that costs less, and
-        the other unknowns as the covariance (6 x 6, rad and m) says. Curvature alone is not enough:
-        ripples in the map of a flat wall have gradients, too, but the frame fits as well all along
-        the wall. A standard error over the points is taken off (our choice: two would call more
-        right poses lost).
-        """
-        variances, directions = np.linalg.eigh(covariance[3:, 3:])
-        twist = _PROBE_M * covariance[:, 3:] @ directions[:, -1] / variances[-1]
-        weight = self.problem.lambda_intensity
-        here = point_costs(self.terms, self.scales, weight)
-        growths = []
-        for way in (1, -1):
-            terms = residual_terms(self.problem, retract(self.T_world_camera, way * twist))
-            growth = point_costs(terms, self.scales, weight) - here
-            growths.append(growth.sum() - growth.std() * len(growth) ** 0.5)
-        return max(min(growths), 0.0)
+    def _costs_at(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
+        terms = residual_terms(self.problem, T_world_camera)
+        return point_costs(terms, self.scales, self.problem.lambda_intensity)
 
     def _begin(self, stage: Stage, problem: Problem) -> None:
         self.stage = stage

@@ -67,11 +67,12 @@ class PointCloud(Field):
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour of the nearest point, and distance (m, without sign) from it."""
-        distance, nearest = self._tree.query(points_world.cpu().numpy())
+        distance, nearest = self.tree.query(points_world.cpu().numpy())
         return self.colors[nearest], torch.from_numpy(distance).to(points_world)
 
     @cached_property
-    def _tree(self) -> cKDTree:
+    def tree(self) -> cKDTree:
+        """The points' search tree."""
         return cKDTree(self.points.cpu().numpy())
 
 

@@ -8,11 +8,13 @@ that the curvature of the cost tells, and the last step's length.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nbtrack.beyond.lm_solver import PRIOR_WEIGHT, retract
+from nbtrack.core.arrays import Pose
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 WRONG_M = 0.05
@@ -20,7 +22,10 @@ WRONG_DEG = 3.0
 _LEAST_SHARE = 0.01  # of points; shares of none and of all would be infinitely telling
 _INTERCEPT = 2.01
 _COEFFICIENTS = np.array([-2.06, -0.28, 2.8, 1.39])
-_CORRELATED = 2.0  # by how much stds that take errors for independent are too small
+# Scales of robust costs are 3 medians of |r|: two standard deviations, were residuals normal.
+MAD_FACTOR = 3.0
+SIGMAS = 0.6745 * MAD_FACTOR
+CORRELATED = 2.0  # by how much stds that take errors for independent are too small
 
 
 def features(said: Mapping[str, float]) -> Float[np.ndarray, "4"]:
@@ -52,9 +57,40 @@ def p_lost(said: Mapping[str, float]) -> float:
     The last step is in rad or m, 0 where the pose has settled.
     """
     is_right = 1 / (1 + math.exp(_INTERCEPT + _COEFFICIENTS @ features(said)))
-    spread = math.hypot(_CORRELATED * said["position_std_m"], said["last_step"])
-    is_held = math.erf(WRONG_M / math.sqrt(2) / spread)
-    return 1 - is_right * is_held
+    spread = math.hypot(CORRELATED * said["position_std_m"], said["last_step"])
+    return 1 - is_right * p_within(spread)
+
+
+def p_within(position_std_m: float) -> float:
+    """The probability that a normal error of the position is below `WRONG_M`."""
+    return math.erf(WRONG_M / math.sqrt(2) / position_std_m)
+
+
+def std_when_moved(
+    costs_at: Callable[[Pose], Float[np.ndarray, "n"]],
+    T_world_camera: Pose,
+    covariance: Float[np.ndarray, "6 6"],
+    n_directions: int = 1,
+) -> float:
+    """The position's standard deviation (m), by what the points' costs grow `WRONG_M` away.
+
+    The pose moves both ways along the position's least certain directions, and turns as the
+    covariance (world frame, rad and m, as `lm_solver.retract` takes twists) says; the smallest
+    growth counts. Curvature alone is not enough: ripples in the map of a flat wall have gradients,
+    too, but the frame fits as well all along the wall. A standard error over the points is taken
+    off (our choice: two would call more right poses lost). Costs are Geman-McClure's, at scales of
+    `MAD_FACTOR` medians.
+    """
+    variances, directions = np.linalg.eigh(covariance[3:, 3:])
+    here = costs_at(T_world_camera)
+    growths = []
+    for k in range(1, n_directions + 1):
+        twist = WRONG_M * covariance[:, 3:] @ directions[:, -k] / variances[-k]
+        for way in (1, -1):
+            growth = costs_at(retract(T_world_camera, way * twist)) - here
+            growths.append(growth.sum() - growth.std() * len(growth) ** 0.5)
+    information = max(min(growths), 0.0) / WRONG_M**2 + PRIOR_WEIGHT
+    return 1 / (SIGMAS * information**0.5)
 
 
 def score_detection(
