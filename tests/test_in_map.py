@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from box_room import BoxRoom, box_sequence
+import torch
+from box_room import BoxRoom, Formula, box_sequence
 from scipy.spatial.transform import Rotation
 
 from nbtrack.checks.in_map import look_in_map
@@ -51,6 +52,21 @@ def test_what_misfits_is_told_with_its_size(change, name: str, off: float) -> No
     if name:
         assert f"as if {name}" in said
         assert float(re.search(r"by ([-+][\d.]+)%", said)[1]) == pytest.approx(off, abs=1)
+
+
+def test_nothing_is_told_before_a_wall() -> None:
+    """Catches the slopes of a rough map taken for depths that are too long: a wall 1 m away waves
+    by 0.5 mm across the view; the depths are too long by 3 %, as a step back would make them."""
+
+    def distance(points: torch.Tensor) -> torch.Tensor:
+        return 1 + 0.0005 * (10 * points[:, 0]).sin() - points[:, 2]
+
+    flat = BoxRoom(half=(9.0, 9.0, 1.0))
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, 0, 3] = np.linspace(-0.2, 0.2, 12)
+    sequence = box_sequence(poses, flat, 48)
+    longer = replace(sequence, depths_mm=np.rint(1.03 * sequence.depths_mm).astype(np.uint16))
+    assert look_in_map(Formula(distance, flat.bounds), longer, poses)["map_misfit"] == ""
 
 
 def test_frames_outside_of_what_was_mapped() -> None:

@@ -24,6 +24,9 @@ _MIN_FRAMES = 8  # that an estimate needs
 _MIN_POINTS = 50  # the same, of each frame
 _MOSTLY = 0.5  # share of a frame's points outside of the map's bounds, where the frame lies outside
 _TINY = 1e-12
+# What motions leave of a column, as a share of the points' distances from the camera: before a flat
+# wall 1 %, which is noise of the map's gradients; in rooms 10 % and more.
+_MIN_LEFT = 0.03
 _NEGLIGIBLE = 0.01  # share by which depths may misfit (our choice)
 _RESAMPLED = 200  # draws of a bootstrap
 _INTERVAL = [0.025, 0.975]  # its quantiles
@@ -64,9 +67,10 @@ def _moved(points: WorldPoints, T_world_camera: Pose) -> WorldPoints:
     return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
 
-def _without_motion(field: Field, points: WorldPoints, T: Pose) -> Float[np.ndarray, "3 2"] | None:
+def _without_motion(field: Field, points: WorldPoints, T: Pose) -> Float[np.ndarray, "4 2"] | None:
     """A column an explanation, motions projected out: its products with residuals and with itself,
-    and the variance of residuals (m²); None of few. Points are in the camera's frame (m)."""
+    the sum of squared distances, and the variance of residuals (m²); None of few. Points are in the
+    camera's frame (m)."""
     x = torch.from_numpy(_moved(points, T)).float().to(field.device).requires_grad_()
     distance = field(x)[1]
     (gradient,) = torch.autograd.grad(distance.sum(), x)
@@ -80,19 +84,21 @@ def _without_motion(field: Field, points: WorldPoints, T: Pose) -> Float[np.ndar
     columns = np.column_stack([r[near], *((q * p) @ change for change in _EXPLANATIONS.values())])
     columns -= motions @ (motions.T @ columns)
     squares = (columns**2).sum(axis=0)
-    return np.stack([columns[:, 1:].T @ columns[:, 0], squares[1:], 2 * [squares[0] / len(p)]])
+    products = columns[:, 1:].T @ columns[:, 0]
+    return np.stack([products, squares[1:], 2 * [(p**2).sum()], 2 * [squares[0] / len(p)]])
 
 
-def _misfit(sums: Float[np.ndarray, "frames 3 2"]) -> str:
+def _misfit(sums: Float[np.ndarray, "frames 4 2"]) -> str:
     """A sentence on the explanation that takes most off the residuals, if it is not negligible."""
     drawn = np.random.default_rng(0).integers(len(sums), size=(_RESAMPLED, len(sums)))
-    products, squares, _ = np.moveaxis(sums[drawn].sum(axis=1), 1, 0)
+    products, squares, _, _ = np.moveaxis(sums[drawn].sum(axis=1), 1, 0)
     low, high = np.quantile(products / squares.clip(_TINY), _INTERVAL, axis=0)
-    products, squares, variance = sums.sum(axis=0)
+    products, squares, far, variance = sums.sum(axis=0)
     shares = products / squares.clip(_TINY)
     # With up to three walls in view a motion does the same as a scale, which is then not known.
     error = np.sqrt(variance / len(sums) / squares.clip(_TINY))
-    gains = np.where(error < _NEGLIGIBLE / 2, products * shares, 0.0)
+    is_told = (error < _NEGLIGIBLE / 2) & (squares > _MIN_LEFT**2 * far)
+    gains = np.where(is_told, products * shares, 0.0)
     best = int(gains.argmax())
     low, high = low[best], high[best]
     if not gains.any() or (low <= _NEGLIGIBLE and high >= -_NEGLIGIBLE):
