@@ -3,15 +3,17 @@
 Both have height, tilt and roll that wander, bursts of speed, and a tremor. Source: our choice.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
-from scipy import ndimage
 from scipy.interpolate import CubicSpline
-from skimage.graph import MCP_Geometric, route_through_array
+from scipy.ndimage import gaussian_filter1d
+from skimage.graph import route_through_array
 
 from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import NumericalError
-from nbtrack.synthetic.primitives import Points, Values
+from nbtrack.synthetic.primitives import Values
 from nbtrack.synthetic.room import Room, Walk
 
 Placed = Float[np.ndarray, "n 6"]  # x, y, z (m, world), pitch, yaw, roll (rad); see `camera_poses`
@@ -31,7 +33,6 @@ _FLATTENING = 0.25  # width of the path's ellipse over its length
 _ATTEMPTS = 400
 _CELL = 0.1  # m, of a tour's plan of free space
 _MARGIN = 0.1  # m that the plan keeps in addition to the clearance, since the path is smoothed
-_COVERED = 2.0  # m: the tour passes so near to every free place
 _SMOOTHED = 0.4  # m, std of the tour's smoothing along itself
 _AHEAD = 45.0  # frames, std of the smoothing of the direction of view: 180 degrees in about 120
 
@@ -47,29 +48,35 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     the speed varies up to threefold, and a hand's tremor of 1.5 to 5 Hz lies on top. Mean speeds
     over the trajectory, or 120 frames if it is shorter, are `MEAN_STEP`.
 
-    Raises `NumericalError` where no path keeps `CLEARANCE`: the room is too full.
+    Raises `NumericalError` as `first_fit` does.
     Source: our choice; the statistics are those of hand-held RGB-D recordings.
     """
     length = max(n_frames, _CALIBRATION_FRAMES)
-    for attempt in range(_ATTEMPTS):
-        rng = np.random.default_rng([seed, attempt, room.number])
-        poses = _glance_around(room.walk, length, rng)
+
+    def is_fit(poses: Poses) -> bool:
         height = poses[:, 1, 3]
         is_upright = height.min() >= HEIGHTS[0] and height.max() <= HEIGHTS[1]
-        is_steady = has_speed(poses, MEAN_STEP, 3 * MEAN_STEP, 0.05)
-        if is_steady and is_upright and is_clear(room, poses):
-            return poses[:n_frames]
-    raise too_full(room)
+        return bool(is_upright and has_speed(poses, MEAN_STEP, 3 * MEAN_STEP, 0.05))
+
+    poses = first_fit(room, seed, lambda rng: _glance_around(room.walk, length, rng), is_fit)
+    return poses[:n_frames]
 
 
-def is_clear(room: Room, poses: Poses) -> bool:
-    """Whether a path keeps `CLEARANCE`."""
-    return bool(room.sdf(poses[:, :3, 3]).min() >= CLEARANCE)
+def first_fit(
+    room: Room,
+    seed: int,
+    drawn: Callable[[np.random.Generator], Poses],
+    is_fit: Callable[[Poses], bool],
+) -> Poses:
+    """The first drawn path that is fit and keeps `CLEARANCE`.
 
-
-def too_full(room: Room) -> NumericalError:
-    """What is wrong with a room where no path keeps `CLEARANCE`."""
-    return NumericalError(
+    Raises `NumericalError` where there is none: the room is too full.
+    """
+    for attempt in range(_ATTEMPTS):
+        poses = drawn(np.random.default_rng([seed, attempt, room.number]))
+        if room.sdf(poses[:, :3, 3]).min() >= CLEARANCE and is_fit(poses):
+            return poses
+    raise NumericalError(
         f"room '{room.name}': no path keeps {CLEARANCE} m from surfaces; move its walk or furniture"
     )
 
@@ -127,16 +134,13 @@ def has_speed(poses: Poses, mean: Values, largest: Values, tolerance: float) -> 
 def tour(room: Room, n_frames: int, seed: int) -> Poses:
     """Camera-to-world poses (OpenCV axes) of a closed walk around a room's free space.
 
-    The walk passes within `_COVERED` (2 m) of every place where a camera has room, by the nearest
-    one that it has not passed, and returns to its start. The camera looks ahead and turns slowly.
-    Its mean speed is the length of the walk over the frames. A seed chooses where the walk begins,
-    and what wanders.
-
-    Raises `NumericalError` where the walk comes nearer than `CLEARANCE` to a surface.
-    Source: our choice.
+    The walk goes by the stops of `paths.toml`, between them along the middle of what is free. The
+    camera looks ahead and turns slowly. Its mean speed is the length of the walk over the frames. A
+    seed chooses the stop where the walk begins, and what wanders. Source: our choice.
     """
     rng = np.random.default_rng([seed, room.number])
-    around = _closed_walk(room, rng)
+    first = rng.integers(len(room.walk.stops))
+    around = _closed_walk(room, np.roll(room.walk.stops, -first, axis=0))
     length = np.linalg.norm(np.diff(around, axis=0, append=around[:1]), axis=1)
     # Three rounds, so that smoothing and interpolation meet no end in the middle one.
     curve = CubicSpline(_before(np.tile(length, 3)), np.tile(around, (3, 1)))
@@ -145,49 +149,28 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     x, z = curve(at).T
     forward = curve(np.concatenate([at - length.sum(), at, at + length.sum()]), 1)
     yaw = np.unwrap(np.arctan2(-forward[:, 0], -forward[:, 1]))
-    yaw = ndimage.gaussian_filter1d(yaw, _AHEAD)[n_frames : 2 * n_frames]
+    yaw = gaussian_filter1d(yaw, _AHEAD)[n_frames : 2 * n_frames]
     height = rng.uniform(1.3, 1.5) + _wander(n_frames, rng, 0.05)
     pitch = room.walk.pitch + _wander(n_frames, rng, 0.09)
     roll = _wander(n_frames, rng, 0.025)
     placed = np.stack([x, height, z, pitch, yaw, roll], axis=1)
-    poses = camera_poses(placed + _tremor(n_frames, rng))
-    if not is_clear(room, poses):
-        raise too_full(room)
-    return poses
+    return camera_poses(placed + _tremor(n_frames, rng))
 
 
-def _closed_walk(room: Room, rng: np.random.Generator) -> Points:
-    """Places (n x 2: x and z, m) of a smooth closed walk past all of a room's free space."""
-    shell = room.parts[0].solid
-    x, z = (np.arange(_CELL - side / 2, side / 2, _CELL) for side in shell.size[::2])
-    heights = np.linspace(*HEIGHTS, 5)
-    points = np.stack(np.meshgrid(x, heights, z, indexing="ij"), axis=-1)
+def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    """Places (x and z, m) of a smooth closed walk by stops, in the middle of what is free."""
+    x, z = (np.arange(_CELL - side / 2, side / 2, _CELL) for side in room.parts[0].solid.size[::2])
+    points = np.stack(np.meshgrid(x, np.linspace(*HEIGHTS, 5), z, indexing="ij"), axis=-1)
     clearance = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:3]).min(axis=1)
-    labels, _ = ndimage.label(clearance >= CLEARANCE + _MARGIN)
-    free = labels == 1 + np.bincount(labels.ravel())[1:].argmax()  # the largest connected part
-    cells = [tuple(cell) for cell in np.argwhere(free)]
-    # Begin as far from a random place as one can walk, then go where one has not been.
-    somewhere = cells[rng.integers(len(cells))]
-    passed = [cells[_walked(free, [somewhere])[free].argmax()]]
-    while (lengths := _walked(free, passed)[free]).max() > _COVERED:
-        passed.append(cells[lengths.argmax()])
-    ordered = [passed.pop(0)]
-    while passed:
-        nearest = min(passed, key=_walked(free, ordered[-1:]).__getitem__)
-        passed.remove(nearest)
-        ordered.append(nearest)
-    costs = np.where(free, 1.0 / np.maximum(clearance - CLEARANCE, 0.01), -1.0)  # the middle
+    is_free = clearance >= CLEARANCE + _MARGIN
+    costs = np.where(is_free, 1.0 / np.maximum(clearance - CLEARANCE, 0.01), -1.0)
+    cells = [(np.abs(x - stop[0]).argmin(), np.abs(z - stop[1]).argmin()) for stop in stops]
     route = []
-    for start, end in zip(ordered, ordered[1:] + ordered[:1], strict=True):
+    for start, end in zip(cells, cells[1:] + cells[:1], strict=True):
         route += route_through_array(costs, start, end, geometric=True)[0][:-1]
     rows, columns = np.array(route).T
     places = np.stack([x[rows], z[columns]], axis=1)
-    return ndimage.gaussian_filter1d(places, _SMOOTHED / _CELL, axis=0, mode="wrap")
-
-
-def _walked(free: np.ndarray, starts: list) -> np.ndarray:
-    """Length (m) of the shortest walk from any start to every free cell of a plan."""
-    return MCP_Geometric(np.where(free, _CELL, -1.0)).find_costs(starts)[0]
+    return gaussian_filter1d(places, _SMOOTHED / _CELL, axis=0, mode="wrap")
 
 
 def _wander(
@@ -224,15 +207,12 @@ def camera_poses(placed: Placed) -> Poses:
 
     Yaw 0 looks along -z and positive turns left; positive pitch looks up.
     """
-    pitch, yaw, roll = placed[:, 3:].T
+    pitch, yaw, roll = placed.T[3:, :, None]
     forward = [-np.sin(yaw) * np.cos(pitch), np.sin(pitch), -np.cos(yaw) * np.cos(pitch)]
-    forward = np.stack(forward, axis=-1)
-    right = np.stack([np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)], axis=-1)
+    forward = np.hstack(forward)
+    right = np.hstack([np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)])
     down = np.cross(forward, right)
-    cosine = np.cos(roll)[:, None]
-    sine = np.sin(roll)[:, None]
+    rolled = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right
     poses = np.tile(np.eye(4), (len(placed), 1, 1))
-    poses[:, :3, 3] = placed[:, :3]
-    axes = [cosine * right + sine * down, cosine * down - sine * right, forward]
-    poses[:, :3, :3] = np.stack(axes, axis=-1)
+    poses[:, :3] = np.stack([*rolled, forward, placed[:, :3]], axis=-1)
     return poses

@@ -3,8 +3,7 @@
 World axes: y up, metres. Distances are positive outside a solid and negative inside it.
 """
 
-from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import reduce
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -55,18 +54,18 @@ class Solid:
     """A closed convex body that is a box in its own coordinates.
 
     A subclass has a `center` (world frame, m). `_coordinates` maps points to coordinates (m, not
-    negative), which are inside up to `_half`. `_crossing` gives the interval in which a line is
+    negative), which are inside up to `half`. `_crossing` gives the interval in which a line is
     inside. `normals` gives unit outward normals at points on the surface.
     """
 
-    @cached_property
-    def reach(self) -> float:
-        """Radius (m) of the sphere around the center that holds the solid."""
-        return float(np.linalg.norm(self._half))
+    def __init__(self, center: Array3, half: Vectors) -> None:
+        """Of a center (m, world) and half the extents in its own coordinates (m)."""
+        self.center, self.half = center, half
+        self.reach = float(np.linalg.norm(half))  # m; of the sphere that holds the solid
 
     def sdf(self, points: Points) -> Values:
         """Exact signed distance (m) outside and inside."""
-        excess = self._coordinates(points) - self._half
+        excess = self._coordinates(points) - self.half
         beyond = np.maximum(excess, 0.0)
         return np.sqrt(row_dot(beyond, beyond)) + np.minimum(_row_max(excess), 0.0)
 
@@ -80,43 +79,37 @@ class Solid:
         return np.where((near <= far) & (near > 0.0), near, np.inf)
 
 
-@dataclass(frozen=True)
 class Box(Solid):
     """A cuboid that may be turned about the vertical axis."""
 
-    center: Vector3
-    size: Vector3  # full edge lengths (m) along its own x, y, z
-    yaw: float = 0.0  # rad, counter-clockwise seen from above
-
-    @cached_property
-    def _half(self) -> Array3:
-        return np.asarray(self.size) / 2
-
-    @cached_property
-    def _axes(self) -> Float[np.ndarray, "3 3"]:
-        """World from box: the rotation by its yaw."""
-        cosine = np.cos(self.yaw)
-        sine = np.sin(self.yaw)
-        return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+    def __init__(self, center: Vector3, size: Vector3, yaw: float = 0.0) -> None:
+        """Of full edge lengths (m) along its own axes; yaw (rad) turns left, seen from above."""
+        self.size = np.asarray(size)
+        super().__init__(np.asarray(center), self.size / 2)
+        sine, cosine = np.sin(yaw), np.cos(yaw)
+        self._axes = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # world from box
 
     def _coordinates(self, points: Points) -> Points:
         return np.abs((points - self.center) @ self._axes)
 
     def _crossing(self, origins: Origins, directions: Points) -> Interval:
         offsets = (origins - self.center) @ self._axes
-        return _slab_interval(offsets, directions @ self._axes, self._half)
+        return _slab_interval(offsets, directions @ self._axes, self.half)
 
     def normals(self, points: Points) -> Points:
         """Unit normals of the face that lies nearest."""
         local = (points - self.center) @ self._axes
-        axis = (np.abs(local) - self._half).argmax(axis=1)
+        axis = (np.abs(local) - self.half).argmax(axis=1)
         return np.eye(3)[axis] * np.where(local < 0, -1.0, 1.0) @ self._axes.T
 
 
 class RoomShell(Box):
     """Walls, floor and ceiling: the solid is everything outside a cuboid, normals point inwards."""
 
-    reach = np.inf
+    def __init__(self, center: Vector3, size: Vector3) -> None:
+        """Of full edge lengths (m)."""
+        super().__init__(center, size)
+        self.reach = np.inf
 
     def sdf(self, points: Points) -> Values:
         """Exact signed distance (m), positive inside the room."""
@@ -132,16 +125,13 @@ class RoomShell(Box):
         return -super().normals(points)
 
 
-@dataclass(frozen=True)
 class Sphere(Solid):
     """A ball."""
 
-    center: Vector3
-    radius: float
-
-    @cached_property
-    def _half(self) -> Float[np.ndarray, "1"]:
-        return np.array([self.radius])
+    def __init__(self, center: Vector3, radius: float) -> None:
+        """Of a radius in metres."""
+        super().__init__(np.asarray(center), np.array([radius]))
+        self.radius = radius
 
     def _coordinates(self, points: Points) -> Float[np.ndarray, "n 1"]:
         offset = points - self.center
@@ -155,29 +145,16 @@ class Sphere(Solid):
         return (points - self.center) / self.radius
 
 
-@dataclass(frozen=True)
 class Cylinder(Solid):
     """A cylinder or rod with flat caps, in any direction."""
 
-    start: Vector3  # center of one cap
-    end: Vector3  # center of the other cap
-    radius: float
-
-    @cached_property
-    def center(self) -> Array3:
-        """Middle of the axis."""
-        return (np.asarray(self.start) + self.end) / 2
-
-    @cached_property
-    def _axis(self) -> Array3:
-        along = np.asarray(self.end) - self.start
-        return along / float(np.linalg.norm(along))
-
-    @cached_property
-    def _half(self) -> Float[np.ndarray, "2"]:
-        """Radius and half the length (m)."""
-        length = float(np.linalg.norm(np.asarray(self.end) - self.start))
-        return np.array([self.radius, length / 2])
+    def __init__(self, start: Vector3, end: Vector3, radius: float) -> None:
+        """Of the centers of both caps (m, world) and a radius (m)."""
+        along = np.asarray(end) - start
+        length = float(np.linalg.norm(along))
+        super().__init__((np.asarray(start) + end) / 2, np.array([radius, length / 2]))
+        self.radius = radius
+        self._axis = along / length
 
     def _split(self, vectors: Origins) -> tuple[Float[np.ndarray, "..."], Origins]:
         """Lengths along the axis, and what of the vectors is across it."""
@@ -193,13 +170,13 @@ class Cylinder(Solid):
         offset_along, offset_across = self._split(origins - self.center)
         direction_along, direction_across = self._split(directions)
         side = _round_interval(offset_across, direction_across, self.radius)
-        caps = _slab_interval(offset_along[..., None], direction_along[:, None], self._half[1:])
+        caps = _slab_interval(offset_along[..., None], direction_along[:, None], self.half[1:])
         return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
 
     def normals(self, points: Points) -> Points:
         """Unit normals of the side or the cap, whichever lies nearer."""
         along, across = self._split(points - self.center)
-        from_side, from_cap = (self._coordinates(points) - self._half).T[:, :, None]
+        from_side, from_cap = (self._coordinates(points) - self.half).T[:, :, None]
         lengths = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
         cap = np.where(along < 0, -1.0, 1.0)[:, None] * self._axis
         return np.where(from_cap > from_side, cap, across / lengths)

@@ -1,4 +1,4 @@
-"""The furnished rooms of `rooms.toml`: exact distance, ray casting, colors."""
+"""The furnished rooms of `rooms.toml` and `paths.toml`: exact distance, ray casting, colors."""
 
 import tomllib
 import zlib
@@ -14,7 +14,10 @@ from nbtrack.synthetic import materials, primitives
 from nbtrack.synthetic.materials import Light, Material, Pair, Part
 from nbtrack.synthetic.primitives import Array3, Indices, Origins, Points, Values, row_dot
 
-_TABLES = tomllib.loads(Path(__file__).with_name("rooms.toml").read_text(encoding="utf-8"))
+_TABLES, _PATHS = (
+    tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
+    for name in ("rooms.toml", "paths.toml")
+)
 _PALETTE = _TABLES.pop("palette")
 _OPENNESS_RADIUS = 0.2  # m; how far contact shadows reach (our choice)
 
@@ -26,9 +29,11 @@ REPORTED_ROOMS: tuple[str, ...] = tuple(n for n in ROOMS if not _TABLES[n].get("
 
 @dataclass(frozen=True)
 class Walk:
-    """Where a camera is carried: across the room near a point, turning (see `motion`)."""
+    """Where cameras go: across the room near a point, turning; and by the paths of `paths.toml`."""
 
     center: Pair  # m; x and z
+    keys: tuple[tuple[tuple[float, ...], ...], ...]  # of an animated camera's two paths
+    stops: tuple[Pair, ...]  # m; x and z; of a tour
     start_yaw: float = 0.0  # rad; 0 walks and looks along -z, positive turns left
     turn: int = 1  # +1 turns left, -1 right
     pitch: float = -0.3  # rad; mean tilt, negative looks down
@@ -100,9 +105,10 @@ class Room:
 
 
 def description(name: str) -> dict[str, Any]:
-    """What `rooms.toml` says of a room. Raises ConfigError, naming the nearest, for any other."""
+    """What both files say of a room. Raises ConfigError, naming the nearest, for any other."""
     table = look_up("synthetic room", name, _TABLES)
-    return {**table, "materials": _PALETTE | table["materials"]}
+    walk = table["walk"] | _PATHS[name]
+    return {**table, "walk": walk, "materials": _PALETTE | table["materials"]}
 
 
 @cache
