@@ -273,8 +273,7 @@ def _export_run(source: Path, format_name: str, out: Path) -> str:
     else:
         with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
             of_run = tracked.frames.iloc[shown], seen.T_world_camera, title
-            pictures = movie_pictures(surface, seen, *of_run, bar.move_to)
-            content = movie_bytes(pictures)
+            content = movie_bytes(movie_pictures(surface, seen, *of_run, bar.move_to))
     write_atomic(out, content)
     return f"{len(shown)} of {last + 1} frames, {len(content) / 1e6:.1f} MB"
 

@@ -19,6 +19,5 @@ from nbtrack.plots.rooms import (
     plot_mesh,
     plot_overview,
     plot_slice,
-    plot_trajectories,
 )
 from nbtrack.plots.viewer import mesh_viewer

@@ -1,6 +1,6 @@
 """What a camera saw beside what a field renders; numbers as curves and bars."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import matplotlib
 import numpy as np
@@ -155,18 +155,24 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     line, 0.2 m, the paper calls the camera lost; the dotted one is a camera that stands still.
     """
     above, below = style.new_axes(title, 4.9, 2, sharex=True)[:, 0]
+    draw_errors(above, frames)
+    for tracked, line in zip(frames.values(), above.lines, strict=False):
+        below.plot(line.get_xdata(), tracked["rotation_error_deg"], color=line.get_color())
+    above.axhline(100 * LOST_THRESHOLD_M, label="lost above 0.2 m", **style.DASHED)
+    below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
+    above.figure.legend_below()
+    return above.figure
+
+
+def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
+    """Errors of the position (cm) over time (s), by label, and those of a camera standing still."""
     for label, color in style.method_colors(frames).items():
         tracked = frames[label]
         seconds = tracked["time"] - tracked["time"].iloc[0]
-        above.plot(seconds, 100 * tracked["translation_error_m"], color=color, label=label)
-        below.plot(seconds, tracked["rotation_error_deg"], color=color)
-    above.plot(seconds, 100 * tracked["still_error_m"], label=STANDING_STILL, **style.DOTTED)
-    above.axhline(100 * LOST_THRESHOLD_M, label="lost above 0.2 m", **style.DASHED)
-    above.set_ylabel("translation error (cm)")
-    below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
-    style.log_axes(above, "y")
-    above.figure.legend_below()
-    return above.figure
+        axes.plot(seconds, 100 * tracked["translation_error_m"], color=color, label=label)
+    axes.plot(seconds, 100 * tracked["still_error_m"], label=STANDING_STILL, **style.DOTTED)
+    axes.set_ylabel("translation error (cm)")
+    style.log_axes(axes, "y")
 
 
 @style.styled
@@ -184,34 +190,29 @@ def plot_curves(
     axes = style.new_axes(title, 3.6)[0, 0]
     labels = table[[group] if isinstance(group, str) else group].agg(", ".join, axis=1)
     is_text = not pd.api.types.is_numeric_dtype(table[x])
+    colors = style.method_colors(labels)
+    group_of_row = labels.map([*colors].index)
+    places = table[x]
     if is_text:
-        names = list(table[x].unique())
+        codes, names = pd.factorize(table[x])
+        places = codes + (group_of_row - (len(colors) - 1) / 2) * 0.5 / max(len(colors), 4)
         turned = {"rotation": 20, "ha": "right"} if sum(map(len, names)) > 90 else {}
         axes.set_xticks(range(len(names)), names, **turned)
-    for label, look, offset in _looks(labels):
-        rows = table[labels == label]
-        places = rows[x].map(names.index) + offset if is_text else rows[x]
-        axes.plot(places, rows[y], linestyle="none" if is_text else "-", **look)
-        if "from" in rows:
-            axes.vlines(places, rows["from"], rows["to"], color=look["color"], linewidth=0.8)
+    for number, (label, color) in enumerate(colors.items()):
+        own, line = group_of_row == number, "none" if is_text else "-"
+        look = {"color": color, "marker": "os^Dv"[number % 5], "linestyle": line, "label": label}
+        axes.plot(places[own], table[y][own], **look)
+        if "from" in table:
+            spans = table.loc[own, "from"], table.loc[own, "to"]
+            axes.vlines(places[own], *spans, color=color, linewidth=0.8)
     if STANDING_STILL in table:
         axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **style.DOTTED)
     axes.set(xlabel=x, ylabel=y)
     style.log_axes(axes, log.replace("x", "") if is_text else log)
     if labels.is_unique and not is_text and len(labels) > 1:
-        style.label_points(axes, table[x], table[y], style.method_colors(labels))
+        style.label_points(axes, table[x], table[y], colors)
         if STANDING_STILL in table:
             axes.legend(handles=axes.lines[-1:])
     else:
         axes.figure.legend(loc="outside right center")
     return axes.figure
-
-
-def _looks(labels: Iterable[str]) -> list[tuple[str, dict[str, str], float]]:
-    """Every label with its colour and marker, and an offset by which its points stand apart."""
-    colors = style.method_colors(labels)
-    offsets = (np.arange(len(colors)) - (len(colors) - 1) / 2) * 0.5 / max(len(colors), 4)
-    return [
-        (label, {"label": label, "color": color, "marker": "os^Dv"[index % 5]}, offsets[index])
-        for index, (label, color) in enumerate(colors.items())
-    ]

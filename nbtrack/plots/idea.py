@@ -3,15 +3,16 @@
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from nbtrack.core.arrays import Pose
 from nbtrack.core.camera import pixel_directions
+from nbtrack.core.geometry import transform_points
 from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
 from nbtrack.fields import Field, LearnedField
-from nbtrack.plots.meshes import query_field
+from nbtrack.plots.scene import draw_slice
 from nbtrack.plots.style import new_axes, styled
 
 _STEP = 0.02  # m, between the grid points of a slice
@@ -37,22 +38,15 @@ def plot_idea(
     distance: the measured point, its distance d, and the way of length d against the gradient.
     """
     left, right = new_axes(title, 4.3, 1, 2, sharex=True, sharey=True)[0]
-    ray = pixel_directions(frame.camera, torch.tensor([column]), torch.tensor([row]))
+    point_camera = frame.points(torch.tensor([row]), torch.tensor([column]))[0]
+    x, _, z = point_camera[0].tolist()
+    pose = torch.from_numpy(T_world_camera).float()
     for axes, field in ((left, density), (right, distance)):
         _draw_row(axes, field, frame, T_world_camera, row)
-    pose = torch.from_numpy(T_world_camera).float()
-    unknown = torch.zeros(1, 3)
-    rays = Rays(pose[None, :3, 3], ray @ pose[:3, :3].T, unknown, unknown[:, 0])
-    depths = density.hierarchical_depths(rays, _N_STRATIFIED, _N_IMPORTANCE)
-    weights = density.render(rays, depths).weights[0].detach()
-    x, z = depths[0] * ray[0, 0], depths[0]
-    left.scatter(
-        x, z, s=8 + 400 * weights, label=f"{len(z)} samples, by weight", color="#3b6fb6", **_DOT
-    )
-    point_camera = _draw_query(right, distance, frame, T_world_camera, row, column)
-    x, z = point_camera[0], point_camera[2]
-    for axes in (left, right):
         axes.plot([0, x], [0, z], color="0.2", linewidth=0.8)
+    _draw_samples(left, density, pose, point_camera / z)
+    _draw_query(right, distance, pose, point_camera)
+    for axes in (left, right):
         axes.legend(loc="upper left", frameon=True)
     return left.figure
 
@@ -63,39 +57,37 @@ def _draw_row(axes: Axes, field: Field, frame: Frame, T_world_camera: Pose, row:
     points, _ = frame.points(torch.full_like(columns, row), columns)
     sides = pixel_directions(frame.camera, columns[[0, -1]], torch.full((2,), row)).numpy()
     far = 1.15 * points[:, 2].max().item()
-    z = np.arange(0.0, far, _STEP)
-    x = np.arange(far * sides[0, 0], far * sides[1, 0], _STEP)
-    x, z = np.meshgrid(x, z)
-    grid = np.stack([x, z * sides[0, 1], z], axis=-1).reshape(-1, 3)
-    grid = grid @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    values = query_field(field, grid)[1].reshape(x.shape)
-    norm, colors = Normalize(-0.6, 0.6), "RdBu"
-    if not field.is_distance:
-        level = field.surface_level
-        norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
-    image = axes.pcolormesh(x, z, values, norm=norm, cmap=colors, rasterized=True)
-    axes.contour(x, z, values, [field.surface_level], colors="black", linewidths=1.2)
-    axes.figure.colorbar(image, ax=axes, label=field.value_label, location="bottom", aspect=30)
+    across = np.arange(far * sides[0, 0], far * sides[1, 0], _STEP)
+    x, z = np.meshgrid(across, np.arange(0.0, far, _STEP))
+    grid = np.stack([x, z * sides[0, 1], z], axis=-1)
+    grid_world = grid @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    draw_slice(axes, field, grid_world, grid[..., [0, 2]], location="bottom", aspect=30)
     axes.plot(points[:, 0], points[:, 2], ".", color="#009e73", markersize=3)
     axes.plot(0, 0, "k^", markersize=9)
     axes.set_ylim(bottom=-0.2)
     axes.set(xlabel="to the right of the camera (m)", ylabel="ahead (m)", aspect="equal")
-    axes.set_title(f"{field.label}")
+    axes.set_title(field.label)
 
 
-def _draw_query(
-    axes: Axes, field: Field, frame: Frame, T_world_camera: Pose, row: int, column: int
-) -> list[float]:
-    """The measured point, its distance and the arrow; returns the point (m, camera frame)."""
-    pose = torch.from_numpy(T_world_camera).float()
-    point_camera = frame.points(torch.tensor([row]), torch.tensor([column]))[0][0]
-    point_world = (pose[:3, :3] @ point_camera + pose[:3, 3])[None].requires_grad_()
+def _draw_samples(axes: Axes, field: LearnedField, pose: Tensor, ray: Tensor) -> None:
+    """The samples of a ray (1 x 3, camera frame, z = 1), by their weights."""
+    unknown = torch.zeros(1, 3)
+    rays = Rays(pose[None, :3, 3], ray @ pose[:3, :3].T, unknown, unknown[:, 0])
+    depths = field.hierarchical_depths(rays, _N_STRATIFIED, _N_IMPORTANCE)
+    sizes = 8 + 400 * field.render(rays, depths).weights[0].detach()
+    label = f"{len(sizes)} samples, by weight"
+    x, z = depths[0] * ray[0, 0], depths[0]
+    axes.scatter(x, z, s=sizes, label=label, color="#3b6fb6", **_DOT)
+
+
+def _draw_query(axes: Axes, field: Field, pose: Tensor, point_camera: Tensor) -> None:
+    """The measured point (1 x 3, m), its distance, and the way against its gradient."""
+    point_world = transform_points(pose, point_camera).requires_grad_()
     d = field(point_world)[1]
     (gradient,) = torch.autograd.grad(d.sum(), point_world)
-    foot = point_camera - d.detach() * (pose[:3, :3].T @ gradient[0])
-    start, end = (point[[0, 2]].tolist() for point in (point_camera, foot))
+    foot = point_camera - d.detach() * (gradient @ pose[:3, :3])
+    start, end = (point[0, [0, 2]].tolist() for point in (point_camera, foot))
     arrow = {"arrowstyle": "-|>", "linewidth": 2, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", end, start, arrowprops=arrow, zorder=5)
     label = f"one query: d = {100 * d.item():.0f} cm"
     axes.scatter(*start, s=25, label=label, color="#e08214", **_DOT)
-    return point_camera.tolist()

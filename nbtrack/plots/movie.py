@@ -1,7 +1,7 @@
 """A tracked run as a moving picture: what was observed, what the map shows there, and the path."""
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.plots.figures import show_image
 from nbtrack.plots.meshes import Mesh
-from nbtrack.plots.rooms import draw_cloud
+from nbtrack.plots.scene import draw_cloud
 from nbtrack.plots.style import new_axes, styled
 
 _WIDTH = 240  # pixels of the map's view
@@ -26,7 +26,6 @@ _RATE_HZ = 10
 _GIF_COLORS = 64
 
 
-@styled
 def movie_pictures(
     surface: Mesh,
     sequence: RgbdSequence,
@@ -34,8 +33,8 @@ def movie_pictures(
     T_estimated: Poses,
     title: str,
     progress: Callable[[int], object] = lambda done: None,
-) -> list[np.ndarray]:
-    """A picture of RGB (height, width, 3; uint8) for each frame of a run.
+) -> Iterator[Image.Image]:
+    """A picture for each frame of a run, drawn when it is asked for.
 
     Left the observed image, in the middle the map's surface seen from the estimated pose, right the
     estimated path so far from above. `run` has the rows of frames.csv of the sequence's frames,
@@ -47,7 +46,6 @@ def movie_pictures(
     here.set_color(path.get_color())
     words = right.text(0, 1.03, "", transform=right.transAxes)
     canvas = FigureCanvasAgg(left.figure)
-    pictures = []
     left.figure.set_dpi(_DPI)
     for index, row in enumerate(run.itertuples()):
         view = view_of(surface, sequence.intrinsics, T_estimated[index])
@@ -55,7 +53,7 @@ def movie_pictures(
         show_image(left, sequence.color(index), "observed")
         middle.clear()
         show_image(middle, view, "the map from the estimated pose")
-        places = T_estimated[: index + 1, :3, 3][:, page].T
+        places = page @ T_estimated[: index + 1, :3, 3].T
         path.set_data(*places)
         here.set_data(*places[:, -1:])
         error_cm = 100 * row.translation_error_m
@@ -63,9 +61,18 @@ def movie_pictures(
         words.set_text(f"frame {row.frame_id}{error}")
         canvas.draw()
         left.figure.set_layout_engine("none")  # nothing moves from picture to picture
-        pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
         progress(index + 1)
-    return pictures
+        picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+        yield picture.quantize(_GIF_COLORS)
+
+
+@styled
+def movie_bytes(pictures: Iterator[Image.Image]) -> bytes:
+    """A GIF that repeats; its pictures are drawn while it is written."""
+    content = io.BytesIO()
+    options = {"duration": 1000 // _RATE_HZ, "loop": 0, "optimize": True}
+    next(pictures).save(content, "GIF", save_all=True, append_images=pictures, **options)
+    return content.getvalue()
 
 
 def view_of(
@@ -106,12 +113,3 @@ def cloud_of(surface: Mesh) -> pd.DataFrame:
     cloud = pd.DataFrame(surface.vertices, columns=["x", "y", "z"])
     cloud[["red", "green", "blue"]] = surface.visual.vertex_colors[:, :3]
     return cloud
-
-
-def movie_bytes(pictures: Sequence[np.ndarray]) -> bytes:
-    """A GIF that repeats."""
-    images = [Image.fromarray(picture).quantize(_GIF_COLORS) for picture in pictures]
-    content = io.BytesIO()
-    options = {"duration": 1000 // _RATE_HZ, "loop": 0, "optimize": True}
-    images[0].save(content, "GIF", save_all=True, append_images=images[1:], **options)
-    return content.getvalue()

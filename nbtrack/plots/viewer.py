@@ -9,7 +9,7 @@ import trimesh
 from trimesh.viewer.notebook import scene_to_notebook
 
 from nbtrack.core.arrays import Poses
-from nbtrack.plots.projection import inward_side, screen_axes, up_of
+from nbtrack.plots.scene import inward_side, screen_axes, up_of
 from nbtrack.plots.style import method_colors
 
 _MAX_FACES_TO_TURN = 10_000  # more are merged for the viewer
@@ -71,7 +71,8 @@ def _path_mesh(T_world_camera: Poses, radius: float) -> trimesh.Trimesh:
     segments = np.stack([corners[:-1], corners[1:]], axis=1)
     moved = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > 1e-6
     parts = [trimesh.creation.cylinder(radius, segment=s, sections=6) for s in segments[moved]]
-    image = np.array([[-1.0, -0.75], [1.0, -0.75], [1.0, 0.75], [-1.0, 0.75]])
-    pyramid = 6 * radius * np.vstack([np.zeros(3), np.column_stack([image, np.full(4, 1.5)])])
-    pyramid = pyramid @ T_world_camera[-1, :3, :3].T + places[-1]
-    return trimesh.util.concatenate([*parts, trimesh.convex.convex_hull(pyramid)])
+    height = 9 * radius
+    tip_first = trimesh.transformations.translation_matrix([0, 0, height]) @ np.diag([1, 1, -1, 1])
+    pose = T_world_camera[-1] @ tip_first
+    parts.append(trimesh.creation.cone(0.8 * height, height, sections=4, transform=pose))
+    return trimesh.util.concatenate(parts)

@@ -1,0 +1,181 @@
+"""What all pictures of rooms share: a mesh or a cloud, a slice through a field's values, paths.
+
+A room is seen from above, or from outside in a parallel projection. Up is the axis of the world
+that the cameras' own up is nearest to: they are mostly held upright.
+"""
+
+from collections.abc import Mapping
+from itertools import cycle
+
+import numpy as np
+import pandas as pd
+import trimesh
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import LogNorm, Normalize
+
+from nbtrack.core.arrays import Poses
+from nbtrack.data.sequence import RgbdSequence
+from nbtrack.fields import Field
+from nbtrack.plots.meshes import query_field, seen_by
+from nbtrack.plots.style import method_colors
+
+_ELEVATION = np.radians(45)  # of the viewer of a mesh
+_AMBIENT = 0.55  # share of the light on a mesh that comes from everywhere
+_DIMMED = 0.72  # how white the unseen becomes
+_CUT = 0.01  # share of a recording's points cut off at either end: wild depths hide the room
+_LINES_M = np.arange(-1.0, 1.01, 0.25)  # distances with a thin line
+
+
+def up_of(*T_paths: Poses) -> np.ndarray:
+    """The world's axis, with its sign, that is nearest to the mean up of cameras."""
+    above = -np.concatenate(T_paths)[:, :3, 1].mean(axis=0)
+    axis = np.abs(above).argmax()
+    return np.sign(above[axis]) * np.eye(3)[axis]
+
+
+def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
+    """Rows: the picture's right, its upward direction, and the way to the viewer (world frame)."""
+    side = np.roll(up, 1)  # any horizontal axis is azimuth 0
+    azimuth = np.radians(azimuth_deg)
+    level = np.cos(azimuth) * side + np.sin(azimuth) * np.cross(up, side)
+    viewer = np.cos(_ELEVATION) * level + np.sin(_ELEVATION) * up
+    right = np.cross(up, level)
+    return np.stack([right, np.cross(viewer, right), viewer])
+
+
+def inward_side(mesh: trimesh.Trimesh) -> float:
+    """1 where the normals of a room's shell point inwards, else -1.
+
+    Marching cubes orients faces by the sign of the field, which differs between densities and
+    distances. The sign is that of the sum over the area, since a room's shell is larger than what
+    stands in it.
+    """
+    inwards = mesh.bounds.mean(axis=0) - mesh.triangles_center
+    return np.sign((inwards * mesh.face_normals).sum(axis=1) @ mesh.area_faces)
+
+
+def draw_mesh(axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
+    """The faces of a room's mesh that show their front, shaded, the nearest on top.
+
+    Returns the `screen_axes` of the view, from where most surface shows its front. Lengths across
+    the picture are true (m).
+    """
+    side = inward_side(mesh)
+    # None of the azimuths looks along the walls of a room aligned to the axes.
+    screens = np.stack([screen_axes(up, azimuth) for azimuth in np.arange(15.0, 360.0, 30.0)])
+    fronts = side * mesh.face_normals @ screens[:, 2].T
+    best = (mesh.area_faces @ fronts.clip(0)).argmax()
+    to_screen = screens[best]
+    faces = mesh.faces[fronts[:, best] > 0]
+    corners = (mesh.vertices @ to_screen.T)[faces]
+    # Smoothed normals: those of single marching-cubes faces flicker.
+    normals = side * mesh.vertex_normals[faces].mean(axis=1)
+    light = to_screen[2] + 0.5 * to_screen[0] + 0.6 * up
+    shade = _AMBIENT + (1 - _AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)
+    colors = mesh.visual.vertex_colors[faces, :3].mean(axis=1) / 255 * shade[:, None]
+    order = corners[..., 2].mean(axis=1).argsort()  # from the farthest to the nearest
+    look = {"edgecolors": "face", "linewidths": 0.4, "rasterized": True}
+    axes.add_collection(PolyCollection(corners[order, :, :2], facecolors=colors[order], **look))
+    look_through(axes)
+    return to_screen
+
+
+def look_through(axes: Axes) -> None:
+    """Axes of a parallel projection."""
+    axes.set(aspect="equal", xlabel="across the picture (m)", yticks=[])
+    axes.spines["left"].set_visible(False)
+    axes.grid(False)
+
+
+def draw_from_above(axes: Axes, T_paths: Mapping[str, Poses]) -> tuple[np.ndarray, np.ndarray]:
+    """Paths, and axes in metres, equal, and turned so that nothing is mirrored.
+
+    Returns up, and the world's axes to the right and ahead on the page, (2, 3).
+    """
+    up = up_of(*T_paths.values())
+    page = np.eye(3)[up == 0]
+    draw_paths(axes, T_paths, page)
+    right, ahead = ("xyz"[axis.argmax()] for axis in page)
+    axes.set(xlabel=f"{right} (m)", ylabel=f"{ahead} (m)", aspect="equal")
+    axes.yaxis.set_inverted(np.cross(*page) @ up < 0)  # right, page-up and up are right-handed
+    return up, page
+
+
+def draw_paths(
+    axes: Axes,
+    T_paths: Mapping[str, Poses],
+    to_page: np.ndarray,
+    width: float = 1.0,
+    aside: np.ndarray | float = 0.0,
+) -> None:
+    """Trajectories by label on a page, (2, 3), with a dot at the start of each; moved aside (m)."""
+    starts = []
+    styles = cycle(("--", "-.", ":"))
+    for label, color in method_colors(T_paths).items():
+        path = (T_paths[label][:, :3, 3] + aside) @ to_page.T
+        # The true path is wide, so that the others do not hide it.
+        dashes, own = ("-", 4.0) if label == "true" else (next(styles), 1.6)
+        look = {"linewidth": own * width, "color": color, "label": label, "zorder": 3}
+        axes.plot(*path.T, dashes, **look)
+        starts.append(path[0])
+    look = {"color": "black", "markersize": 5 * width, "zorder": 4, "label": "start"}
+    axes.plot(*np.transpose(starts), "o", **look)
+
+
+def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) -> np.ndarray:
+    """Coloured points from above, but for those higher than all cameras; and paths.
+
+    Returns the world's axes to the right and ahead, (2, 3).
+    """
+    up, page = draw_from_above(axes, T_paths)
+    places = cloud[["x", "y", "z"]]
+    inside = (places >= places.quantile(_CUT)) & (places <= places.quantile(1 - _CUT))
+    heights = (places @ up)[inside.all(axis=1)].sort_values()  # drawn from the floor up
+    highest = max((path[:, :3, 3] @ up).max() for path in T_paths.values())
+    shown = cloud.loc[heights.index[heights <= highest + 0.1]]
+    colors = shown[["red", "green", "blue"]].to_numpy() / 255
+    axes.scatter(*page @ places.loc[shown.index].to_numpy().T, c=colors, s=4, linewidths=0)
+    return page
+
+
+def draw_slice(
+    axes: Axes,
+    field: Field,
+    points: Float[np.ndarray, "rows columns 3"],
+    places: Float[np.ndarray, "rows columns 2"],
+    sequence: RgbdSequence | None = None,
+    **bar: object,
+) -> None:
+    """A field's values at a grid of points (m, world frame), drawn at places on the page.
+
+    A signed distance is blue in free space and red in matter, with thin lines 0.25 m apart; a
+    density or an occupancy has a logarithmic scale. Black is the surface (the field's
+    `surface_level`). What no frame of a sequence has seen is pale: there the field invents.
+    """
+    flat, shape = points.reshape(-1, 3), points.shape[:2]
+    values = query_field(field, flat)[1].reshape(shape)
+    level = field.surface_level
+    norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
+    if field.is_distance:
+        limit = np.clip(np.quantile(np.abs(values), 0.98), 0.2, 1.5)
+        norm, colors = Normalize(-limit, limit), "RdBu"
+    grid = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
+    page = np.moveaxis(places, -1, 0)
+    image = axes.pcolormesh(*page, values, cmap=colors, norm=norm, **grid)
+    axes.figure.colorbar(image, ax=axes, label=field.value_label, extend="both", **bar)
+    if field.is_distance:
+        draw_levels(axes, places, values, _LINES_M, colors="0.35", linewidths=0.4, linestyles="-")
+    draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
+    if sequence is not None:
+        pale = image.to_rgba(values)
+        pale += _DIMMED * (1 - pale)
+        pale[..., 3] = ~seen_by(flat, sequence).reshape(shape)
+        axes.pcolormesh(*page, pale, gid="unseen", zorder=2.5, **grid)  # above the map's lines
+
+
+def draw_levels(axes: Axes, places: np.ndarray, values: np.ndarray, levels, **look: object) -> None:
+    """Lines where values reach levels, if they do: else matplotlib warns."""
+    if values.min() < max(levels) and min(levels) < values.max():
+        axes.contour(*np.moveaxis(places, -1, 0), values, levels, **look)
