@@ -19,7 +19,7 @@ from motions import HAND_HELD
 
 from nbtrack import METHODS, Method, load_preset, make_tracker, open_scenes, track_scenes
 from nbtrack.core.device import choose_device, device_name
-from nbtrack.core.files import tables_folder, write_atomic
+from nbtrack.core.files import tables_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_3
@@ -27,7 +27,7 @@ from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.tables import write_table_3
+from nbtrack.tables import write_csv, write_table_3
 from nbtrack.tracking import StepBudget, track_sequence
 from nbtrack.tracking.metrics import trajectory_metrics
 
@@ -51,9 +51,7 @@ INGREDIENTS = [
 
 def write(name: str, table: pd.DataFrame) -> None:
     """One file of paper_tables/beyond/."""
-    path = tables_folder() / "beyond" / f"{name}.csv"
-    write_atomic(path, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
-    print(f"{path.name}: {len(table)} rows")
+    print(f"{write_csv(tables_folder() / 'beyond' / f'{name}.csv', table)}: {len(table)} rows")
 
 
 def beyond(scenes: Sequence[Scene], preset: Preset) -> None:

@@ -21,13 +21,14 @@ from motions import HAND_HELD
 
 from nbtrack import METHODS, load_preset, make_tracker, open_scene, open_scenes, read_run
 from nbtrack.core.device import choose_device, device_name
-from nbtrack.core.files import tables_folder, write_atomic
+from nbtrack.core.files import tables_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.grid import Execution, map_scene, run_jobs, track_scenes
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.track_jobs import TrackJob
+from nbtrack.tables import write_csv
 from nbtrack.tracking import StepBudget, Tracker
 
 ALONE = Execution(workers=1)
@@ -209,8 +210,7 @@ def write_rows(name: str, rows: pd.DataFrame) -> None:
     """With machine and date."""
     made = {"device": device_name(choose_device()), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
     rows = rows.drop(columns="run", errors="ignore")
-    text = rows.assign(**made).to_csv(index=False, float_format="%.6g", lineterminator="\n")
-    write_atomic(tables_folder() / "corrected" / name, text)
+    write_csv(tables_folder() / "corrected" / name, rows.assign(**made))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from scipy.stats import binomtest, bootstrap
 
 from nbtrack import METHODS, Method, load_preset, map_scene, open_scenes, track_scenes
 from nbtrack.core.device import choose_device, device_name
-from nbtrack.core.files import tables_folder, write_atomic
+from nbtrack.core.files import tables_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.bench import camera_motion
 from nbtrack.experiments.grid import Execution
@@ -34,7 +34,7 @@ from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.recordings.recording import Recording, open_recording
-from nbtrack.tables import write_table_1
+from nbtrack.tables import write_csv, write_table_1
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 VR, SDF = METHODS["vr"], METHODS["sdf"]
@@ -208,8 +208,7 @@ def main(experiment: str, seeds: int) -> None:
     add_rows(path, (chunk for seed in range(seeds) for chunk in chunks_of(grid, seed)))
     rows = pd.read_csv(path)  # as anybody has them, rounded
     if experiment == "nine_rooms":
-        judged = verdicts(rows).to_csv(index=False, float_format="%.4g", lineterminator="\n")
-        write_atomic(path.parent / "verdicts.csv", judged)
+        write_csv(path.parent / "verdicts.csv", verdicts(rows), float_format="%.4g")
         rows = rows.query("path == 'mapped'")
     if grid.has_table:
         motion, machine = camera_motion(grid.preset, rows), ", ".join(rows["device"].unique())
@@ -233,7 +232,7 @@ def add_rows(path: Path, chunks: Iterator[Chunk]) -> None:
         made = make().assign(**place, device=device, date=f"{datetime.now(UTC):%Y-%m-%d}")
         made = made[[*place, *made.columns.difference([*place], sort=False)]]
         rows = pd.concat([rows, made])
-        write_atomic(path, rows.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+        write_csv(path, rows)
 
 
 def chunks_of(grid: Grid, seed: int) -> Iterator[Chunk]:

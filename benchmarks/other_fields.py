@@ -22,9 +22,10 @@ from evidence import Chunk, add_rows, track
 from motions import HAND_HELD
 
 from nbtrack import load_preset, map_scene, open_scenes
-from nbtrack.core.files import tables_folder, write_atomic
+from nbtrack.core.files import tables_folder
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.experiments.methods import METHODS
+from nbtrack.tables import write_csv
 
 ROWS = (
     "vr", "color", "vr_neus", "color_neus", "sdf", "vr_volsdf", "color_volsdf", "sdf_volsdf",
@@ -39,7 +40,7 @@ def starts(path: Path) -> None:
     preset = load_preset("smoke", settings=HAND_HELD)
     methods = dict.fromkeys(["vr", "color", "vr_neus", "color_neus"], 100)
     found = find_from_afar(open_scenes(preset)[0], methods, preset, OFFSETS[:3], 8)
-    write_atomic(path, found.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+    write_csv(path, found)
 
 
 @torch.no_grad()
@@ -77,8 +78,7 @@ def main(seeds: int) -> None:
     """Make the rows that are missing."""
     folder = tables_folder() / "other_fields"
     add_rows(folder / "table_1_cells.csv", track_rows(seeds))
-    found = opacity(seeds).to_csv(index=False, float_format="%.4g", lineterminator="\n")
-    write_atomic(folder / "opacity.csv", found)
+    write_csv(folder / "opacity.csv", opacity(seeds), float_format="%.4g")
     if not (folder / "starts.csv").exists():
         starts(folder / "starts.csv")
 

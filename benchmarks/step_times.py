@@ -26,6 +26,7 @@ from nbtrack.core.device import choose_device, device_name, synchronize
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, field_class, make_field
 from nbtrack.mapping.fit import _Fit
+from nbtrack.tables import write_csv
 from nbtrack.tracking import StepBudget
 
 DEVICE = choose_device()
@@ -46,10 +47,8 @@ def noise(n_frames: int) -> RgbdSequence:
     colors = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
     depths_mm = rng.integers(1950, 2050, size).astype(np.uint16)
     poses = np.tile(np.eye(4), (n_frames, 1, 1))
-    camera = Intrinsics.from_focal(WIDTH, HEIGHT, float(HEIGHT))
-    return RgbdSequence(
-        "wall", camera, colors, depths_mm, poses, np.arange(n_frames), np.arange(n_frames)
-    )
+    camera, ids = Intrinsics.from_focal(WIDTH, HEIGHT, float(HEIGHT)), np.arange(n_frames)
+    return RgbdSequence("wall", camera, colors, depths_mm, poses, ids, ids)
 
 
 SEQUENCE = noise(20)
@@ -165,14 +164,13 @@ def main(part: str) -> None:
     """Measure one part, at each precision, and write what is there after each row."""
     torch.set_num_threads(1)
     found, out = [], Path(os.environ.get("OUT", "runs/first_gpu_run"))
-    out.mkdir(parents=True, exist_ok=True)
     about = {"device": device_name(DEVICE), "torch": torch.__version__}
     for precision, word in PRECISIONS.items():
         torch.set_float32_matmul_precision(word)
         for row in PARTS[part]():
             found.append({**row, "precision": precision, **about})
             print(found[-1], flush=True)
-            pd.DataFrame(found).to_csv(out / f"{part}.csv", index=False, float_format="%.6g")
+            write_csv(out / f"{part}.csv", pd.DataFrame(found))
 
 
 if __name__ == "__main__":

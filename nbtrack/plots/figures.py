@@ -1,6 +1,7 @@
 """What a camera saw beside what a field renders; numbers as curves and bars."""
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 
 import matplotlib
 import numpy as np
@@ -17,6 +18,9 @@ from nbtrack.plots import style
 from nbtrack.tables import STANDING_STILL
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
+DEPTH, DEPTH_ERROR = "depth (m)", "depth error (cm)"
+Panel = tuple[str, np.ndarray, str]  # a title, an image (colours or numbers), the numbers' unit
+
 
 @style.styled
 def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figure:
@@ -26,13 +30,10 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     sequence=fixed(sequence), index=(0, len(sequence) - 1), title=fixed("A room"))`.
     """
     some = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
-    height = style.WIDTH * sequence.intrinsics.height / sequence.intrinsics.width  # inches
-    left, right = style.new_axes(title, 0.4 + 0.5 * height, 1, 2)[0]
-    show_image(left, sequence.color(index), f"frame {sequence.frame_ids[index]}: colour")
     depth = np.ma.masked_equal(sequence.depth(index), 0)
-    image = show_image(right, depth, "depth", MILLIMETRE * _upper_limit(some))
-    right.figure.colorbar(image, ax=right, label="depth (m)", extend="max", aspect=25, pad=0.02)
-    return right.figure
+    name = f"frame {sequence.frame_ids[index]}: colour"
+    row = [(name, sequence.color(index), ""), ("depth", depth, DEPTH)]
+    return _image_grid(title, [row], MILLIMETRE * _most(np.ma.masked_equal(some, 0)))
 
 
 @style.styled
@@ -41,67 +42,66 @@ def plot_views(
 ) -> Figure:
     """Observed and rendered colour and depth of some frames, one a row; unmeasured pixels grey.
 
-    Depths (m) share one colour scale and errors (cm) another, cut at their 98 % quantiles, so
-    that a few wild pixels do not hide the rest. `indices` are positions in the sequence, `views`
-    what the field renders from the same poses.
+    Depths (m) share one colour scale and errors (cm) another. `indices` are positions in the
+    sequence, `views` what the field renders from the same poses.
     """
-    depths = np.ma.stack([np.ma.masked_equal(sequence.depth(index), 0) for index in indices])
-    errors = 100 * np.abs(np.stack([depth for _, depth in views]) - depths)
-    far = _upper_limit(depths)
-    worst = _upper_limit(errors)
-    aspect = sequence.intrinsics.height / sequence.intrinsics.width
-    height = 0.9 + len(views) * (0.2 + 0.2 * style.WIDTH * aspect)
-    grid = style.new_axes(title, height, len(views), 5)
-    parts = zip(grid, indices, views, depths, errors, strict=True)
-    for row, index, (color, rendered), depth, error in parts:
-        show_image(row[0], sequence.color(index), f"frame {sequence.frame_ids[index]}")
-        show_image(row[1], color, "rendered colour")
-        show_image(row[2], depth, "depth", far)
-        depth_image = show_image(row[3], rendered, "rendered depth", far)
-        error_image = show_image(row[4], error, "|error|", worst, "magma")
-    bars = {"location": "bottom", "pad": 0.02, "aspect": 30, "extend": "max"}
-    depth_image.figure.colorbar(depth_image, ax=grid[:, 2:4], label="depth (m)", **bars)
-    error_image.figure.colorbar(error_image, ax=grid[:, 4:], label="depth error (cm)", **bars)
-    return error_image.figure
+    rows = []
+    for index, (color, rendered) in zip(indices, views, strict=True):
+        depth = np.ma.masked_equal(sequence.depth(index), 0)
+        observed = sequence.color(index)
+        rows.append([
+            (f"frame {sequence.frame_ids[index]}", observed, ""), ("rendered colour", color, ""),
+            ("depth", depth, DEPTH), ("rendered depth", rendered, DEPTH),
+            ("|error|", 100 * np.abs(rendered - depth), DEPTH_ERROR),
+        ])  # fmt: skip
+    return _image_grid(title, rows)
 
 
 @style.styled
 def plot_distances(frame: Frame, distances: Mapping[str, Values], title: str = "") -> Figure:
     """A frame's colour, and by label |d| (cm) of its points in a map; unmeasured pixels are grey.
 
-    The distances (m) are those of `frame.measured_pixels()`, in this order. All images share one
-    scale, cut at the 98 % quantile.
+    The distances (m) are those of `frame.measured_pixels()`, in this order.
     """
     rows, columns = frame.measured_pixels().cpu().numpy()
-    aspect = frame.camera.height / frame.camera.width
-    height = 1.0 + aspect * style.WIDTH / (1 + len(distances))  # inches
-    color_axes, *panels = style.new_axes(title, height, 1, 1 + len(distances))[0]
-    show_image(color_axes, frame.color.cpu().numpy(), "observed colour")
-    images = np.full((len(panels), *frame.depth_mm.shape), np.nan)
-    for image, sdf in zip(images, distances.values(), strict=True):
+    panels = [("observed colour", frame.color.cpu().numpy(), "")]
+    for label, sdf in distances.items():
+        image = np.ma.masked_all(frame.depth_mm.shape)
         image[rows, columns] = 100 * sdf.abs().cpu().numpy()
-    limit = np.nanquantile(images, 0.98)
-    for axes, label, image in zip(panels, distances, images, strict=True):
-        label = f"{label}: mean {np.nanmean(image):.1f} cm"
-        shown = show_image(axes, image, label, limit, "magma")
-    bar = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max"}
-    shown.figure.colorbar(shown, ax=panels, label="|signed distance| (cm)", **bar)
-    return shown.figure
+        panels.append((f"{label}: mean {image.mean():.1f} cm", image, "|signed distance| (cm)"))
+    return _image_grid(title, [panels])
 
 
-def show_image(
-    axes: Axes, image: np.ndarray, title: str, maximum: float | None = None, colors: str = "viridis"
-) -> AxesImage:
+def _image_grid(title: str, rows: list[list[Panel]], far: float | None = None) -> Figure:
+    """Images in rows; those of a unit share a bar, and a scale that ends at `far` or `_most`."""
+    height, width = rows[0][0][1].shape[:2]
+    inches = 0.9 + len(rows) * (0.2 + style.WIDTH / len(rows[0]) * height / width)
+    grid = style.new_axes(title, inches, len(rows), len(rows[0]))
+    shown: dict[str, list[AxesImage]] = {}
+    for axes, (name, image, unit) in zip(grid.flat, chain(*rows), strict=True):
+        colors = "viridis" if unit == DEPTH else "magma"
+        shown.setdefault(unit, []).append(show_image(axes, image, name, colors))
+    del shown[""]
+    for unit, images in shown.items():
+        limit = far or _most(np.ma.stack([image.get_array() for image in images]))
+        for image in images:
+            image.set_clim(0, limit)
+        bar = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max", "label": unit}
+        image.figure.colorbar(image, ax=[image.axes for image in images], **bar)
+    return grid[0, 0].figure
+
+
+def _most(images: np.ndarray) -> float:
+    """The 98 % quantile of what is known, so that a few wild pixels do not hide the rest."""
+    values = np.ma.compressed(images)
+    return float(np.quantile(values, 0.98)) if len(values) else 1.0
+
+
+def show_image(axes: Axes, image: np.ndarray, title: str, colors: str = "viridis") -> AxesImage:
     """An image without ticks, grid and frame; unknown pixels are grey."""
     axes.set_title(title)
     axes.set_axis_off()
-    cmap = matplotlib.colormaps[colors].with_extremes(bad="#bdbdbd")
-    return axes.imshow(image, cmap=cmap, vmin=0, vmax=maximum)
-
-
-def _upper_limit(images: np.ndarray) -> float:
-    values = np.ma.masked_equal(images, 0).compressed()
-    return float(np.quantile(values, 0.98)) if len(values) else 1.0
+    return axes.imshow(image, cmap=matplotlib.colormaps[colors].with_extremes(bad="#bdbdbd"))
 
 
 @style.styled
