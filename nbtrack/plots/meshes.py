@@ -1,12 +1,11 @@
 """Surfaces of maps as coloured meshes, and which part of them was seen."""
 
-import math
 import re
 
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from skimage.measure import marching_cubes
 
 from nbtrack.beyond import PointCloud
@@ -38,14 +37,10 @@ def extract_mesh(
         colors = (255 * field.colors).round().byte()
         return trimesh.PointCloud(field.points.cpu().numpy(), colors.cpu().numpy())
     low, high = np.array([field.bounds.minimum, field.bounds.maximum])
-    axes = [np.arange(a, b + voxel, voxel) for a, b in zip(low, high, strict=True)]
-    shape = tuple(map(len, axes))
-    parts = []
-    for first in range(0, math.prod(shape), _POINTS_AT_ONCE):  # of a large place all are gigabytes
-        numbers = np.arange(first, min(first + _POINTS_AT_ONCE, math.prod(shape)))
-        places = zip(axes, np.unravel_index(numbers, shape), strict=True)
-        parts.append(query_field(field, np.stack([axis[i] for axis, i in places], axis=-1))[1])
-    values = np.concatenate(parts).reshape(shape)
+    first, *others = (np.arange(a, b + voxel, voxel) for a, b in zip(low, high, strict=True))
+    # One layer at a time: all points of a large place are gigabytes.
+    layers = (np.stack(np.meshgrid(x, *others, indexing="ij"), axis=-1)[0] for x in first)
+    values = np.stack([query_field(field, layer)[1] for layer in layers])
     if not values.min() < field.surface_level < values.max():
         raise DataError(
             f"the {field.label} map has no surface: its values lie in [{values.min():.3g}, "
@@ -87,12 +82,14 @@ def mesh_bytes(mesh: Mesh, kind: str, origin: Position) -> bytes:
 
 
 @torch.no_grad()
-def query_field(field: Field, points_world: WorldPoints) -> tuple[WorldPoints, np.ndarray]:
+def query_field(
+    field: Field, points_world: Float[np.ndarray, "*shape 3"]
+) -> tuple[Float[np.ndarray, "*shape 3"], Float[np.ndarray, "*shape"]]:
     """Colours and values at any number of points (m), some at a time to bound the memory."""
-    points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32))
+    points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32)).view(-1, 3)
     answers = [field(part.to(field.device)) for part in points.split(_POINTS_AT_ONCE)]
     colors, values = (torch.cat(parts).cpu().numpy() for parts in zip(*answers, strict=True))
-    return colors, values
+    return colors.reshape(points_world.shape), values.reshape(points_world.shape[:-1])
 
 
 def seen_by(

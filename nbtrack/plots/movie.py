@@ -20,7 +20,8 @@ from nbtrack.plots.style import new_axes, styled
 
 _WIDTH = 240  # pixels of the map's view
 _NEAR = 0.1  # m; nearer surfaces are not drawn
-_POINT_SIZE = 0.02  # m, of a map of points
+_POINT_SIZE = 0.02  # m; half the side of what is drawn for a point
+_SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 _DPI = 72
 _RATE_HZ = 10
 _GIF_COLORS = 64
@@ -86,24 +87,19 @@ def view_of(
     """
     scale = width / camera.width
     points = (np.asarray(surface.vertices) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-    depth = np.maximum(points[:, 2:], _NEAR)
-    pixels = scale * (points[:, :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
-    if isinstance(surface, trimesh.Trimesh):
-        parts = np.asarray(surface.faces)
-        corners = pixels[parts]
-    else:
-        parts = np.arange(len(points))[:, None]
-        square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        half = np.maximum(1, scale * camera.fx * _POINT_SIZE / depth).astype(int)
-        corners = pixels[parts] + half[:, None] * square
+    parts = getattr(surface, "faces", np.arange(len(points))[:, None])
+    corners = points[parts]  # m, camera frame
+    if isinstance(surface, trimesh.PointCloud):
+        corners = corners + _POINT_SIZE * _SQUARE
+    depth = np.maximum(corners[..., 2:], _NEAR)
+    pixels = scale * (corners[..., :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
     size = round(scale * camera.width), round(scale * camera.height)
-    is_seen = (points[parts, 2] > _NEAR).all(axis=1)
-    is_seen &= ((corners.max(axis=1) > 0) & (corners.min(axis=1) < size)).all(axis=1)
-    seen = np.flatnonzero(is_seen)
-    seen = seen[np.argsort(-points[parts[seen], 2].mean(axis=1))]
+    is_seen = ((pixels.max(axis=1) > 0) & (pixels.min(axis=1) < size)).all(axis=1)
+    seen = np.flatnonzero(is_seen & (corners[..., 2] > _NEAR).all(axis=1))
+    seen = seen[np.argsort(-corners[seen, :, 2].mean(axis=1))]
     colors = surface.visual.vertex_colors[parts[seen], :3].mean(axis=1)
     image = np.full((*size[::-1], 3), 255, np.uint8)
-    for polygon, color in zip(corners[seen].round().astype(np.int32), colors.tolist(), strict=True):
+    for polygon, color in zip(pixels[seen].round().astype(np.int32), colors.tolist(), strict=True):
         cv2.fillConvexPoly(image, polygon, color)
     return image
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import torch
+import trimesh
 from matplotlib.figure import Figure
 
 from nbtrack.core.arrays import Transform
@@ -12,7 +13,7 @@ from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
 from nbtrack.fields import Field, LearnedField
 from nbtrack.fields.base import rendered_losses
-from nbtrack.plots.style import DASHED, in_house_style, new_axes
+from nbtrack.plots.style import DASHED, new_axes, styled
 from nbtrack.tracking.paper import sdf_loss
 
 _OFFSETS_CM = np.arange(-20, 21, 2)
@@ -21,10 +22,8 @@ _N_PIXELS = 128  # enough for smooth curves, and fast enough for a slider
 
 def move_sideways(frame: Frame, x_cm: float, y_deg: float) -> Transform:
     """The true camera-to-world pose (m), moved along the camera's x and turned about its y."""
-    cosine, sine = np.cos(np.radians(y_deg)), np.sin(np.radians(y_deg))
-    T_camera_moved = np.eye(4)
-    T_camera_moved[0] = cosine, 0, sine, x_cm / 100
-    T_camera_moved[2] = -sine, 0, cosine, 0
+    T_camera_moved = trimesh.transformations.rotation_matrix(np.radians(y_deg), [0, 1, 0])
+    T_camera_moved[0, 3] = x_cm / 100
     return torch.from_numpy(frame.T_world_camera @ T_camera_moved).float()
 
 
@@ -57,6 +56,7 @@ def pose_losses(
     return pd.DataFrame(losses, pd.Index(_OFFSETS_CM, name="x_cm"), names)
 
 
+@styled
 def plot_pose_losses(
     density: LearnedField, distance: Field, frame: Frame, x_cm: float = 0.0, y_deg: float = 0.0
 ) -> Figure:
@@ -67,14 +67,13 @@ def plot_pose_losses(
     """
     straight = pose_losses(density, distance, frame)
     turned = pose_losses(density, distance, frame, y_deg)
-    with in_house_style():
-        title = f"The camera {x_cm:g} cm along its x and turned by {y_deg:g}° about its y"
-        panels = new_axes(title, 2.9, 1, 3)[0]
-        for axes, name in zip(panels, turned, strict=True):
-            axes.plot(straight[name], color="0.7", label="not turned")
-            axes.plot(turned[name], label=f"turned by {y_deg:g}°")
-            axes.plot(x_cm, np.interp(x_cm, turned.index, turned[name]), "o", label="this pose")
-            axes.axvline(0, label="the true pose", **DASHED)
-            axes.set(xlabel="camera off along x (cm)", ylabel=name)
-        axes.figure.legend_below()
+    title = f"The camera {x_cm:g} cm along its x and turned by {y_deg:g}° about its y"
+    panels = new_axes(title, 2.9, 1, 3)[0]
+    for axes, name in zip(panels, turned, strict=True):
+        axes.plot(straight[name], color="0.7", label="not turned")
+        axes.plot(turned[name], label=f"turned by {y_deg:g}°")
+        axes.plot(x_cm, np.interp(x_cm, turned.index, turned[name]), "o", label="this pose")
+        axes.axvline(0, label="the true pose", **DASHED)
+        axes.set(xlabel="camera off along x (cm)", ylabel=name)
+    axes.figure.legend_below()
     return axes.figure

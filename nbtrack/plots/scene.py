@@ -154,8 +154,7 @@ def draw_slice(
     density or an occupancy has a logarithmic scale. Black is the surface (the field's
     `surface_level`). What no frame of a sequence has seen is pale: there the field invents.
     """
-    flat, shape = points.reshape(-1, 3), points.shape[:2]
-    values = query_field(field, flat)[1].reshape(shape)
+    values = query_field(field, points)[1]
     level = field.surface_level
     norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
     if field.is_distance:
@@ -171,7 +170,7 @@ def draw_slice(
     if sequence is not None:
         pale = image.to_rgba(values)
         pale += _DIMMED * (1 - pale)
-        pale[..., 3] = ~seen_by(flat, sequence).reshape(shape)
+        pale[..., 3] = ~seen_by(points.reshape(-1, 3), sequence).reshape(values.shape)
         axes.pcolormesh(*page, pale, gid="unseen", zorder=2.5, **grid)  # above the map's lines
 
 

@@ -21,8 +21,7 @@ def _make_unlit(tree: dict) -> None:
     tree["materials"] = [{"extensions": {"KHR_materials_unlit": {}}}]
     tree["extensionsUsed"] = ["KHR_materials_unlit"]
     for mesh in tree["meshes"]:
-        for primitive in mesh["primitives"]:
-            primitive["material"] = 0
+        mesh["primitives"][0]["material"] = 0
 
 
 def mesh_viewer(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses]) -> Any:
