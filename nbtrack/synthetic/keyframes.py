@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from nbtrack.core.arrays import Poses
 from nbtrack.synthetic.motion import camera_poses, first_fit, has_speed, steps_between
-from nbtrack.synthetic.primitives import Points, Values
 from nbtrack.synthetic.room import Room
 from nbtrack.tracking.metrics import still_metrics
 
@@ -46,7 +45,8 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     """
     keys = np.array(room.walk.keys[n_frames > _SHORT])
     length = round(keys[-1, 6]) + 1
-    least = min(_MIN_STILL, _STILL_SHARE * _still(_calibrated_path(room, keys)))
+    base = _calibrated_path(room, keys)
+    least = min(_MIN_STILL, _STILL_SHARE * still_metrics(base)["still_ate_m"])
 
     def drawn(rng: np.random.Generator) -> Poses:
         moved = keys.copy()
@@ -55,14 +55,13 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
         return _calibrated_path(room, moved)
 
     def is_fit(poses: Poses) -> bool:
-        return _still(poses) > least and _is_like_the_dataset(room, poses)
+        unit, near = _view(room, poses)
+        speeds = np.stack([MEAN_STEP, _FASTEST]) * [1e3 * unit, 1.0]
+        is_far = near > _NEAR and still_metrics(poses)["still_ate_m"] > least
+        return is_far and has_speed(poses, *speeds, tolerance=0.03)
 
     poses = first_fit(room, seed, drawn, is_fit)
     return poses[np.pad(np.arange(length), (0, n_frames), mode="reflect")[:n_frames]]
-
-
-def _still(poses: Poses) -> float:
-    return still_metrics(poses)["still_ate_m"]
 
 
 def _calibrated_path(room: Room, keys: Keys) -> Poses:
@@ -72,7 +71,7 @@ def _calibrated_path(room: Room, keys: Keys) -> Poses:
     unit = np.max(room.parts[0].solid.size) / 2
     for _ in range(4):
         poses = _path(keys)
-        unit = _unit_of_view(room, poses) if room.sdf(poses[:, :3, 3]).min() > 0 else unit
+        unit = _view(room, poses)[0] if room.sdf(poses[:, :3, 3]).min() > 0 else unit
         wanted = MEAN_STEP * [1e3 * unit, 1.0]
         farther, faster = np.clip(wanted / steps_between(poses).mean(axis=1), 0.5, 2.0)
         middle = keys[:, columns].mean(axis=0)
@@ -104,24 +103,13 @@ def _path(keys: Keys) -> Poses:
     return poses
 
 
-def _views(room: Room, poses: Poses) -> tuple[Points, Values]:
-    """Points (m, world) that some frames see, and their z-depths (m)."""
+def _view(room: Room, poses: Poses) -> tuple[float, float]:
+    """What some frames see: the unit (m) of a map of it, as `SceneBounds` has it, and the least
+    z-depth (m) that a quarter of an image does not exceed."""
     rays = np.stack(np.meshgrid(_ACROSS, _DOWN, [1.0]), axis=-1).reshape(-1, 3)
     directions = (rays @ poses[::12, :3, :3].mT).reshape(-1, 3)
     origins = poses[::12, :3, 3].repeat(len(rays), axis=0)
     depths, _ = room.first_hit(origins, directions)
-    return origins + depths[:, None] * directions, depths
-
-
-def _unit_of_view(room: Room, poses: Poses) -> float:
-    """The unit (m) that a map of what the camera sees would have; see `SceneBounds`."""
-    points = np.concatenate([_views(room, poses)[0], poses[:, :3, 3]])
-    return float(np.ptp(points, axis=0).max() / 2 + _MARGIN)
-
-
-def _is_like_the_dataset(room: Room, poses: Poses) -> bool:
-    """Whether a path in free space has the right speed, and looks at things far enough."""
-    unit = [1e3 * _unit_of_view(room, poses), 1.0]
-    depths = _views(room, poses)[1].reshape(-1, len(_ACROSS) * len(_DOWN))
-    is_far = np.quantile(depths, 0.25, axis=1).min() > _NEAR
-    return bool(is_far and has_speed(poses, MEAN_STEP * unit, _FASTEST * unit, 0.03))
+    points = np.concatenate([origins + depths[:, None] * directions, poses[:, :3, 3]])
+    near = np.quantile(depths.reshape(-1, len(rays)), 0.25, axis=1).min()
+    return float(np.ptp(points, axis=0).max() / 2 + _MARGIN), float(near)

@@ -76,8 +76,8 @@ def make_room(
     """
     record = {"room": name, "version": ROOM_VERSION, "motion": motion, "seed": seed}
     record |= {"frames": n_frames, "width": width, "height": height}
-    frames = room_frames(build_room(name), n_frames, width, height, seed, motion)
     notes = {ROOM_FILE: json_text(record)}
+    frames = room_frames(build_room(name), n_frames, width, height, seed, motion)
     with closing(frames):  # its threads end with it, whatever keeps it from being written
         write_sequence(folder, room_intrinsics(width, height), frames, notes, progress)
     return folder

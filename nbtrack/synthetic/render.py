@@ -119,10 +119,8 @@ def _is_grazing(disparity: Depth, focal: float) -> Bool[np.ndarray, "h w"]:
 
 def _smaller_difference(values: Depth) -> Depth:
     """Difference per row to the next or the last row, whichever is less: no slope over an edge."""
-    steps = np.diff(values, axis=0)
-    forward = np.concatenate([steps, steps[-1:]])
-    backward = np.concatenate([steps[:1], steps])
-    return np.where(np.abs(forward) < np.abs(backward), forward, backward)
+    steps = np.pad(np.diff(values, axis=0), ((1, 1), (0, 0)), mode="edge")
+    return np.where(np.abs(steps[1:]) < np.abs(steps[:-1]), steps[1:], steps[:-1])
 
 
 def filter_depth(depth: Depth, sigma_px: float = 2.0, sigma_range: float = 0.1) -> Depth:
