@@ -1,7 +1,5 @@
 """Surfaces of maps as coloured meshes, and which part of them was seen."""
 
-import re
-
 import numpy as np
 import torch
 import trimesh
@@ -67,16 +65,13 @@ def mesh_bytes(mesh: Mesh, kind: str, origin: Position) -> bytes:
         scene = trimesh.Scene()
         scene.add_geometry(mesh, transform=trimesh.transformations.translation_matrix(origin))
         return scene.export(file_type=kind)
-    content = mesh.export(file_type=kind)
+    content = mesh.export(file_type=kind, vertex_normal=False)
     if not origin.any():
         return content
     head, end, body = content.partition(b"end_header\n")
-    columns = re.findall(r"property (float|uchar) (\w+)", head.split(b"element face")[0].decode())
-    single = np.dtype([(name, "<f4" if kind == "float" else "u1") for kind, name in columns])
-    double = np.dtype([(name, "<f8" if kind == "float" else "u1") for kind, name in columns])
+    single, double = (np.dtype([("xyz", f, 3), ("rgba", "u1", 4)]) for f in ("<f4", "<f8"))
     vertices = np.frombuffer(body, single, len(mesh.vertices)).astype(double)
-    for name, values in zip("xyz", (mesh.vertices + origin).T, strict=True):
-        vertices[name] = values
+    vertices["xyz"] = mesh.vertices + origin
     head = head.replace(b"property float", b"property double")
     return head + end + vertices.tobytes() + body[len(vertices) * single.itemsize :]
 
