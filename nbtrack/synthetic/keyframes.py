@@ -12,7 +12,7 @@ from scipy.interpolate import CubicHermiteSpline, PPoly
 from scipy.spatial.transform import Rotation, Slerp
 
 from nbtrack.core.arrays import Poses
-from nbtrack.synthetic.motion import camera_poses, first_fit, has_speed, steps_between
+from nbtrack.synthetic.motion import attempts, camera_poses, has_speed, is_clear, steps_between
 from nbtrack.synthetic.room import Room
 from nbtrack.tracking.metrics import still_metrics
 
@@ -41,27 +41,28 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     Its mean speeds are `MEAN_STEP`, in the unit of a map of what the camera sees. The key poses
     belong to the room, those of 240 frames and those of 300; a seed moves and turns them a little.
     A shorter path is the beginning of one of these, a longer one turns back at both ends (our
-    choice). Raises `NumericalError` as `first_fit` does.
+    choice). Raises `NumericalError` as `attempts` does.
     """
     keys = np.array(room.walk.keys[n_frames > _SHORT])
     length = round(keys[-1, 6]) + 1
     base = _calibrated_path(room, keys)
     least = min(_MIN_STILL, _STILL_SHARE * still_metrics(base)["still_ate_m"])
 
-    def drawn(rng: np.random.Generator) -> Poses:
+    for rng in attempts(room, seed):
         moved = keys.copy()
         moved[:, :3] += rng.uniform(-1, 1, (len(keys), 3)) * _SHIFTED
         moved[:, 4] += rng.uniform(-_TURNED, _TURNED, len(keys))
-        return _calibrated_path(room, moved)
+        poses = _calibrated_path(room, moved)
+        is_far = still_metrics(poses)["still_ate_m"] > least
+        if is_far and is_clear(room, poses) and _is_like_the_dataset(room, poses):
+            return poses[np.pad(np.arange(length), (0, n_frames), mode="reflect")[:n_frames]]
 
-    def is_fit(poses: Poses) -> bool:
-        unit, near = _view(room, poses)
-        speeds = np.stack([MEAN_STEP, _FASTEST]) * [1e3 * unit, 1.0]
-        is_far = near > _NEAR and still_metrics(poses)["still_ate_m"] > least
-        return is_far and has_speed(poses, *speeds, tolerance=0.03)
 
-    poses = first_fit(room, seed, drawn, is_fit)
-    return poses[np.pad(np.arange(length), (0, n_frames), mode="reflect")[:n_frames]]
+def _is_like_the_dataset(room: Room, poses: Poses) -> bool:
+    """Whether a path in free space has the right speed, and looks at things far enough."""
+    unit, near = _view(room, poses)
+    mean, largest = np.stack([MEAN_STEP, _FASTEST]) * [1e3 * unit, 1.0]
+    return near > _NEAR and has_speed(poses, mean, largest, 0.03)
 
 
 def _calibrated_path(room: Room, keys: Keys) -> Poses:

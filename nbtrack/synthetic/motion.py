@@ -3,7 +3,7 @@
 Both have height, tilt and roll that wander, bursts of speed, and a tremor. Source: our choice.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float
@@ -48,37 +48,34 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     the speed varies up to threefold, and a hand's tremor of 1.5 to 5 Hz lies on top. Mean speeds
     over the trajectory, or 120 frames if it is shorter, are `MEAN_STEP`.
 
-    Raises `NumericalError` as `first_fit` does.
+    Raises `NumericalError` as `attempts` does.
     Source: our choice; the statistics are those of hand-held RGB-D recordings.
     """
     length = max(n_frames, _CALIBRATION_FRAMES)
-
-    def is_fit(poses: Poses) -> bool:
+    for rng in attempts(room, seed):
+        poses = _glance_around(room.walk, length, rng)
         height = poses[:, 1, 3]
         is_upright = height.min() >= HEIGHTS[0] and height.max() <= HEIGHTS[1]
-        return bool(is_upright and has_speed(poses, MEAN_STEP, 3 * MEAN_STEP, 0.05))
+        is_steady = has_speed(poses, MEAN_STEP, 3 * MEAN_STEP, 0.05)
+        if is_steady and is_upright and is_clear(room, poses):
+            return poses[:n_frames]
 
-    poses = first_fit(room, seed, lambda rng: _glance_around(room.walk, length, rng), is_fit)
-    return poses[:n_frames]
 
+def attempts(room: Room, seed: int) -> Iterator[np.random.Generator]:
+    """Random numbers for one path after another, until one is taken.
 
-def first_fit(
-    room: Room,
-    seed: int,
-    drawn: Callable[[np.random.Generator], Poses],
-    is_fit: Callable[[Poses], bool],
-) -> Poses:
-    """The first drawn path that is fit and keeps `CLEARANCE`.
-
-    Raises `NumericalError` where there is none: the room is too full.
+    Raises `NumericalError` after the last: the room is too full for any to keep `CLEARANCE`.
     """
     for attempt in range(_ATTEMPTS):
-        poses = drawn(np.random.default_rng([seed, attempt, room.number]))
-        if room.sdf(poses[:, :3, 3]).min() >= CLEARANCE and is_fit(poses):
-            return poses
+        yield np.random.default_rng([seed, attempt, room.number])
     raise NumericalError(
         f"room '{room.name}': no path keeps {CLEARANCE} m from surfaces; move its walk or furniture"
     )
+
+
+def is_clear(room: Room, poses: Poses) -> bool:
+    """Whether a path keeps `CLEARANCE`."""
+    return bool(room.sdf(poses[:, :3, 3]).min() >= CLEARANCE)
 
 
 def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
