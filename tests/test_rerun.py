@@ -44,11 +44,9 @@ def test_what_the_file_holds(finished: Path, tmp_path: Path) -> None:
     out = tmp_path / "run.rrd"
     assert main(["export", str(finished / "run"), "--to", "rrd", str(out)]) == 0
     n_frames, rows = len(read_trajectory(finished / "run").frames), rows_of(out)
-    assert [rows[f"/world/{name}", True] for name in ("map", "tracked", "true", "camera")] == [
-        1
-    ] * 4
-    moving = "world/camera", "world/camera/color", "world/camera/depth", "error_m", "lost"
-    assert [rows[f"/{name}", False] for name in moving] == [n_frames] * 5
+    assert all(rows[f"/world/{name}", True] == 1 for name in ("map", "tracked", "true", "camera"))
+    for name in ("world/camera", "world/camera/color", "world/camera/depth", "error_m", "lost"):
+        assert rows[f"/{name}", False] == n_frames
 
 
 def test_points_and_a_verdict(finished: Path, tmp_path: Path) -> None:
