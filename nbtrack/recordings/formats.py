@@ -17,7 +17,7 @@ from nbtrack.core.settings import limited, one_of, with_values
 from nbtrack.data.dataset import DATASET_UNITS
 from nbtrack.data.text_files import Times, read_object, read_poses
 from nbtrack.recordings.calibration import Calibration, read_calibration
-from nbtrack.recordings.names import frame_keys
+from nbtrack.recordings.pairing import frame_keys
 
 DECLARATION_FILE = "sequence.toml"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -87,7 +87,6 @@ class Format:
     known_cameras: tuple[Calibration, ...] = ()  # without a file; `source` is in the folder's name
     declared: Declaration = Declaration()  # what its numbers mean
     counts_from_0: bool = False  # a number is the place of the frame's pose in a list
-    poses_in_order: bool = False  # the first pose of a list is the first image's, and so on
     resize_color: bool = False  # colour has another size than depth and shows the same view
     # Own readers: of a file of poses, their quaternions' order given, with times (s) where it says
     # them; of a calibration; of a depth map in `depth_scale`, where that is no PNG or JPEG file.

@@ -75,5 +75,5 @@ _FILES = ("metadata", "metadata.json")
 FORMATS["record3d"] = Format(
     "Record3D", color=("rgbd/*", "rgb/*"), depth=("rgbd/*.depth", "depth/*"), poses=_FILES,
     cameras=_FILES, declared=Declaration(camera_axes="opengl"), counts_from_0=True,
-    poses_in_order=True, read_poses=_read_poses, read_camera=_read_camera, read_depth=_read_depth,
+    read_poses=_read_poses, read_camera=_read_camera, read_depth=_read_depth,
 )  # fmt: skip

@@ -1,11 +1,7 @@
-"""A recording: its files found and paired, its texts read, before any pixel is decoded.
-
-Images, depth maps and poses belong together by numbers in their names, or by times in lists.
-"""
+"""A recording: its files found and paired, its texts read, before any pixel is decoded."""
 
 import hashlib
 import os
-from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,15 +10,9 @@ import numpy as np
 from jaxtyping import Bool
 
 from nbtrack.core.arrays import Poses, Position
-from nbtrack.core.errors import DataError, MissingError
-from nbtrack.core.files import absolute, naming_damaged
-from nbtrack.data.text_files import (
-    Times,
-    checked_poses,
-    in_seconds,
-    read_lines,
-    read_numbers,
-)
+from nbtrack.core.errors import DataError
+from nbtrack.core.files import absolute
+from nbtrack.data.text_files import Times, checked_poses, in_seconds, read_numbers
 from nbtrack.recordings.calibration import Calibration
 from nbtrack.recordings.formats import (
     FORMATS,
@@ -34,12 +24,10 @@ from nbtrack.recordings.formats import (
     inverse,
     is_declared,
 )
-from nbtrack.recordings.moments import TOLERANCE, Moments, nearest
-from nbtrack.recordings.names import frame_keys, frame_numbers, stamp_in
+from nbtrack.recordings.pairing import TIMES_FILE, Moments, check_paired, pair_lists, stamp_in
 
 _PNG = b"\x89PNG\r\n\x1a\n"  # how its files begin
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
-TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,21 +115,27 @@ def open_recording(
     colors = layout.files(folder, layout.color, "colour images (PNG or JPEG)")
     depths = layout.files(folder, depth, "depth maps (PNG of 16 bits)")
     if colors[0].suffix == ".txt":
-        colors, depths, own_times = _listed_pairs(colors[0], depths[0], notes)
+        colors, depths, own_times = pair_lists(colors[0], depths[0], notes)
     else:
-        _check_paired(colors, depths)
+        check_paired(colors, depths)
         own_times = _own_times(folder, colors)
     camera = _calibration(folder, layout, notes)
     if camera.depth_scale and not is_declared(folder, "depth_scale"):
         declared = replace(declared, depth_scale=camera.depth_scale)
-    numbers = frame_numbers(colors)
-    rate_hz = declared.frame_rate
-    moments = Moments(len(colors), own_times, numbers, rate_hz, layout.counts_from_0)
+    moments = Moments(colors, own_times, declared.frame_rate, layout.counts_from_0)
     images = colors, depths, moments.times
     no_poses = np.full((len(colors), 4, 4), np.nan)
     name = folder.name
     recording = Recording(folder, name, layout, declared, *images, camera, notes, no_poses)
-    return _with_poses(recording, moments, pose_file)
+    names = (pose_file,) if pose_file else layout.poses
+    there = [pattern for pattern in names if files_of(folder, pattern)]
+    if len(there) > 1:
+        both = " and ".join(there)
+        raise DataError(f"{folder} has {both}: keep one, or choose by `data convert --poses FILE`")
+    if not there and not pose_file:
+        notes.append("no poses")
+        return recording
+    return _with_poses(recording, moments, layout.files(folder, names, "poses"), folder / there[0])
 
 
 def _own_times(folder: Path, colors: list[Path]) -> Times | None:
@@ -172,91 +166,21 @@ def _calibration(folder: Path, layout: Format, notes: list[str]) -> Calibration:
     return camera
 
 
-def _with_poses(recording: Recording, moments: Moments, pose_file: str | None) -> Recording:
-    """The recording with a pose a frame, where there is a file of poses."""
-    folder = recording.folder
-    colors = recording.color_files
+def _with_poses(recording: Recording, moments: Moments, files: list[Path], path: Path) -> Recording:
+    """The recording with a pose a frame; `path` names the files, with `*` where each has one."""
     declared = recording.declared
-    names = (pose_file,) if pose_file else recording.format.poses
-    there = [name for name in names if files_of(folder, name)]
-    if len(there) > 1:
-        both = " and ".join(there)
-        raise DataError(f"{folder} has {both}: keep one, or choose by `data convert --poses FILE`")
-    if not there and not pose_file:
-        recording.notes.append("no poses")
-        return recording
-    files = recording.format.files(folder, names, "poses")
-    path = folder / there[0]
-    times = recording.times
     tables = [recording.format.read_poses(file, declared.quaternion) for file in files]
     poses = checked_poses(np.concatenate([T for T, _ in tables]), path)
     has_stamps = all(times is not None for _, times in tables)
     stamps = np.concatenate([times for _, times in tables]) if has_stamps else None
-    is_in_order = recording.format.poses_in_order and len(poses) == len(colors)
-    if "*" in path.name:
-        _check_paired(colors, files)
-    elif not is_in_order:
-        flip = inverse if declared.poses == WORLD_TO_CAMERA else np.copy
-        matched = moments.matched(poses, stamps, flip)
-        if matched is None:
-            raise DataError(
-                f"{path} has {len(poses)} poses but there are {len(colors)} images, "
-                f"{colors[0].name} to {colors[-1].name}, and nothing tells whose each is: every "
-                "image needs one, 'nan' where it has none, and every pose an image; remove what is "
-                f"odd, or write {TIMES_FILE}, a time (s) an image on the clock of the poses' stamps"
-            )
-        poses, note = matched
-        recording.notes.extend([f"{path.name}: {note}"] * bool(note))
+    times = recording.times
     # Frames without times of their own have those of the poses, if there is one for each.
-    is_whole = moments.own is None and stamps is not None and len(stamps) == len(colors)
-    times = stamps if is_whole and (np.diff(stamps) > 0).all() else times
+    if moments.own is None and has_stamps and len(stamps) == len(times):
+        times = stamps if (np.diff(stamps) > 0).all() else times
+    if "*" in path.name:
+        check_paired(recording.color_files, files)
+    else:
+        flip = inverse if declared.poses == WORLD_TO_CAMERA else np.copy
+        poses, note = moments.poses_of(path, poses, stamps, flip)
+        recording.notes.extend([f"{path.name}: {note}"] * bool(note))
     return replace(recording, times=times, file_poses=poses, pose_file=path)
-
-
-def _check_paired(colors: list[Path], others: list[Path]) -> None:
-    """Raises DataError unless every image has its depth map or pose, with the same frame number."""
-    keys, other_keys = frame_keys(colors), frame_keys(others)
-    if keys != other_keys or len(set(keys)) < len(keys):
-        count = Counter([*keys, *other_keys])
-        both = zip((*colors, *others), (*keys, *other_keys), strict=True)
-        odd = [path.name for path, key in both if count[key] != 2]
-        raise DataError(
-            f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
-            f"{len(others)} {others[0].suffix} files ({len(odd)} without a partner, or with two: "
-            f"{', '.join(odd[:4])}): every image needs one of its number, and a folder one "
-            "session; rename or remove them"
-        )
-
-
-def _listed_pairs(
-    color_list: Path, depth_list: Path, notes: list[str]
-) -> tuple[list[Path], list[Path], Times]:
-    """Images and depth maps of two lists that are each other's nearest in time, and the times."""
-    (color_times, colors), (depth_times, depths) = map(_read_list, (color_list, depth_list))
-    closest = nearest(color_times, depth_times, TOLERANCE)
-    back = nearest(depth_times, color_times, TOLERANCE)
-    kept = np.flatnonzero((closest >= 0) & (back[closest] == np.arange(len(colors))))
-    left_out = f"no depth map of {depth_list.name} is within {TOLERANCE} s"
-    if not len(kept):
-        raise DataError(f"{left_out} of any time in {color_list}: both need the same clock")
-    if n_left_out := len(colors) - len(kept):
-        of = f"{n_left_out} of the {len(colors)} images in {color_list.name}"
-        notes.append(f"{of} are left out: {left_out}")
-    return [colors[i] for i in kept], [depths[i] for i in closest[kept]], color_times[kept]
-
-
-def _read_list(path: Path) -> tuple[Times, list[Path]]:
-    """Times and files of a list with `timestamp file` a line, in the order of time."""
-    rows = [line.strip().split(maxsplit=1) for line in read_lines(path)]
-    advice = "every line holds 'timestamp file', such as '1305031102.175 rgb/1305031102.175.png'"
-    with naming_damaged(path, "list", advice):
-        rows = sorted((float(time), name) for time, name in rows)
-        times = in_seconds(np.array([time for time, _ in rows]))
-        if not np.isfinite(times).all():
-            raise ValueError("a time is not finite")
-    files = [path.parent / name for _, name in rows]
-    for file in files:
-        if not os.path.isfile(file):  # unlike pathlib's, it takes names that no file can have
-            file = f"{str(file)[:200]!r}"
-            raise MissingError(f"{path} names {file}, which is not there: add it, or take it out")
-    return times, files

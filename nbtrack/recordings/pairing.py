@@ -1,0 +1,260 @@
+"""Which image, depth map and pose belong together: by numbers in their names, or by time.
+
+The name of a file says which frame it belongs to, or when it was taken; lists say times.
+"""
+
+import os
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation, Slerp
+
+from nbtrack.core.arrays import Frames, Poses
+from nbtrack.core.errors import DataError, MissingError
+from nbtrack.core.files import naming_damaged
+from nbtrack.data.text_files import Times, in_seconds, read_lines
+
+# Seconds since 1970 with decimals, or as many milli-, micro- or nanoseconds, in 13 to 19 digits.
+_STAMP = re.compile(
+    r"(?<!\d)(?<!\d\.)([1-9]\d{8,9}\.\d+|1\d{12}(?:\d{3}){0,2})(?!\.?\d)", flags=re.ASCII
+)
+TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
+_TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
+_SAME_TIME = 1e-6  # s: the last digit of lists
+_ON_TIME = 1e-3  # s between a stamp and the number, over the rate, of the same frame
+_GAP = 0.0505  # s between poses that are interpolated, 20 Hz: at a hand's 2 m/s² 0.6 mm off
+_UNEVEN = 0.1  # share of the median step by which steps of stamps that only count may differ
+_MOST = 0.75  # share of frames whose numbers stamps tell, where they are not of another clock
+
+
+def stamp_in(path: Path) -> float | None:
+    """The time (s) that a file is named after, as 1305031102.175304.png or in nanoseconds.
+
+    >>> [stamp_in(Path(name)) for name in ("1305031102.5.png", "rgb_1305031102500000000.png")]
+    [1305031102.5, 1305031102.5]
+    >>> [stamp_in(Path(name)) for name in ("000017.png", "img17.5.png", "0000000000000017.png")]
+    [None, None, None]
+    """
+    match = _STAMP.search(path.stem)
+    return _seconds(match[0]) if match else None
+
+
+def _seconds(stamp: str) -> float:
+    return float(stamp) if "." in stamp else int(stamp) / 10 ** (len(stamp) - 10)
+
+
+def _numbers_in(path: Path) -> tuple[int, ...]:
+    """The numbers in a file's name, a time as microseconds.
+
+    >>> _numbers_in(Path("cam0_1305031102.5.png"))
+    (0, 1305031102500000)
+    """
+    # A dot ends the stem: frame-000001.color.png counts as 1. Of more digits no camera is capable.
+    stem = _STAMP.sub(lambda match: str(round(1e6 * _seconds(match[0]))), path.stem)
+    return tuple(int(digits[-18:]) for digits in re.findall(r"[0-9]+", stem))
+
+
+def frame_keys(files: list[Path]) -> list[tuple[int, ...]]:
+    """The numbers that vary in the names of a folder's files, of each; all, where none does.
+
+    >>> frame_keys([Path("0017_cam0.png"), Path("0018_cam0.png")])
+    [(17,), (18,)]
+    >>> frame_keys([Path("a1_1.png"), Path("a1_2.png"), Path("a2_1.png")])
+    [(1, 1), (1, 2), (2, 1)]
+    >>> frame_keys([Path("0017_cam0.png")])
+    [(17, 0)]
+    """
+    rows = [_numbers_in(path) for path in files]
+    if len(set(map(len, rows))) > 1:
+        return rows
+    varying = [i for i, column in enumerate(zip(*rows, strict=True)) if len(set(column)) > 1]
+    return [tuple(row[i] for i in varying) for row in rows] if varying else rows
+
+
+def check_paired(colors: list[Path], others: list[Path]) -> None:
+    """Raises DataError unless every image has its depth map or pose, with the same frame number."""
+    keys, other_keys = frame_keys(colors), frame_keys(others)
+    if keys != other_keys or len(set(keys)) < len(keys):
+        count = Counter([*keys, *other_keys])
+        both = zip((*colors, *others), (*keys, *other_keys), strict=True)
+        odd = [path.name for path, key in both if count[key] != 2]
+        raise DataError(
+            f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
+            f"{len(others)} {others[0].suffix} files ({len(odd)} without a partner, or with two: "
+            f"{', '.join(odd[:4])}): every image needs one of its number, and a folder one "
+            "session; rename or remove them"
+        )
+
+
+def nearest(times: Times, others: Times, tolerance: float) -> Frames:
+    """For every time the index of the nearest other one; -1 if none is within the tolerance (s)."""
+    apart, closest = cKDTree(others[:, None]).query(times[:, None], p=1)
+    return np.where(apart <= tolerance, closest, -1)
+
+
+def pair_lists(
+    color_list: Path, depth_list: Path, notes: list[str]
+) -> tuple[list[Path], list[Path], Times]:
+    """Images and depth maps of two lists that are each other's nearest in time, and the times."""
+    (color_times, colors), (depth_times, depths) = map(_read_list, (color_list, depth_list))
+    closest = nearest(color_times, depth_times, _TOLERANCE)
+    back = nearest(depth_times, color_times, _TOLERANCE)
+    kept = np.flatnonzero((closest >= 0) & (back[closest] == np.arange(len(colors))))
+    left_out = f"no depth map of {depth_list.name} is within {_TOLERANCE} s"
+    if not len(kept):
+        raise DataError(f"{left_out} of any time in {color_list}: both need the same clock")
+    if n_left_out := len(colors) - len(kept):
+        of = f"{n_left_out} of the {len(colors)} images in {color_list.name}"
+        notes.append(f"{of} are left out: {left_out}")
+    return [colors[i] for i in kept], [depths[i] for i in closest[kept]], color_times[kept]
+
+
+def _read_list(path: Path) -> tuple[Times, list[Path]]:
+    """Times and files of a list with `timestamp file` a line, in the order of time."""
+    rows = [line.strip().split(maxsplit=1) for line in read_lines(path)]
+    advice = "every line holds 'timestamp file', such as '1305031102.175 rgb/1305031102.175.png'"
+    with naming_damaged(path, "list", advice):
+        rows = sorted((float(time), name) for time, name in rows)
+        times = in_seconds(np.array([time for time, _ in rows]))
+        if not np.isfinite(times).all():
+            raise ValueError("a time is not finite")
+    files = [path.parent / name for _, name in rows]
+    for file in files:
+        if not os.path.isfile(file):  # unlike pathlib's, it takes names that no file can have
+            file = f"{str(file)[:200]!r}"
+            raise MissingError(f"{path} names {file}, which is not there: add it, or take it out")
+    return times, files
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """What files tell of the time of frames."""
+
+    images: list[Path]
+    own: Times | None  # s: of a list, a file of times, or the names of images
+    rate_hz: float  # of the numbers in names
+    counts_from_0: bool  # a number is the place of the frame's pose in a list
+
+    @cached_property
+    def numbers(self) -> Frames | None:
+        """The frames' numbers, where just one in the names varies."""
+        keys = frame_keys(self.images)
+        return np.array(keys).ravel() if set(map(len, keys)) == {1} else None
+
+    @cached_property
+    def times(self) -> Times:
+        """Times (s) of frames: their own, else by their numbers and the rate."""
+        if self.own is not None:
+            return self.own
+        numbers = np.arange(len(self.images)) if self.numbers is None else self.numbers
+        return (numbers - numbers[0]) / self.rate_hz
+
+    def poses_of(
+        self, path: Path, poses: Poses, stamps: Times | None, flip: Callable[[Poses], Poses]
+    ) -> tuple[Poses, str]:
+        """A pose a frame of those of a list, NaN without one, and a note.
+
+        Stamps (s) of the list count where they are the very times of frames, or are of the clock
+        of their own times; else frames' numbers do. `flip` makes camera-to-world poses of the
+        list's, and the other way round. Raises DataError where nothing tells it.
+        """
+        is_known = np.isfinite(poses).all(axis=(1, 2))
+        has_stamps = stamps is not None and is_known.any()
+        found = has_stamps and self._by_time(poses[is_known], stamps[is_known], flip)
+        # Of two clocks equal counts alone prove nothing, unless stamps only count the lines.
+        is_other_clock = self.own is not None and has_stamps and not _are_even(stamps[is_known])
+        if not found and not is_other_clock:
+            is_stamped = has_stamps and not self.counts_from_0 and np.isfinite(stamps).all()
+            found = self._by_number(poses, stamps if is_stamped else None)
+        if found:
+            return found
+        first, last = self.images[0].name, self.images[-1].name
+        raise DataError(
+            f"{path} has {len(poses)} poses but there are {len(self.images)} images, {first} to "
+            f"{last}, and nothing tells whose each is: every image needs one, 'nan' where it has "
+            f"none, and every pose an image; remove what is odd, or write {TIMES_FILE}, a time (s) "
+            "an image on the clock of the poses' stamps"
+        )
+
+    def _by_time(
+        self, poses: Poses, stamps: Times, flip: Callable[[Poses], Poses]
+    ) -> tuple[Poses, str] | None:
+        """The nearest poses; between two that are close to each other, the one between them.
+
+        The camera goes straight there, and turns about one axis. A pose of a frame's very time
+        stays as it is.
+        """
+        exact = nearest(self.times, stamps, 0.0)
+        if (exact >= 0).sum() == len(stamps):  # as in trajectories that nbtrack wrote
+            return _at(poses, exact), ""
+        near = nearest(self.times, stamps, _TOLERANCE)
+        if self.own is None or not (near >= 0).any():
+            return None
+        found = _at(poses, near)
+        stamps, first = np.unique(stamps, return_index=True)
+        later = np.searchsorted(stamps, self.times).clip(1, len(stamps) - 1)
+        before = self.times - stamps[later - 1]
+        after = stamps[later] - self.times
+        apart = np.minimum(before, after)
+        is_between = (before + after <= _GAP) & (apart > _SAME_TIME)
+        if not is_between.any():
+            return found, ""
+        later = later[is_between]
+        share = (before / (before + after))[is_between]
+        T = flip(poses[first])
+        between = T[later - 1]
+        between[:, :3, 3] += share[:, None] * (T[later] - T[later - 1])[:, :3, 3]
+        turns = Slerp(stamps, Rotation.from_matrix(T[:, :3, :3]))
+        between[:, :3, :3] = turns(self.times[is_between]).as_matrix()
+        found[is_between] = flip(between)
+        far_ms = 1e3 * apart[is_between].max()
+        note = f"{is_between.sum()} of {len(found)} poses are interpolated, the nearest"
+        return found, f"{note} up to {far_ms:.1f} ms away"
+
+    def _by_number(self, poses: Poses, stamps: Times | None) -> tuple[Poses, str] | None:
+        """Poses whose stamps (s), or places in a longer list, are frames' numbers over the rate.
+
+        That must be so in just one way to count. Else poses follow one another, if there are as
+        many as frames.
+        """
+        n_frames, n_poses = len(self.images), len(poses)
+        clock = np.arange(n_poses) / self.rate_hz if stamps is None else stamps
+        tolerance = min(_ON_TIME, 0.25 / self.rate_hz)
+        ways = [nearest(times, clock, tolerance) for times in self._counted()]
+        n_found = [(way >= 0).sum() for way in ways]
+        n_whole = min(n_frames, n_poses)
+        whole = {tuple(way) for way, n in zip(ways, n_found, strict=True) if n == n_whole}
+        if len(whole) == 1 and (n_poses > n_frames or stamps is not None):
+            note = f"of {n_poses} poses those of the images' numbers" if n_poses > n_frames else ""
+            return _at(poses, np.array(whole.pop())), note
+        # Stamps of most frames leave out others than the frames do; even ones only count the lines.
+        is_odd = stamps is not None and max(n_found, default=0) > _MOST * n_frames
+        if n_poses != n_frames or (is_odd and not _are_even(stamps)):
+            return None
+        is_plain = np.array_equal(self.numbers, np.arange(n_frames))
+        return poses, "" if is_plain else "images have the poses one after another"
+
+    def _counted(self) -> list[Times]:
+        """Times (s) of frames by their numbers, for each number that the count may begin with."""
+        if self.numbers is None:
+            return []
+        first = self.numbers[0]
+        is_cut = first != 1 or np.ptp(self.numbers) != len(self.numbers) - 1
+        starts = {0} if self.counts_from_0 and is_cut else {0, min(first, 1), first}
+        return [(self.numbers - start) / self.rate_hz for start in starts]
+
+
+def _are_even(stamps: Times) -> bool:
+    steps = np.diff(stamps)
+    return len(steps) == 0 or np.ptp(steps) <= _UNEVEN * np.median(np.abs(steps))
+
+
+def _at(poses: Poses, places: Frames) -> Poses:
+    """The poses at places in a list; NaN at -1."""
+    return np.where(places[:, None, None] >= 0, poses[places], np.nan)
