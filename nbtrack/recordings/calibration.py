@@ -18,18 +18,21 @@ from nbtrack.data.text_files import read_numbers, read_object
 
 _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
 _LARGEST = 1e6  # pixels: no image is so wide
+_MIN_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
-# Entries of a camera's JSON file, and how many numbers each may have.
-_COUNTS = dict.fromkeys(("fx", "fy", "cx", "cy", "width", "height", *_LENS), (1,))
-_COUNTS |= {"depth_scale": (1,), "scale": (1,), "intrinsic_matrix": (9,)}
-_COUNTS |= dict.fromkeys(("distortion", "coeffs"), (0, 4, 5, 8, 12, 14))
+# Entries of a camera's JSON file, by names of this package, and how many numbers each may have.
+_OTHER_NAMES = {"w": "width", "h": "height", "coeffs": "distortion", "scale": "depth_scale"}
+_COUNTS = dict.fromkeys(("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *_LENS), (1,))
+_COUNTS |= {"intrinsic_matrix": (9,), "distortion": (0, 4, 5, 8, 12, 14)}
+# What else a number must be.
+_LIMITS = dict.fromkeys(("width", "height"), "whole pixels above 0")
+_LIMITS |= {"depth_scale": "above 0: the depth values that make a metre"}
 # Other entries that tell of the camera, and the words that say what holds anyway.
 _TELLING = re.compile(
     r"([kpsb]\d+|tau.*|xi|alpha|skew|gamma)$|.*(radial|tangential|dist|lens|fish|model|unit)", re.I
 )
 _USUAL = ("", "none", "px", "pixel", "pixels", "pinhole", "simple_pinhole", "perspective")
 _USUAL += ("opencv", "full_opencv", "radtan", "plumb_bob", "brown_conrady", "rational_polynomial")
-_MIN_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,34 @@ class Calibration:
         return Intrinsics(width, height, fx, fy, cx, cy)
 
 
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
+    """OpenCV's camera matrix, as `read_calibration` takes it."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
+
+
+def calibration(path: Path, K: Float[np.ndarray, "3 3"], **others: Any) -> Calibration:
+    """The camera of OpenCV's matrix, and what else is known of it.
+
+    Raises DataError, which names the file, where the numbers are no camera's.
+    """
+    fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    # Also false for NaN.
+    is_camera = np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6)
+    is_camera &= min(fx, fy) >= _MIN_FOCAL and np.abs(K).max() < _LARGEST
+    if is_camera and min(others.get("size", (1,))) >= 1:
+        return Calibration(path, fx, fy, **{"principal_point": (cx + 0.5, cy + 0.5), **others})
+    advice = "calibrate anew"
+    if fy < 0:  # as in ICL-NUIM
+        advice = (
+            "a negative fy is that of a camera whose y axis points up: write it positive, and "
+            "if `data check` then finds other axes, the camera_axes that it names"
+        )
+    raise DataError(
+        f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
+        f"pixels, without skew, the focal lengths positive, all finite; {advice}"
+    )
+
+
 def read_calibration(path: Path) -> Calibration:
     """A camera from a text or a JSON file.
 
@@ -78,98 +109,64 @@ def read_calibration(path: Path) -> Calibration:
     metres a value. It may be the value of `camera`, as in Replica's files. Raises DataError if
     something is missing, no number, or impossible, or tells of another lens or unit.
     """
-    K, others = _from_json(path) if path.suffix.lower() == ".json" else _from_text(path)
-    fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    if not np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6):
-        raise _no_camera(path, K)
-    camera = Calibration(path, fx, fy, **{"principal_point": (cx + 0.5, cy + 0.5), **others})
-    return checked_camera(camera)
-
-
-def checked_camera(camera: Calibration) -> Calibration:
-    """The camera, or raises DataError where its numbers are none's."""
-    fx, fy = camera.fx, camera.fy
-    cx, cy = camera.principal_point or (0.0, 0.0)
-    # NaN fails both: numpy's minimum keeps it, unlike Python's.
-    is_camera = np.min([fx, fy]) >= _MIN_FOCAL and np.abs([fx, fy, cx, cy]).max() < _LARGEST
-    if not (is_camera and min(camera.size or (1,)) >= 1):
-        raise _no_camera(camera.source, camera_matrix(fx, fy, cx - 0.5, cy - 0.5))
-    return camera
-
-
-def _no_camera(path: Path, K: Float[np.ndarray, "3 3"]) -> DataError:
-    advice = "calibrate anew"
-    if K[1, 1] < 0:  # as in ICL-NUIM
-        advice = (
-            "a negative fy is that of a camera whose y axis points up: write it positive, and "
-            "if `data check` then finds other axes, the camera_axes that it names"
-        )
-    return DataError(
-        f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
-        f"pixels, without skew, the focal lengths positive, all finite; {advice}"
-    )
-
-
-def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
-    """OpenCV's camera matrix, as `read_calibration` takes it."""
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
-
-
-def _from_text(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    if path.suffix.lower() == ".json":
+        return _from_json(path)
     numbers = read_numbers(path, (1, 3, 4, 9, 16), _CAMERA_LINE)
     if numbers.size == 1:
         focal = numbers.item()
-        return camera_matrix(focal, focal, 0.0, 0.0), {"principal_point": None}
+        return calibration(path, camera_matrix(focal, focal, 0.0, 0.0), principal_point=None)
     if numbers.size == 4:
-        return camera_matrix(*numbers.flat), {}
+        return calibration(path, camera_matrix(*numbers.flat))
     columns = {9: 3, 12: 4, 16: 4}.get(numbers.size)
     if not columns:
         raise DataError(f"{path} holds {numbers.size} numbers: every line holds {_CAMERA_LINE}")
-    return numbers.reshape(-1, columns)[:3, :3], {}
+    return calibration(path, numbers.reshape(-1, columns)[:3, :3])
 
 
-def _from_json(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+def _from_json(path: Path) -> Calibration:
     content = read_object(path)
     camera = content["camera"] if isinstance(content.get("camera"), dict) else content
-    camera = {{"w": "width", "h": "height"}.get(key, key): camera[key] for key in camera}
-    others: dict[str, Any] = {"unused": tuple(sorted(camera.keys() - _COUNTS.keys()))}
-    _check_unused(path, {key: camera[key] for key in others["unused"]})
-    found = {}
-    for key in camera.keys() & _COUNTS.keys():
-        values = camera[key] if isinstance(camera[key], list) else [camera[key]]
-        # NaN is not below anything, and True is no number here.
-        are_numbers = all(type(v) in (int, float) and abs(v) < _LARGEST for v in values)
-        if not are_numbers or len(values) not in _COUNTS[key]:
-            counts = " or ".join(map(str, _COUNTS[key]))
-            said = f"{path}: {key} is {str(camera[key])[:40]!r}"
-            raise DataError(f"{said}: write {counts} finite number(s)")
-        found[key] = [float(value) for value in values]
-    if found.keys() & _LENS:
-        others["distortion"] = tuple(found.get(key, [0.0])[0] for key in _LENS)
-    for key in found.keys() & {"distortion", "coeffs"}:
-        others["distortion"] = tuple(found[key])
-    for key in found.keys() & {"depth_scale", "scale"}:
-        (value,) = found[key]
-        if value <= 0:
-            raise DataError(f"{path}: {key} is {value:g}: write how many depth values make a metre")
+    camera = {_OTHER_NAMES.get(key, key): value for key, value in camera.items()}
+    unused = sorted(camera.keys() - _COUNTS.keys())
+    for key in unused:
+        _check_unused(path, key, camera[key])
+    found = {key: _numbers(path, key, camera[key]) for key in camera.keys() & _COUNTS.keys()}
+    others: dict[str, Any] = {"unused": tuple(unused)}
+    if "distortion" in found or found.keys() & _LENS:
+        named = [found.get(key, [0.0])[0] for key in _LENS]
+        others["distortion"] = tuple(found.get("distortion", named))
+    if "depth_scale" in found:
+        (value,) = found["depth_scale"]
         others["depth_scale"] = value if value >= 1 else 1 / value
     if found.keys() & {"width", "height"}:
-        size = [*found.get("width", []), *found.get("height", [])]
-        if len(size) < 2 or min(size) < 1 or any(side % 1 for side in size):
-            raise DataError(f"{path} gives the size {size}: write width and height, whole pixels")
-        others["size"] = tuple(map(int, size))
+        if not {"width", "height"} <= found.keys():
+            raise DataError(f"{path} gives one side of the image: write width and height, or none")
+        others["size"] = int(*found["width"]), int(*found["height"])
     if "intrinsic_matrix" in found:
-        return np.array(found["intrinsic_matrix"]).reshape(3, 3).T, others
-    named = (found.get(key, [np.nan])[0] for key in ("fx", "fy", "cx", "cy"))
-    return camera_matrix(*named), others
+        return calibration(path, np.array(found["intrinsic_matrix"]).reshape(3, 3).T, **others)
+    numbers = (found.get(key, [np.nan])[0] for key in ("fx", "fy", "cx", "cy"))
+    return calibration(path, camera_matrix(*numbers), **others)
 
 
-def _check_unused(path: Path, entries: dict[str, Any]) -> None:
-    """Raises DataError where entries that are not used tell of another lens or unit."""
-    for key, value in entries.items():
-        is_usual = value.lower() in _USUAL if isinstance(value, str) else not np.any(value)
-        if _TELLING.match(key) and not is_usual:
-            raise DataError(
-                f"{path}: {key} is {str(value)[:40]!r}, which is not used: undistort the images, "
-                f"and describe a pinhole camera, or OpenCV's lens by {', '.join(_LENS)}"
-            )
+def _numbers(path: Path, key: str, value: Any) -> list[float]:
+    """The numbers of an entry. Raises DataError where they are too few, or none."""
+    values = value if isinstance(value, list) else [value]
+    # NaN is not below anything, and True is no number here.
+    is_valid = all(type(v) in (int, float) and abs(v) < _LARGEST for v in values)
+    is_valid = is_valid and len(values) in _COUNTS[key]
+    if key in _LIMITS:
+        is_valid = is_valid and values[0] > 0 and (key == "depth_scale" or values[0] % 1 == 0)
+    if not is_valid:
+        wanted = f"{' or '.join(map(str, _COUNTS[key]))} finite number(s){_LIMITS.get(key, '')}"
+        raise DataError(f"{path}: {key} is {str(value)[:40]!r}: write {wanted}")
+    return [float(v) for v in values]
+
+
+def _check_unused(path: Path, key: str, value: Any) -> None:
+    """Raises DataError where an entry that is not used tells of another lens or unit."""
+    is_usual = value.lower() in _USUAL if isinstance(value, str) else not np.any(value)
+    if _TELLING.match(key) and not is_usual:
+        raise DataError(
+            f"{path}: {key} is {str(value)[:40]!r}, which is not used: undistort the images, "
+            f"and describe a pinhole camera, or OpenCV's lens by {', '.join(_LENS)}"
+        )
