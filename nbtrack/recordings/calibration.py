@@ -25,8 +25,8 @@ _OTHER_NAMES = {"w": "width", "h": "height", "coeffs": "distortion", "scale": "d
 _COUNTS = dict.fromkeys(("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *_LENS), (1,))
 _COUNTS |= {"intrinsic_matrix": (9,), "distortion": (0, 4, 5, 8, 12, 14)}
 # What else a number must be.
-_LIMITS = dict.fromkeys(("width", "height"), "whole pixels above 0")
-_LIMITS |= {"depth_scale": "above 0: the depth values that make a metre"}
+_LIMITS = dict.fromkeys(("width", "height"), ", whole pixels above 0")
+_LIMITS |= {"depth_scale": ", above 0: the depth values that make a metre"}
 # Other entries that tell of the camera, and the words that say what holds anyway.
 _TELLING = re.compile(
     r"([kpsb]\d+|tau.*|xi|alpha|skew|gamma)$|.*(radial|tangential|dist|lens|fish|model|unit)", re.I
