@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond.verdict import score_detection
-from nbtrack.checks.belongs import other_world
+from nbtrack.checks.in_map import other_world
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import json_text, write_atomic
 from nbtrack.tracking.metrics import (

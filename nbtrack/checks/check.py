@@ -48,7 +48,7 @@ class DataReport:
     """What a recording holds, and how well its frames agree with each other."""
 
     recording: Recording
-    frames: pd.DataFrame  # what `_facts` and `_changes` tell of each
+    frames: pd.DataFrame  # what `_read` tells of each
     T_world_camera: Poses  # of the frames that have one, as declared
     cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m)
     outliers: pd.DataFrame  # the same of depths beyond `far_limit`
@@ -189,7 +189,7 @@ def check_recording(
     poses = recording.T_world_camera[ids]
     poses[:, :3, 3] -= recording.origin
     pairs = _pairs(poses, _N_PAIRS if is_whole else _QUICK_PAIRS)
-    fitted = _pairs(poses, _FIT_PAIRS, MAX_SHIFT)[:, : is_whole * _FIT_PAIRS]
+    fitted = _pairs(poses, _FIT_PAIRS if is_whole else 0, MAX_SHIFT)
     around = np.add.outer(fitted, np.arange(-MAX_SHIFT, MAX_SHIFT + 1))
     shown = np.arange(0, len(ids), max(1, round(len(ids) / _CLOUD_FRAMES)))
     shown = shown if is_whole else np.unique(pairs)
@@ -200,21 +200,16 @@ def check_recording(
     sequence, frames = _read(in_files, ids if is_whole else kept, kept, progress)
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
-    bar = ProgressBar("comparing frames", 2, progress)
-    compared = FramePairs(recording, ids, sequence, pairs)
-    conventions, best = fit_all(compared, Reading(recording.declared, sequence.intrinsics))
-    bar.move_to(1)
-    own = conventions[0].reading
-    cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))
-    is_far = cloud.depth > far_limit(cloud.depth)
-    found = []
-    correlation = math.nan
+    own = Reading(recording.declared, sequence.intrinsics)
+    conventions, best = fit_all(FramePairs(recording, ids, sequence, pairs), own)
+    misfits, correlation = [], math.nan
     if best is conventions[0] and fitted.size:
         compared = FramePairs(recording, ids, sequence, fitted)
-        found, correlation = find_misfits(compared, sequence, own)
-    bar.close()
+        misfits, correlation = find_misfits(compared, sequence, best.reading)
+    cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))
+    is_far = cloud.depth > far_limit(cloud.depth)
     of_points = cloud[~is_far], cloud[is_far]
-    agreement = conventions, best, found, correlation
+    agreement = conventions, best, misfits, correlation
     return DataReport(recording, frames, poses, *of_points, *agreement, is_whole)
 
 
@@ -248,45 +243,34 @@ def _pairs(T_world_camera: Poses, maximum: int, margin: int = 0) -> Int[np.ndarr
 def _read(
     recording: Recording, looked_at: Frames, kept: Frames, progress: bool
 ) -> tuple[RgbdSequence, pd.DataFrame]:
-    """The frames to keep of those looked at, and what is told of each, read in parts."""
+    """The frames to keep of those looked at, read in parts, and a row for each looked at.
+
+    The row holds the share that is measured, the brightness in [0, 1], the number that divides all
+    depths, whether these are those of the row before, by what the frame differs from the one before
+    it, and how far it is off the middle of its neighbours; NaN where these are not looked at.
+    """
     parts = []
     rows = []
     with ProgressBar("reading frames", len(looked_at), progress) as bar:
         for first in range(0, len(looked_at), _FRAMES_AT_ONCE):
             part = read_frames(recording, looked_at[first : first + _FRAMES_AT_ONCE])
-            rows += map(_facts, part.depths_mm, part.colors)
+            for depth, color in zip(part.depths_mm, part.colors, strict=True):
+                step, checksum = np.gcd.reduce(depth, None), zlib.crc32(depth)
+                rows.append(((depth > 0).mean(), color.mean() / 255, step, checksum))
             parts.append(part.select(np.isin(part.frame_ids, kept)))
             bar.move_to(first + len(part))
-    frames = pd.DataFrame(rows, looked_at)
-    frames["is_repeated"] = frames.digest.diff() == 0
-    return _joined(parts), frames.join(_changes(frames, recording.T_world_camera[looked_at]))
-
-
-def _facts(depth: np.ndarray, color: np.ndarray) -> dict[str, float]:
-    """The share of a frame that is measured, its brightness in [0, 1], the number that divides all
-    its depths, and a checksum of these."""
-    return {
-        "measured": (depth > 0).mean(),
-        "brightness": color.mean() / 255,
-        "depth_step": np.gcd.reduce(depth, None),
-        "digest": zlib.crc32(depth),
-    }
-
-
-def _changes(frames: pd.DataFrame, T_world_camera: Poses) -> pd.DataFrame:
-    """A row a frame that follows another: by what it differs from that one, and how far it is off
-    the middle of its neighbours."""
-    is_next = np.diff(frames.index) == 1
-    moves = 1e3 * np.diff(T_world_camera[:, :3, 3], axis=0)
-    moves[~is_next] = np.nan
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
+    frames = pd.DataFrame(rows, looked_at, ["measured", "brightness", "depth_step", "checksum"])
+    frames["is_repeated"] = frames.pop("checksum").diff() == 0
+    T_world_camera = recording.T_world_camera[looked_at]
+    follows = frames.index.diff() == 1
+    moves_mm = 1e3 * pd.DataFrame(T_world_camera[:, :3, 3], looked_at).diff().where(follows)
+    frames["moved_mm"] = np.linalg.norm(moves_mm, axis=1)
+    frames["turned_deg"] = np.where(follows, [np.nan, *_turned_deg(T_world_camera)], np.nan)
     levels = np.log(frames.brightness + 1e-3)  # 0 has none
-    changes = {
-        "moved_mm": np.linalg.norm(moves, axis=1),
-        "turned_deg": _turned_deg(T_world_camera),
-        "flicker": np.expm1(np.abs(np.diff(levels))),  # share of the darker one
-        "off_mm": np.linalg.norm(np.diff(moves, axis=0, append=np.nan), axis=1) / 2,
-    }
-    return pd.DataFrame(changes, frames.index[1:])[is_next]
+    frames["flicker"] = np.expm1(levels.diff().abs()).where(follows)  # share of the darker one
+    frames["off_mm"] = np.linalg.norm(moves_mm.diff().shift(-1), axis=1) / 2
+    return replace(parts[0], **arrays), frames
 
 
 def _cloud(own: Reading, sequence: RgbdSequence) -> pd.DataFrame:
@@ -299,9 +283,3 @@ def _cloud(own: Reading, sequence: RgbdSequence) -> pd.DataFrame:
     cloud = np.concatenate([world, colors, points[..., 2:]], axis=-1).reshape(-1, 7)
     cloud = pd.DataFrame(cloud, columns=[*_XYZ, *_RGB, "depth"])
     return cloud[cloud.depth > 0]
-
-
-def _joined(parts: list[RgbdSequence]) -> RgbdSequence:
-    """Parts of one sequence, at least one, in the order given."""
-    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
-    return replace(parts[0], **arrays)

@@ -12,8 +12,7 @@ import torch
 
 from nbtrack import provenance
 from nbtrack.beyond.verdict import score_detection
-from nbtrack.checks.belongs import check_belongs, in_world_of_map
-from nbtrack.checks.in_map import look_in_map
+from nbtrack.checks.in_map import check_belongs, in_world_of_map, look_in_map
 from nbtrack.core import files
 from nbtrack.core.arrays import Pose
 from nbtrack.core.device import choose_device, device_name
