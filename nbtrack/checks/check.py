@@ -205,7 +205,7 @@ def check_recording(
     misfits, correlation = [], math.nan
     if best is conventions[0] and fitted.size:
         compared = FramePairs(recording, ids, sequence, fitted)
-        misfits, correlation = find_misfits(compared, sequence, best.reading)
+        misfits, correlation = find_misfits(compared, best.reading)
     cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))
     is_far = cloud.depth > far_limit(cloud.depth)
     of_points = cloud[~is_far], cloud[is_far]

@@ -6,9 +6,8 @@ best is the estimate; its interval comes from drawing the pairs anew (bootstrap)
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import starmap
 from typing import NamedTuple
 
 import cv2
@@ -18,7 +17,6 @@ from jaxtyping import Float
 from torch.nn.functional import grid_sample
 
 from nbtrack.checks.readings import FramePairs, Reading
-from nbtrack.data.sequence import RgbdSequence
 
 MAX_SHIFT = 3  # frames by which depth or colours may be late or early (our choice)
 _SHARES = np.linspace(-0.15, 0.15, 13)  # by which lengths may be off
@@ -49,27 +47,28 @@ class Parameter(NamedTuple):
 
 
 _POSES = "record or register the poses anew"
-_DEPTH_PARAMETERS = (
-    ("depth_shift", "depth comes after the poses by", "+.1f", " frames", _FRAMES, 0.3,
-     "shift one of them against the other"),
-    ("focal_share", "focal lengths should change by", "+.1%", "", _SHARES, 0.01,
-     "calibrate anew, or multiply them by {factor:.3f}"),
-    ("depth_share", "depths should change against the poses by", "+.1%", "", _SHARES, 0.01,
-     "divide depth_scale, or the positions, by {factor:.3f}"),
-    ("depth_growth", "depths grow over the recording by", "+.1%", "", _SHARES, 0.02,
-     "let the camera warm up before recording"),
-    ("drift_x", "poses drift along x by", "+.2f", " m", _METRES, 0.1, _POSES),
-    ("drift_y", "poses drift along y by", "+.2f", " m", _METRES, 0.1, _POSES),
-    ("drift_z", "poses drift along z by", "+.2f", " m", _METRES, 0.1, _POSES),
-    ("scatter", "positions scatter by", ".3f", " m", _SCATTER, 5e-3, _POSES),
-)  # fmt: skip
-_COLOR_PARAMETERS = (
-    ("color_shift", "colours come after depth by", "+.1f", " frames", _FRAMES, 0.5,
-     "shift one against the other"),
-    ("color_right", "colours lie too far right by", "+.1%", " of the width", _PIXELS, 0.01,
-     "register colour and depth anew"),
-    ("is_mirrored", "colours alone are mirrored", "", "", _NO_YES, 0.5, "mirror them back"),
-)  # fmt: skip
+_DEPTH_PARAMETERS = [
+    Parameter("depth_shift", "depth comes after the poses by", "+.1f", " frames", _FRAMES, 0.3,
+              "shift one of them against the other"),
+    Parameter("focal_share", "focal lengths should change by", "+.1%", "", _SHARES, 0.01,
+              "calibrate anew, or multiply them by {factor:.3f}"),
+    Parameter("depth_share", "depths should change against the poses by", "+.1%", "", _SHARES, 0.01,
+              "divide depth_scale, or the positions, by {factor:.3f}"),
+    Parameter("depth_growth", "depths grow over the recording by", "+.1%", "", _SHARES, 0.02,
+              "let the camera warm up before recording"),
+    Parameter("drift_x", "poses drift along x by", "+.2f", " m", _METRES, 0.1, _POSES),
+    Parameter("drift_y", "poses drift along y by", "+.2f", " m", _METRES, 0.1, _POSES),
+    Parameter("drift_z", "poses drift along z by", "+.2f", " m", _METRES, 0.1, _POSES),
+    Parameter("scatter", "positions scatter by", ".3f", " m", _SCATTER, 5e-3, _POSES),
+]  # fmt: skip
+_COLOR_PARAMETERS = [
+    Parameter("color_shift", "colours come after depth by", "+.1f", " frames", _FRAMES, 0.5,
+              "shift one against the other"),
+    Parameter("color_right", "colours lie too far right by", "+.1%", " of the width", _PIXELS, 0.01,
+              "register colour and depth anew"),
+    Parameter("is_mirrored", "colours alone are mirrored", "", "", _NO_YES, 0.5,
+              "mirror them back"),
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,17 +94,15 @@ class Misfit:
         return f"{name} {self.estimate:{form}} ({self.low:{form}} to {self.high:{form}}){unit}"
 
 
-def find_misfits(
-    pairs: FramePairs, sequence: RgbdSequence, own: Reading
-) -> tuple[list[Misfit], float]:
+def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
     """Misfits that pairs of frames can tell, whether there or not, and how alike their colours are:
     the correlation of intensities of points that both see, NaN without contrast.
 
-    The sequence holds the frames up to MAX_SHIFT around those of the pairs too. Misfits of colours
-    are looked for where depth is right.
+    The frames up to MAX_SHIFT around those of the pairs must be kept too. Misfits of colours are
+    looked for where depth is right.
     """
-    costs = _Costs(pairs, sequence, own)
-    found = _estimates(_DEPTH_PARAMETERS, own, costs.of_depth)
+    costs = _Costs(pairs, own)
+    found = [*_estimates(_DEPTH_PARAMETERS, own, costs.of_depth)]
     unlike = costs.of_color(own)
     correlation = float(1 - np.nanmedian(unlike)) if np.isfinite(unlike).any() else math.nan
     if not any(misfit.is_told for misfit in found):
@@ -128,10 +125,9 @@ def told_misfit(misfits: list[Misfit]) -> str:
 class _Costs:
     """How little the frames of pairs agree, as a recording is read."""
 
-    def __init__(self, pairs: FramePairs, sequence: RgbdSequence, own: Reading) -> None:
+    def __init__(self, pairs: FramePairs, own: Reading) -> None:
         """See `find_misfits`."""
         self.pairs = pairs
-        self.colors = sequence.colors
         apart, measured, counts, self.seen_at = pairs.compare(own)
         relative = (apart / measured).abs()
         self.scale = 3 * relative[counts].median()
@@ -146,8 +142,11 @@ class _Costs:
         return torch.where(enough, total / counts.sum(dim=1), torch.nan).numpy()
 
     def of_color(self, reading: Reading) -> Float[np.ndarray, "pairs"]:
-        """1 - the correlation of intensities of points whose depths agree; exposures may differ."""
-        last = self.colors.shape[2] - 1
+        """1 - the correlation of intensities of points whose depths agree; exposures may differ.
+
+        NaN of few points, and without contrast.
+        """
+        last = self.pairs.colors.shape[2] - 1
         columns = self.pairs.columns + reading.color_right * (last + 1)
         at = self.seen_at.clone()
         at[..., 0] += 2 * reading.color_right
@@ -155,32 +154,26 @@ class _Costs:
             columns = last - columns
             at[..., 0] *= -1
         places = self.pairs.places + reading.color_shift
-        gray = [cv2.cvtColor(self.colors[i], cv2.COLOR_RGB2GRAY) for i in places.ravel()]
+        gray = [cv2.cvtColor(self.pairs.colors[i], cv2.COLOR_RGB2GRAY) for i in places.ravel()]
         first, second = torch.from_numpy(np.stack(gray)).float().div(255).chunk(2)
         seen = grid_sample(second[:, None], at, "bilinear", align_corners=True)[:, 0, 0]
         own = first[:, self.pairs.rows, columns.round().long().clamp(0, last)]
         mask = self.agree & (at.abs() <= 1).all(dim=-1)[:, 0]
-        few = _MIN_OVERLAP * mask.shape[1]
-        rows = zip(own.numpy(), seen.numpy(), mask.numpy(), strict=True)
-        return np.array([1 - _correlation(a[m], b[m], few) for a, b, m in rows])
-
-
-def _correlation(a: Float[np.ndarray, "n"], b: Float[np.ndarray, "n"], few: float) -> float:
-    """NaN of few values, and without contrast."""
-    if len(a) < few or min(a.std(), b.std()) < _MIN_CONTRAST:
-        return math.nan
-    return np.corrcoef(a, b)[0, 1]
+        costs = np.full(len(mask), np.nan)
+        for i, row in enumerate(mask):
+            a, b = own[i, row].numpy(), seen[i, row].numpy()
+            has_many = len(a) >= _MIN_OVERLAP * len(row)
+            if has_many and min(a.std(), b.std()) >= _MIN_CONTRAST:
+                costs[i] = 1 - np.corrcoef(a, b)[0, 1]
+        return costs
 
 
 def _estimates(
-    parameters: tuple[tuple, ...],
-    own: Reading,
-    cost: Callable[[Reading], Float[np.ndarray, "pairs"]],
-) -> list[Misfit]:
+    parameters: list[Parameter], own: Reading, cost: Callable[[Reading], Float[np.ndarray, "pairs"]]
+) -> Iterator[Misfit]:
     """The values where pairs agree best; of parameters at all of whose values enough pairs see
     enough of the same."""
-    found = []
-    for parameter in starmap(Parameter, parameters):
+    for parameter in parameters:
         values = parameter.values
         readings = [replace(own, **{parameter.key: value}) for value in values]
         costs = np.stack([cost(reading) for reading in readings], axis=1)
@@ -191,19 +184,17 @@ def _estimates(
         low, high = np.quantile(_lowest(values, costs[drawn].mean(axis=1)), _INTERVAL)
         mean = costs.mean(axis=0)
         gain = float(mean.min() / mean[np.abs(values).argmin()])
-        found.append(Misfit(parameter, float(_lowest(values, mean)), low, high, gain))
-    return found
+        yield Misfit(parameter, float(_lowest(values, mean)), low, high, gain)
 
 
 def _lowest(
     values: Float[np.ndarray, "values"], costs: Float[np.ndarray, "*n values"]
 ) -> Float[np.ndarray, "*n"]:
     """The place of the lowest of costs at equal steps, by a parabola through three of them."""
-    at = costs.argmin(axis=-1)
-    inner = at.clip(1, max(1, len(values) - 2))
-    around = np.stack([inner - 1, inner, inner + 1], axis=-1).clip(0, len(values) - 1)
+    at, last = costs.argmin(axis=-1), len(values) - 1
+    around = np.clip(at[..., None] + [-1, 0, 1], 0, last)
     before, middle, after = np.moveaxis(np.take_along_axis(costs, around, axis=-1), -1, 0)
     bend = before - 2 * middle + after
-    is_inside = (at == inner) & (len(values) > 2) & (bend > 0)
+    is_inside = (at > 0) & (at < last) & (bend > 0)
     offset = np.where(is_inside, (before - after) / 2 / np.where(is_inside, bend, 1), 0)
     return values[at] + offset * (values[1] - values[0])
