@@ -217,7 +217,7 @@ def test_no_memory_is_told_in_a_line(box: Path, capsys, monkeypatch) -> None:
     def full(*arguments, **options):
         raise MemoryError
 
-    monkeypatch.setattr("nbtrack.recordings.images.np.empty", full)
+    monkeypatch.setattr("nbtrack.recordings.reading.np.empty", full)
     assert main(["data", "convert", str(box), str(box.parent / "new")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "--frames ::2" in line

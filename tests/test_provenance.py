@@ -40,7 +40,7 @@ def key() -> str:
     ("file", "counts"),
     [
         ("fields/rendering.py", True), ("core/geometry.py", True), ("beyond/correction.py", True),
-        ("experiments/quality.py", True), ("recordings/images.py", True),
+        ("experiments/quality.py", True), ("recordings/reading.py", True),
         ("checks/check.py", False), ("plots/rooms.py", False), ("cli.py", False),
     ],
 )  # fmt: skip
@@ -58,7 +58,7 @@ def test_reading_counts(package: Path, tmp_path: Path) -> None:
     before = Scene("office", folder).fingerprint
     provenance.package_code.cache_clear()
     assert Scene("office", folder).fingerprint == before
-    file = package / "recordings/images.py"
+    file = package / "recordings/reading.py"
     file.write_text(file.read_text().replace("INTER_NEAREST", "INTER_LINEAR"))
     provenance.package_code.cache_clear()
     assert Scene("office", folder).fingerprint != before

@@ -264,7 +264,8 @@ def _read(
     frames["is_repeated"] = frames.pop("checksum").diff() == 0
     T_world_camera = recording.T_world_camera[looked_at]
     follows = frames.index.diff() == 1
-    moves_mm = 1e3 * pd.DataFrame(T_world_camera[:, :3, 3], looked_at).diff().where(follows)
+    moves_mm = 1e3 * pd.DataFrame(T_world_camera[:, :3, 3], looked_at).diff()
+    moves_mm[~follows] = np.nan
     frames["moved_mm"] = np.linalg.norm(moves_mm, axis=1)
     frames["turned_deg"] = np.where(follows, [np.nan, *_turned_deg(T_world_camera)], np.nan)
     levels = np.log(frames.brightness + 1e-3)  # 0 has none

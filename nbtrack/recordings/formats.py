@@ -7,6 +7,7 @@ recording does otherwise than its format, it says in `sequence.toml`: any field 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -56,22 +57,22 @@ class Declaration:
         words = SPELLED_AXES.get(self.camera_axes, self.camera_axes).split()
         return np.array([_DIRECTIONS.get(word, np.zeros(3)) for word in words])
 
+    def turned_round(self, poses: Poses) -> Poses:
+        """Camera-to-world poses of a file's, and the other way round; NaN stays NaN."""
+        T = poses.copy()
+        if self.poses == WORLD_TO_CAMERA:
+            # A transpose, unlike a solver, takes NaN and never fails.
+            T[:, :3, :3] = poses[:, :3, :3].mT
+            T[:, :3, 3:] = -T[:, :3, :3] @ poses[:, :3, 3:]
+        return T
+
     def poses_to_opencv(self, file_poses: Poses) -> Poses:
         """Camera-to-world poses with OpenCV's camera axes, of a file's; NaN poses stay NaN."""
         axes = self._axes
-        T = inverse(file_poses) if self.poses == WORLD_TO_CAMERA else file_poses.copy()
+        T = self.turned_round(file_poses)
         T[:, :3, :3] = T[:, :3, :3] @ axes
         T[:, 2] *= np.linalg.det(axes)  # left-handed cameras come with a mirrored world
         return T
-
-
-def inverse(poses: Poses) -> Poses:
-    """World-to-camera of camera-to-world poses, and the other way round; NaN stays NaN."""
-    T = poses.copy()
-    # A transpose, unlike a solver, takes NaN and never fails.
-    T[:, :3, :3] = poses[:, :3, :3].mT
-    T[:, :3, 3:] = -T[:, :3, :3] @ poses[:, :3, 3:]
-    return T
 
 
 @dataclass(frozen=True)
@@ -178,11 +179,12 @@ FORMATS: dict[str, Format] = {
 }  # fmt: skip
 
 
-def declaration(folder: Path, format: str | None = None) -> Declaration:
+def declaration(folder: Path, format: str | None = None, **known: Any) -> Declaration:
     """What a recording's numbers mean, with its format: named, declared, or told by the files.
 
-    Where files are missing, the format that the most are left of; reading says what is missing.
-    Raises MissingError, ConfigError or DataError for what it cannot tell.
+    What is known of them otherwise counts where the folder does not declare it. Where files are
+    missing, the format that the most are left of; reading says what is missing. Raises
+    MissingError, ConfigError or DataError for what it cannot tell.
     """
     if not folder.is_dir():
         raise MissingError(f"no folder {folder}: give a recording's, or a synthetic room's name")
@@ -194,16 +196,9 @@ def declaration(folder: Path, format: str | None = None) -> Declaration:
         raise DataError(f"{path}: {error}") from None
     format = format or own_format or _told_by_files(folder)
     usual = look_up("format", format, FORMATS).declared
-    if format == "neural_rgbd":
-        unit = DATASET_UNITS.get(absolute(folder).name, usual.metres_per_unit)
-        usual = replace(usual, metres_per_unit=unit)
-    return replace(with_values(usual, said), format=format)
-
-
-def is_declared(folder: Path, key: str) -> bool:
-    """Whether the folder's own file declares something."""
-    path = folder / DECLARATION_FILE
-    return path.is_file() and key in read_object(path)
+    if format == "neural_rgbd" and (unit := DATASET_UNITS.get(absolute(folder).name)):
+        known["metres_per_unit"] = unit
+    return replace(with_values(replace(usual, **known), said), format=format)
 
 
 def _told_by_files(folder: Path) -> str:

@@ -111,16 +111,16 @@ def _polycam_camera(path: Path) -> Calibration:
         return _camera(path, numbers, (width, height))
 
 
-_FILES = ("metadata", "metadata.json")
-FORMATS["record3d"] = Format(
-    "Record3D", color=("rgbd/*", "rgb/*"), depth=("rgbd/*.depth", "depth/*"), poses=_FILES,
-    cameras=_FILES, declared=Declaration(camera_axes="opengl"), counts_from_0=True,
-    read_poses=_record3d_poses, read_camera=_record3d_camera, read_depth=_record3d_depth,
-)  # fmt: skip
 _FILES = ("keyframes/cameras/*.json",)
 FORMATS["polycam"] = Format(
     "Polycam raw data", color=("keyframes/corrected_images/*", "keyframes/images/*"),
     depth=("keyframes/depth/*",), poses=_FILES, cameras=_FILES,
     declared=Declaration(camera_axes="opengl"),
     read_poses=_polycam_pose, read_camera=_polycam_camera,
+)  # fmt: skip
+_FILES = ("metadata", "metadata.json")
+FORMATS["record3d"] = Format(
+    "Record3D", color=("rgbd/*", "rgb/*"), depth=("rgbd/*.depth", "depth/*"), poses=_FILES,
+    cameras=_FILES, declared=Declaration(camera_axes="opengl"), counts_from_0=True,
+    read_poses=_record3d_poses, read_camera=_record3d_camera, read_depth=_record3d_depth,
 )  # fmt: skip

@@ -1,17 +1,29 @@
-"""Recordings on disk as sequences in memory, whatever format they are stored in."""
+"""From files to arrays: recordings on disk as sequences in memory, whatever their format is.
+
+Images have one size, depth is in mm along the optical axis, and a lens's distortion is taken out.
+"""
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+from jaxtyping import Int, Shaped, UInt8, UInt16
+from PIL import Image
 
 from nbtrack.core.arrays import Frames, Position
+from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError, MissingError
+from nbtrack.core.files import naming_damaged
+from nbtrack.core.progress import ProgressBar
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.recordings.images import decode
+from nbtrack.recordings.calibration import camera_matrix
+from nbtrack.recordings.formats import IMAGE_SUFFIXES
 from nbtrack.recordings.recording import Recording, open_recording
 
+_FARTHEST_MM = _SATURATED = 65535  # what 16 bits hold; a camera's "farther than I can say"
 _SLICE = r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?"
 # Beyond so many times the distance that nine in ten depths lie within, they are no measurement: of
 # eleven rooms and two real recordings the farthest was 2.1 times as far (our choice).
@@ -102,3 +114,126 @@ def without_outliers(sequence: RgbdSequence) -> RgbdSequence:
 def far_limit(depths: np.ndarray) -> float:
     """The distance, in the unit of some measured depths, beyond which they are outliers."""
     return FAR * float(np.quantile(depths, 0.9)) if len(depths) else np.inf
+
+
+def decode(
+    recording: Recording, frame_ids: Int[np.ndarray, "n"], progress: bool = False
+) -> tuple[Intrinsics, UInt8[np.ndarray, "n height width 3"], UInt16[np.ndarray, "n height width"]]:
+    """The camera, and RGB colours and depths (mm along the axis) of some frames (at least one).
+
+    Raises DataError if a file is damaged, of another kind or size, or holds depths over 65.535 m.
+    """
+    files = [(recording.color_files[i], recording.depth_files[i]) for i in frame_ids]
+    color, depth = _read_image(files[0][0], is_color=True), _read_depth(files[0][1], recording)
+    resize = recording.format.resize_color or _is_larger(color, depth, recording)
+    first = files[0][1 if resize else 0]  # the size is its
+    height, width = (depth if resize else color).shape[:2]
+    camera = recording.calibration.for_size(width, height, first)
+    maps = _undistortion(camera, recording.calibration.distortion)
+    colors = np.empty((len(files), height, width, 3), np.uint8)
+    depths = np.empty((len(files), height, width), np.uint16)
+
+    def read(index: int) -> None:
+        color_file, depth_file = files[index]
+        color = _read_image(color_file, is_color=True)
+        depth = _read_depth(depth_file, recording)
+        if resize:
+            color = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
+        _check(color_file, color, colors[index], first)
+        _check(depth_file, depth, depths[index], first)
+        if maps:
+            color = cv2.remap(color, *maps, cv2.INTER_LINEAR)
+            # Interpolation would invent points between a table and the wall behind.
+            depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
+        depth[(depth == recording.declared.no_depth) | (depth == _SATURATED)] = 0
+        depths[index] = _in_millimetres(depth, recording, camera, depth_file)
+        colors[index] = color
+
+    # Decoding releases the interpreter lock, so a few threads suffice.
+    bar = ProgressBar("reading frames", len(files), progress)
+    with bar, ThreadPoolExecutor(max_workers=4) as pool:
+        for done, _ in enumerate(pool.map(read, range(len(files))), start=1):
+            bar.move_to(done)
+    return camera, colors, depths
+
+
+def _read_image(path: Path, is_color: bool) -> Shaped[np.ndarray, "height width *channels"]:
+    """A PNG or JPEG file's pixels as they are stored, colour as RGB of 8 bits.
+
+    The orientation that a file gives to viewers does not count: depth images know none.
+    """
+    advice = "copy it again, or remove the frame's image, depth and pose"
+    with naming_damaged(path, "PNG or JPEG", advice):
+        with Image.open(path, formats=("PNG", "JPEG")) as image:
+            image.verify()  # the checksums of a PNG; reading finds what a JPEG lacks
+        with Image.open(path) as image:
+            is_8_bit = not image.mode.startswith("I")
+            return np.array(image.convert("RGB") if is_color and is_8_bit else image)
+
+
+def _read_depth(path: Path, recording: Recording) -> Shaped[np.ndarray, "height width *channels"]:
+    """A depth map's values as they are stored, or as its format has them."""
+    if recording.format.read_depth and path.suffix.lower() not in IMAGE_SUFFIXES:
+        return recording.format.read_depth(path, recording.calibration)
+    return _read_image(path, is_color=False)
+
+
+def _is_larger(color: np.ndarray, depth: np.ndarray, recording: Recording) -> bool:
+    """Whether colour is larger than depth, in the same proportions, as phones with LiDAR give it.
+
+    It is then made as small, and a note says so. Raises DataError where the calibration does not
+    say which of both it is for.
+    """
+    of_color, of_depth = color.shape[1::-1], depth.shape[1::-1]
+    factor = of_color[0] / of_depth[0]
+    if factor <= 1 or abs(factor * of_depth[1] - of_color[1]) > 1:
+        return False
+    sizes = " and ".join("x".join(map(str, size)) for size in (of_color, of_depth))
+    camera = recording.calibration
+    if not camera.size:
+        raise DataError(
+            f"colour and depth are {sizes}, and {camera.source} does not say which of both it is "
+            "for: write a JSON file with fx, fy, cx, cy and their width and height"
+        )
+    note = f"colour is made as small as depth: {sizes}"
+    recording.notes.extend([note] * (note not in recording.notes))
+    return True
+
+
+def _check(path: Path, image: np.ndarray, wanted: np.ndarray, first: Path) -> None:
+    if (image.shape, image.dtype) != (wanted.shape, wanted.dtype):
+        raise DataError(
+            f"{path} is {image.dtype} of shape {image.shape}: it must be {wanted.dtype} of shape "
+            f"{wanted.shape}, for the size of {first} (depth has 16 bits and one channel)"
+        )
+
+
+def _in_millimetres(
+    depth: np.ndarray, recording: Recording, camera: Intrinsics, file: Path
+) -> np.ndarray:
+    """Millimetres along the optical axis."""
+    scale = recording.declared.depth_scale
+    along_ray = recording.declared.depth_along == "ray"
+    if scale == 1000 and not along_ray:
+        return depth
+    depth_mm = depth * (1000 / scale)
+    if along_ray:
+        x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+        y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+        depth_mm = depth_mm / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
+    if depth_mm.max() > _FARTHEST_MM:
+        raise DataError(
+            f"{file} holds {depth_mm.max() / 1000:.4g} m with {scale:g} depth values a metre: at "
+            "most 65.535 m can be kept; set depth_scale or no_depth in sequence.toml"
+        )
+    return np.rint(depth_mm).astype(np.uint16)
+
+
+def _undistortion(camera: Intrinsics, distortion: tuple[float, ...]) -> tuple[np.ndarray, ...]:
+    """For cv2.remap: where a pinhole camera's pixels lie in the image; empty for a pinhole's."""
+    if not any(distortion):
+        return ()
+    # OpenCV counts pixel centres as whole numbers.
+    K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
+    size = (camera.width, camera.height)
+    return cv2.initUndistortRectifyMap(K, np.array(distortion), None, K, size, cv2.CV_32FC1)

@@ -14,16 +14,7 @@ from nbtrack.core.errors import DataError
 from nbtrack.core.files import absolute
 from nbtrack.data.text_files import Times, checked_poses, in_seconds, read_numbers
 from nbtrack.recordings.calibration import Calibration
-from nbtrack.recordings.formats import (
-    FORMATS,
-    WORLD_TO_CAMERA,
-    Declaration,
-    Format,
-    declaration,
-    files_of,
-    inverse,
-    is_declared,
-)
+from nbtrack.recordings.formats import FORMATS, Declaration, Format, declaration, files_of
 from nbtrack.recordings.pairing import TIMES_FILE, Moments, check_paired, pair_lists, stamp_in
 
 _PNG = b"\x89PNG\r\n\x1a\n"  # how its files begin
@@ -120,8 +111,8 @@ def open_recording(
         check_paired(colors, depths)
         own_times = _own_times(folder, colors)
     camera = _calibration(folder, layout, notes)
-    if camera.depth_scale and not is_declared(folder, "depth_scale"):
-        declared = replace(declared, depth_scale=camera.depth_scale)
+    if camera.depth_scale:
+        declared = declaration(folder, declared.format, depth_scale=camera.depth_scale)
     moments = Moments(colors, own_times, declared.frame_rate, layout.counts_from_0)
     images = colors, depths, moments.times
     no_poses = np.full((len(colors), 4, 4), np.nan)
@@ -180,7 +171,6 @@ def _with_poses(recording: Recording, moments: Moments, files: list[Path], path:
     if "*" in path.name:
         check_paired(recording.color_files, files)
     else:
-        flip = inverse if declared.poses == WORLD_TO_CAMERA else np.copy
-        poses, note = moments.poses_of(path, poses, stamps, flip)
+        poses, note = moments.poses_of(path, poses, stamps, declared.turned_round)
         recording.notes.extend([f"{path.name}: {note}"] * bool(note))
     return replace(recording, times=times, file_poses=poses, pose_file=path)

@@ -21,9 +21,8 @@ from nbtrack.core.progress import ProgressBar
 from nbtrack.locks import locked
 from nbtrack.recordings.calibration import camera_matrix
 from nbtrack.recordings.formats import FORMATS
-from nbtrack.recordings.images import decode
 from nbtrack.recordings.pairing import TIMES_FILE
-from nbtrack.recordings.reading import select_frames
+from nbtrack.recordings.reading import decode, select_frames
 from nbtrack.recordings.recording import Recording
 
 # RGB colour, depth maps (mm) by depth folder, and pose with OpenCV camera axes.
