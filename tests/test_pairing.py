@@ -118,6 +118,8 @@ LISTS = {
     "out of order": (RUN, (0, 2, 1, 3, 4, 5), "plain", (0, 2, 1, 3, 4, 5)),
     "another clock": (RUN, (90, 92, 93, 94, 95, 99), "plain", RUN),
     "another clock, cut": (RUN[:4], range(90, 96), "plain", None),
+    "another rate, the first lost": (RUN, (1.2, 2.4, 3.6, 4.8, 6.0), "plain", None),
+    "the first lost, stamped": (RUN, (1, 2, 3, 4, 5), "plain", (-1, 0, 1, 2, 3, 4)),
     "another rate, cut": (RUN[:4], (0, 1.3, 2.6, 3.9, 5.2, 6.5), "plain", None),
 }
 
@@ -193,6 +195,13 @@ def test_one_unit_of_times_wherever_they_stand(plain: Path, per_second: int) -> 
         open_recording(plain)
 
 
+def test_times_of_stamped_poses(plain: Path) -> None:
+    """Catches frame numbers in place of a recording's own times, which evaluation tools need."""
+    times = START + np.arange(N_FRAMES) / 15
+    (plain / "trajectory.txt").write_text(tum_lines(times, source().poses))
+    assert open_recording(plain).times == pytest.approx(times, abs=1e-6)
+
+
 def test_times_in_names(plain: Path) -> None:
     """Catches times in the order of their digits, .175304 behind .2, and times from 0 for images
     that are named after theirs, whatever the poses are stamped with."""
@@ -211,10 +220,10 @@ def test_times_in_names(plain: Path) -> None:
     (plain / "trajectory.txt").write_text("\n".join([*lines[:2], "nan " * 8, *lines[3:]]))
     assert np.flatnonzero(~open_recording(plain).has_pose).tolist() == [2]
     (plain / "trajectory.txt").write_text("\n".join(lines))
-    milliseconds = [str(1305031102175 + 33 * i) for i in RUN]
-    for kind in ("color", "depth"):
-        rename(plain / kind, milliseconds)
-    assert np.diff(open_recording(plain).times) == pytest.approx(0.033, abs=1e-6)
+    for per_second in (10**3, 10**9):
+        for kind in ("color", "depth"):
+            rename(plain / kind, [str(int((1305031102.175 + 0.033 * i) * per_second)) for i in RUN])
+        assert np.diff(open_recording(plain).times) == pytest.approx(0.033, abs=1e-3)
     # Two clocks: as many poses as images, each with a moment of its own, prove nothing.
     uneven = np.array([3.0, 3.1, 3.4, 3.5, 3.9, 4.0])
     (plain / "trajectory.txt").write_text(tum_lines(uneven, source().poses))
