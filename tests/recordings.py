@@ -105,6 +105,15 @@ def write_images(
         write_image(folder / depth.format(i), values)
 
 
+def write_matrices(folder: Path, data: Source, settings: str = "") -> Path:
+    """A plain folder whose poses are matrices, and what it declares; returns `folder`."""
+    write_images(folder, data)
+    (folder / "poses.txt").write_text(matrix_text(data.poses.reshape(-1, 16)))
+    (folder / "intrinsics.txt").write_text(matrix_text(camera_matrix(data.camera)))
+    (folder / "sequence.toml").write_text(settings + "\n")
+    return folder
+
+
 def write_neural_rgbd(folder: Path, data: Source) -> None:
     opengl = data.poses @ np.diag([1.0, -1, -1, 1])
     write_images(folder, data, "images/img{}.png", "depth_filtered/depth{}.png")
