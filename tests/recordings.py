@@ -5,6 +5,7 @@ Nothing of the readers is used here: a convention that both got wrong would go u
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -37,6 +38,9 @@ class Source(NamedTuple):
     camera: Intrinsics = CAMERA
 
 
+Change = Callable[[Source], Source]
+
+
 @cache
 def source(room: str = "living_room", n_frames: int = N_FRAMES, stride: int = 3) -> Source:
     """Clean frames; every `stride`-th of a hand-held camera's."""
@@ -55,6 +59,34 @@ def with_noise(data: Source) -> Source:
         noisy = add_kinect_noise(clean, data.camera.fx, rng)
         depths.append(np.rint(1000 * filter_depth(noisy)).astype(np.uint16))
     return data._replace(depths_mm=np.stack(depths))
+
+
+def depth(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return lambda data: data._replace(depths_mm=np.rint(change(data.depths_mm)).astype(np.uint16))
+
+
+def color(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return lambda data: data._replace(colors=change(data.colors))
+
+
+def camera(f: float, c: float = 1.0) -> Change:
+    """Focal lengths and principal point times a factor each."""
+
+    def change(data: Source) -> Source:
+        k = data.camera
+        scaled = replace(k, fx=f * k.fx, fy=f * k.fy, cx=c * k.cx, cy=c * k.cy)
+        return data._replace(camera=scaled)
+
+    return change
+
+
+def positions(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    def moved(data: Source) -> Source:
+        poses = data.poses.copy()
+        poses[:, :3, 3] = change(poses[:, :3, 3])
+        return data._replace(poses=poses)
+
+    return moved
 
 
 def write_image(path: Path, image: np.ndarray) -> None:

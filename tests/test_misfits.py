@@ -1,15 +1,23 @@
 """Small misfits of recordings: each must be told with its size, and none where there is none."""
 
 import re
-from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from recordings import Source, source, with_noise, write_matrices
+from recordings import (
+    Change,
+    Source,
+    camera,
+    color,
+    depth,
+    positions,
+    source,
+    with_noise,
+    write_matrices,
+)
 
 from nbtrack.checks.check import check_recording
 from nbtrack.experiments.presets import load_preset
@@ -19,7 +27,6 @@ from nbtrack.recordings.recording import open_recording
 DATA = Path(__file__).resolve().parents[2] / "shared/data"
 REAL = {"real_room": "opengl", "real_office": "opencv"}  # and the axes of their cameras
 N_FRAMES = 120
-Change = Callable[[Source], Source]
 
 
 def warnings_of(folder: Path, data: Source) -> list[str]:
@@ -50,31 +57,6 @@ def late(images: np.ndarray, n_frames: int) -> np.ndarray:
     return images[(np.arange(len(images)) - n_frames).clip(0, len(images) - 1)]
 
 
-def depth(change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    return lambda data: data._replace(depths_mm=np.rint(change(data.depths_mm)).astype(np.uint16))
-
-
-def color(change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    return lambda data: data._replace(colors=change(data.colors))
-
-
-def focal(factor: float) -> Change:
-    def change(data: Source) -> Source:
-        k = data.camera
-        return data._replace(camera=replace(k, fx=factor * k.fx, fy=factor * k.fy))
-
-    return change
-
-
-def positions(change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    def moved(data: Source) -> Source:
-        poses = data.poses.copy()
-        poses[:, :3, 3] = change(poses[:, :3, 3])
-        return data._replace(poses=poses)
-
-    return moved
-
-
 def line(n: int) -> np.ndarray:
     return np.linspace(0, 1, n)[:, None]
 
@@ -101,8 +83,8 @@ CASES: dict[str, tuple[Change, str, float, float]] = {
     "poses one frame late": (
         lambda data: data._replace(poses=late(data.poses, 1)), "depth comes after", -1, 0.2
     ),
-    "focal length 5 % short": (focal(0.95), "focal lengths should change", 5.26, 0.7),
-    "focal length 5 % long": (focal(1.05), "focal lengths should change", -4.76, 0.7),
+    "focal length 5 % short": (camera(0.95), "focal lengths should change", 5.26, 0.7),
+    "focal length 5 % long": (camera(1.05), "focal lengths should change", -4.76, 0.7),
     "depth 5 % short": (depth(lambda d: 0.95 * d), "depths should change", 5.26, 1),
     "depth 5 % long": (depth(lambda d: 1.05 * d), "depths should change", -4.76, 1),
     "depth 2 % short": (depth(lambda d: 0.98 * d), "depths should change", 2.04, 0.8),

@@ -1,8 +1,5 @@
 """The Neural RGB-D layout as it is written: whole or not at all, and nothing lost."""
 
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -63,30 +60,6 @@ def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"exists: choose another"):
         write_sequence(tmp_path, CAMERA, frames(1))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_a_killed_writer_leaves(tmp_path: Path) -> None:
-    """Catches a folder aside that stays for good, and one of another writer that is removed while
-    it is being written."""
-    killed = (
-        "from nbtrack.recordings.writer import write_sequence as w; from test_writer import *; "
-    )
-    killed += "import os; w(Path('room'), CAMERA, (x or os.kill(os.getpid(), 9) for x in "
-    killed += "[*frames(1), None]))"
-    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    run = [sys.executable, "-c", killed]
-    subprocess.run(run, cwd=tmp_path, env={**os.environ, "PYTHONPATH": paths})
-    assert len(list(tmp_path.iterdir())) == 1
-
-    def late() -> Iterator[WrittenFrame]:
-        yield from frames(1)
-        other = set(tmp_path.iterdir())
-        write_sequence(tmp_path / "room", CAMERA, frames(2))
-        assert other < set(tmp_path.iterdir())
-
-    with pytest.raises(OSError, match="not empty"):
-        write_sequence(tmp_path / "room", CAMERA, late())
-    assert [path.name for path in tmp_path.iterdir()] == ["room"]
 
 
 def test_two_writers_of_one_scene(tmp_path: Path) -> None:
