@@ -19,16 +19,11 @@ _FAR_APART = 0.05  # m, median distance above which a map of the scene would be 
 _MIN_OVERLAP = 0.15  # share of points below which a median tells nothing (our choice)
 # The common camera axes first: where several fit alike, the first is named.
 AXES = {
-    "opengl": "OpenGL axes",
-    "opencv": "OpenCV axes",
-    "forward left up": "robot axes",
-    "right up forward": "left-handed axes",
-    "left up forward": "PyTorch3D axes",
-    "left down backward": "right-handed axes",
-    "left down forward": "left-handed axes",
-    "left up backward": "left-handed axes",
-    "right down backward": "left-handed axes",
-}
+    "opengl": "OpenGL axes", "opencv": "OpenCV axes", "forward left up": "robot axes",
+    "right up forward": "left-handed axes", "left up forward": "PyTorch3D axes",
+    "left down backward": "right-handed axes", "left down forward": "left-handed axes",
+    "left up backward": "left-handed axes", "right down backward": "left-handed axes",
+}  # fmt: skip
 # Those that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1 mm, SUN3D's
 # millimetres and tenths times 8; and metres and micrometres, which 16 bits hold badly.
 _SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 8000.0, 80_000.0, 256.0, 100.0, 1.0, 1e6)
@@ -82,28 +77,27 @@ def axes_name(camera_axes: str, poses: str) -> str:
     return "{} (x {}, y {}, z {}), {}".format(AXES.get(camera_axes, "axes"), *words, poses)
 
 
+_DECLARED = [
+    *(("poses", axes_name(axes, poses), {"camera_axes": axes, "poses": poses})
+      for poses, axes in product((CAMERA_TO_WORLD, WORLD_TO_CAMERA), AXES)),
+    *(("poses", f"quaternions in the order {order}", {"quaternion": order})
+      for order in ("wxyz", "xyzw")),
+    *(("depth", f"{scale:g} depth values a metre", {"depth_scale": scale}) for scale in _SCALES),
+    ("depth", "depth along the optical axis", {"depth_along": "axis"}),
+    ("depth", "distances along the ray, not z-depth", {"depth_along": "ray"}),
+]  # fmt: skip
+
+
 def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
     """Subject, name and reading of the usual mistakes, common ones first."""
-
-    def declared(**keys: str | float) -> Reading:
-        return replace(own, declared=replace(own.declared, **keys))
-
-    for poses, axes in product((CAMERA_TO_WORLD, WORLD_TO_CAMERA), AXES):
-        yield "poses", axes_name(axes, poses), declared(camera_axes=axes, poses=poses)
-    for order in ("wxyz", "xyzw"):
-        yield "poses", f"quaternions in the order {order}", declared(quaternion=order)
-    for scale in _SCALES:
-        yield "depth", f"{scale:g} depth values a metre", declared(depth_scale=scale)
-    yield "depth", "depth along the optical axis", declared(depth_along="axis")
-    yield "depth", "distances along the ray, not z-depth", declared(depth_along="ray")
+    for subject, name, keys in _DECLARED:
+        yield subject, name, replace(own, declared=replace(own.declared, **keys))
     camera = own.camera
+    # The principal point scales with the rest, or is in the middle of any image.
+    middle = camera.width / 2, camera.height / 2
     for label, factor in _CALIBRATIONS.items():
         scaled = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
-        # The principal point scales with the rest, or is in the middle of any image.
-        for cx, cy in (
-            (factor * camera.cx, factor * camera.cy),
-            (camera.width / 2, camera.height / 2),
-        ):
+        for cx, cy in ((factor * camera.cx, factor * camera.cy), middle):
             yield "calibration", label, replace(own, camera=replace(scaled, cx=cx, cy=cy))
     for unit, metres in _UNITS.items():
         yield "poses", f"ones in {unit}", replace(own, metres=metres)
