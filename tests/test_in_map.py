@@ -1,6 +1,7 @@
 """What a recording says of a map, in a box whose distance is exact."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from nbtrack.checks.in_map import look_in_map
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.data.sequence import RgbdSequence
 
+Change = Callable[[RgbdSequence], RgbdSequence]
 ROOM = BoxRoom(half=(1.5, 1.2, 2.0))
 
 
@@ -27,17 +29,21 @@ def seen(n_frames: int = 12) -> RgbdSequence:
     return box_sequence(poses, ROOM, 20)  # wide: with three walls a motion does the same
 
 
+def longer(share: float) -> Change:
+    return lambda s: replace(s, depths_mm=np.rint((1 + share) * s.depths_mm).astype(np.uint16))
+
+
+def focal(pixels: float) -> Change:
+    return lambda s: replace(s, intrinsics=replace(s.intrinsics, fx=pixels, fy=pixels))
+
+
 @pytest.mark.parametrize(
     ("change", "name", "off"),
     [
-        (lambda s: s, "", 0),
-        (
-            lambda s: replace(s, depths_mm=np.rint(1.03 * s.depths_mm).astype(np.uint16)),
-            "depths",
-            3,
-        ),
-        (lambda s: replace(s, intrinsics=replace(s.intrinsics, fx=21.0, fy=21.0)), "focal", 5),
-        (lambda s: replace(s, intrinsics=replace(s.intrinsics, fx=19.0, fy=19.0)), "focal", -5),
+        (longer(0), "", 0),
+        (longer(0.03), "depths", 3),
+        (focal(21), "focal", 5),
+        (focal(19), "focal", -5),
     ],
     ids=["right", "long depths", "long focal", "short focal"],
 )
