@@ -2,7 +2,6 @@
 
 import math
 import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,15 +65,15 @@ class DataReport:
                 "no pixel that was looked at has a depth: all are 0, or saturated (65535); check "
                 "the depth folder, and no_depth in sequence.toml"
             ]
-        found = [*_image_warnings(self)]
-        needs_proof = self.is_whole and not found
-        found.append(
-            told_misfit(self.misfits)
-            or diagnosis(self.conventions, self.best, self.recording, needs_proof)
-        )
+        found = _of_depth_images(self)
+        needs_proof = self.is_whole and not any(found.values())
+        misread = diagnosis(self.conventions, self.best, self.recording, needs_proof)
+        sentence = told_misfit(self.misfits) or misread
+        found[sentence] = bool(sentence)
         if self.best is self.conventions[0]:
-            found += [*_pose_warnings(self), *_depth_warnings(self)]
-        return [text for text in [*found, *_color_warnings(self)] if text]
+            found |= _of_poses_and_depths(self)
+        found |= _of_colors(self)
+        return [text for text, is_so in found.items() if is_so]
 
     def __str__(self) -> str:
         cloud = self.cloud
@@ -106,74 +105,61 @@ class DataReport:
         return "\n".join(lines)
 
 
-def _pose_warnings(report: DataReport) -> Iterator[str]:
+def _of_depth_images(report: DataReport) -> dict[str, bool]:
+    """What may be wrong with them, whatever their numbers mean, and whether it is."""
+    frames, depth = report.frames, report.cloud.depth
+    step = np.gcd.reduce(frames.depth_step) / report.recording.declared.depth_scale
+    repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()  # below 1: the first is not
+    return {
+        f"depths come in steps of {100 * step:.1f} cm: look for those that the camera gave, or "
+        "expect no better poses": _MAX_STEP * depth.median() < step < depth.max() / 8,
+        f"{repeated:.0%} of the depth images repeat the one before, though the poses move: "
+        f"leave them out, as with --frames ::{round(1 / (1 - repeated))} of map and "
+        "track": repeated > _MIN_REPEATED,
+    }
+
+
+def _of_poses_and_depths(report: DataReport) -> dict[str, bool]:
+    """What may be wrong with numbers that are read rightly, and whether it is."""
     off = report.frames.off_mm / 1e3
     is_odd = off > max(_OFF, _OFF_STEPS * report.frames.moved_mm.median() / 1e3)
     # The neighbours of a pose that is off are off by half.
     odd = off[is_odd & (off == off.rolling(3, 1, center=True).max())]
-    if len(odd):
-        yield (
-            f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path of "
-            f"their neighbours, first {report.recording.color_files[odd.index[0]].name}: check the "
-            "poses there, or leave frames out with --frames of map and track"
-        )
-
-
-def _image_warnings(report: DataReport) -> Iterator[str]:
-    """What is wrong with the depth images, whatever their numbers mean."""
-    frames = report.frames
-    depth = report.cloud.depth
-    step = np.gcd.reduce(frames.depth_step) / report.recording.declared.depth_scale
-    repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
-    if _MAX_STEP * depth.median() < step < depth.max() / 8:
-        yield (
-            f"depths come in steps of {100 * step:.1f} cm: look for those that the camera gave, or "
-            "expect no better poses"
-        )
-    if repeated > _MIN_REPEATED:
-        yield (
-            f"{repeated:.0%} of the depth images repeat the one before, though the poses move: "
-            f"leave them out, as with --frames ::{round(1 / (1 - repeated))} of map and track"
-        )
-
-
-def _depth_warnings(report: DataReport) -> Iterator[str]:
+    first = "".join(report.recording.color_files[i].name for i in odd.index[:1])
     near, far = PLAUSIBLE_DEPTH
-    depth = report.cloud.depth.median()
-    outliers = report.outliers.depth
-    if len(outliers):
-        share = len(outliers) / (len(outliers) + len(report.cloud))
-        yield (
-            f"{share:.2%} of the depths are outliers, {outliers.min():.3g} to {outliers.max():.3g} "
-            f"m away, more than {FAR:g} times as far as nine in ten: maps and tracking leave them "
-            "out; check the camera, or set no_depth in sequence.toml to what it gives for none"
-        )
-    if not near <= depth <= far:
-        yield (
-            f"the median depth is {depth:.3g} m, outside {near:g} to {far:g} m: set depth_scale, "
-            "the depth values a metre, in sequence.toml"
-        )
+    depth, outliers = report.cloud.depth.median(), report.outliers.depth
+    share = len(outliers) / (len(outliers) + len(report.cloud))
+    return {
+        f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path of "
+        f"their neighbours, first {first}: check the poses there, or leave frames out with "
+        "--frames of map and track": len(odd) > 0,
+        f"{share:.2%} of the depths are outliers, {outliers.min():.3g} to {outliers.max():.3g} "
+        f"m away, more than {FAR:g} times as far as nine in ten: maps and tracking leave them "
+        "out; check the camera, or set no_depth in sequence.toml to what it gives for "
+        "none": share > 0,
+        f"the median depth is {depth:.3g} m, outside {near:g} to {far:g} m: set depth_scale, "
+        "the depth values a metre, in sequence.toml": not near <= depth <= far,
+    }
 
 
-def _color_warnings(report: DataReport) -> Iterator[str]:
+def _of_colors(report: DataReport) -> dict[str, bool]:
+    """What may be wrong with the colour images, and whether it is."""
     frames = report.frames
     flicker = frames.flicker[frames.turned_deg < _SAME_VIEW_DEG].max()
+    is_elsewhere = report.correlation < MIN_CORRELATION and not told_misfit(report.misfits)
     no_color = (
         "track without colour: --set tracking.lm.lambda_intensity=0, or "
         "tracking.sdf.lambda_color=0 for sdf"
     )
-    if frames.brightness.median() < _BLACK:
-        yield f"the colour images are black: check their folder, or {no_color}"
-    if report.correlation < MIN_CORRELATION and not told_misfit(report.misfits):
-        yield (
-            f"colours do not belong to the depth images: of points that two frames see they "
-            f"correlate by {report.correlation:.2f}; check their folder and order"
-        )
-    if flicker > _FLICKER:
-        yield (
-            f"brightness changes by {flicker:.0%} between two frames: fix exposure and white "
-            f"balance when recording, or {no_color}"
-        )
+    return {
+        f"the colour images are black: check their folder, or {no_color}": (
+            frames.brightness.median() < _BLACK
+        ),
+        "colours do not belong to the depth images: of points that two frames see they "
+        f"correlate by {report.correlation:.2f}; check their folder and order": is_elsewhere,
+        f"brightness changes by {flicker:.0%} between two frames: fix exposure and white "
+        f"balance when recording, or {no_color}": flicker > _FLICKER,
+    }
 
 
 def check_recording(
