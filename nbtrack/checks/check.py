@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.checks.conventions import PLAUSIBLE_DEPTH, Convention, diagnosis, fit_all
 from nbtrack.checks.misfits import MAX_SHIFT, MIN_CORRELATION, Misfit, find_misfits, told_misfit
-from nbtrack.checks.readings import FramePairs, Reading, on_grid
+from nbtrack.checks.readings import FramePairs, Pairs, Reading, on_grid
 from nbtrack.core.arrays import Frames, Poses
 from nbtrack.core.errors import DataError
 from nbtrack.core.progress import ProgressBar
@@ -212,7 +212,7 @@ def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:
     return np.degrees(Rotation.from_matrix(turns).magnitude())
 
 
-def _pairs(T_world_camera: Poses, maximum: int, margin: int = 0) -> Int[np.ndarray, "2 pairs"]:
+def _pairs(T_world_camera: Poses, maximum: int, margin: int = 0) -> Pairs:
     """Positions of frames that see much the same, spread over a sequence, with all gaps alike.
 
     None are within the margin of its ends. How far the camera turns is the same in all conventions.

@@ -56,9 +56,8 @@ _DEPTH_PARAMETERS = [
               "divide depth_scale, or the positions, by {factor:.3f}"),
     Parameter("depth_growth", "depths grow over the recording by", "+.1%", "", _SHARES, 0.02,
               "let the camera warm up before recording"),
-    Parameter("drift_x", "poses drift along x by", "+.2f", " m", _METRES, 0.1, _POSES),
-    Parameter("drift_y", "poses drift along y by", "+.2f", " m", _METRES, 0.1, _POSES),
-    Parameter("drift_z", "poses drift along z by", "+.2f", " m", _METRES, 0.1, _POSES),
+    *(Parameter(f"drift_{axis}", f"poses drift along {axis} by", "+.2f", " m", _METRES, 0.1, _POSES)
+      for axis in "xyz"),
     Parameter("scatter", "positions scatter by", ".3f", " m", _SCATTER, 5e-3, _POSES),
 ]  # fmt: skip
 _COLOR_PARAMETERS = [

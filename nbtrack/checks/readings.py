@@ -25,6 +25,7 @@ _HIDDEN_BEHIND = 0.25  # m behind a surface points are hidden: several times a c
 _SAME_SURFACE = 0.025  # of the depth: where neighbours blend to more, they lie on two surfaces
 _POINTS_PER_FRAME = 1000  # 20 pairs of frames have enough for a median
 _SMOOTHED = 5  # frames, over which positions are averaged
+Pairs = Int[np.ndarray, "2 pairs"]  # of frames
 
 
 @dataclass(frozen=True)
@@ -95,21 +96,15 @@ class Comparison(NamedTuple):
 class FramePairs:
     """Pairs of frames that see much the same, to be read in one way or another."""
 
-    def __init__(
-        self,
-        recording: Recording,
-        ids: Frames,
-        sequence: RgbdSequence,
-        pairs: Int[np.ndarray, "2 pairs"],
-    ) -> None:
-        """Pairs are positions in the numbers of a recording's frames that have a pose; a sequence
-        of some of these, with depth values as in the files, holds those of the pairs."""
+    def __init__(self, recording: Recording, ids: Frames, kept: RgbdSequence, pairs: Pairs) -> None:
+        """Pairs are positions in the numbers of a recording's frames that have a pose; of these,
+        those of the pairs are kept, with depth values as in the files."""
         self.pairs = pairs
         self.file_poses = recording.file_poses[ids]
         self.order = recording.declared.quaternion
-        self.colors = sequence.colors
-        self.places = np.searchsorted(sequence.frame_ids, ids[pairs])
-        first, second = sequence.depths_mm[self.places]
+        self.colors = kept.colors
+        self.places = np.searchsorted(kept.frame_ids, ids[pairs])
+        first, second = kept.depths_mm[self.places]
         stride = math.ceil((math.prod(first.shape[1:]) / _POINTS_PER_FRAME) ** 0.5)
         self.columns, self.rows, self.values = on_grid(first, stride)
         self.inverse = 1 / torch.from_numpy(second[:, None].astype(np.float32))
