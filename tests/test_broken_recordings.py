@@ -14,7 +14,7 @@ import pytest
 from recordings import N_FRAMES, WRITERS, write_recording
 
 from nbtrack.cli import main
-from nbtrack.core.errors import DataError, NbtrackError
+from nbtrack.core.errors import NbtrackError
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.recording import open_recording
 
@@ -122,7 +122,7 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
     "replica": {
         "no rotation": (line("traj.txt", 1, SKEWED), "traj.txt frame 1 is no rigid transform"),
         "out of this world": (line("traj.txt", 1, FAR), "frame 1 is no .*1e.300.* t up to 1e.07"),
-        "a pose less": (line("traj.txt", 1), "traj.txt has 5 poses but there are 6 images"),
+        "a pose less": (line("traj.txt", 1), "5 poses but there are 6 im.*; remove what is odd"),
         "camera is a list": (text("../cam_params.json", "[1, 2]"), "readable JSON .*list"),
         "deep JSON": (text("../cam_params.json", "[" * 100_000), "readable JSON file"),
         "depth is a JPEG": (image("results/depth000002.png", THREE_CHANNELS), "png is uint8 of"),
@@ -240,14 +240,9 @@ def test_command(whole, tmp_path: Path, capfd, format: str) -> None:
     assert error.count("\n") == 1
 
 
-def test_files_of_the_system_and_images_too_many(tmp_path: Path) -> None:
-    """Catches hidden files that are taken for images, and advice that fits only one of two ways in
-    which images and poses may differ in number."""
+def test_files_of_the_system(tmp_path: Path) -> None:
+    """Catches hidden files that are taken for images."""
     folder = write_recording("replica", tmp_path / "r")
     for name in (".DS_Store", "._frame000001.jpg"):
         (folder / "results" / name).write_bytes(b"no image")
     assert len(open_recording(folder)) == N_FRAMES
-    rows = (folder / "traj.txt").read_text().splitlines()
-    (folder / "traj.txt").write_text("\n".join(rows[:-1]) + "\n")
-    with pytest.raises(DataError, match=r"5 poses but there are 6 images.*; remove what is odd"):
-        open_recording(folder)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.checks.conventions import PLAUSIBLE_DEPTH, Convention, diagnosis, fit_all
-from nbtrack.checks.misfits import MAX_SHIFT, MIN_CORRELATION, Misfit, find_misfits, told_misfit
+from nbtrack.checks.misfits import MAX_SHIFT, MIN_CORRELATION, Misfit, find_misfits, main_misfit
 from nbtrack.checks.readings import FramePairs, Pairs, Reading, on_grid
 from nbtrack.core.arrays import Frames, Poses
 from nbtrack.core.errors import DataError
@@ -68,7 +68,7 @@ class DataReport:
         found = _of_depth_images(self)
         needs_proof = self.is_whole and not any(found.values())
         misread = diagnosis(self.conventions, self.best, self.recording, needs_proof)
-        sentence = told_misfit(self.misfits) or misread
+        sentence = main_misfit(self.misfits) or misread
         found[sentence] = bool(sentence)
         if self.best is self.conventions[0]:
             found |= _of_poses_and_depths(self)
@@ -146,7 +146,7 @@ def _of_colors(report: DataReport) -> dict[str, bool]:
     """What may be wrong with the colour images, and whether it is."""
     frames = report.frames
     flicker = frames.flicker[frames.turned_deg < _SAME_VIEW_DEG].max()
-    is_elsewhere = report.correlation < MIN_CORRELATION and not told_misfit(report.misfits)
+    is_elsewhere = report.correlation < MIN_CORRELATION and not main_misfit(report.misfits)
     no_color = (
         "track without colour: --set tracking.lm.lambda_intensity=0, or "
         "tracking.sdf.lambda_color=0 for sdf"

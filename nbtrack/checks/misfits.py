@@ -81,7 +81,7 @@ class Misfit:
     gain: float  # the cost at the estimate, as a share of that as declared
 
     @property
-    def is_told(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether all of the interval is more than negligible, and frames agree better there."""
         negligible = self.parameter.negligible
         return (self.low > negligible or self.high < -negligible) and self.gain < _GAIN
@@ -89,7 +89,7 @@ class Misfit:
     def __str__(self) -> str:
         _, name, form, unit, *_ = self.parameter
         if not form:
-            return f"{name}: {'yes' if self.is_told else 'no'}"
+            return f"{name}: {'yes' if self.is_significant else 'no'}"
         return f"{name} {self.estimate:{form}} ({self.low:{form}} to {self.high:{form}}){unit}"
 
 
@@ -104,7 +104,7 @@ def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
     found = [*_estimates(_DEPTH_PARAMETERS, own, costs.of_depth)]
     unlike = costs.of_color(own)
     correlation = float(1 - np.nanmedian(unlike)) if np.isfinite(unlike).any() else math.nan
-    if not any(misfit.is_told for misfit in found):
+    if not any(misfit.is_significant for misfit in found):
         # What leaves them unlike is none: they are of another place.
         least = (1 - MIN_CORRELATION) / max(1e-9, 1 - correlation)
         colors = _estimates(_COLOR_PARAMETERS, own, costs.of_color)
@@ -112,13 +112,13 @@ def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
     return found, correlation
 
 
-def told_misfit(misfits: list[Misfit]) -> str:
-    """A sentence on the one that explains the most; empty where none is told."""
-    told = min((m for m in misfits if m.is_told), key=lambda m: m.gain, default=None)
-    if not told:
+def main_misfit(misfits: list[Misfit]) -> str:
+    """A sentence on the significant one that explains the most; empty where none is."""
+    main = min((m for m in misfits if m.is_significant), key=lambda m: m.gain, default=None)
+    if not main:
         return ""
-    advice = told.parameter.advice.format(factor=1 + told.estimate)
-    return f"{told}; without it frames differ {told.gain:.0%} as much: {advice}"
+    advice = main.parameter.advice.format(factor=1 + main.estimate)
+    return f"{main}; without it frames differ {main.gain:.0%} as much: {advice}"
 
 
 class _Costs:
@@ -127,18 +127,18 @@ class _Costs:
     def __init__(self, pairs: FramePairs, own: Reading) -> None:
         """See `find_misfits`."""
         self.pairs = pairs
-        apart, measured, counts, self.seen_at = pairs.compare(own)
-        relative = (apart / measured).abs()
-        self.scale = 3 * relative[counts].median()
-        self.agree = counts & (relative < self.scale)
+        residual, measured, is_valid, self.seen_at = pairs.compare(own)
+        relative = (residual / measured).abs()
+        self.scale = 3 * relative[is_valid].median()
+        self.agree = is_valid & (relative < self.scale)
 
     def of_depth(self, reading: Reading) -> Float[np.ndarray, "pairs"]:
         """Geman-McClure's of the differences; NaN of pairs that see little of the same."""
-        apart, measured, counts, _ = self.pairs.compare(reading)
-        square = (apart / measured / self.scale) ** 2
-        total = torch.where(counts, square / (1 + square), 0.0).sum(dim=1)
-        enough = counts.sum(dim=1) >= _MIN_OVERLAP * counts.shape[1]
-        return torch.where(enough, total / counts.sum(dim=1), torch.nan).numpy()
+        residual, measured, is_valid, _ = self.pairs.compare(reading)
+        square = (residual / measured / self.scale) ** 2
+        total = torch.where(is_valid, square / (1 + square), 0.0).sum(dim=1)
+        enough = is_valid.sum(dim=1) >= _MIN_OVERLAP * is_valid.shape[1]
+        return torch.where(enough, total / is_valid.sum(dim=1), torch.nan).numpy()
 
     def of_color(self, reading: Reading) -> Float[np.ndarray, "pairs"]:
         """1 - the correlation of intensities of points whose depths agree; exposures may differ.
