@@ -80,7 +80,7 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
     """
     numbers = read_numbers(path, (4, 8, 12, 16), _POSE_LINE)
     if numbers.shape[1] == 8:
-        return _from_quaternions(numbers, quaternion, path), in_seconds(numbers[:, 0])
+        return from_quaternions(numbers, quaternion, path), in_seconds(numbers[:, 0])
     if numbers.shape == (3, 4):
         numbers = numbers.reshape(1, 12)
     if numbers.shape[1] == 12:
@@ -90,7 +90,7 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times | Non
     return checked_poses(numbers.reshape(-1, 4, 4), path), None
 
 
-def _from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> Poses:
+def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> Poses:
     """Poses of rows with a timestamp, a position and a quaternion.
 
     NaN for a frame if a number is none, or its quaternion is zero, as tools write a lost frame.

@@ -20,12 +20,11 @@ github.com/PolyCam/polyform, README and `core/capture_folder.py`.
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import DepthImage, Poses
 from nbtrack.core.errors import DataError, MissingError
 from nbtrack.core.files import naming_damaged
-from nbtrack.data.text_files import Times, read_object
+from nbtrack.data.text_files import Times, from_quaternions, read_object
 from nbtrack.recordings.calibration import Calibration, calibration, camera_matrix
 from nbtrack.recordings.formats import FORMATS, Declaration, Format
 
@@ -45,11 +44,10 @@ def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times | None]:
     with naming_damaged(path, "Record3D metadata", _ADVICE):
         rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
         times = np.array(content.get("frameTimestamps", ()), dtype=np.float64)
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        poses[:, :3, :3] = Rotation.from_quat(rows[:, :4]).as_matrix()
-        poses[:, :3, 3] = rows[:, 4:]
-        is_timed = times.shape == (len(rows),) and np.isfinite(times).all()
-        return poses, times if is_timed else np.arange(len(rows)) / float(content["fps"])
+        if times.shape != (len(rows),) or not np.isfinite(times).all():
+            times = np.arange(len(rows)) / float(content["fps"])
+        rows = np.column_stack([times, rows[:, 4:], rows[:, :4]])
+        return from_quaternions(rows, "xyzw", path), times
 
 
 def _record3d_camera(path: Path) -> Calibration:
