@@ -114,6 +114,12 @@ LISTS = {
     "from 1, one lost, stamped": ((1, 2, 4, 5, 6), RUN, "plain", (0, 1, 3, 4, 5)),
     "one pose lost, stamped": (RUN, (0, 1, 2, 4, 5), "plain", (0, 1, 2, -1, 3, 4)),
     "stamps of one lost": ((0, 1, 3, 4, 5, 6), RUN, "plain", RUN),
+    "one pose lost, stamped, of a dataset": (
+        RUN,
+        (0, 1, 2, 4, 5),
+        "neural_rgbd",
+        (0, 1, 2, -1, 3, 4),
+    ),
     "others lost": (RUN, (0, 1, 2, 3, 4, 6), "plain", None),
     "out of order": (RUN, (0, 2, 1, 3, 4, 5), "plain", (0, 2, 1, 3, 4, 5)),
     "another clock": (RUN, (90, 92, 93, 94, 95, 99), "plain", RUN),
@@ -132,7 +138,11 @@ def listed(folder: Path, case: str) -> Recording:
         rename(folder / kind, [f"{i:06}" for i in numbers])
     if stamps is not None:
         times = np.array(stamps) / 30
-        (folder / "trajectory.txt").write_text(tum_lines(times, source().poses[: len(times)]))
+        name, axes = (
+            ("poses.txt", [1, -1, -1, 1]) if format == "neural_rgbd" else ("trajectory.txt", 1)
+        )
+        poses = source().poses[: len(times)] * axes
+        (folder / name).write_text(tum_lines(times, poses))
     elif format == "plain":
         (folder / "trajectory.txt").write_text(matrix_text(source().poses.reshape(-1, 16)))
     return open_recording(folder)

@@ -88,6 +88,7 @@ class Format:
     known_cameras: tuple[Calibration, ...] = ()  # without a file; `source` is in the folder's name
     declared: Declaration = Declaration()  # what its numbers mean
     counts_from_0: bool = False  # a number is the place of the frame's pose in a list
+    stamps_tell: bool = True  # whose a pose of a list is; else places alone do
     resize_color: bool = False  # colour has another size than depth and shows the same view
     # Own readers: of a file of poses, their quaternions' order given, with times (s) where it says
     # them; of a calibration; of a depth map in `depth_scale`, where that is no PNG or JPEG file.

@@ -170,7 +170,7 @@ class Moments:
         # Of two clocks equal counts alone prove nothing, unless stamps only count the lines.
         is_other_clock = self.own is not None and has_stamps and not _are_even(stamps[is_known])
         if not found and not is_other_clock:
-            is_stamped = has_stamps and not self.counts_from_0 and np.isfinite(stamps).all()
+            is_stamped = has_stamps and np.isfinite(stamps).all()
             found = self._by_number(poses, stamps if is_stamped else None)
         if found:
             return found

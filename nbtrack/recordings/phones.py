@@ -120,5 +120,6 @@ _FILES = ("metadata", "metadata.json")
 FORMATS["record3d"] = Format(
     "Record3D", color=("rgbd/*", "rgb/*"), depth=("rgbd/*.depth", "depth/*"), poses=_FILES,
     cameras=_FILES, declared=Declaration(camera_axes="opengl"), counts_from_0=True,
-    read_poses=_record3d_poses, read_camera=_record3d_camera, read_depth=_record3d_depth,
+    stamps_tell=False, read_poses=_record3d_poses, read_camera=_record3d_camera,
+    read_depth=_record3d_depth,
 )  # fmt: skip

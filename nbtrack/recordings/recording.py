@@ -171,6 +171,7 @@ def _with_poses(recording: Recording, moments: Moments, files: list[Path], path:
     if "*" in path.name:
         check_paired(recording.color_files, files)
     else:
+        stamps = stamps if recording.format.stamps_tell else None
         poses, note = moments.poses_of(path, poses, stamps, declared.turned_round)
         recording.notes.extend([f"{path.name}: {note}"] * bool(note))
     return replace(recording, times=times, file_poses=poses, pose_file=path)
