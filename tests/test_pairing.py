@@ -114,12 +114,7 @@ LISTS = {
     "from 1, one lost, stamped": ((1, 2, 4, 5, 6), RUN, "plain", (0, 1, 3, 4, 5)),
     "one pose lost, stamped": (RUN, (0, 1, 2, 4, 5), "plain", (0, 1, 2, -1, 3, 4)),
     "stamps of one lost": ((0, 1, 3, 4, 5, 6), RUN, "plain", RUN),
-    "one pose lost, stamped, of a dataset": (
-        RUN,
-        (0, 1, 2, 4, 5),
-        "neural_rgbd",
-        (0, 1, 2, -1, 3, 4),
-    ),
+    "one lost, stamped, of a dataset": (RUN, (0, 1, 2, 4), "neural_rgbd", (0, 1, 2, -1, 3, -1)),
     "others lost": (RUN, (0, 1, 2, 3, 4, 6), "plain", None),
     "out of order": (RUN, (0, 2, 1, 3, 4, 5), "plain", (0, 2, 1, 3, 4, 5)),
     "another clock": (RUN, (90, 92, 93, 94, 95, 99), "plain", RUN),
