@@ -150,6 +150,6 @@ def test_each_is_told_with_its_size(tmp_path: Path, name: str) -> None:
 def test_nothing_is_told_of_right_recordings(tmp_path: Path, name: str) -> None:
     """Catches false alarms, of real noise, exposure and calibration too: the bar is none, but that
     a room may not prove its pose file."""
-    for number, change in enumerate(SILENT.values()):
-        said = warnings_of(tmp_path / str(number), change(recorded(name)))
+    for case in SILENT if name in ("living_room", *REAL) else ["right"]:
+        said = warnings_of(tmp_path / case, SILENT[case](recorded(name)))
         assert [text for text in said if name in REAL or "is not proved" not in text] == []
