@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from nbtrack import METHODS, load_preset, make_tracker, open_scenes, read_sequence
-from nbtrack.beyond.correct import correct_map
+from nbtrack.beyond.correction import correct_map
 from nbtrack.beyond.observed import draw_points
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.files import tables_folder

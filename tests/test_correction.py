@@ -10,8 +10,7 @@ from box_room import BoxRoom, Formula, box_sequence
 from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond import LmSettings, LmTracker
-from nbtrack.beyond.correct import correct_map
-from nbtrack.beyond.correction import CorrectedField, corrected
+from nbtrack.beyond.correction import CorrectedField, correct_map, corrected
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.least_squares import (
     Equations,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from tiny import TINY
 
-from nbtrack.beyond.correct import correct_map
+from nbtrack.beyond.correction import correct_map
 from nbtrack.core.errors import ConfigError, NbtrackError
 from nbtrack.core.files import fingerprint
 from nbtrack.core.settings import changed_settings, flat, with_settings

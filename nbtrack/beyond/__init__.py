@@ -1,8 +1,7 @@
 """What goes beyond the paper: fields, trackers and methods that join as a user's own file does."""
 
 import nbtrack.beyond.methods  # joins the registry
-from nbtrack.beyond.correct import correct_map
-from nbtrack.beyond.correction import CorrectedField
+from nbtrack.beyond.correction import CorrectedField, correct_map
 from nbtrack.beyond.feature_grid import GridPlusField
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.icp import IcpSettings, IcpTracker

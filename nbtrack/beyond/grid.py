@@ -34,7 +34,7 @@ class BakedField(Field):
     # larger residuals are down-weighted in second-order tracking. Our choice, for small networks.
     residual_sigma: tuple[float, float] = (0.02, 0.05)
     inlier_distance: float = 0.05  # m from its surface within which a point fits
-    intensity_mad: float = np.inf  # median residual of luma at what was mapped, where known
+    intensity_mad: float = 0.02  # median residual of luma at what was mapped; a guess where unknown
     T_world_cameras: Float[Tensor, "cameras 4 4"] | None = None  # some that mapped it
 
     @torch.no_grad()

@@ -1,9 +1,9 @@
 """LM: second-order steps on signed distance and colour at observed points, and restarts."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from enum import Enum
+from functools import partial
 
 import numpy as np
 import torch
@@ -42,7 +42,6 @@ _MAX_FOLLOWING = 20
 _SAME = 0.01  # rad, m; another descent that ends so near a pose confirms it
 _LARGEST_INNOVATION = 1.0  # rad, m; of a pose where the frame before led to none
 _ROUNDING = 0.25 / 255  # median that 256 grey levels leave; no intensity is more accurate
-_UNKNOWN_MAD = 0.02  # of intensities, where the map does not say how accurate they are
 _MIN_CONTRAST = 0.01  # standard deviation of a picture that is not dark, covered or overexposed
 _RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
 # Where a map has views, a lost camera is looked for where the views most like the frame were taken,
@@ -52,14 +51,6 @@ _RANDOM = 1000  # poses, of which the cheapest `_TRIED` are kept
 _RANDOM_STD = 0.3  # m, of their offsets from where a view was taken
 _TRIED = 20
 _TRIED_STEPS = 6
-
-
-class Search(Enum):
-    """What the search for a frame's pose is at."""
-
-    FOLLOWING = "the descent from where the motion model expects the camera"
-    LOOKING = "other descents, as the pose found is in doubt"
-    DONE = "nothing is left to try"
 
 
 @dataclass(frozen=True)
@@ -127,115 +118,105 @@ class LmTracker(Tracker):
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
         R = starts[:, :3, :3]
         R[:] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
-        self.frame = frame
-        self.expected = starts
-        self.best = None
-        self.steps = 0
+        self.T_start, self.best, self.search = starts[0], None, iter(())
+        observed = draw_points(frame, self.settings.n_pixels, self.generator)
+        n_points = len(observed.points)
+        self.is_converged = n_points < _MIN_POINTS
+        if self.is_converged:
+            return
         # Poses that a right one is near: after a lost frame the last good one, if there was any.
         n_good = int(self.last_good is not None)
         self.trusted = starts[len(starts) - n_good :] if self.was_lost else starts
-        observed = draw_points(frame, self.settings.n_pixels, self.generator)
-        n_points = len(observed[0])
-        self.others: list[Pose] | None = None  # starts elsewhere, once they are looked for
-        self.search = Search.FOLLOWING if n_points >= _MIN_POINTS else Search.DONE
-        if self.is_converged:
-            return
-        n_coarse = max(_MIN_COARSE, n_points // _COARSE_SHARE)
-        self.points = with_normals(frame, observed, n_coarse), observed
-        has_contrast = observed[1].std() > _MIN_CONTRAST  # else the picture says nothing
+        some = with_normals(frame, observed, max(_MIN_COARSE, n_points // _COARSE_SHARE))
+        has_contrast = observed.intensity.std() > _MIN_CONTRAST  # else the picture says nothing
         self.weight = self.settings.lambda_intensity if has_contrast else 0.0
-        descents = [self._descent_from(T) for T in starts]
+        self.descent_from = partial(LmOptimizer, self.grid, some, observed, self.weight)
+        descents = [self.descent_from(T) for T in starts]
         if np.abs(starts - starts[0]).max() > _FAR_APART:
             for descent in descents:
                 descent.run_stage(_MAX_COARSE_STEPS)
         self.best = _by_cost(descents)[0]
-
-    @property
-    def is_converged(self) -> bool:
-        """Whether further steps would change nothing."""
-        return self.search is Search.DONE
+        self.search = self._steps(frame, starts[-1])
 
     def step(self) -> float:
         """One step of Levenberg-Marquardt, or one descent elsewhere; returns the cost before it."""
-        if self.search is Search.DONE:
-            return float("nan")
-        if self.search is Search.LOOKING:
-            before = self.best.cost(NEAR_SCALES)
-            self.relocalise()
-            return before
-        before = self.best.step()
-        self.steps += 1
-        if self.steps == _MAX_FOLLOWING:
-            self.best.run()
-        elif self.best.is_ended and not self.best.is_finished:
-            self.best.refine()
-        if self.best.is_finished or self.steps == _MAX_FOLLOWING:
-            self.verdict = self._judge(self.best)
-            is_sure = self.verdict["p_lost"] < _DOUBTFUL or not self.settings.n_restarts
-            self.search = Search.DONE if is_sure else Search.LOOKING
-        return before
+        return next(self.search, float("nan"))
 
     @property
     def T_world_camera(self) -> Transform:
         """The estimate so far; without points, the first start."""
-        return torch.from_numpy(self.expected[0] if self.best is None else self.best.T_world_camera)
+        return torch.from_numpy(self.best.T_world_camera if self.best else self.T_start)
 
     def report(self) -> dict[str, float | bool]:
-        """Inliers, stds, condition number, the probability of a wrong pose, and the verdict."""
+        """What a descent says of its pose, and how likely that makes it a wrong one: the verdict.
+
+        These are the inliers, standard deviations, the condition number and what `p_lost` takes.
+        """
         if self.best is None:
             return {"inlier_ratio": 0.0, "p_lost": 1.0, "lost": True}
-        return self._judge(self.best) if self.search is Search.FOLLOWING else self.verdict
-
-    def _judge(self, descent: LmOptimizer) -> dict[str, float | bool]:
-        """What a descent says of its pose, and how likely that makes it a wrong one."""
-        said = descent.certainty()
-        mad = self.field.intensity_mad
-        usual_mad = max(mad if np.isfinite(mad) else _UNKNOWN_MAD, _ROUNDING)
-        changes = np.linalg.inv(self.trusted) @ descent.T_world_camera - np.eye(4)
-        innovation = np.abs(changes).max(axis=(1, 2)).min(initial=_LARGEST_INNOVATION)
+        said = self.best.certainty()
+        usual_mad = max(self.field.intensity_mad, _ROUNDING)
+        innovation = _apart(self.trusted, self.best.T_world_camera)
         said |= {
             "intensity_ratio": said["intensity_mad"] / usual_mad if self.weight else 1.0,
-            "last_step": 0.0 if descent.is_finished else float(descent.last_step),
-            "innovation": float(innovation),
+            "last_step": 0.0 if self.best.is_finished else float(self.best.last_step),
+            "innovation": float(innovation.min(initial=_LARGEST_INNOVATION)),
         }
         probability = p_lost(said)
         return {**said, "p_lost": probability, "lost": probability >= _LOST}
 
-    def _descent_from(self, T_start: Pose) -> LmOptimizer:
-        return LmOptimizer(self.grid, *self.points, self.weight, T_start)
+    def _steps(self, frame: Frame, T_expected: Pose) -> Iterator[float]:
+        """Steps of the best descent, then other descents while its pose is in doubt.
 
-    def relocalise(self) -> None:
-        """One more descent; what it finds takes over if it is clearly better."""
-        if self.others is None:
-            others = self._other_starts()  # all are tried where nothing is known of the camera
-            self.others = others[: self.settings.n_restarts] if len(self.trusted) else others
-        descent = self._descent_from(self.others.pop(0))
+        Gives the cost before each of them.
+        """
+        for number in range(1, _MAX_FOLLOWING + 1):
+            cost = self.best.step()
+            if number == _MAX_FOLLOWING:
+                self.best.run()
+            elif self.best.is_ended and not self.best.is_finished:
+                self.best.refine()
+            if self.best.is_finished:
+                break
+            if number < _MAX_FOLLOWING:
+                yield cost
+        max_p_lost, others = _DOUBTFUL, None
+        while self.settings.n_restarts and others != [] and self.report()["p_lost"] >= max_p_lost:
+            yield cost
+            cost = self.best.cost(NEAR_SCALES)
+            others = self._other_starts(frame, T_expected) if others is None else others
+            max_p_lost = _LOST if self._relocalise(others.pop(0)) else _DOUBTFUL
+        self.is_converged = True
+        yield cost
+
+    def _relocalise(self, T_start: Pose) -> bool:
+        """Whether one more descent ends at the pose; what it finds takes over if clearly better."""
+        descent = self.descent_from(T_start)
         descent.run()
-        is_confirmed = _distance(descent, self.best) < _SAME
+        is_confirmed = _apart(descent.T_world_camera, self.best.T_world_camera) < _SAME
         if descent.cost(NEAR_SCALES) < _CLEARLY * self.best.cost(NEAR_SCALES):
             self.best = descent
-        self.verdict = self._judge(self.best)
-        is_sure = self.verdict["p_lost"] < (_LOST if is_confirmed else _DOUBTFUL)
-        self.search = Search.DONE if is_sure or not self.others else Search.LOOKING
+        return bool(is_confirmed)
 
-    def _other_starts(self) -> list[Pose]:
-        """Where else the camera may be, the likeliest first."""
-        anchor = self.expected[-1] if self.last_good is None else self.last_good.numpy()
+    def _other_starts(self, frame: Frame, T_expected: Pose) -> list[Pose]:
+        """Where else the camera may be, the likeliest first; all that can be thought of where no
+        pose is trusted."""
+        anchor = T_expected if self.last_good is None else self.last_good.numpy()
+        n_restarts = self.settings.n_restarts
         if self.field.views is None:
             # The last good pose itself, then turned about x, y and z both ways, and wider.
-            turns = [way * axis for axis in np.eye(6)[:3] for way in (1, -1)]
-            wider = [
-                factor * turn for factor in range(1, self.settings.n_restarts) for turn in turns
-            ]
-            twists = [np.zeros(6), *(_RESTART_ANGLE * np.array(wider))]
-            return [retract(anchor, twist) for twist in twists]
-        cameras = self.field.T_world_cameras.double().numpy()
-        alike = retrieve(view_of(self.frame), self.field.views, cameras, _ALIKE)
-        random = [self._descent_from(T) for T in self._random_poses(cameras)]
-        tried = [self._descent_from(T) for T in (anchor, *alike)] + _by_cost(random)[:_TRIED]
-        for descent in tried:
-            descent.run_stage(_TRIED_STEPS)
-        return [descent.T_world_camera for descent in _by_cost(tried)]
+            turns = _RESTART_ANGLE * np.kron(np.eye(6)[:3], [[1], [-1]])
+            twists = (factor * turn for factor in range(1, n_restarts) for turn in turns)
+            starts = [anchor, *(retract(anchor, twist) for twist in twists)]
+        else:
+            cameras = self.field.T_world_cameras.double().numpy()
+            alike = retrieve(view_of(frame), self.field.views, cameras, _ALIKE)
+            random = [self.descent_from(T) for T in self._random_poses(cameras)]
+            tried = [self.descent_from(T) for T in (anchor, *alike)] + _by_cost(random)[:_TRIED]
+            for descent in tried:
+                descent.run_stage(_TRIED_STEPS)
+            starts = [descent.T_world_camera for descent in _by_cost(tried)]
+        return starts[:n_restarts] if len(self.trusted) else starts
 
     def _random_poses(self, T_world_cameras: Poses) -> Poses:
         """Where else a camera may be: near the known ones, turned about the vertical they share."""
@@ -250,11 +231,10 @@ class LmTracker(Tracker):
 
 
 def _by_cost(descents: Sequence[LmOptimizer]) -> list[LmOptimizer]:
-    """LmOptimizers in the order of their robust costs, all at equal scales."""
-    return sorted(descents, key=lambda d: d.cost(_WIDE_SCALES)) if descents[1:] else [*descents]
+    """Descents in the order of their robust costs, all at equal scales."""
+    return sorted(descents, key=lambda descent: descent.cost(_WIDE_SCALES))
 
 
-def _distance(first: LmOptimizer, second: LmOptimizer) -> float:
-    """How far two descents' poses are apart (rad or m, whichever is more)."""
-    change = np.linalg.inv(first.T_world_camera) @ second.T_world_camera - np.eye(4)
-    return float(np.abs(change).max())
+def _apart(T_first: Pose | Poses, T_second: Pose) -> np.ndarray:
+    """How far poses are from another one (rad or m, whichever is more)."""
+    return np.abs(np.linalg.inv(T_first) @ T_second - np.eye(4)).max(axis=(-2, -1))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nbtrack import provenance
-from nbtrack.beyond.correct import correct_map
+from nbtrack.beyond.correction import correct_map
 from nbtrack.beyond.grid import checked_size
 from nbtrack.core.device import choose_device
 from nbtrack.core.files import fingerprint
