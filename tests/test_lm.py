@@ -125,7 +125,7 @@ def test_without_restarts_no_hypotheses_are_evaluated(monkeypatch: pytest.Monkey
     known = BakedField(narrow_room(), 0.04)
     known.T_world_cameras = torch.eye(4)[None]
     tracker = LmTracker(known, T_TRUE, StepBudget(1), LmSettings(n_restarts=0))
-    monkeypatch.setattr(tracker, "_other_starts", lambda: pytest.fail("evaluated"))
+    monkeypatch.setattr(tracker, "_other_starts", lambda *_: pytest.fail("evaluated"))
     assert run(tracker, retract(T_TRUE, FAR), 200)
     assert tracker.is_converged
 

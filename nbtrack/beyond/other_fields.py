@@ -41,6 +41,7 @@ class VolSdfField(NeuSField):
 
     name = "volsdf"
     label = "VolSDF"
+    weighs_sections = False
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
         """Weights of samples, from the density that belongs to the signed distance."""

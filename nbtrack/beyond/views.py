@@ -71,21 +71,14 @@ def retrieve(view: View, views: Views, T_world_camera: Poses, n: int) -> Poses:
 
     Each is turned about the camera's x and y as it fits best.
     """
-    seen = view.float()
-    known = views.float()
-    unlikeness = []
-    turns = []
-    for across in _TURNS_ACROSS:
-        for down in _TURNS_DOWN:
-            here = _moved(seen, down, across)
-            there = _moved(known, -down, -across)
-            unlikeness.append(_unlikeness(here, there))
-            turns.append(_STEP * np.array([down, -across, 0.0]))
-    least, turn = torch.stack(unlikeness).min(dim=0)
-    order = least.argsort()[:n].numpy()
+    turns = [(down, across) for across in _TURNS_ACROSS for down in _TURNS_DOWN]
+    here, there = view.float(), views.float()
+    unlikeness = [_unlikeness(_moved(here, *t), _moved(there, -t[0], -t[1])) for t in turns]
+    minimum, best = torch.stack(unlikeness).min(dim=0)
+    order = minimum.argsort()[:n].numpy()
+    rotations = _STEP * np.array([[down, -across, 0.0] for down, across in turns])
     poses = T_world_camera[order].copy()
-    turned = Rotation.from_rotvec(np.stack(turns)[turn[order].numpy()]).as_matrix()
-    poses[:, :3, :3] = poses[:, :3, :3] @ turned
+    poses[:, :3, :3] @= Rotation.from_rotvec(rotations[best[order].numpy()]).as_matrix()
     return poses
 
 

@@ -24,18 +24,13 @@ class SceneBounds:
         return (np.array(self.minimum) + np.array(self.maximum)) / 2
 
     @property
-    def half_longest_side(self) -> float:
-        """As a unit (m) it maps the box into [-1, 1]^3 without changing its shape."""
-        return float((np.array(self.maximum) - np.array(self.minimum)).max() / 2)
-
-    @property
     def metres_per_unit(self) -> float:
         """The unit of the map: networks see coordinates in it, and Adam moves a camera by it.
 
         It is the declared one, else half of the longest side, as NeuS and the Neural RGB-D dataset
         normalise their scenes to about [-1, 1]^3.
         """
-        return self.declared_unit or self.half_longest_side
+        return self.declared_unit or float(np.subtract(self.maximum, self.minimum).max() / 2)
 
     def far_bound(self, origins_world: Points, directions_world: Points) -> Values:
         """Where rays from inside leave the box, in units of the direction (z-depth, m, for z = 1).

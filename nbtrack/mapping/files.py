@@ -48,13 +48,9 @@ class Map:
     @cached_property
     def key(self) -> str:
         """Twelve hexadecimal digits that change with the field, its bounds and its weights."""
-        plain = [
-            self.field.name,
-            self.field.form,
-            self.record["network"],
-            asdict(self.field.bounds),
-        ]
-        return _digest(plain, _tensors(self.field))[:12]
+        field, network = self.field, self.record["network"]
+        plain = [field.name, field.form, network, asdict(field.bounds)]
+        return _digest(plain, _tensors(field))[:12]
 
 
 def write_map(path: Path, finished: Map) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from nbtrack.core.arrays import Pose, Poses
+from nbtrack.core.arrays import Poses
 from nbtrack.core.errors import DataError
 
 Errors = Float[np.ndarray, "frames"]
@@ -77,13 +77,7 @@ def pose_errors(T_estimated: Poses, T_true: Poses) -> tuple[Errors, Errors]:
 
 
 def align_rigidly(points: Positions, targets: Positions) -> Positions:
-    """Points (m) after `rigid_motion` to their targets."""
-    T_target_points = rigid_motion(points, targets)
-    return points @ T_target_points[:3, :3].T + T_target_points[:3, 3]
-
-
-def rigid_motion(points: Positions, targets: Positions) -> Pose:
-    """The rotation and translation (m) that bring points closest to their targets.
+    """Points (m) after the rotation and translation that bring them closest to their targets.
 
     Least squares, without scale. Where points lie on a line the best rotation is not unique, but
     the distances that remain are. Source: Horn 1987 and Umeyama 1991, by SVD.
@@ -91,11 +85,8 @@ def rigid_motion(points: Positions, targets: Positions) -> Pose:
     center, target_center = points.mean(axis=0), targets.mean(axis=0)
     u, _, vt = np.linalg.svd((targets - target_center).T @ (points - center))
     # The best orthogonal matrix may be a mirror; flipping the weakest axis makes it a rotation.
-    T_target_points = np.eye(4)
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    T_target_points[:3, :3] = rotation
-    T_target_points[:3, 3] = target_center - rotation @ center
-    return T_target_points
+    return points @ rotation.T + (target_center - rotation @ center)
 
 
 def _root_mean_square(values: Errors) -> float:

@@ -10,20 +10,14 @@ Kingma & Ba 2015, Sec. 2.1 (the bound of a step).
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Poses
 from nbtrack.tracking.metrics import trajectory_metrics
 from nbtrack.tracking.starts import expected_poses
 
-
-@dataclass(frozen=True)
-class Motion:
-    """What is left for the search of every frame but the first, from where it starts."""
-
-    position: Float[np.ndarray, "frames 3"]  # m, along the axes of the world
-    orientation: Float[np.ndarray, "frames 3"]  # rad, a rotation vector
+Motions = Float[np.ndarray, "frames 3"]  # m, along the axes of the world; or rad, rotation vectors
 
 
 @dataclass(frozen=True)
@@ -33,10 +27,10 @@ class Reach:
     position: float  # m, along an axis of the world
     orientation: float  # rad
 
-    def is_exceeded(self, motion: Motion) -> Float[np.ndarray, "frames"]:
+    def is_exceeded(self, offsets: Motions, turns: Motions) -> Bool[np.ndarray, "frames"]:
         """Whether the camera moves or turns farther than that, a flag a frame."""
-        too_far = np.abs(motion.position).max(axis=1) > self.position
-        return too_far | (np.abs(motion.orientation).max(axis=1) > self.orientation)
+        too_far = np.abs(offsets).max(axis=1) > self.position
+        return too_far | (np.abs(turns).max(axis=1) > self.orientation)
 
 
 def reach(steps: float, rate: float) -> float:
@@ -48,14 +42,19 @@ def reach(steps: float, rate: float) -> float:
     return steps * rate
 
 
-def motion_of(T_world_camera: Poses, motion_model: str = "previous_pose") -> Motion:
-    """The motion that a path leaves to the search, where every frame before was found exactly."""
+def motion_of(
+    T_world_camera: Poses, motion_model: str = "previous_pose"
+) -> tuple[Motions, Motions]:
+    """Offsets and turns that a path leaves to the search of every frame but the first.
+
+    Every frame before is taken to be found exactly.
+    """
     offsets, turns = np.zeros((2, len(T_world_camera) - 1, 3))
     for k, T_true in enumerate(T_world_camera[1:]):
         T_start = _nearest_start(motion_model, [*T_world_camera[max(0, k - 1) : k + 1]], T_true)
         offsets[k] = T_true[:3, 3] - T_start[:3, 3]
         turns[k] = Rotation.from_matrix(T_start[:3, :3].T @ T_true[:3, :3]).as_rotvec()
-    return Motion(offsets, turns)
+    return offsets, turns
 
 
 def best_follower(
@@ -94,7 +93,7 @@ def reach_metrics(
     metrics = {"reach_m": reach.position, "reach_deg": float(np.degrees(reach.orientation))}
     if not np.isfinite(T_world_camera).all() or len(T_world_camera) < 2:
         return metrics
-    exceeded = reach.is_exceeded(motion_of(T_world_camera, motion_model))
+    exceeded = reach.is_exceeded(*motion_of(T_world_camera, motion_model))
     least_m = least_ate(T_world_camera, reach.position, motion_model)
     return {**metrics, "beyond_reach_share": float(exceeded.mean()), "least_ate_m": least_m}
 
