@@ -1,5 +1,6 @@
 """The corrected field: better at surfaces that were measured, as before elsewhere; in a file."""
 
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -13,11 +14,10 @@ from nbtrack.beyond import LmSettings, LmTracker
 from nbtrack.beyond.correction import CorrectedField, correct_map, corrected
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.least_squares import (
-    Equations,
-    add_equations,
     corrected_vertices,
     interpolation,
     regularisation_of,
+    solve,
 )
 from nbtrack.beyond.views import retrieve, spread_out, view_of
 from nbtrack.core.errors import DataError
@@ -47,12 +47,17 @@ def sequence() -> RgbdSequence:
     return box_sequence(poses, ROOM, 96)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_points() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nbtrack.beyond.correction._N_POINTS", 40_000)
+        yield
+
+
 @pytest.fixture(scope="module")
 def found(sequence: RgbdSequence) -> CorrectedField:
     dark = Formula(wavy, ROOM.bounds, lambda points: 0.8 * ROOM.color(points))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbtrack.beyond.correction._N_POINTS", 40_000)
-        return corrected(dark, sequence, np.arange(12), VOXEL)
+    return corrected(dark, sequence, np.arange(12), VOXEL)
 
 
 def errors(field: Formula | CorrectedField) -> tuple[float, float]:
@@ -88,9 +93,7 @@ def test_the_same_data_give_the_same_corrections(
     found: CorrectedField, sequence: RgbdSequence
 ) -> None:
     """Catches draws that follow no seed. Frames without any surface are reported."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbtrack.beyond.correction._N_POINTS", 40_000)
-        again = corrected(found.source, sequence, np.arange(12), VOXEL)
+    again = corrected(found.source, sequence, np.arange(12), VOXEL)
     assert torch.equal(found.corrections, again.corrections)
     sequence = box_sequence([[0.0, 0.0, 0.0]], ROOM)
     sequence.depths_mm[:] = 0
@@ -108,41 +111,37 @@ def test_weights_of_interpolation(found: CorrectedField) -> None:
     np.testing.assert_allclose(values, expected, atol=1e-5)
 
 
-def test_equations_are_summed_as_sparse_products() -> None:
-    """Catches a product in a wrong entry of the matrix, a neighbour beyond the grid's border that
-    comes back at the other side, and weights that count twice or not at all."""
-    shape, rng, huber = (5, 4, 6), np.random.default_rng(1), 0.1
+def test_the_solution_is_that_of_dense_least_squares() -> None:
+    """Catches weights that count twice or not at all, a vertex in another's column, and a minimum
+    that is not one: of two columns, whose larger residual decides on a row's weight."""
+    shape, rng, huber = (5, 4, 6), np.random.default_rng(1), 0.3
     corners = np.array([*np.ndindex(2, 2, 2)])
     cells = np.vstack([rng.integers(0, [4, 3, 5], size=(40, 3)), [[0, 0, 0], [3, 2, 4]]])
     vertices = np.ravel_multi_index((cells[:, None] + corners).transpose(2, 0, 1), shape)
-    numbers, columns = corrected_vertices(vertices, shape)
-    springs, slots = regularisation_of(numbers, shape)
+    numbers, matrix = corrected_vertices(vertices, rng.random((42, 8)), shape)
+    springs, dense = regularisation_of(numbers, shape), matrix.toarray()
     np.testing.assert_allclose(springs.toarray(), springs.toarray().T)
-    dense, weights = np.zeros((42, len(numbers))), rng.random((42, 8))
-    np.put_along_axis(dense, columns, weights, axis=1)
     wanted, reliability = rng.normal(size=(42, 2)), rng.random(42)
-    solution = rng.normal(size=(len(numbers), 2))
-    matrix, vectors = springs.copy(), np.zeros_like(solution)
-    equations = Equations(columns, weights, wanted, reliability)
-    add_equations(equations, huber, solution, slots, matrix.data, vectors)
-    largest = np.abs(wanted - dense @ solution).max(axis=1)
-    weighted = dense * (reliability * huber / largest.clip(huber))[:, None]
-    np.testing.assert_allclose(matrix.toarray(), dense.T @ weighted + springs.toarray())
-    np.testing.assert_allclose(vectors, weighted.T @ wanted)
+    expected = np.zeros((len(numbers), 2))
+    for _ in range(3):
+        largest = np.abs(wanted - dense @ expected).max(axis=1)
+        weighted = dense * (reliability * huber / largest.clip(huber))[:, None]
+        hessian = dense.T @ weighted + springs.toarray()
+        expected = np.linalg.solve(hessian, weighted.T @ wanted)
+    found, diagonal = solve(matrix, wanted, reliability, springs, huber, 3)
+    np.testing.assert_allclose(found, expected, atol=0.01)
+    np.testing.assert_allclose(diagonal, hessian.diagonal(), rtol=0.01)
 
 
 def test_regularisation_by_hand() -> None:
     """Catches springs across edges and corners of cells: two vertices of a row, one of another."""
-    springs, _ = regularisation_of(np.array([0, 1, 7]), (2, 2, 2))
+    springs = regularisation_of(np.array([0, 1, 7]), (2, 2, 2))
     expected = [[0.7, -0.1, 0.0], [-0.1, 0.7, 0.0], [0.0, 0.0, 0.7]]
     np.testing.assert_allclose(springs.toarray(), expected)
 
 
-def test_a_file_keeps_it_whole(
-    tmp_path: Path, sequence: RgbdSequence, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_keeps_it_whole(tmp_path: Path, sequence: RgbdSequence) -> None:
     """Catches corrections lost or rounded on the way to disk and back, and a wrong size."""
-    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 10_000)
     network = NetworkSettings(width=16)
     field = make_field("neus", network, ROOM.bounds, seed=0).eval().requires_grad_(False)
     made = {"field": "neus", "network": vars(network), "seconds": 0.0, "seed": 0}
@@ -227,17 +226,14 @@ def test_colours_are_those_of_the_surface(found: CorrectedField, sequence: RgbdS
     """Catches colours that are smeared along normals, as where they are asked for off the surface
     too, or that are as stiff as distances: an eightieth of the error would be left."""
     grey = Formula(wavy, ROOM.bounds)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbtrack.beyond.correction._N_POINTS", 40_000)
-        assert errors(corrected(grey, sequence, np.arange(12), VOXEL))[1] < errors(grey)[1] / 150
+    assert errors(corrected(grey, sequence, np.arange(12), VOXEL))[1] < errors(grey)[1] / 150
 
 
 def test_the_minimum_scales_follow_the_sensor(
-    found: CorrectedField, sequence: RgbdSequence, monkeypatch: pytest.MonkeyPatch
+    found: CorrectedField, sequence: RgbdSequence
 ) -> None:
     """Catches a tracker that takes a noisy camera's residuals for outliers, or a good one's for
     noise: 5.5 medians of normal noise are 3.7 of its standard deviations."""
-    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 40_000)
     assert found.residual_sigma == pytest.approx((0.01, 0.05))  # nearly exact: no less than these
     noise = np.random.default_rng(0).normal(scale=6.0, size=sequence.depths_mm.shape)
     noisy = replace(sequence, depths_mm=(sequence.depths_mm + noise).astype(np.uint16))
