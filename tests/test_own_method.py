@@ -6,30 +6,26 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from unittest import mock
 
 import nbformat
 import pytest
-import torch
 from nbconvert.preprocessors import ExecutePreprocessor
 from tiny import TINY, tiny_words
 
 import nbtrack
 from nbtrack import experiments
 from nbtrack.cli import main
-from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError, NbtrackError
 from nbtrack.core.files import runs_folder
 from nbtrack.core.settings import with_settings
 from nbtrack.experiments.methods import METHODS, Method, method_of
 from nbtrack.experiments.presets import load_preset
-from nbtrack.fields import FIELDS, NetworkSettings, NeusMapping, field_class
-from nbtrack.fields.mlp import FourierMlp
-from nbtrack.mapping.files import write_map
+from nbtrack.fields import FIELDS, NeusMapping
 from nbtrack.tracking import TRACKERS, tracker_class
 
 OWN = '''
@@ -68,29 +64,6 @@ FIELDS["fading"] = FadingField
 TRACKERS["distance"] = DistanceTracker
 nbtrack.METHODS["mine"] = nbtrack.Method("Mine", "fading", "distance")
 '''
-
-
-@pytest.fixture
-def own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The file, imported as any other; what it adds is taken away afterwards."""
-    (tmp_path / "own_method.py").write_text(OWN)
-    monkeypatch.syspath_prepend(tmp_path)
-    importlib.import_module("own_method")
-    yield
-    del FIELDS["fading"], TRACKERS["distance"], METHODS["mine"], sys.modules["own_method"]
-
-
-def test_a_row_in_both_tables(own_file: None, tmp_path: Path) -> None:
-    """Catches an extension that needs more than its own file: presets, layouts, registries."""
-    assert OWN.count("\n") <= 40
-    words = tiny_words(
-        "tables.rates_hz=[10]", "tracking.distance.n_pixels=8", "mapping.fading.decay=0.1",
-        "mapping.fading.iterations=6", "mapping.fading.n_rays=8",
-    )  # fmt: skip
-    words += ["--scenes", "office", "--workers", "1", "--out", str(tmp_path / "out")]
-    assert main(["tables", "--method", "sdf,mine", *words]) == 0
-    assert (tmp_path / "out/table_1.csv").read_text().count("Mine,office") == 1
-    assert "DISTANCE,8," in (tmp_path / "out/table_2.csv").read_text()
 
 
 @pytest.fixture
@@ -150,8 +123,10 @@ def nbtrack_there(folder: Path, *words: str) -> subprocess.CompletedProcess:
 def test_a_file_joins_by_an_option_of_every_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    """Catches a user's file that some command, or a worker process, does not know; a map of its
-    field that can be read only where it was made, and a command that does not make a run again."""
+    """Catches an extension that needs more than its own file: presets, layouts, registries; a file
+    that some command, or a worker process, does not know; a map of its field that can be read only
+    where it was made, and a command that does not make a run again."""
+    assert OWN.count("\n") <= 40
     (tmp_path / "own").mkdir()
     (tmp_path / "own/my-method.py").write_text("from helper import *\n" + OWN)
     (tmp_path / "own/helper.py").write_text("")
@@ -159,11 +134,13 @@ def test_a_file_joins_by_an_option_of_every_command(
     words = [
         *tiny_words("tables.rates_hz=[10]", "mapping.fading.iterations=6", "scenes.n_frames=3"),
         "--set", "mapping.fading.n_rays=8", "--set", "network.neus.width=16",
+        "--set", "tracking.distance.n_pixels=8", "--set", "mapping.fading.decay=0.1",
     ]  # fmt: skip
     grid = ["--method", "mine", "--workers", "2", "--scenes", "office,bedroom", "--out", "out"]
     done = nbtrack_there(tmp_path, "tables", *own, *grid, *words)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out/table_1.csv").read_text().count("Mine,") == 2
+    assert "DISTANCE,8," in (tmp_path / "out/table_2.csv").read_text()
     (made,) = (tmp_path / "runs/maps").glob("office-fading-*")
     run = ["track", "office", "--map-from", str(made), "--steps", "1", "--out", "run", *words]
     monkeypatch.chdir(tmp_path)
@@ -239,40 +216,26 @@ class Mine(Base):
 """
 
 
-def in_a_cell(source: str) -> type:
-    """The tracker, from a module without a file."""
-    module = ModuleType("cell")
-    exec(compile(source, "<cell>", "exec"), module.__dict__)
-    return module.Mine
-
-
-def test_settings_of_what_is_registered_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_of_a_tracker_whenever_it_is_registered(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches settings that only a preset loaded afterwards knows, or that a class written anew, as
-    a cell run again does, loses."""
-    preset = with_settings(load_preset("smoke"), "tracking.sdf.lambda_sdf=3.0")
-    monkeypatch.setitem(TRACKERS, "mine", in_a_cell(CELL))
+    a cell run again does, loses; and a class that loses its own defaults: smoke asks fewer pixels
+    of all, and no other motion model."""
+
+    @dataclass(frozen=True)
+    class Settings(TRACKERS["sdf"].Settings):
+        motion_model: str = "constant_velocity"
+        extra: float = 0.5
+
+    preset = load_preset("smoke", settings=["tracking.sdf.lambda_sdf=3.0"])
+    monkeypatch.setitem(TRACKERS, "mine", type("Mine", (TRACKERS["sdf"],), {"name": "mine"}))
     once = with_settings(preset, "tracking.mine.n_pixels=7")
     assert once.tracking_of("mine").n_pixels == 7
     assert once.tracking_of("mine").lambda_sdf == 1.0  # the user's value is of `sdf` alone
-    more = "class Settings(SdfSettings):\n        extra: float = 0.5"
-    more = CELL.replace('name = "mine"', f'name = "mine"\n    @dataclass(frozen=True)\n    {more}')
-    monkeypatch.setitem(TRACKERS, "mine", in_a_cell("from dataclasses import dataclass\n" + more))
-    again = with_settings(once, "tracking.mine.extra=2.0")
-    assert again.tracking_of("mine").extra == 2.0
-    assert again.tracking_of("mine").n_pixels == 7
-
-
-def test_settings_do_not_depend_on_when_a_class_is_registered(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Catches sizes of a preset that miss what was registered before the presets were made, and a
-    class that loses its own defaults: smoke asks fewer pixels of all, and no other motion model."""
-    own = CELL.replace('name = "mine"', 'name, Settings = "mine", Own')
-    own = own.replace("class Mine", "@dataclass(frozen=True)\nclass Own(SdfSettings):\n"
-                      '    motion_model: str = "constant_velocity"\nclass Mine')  # fmt: skip
-    monkeypatch.setitem(TRACKERS, "mine", in_a_cell("from dataclasses import dataclass\n" + own))
-    settings = load_preset("smoke").tracking_of("mine")
-    assert (settings.n_pixels, settings.motion_model) == (512, "constant_velocity")
+    anew = type("Mine", (TRACKERS["sdf"],), {"name": "mine", "Settings": Settings})
+    monkeypatch.setitem(TRACKERS, "mine", anew)
+    again = with_settings(once, "tracking.mine.extra=2.0").tracking_of("mine")
+    assert (again.extra, again.n_pixels, again.motion_model) == (2.0, 7, "constant_velocity")
+    assert load_preset("smoke").tracking_of("mine").n_pixels == 512
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
@@ -306,67 +269,35 @@ def test_settings_of_a_field_whenever_it_is_registered(
     assert "did you mean" not in str(caught.value)
 
 
-@pytest.mark.parametrize("registry", [FIELDS, TRACKERS])
-def test_a_class_without_a_name(registry: dict, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a traceback where a class says no name."""
-    monkeypatch.setitem(registry, "mine", type("Mine", (), {}))
-    look_up_class = field_class if registry is FIELDS else tracker_class
-    with pytest.raises(ConfigError, match="'mine' lacks name"):
-        look_up_class("mine")
+class Nameless(nbtrack.LearnedField):
+    name = "mine"
 
 
-def test_a_class_is_registered_by_its_own_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a subclass without a name of its own: its map would be read as its base's."""
-    monkeypatch.setitem(FIELDS, "tanh", FIELDS["neus"])
-    with pytest.raises(ConfigError, match="calls itself 'neus'"):
-        field_class("tanh")
+class Blank(nbtrack.Field):
+    name, label, surface_level, is_distance = "mine", "Blank", 0.0, False
+
+    def forward(self, points_world):
+        return points_world, points_world[:, 0]
 
 
-def test_what_an_own_class_needs_is_public() -> None:
-    """Catches a class of one's own that must look into modules, or set up what only a private
-    function can: a field with another network starts as the distance inside its room."""
-
-    class Mine(FIELDS["neus"]):
-        name = "mine"
-
-        def make_network(self, settings, generator):
-            self.made = FourierMlp(settings, self.bounds, torch.relu, generator)
-            return self.made
-
-    assert issubclass(Mine, nbtrack.LearnedField)
-    assert issubclass(nbtrack.LearnedField, nbtrack.Field)
-    assert issubclass(TRACKERS["sdf"], nbtrack.AdamTracker)
-    assert (nbtrack.FIELDS, nbtrack.TRACKERS) == (FIELDS, TRACKERS)
-    assert nbtrack.write_map is write_map
-    box = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-    mine = Mine(NetworkSettings(width=64), box, torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        distance = mine(torch.tensor([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]]))[1]
-    assert mine.mlp is mine.made
-    assert distance[0] > 0.3
-    assert abs(distance[1] - 0.1) < 0.15
-
-
-def test_classes_that_lack_something(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("registry", "kind", "says"),
+    [
+        (FIELDS, type("Mine", (), {}), "'mine' lacks name"),
+        (TRACKERS, type("Mine", (), {}), "'mine' lacks name"),
+        (FIELDS, FIELDS["neus"], "calls itself 'neus'"),  # its map would be read as its base's
+        (FIELDS, Nameless, "'mine' lacks label, forward, mapping_losses, weights: give them to"),
+        (FIELDS, Blank, "no tracker works on field 'mine'"),
+    ],
+)
+def test_classes_that_lack_something(
+    registry: dict, kind: type, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches an AttributeError in the middle of a command, and a StopIteration where no tracker of
     the package's works in an own field."""
-
-    class Nameless(nbtrack.LearnedField):
-        name = "nameless"
-
-    class Blank(nbtrack.Field):
-        name, label, surface_level, is_distance = "blank", "Blank", 0.0, False
-
-        def forward(self, points_world):
-            return points_world, points_world[:, 0]
-
-    monkeypatch.setitem(FIELDS, "nameless", Nameless)
-    monkeypatch.setitem(FIELDS, "blank", Blank)
-    lacks = "'nameless' lacks label, forward, mapping_losses, weights: give them to"
-    with pytest.raises(ConfigError, match=lacks):
-        field_class("nameless")
-    with pytest.raises(ConfigError, match="no tracker works on field 'blank'"):
-        method_of(None, "blank", None)
+    monkeypatch.setitem(registry, "mine", kind)
+    with pytest.raises(ConfigError, match=says):
+        tracker_class("mine") if registry is TRACKERS else method_of(None, "mine", None)
 
 
 def test_a_broken_plug_in(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
@@ -379,67 +310,53 @@ def test_a_broken_plug_in(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     assert said in capsys.readouterr().err
 
 
-def test_terms_that_change(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches torch's words about sizes where a loss has a term only now and then."""
-
-    class Mine(FIELDS["neus"]):
-        name, calls = "mine", 0
-
-        def mapping_losses(self, draw, settings, generator):
-            self.calls += 1
-            terms = super().mapping_losses(draw, settings, generator)
-            return terms if self.calls < 4 else {"color": terms["color"]}
-
-    monkeypatch.setitem(FIELDS, "mine", Mine)
-    preset = load_preset(settings=[*TINY, "scenes.names=['office']"])
-    (scene,) = nbtrack.open_scenes(preset)
-    with pytest.raises(ConfigError, match="gave color after depth, color, eikonal: give the same"):
-        nbtrack.map_scene(scene, "mine", preset)
-
-
 def test_a_place_too_large_for_a_correction() -> None:
     """Catches a refusal after minutes of mapping, and one that names no setting."""
-    settings = [*TINY, "scenes.names=['office']", "correction.neus_plus=0.001"]
-    preset = load_preset(settings=settings)
+    place = ("scenes.names=['office']", "correction.neus_plus=0.001")
+    preset = load_preset(settings=[*TINY, *place])
     (scene,) = nbtrack.open_scenes(preset)
     with pytest.raises(ConfigError, match=r"correction.neus_plus is 0.001 m.* set correction.neus"):
         nbtrack.map_scene(scene, "neus_plus", preset)
     assert not [*(runs_folder() / "maps").glob("*/map*")]
 
 
-def test_a_loss_without_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches torch's words about sparse tensors where a field returns the sum of its terms."""
+@pytest.mark.parametrize(
+    ("spoilt", "says"),
+    [
+        (lambda terms, calls: sum(terms.values()), "mapping_losses of mine gave no dict"),
+        (
+            lambda terms, calls: terms if calls < 4 else {"color": terms["color"]},
+            "gave color after depth, color, eikonal: give the same",
+        ),
+    ],
+)
+def test_losses_that_are_no_terms(
+    spoilt: Callable, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches torch's words about sizes or sparse tensors where a field returns the sum of its
+    terms, or a term only now and then."""
 
     class Mine(FIELDS["neus"]):
-        name = "mine"
+        name, calls = "mine", 0
 
         def mapping_losses(self, draw, settings, generator):
-            return sum(super().mapping_losses(draw, settings, generator).values())
+            self.calls += 1
+            return spoilt(super().mapping_losses(draw, settings, generator), self.calls)
 
     monkeypatch.setitem(FIELDS, "mine", Mine)
     preset = load_preset(settings=[*TINY, "scenes.names=['office']"])
-    with pytest.raises(ConfigError, match="mapping_losses of mine gave no dict"):
+    with pytest.raises(ConfigError, match=says):
         nbtrack.map_scene(nbtrack.open_scenes(preset)[0], "mine", preset)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "says"),
-    [
-        ({"rates_hz": 10}, "rates_hz = 10 is no list"), ({"seeds": 3}, "seeds = 3 is no list"),
-        ({"methods": "huber"}, "methods = 'huber' is no list"), ({"frames": 30}, "'30' is no"),
-        ({"scenes": "office"}, "scenes = 'office' is no list"),
-        ({"methods": METHODS["sdf"]}, "is no list"),
-    ],
-)  # fmt: skip
-def test_one_thing_in_place_of_several(wrong: dict, says: str) -> None:
+def test_one_thing_in_place_of_several() -> None:
     """Catches a number that cannot be looped over, and letters taken for names of methods."""
     preset = load_preset(settings=[*TINY, "scenes.names=['office']"])
     right = {"scenes": nbtrack.open_scenes(preset), "methods": ["sdf"], "preset": preset}
-    with pytest.raises(NbtrackError) as caught:
-        nbtrack.track_scenes(**right | wrong)
+    for name, wrong in {"rates_hz": 10, "seeds": 3, "methods": "huber", "scenes": "office"}.items():
+        with pytest.raises(NbtrackError, match=f"^{name} = {wrong!r} is no list: write"):
+            nbtrack.track_scenes(**right | {name: wrong})
     assert not (runs_folder() / "maps").exists()
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_method_in_a_notebook(tmp_path: Path) -> None:
