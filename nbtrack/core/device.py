@@ -21,20 +21,16 @@ if hasattr(os, "register_at_fork"):  # a child has none of OpenMP's threads, and
 def choose_device() -> torch.device:
     """The device that `NBTRACK_DEVICE` names, else the accelerator there is, else the CPU.
 
-    Raises ConfigError if the named device is unknown, or not there.
+    Raises ConfigError, saying what there is, if the named device is unknown, or not there.
     """
-    if name := os.environ.get("NBTRACK_DEVICE"):
-        return named_device(name)
-    return torch.accelerator.current_accelerator(check_available=True) or torch.device("cpu")
-
-
-def named_device(name: str) -> torch.device:
-    """A device by its name. Raises ConfigError, saying what there is, if it is not there."""
+    kind = torch.accelerator.current_accelerator(check_available=True)
+    name = os.environ.get("NBTRACK_DEVICE")
+    if not name:
+        return kind or torch.device("cpu")
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()  # which a device without memory cannot say
     except (RuntimeError, AssertionError, NotImplementedError, ImportError):
-        kind = torch.accelerator.current_accelerator(check_available=True)
         there = ["cpu", *(f"{kind}:{i}" for i in range(torch.accelerator.device_count()))]
         raise ConfigError(f"no device {name!r}: this machine has {', '.join(there)}") from None
     return device

@@ -176,15 +176,12 @@ class Tracker(abc.ABC):
         for name in self.remembers:
             setattr(self, name, state[name])
 
-    def _begin(self, frame: Frame, T_starts: Poses) -> None:
-        self.begin(frame.to(self.device), torch.from_numpy(T_starts))
-
     def _search(self, frame: Frame, T_starts: Poses, budget: Budget) -> Estimate:
         if not self._is_warm and frame.has_depth:
             # Steps that count nowhere: first calls load, allocate and record for a second or more.
             state = self.state()
             self._is_warm = True
-            self._begin(frame, T_starts[:1])
+            self.begin(frame.to(self.device), torch.from_numpy(T_starts[:1]))
             for _ in range(CALLS_BEFORE_RECORDING + 1):
                 if not self.is_converged:
                     self.step()
@@ -193,7 +190,7 @@ class Tracker(abc.ABC):
             synchronize(self.device)
         began = time.perf_counter()
         allowed = budget.frame(self.device)
-        self._begin(frame, T_starts)
+        self.begin(frame.to(self.device), torch.from_numpy(T_starts))
         steps = 0
         loss = float("nan")
         for step in allowed:
