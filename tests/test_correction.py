@@ -15,7 +15,6 @@ from nbtrack.beyond.correction import CorrectedField, correct_map, corrected
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.least_squares import (
     corrected_vertices,
-    interpolation,
     regularisation_of,
     solve,
 )
@@ -99,16 +98,6 @@ def test_the_same_data_give_the_same_corrections(
     sequence.depths_mm[:] = 0
     with pytest.raises(DataError, match="shows no surface to correct a map by: check its depth"):
         corrected(found.source, sequence, np.arange(1), VOXEL)
-
-
-def test_weights_of_interpolation(found: CorrectedField) -> None:
-    """Catches corners in another order than the grid's: the mean of vertices must be its answer."""
-    points = (2 * np.random.default_rng(0).random((50, 3)) - 1) * [0.9, 0.5, 0.9]
-    vertices, weights = interpolation(points, found)
-    np.testing.assert_allclose(weights.sum(axis=1), 1)
-    expected = found(torch.from_numpy(points).float())[1]
-    values = (found.volume[3].numpy()[vertices] * weights).sum(axis=1)
-    np.testing.assert_allclose(values, expected, atol=1e-5)
 
 
 def test_the_solution_is_that_of_dense_least_squares() -> None:

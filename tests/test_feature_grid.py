@@ -7,7 +7,7 @@ import torch
 from test_neus_plus import slanted_wall
 from torch import Generator
 
-from nbtrack.beyond.feature_grid import FeatureGrid, GridNetwork, GridPlusField, GridPlusMapping
+from nbtrack.beyond.feature_grid import FeatureGrid, GridNetwork, GridPlusMapping
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError
 from nbtrack.experiments.presets import load_preset
@@ -15,21 +15,6 @@ from nbtrack.mapping.files import read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 
 BOX = SceneBounds((-1.0, -0.5, 0.0), (1.0, 0.5, 3.0))
-
-
-def test_gradient_is_that_of_finite_differences() -> None:
-    """Catches a gradient in units of cells, or of one axis for another's: poses move along it."""
-    field = GridPlusField(GridNetwork(), BOX, Generator().manual_seed(0)).double()
-    points = torch.rand(50, 3, generator=Generator().manual_seed(1)).double() * 0.9 + 0.05
-    points = (points - torch.tensor([0.5, 0.5, 0.0])).requires_grad_()
-    (gradient,) = torch.autograd.grad(field(points)[1].sum(), points)
-    step = 1e-6 * torch.eye(3, dtype=torch.float64)
-    with torch.no_grad():
-        ahead, behind = (
-            torch.stack([field(points + sign * axis)[1] for axis in step], dim=1)
-            for sign in (1, -1)
-        )
-    torch.testing.assert_close(gradient, (ahead - behind) / 2e-6, atol=1e-5, rtol=1e-5)
 
 
 def test_levels_by_hand() -> None:

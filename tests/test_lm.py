@@ -40,7 +40,7 @@ def errors(tracker: LmTracker) -> tuple[float, float]:
     return error_m, error_deg
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(8))
 def test_every_start_in_the_basin_reaches_the_true_pose(seed: int) -> None:
     """Catches wrong steps, a basin that got smaller, and a bias: the distance here is exact.
 
@@ -95,18 +95,6 @@ def test_a_hopeless_start_is_followed_by_restarts_from_the_last_good_pose() -> N
     resumed.restore(before.state())
     assert not run(resumed, turned, 200)
     assert errors(resumed)[0] < 0.01
-
-
-def test_a_report_changes_nothing() -> None:
-    """Catches a verdict that another one, asked for before, has changed."""
-    tracker = begun()
-    tracker.begin(FRAME, torch.from_numpy(T_TRUE)[None])
-    tracker.step()
-    before = tracker.state()
-    assert tracker.report() == tracker.report()
-    after = tracker.state()
-    assert before["last_good"] is after["last_good"] is None
-    assert before["was_lost"] is after["was_lost"] is False
 
 
 def test_a_restart_forgets_the_past() -> None:

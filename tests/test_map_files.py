@@ -77,47 +77,31 @@ def test_a_file_is_small_and_always_the_same(sound: Path, tmp_path: Path) -> Non
     assert (tmp_path / "full").stat().st_size < 1.1e6
 
 
-NAN, INFINITE, GONE = float("nan"), float("inf"), object()
+NAN, GONE = float("nan"), object()
 WEIGHT = "mlp.layer_2.weight"
 OTHER, CHANGED = "is not a readable map file", "is not what was written"
 # What a file may hold in place of a map: a part of its header or a tensor, and what it is instead.
 # Where something else than the digest must tell, the file has one that is right.
 MAP_CONTENT: dict[str, tuple[str, Any, str]] = {
     "a later version": ("format_version", 5, "format 5; this nbtrack reads 4"),
-    "no version": ("format_version", GONE, "format None"),
-    "a word for a version": ("format_version", "new", "format 'new'"),
     "unknown field": ("field", "nerf", "field 'nerf', which is not registered: import the file"),
     "field of another kind": ("field", [3], OTHER),
     "another field": ("field", "points", OTHER),
-    "no weights": ("all weights", GONE, "Missing key"),
     "a weight less": ("mlp.head.bias", GONE, "Missing key"),
-    "whole numbers for weights": (WEIGHT, lambda w: w.int(), CHANGED),
     "other shape": (WEIGHT, lambda w: w[:3].contiguous(), "size mismatch"),
     "changed weights": (WEIGHT, lambda w: w + 1e-6, CHANGED),
-    "changed origin": ("made/scene", "floor", CHANGED),
     "other width": ("made/network/width", 17, "size mismatch"),
-    "giant width": ("made/network/width", 10**9, CHANGED),
     "width as text": ("made/network/width", "16", OTHER),
     "unknown setting": ("made/network/depth", 9, "unexpected keyword"),
     "one corner": ("bounds", [[0.0, 0.0, 0.0]], "TypeError"),
-    "empty bounds": ("bounds", [[0.0] * 3, [0.0] * 3], CHANGED),
-    "NaN bounds": ("bounds", [[NAN] * 3, [1.0] * 3], CHANGED),
-    "infinite bounds": ("bounds", [[0.0] * 3, [INFINITE] * 3], CHANGED),
     "no camera": ("camera", {}, "KeyError"),
-    "camera without size": ("camera/width", 0, CHANGED),
-    "NaN camera": ("camera/fx", NAN, CHANGED),
-    "misfit in words": ("made/misfit_m", "little", CHANGED),
     "no provenance": ("made", {}, "KeyError"),
     "no digest": ("digest", GONE, CHANGED),
     # With a digest that is right.
-    "no origin": ("made/origin", GONE, "KeyError"),
     "origin of two": ("made/origin", [0.0, 0.0], "a number of its header"),
-    "origin in words": ("made/origin", ["a", "b", "c"], "a number of its header"),
     "seconds of NaN": ("made/seconds", NAN, "a number of its header"),
-    "no seconds": ("made/seconds", GONE, "KeyError"),
     "a scene of control characters": ("made/scene", "a\x1b[2Jb", "can be printed"),
     "a corner of NaN": ("bounds", [[NAN, 0.0, 0.0], [1.0] * 3], "a number of its header"),
-    "a camera of NaN": ("camera/fx", NAN, "a number of its header"),
     "weights of NaN": (WEIGHT, lambda w: w * NAN, "is not finite"),
 }
 
@@ -131,9 +115,7 @@ def test_map_content(case: str, sound: Path) -> None:
         tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
     *outer, name = place.split("/")
     part = tensors if place in tensors else reduce(dict.get, outer, header)
-    if place == "all weights":
-        tensors = {}
-    elif value is GONE:
+    if value is GONE:
         del part[name]
     else:
         part[name] = value(part[name]) if callable(value) else value
@@ -167,21 +149,13 @@ def _torch_file(content: Any) -> bytes:
 
 MAP_BYTES: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda sound: b"",
-    "text": lambda sound: b"a map\n",
-    "zeros": lambda sound: bytes(4096),
     "half": lambda sound: sound[: len(sound) // 2],
-    "without its end": lambda sound: sound[:-30],
-    "beginning lost": lambda sound: sound[100:],
-    "bytes flipped": lambda s: s[:9000] + bytes(255 - b for b in s[9000:9100]) + s[9100:],
     "a bit flipped": lambda s: s[:-90] + bytes([s[-90] ^ 1]) + s[-89:],
     "an endless header": lambda sound: b"\xff" * 8 + sound[8:],
     "another's header": lambda sound: save({"a": torch.ones(3)}, {"format": "pt"}),
-    "no header": lambda sound: save({"a": torch.ones(3)}),
     "a header that is no JSON": lambda sound: save({}, {"nbtrack map": "{"}),
     "a header that is a list": lambda sound: save({}, {"nbtrack map": "[1, 2]"}),
-    "an archive": lambda sound: _torch_file(Bomb())[:-5],
     "a pickled bomb": lambda sound: pickle.dumps(Bomb()),
-    "a saved bomb": lambda sound: _torch_file({"format": "nbtrack map", "field": Bomb()}),
     "a zipped bomb": lambda sound: _torch_file(Bomb()),
 }
 
@@ -262,8 +236,7 @@ def test_trajectories(work: Path) -> None:
     np.testing.assert_allclose(np.loadtxt("kitti").reshape(-1, 3, 4), expected, atol=1e-15)
 
 
-@pytest.mark.parametrize("source", ["map", "room"])
-@pytest.mark.parametrize("kind", ["ply", "glb"])
+@pytest.mark.parametrize(("source", "kind"), [("map", "ply"), ("room", "glb")])
 def test_meshes_keep_their_colours(work: Path, source: str, kind: str) -> None:
     """Catches meshes that come out grey, empty, or on another side of the world."""
     assert main(["export", source, "--to", kind, f"mesh.{kind}"]) == 0

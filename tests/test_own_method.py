@@ -192,27 +192,22 @@ def test_a_file_that_cannot_be_imported(
     assert "Traceback" in capsys.readouterr().err
 
 
-# What a notebook's cells may hold: constants and helpers, a base class, decorators, settings.
+# What a notebook's cells may hold: constants, helpers, a base class, decorators.
 CELL = """
 import torch
-from nbtrack.tracking import SdfTracker, SdfSettings
-HALF = 0.5
+from nbtrack.tracking import SdfTracker
 KINDS = {"a", "b", "c", "d"}
 def halved(x):
-    return x * HALF
+    return x * 0.5
 class Base(SdfTracker):
     @property
     def speed(self):
-        "How fast."
         return [halved(x) for x in (1, 2)]
 class Mine(Base):
     name = "mine"
-    @classmethod
-    def works_in(cls, field):
-        return super().works_in(field) and "neus" in {"neus", "volsdf", "points"}
     @torch.no_grad()
     def report(self):
-        return {kind: 1.0 for kind in KINDS}
+        return {kind: self.speed[0] for kind in KINDS}
 """
 
 

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from nbtrack.beyond.grid import BakedField
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
 from nbtrack.core.settings import with_values
-from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.tracking import (
     ClockBudget,
@@ -89,17 +88,6 @@ def test_the_fewest_samples_move_the_camera(n_samples: tuple[int, int]) -> None:
     assert np.abs(found.T_estimated[0, :3, 3]).max() > 1e-3
     with pytest.raises(ConfigError, match="n_stratified"):
         with_values(SETTINGS["vr"], {"n_stratified": 1})
-
-
-def test_one_step_of_adam_moves_by_the_learning_rates() -> None:
-    """Catches swapped or scaled rates: Adam's first step is the rate, in each coordinate."""
-    tracker = tracker_of("sdf", 1)
-    tracker.begin(box_sequence([[0.05, 0.04, 0.03]])[0], torch.eye(4)[None])
-    tracker.step()
-    rate = 5e-4 * tracker.field.bounds.metres_per_unit
-    assert tracker.position.detach().abs().tolist() == pytest.approx([rate] * 3, rel=1e-3)
-    assert tracker.q_wxyz.detach()[1:].abs().tolist() == pytest.approx([1e-3] * 3, rel=1e-2)
-    assert tracker.q_wxyz.norm().item() == pytest.approx(1.0, abs=1e-6)
 
 
 def test_colour_alone() -> None:
@@ -199,20 +187,6 @@ def test_a_grid_is_tracked_in_by_one_thread() -> None:
     grid = BakedField(BoxRoom(), 0.2)
     grid.source = torch.nn.Linear(3, 512)
     assert make_tracker("sdf", grid, np.eye(4), StepBudget(1)).field.width == 0
-
-
-def test_the_frame_is_copied_within_its_time() -> None:
-    """Catches images on their way to a device that cost no time, and the clock of another device
-    than the tracker's."""
-    events, tracker, sequence = [], tracker_of("sdf", 1), walk(2)
-    tracker.track(sequence[0])
-    begin, frames = tracker.budget.frame, Frame.to
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Frame, "to", lambda *a: events.append("copied") or frames(*a))
-        recorded = lambda device: events.append(device) or begin(device)  # noqa: E731
-        patch.setattr(tracker.budget, "frame", recorded)
-        tracker.track(sequence[1])
-    assert events == [tracker.device, "copied"]
 
 
 @pytest.mark.parametrize("name", ["vr", "sdf"])
