@@ -85,7 +85,7 @@ def test_terms_and_sums_are_the_formulas(field: BakedField, is_fine: bool) -> No
     sines = (turn - turn.T)[[2, 0, 1], [1, 2, 0]] / 2
     A = H + 4 * np.eye(6) + 0.1 * np.diag(H.diagonal())
     twist = -np.linalg.solve(A, b + 4 * np.concatenate([sines, t - START[:3, 3]]))
-    np.testing.assert_allclose(damped_step(*equations, START, POSE, 0.1), twist, atol=1e-4)
+    np.testing.assert_allclose(damped_step(problem, POSE, terms, scales, 0.1), twist, atol=1e-4)
 
 
 def test_scales_only_fall() -> None:

@@ -13,7 +13,7 @@ from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.lm_optimizer import NEAR_SCALES, LmOptimizer
 from nbtrack.beyond.lm_residuals import grid_of
 from nbtrack.beyond.lm_solver import retract
-from nbtrack.beyond.observed import draw_points, with_normals
+from nbtrack.beyond.observed import Observed, draw_points, with_normals
 from nbtrack.beyond.verdict import p_lost
 from nbtrack.beyond.views import retrieve, view_of
 from nbtrack.core.arrays import Pose, Poses, Transform, Transforms
@@ -93,6 +93,10 @@ class LmTracker(Tracker):
         grid = field if isinstance(field, BakedField) else BakedField(field, self.settings.voxel)
         grid = grid if grid.device.type == "cpu" else deepcopy(grid).cpu()
         self.grid = grid_of(grid)
+        # Loads what numba has compiled, the inner functions before those that call them: sums would
+        # else be rounded otherwise in the process that compiles than in later ones.
+        point = Observed(np.zeros((1, 3)), np.zeros(1), np.empty((0, 3)))
+        LmOptimizer(self.grid, point, point, 1.0, np.eye(4)).certainty()
         return grid
 
     def restart_anywhere(self) -> None:

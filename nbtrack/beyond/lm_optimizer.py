@@ -8,7 +8,6 @@ from jaxtyping import Float
 from nbtrack.beyond.lm_residuals import Grid, Problem, residual_terms
 from nbtrack.beyond.lm_solver import (
     PRIOR_WEIGHT,
-    damped_step,
     normal_equations,
     point_costs,
     robust_cost,
@@ -67,12 +66,9 @@ class LmOptimizer:
 
     def step(self) -> float:
         """One step, taken or refused; returns the robust cost before it."""
-        problem, T = self.problem, self.T_world_camera
-        # Called one by one: where one compiled function calls another, its sums may be rounded
-        # otherwise once numba has both on disk.
-        equations = normal_equations(self.terms, self.scales, problem.lambda_intensity)
-        twist = damped_step(*equations, problem.T_start, T, self.damping)
-        step = try_step(problem, T, self.terms, self.scales, twist, self.twist)
+        step = try_step(
+            self.problem, self.T_world_camera, self.terms, self.scales, self.damping, self.twist
+        )
         self.T_world_camera, self.terms, self.twist = step.T_world_camera, step.terms, step.twist
         self.last_step = step.length
         if step.is_better:

@@ -126,8 +126,10 @@ def retract(T, twist):
 
 @no_type_check
 @compiled
-def damped_step(matrix, vector, T_start, T, damping):
-    """The twist (6,) that solves the damped normal equations of data and prior, in their place."""
+def damped_step(problem, T, terms, scales, damping):
+    """The twist (6,) that solves the damped normal equations of data and prior."""
+    matrix, vector = normal_equations(terms, scales, problem.lambda_intensity)
+    T_start = problem.T_start
     for k in range(3):
         i, j = (k + 2) % 3, (k + 1) % 3
         turned = 0.0
@@ -152,8 +154,8 @@ def damped_step(matrix, vector, T_start, T, damping):
 
 @no_type_check
 @compiled
-def try_step(problem, T, terms, scales, twist, last_twist):
-    """A step of a twist from a pose with its terms, after a step of `last_twist` (0 at first).
+def try_step(problem, T, terms, scales, damping, last_twist):
+    """A step from a pose with its terms, after a step of `last_twist` (0 at first).
 
     Steps that creep, each hardly shorter than the last one, are a geometric series: first its
     limit is tried (Aitken 1926), so far as `_MAX_RATIO` allows.
@@ -161,6 +163,7 @@ def try_step(problem, T, terms, scales, twist, last_twist):
     From cell to cell of a grid gradients jump, and reliabilities: in the fine stage a pose is no
     worse for that. But at first, from afar, the gradient tells that a surface is near.
     """
+    twist = damped_step(problem, T, terms, scales, damping)
     before = robust_cost(terms.residuals, terms.reliability, scales, problem.lambda_intensity)
     along, length = (twist * last_twist).sum(), (last_twist * last_twist).sum()
     does_creep = along > _MIN_RATIO * length and along**2 > 0.5 * length * (twist * twist).sum()
