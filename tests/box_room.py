@@ -35,7 +35,6 @@ class Formula(LearnedField):
     ) -> None:
         super().__init__(bounds)
         self.value, self.color, self.as_density = value, color, as_density
-        self.weighs_sections = not as_density
 
     def forward(self, points_world: Tensor) -> tuple[Tensor, Tensor]:
         return self.color(points_world), self.value(points_world)

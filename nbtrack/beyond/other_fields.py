@@ -41,7 +41,6 @@ class VolSdfField(NeuSField):
 
     name = "volsdf"
     label = "VolSDF"
-    weighs_sections = False
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
         """Weights of samples, from the density that belongs to the signed distance."""

@@ -104,11 +104,10 @@ class LearnedField(Field):
     """
 
     Network: type = NetworkSettings
-    weighs_sections: bool = False  # whether `weights` are those of sections between two samples
 
     @abc.abstractmethod
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
-        """Probabilities that rays end at samples at ascending z-depths (m), or in the sections."""
+        """Probabilities that rays end at samples at ascending z-depths (m), or between two."""
 
     @abc.abstractmethod
     def mapping_losses(self, draw: Draw, settings: MappingSettings, generator: Generator) -> Losses:
@@ -133,7 +132,7 @@ class LearnedField(Field):
         NeuS evaluates the network there once more).
         """
         weights = self.weights(values, rays, depths)
-        if self.weighs_sections:
+        if weights.shape != depths.shape:
             colors, depths = ((ends[:, 1:] + ends[:, :-1]) / 2 for ends in (colors, depths))
         return rendering.composite(weights, colors, depths)
 
@@ -197,7 +196,7 @@ class LearnedField(Field):
         answers = self.query_along(rays, coarse)
         with torch.no_grad():
             weights = self.weights(answers[1], rays, coarse)
-            if self.weighs_sections:  # both ends of one get a share
+            if weights.shape != coarse.shape:  # of sections: both ends of one get a share
                 weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
             fine = rendering.importance_depths(coarse, weights, n_importance, generator)
         return coarse, answers, fine

@@ -38,7 +38,6 @@ class NeuSField(LearnedField):
     label = "NeuS"
     surface_level = 0.0
     Settings = NeusMapping
-    weighs_sections = True
 
     def __init__(self, network: NetworkSettings, bounds: SceneBounds, generator: Generator) -> None:
         super().__init__(bounds)
