@@ -1,6 +1,7 @@
 """The provenance of results: what keys of the cache are made of besides settings and data."""
 
 import ast
+import contextlib
 import importlib.metadata
 import importlib.util
 import platform
@@ -20,11 +21,9 @@ _COMPUTING = (
 )  # fmt: skip
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp")  # that compute results beside torch
 _LIBRARIES = ("nbtrack", "torch", "abc", "typing", "builtins")  # what own classes are built on
-_LIBRARY_FOLDERS = "stdlib", "platstdlib", "purelib", "platlib"
 _INSTALLED = (
-    *(sysconfig.get_path(name) for name in _LIBRARY_FOLDERS),
-    *site.getsitepackages(),
-    site.getusersitepackages(),
+    *map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")),
+    *(*site.getsitepackages(), site.getusersitepackages()),
 )
 
 
@@ -60,31 +59,20 @@ def own_code(packages: set[str]) -> dict[str, str]:
         if is_own and file.endswith(".py") and Path(file).is_file():
             texts[name] = Path(file).read_text("utf-8")
     for cell in getattr(sys.modules["__main__"], "In", []):
-        texts |= definitions(cell)
+        with contextlib.suppress(SyntaxError):  # of a cell that ended with an error
+            for statement in ast.parse(cell).body:
+                texts |= _definition(statement)
     return texts
 
 
-def definitions(cell: str) -> dict[str, str]:
-    """The classes, functions and constants that a cell of a notebook defines, by name."""
-    try:
-        statements = ast.parse(cell).body
-    except SyntaxError:  # it ended with an error when it was executed
-        return {}
-    found = {}
-    for statement in statements:
-        if isinstance(statement, ast.ClassDef | ast.FunctionDef):
-            found[statement.name] = ast.unparse(statement)
-        elif isinstance(statement, ast.Assign) and _is_literal(statement.value):
-            found[ast.unparse(statement.targets[0])] = ast.unparse(statement)
-    return found
-
-
-def _is_literal(value: ast.expr) -> bool:
-    try:
-        ast.literal_eval(value)
-    except ValueError:
-        return False
-    return True
+def _definition(statement: ast.stmt) -> dict[str, str]:
+    """The class, the function or the constant that a statement defines, by its name."""
+    if isinstance(statement, ast.ClassDef | ast.FunctionDef):
+        return {statement.name: ast.unparse(statement)}
+    is_constant = isinstance(statement, ast.Assign) and not any(
+        isinstance(node, ast.Name) for node in ast.walk(statement.value)
+    )
+    return {ast.unparse(statement.targets[0]): ast.unparse(statement)} if is_constant else {}
 
 
 def versions() -> dict[str, str]:

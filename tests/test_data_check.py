@@ -385,11 +385,12 @@ def test_command_prints_the_sentence_and_draws(tmp_path: Path, capsys) -> None:
     assert "start with: track " in printed
     assert (tmp_path / "out/check.png").stat().st_size > 5000
     assert sorted(folder.rglob("*")) == before
-    again = ["data", "check", str(folder), "--out", str(tmp_path / "out")]
-    assert main(again) == 0  # its own picture is drawn anew, somebody else's is kept
-    Image.new("L", (8, 8)).save(tmp_path / "out/check.png")
-    assert main(again) == 2
-    assert "check.png exists" in capsys.readouterr().err
+    again = ["data", "check", str(folder), "--out"]
+    assert main([*again, str(tmp_path / "out")]) == 0  # its own picture is drawn anew
+    (tmp_path / "mine").mkdir()
+    Image.new("L", (8, 8)).save(tmp_path / "mine/check.png")
+    assert main([*again, str(tmp_path / "mine")]) == 2
+    assert "mine has a check.png that nbtrack did not write" in capsys.readouterr().err
 
 
 def test_images_that_change(tmp_path: Path) -> None:

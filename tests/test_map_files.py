@@ -221,8 +221,8 @@ def test_a_file_gives_the_same_trajectory_elsewhere(
     for name in ("trajectory.txt", "groundtruth.txt"):
         assert (work / "again" / name).read_bytes() == (work / "run" / name).read_bytes()
     metrics = json.loads((work / "again/metrics.json").read_text())
-    assert (metrics["map_from"]["scene"], metrics["field"]) == ("living_room", "neus")
-    assert metrics["map_config"]["network"]["width"] == 16
+    assert (metrics["map_record"]["scene"], metrics["field"]) == ("living_room", "neus")
+    assert metrics["map_record"]["network"]["width"] == 16
     names = {path.name for path in (work / "map").iterdir()}
     assert names == {MAP_FILE, "history.csv", "mesh.ply", LOCK_FILE}
     assert (work / "room").read_bytes() == (work / "map" / MAP_FILE).read_bytes()

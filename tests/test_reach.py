@@ -13,10 +13,9 @@ from nbtrack.core.files import tables_folder
 from nbtrack.data.dataset import DATASET_UNITS
 from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.map_jobs import MapJob
-from nbtrack.experiments.outlook import expected_reach, reach_warnings
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene, open_scene
-from nbtrack.experiments.track_jobs import TrackJob
+from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.synthetic import make_room
 from nbtrack.tables import published_table_1
@@ -152,10 +151,10 @@ def test_a_warning_before_the_work(tmp_path: Path) -> None:
     runs = {n: TrackJob(job, scene, "sdf", sdf, n) for n in (few, many)}
     (said,) = reach_warnings([*runs.values()])
     assert said.startswith(f"{few} steps of sdf")
-    assert expected_reach(runs[few])["least_ate_m"] > expected_reach(runs[many])["least_ate_m"]
+    assert runs[few].expected_reach()["least_ate_m"] > runs[many].expected_reach()["least_ate_m"]
     assert not [*reach_warnings([TrackJob(job, scene, "lm", lm, few)])]
     by_clock = TrackJob(job, scene, "sdf", sdf, rate_hz=10)
-    assert expected_reach(by_clock) == {}
+    assert by_clock.expected_reach() == {}
 
 
 def test_no_tracker_beats_the_bound() -> None:

@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from nbtrack.core.errors import ConfigError, NbtrackError
 from nbtrack.core.files import fingerprint
 from nbtrack.core.settings import changed_settings, flat, with_settings
 from nbtrack.experiments.bench import measure_steps
-from nbtrack.experiments.commands import _preset_of
 from nbtrack.experiments.methods import METHODS, TABLE_1
 from nbtrack.experiments.presets import PRESETS, Preset, claim, load_preset
 from nbtrack.experiments.scenes import open_scene, open_scenes
@@ -115,8 +113,8 @@ def test_a_method_gives_way_to_the_user(
     own = preset.with_method(method.settings)
     assert own.tracking_of("lm").n_pixels == 64
     assert own.correction["neus_plus"] == 0.04  # what the user left to the method
-    options = Namespace(preset=None, config=given.get("config_file"), settings=[f"{key}=32"])
-    assert _preset_of(options, method).tracking_of("lm").n_pixels == 32  # as `track` does
+    chosen = load_preset(**given, settings=[f"{key}=32"], of_method=method.settings)
+    assert chosen.tracking_of("lm").n_pixels == 32  # as `track` does
     assert load_preset(settings=[f"{key}=512"]).with_method(method.settings) != own
 
 

@@ -14,23 +14,23 @@ from nbtrack.checks.check import check_recording, quick_warning
 from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
-from nbtrack.core.settings import read_setting, with_values
+from nbtrack.core.settings import flat, read_setting, with_values
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.grid import run_jobs
-from nbtrack.experiments.map_jobs import OF_MAPS, GivenMap, MapJob
+from nbtrack.experiments.map_jobs import OF_MAPS, GivenMap, MapJob, setting_tree
 from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
-from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.output import (
+    CHECK_FILE,
     OVERVIEW_FILE,
+    check_new,
     check_no_recording,
-    new_file,
     output_folder,
     save_picture,
-)
+)  # fmt: skip
 from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
 from nbtrack.experiments.runs import read_trajectory
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
-from nbtrack.experiments.track_jobs import TrackJob
+from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh, mesh_bytes
@@ -40,11 +40,11 @@ from nbtrack.recordings.reading import (
     read_frames,
     select_frames,
     without_outliers,
-)
+)  # fmt: skip
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.recordings.writer import convert_sequence
 from nbtrack.tracking import Trajectory, make_budget
-from nbtrack.tracking.methods import METHODS, Method
+from nbtrack.tracking.methods import METHODS
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 from nbtrack.tracking.trajectories import number_lines, read_tum
 
@@ -70,7 +70,7 @@ def methods_command(options: Namespace) -> None:
 def map_command(options: Namespace) -> None:
     """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
     method = method_of(options.method, options.field, None)
-    preset = _preset_of(options, method)
+    preset = load_preset(options.preset, options.config, options.settings, method.settings)
     scene = _opened(options, preset)
     scene.count(options.frames)
     job = MapJob.of(scene, method.field, preset, options.frames, options.seed)
@@ -104,9 +104,9 @@ def track_command(options: Namespace) -> None:
     given = read_map(options.map_from) if options.map_from else None
     own = given.field.name if given and not options.method else None
     method = method_of(options.method, options.field or own, options.tracker)
-    preset = _preset_of(options, method)
+    preset = load_preset(options.preset, options.config, options.settings, method.settings)
     if given:
-        _check_fits(given, method, preset, options)
+        _check_fits(given, method.field, options)
     steps = method.usual_steps if options.steps is options.rate is None else options.steps
     budget = make_budget(steps, options.rate)  # told before a room is made
     scene = _opened(options, preset)
@@ -115,9 +115,11 @@ def track_command(options: Namespace) -> None:
     else:
         job = MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
         scene.count(job.frames)
-    what = job, scene, method.tracker, preset.tracking_of(method.tracker)
-    how = options.frames, options.seed, options.out, options.start
-    run = TrackJob(*what, steps, options.rate, *how)
+    run = TrackJob(
+        job, scene, method.tracker, preset.tracking_of(method.tracker),
+        steps=steps, rate_hz=options.rate, frames=options.frames, seed=options.seed,
+        out=options.out, start=options.start,
+    )  # fmt: skip
     run.check()
     for warning in reach_warnings([run]):
         tell(f"nbtrack: warning: {warning}")
@@ -128,21 +130,19 @@ def track_command(options: Namespace) -> None:
         (metrics,) = run_jobs([run])
         _draw_overview(run)
     print(f"{run.folder}: {method.tracker} in {job.map().field.label}, {budget}")
+    _print_run(metrics)
+
+
+def _print_run(metrics: dict[str, Any]) -> None:
+    """The errors of a finished run, and what is to be said of them."""
     _print_numbers(metrics)
     if "ate_rmse_m" not in metrics:
         print("  no true pose is known of the tracked frames: errors cannot be computed")
     print(f"  on {metrics['device']}")
     outside = metrics.get("outside_map_share", 0.0)
     is_outside = f"{outside:.0%} of the frames saw little of what was mapped" * (outside > 0)
-    for said in (metrics.get("map_warning"), is_outside, metrics.get("map_misfit")):
-        if said:
-            tell(f"nbtrack: warning: {said}")
-
-
-def _preset_of(options: Namespace, method: Method) -> Preset:
-    """The preset with what a method changes, and then the user."""
-    preset = load_preset(options.preset, options.config, options.settings)
-    return preset.with_method(method.settings)
+    for said in filter(None, (metrics["map_warning"], is_outside, metrics.get("map_misfit"))):
+        tell(f"nbtrack: warning: {said}")
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:
@@ -154,31 +154,27 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
     return scene
 
 
-def _check_fits(given: Map, method: Method, preset: Preset, options: Namespace) -> None:
+def _check_fits(given: Map, field: str, options: Namespace) -> None:
     """Raises ConfigError where a given map is of another field or other settings than asked for."""
-    name = given.field.name
-    record = given.record
-    path = options.map_from
-    if options.map_frames is not None:
+    path, made = options.map_from, given.field.name
+    if options.map_frames:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
-    if method.field != name:
+    if field != made:
         advice = "leave --method and --field out"
-        raise ConfigError(f"{path} is a map of field {name!r}, not {method.field!r}: {advice}")
-    network = name if name in preset.settings["network"] else "neus"
-    made = {f"network.{network}.{k}": v for k, v in record["network"].items()}
-    made |= {f"mapping.{name}.{k}": v for k, v in record["settings"].items()}
-    made[f"correction.{name}"] = record.get("correction", 0.0)
+        raise ConfigError(f"{path} is a map of field {made!r}, not {field!r}: {advice}")
+    record = given.record
+    correction = record.get("correction", 0.0)
+    known = flat(setting_tree(made, record["network"], record["settings"], correction))
     for text in options.settings:
-        if any(made.get(key, value) != value for key, value in read_setting(text).items()):
+        if any(known.get(key, value) != value for key, value in read_setting(text).items()):
             advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
             raise ConfigError(f"{path} was made with other settings than --set {text}: {advice}")
 
 
 def _map(job: MapJob) -> None:
     """Map, unless the map is there, and say so."""
-    print(
-        f"map found in {job.folder}" if job.is_done else f"no finished map in {job.folder}: mapping"
-    )
+    state = "map found in {}" if job.is_done else "no finished map in {}: mapping"
+    print(state.format(job.folder))
     has_pose = job.scene.recording.has_pose[parse_frames(job.frames)]
     if not has_pose.all():
         tell(f"nbtrack: {(~has_pose).sum()} of {len(has_pose)} frames have no pose: not mapped")
@@ -195,9 +191,7 @@ def _print_numbers(results: dict[str, Any]) -> None:
 def _draw_overview(run: TrackJob) -> None:
     """A picture of a finished run, beside its files: the path in what was seen of the map."""
     tracked = read_trajectory(run.folder)
-    field = run.needs.map().field
-    n_frames = len(tracked.frames)
-    metrics = tracked.metrics
+    field, metrics, n_frames = run.needs.map().field, tracked.metrics, len(tracked.frames)
     shown = np.arange(0, n_frames, max(1, n_frames // _FRAMES_SHOWN))
     try:
         seen = _seen(tracked, shown, run.scene.recording)
@@ -208,8 +202,8 @@ def _draw_overview(run: TrackJob) -> None:
     title = f"{run.scene.name}: {run.tracker} in {field.label}, {n_frames} frames"
     paths = {}
     if "ate_rmse_m" in metrics:
-        ate, still = (100 * metrics.get(n, np.nan) for n in ("ate_rmse_m", "still_ate_m"))
-        title += f", ATE {ate:.2f} cm (standing still {still:.0f} cm)"
+        ate_m, still_m = metrics["ate_rmse_m"], metrics.get("still_ate_m", np.nan)
+        title += f", ATE {100 * ate_m:.2f} cm (standing still {100 * still_m:.0f} cm)"
         paths["true"] = tracked.T_true[np.isfinite(tracked.T_true).all(axis=(1, 2))]
     paths["tracked"] = tracked.T_estimated
     figure = plot_overview(cloud_of(surface), paths, tracked.frames, title)
@@ -236,11 +230,14 @@ def export_command(options: Namespace) -> None:
     DataError where the result is not there, unfinished, damaged, or not what the format is for.
     """
     export = look_up("format", options.to, _EXPORTS)
-    summary = export(options.source, options.to, new_file(options.out))
+    check_new(options.out)
+    content, summary = export(options.source, options.to)
+    write_atomic(options.out, content)
     print(f"{options.out}: {summary}")
 
 
-def _export_map(source: Path, format_name: str, out: Path) -> str:
+def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
+    """A coloured mesh: of what was seen of the map, where that is known."""
     finished = read_map(source)
     seen = source / MESH_FILE
     is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
@@ -249,11 +246,11 @@ def _export_map(source: Path, format_name: str, out: Path) -> str:
         origin = np.array(finished.record["origin"])
         mesh.vertices -= origin * is_seen  # the file stands in the world of the recording
         content = mesh_bytes(mesh, format_name, origin)
-    write_atomic(out, content)
-    return f"{len(mesh.vertices)} coloured vertices of {'what was seen' if is_seen else 'all'}"
+    what = "what was seen" if is_seen else "all"
+    return content, f"{len(mesh.vertices)} coloured vertices of {what}"
 
 
-def _export_run(source: Path, format_name: str, out: Path) -> str:
+def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
     """A movie of a run or a recording for Rerun; its recording and map must be where they were."""
     if format_name == "rrd" and importlib.util.find_spec("rerun") is None:
         raise MissingError("--to rrd needs Rerun: pip install 'nbtrack[rerun]'")
@@ -274,16 +271,15 @@ def _export_run(source: Path, format_name: str, out: Path) -> str:
         with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
             of_run = tracked.frames.iloc[shown], seen.T_world_camera, title
             content = movie_bytes(movie_pictures(surface, seen, *of_run, bar.move_to))
-    write_atomic(out, content)
-    return f"{len(shown)} of {last + 1} frames, {len(content) / 1e6:.1f} MB"
+    return content, f"{len(shown)} of {last + 1} frames, {len(content) / 1e6:.1f} MB"
 
 
-def _export_trajectory(source: Path, format_name: str, out: Path) -> str:
-    n_poses = len(read_trajectory(source).frames)
+def _export_trajectory(source: Path, format_name: str) -> tuple[str, str]:
+    n_poses = len(read_trajectory(source).frames)  # raises for what is no run
     T_world_camera = read_tum(source / "trajectory.txt")[1]
-    write_atomic(out, number_lines(T_world_camera[:, :3].reshape(-1, 12)))
     what = "KITTI: three rows of the matrix (m), no time stamps"
-    return f"{n_poses} poses, {what}; the first frame's, which was given, is not among them"
+    given = "the first frame's, which was given, is not among them"
+    return number_lines(T_world_camera[:, :3].reshape(-1, 12)), f"{n_poses} poses, {what}; {given}"
 
 
 _EXPORTS = {
@@ -305,21 +301,24 @@ def make_command(options: Namespace) -> None:
 
 def check_command(options: Namespace) -> None:
     """Validate a recording; print what it holds and what is wrong, and draw it if asked to."""
-    recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
-    report = check_recording(recording, progress=True)
-    print(report)
-    if options.out is not None:
-        path = new_file(options.out / "check.png")
-        apart_mm = 1e3 * report.conventions[0].median_m
-        title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart (median)"
-        figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)
-        save_picture(figure, path)
-        print(f"  picture         {path}")
+    with output_folder(options.out):
+        recording = _recording_of(options)
+        report = check_recording(recording, progress=True)
+        print(report)
+        if options.out:
+            apart_mm = 1e3 * report.conventions[0].median_m
+            title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart (median)"
+            figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)
+            save_picture(figure, options.out / CHECK_FILE)
+            print(f"  picture         {options.out / CHECK_FILE}")
 
 
 def convert_command(options: Namespace) -> None:
     """Write a recording in the Neural RGB-D layout; print what became of it."""
     frames = parse_frames(options.frames)
     check_no_recording(options.out)
-    recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
-    print(convert_sequence(recording, options.out, frames, progress=True))
+    print(convert_sequence(_recording_of(options), options.out, frames, progress=True))
+
+
+def _recording_of(options: Namespace) -> Recording:
+    return open_recording(options.folder, options.format, options.depth_folder, options.poses)

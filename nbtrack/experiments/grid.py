@@ -33,11 +33,10 @@ from nbtrack.core.files import data_folder, runs_folder
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.experiments.jobs import Job
 from nbtrack.experiments.map_jobs import MapJob
-from nbtrack.experiments.outlook import reach_warnings
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.runs import read_trajectory
 from nbtrack.experiments.scenes import Scene
-from nbtrack.experiments.track_jobs import TrackJob
+from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.fields import FIELDS
 from nbtrack.mapping.files import Map
 from nbtrack.tracking import TRACKERS
@@ -150,7 +149,7 @@ def _row_of(
     row["n_pixels"] = job.settings.n_pixels
     if isinstance(result, NbtrackError):
         return {**row, "failure": str(result), "ate_m": float("nan")}
-    metrics = {k: v for k, v in result.items() if k not in ("config", "map_config", "versions")}
+    metrics = {k: v for k, v in result.items() if k not in ("config", "map_record", "versions")}
     return {**metrics, **row, "failure": "", "ate_m": result.get("ate_rmse_m", float("nan"))}
 
 

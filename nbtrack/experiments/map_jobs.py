@@ -6,6 +6,8 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nbtrack import provenance
 from nbtrack.beyond.correction import correct_map
 from nbtrack.beyond.grid import checked_size
@@ -19,12 +21,24 @@ from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
+from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
 
 OF_MAPS = ("network.", "mapping.", "correction.")
 """How keys of settings begin that only matter where a map is made."""
 PLAIN_PRESET = "synthetic"
 """The preset whose settings are the classes' own."""
+_FRAMES_LOOKED_AT = 20  # that tell a map's unit before there is a map
 _AROUND_MAPS = 1e6  # queries of a network in the time of a map's scores, or of its correction
+
+
+def setting_tree(field: str, network: Any, settings: Any, correction: float) -> dict[str, Any]:
+    """The settings of a map where a preset has them."""
+    plain = PRESETS[PLAIN_PRESET].settings
+    return {
+        "network": {field if field in plain["network"] else "neus": network} if network else {},
+        "mapping": {field: settings},
+        "correction": {field: correction} if field in plain["correction"] else {},
+    }
 
 
 @dataclass(frozen=True)
@@ -91,15 +105,6 @@ class MapJob(Job):
         a_batch = own["n_rays"] * (own["n_stratified"] + own["n_surface"]) + own["n_surface_points"]
         return _AROUND_MAPS + own["iterations"] * a_batch
 
-    def setting_tree(self) -> dict[str, Any]:
-        """Its settings where a preset has them."""
-        network = self.field if self.field in PRESETS[PLAIN_PRESET].settings["network"] else "neus"
-        return {
-            "network": {network: self.network} if self.network else {},
-            "mapping": {self.field: self.settings},
-            "correction": {self.field: self.correction} if self.correction else {},
-        }
-
     def result(self) -> dict[str, Any]:
         """How the finished map was made, and its scores."""
         return self._stored().record
@@ -108,6 +113,13 @@ class MapJob(Job):
         """The finished map, ready for tracking."""
         finished = self._stored()
         return replace(finished, field=finished.field.to(choose_device()))
+
+    @property
+    def metres_per_unit(self) -> float:
+        """The unit of the map; about that of one that is still to be made."""
+        if self.is_done:
+            return self.map().field.bounds.metres_per_unit
+        return _rough_unit(self.scene, self.frames)
 
     def _stored(self) -> Map:
         return _read(self.folder, (self.folder / MAP_FILE).stat().st_mtime_ns)
@@ -167,9 +179,22 @@ class GivenMap(Job):
         """Cells (m) in which it was corrected; 0: it was not."""
         return self.finished.record.get("correction", 0.0)
 
+    @property
+    def metres_per_unit(self) -> float:
+        """The unit of the map."""
+        return self.finished.field.bounds.metres_per_unit
+
     def map(self) -> Map:
         """The map, ready for tracking."""
         return replace(self.finished, field=self.finished.field.to(choose_device()))
+
+
+@lru_cache
+def _rough_unit(scene: Scene, frames: str) -> float:
+    """Metres a unit, told by a few frames before there is a map."""
+    ids = select_frames(scene.recording, parse_frames(frames))
+    some = ids[np.linspace(0, len(ids) - 1, min(len(ids), _FRAMES_LOOKED_AT)).astype(int)]
+    return observed_bounds(read_frames(scene.recording, some)).metres_per_unit
 
 
 @lru_cache(maxsize=4)

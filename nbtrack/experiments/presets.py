@@ -21,7 +21,7 @@ from nbtrack.core.settings import (
     read_setting,
     with_settings,
     with_values,
-)
+)  # fmt: skip
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
@@ -118,13 +118,7 @@ class Preset:
 
     def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Values as their keys have them; ConfigError for unknown keys, wrong types and ranges."""
-        tree = self.settings
-        for key in values:
-            part, *names = key.split(".")
-            if names and isinstance(known := tree.get(part), dict):
-                # The nearest whole key would be something else's.
-                look_up(f"config key, {part} of", names[0], known)
-        checked = flat(with_values(tree, values))
+        checked = flat(with_values(self.settings, values))
         return {key: checked[key] for key in values}
 
     def with_values(self, values: Mapping[str, Any]) -> "Preset":
@@ -186,13 +180,17 @@ PRESETS = {
 
 
 def load_preset(
-    name: str | None = None, config_file: Path | None = None, settings: Sequence[str] = ()
+    name: str | None = None,
+    config_file: Path | None = None,
+    settings: Sequence[str] = (),
+    of_method: Sequence[str] = (),
 ) -> Preset:
     """A preset, by default that of `NBTRACK_PRESET`, else `smoke`, with all overrides applied.
 
-    They are a TOML file, by default the one that `NBTRACK_CONFIG` names, and `key=value` texts,
-    after those in `NBTRACK_SET`. Raises ConfigError for an unknown preset or key, or a value of the
-    wrong type; MissingError if the file does not exist, DataError if it is no TOML.
+    They are the `key=value` texts of a method, a TOML file, by default the one that
+    `NBTRACK_CONFIG` names, and `key=value` texts, after those in `NBTRACK_SET`. Raises ConfigError
+    for an unknown preset or key, or a value of the wrong type; MissingError if the file does not
+    exist, DataError if it is no TOML.
     """
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
     if config_file := config_file or os.environ.get("NBTRACK_CONFIG"):
@@ -205,7 +203,7 @@ def load_preset(
     except ValueError as error:
         advice = "quote each setting as in a shell"
         raise ConfigError(f"NBTRACK_SET cannot be split ({error}): {advice}") from None
-    return with_settings(preset, *before, *settings)
+    return with_settings(preset, *before, *settings).with_method(of_method)
 
 
 def claim(preset: Preset, holds: bool, text: str, usual: Sequence[str] = ()) -> None:

@@ -1,13 +1,16 @@
-"""Finished runs: read from their folders, and means of their errors over rooms."""
+"""Finished runs: their scores, what their folders hold, and means of errors over rooms."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.special import stdtrit
 
+from nbtrack.beyond.verdict import score_detection
 from nbtrack.core import files
 from nbtrack.core.errors import MissingError
+from nbtrack.tracking.metrics import trajectory_metrics
 from nbtrack.tracking.trajectories import Trajectory, read_tum, shifted
 
 METRICS_FILE = "metrics.json"  # written last: where it stands, a run is complete
@@ -33,6 +36,26 @@ def read_trajectory(folder: Path) -> Trajectory:
             raise ValueError(f"{len(frames)} rows for {len(T_estimated)} poses")
     back = -np.array(metrics.get("origin", [0, 0, 0]))
     return Trajectory(shifted(T_estimated, back), shifted(T_true, back), frames, metrics)
+
+
+def scores_of(tracked: Trajectory) -> dict[str, Any]:
+    """Errors of a run, the tracker's own verdicts against them, and its speed."""
+    rows = tracked.frames
+    metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
+    if "lost" in rows:
+        rated = rows.dropna(subset="translation_error_m")
+        errors_m = rated["translation_error_m"].to_numpy()
+        metrics["flagged_frames"] = int(rows["lost"].sum())
+        metrics |= score_detection(rated["lost"].to_numpy(dtype=bool), errors_m)
+    steps = int(rows["steps"].sum())
+    seconds = rows["seconds"]
+    return {
+        **metrics,
+        "frames_without_depth": int(rows["without_depth"].sum()),
+        "steps_per_frame": steps / len(rows),
+        "seconds_per_step": float(seconds.sum()) / max(steps, 1),
+        "seconds_per_frame": float(seconds.mean()),
+    }
 
 
 def over_rooms(results: pd.DataFrame, by: list[str], value: str = "ate_m") -> pd.DataFrame:

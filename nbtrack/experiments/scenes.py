@@ -6,12 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up, nearest_name
-from nbtrack.core.files import (
-    absolute,
-    data_folder,
-    fingerprint,
-    runs_folder,
-)
+from nbtrack.core.files import absolute, data_folder, fingerprint, runs_folder
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.sequence import RgbdSequence
@@ -24,7 +19,7 @@ from nbtrack.recordings.reading import (
     read_frames,
     select_frames,
     without_outliers,
-)
+)  # fmt: skip
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
 from nbtrack.synthetic.make import MOTIONS

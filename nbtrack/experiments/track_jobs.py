@@ -1,7 +1,9 @@
 """Runs as jobs: a camera tracked in a map, its errors, and where they come from."""
 
+import contextlib
 import shlex
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,25 +13,24 @@ import numpy as np
 import torch
 
 from nbtrack import provenance
-from nbtrack.beyond.verdict import score_detection
 from nbtrack.checks.in_map import check_belongs, in_world_of_map, look_in_map
 from nbtrack.core import files
 from nbtrack.core.arrays import Pose
 from nbtrack.core.device import choose_device, device_name
-from nbtrack.core.errors import DataError
+from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.settings import as_dict, changed_settings
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments import IMPORTED
 from nbtrack.experiments.jobs import Job, Report
-from nbtrack.experiments.map_jobs import PLAIN_PRESET, GivenMap, MapJob
+from nbtrack.experiments.map_jobs import PLAIN_PRESET, GivenMap, MapJob, setting_tree
 from nbtrack.experiments.presets import PRESETS, SIZES
-from nbtrack.experiments.runs import METRICS_FILE
+from nbtrack.experiments.runs import METRICS_FILE, scores_of
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
 from nbtrack.mapping.files import Map
 from nbtrack.recordings.reading import parse_frames, select_frames
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
-from nbtrack.tracking.metrics import still_metrics, trajectory_metrics
+from nbtrack.tracking.metrics import still_metrics
 from nbtrack.tracking.reach import reach_metrics
 from nbtrack.tracking.starts import expected_poses
 from nbtrack.tracking.tracker import TrackerSettings
@@ -40,7 +41,11 @@ _OTHER_WORLD = (
     "the recording's poses are in another world than the map: they were moved into it by the one "
     "rigid motion that explains the difference, and errors are those that remain"
 )
-_MAP_SETTINGS = ("network", "settings", "correction")  # in the record of a map
+# A user is told where even the best follower has a larger error (m), or the camera moves farther
+# than a search reaches in a larger share of the frames: hands start and stop, and the search
+# catches up (our choice).
+_LEAST_ATE = 0.01
+_SHARE = 0.5
 # For the work of runs, measured with `smoke` on one core.
 _QUERIES_A_SECOND = 60_000  # of a network
 _NO_NETWORK = 0.05  # of a query's time: where a grid or points are asked
@@ -122,6 +127,17 @@ class TrackJob(Job):
         if self.start == "unknown" or not recording.has_pose[frame_ids[0]]:
             tracker_class(self.tracker).check_finds(in_corrected=self.needs.correction > 0)
 
+    def expected_reach(self) -> dict[str, float]:
+        """What `reach_metrics` will say of it; nothing where its steps are not known before."""
+        if self.steps is not None:
+            with contextlib.suppress(NbtrackError):  # the run itself will say what is wrong
+                recording = self.scene.recording
+                frame_ids = select_frames(recording, parse_frames(self.frames), needs_poses=False)
+                path = recording.T_world_camera[frame_ids]
+                reach = self.settings.reach(self.steps, self.needs.metres_per_unit)
+                return reach_metrics(reach, path, self.settings.motion_model)
+        return {}
+
     def result(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""
         path = self.folder / METRICS_FILE
@@ -147,7 +163,7 @@ class TrackJob(Job):
         if start.is_in_other_world:
             tracked, is_explained = in_world_of_map(tracked)
             notes["map_warning"] = _OTHER_WORLD if is_explained else None
-        metrics = _scores(tracked) | self._provenance(finished) | notes
+        metrics = scores_of(tracked) | self._provenance(finished) | notes
         times = tracked.frames["time"].to_numpy()
         texts = {
             "trajectory.txt": tum_text(times, shifted(tracked.T_estimated, origin)),
@@ -203,23 +219,15 @@ class TrackJob(Job):
         T_true = sequence.T_world_camera
         metres_per_unit = finished.field.bounds.metres_per_unit
         reach = self.settings.reach(tracked.frames["steps"].mean(), metres_per_unit)
-        notes = {
-            "map_seconds": finished.record["seconds"],
-            "budget": str(make_budget(self.steps, self.rate_hz)),
-            "origin": finished.record["origin"],
-            **still_metrics(T_true),
-            "metres_per_unit": metres_per_unit,
-            "map_warning": start.warning,
-            "start": "given" if start.is_known else "unknown",
-        }
-        if self.is_elsewhere:
-            notes["map_from"] = finished.record
+        notes = {"metres_per_unit": metres_per_unit, "map_warning": start.warning}
+        notes |= {"start": "given" if start.is_known else "unknown"}
         if isinstance(self.needs, GivenMap):
             followed = sequence.select(slice(len(sequence) - len(tracked.frames), None))
             if start.is_in_other_world:
                 followed = replace(followed, T_world_camera=tracked.T_estimated)
             notes |= look_in_map(finished.field, followed, tracked.T_estimated)
-        return notes | reach_metrics(reach, T_true, self.settings.motion_model)
+        motion_model = self.settings.motion_model
+        return notes | still_metrics(T_true) | reach_metrics(reach, T_true, motion_model)
 
     def _provenance(self, finished: Map) -> dict[str, Any]:
         """Where a run comes from: data, map, method, settings, machine; how to make it again."""
@@ -234,10 +242,13 @@ class TrackJob(Job):
             "command": self._command(),
             "recording": str(self.scene.folder),
             "format": self.scene.format,
+            "budget": str(make_budget(self.steps, self.rate_hz)),
+            "config": as_dict(self.settings),
+            "origin": finished.record["origin"],
             "map": str(self.needs.folder.resolve()),
             "map_key": finished.key,
-            "config": as_dict(self.settings),
-            "map_config": {name: finished.record.get(name) for name in _MAP_SETTINGS},
+            "map_seconds": finished.record["seconds"],
+            "map_record": finished.record,
         }
 
     def _command(self) -> str:
@@ -251,7 +262,8 @@ class TrackJob(Job):
             options["map-from"] = self.needs.folder
         else:
             options |= {"field": self.needs.field, "map-frames": self.needs.frames}
-            settings |= self.needs.setting_tree()
+            made = self.needs
+            settings |= setting_tree(made.field, made.network, made.settings, made.correction)
         sequence = str(self.scene.folder)
         if self.scene.made and not self.is_elsewhere:
             sequence = self.scene.name
@@ -265,21 +277,29 @@ class TrackJob(Job):
         return shlex.join([*words, "--out", f"again_{self.name}"])
 
 
-def _scores(tracked: Trajectory) -> dict[str, Any]:
-    """Errors of a run, the tracker's own verdicts against them, and its speed."""
-    rows = tracked.frames
-    metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
-    if "lost" in rows:
-        rated = rows.dropna(subset="translation_error_m")
-        errors_m = rated["translation_error_m"].to_numpy()
-        metrics["flagged_frames"] = int(rows["lost"].sum())
-        metrics |= score_detection(rated["lost"].to_numpy(dtype=bool), errors_m)
-    steps = int(rows["steps"].sum())
-    seconds = rows["seconds"]
-    return {
-        **metrics,
-        "frames_without_depth": int(rows["without_depth"].sum()),
-        "steps_per_frame": steps / len(rows),
-        "seconds_per_step": float(seconds.sum()) / max(steps, 1),
-        "seconds_per_frame": float(seconds.mean()),
-    }
+def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
+    """A line for each kind of run whose search falls behind its camera, whatever the map is."""
+    kinds: dict[tuple, list[TrackJob]] = {}
+    for run in runs:
+        kinds.setdefault((run.tracker, run.settings, run.steps), []).append(run)
+    for (tracker, settings, steps), alike in kinds.items():
+        reaches = {run.scene.name: run.expected_reach() for run in alike}
+        short = {
+            name: reach
+            for name, reach in reaches.items()
+            if reach.get("least_ate_m", 0.0) > _LEAST_ATE
+            or reach.get("beyond_reach_share", 0.0) > _SHARE
+        }
+        if not short:
+            continue
+        scene, worst = max(short.items(), key=lambda pair: pair[1]["least_ate_m"])
+        others = f" (of {len(short)} scenes)" if len(short) > 1 else ""
+        bound = f", and the best that follows it has an ATE of {worst['least_ate_m']:.3f} m there"
+        velocity = f"--set tracking.{tracker}.motion_model=constant_velocity, "
+        yield (
+            f"{steps:g} steps of {tracker} move the camera by at most {1e3 * worst['reach_m']:.1f} "
+            f"mm along an axis and {worst['reach_deg']:.2f} deg about it; it moves farther in "
+            f"{worst['beyond_reach_share']:.0%} of the frames of {scene}{others}"
+            f"{bound if worst['least_ate_m'] > _LEAST_ATE else ''}: take more steps, a lower rate, "
+            f"{velocity if settings.motion_model == 'previous_pose' else ''}or --method corrected"
+        )
