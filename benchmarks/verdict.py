@@ -26,7 +26,7 @@ from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.verdict import WRONG_DEG, WRONG_M, features
 from nbtrack.core.settings import with_settings
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.experiments.grid import run_jobs
+from nbtrack.experiments.jobs import run_jobs
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene

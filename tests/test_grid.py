@@ -30,8 +30,7 @@ from tiny import tiny_words
 from nbtrack.cli import main
 from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.progress import ProgressBar
-from nbtrack.experiments.grid import Execution, run_jobs
-from nbtrack.experiments.jobs import Job, Report
+from nbtrack.experiments.jobs import Execution, Job, Report, run_jobs
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import open_scene
@@ -158,7 +157,7 @@ def test_the_bar_weighs_jobs_by_their_work(monkeypatch: pytest.MonkeyPatch) -> N
         def move_to(self, done: float, status: str = "") -> None:
             seen.append(done / self.total)
 
-    monkeypatch.setattr("nbtrack.experiments.grid.ProgressBar", Noted)
+    monkeypatch.setattr("nbtrack.experiments.jobs.ProgressBar", Noted)
     small = replace(made, settings=replace(made.settings, iterations=6, n_rays=8))
     job = replace(vr, needs=small, frames=":3")
     run_jobs([job], Execution(workers=1))
@@ -233,7 +232,7 @@ def test_no_scheduler(
     capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Catches a traceback of sockets where the address is wrong."""
-    monkeypatch.setattr("nbtrack.experiments.grid._SECONDS_TO_CONNECT", 0.5)
+    monkeypatch.setattr("nbtrack.experiments.jobs._SECONDS_TO_CONNECT", 0.5)
     assert tables(tmp_path, "--dask", "tcp://127.0.0.1:9") == 2
     assert "no Dask scheduler at 'tcp://127.0.0.1:9'" in capsys.readouterr().err.splitlines()[-1]
 

@@ -325,4 +325,4 @@ def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
 def test_a_motion_names_no_folder(work: Path, capsys: pytest.CaptureFixture) -> None:
     """Catches folders that are made outside of the cache before a wrong name is refused."""
     command = [*MAP, "--set", "scenes.motion=tour/../../../x"]
-    assert_refused(work, capsys, command, "unknown motion 'tour/../../../x'")
+    assert_refused(work, capsys, command, "'tour/../../../x': write 'keyframes' or ")

@@ -39,7 +39,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("runs")
         patch.setenv("NBTRACK_RUNS", str(folder))
-        patch.setattr("nbtrack.experiments.grid.usable_cores", lambda: 1)
+        patch.setattr("nbtrack.experiments.jobs.usable_cores", lambda: 1)
         yield folder
 
 

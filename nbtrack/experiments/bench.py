@@ -42,46 +42,48 @@ def tables_command(options: Namespace) -> None:
     names = [f"scenes.names={options.scenes.split(',')}"] if options.scenes else []
     preset = load_preset(options.preset, options.config, [*options.settings, *names])
     usual = TABLE_3 if options.beyond else TABLE_1
-    methods = options.method.split(",") if options.method else usual
-    find_methods(methods)  # a bad name is told before a room is made
-    with output_folder(options.out):
-        _fill_tables(options, preset, methods)
-
-
-def _fill_tables(options: Namespace, preset: Preset, methods: Methods) -> None:
-    labels = dict(_label_of(text) for text in preset.scenes.labels)  # a bad one is told at once
+    methods = find_methods(options.method.split(",") if options.method else usual)
+    labels = dict(map(_label_of, preset.scenes.labels))  # what is wrong is told before any work
     wording = tables.Wording(options.caption, options.label, labels)
-    execution = Execution(options.workers, options.dask, keep_going=True)
-    scenes = open_scenes(preset)
-    clock = options.budget == "clock"
-    rates_hz = RATES_3_HZ if options.beyond else None
-    how = {"clock": clock, "seeds": range(options.seeds), "execution": execution}
-    results = track_scenes(scenes, methods, preset, rates_hz, **how)
-    if options.no_still:
-        results = results.drop(columns="still_ate_m", errors="ignore")
-    name = f"{preset.name}_clock" if clock else preset.name
-    folder = options.out or runs_folder() / "tables" / name
-    note = f"{camera_motion(preset, results)}; {_note(preset, clock)}"
-    print(f"Table {'III: ATE (mm)' if options.beyond else 'I: ATE (m)'}, {note}")
-    if options.beyond:
-        print(tables.style_table_1(tables.naming_points(results), unit="mm"))
-        paths = tables.write_table_3(folder, results, note, wording)
-    else:
-        print(tables.style_table_1(results))
-        print("Table I beside the paper's")
-        print(tables.beside_published(results).to_string(float_format="%.3f", na_rep="–"))
-        steps = _table_2(preset, scenes[0], methods)
-        pixels = default_pixels(preset, methods)
-        by_clock = _note(preset, clock=True)
-        paths = tables.write_tables(folder, results, steps, note, pixels, by_clock, wording)
-    cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
-    paths.append(tables.write_csv(cells, results.filter(_CELL_COLUMNS), float_format=None))
-    print("\n".join(map(str, paths)))
+    with output_folder(options.out):
+        results = _fill_tables(options, preset, methods, wording)
     failed = results[results["failure"] != ""]
     if len(failed):
         first, why = failed.iloc[0][["run", "failure"]]
         cells = f"{len(failed)} cells of the table failed and are empty, the first of them {first}"
         raise NbtrackError(f"{cells}: {why}; mend the cause and run again, the rest is kept")
+
+
+def _fill_tables(
+    options: Namespace, preset: Preset, methods: Methods, wording: tables.Wording
+) -> pd.DataFrame:
+    """Track, print and write; the results, a row a run."""
+    clock = options.budget == "clock"
+    scenes = open_scenes(preset)
+    results = track_scenes(
+        scenes, methods, preset, RATES_3_HZ if options.beyond else None, clock=clock,
+        seeds=range(options.seeds),
+        execution=Execution(options.workers, options.dask, keep_going=True),
+    )  # fmt: skip
+    shown = results.drop(columns="still_ate_m", errors="ignore") if options.no_still else results
+    name = f"{preset.name}_clock" if clock else preset.name
+    folder = options.out or runs_folder() / "tables" / name
+    note = f"{camera_motion(preset, results)}; {_note(preset, clock)}"
+    print(f"Table {'III: ATE (mm)' if options.beyond else 'I: ATE (m)'}, {note}")
+    if options.beyond:
+        print(tables.style_table_1(tables.naming_points(shown), unit="mm"))
+        paths = tables.write_table_3(folder, shown, note, wording)
+    else:
+        print(tables.style_table_1(shown))
+        print("Table I beside the paper's")
+        print(tables.beside_published(shown).to_string(float_format="%.3f", na_rep="–"))
+        steps, pixels = _table_2(preset, scenes[0], methods)
+        by_clock = _note(preset, clock=True)
+        paths = tables.write_tables(folder, shown, steps, note, pixels, by_clock, wording)
+    cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
+    paths.append(tables.write_csv(cells, results.filter(_CELL_COLUMNS), float_format=None))
+    print("\n".join(map(str, paths)))
+    return results
 
 
 def _label_of(text: str) -> tuple[str, str]:
@@ -100,19 +102,20 @@ def bench_command(options: Namespace) -> None:
     quick = ("scenes.n_frames=2", "mapping.imap.iterations=1", "mapping.neus.iterations=1")
     preset = load_preset(name, options.config, [*options.settings, *quick])
     with output_folder(options.out):
-        steps = _table_2(preset, open_scene(preset.scenes.names[0], preset))
+        steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset))
         folder = options.out or runs_folder() / "bench" / preset.name
         print(tables.write_csv(folder / "table_2.csv", steps))
 
 
-def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
-    """Measure and print it."""
-    steps = measure_steps(preset, scene, methods)
-    pixels = default_pixels(preset, methods)
+def _table_2(
+    preset: Preset, scene: Scene, methods: Methods = TABLE_1
+) -> tuple[pd.DataFrame, dict[str, int]]:
+    """Measure and print it; the steps, and the n of Table I."""
+    steps, pixels = measure_steps(preset, scene, methods), default_pixels(preset, methods)
     machine = f"{device_name(choose_device())}, {torch.get_num_threads()} threads"
     print(f"Table II: steps, {preset.name} networks, on {machine}")
     print(tables.style_table_2(steps, default_pixels=pixels))
-    return steps
+    return steps, pixels
 
 
 def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
@@ -128,15 +131,14 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     for method in find_methods(methods):
         firsts.setdefault(method.tracker, method)
     pixels = preset.tables.pixels
-    rows = []
     plan = [(m, n) for m in firsts.values() for n in pixels.get(m.tracker, pixels["sdf"])]
-    recording = scene.recording
-    sequence = read_frames(recording, np.flatnonzero(recording.has_pose)[:1])
+    has_pose = np.flatnonzero(scene.recording.has_pose)
+    sequence = read_frames(scene.recording, has_pose[:1])
     T_first = sequence.T_world_camera[0]
+    rows = []
     with ProgressBar("Table II", len(plan)) as bar:
         for done, (method, n_pixels) in enumerate(plan):
-            name = method.tracker
-            own = preset.with_method(method.settings)
+            name, own = method.tracker, preset.with_method(method.settings)
             bar.move_to(done, f"{name}={n_pixels}")
             settings = replace(own.tracking_of(name), n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
@@ -151,8 +153,7 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
                     mean, std = float(np.mean(counts[1:])), float(np.std(counts[1:]))
                     rows.append((name.upper(), n_pixels, budget_ms, mean, std))
         bar.move_to(len(plan))
-    columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_std"]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows, columns=["tracker", "n_pixels", "budget_ms", "steps", "steps_std"])
 
 
 def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]:
@@ -175,9 +176,7 @@ def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
 def _note(preset: Preset, clock: bool) -> str:
     """How the numbers were measured, in a sentence. The columns name the scenes."""
     changed = changed_settings(preset.settings, PRESETS[preset.name].settings)
-    changed = ", ".join(
-        text for text in changed if not text.startswith(("scenes.names", "scenes.labels"))
-    )
-    label = f"{preset.name}, with {changed}" if changed else preset.name
+    changed = [text for text in changed if not text.startswith(("scenes.names", "scenes.labels"))]
+    label = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name
     budget = "wall clock" if clock else preset.step_counts
     return f"Preset: {label}; budget: {budget}; device: {device_name(choose_device())}."

@@ -16,17 +16,10 @@ from nbtrack.core.files import naming_damaged, write_atomic
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.core.settings import flat, read_setting, with_values
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.experiments.grid import run_jobs
+from nbtrack.experiments import output
+from nbtrack.experiments.jobs import run_jobs
 from nbtrack.experiments.map_jobs import OF_MAPS, GivenMap, MapJob, setting_tree
 from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
-from nbtrack.experiments.output import (
-    CHECK_FILE,
-    OVERVIEW_FILE,
-    check_new,
-    check_no_recording,
-    output_folder,
-    save_picture,
-)  # fmt: skip
 from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
 from nbtrack.experiments.runs import read_trajectory
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
@@ -35,12 +28,7 @@ from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh, mesh_bytes
 from nbtrack.plots.rerun_file import rerun_bytes
-from nbtrack.recordings.reading import (
-    parse_frames,
-    read_frames,
-    select_frames,
-    without_outliers,
-)  # fmt: skip
+from nbtrack.recordings import reading
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.recordings.writer import convert_sequence
 from nbtrack.tracking import Trajectory, make_budget
@@ -48,8 +36,7 @@ from nbtrack.tracking.methods import METHODS
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 from nbtrack.tracking.trajectories import number_lines, read_tum
 
-# What is printed in place of names in metrics.json that say too little.
-_MEANINGS = {
+_MEANINGS = {  # printed in place of names in metrics.json that say too little
     "lost_frames": f"frames off by more than {LOST_THRESHOLD_M:g} m",
     "flagged_frames": "frames that the tracker itself calls lost",
     "frames_without_reference": "frames without a true pose, in no error",
@@ -73,9 +60,8 @@ def map_command(options: Namespace) -> None:
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     scene = _opened(options, preset)
     scene.count(options.frames)
-    job = MapJob.of(scene, method.field, preset, options.frames, options.seed)
-    job = replace(job, out=options.out)
-    with output_folder(options.out):
+    job = MapJob.of(scene, method.field, preset, options.frames, options.seed, options.out)
+    with output.output_folder(options.out):
         _map(job)
         finished = job.map()
         print(f"{job.folder}: {finished.field.label} map of {scene.name}")
@@ -88,8 +74,8 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
     """The mesh of what was seen, beside a map."""
     try:
         recording = job.scene.recording
-        mapped = select_frames(recording, parse_frames(job.frames))
-        seen = without_outliers(read_frames(recording, mapped[::_FRAMES_APART]))
+        mapped = reading.select_frames(recording, reading.parse_frames(job.frames))
+        seen = reading.without_outliers(reading.read_frames(recording, mapped[::_FRAMES_APART]))
         mesh = extract_mesh(finished.field, seen)
     except DataError as error:
         print(f"  no mesh: {error}")
@@ -123,7 +109,7 @@ def track_command(options: Namespace) -> None:
     run.check()
     for warning in reach_warnings([run]):
         tell(f"nbtrack: warning: {warning}")
-    with output_folder(options.out):
+    with output.output_folder(options.out):
         if not given:
             _map(job)
         run = replace(run, out=run.folder)  # made anew, whatever the cache holds
@@ -148,7 +134,6 @@ def _print_run(metrics: dict[str, Any]) -> None:
 def _opened(options: Namespace, preset: Preset) -> Scene:
     """The scene that is named, and a warning where it is likely read wrongly."""
     scene = open_scene(options.sequence, preset, options.format)
-    # A room of the cache is as it should be.
     if not scene.made and (said := quick_warning(scene.recording)):
         tell(f"nbtrack: warning: {said}; `data check` tells more")
     return scene
@@ -175,14 +160,14 @@ def _map(job: MapJob) -> None:
     """Map, unless the map is there, and say so."""
     state = "map found in {}" if job.is_done else "no finished map in {}: mapping"
     print(state.format(job.folder))
-    has_pose = job.scene.recording.has_pose[parse_frames(job.frames)]
+    has_pose = job.scene.recording.has_pose[reading.parse_frames(job.frames)]
     if not has_pose.all():
         tell(f"nbtrack: {(~has_pose).sum()} of {len(has_pose)} frames have no pose: not mapped")
     run_jobs([job])
 
 
 def _print_numbers(results: dict[str, Any]) -> None:
-    """The numbers among some results, by name; zeros are said of lost frames alone."""
+    """The numbers among some results, by name; zeros of lost frames alone."""
     for name, value in results.items():
         if isinstance(value, int | float) and (value or name in ("lost_frames", "flagged_frames")):
             print(f"  {_MEANINGS.get(name, name)}: {value:.5g}")
@@ -194,8 +179,7 @@ def _draw_overview(run: TrackJob) -> None:
     field, metrics, n_frames = run.needs.map().field, tracked.metrics, len(tracked.frames)
     shown = np.arange(0, n_frames, max(1, n_frames // _FRAMES_SHOWN))
     try:
-        seen = _seen(tracked, shown, run.scene.recording)
-        surface = extract_mesh(field, seen, voxel=_cell_of(field))
+        surface = _surface(field, _seen(tracked, shown, run.scene.recording), _CELLS)
     except DataError as error:
         print(f"  no picture: {error}")
         return
@@ -207,30 +191,26 @@ def _draw_overview(run: TrackJob) -> None:
         paths["true"] = tracked.T_true[np.isfinite(tracked.T_true).all(axis=(1, 2))]
     paths["tracked"] = tracked.T_estimated
     figure = plot_overview(cloud_of(surface), paths, tracked.frames, title)
-    save_picture(figure, run.folder / OVERVIEW_FILE, dpi=120)
-    print(f"  picture: {run.folder / OVERVIEW_FILE}")
+    output.save_picture(figure, run.folder / output.OVERVIEW_FILE, dpi=120)
+    print(f"  picture: {run.folder / output.OVERVIEW_FILE}")
 
 
 def _seen(tracked: Trajectory, rows: np.ndarray, recording: Recording) -> RgbdSequence:
     """What was observed in some rows of a run, from where its camera was estimated to be."""
     frame_ids = tracked.frames["frame_id"].to_numpy()[rows]
-    sequence = read_frames(recording, frame_ids, needs_poses=False)
+    sequence = reading.read_frames(recording, frame_ids, needs_poses=False)
     return replace(sequence, T_world_camera=tracked.T_estimated[rows])
 
 
-def _cell_of(field: Any) -> float:
-    """The edge (m) of a picture's cells: large places have larger ones."""
-    return max(0.05, 2 * field.bounds.metres_per_unit / _CELLS)
+def _surface(field: Any, seen: RgbdSequence, n_cells: int) -> Any:
+    """What was seen of a map, in so many cells across, of at least 6 m."""
+    return extract_mesh(field, seen, voxel=max(6.0, 2 * field.bounds.metres_per_unit) / n_cells)
 
 
 def export_command(options: Namespace) -> None:
-    """Write a run's trajectory, or a map (of folders or files), in another format; print what.
-
-    Raises ConfigError for an unknown format, or where a file would be replaced; MissingError and
-    DataError where the result is not there, unfinished, damaged, or not what the format is for.
-    """
+    """Write a run's trajectory, or a map (of folders or files), in another format; print what."""
     export = look_up("format", options.to, _EXPORTS)
-    check_new(options.out)
+    output.check_new(options.out)
     content, summary = export(options.source, options.to)
     write_atomic(options.out, content)
     print(f"{options.out}: {summary}")
@@ -255,23 +235,23 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
     if format_name == "rrd" and importlib.util.find_spec("rerun") is None:
         raise MissingError("--to rrd needs Rerun: pip install 'nbtrack[rerun]'")
     tracked = read_trajectory(source)
-    metrics = tracked.metrics
-    last = len(tracked.frames) - 1
+    metrics, n_frames = tracked.metrics, len(tracked.frames)
     stored = read_map(metrics["map"])
+    field = stored.field
     if metrics.get("map_key") != stored.key:
         raise DataError(f"{metrics['map']} is not the map of this run any more: track again")
-    field = stored.field
-    shown = np.unique(np.linspace(0, last, _MOVIE_FRAMES).round().astype(int))
+    shown = np.unique(np.linspace(0, n_frames - 1, _MOVIE_FRAMES).round().astype(int))
     seen = _seen(tracked, shown, open_recording(metrics["recording"], metrics["format"]))
-    surface = extract_mesh(field, seen, voxel=_cell_of(field) / 2)
+    surface = _surface(field, seen, 2 * _CELLS)
     title = f"{metrics['scene']}: {metrics['tracker']} in {field.label}"
     if format_name == "rrd":
         content = rerun_bytes(surface, seen, tracked, title)
     else:
         with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
-            of_run = tracked.frames.iloc[shown], seen.T_world_camera, title
-            content = movie_bytes(movie_pictures(surface, seen, *of_run, bar.move_to))
-    return content, f"{len(shown)} of {last + 1} frames, {len(content) / 1e6:.1f} MB"
+            frames, poses = tracked.frames.iloc[shown], seen.T_world_camera
+            pictures = movie_pictures(surface, seen, frames, poses, title, bar.move_to)
+            content = movie_bytes(pictures)
+    return content, f"{len(shown)} of {n_frames} frames, {len(content) / 1e6:.1f} MB"
 
 
 def _export_trajectory(source: Path, format_name: str) -> tuple[str, str]:
@@ -294,14 +274,14 @@ def make_command(options: Namespace) -> None:
     if options.out is None:
         raise ConfigError(f"--out is missing: name the folder that {options.room} is written to")
     config = with_values(ScenesConfig(), {name: getattr(options, name) for name in SIZES})
-    check_no_recording(options.out)
+    output.check_no_recording(options.out)
     write_room(options.room, options.out, config)
     print(f"{options.out}: {options.room}, {options.n_frames} frames, seed {options.seed}")
 
 
 def check_command(options: Namespace) -> None:
     """Validate a recording; print what it holds and what is wrong, and draw it if asked to."""
-    with output_folder(options.out):
+    with output.output_folder(options.out):
         recording = _recording_of(options)
         report = check_recording(recording, progress=True)
         print(report)
@@ -309,14 +289,14 @@ def check_command(options: Namespace) -> None:
             apart_mm = 1e3 * report.conventions[0].median_m
             title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart (median)"
             figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)
-            save_picture(figure, options.out / CHECK_FILE)
-            print(f"  picture         {options.out / CHECK_FILE}")
+            output.save_picture(figure, options.out / output.CHECK_FILE)
+            print(f"  picture         {options.out / output.CHECK_FILE}")
 
 
 def convert_command(options: Namespace) -> None:
     """Write a recording in the Neural RGB-D layout; print what became of it."""
-    frames = parse_frames(options.frames)
-    check_no_recording(options.out)
+    frames = reading.parse_frames(options.frames)
+    output.check_no_recording(options.out)
     print(convert_sequence(_recording_of(options), options.out, frames, progress=True))
 
 

@@ -1,15 +1,41 @@
-"""A job: one piece of work, named by all that it depends on, and made once."""
+"""Jobs: pieces of work that are named by all that they depend on and made once, and their running.
 
-from collections.abc import Callable
+They run one after the other here, or side by side in processes or on a Dask cluster: small networks
+gain nothing from a second thread, so scenes and methods share the cores instead.
+"""
+
+import contextlib
+import importlib.util
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from nbtrack.core import files
-from nbtrack.core.device import advise_on_memory
-from nbtrack.core.errors import NbtrackError
-from nbtrack.experiments.output import check_no_recording
-from nbtrack.locks import locked
+import cloudpickle
+import torch
 
+from nbtrack.core.device import advise_on_memory, choose_device, threads, usable_cores
+from nbtrack.core.errors import MissingError, NbtrackError
+from nbtrack.core.files import data_folder, runs_folder
+from nbtrack.core.progress import ProgressBar
+from nbtrack.experiments.output import check_no_recording
+from nbtrack.fields import FIELDS
+from nbtrack.locks import locked
+from nbtrack.tracking import TRACKERS
+
+_START = "spawn"  # how worker processes begin: forked ones would lack the threads of libraries
+_LOOK_SECONDS = 1.0  # between two looks at jobs elsewhere, so that the bar's clock moves
+_SECONDS_TO_CONNECT = 10
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""
 
@@ -31,7 +57,7 @@ class Job:
     @property
     def cache(self) -> Path:
         """Its folder in the cache."""
-        return files.runs_folder() / self.kind / f"{self.name}-{self.key}"
+        return runs_folder() / self.kind / f"{self.name}-{self.key}"
 
     @property
     def folder(self) -> Path:
@@ -46,7 +72,7 @@ class Job:
         """
         if isinstance(needed, NbtrackError):
             return NbtrackError(f"not run, because {self.needs.name} failed: {needed}")
-        path = files.runs_folder() / "locks" / f"{self.cache.name}.lock"
+        path = runs_folder() / "locks" / f"{self.cache.name}.lock"
         report(0.0, "begins, or waits for another process that makes the same")
         try:
             check_no_recording(path)
@@ -54,3 +80,174 @@ class Job:
                 return self.result() if self.is_done else self.compute(report)
         except NbtrackError as error:
             return error
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How jobs are run."""
+
+    # Processes, which share the threads; by default one a core, or this one alone where a GPU does
+    # the work: jobs share its memory, and side by side gain less (benchmarks/README.md).
+    workers: int | None = None
+    dask: str | None = None  # address of a Dask scheduler whose workers run the jobs instead
+    # A user's mistake in one job stands among the results, also of what needs it; others still run.
+    keep_going: bool = False
+
+    def __post_init__(self) -> None:
+        """Raises MissingError, before any work, if Dask is needed and not there."""
+        if self.dask is not None and not importlib.util.find_spec("distributed"):
+            raise MissingError("--dask needs Dask: pip install 'nbtrack[cluster]', or --workers")
+
+
+def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[Any]:
+    """The results of all jobs, in order; those that are missing, and what they need, are made.
+    Raises what the first failing job raised, unless it is to keep going."""
+    execution = execution or Execution()
+    missing = {part.folder: part for job in jobs for part in _missing(job)}
+    results: dict[Path, Any] = {}
+
+    def show(job: Job, share: float = 0.0, status: str = "running") -> None:
+        """Where the work is: `share` of a job that runs in this process, and all that ended."""
+        worked = sum(missing[folder].work for folder in results) + share * job.work
+        if 0 < share < 1 and not bar.warm_up[0]:  # a first frame waits for what is compiled
+            bar.warm_up = worked, bar.format_dict["elapsed"]
+        bar.set_description_str(job.doing, refresh=False)
+        bar.move_to(worked, f"{len(results)} of {len(missing)} done, {job.name}: {status}")
+
+    with (
+        ProgressBar(Job.doing, sum(job.work for job in missing.values())) as bar,
+        contextlib.closing(_outcomes(missing, results, show, execution)) as outcomes,
+    ):
+        for folder, outcome in outcomes:
+            if isinstance(outcome, NbtrackError) and not execution.keep_going:
+                raise outcome
+            results[folder] = outcome
+            show(missing[folder], status="done")
+    return [results[job.folder] if job.folder in results else job.result() for job in jobs]
+
+
+def _missing(job: Job | None) -> list[Job]:
+    """What is not done of a job and what it needs, in the order in which it can be done."""
+    return [] if job is None or job.is_done else [*_missing(job.needs), job]
+
+
+def _outcomes(
+    jobs: Mapping[Path, Job], results: Mapping[Path, Any], show: Callable, execution: Execution
+) -> Iterator[tuple[Path, Any]]:
+    """What becomes of each job, as they end; each begins when what it needs is in the results."""
+    usual = usable_cores() if choose_device().type == "cpu" else 1
+    workers = min(execution.workers or usual, len(jobs))
+    needs = {folder: job.needs.folder if job.needs else None for folder, job in jobs.items()}
+    if workers <= 1 and execution.dask is None:
+        for folder, job in jobs.items():
+            yield folder, job.outcome(results.get(needs[folder]), partial(show, job))
+        return
+    waiting = list(jobs)
+    running: dict[Future, Path] = {}
+    with _submitting(execution.dask, workers) as submit:
+        while waiting or running:
+            for folder in [f for f in waiting if needs[f] in results or needs[f] not in jobs]:
+                if execution.dask or len(running) < workers:
+                    running[submit(jobs[folder], results.get(needs[folder]))] = folder
+                    waiting.remove(folder)
+            show(jobs[next(iter(running.values()))])
+            ended, _ = wait(running, _LOOK_SECONDS, FIRST_COMPLETED)
+            names = " or ".join(folder.name for folder in running.values())
+            for future in ended:
+                yield running.pop(future), _result_of(future, names)
+
+
+def _result_of(future: Future, names: str) -> Any:
+    """What a job gave. Raises NbtrackError where its process died, beside jobs of some names."""
+    error = future.exception()
+    if type(error).__name__ not in ("BrokenProcessPool", "KilledWorker"):  # the latter is Dask's
+        return future.result()
+    died = f"a worker process died at {names}, perhaps for lack of memory"
+    advice = "run it again, with fewer --workers or smaller settings; what was finished is kept"
+    raise NbtrackError(f"{died}: {advice}")
+
+
+@contextlib.contextmanager
+def _submitting(address: str | None, workers: int) -> Iterator[Callable[[Job, Any], Future]]:
+    """A function that begins a job elsewhere, given what became of the one that it needs.
+
+    Folders, device, search path, fields and trackers there are those of this process. Classes of a
+    notebook or script travel whole, those of files by the name of their module.
+    """
+    settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
+    settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
+    n_threads = 1 if address else max(1, torch.get_num_threads() // workers)
+    with _cluster(address) if address else _pool(workers) as executor:
+
+        def submit(job: Job, needed: Any) -> Future:
+            work = cloudpickle.dumps((FIELDS, TRACKERS, job, needed))
+            return executor.submit(_outcome_there, settings, sys.path, n_threads, work)
+
+        yield submit
+
+
+def _outcome_there(
+    settings: Mapping[str, str], search_path: Sequence[str], n_threads: int, work: bytes
+) -> Any:
+    """Runs in a worker, which may have been started elsewhere."""
+    os.environ |= settings
+    sys.path += [folder for folder in search_path if folder not in sys.path]
+    fields, trackers, job, needed = pickle.loads(work)
+    FIELDS.update(fields)
+    TRACKERS.update(trackers)
+    with threads(n_threads):
+        return job.outcome(needed, lambda share, status: None)
+
+
+@contextlib.contextmanager
+def _pool(workers: int) -> Iterator[Executor]:
+    """Processes of this machine, which end with the block, or with this process if it is killed."""
+    context = multiprocessing.get_context(_START)
+    theirs, ours = context.Pipe(duplex=False)
+    with ProcessPoolExecutor(workers, context, _end_with, (theirs,)) as executor, ours:
+        with _spared():
+            for _ in range(workers):
+                executor.submit(int)  # a process is begun for each, since none is idle yet
+        yield executor
+
+
+def _end_with(pipe: Connection) -> None:
+    """End this worker, whatever it does, as soon as the other end of a pipe is closed."""
+
+    def watch() -> None:
+        pipe.poll(None)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def _spared() -> Iterator[None]:
+    """Spare the processes that are started in a block what is this one's business: Ctrl-C, of
+    which each would tell in a traceback, and the main script, which Python runs in them once more:
+    without a `__main__` guard it would start processes from within them."""
+    script = sys.modules["__main__"]
+    is_main = threading.current_thread() is threading.main_thread()  # others have no handlers
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
+        if handler is not None:
+            signal.signal(signal.SIGINT, handler)
+
+
+@contextlib.contextmanager
+def _cluster(address: str) -> Iterator[Executor]:
+    """The workers of a Dask scheduler. Raises MissingError where there are none."""
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout=_SECONDS_TO_CONNECT)
+        client.wait_for_workers(1, timeout=_SECONDS_TO_CONNECT)
+    except (OSError, ValueError):
+        advice = "start 'dask scheduler', and 'dask worker ADDRESS --nthreads 1'"
+        raise MissingError(f"no Dask scheduler at {address!r} with a worker: {advice}") from None
+    with client, client.get_executor(pure=False) as executor:
+        yield executor

@@ -60,22 +60,20 @@ class MapJob(Job):
 
     @classmethod
     def of(
-        cls, scene: Scene, field: str, preset: Preset, frames: str = ":", seed: int = 0
+        cls, scene: Scene, field: str, preset: Preset, frames=":", seed=0, out: Path | None = None
     ) -> "MapJob":
         """The map of a scene with the settings of a preset."""
-        settings = preset.network_of(field), preset.mapping_of(field)
-        return cls(scene, field, *settings, frames, seed, preset.correction.get(field, 0.0))
+        network, settings = preset.network_of(field), preset.mapping_of(field)
+        correction = preset.correction.get(field, 0.0)
+        return cls(scene, field, network, settings, frames, seed, correction, out)
 
     @cached_property
     def key(self) -> str:
         """A digest of code, device, data, settings and seed."""
+        code = provenance.code_fingerprint(field_class(self.field))
+        how = code, provenance.versions(), choose_device().type
         settings = self.field, self.network, self.settings, self.correction
         what = self.scene.fingerprint, self.frames, self.seed
-        how = (
-            provenance.code_fingerprint(field_class(self.field)),
-            provenance.versions(),
-            choose_device().type,
-        )
         return fingerprint(*how, *settings, *what)
 
     @property
@@ -136,17 +134,24 @@ class MapJob(Job):
         if self.is_corrected_in:  # what would fail after minutes of mapping is told now
             setting = f"correction.{self.field}"
             checked_size(observed_bounds(sequence), self.is_corrected_in, setting)
-        parts = self.field, sequence, self.network, self.settings, self.seed
         if path.is_file():  # a folder of the user's, with another finished map
-            recipe = recipe_of(*parts) | {"correction": self.correction}
+            recipe = recipe_of(self.field, sequence, self.network, self.settings, self.seed)
+            recipe["correction"] = self.correction
             check_recipe(path, self._stored().record, recipe)
         if self.needs:
             finished = correct_map(self.needs.map(), sequence, self.correction)
         else:
-            finished = map_sequence(*parts, choose_device(), checkpoint, tell, self.key)
-        record = {"quality": score_map(finished, sequence, self.scene.room)}
-        record |= {"frames": self.frames, "key": self.key, "correction": self.correction}
-        record |= {"versions": provenance.versions()}
+            finished = map_sequence(
+                self.field, sequence, self.network, self.settings, self.seed, choose_device(),
+                checkpoint=checkpoint, on_iteration=tell, code=self.key,
+            )  # fmt: skip
+        record = {
+            "quality": score_map(finished, sequence, self.scene.room),
+            "frames": self.frames,
+            "key": self.key,
+            "correction": self.correction,
+            "versions": provenance.versions(),
+        }
         finished = replace(finished, record=finished.record | record)
         write_map(path, finished)
         checkpoint.unlink(missing_ok=True)

@@ -18,6 +18,7 @@ from nbtrack.core.settings import (
     changed_settings,
     flat,
     limited,
+    one_of,
     read_setting,
     with_settings,
     with_values,
@@ -26,6 +27,7 @@ from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
 from nbtrack.synthetic import REPORTED_ROOMS
+from nbtrack.synthetic.make import MOTIONS
 from nbtrack.tables import PAPER_PIXELS
 from nbtrack.tracking import TRACKERS, TrackerSettings
 
@@ -35,7 +37,7 @@ class ScenesConfig:
     """Which sequences a preset maps and tracks, and how synthetic rooms are made."""
 
     names: tuple[str, ...] = ()  # synthetic rooms, or folders below the data folder
-    motion: str = "keyframes"  # in a synthetic room: as the dataset's; or handheld, or a tour
+    motion: str = one_of(*MOTIONS)  # in a synthetic room: by default as the dataset's
     n_frames: int = limited(300, 2, 10_000)
     width: int = limited(640, 11, 4096)  # pixels; the height is three quarters of it
     track_frames: str = ":"  # the Python slice of frames that is tracked

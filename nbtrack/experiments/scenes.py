@@ -5,7 +5,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up, nearest_name
+from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
 from nbtrack.core.files import absolute, data_folder, fingerprint, runs_folder
 from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.dataset import DATASET_SCENES
@@ -14,15 +14,9 @@ from nbtrack.experiments.output import check_no_recording, is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
 from nbtrack.locks import locked
 from nbtrack.provenance import package_code
-from nbtrack.recordings.reading import (
-    parse_frames,
-    read_frames,
-    select_frames,
-    without_outliers,
-)  # fmt: skip
+from nbtrack.recordings import reading
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
-from nbtrack.synthetic.make import MOTIONS
 
 _KNOWN = [*ROOMS, *DATASET_SCENES]
 
@@ -52,13 +46,14 @@ class Scene:
         return fingerprint(*self.recording.contents(), package_code("data", "recordings"))
 
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
-        """The frames of a slice such as `10:50:2`, `without_outliers`; more options and errors: see
+        """The frames of a slice such as `10:50:2`, without outliers; more options and errors: see
         `read_frames`."""
-        return without_outliers(read_frames(self.recording, parse_frames(frames), **options))
+        frame_ids = reading.parse_frames(frames)
+        return reading.without_outliers(reading.read_frames(self.recording, frame_ids, **options))
 
     def count(self, frames: str, needs_poses: bool = True) -> int:
         """How many frames a slice selects; raises as `select_frames` does."""
-        return len(select_frames(self.recording, parse_frames(frames), needs_poses))
+        return len(reading.select_frames(self.recording, reading.parse_frames(frames), needs_poses))
 
 
 def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) -> Scene:
@@ -123,7 +118,6 @@ def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
 
 def _room(name: str, config: ScenesConfig) -> Scene:
     """A room of this size, length and seed in the cache, made if it is not there."""
-    look_up("motion", config.motion, MOTIONS)  # told before it names a folder
     recipe = f"{config.motion}-{config.n_frames}x{config.width}-seed{config.seed}"
     recipe += f"-{room_version(name)}"
     folder = runs_folder() / "rooms" / f"{name}-{recipe}" / name

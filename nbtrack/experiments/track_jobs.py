@@ -41,11 +41,9 @@ _OTHER_WORLD = (
     "the recording's poses are in another world than the map: they were moved into it by the one "
     "rigid motion that explains the difference, and errors are those that remain"
 )
-# A user is told where even the best follower has a larger error (m), or the camera moves farther
-# than a search reaches in a larger share of the frames: hands start and stop, and the search
-# catches up (our choice).
-_LEAST_ATE = 0.01
-_SHARE = 0.5
+# A user is warned of larger ones. Hands start and stop, and a search catches up (our choice).
+_LEAST_ATE = 0.01  # m, of the best that follows a camera
+_SHARE = 0.5  # of the frames, in which it moves farther than a search reaches
 # For the work of runs, measured with `smoke` on one core.
 _QUERIES_A_SECOND = 60_000  # of a network
 _NO_NETWORK = 0.05  # of a query's time: where a grid or points are asked
@@ -179,10 +177,8 @@ class TrackJob(Job):
         return metrics
 
     def _begin(self, finished: Map, sequence: RgbdSequence) -> _Start:
-        """Where to begin. Raises DataError where a given map does not fit the pose to start from.
-
-        Where that is not used, and the map does not fit it, the recording has a world of its own.
-        """
+        """Where to begin. A given map that does not fit the pose to start from is a DataError; one
+        that does not fit a pose which is not used tells of a recording in another world."""
         T_first = sequence.T_world_camera[0]
         is_known = self.start == "given" and bool(np.isfinite(T_first).all())
         start = _Start(T_first if is_known else np.eye(4), is_known)
@@ -206,8 +202,9 @@ class TrackJob(Job):
             report(done / len(sequence), status)
 
         budget = make_budget(self.steps, self.rate_hz)
-        how = start.T_world_camera, budget, self.settings, self.seed
-        tracker = make_tracker(self.tracker, finished.field, *how)
+        tracker = make_tracker(
+            self.tracker, finished.field, start.T_world_camera, budget, self.settings, self.seed
+        )
         checkpoint = self.cache / RUN_FILE  # a folder of the user's holds results alone
         tracked = track_sequence(tracker, sequence, checkpoint, tell, start.is_known)
         return tracked, device_name(tracker.device)  # LM and ICP run on the host
@@ -255,8 +252,8 @@ class TrackJob(Job):
         """What makes this run anew, and its map where that is not cached."""
         options = {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
         options |= {"start": self.start, "frames": self.frames, "seed": self.seed}
-        options |= {"device": choose_device().type}
-        options |= {"format": self.scene.format, "preset": PLAIN_PRESET}
+        options |= {"format": self.scene.format, "device": choose_device().type}
+        options["preset"] = PLAIN_PRESET
         settings: dict[str, Any] = {"tracking": {self.tracker: self.settings}}
         if self.is_elsewhere:
             options["map-from"] = self.needs.folder
@@ -267,13 +264,12 @@ class TrackJob(Job):
         sequence = str(self.scene.folder)
         if self.scene.made and not self.is_elsewhere:
             sequence = self.scene.name
-            made = self.scene.made
-            settings["scenes"] = {name: getattr(made, name) for name in SIZES}
-        plain = PRESETS[PLAIN_PRESET].settings
-        words = [f"--set={text}" for text in changed_settings(settings, plain)]
+            settings["scenes"] = {name: getattr(self.scene.made, name) for name in SIZES}
+        words = ["python", "-m", "nbtrack", "track", sequence]
+        changed = changed_settings(settings, PRESETS[PLAIN_PRESET].settings)
+        words += [f"--set={text}" for text in changed]
         words += [f"--{name}={value}" for name, value in options.items() if value is not None]
         words += [f"--import={source}" for source in IMPORTED]
-        words = ["python", "-m", "nbtrack", "track", sequence, *words]
         return shlex.join([*words, "--out", f"again_{self.name}"])
 
 
