@@ -5,14 +5,11 @@ table. Rows follow the data: a new tracker is a new row and nothing here names a
 """
 
 import html
-import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 import pandas as pd
 from pandas.io.formats.style import Styler
@@ -20,6 +17,7 @@ from pandas.io.formats.style import Styler
 from nbtrack.core.errors import DataError, look_up
 from nbtrack.core.files import fingerprint, write_atomic
 from nbtrack.data.dataset import DATASET_SCENES
+from nbtrack.latex import OUR_WORDING, Wording, latex_file
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 PAPER_PIXELS = {"VR": 512, "SDF": 4096}
@@ -30,19 +28,8 @@ _CELL_1 = ["rate_hz", "method", "scene"]
 _CELL_2 = ["tracker", "n_pixels", "budget_ms"]
 _MISSING = "–"
 _BOLD = "font-weight: bold;"
-_PLAIN = "font-weight: normal;"
-# What the marks mean, for the caption: they stand in the cells too, because pages that do not trust
-# a notebook drop its style sheets.
 _LEGEND = f"bold: best at this rate; † and red: above {LOST_THRESHOLD_M:g} m"
 _UNITS = {"m": (1, "{:.3f}"), "mm": (1000, "{:.1f}")}  # of an ATE, and how it is printed
-_SPECIAL = {character: rf"\{character}" for character in "_&%$#{}"}
-_SPECIAL |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-_KINDS = {"table_1": "ate", "table_2": "runtime", "table_3": "beyond"}  # by a file's name
-_LATEX = jinja2.Environment(
-    loader=jinja2.PackageLoader("nbtrack", ""), keep_trailing_newline=True, trim_blocks=True,
-    block_start_string="<%", block_end_string="%>", variable_start_string="<<",
-    variable_end_string=">>", comment_start_string="<#", comment_end_string="#>",
-)  # fmt: skip
 
 
 def published_table_1() -> pd.DataFrame:
@@ -64,10 +51,10 @@ def naming_points(results: pd.DataFrame) -> pd.DataFrame:
 def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
     """Table I in long form from a row for every seed; rates fall, dataset's scenes are labelled.
 
-    Columns are rate_hz, method, scene, ate_m, and seed where there are several: then the column
-    ate_std_m is their std (m) as a sample. A cell with a seed that failed is NaN: a mean over the
-    others would hide the failure. Where results have a column still_ate_m, the method
-    `STANDING_STILL` is added. Raises DataError where two rows have one place.
+    Columns are rate_hz, method, scene, ate_m, and with several seeds ate_std_m, their std (m) as a
+    sample. A cell with a seed that failed is NaN: a mean over the others would hide the failure.
+    Where results have a column still_ate_m, the method `STANDING_STILL` is added. Raises DataError
+    where two rows have one place.
     """
     keys = [*_CELL_1, "seed"] if "seed" in results else _CELL_1
     _refuse_doubles(results, keys)
@@ -92,9 +79,9 @@ def table_1(results: pd.DataFrame, value: str = "ate_m") -> pd.DataFrame:
     gets a row at every rate; what has no result is NaN.
     """
     cells = average_over_seeds(results)
-    rows = [cells["rate_hz"].unique(), cells["method"].unique()]
-    index = pd.MultiIndex.from_product(rows, names=_CELL_1[:2])
-    return _wide(cells, _CELL_1, value).reindex(index=index, columns=cells["scene"].unique())
+    rates, methods, scenes = (cells[key].unique() for key in _CELL_1)
+    index = pd.MultiIndex.from_product([rates, methods], names=_CELL_1[:2])
+    return _wide(cells, _CELL_1, value).reindex(index=index, columns=scenes)
 
 
 def table_2(steps: pd.DataFrame, value: str = "steps") -> pd.DataFrame:
@@ -110,9 +97,8 @@ def table_2(steps: pd.DataFrame, value: str = "steps") -> pd.DataFrame:
 def beside_published(results: pd.DataFrame) -> pd.DataFrame:
     """Our Table I beside the paper's: scene by scene if ours hold scenes of the paper's.
 
-    Errors in different rooms say nothing about each other. Rooms of our own are therefore compared
-    in summary only: the median ATE (m), and the share of scenes in which the camera was lost (ATE
-    above 0.2 m, or no result).
+    Errors in different rooms say nothing about each other. Of our own rooms a summary is compared:
+    the median ATE (m), and the share of scenes where it is above 0.2 m, or there is no result.
     """
     ours, paper = table_1(results), table_1(published_table_1())
     if common := [scene for scene in ours if scene in paper]:
@@ -148,7 +134,10 @@ def _refuse_doubles(cells: pd.DataFrame, keys: list[str]) -> None:
 
 @dataclass(frozen=True)
 class Cell:
-    """A number as it is printed, perhaps with a std, and its marks."""
+    """A number as it is printed, perhaps with a std, and its marks.
+
+    They stand in the text too, because pages that do not trust a notebook drop its style sheets.
+    """
 
     value: str
     std: str = ""
@@ -159,11 +148,11 @@ class Cell:
         return f"{self.value} ± {self.std}" if self.std else self.value
 
     def css(self) -> str:
-        """The style of its marks."""
+        """Its style."""
         return "color: red;" * self.is_lost + _BOLD * self.is_best
 
     def html(self) -> str:
-        """With marks that stand without a style sheet too."""
+        """Its text."""
         text = f"{self} †" if self.is_lost else str(self)
         return f"<b>{text}</b>" if self.is_best else text
 
@@ -183,9 +172,9 @@ def style_table_1(
 ) -> TableStyler:
     """Table I, mean ± std over seeds: best bold, above 0.2 m red with a dagger, missing "–".
 
-    Both marks follow the digits printed, three in m and one in mm, so that they can be checked from
-    the page: values equal to the last digit are equally good. A value without a rival at its rate
-    is not bold. Raises ConfigError for another unit. Source: caption of the paper's Table I.
+    Both marks follow the digits printed, three in m and one in mm: values equal to the last digit
+    are equally good. A value without a rival at its rate is not bold. Raises ConfigError for
+    another unit. Source: caption of the paper's Table I.
     """
     scale, form = look_up("unit", unit, _UNITS)
     shown = (scale * table_1(results)).map(lambda value: float(form.format(value)))
@@ -218,7 +207,7 @@ def style_table_2(
     labels = ["<b>{} *</b>" if default else "{}" for default in is_default]
     styler.relabel_index(labels, level="n_pixels")
     # Notebooks show every row label in bold, so the others are set to normal weight.
-    weights = [_BOLD if default else _PLAIN for default in is_default]
+    weights = [_BOLD if default else "font-weight: normal;" for default in is_default]
     styler.apply_index(lambda _: weights, axis="index", level="n_pixels")
     return _labelled(styler, caption, "* and bold: the n used for tracking")
 
@@ -243,47 +232,6 @@ def _labelled(styler: TableStyler, caption: str | None, legend: str) -> TableSty
     return styler.set_uuid(fingerprint(styler.set_uuid("table").to_html()))
 
 
-@dataclass(frozen=True)
-class Wording:
-    """What an author's LaTeX says in place of ours."""
-
-    caption: str | None = None  # LaTeX; empty: the usual one without the note
-    label: str | None = None  # Table II beside Table I has it too, ending in `-steps`
-    scenes: dict[str, str] = field(default_factory=dict)  # labels by the names in the table
-
-
-def latex_file(styler: TableStyler, path: Path, note: str, own: Wording = Wording()) -> str:
-    """A styled table as the text of a `.tex` file, marked up as in the paper.
-
-    The file's name, `table_1`, `table_2` or `table_3`, chooses the caption; its folder's name goes
-    into the label; a plain note tells how the numbers came about. An author's own caption is that
-    of Table I or III; Table II then has the usual one without the note.
-    """
-    cells = styler.data
-    columns = [own.scenes.get(scene, scene) for scene in cells]
-    groups = groupby(zip(cells.index, cells.to_numpy(), strict=True), lambda row: row[0][0])
-    return _LATEX.get_template("table.tex.jinja").render(
-        styler=styler,
-        own=own,
-        kind=_KINDS[path.stem],
-        name=path.stem,
-        folder=re.sub(r"[^\w.-]", "_", path.resolve().parent.name),  # without special characters
-        note=" ".join(note.split()),
-        has_steps="n_pixels" in cells.index.names,
-        has_std=any(cell.std for cell in cells.to_numpy().flat),
-        columns=columns,
-        groups=[(first, [(key[1], row) for key, row in rows]) for first, rows in groups],
-    )
-
-
-def _plain(text: object) -> str:
-    """Text with LaTeX's special characters made printable, and n = 64 as in the paper."""
-    return re.sub(r"\bn = \d+", r"$\g<0>$", str(text).translate(str.maketrans(_SPECIAL)))
-
-
-_LATEX.filters["plain"] = _plain
-
-
 def write_tables(
     folder: Path,
     results: pd.DataFrame,
@@ -291,43 +239,42 @@ def write_tables(
     note: str,
     default_pixels: dict[str, int] = PAPER_PIXELS,
     steps_note: str | None = None,
-    own: Wording = Wording(),
+    own: Wording = OUR_WORDING,
 ) -> list[Path]:
     """Writes Tables I and II as CSV (long form), LaTeX, and beside the paper's; returns the paths.
 
     The arguments are those of `table_1`, `table_2`, `latex_file` and `style_table_2`. Table II is
     always measured by the clock and may have a note of its own.
     """
-    styled = style_table_2(steps, default_pixels=default_pixels)
-    compared = beside(table_2(steps), table_2(published_table_2()))
     paths = write_table_1(folder, results, note, own)
-    note = steps_note or note
-    return paths + _write_table(folder / "table_2", steps, styled, note, own, compared)
+    styled = style_table_2(steps, default_pixels=default_pixels)
+    paths += _write_table(folder / "table_2", steps, styled, steps_note or note, own)
+    compared = beside(table_2(steps), table_2(published_table_2()))
+    return [*paths, write_csv(folder / "table_2_vs_paper.csv", compared, index=True)]
 
 
-def write_table_1(folder: Path, results: pd.DataFrame, note: str, own=Wording()) -> list[Path]:
+def write_table_1(folder: Path, results: pd.DataFrame, note: str, own=OUR_WORDING) -> list[Path]:
     """Writes Table I alone as CSV, LaTeX, and beside the paper's; see `write_tables`."""
-    cells, compared = average_over_seeds(results), beside_published(results)
-    return _write_table(folder / "table_1", cells, style_table_1(results), note, own, compared)
+    cells, styled = average_over_seeds(results), style_table_1(results)
+    paths = _write_table(folder / "table_1", cells, styled, note, own)
+    compared = beside_published(results)
+    return [*paths, write_csv(folder / "table_1_vs_paper.csv", compared, index=True)]
 
 
-def write_table_3(folder: Path, results: pd.DataFrame, note: str, own=Wording()) -> list[Path]:
+def write_table_3(folder: Path, results: pd.DataFrame, note: str, own=OUR_WORDING) -> list[Path]:
     """Writes Table III, Table I with other rows and in mm, as CSV and LaTeX; see `write_tables`.
 
     Labels of rows contain n, since a method with more points a frame is another method.
     """
     results = naming_points(results)
-    cells = average_over_seeds(results)
-    return _write_table(folder / "table_3", cells, style_table_1(results, unit="mm"), note, own)
+    cells, styled = average_over_seeds(results), style_table_1(results, unit="mm")
+    return _write_table(folder / "table_3", cells, styled, note, own)
 
 
-def _write_table(stem: Path, cells, styler, note: str, own: Wording, compared=None) -> list[Path]:
+def _write_table(stem: Path, cells, styler: TableStyler, note: str, own: Wording) -> list[Path]:
     path = stem.with_suffix(".tex")
     write_atomic(path, latex_file(styler, path, note, own))
-    paths = [write_csv(stem.with_suffix(".csv"), cells), path]
-    if compared is not None:
-        paths.append(write_csv(Path(f"{stem}_vs_paper.csv"), compared, index=True))
-    return paths
+    return [write_csv(stem.with_suffix(".csv"), cells), path]
 
 
 def write_csv(path: Path, table: pd.DataFrame, **options: Any) -> Path:

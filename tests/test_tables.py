@@ -12,13 +12,12 @@ from nbtrack import tables
 from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.experiments.runs import over_rooms
+from nbtrack.latex import Wording, latex_file
 from nbtrack.tables import (
     STANDING_STILL,
-    Wording,
     average_over_seeds,
     beside,
     beside_published,
-    latex_file,
     published_table_1,
     published_table_2,
     style_table_1,

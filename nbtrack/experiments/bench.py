@@ -20,6 +20,7 @@ from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
 from nbtrack.experiments.output import output_folder
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
+from nbtrack.latex import Wording
 from nbtrack.recordings.reading import read_frames
 from nbtrack.synthetic import ROOMS
 from nbtrack.tracking import ClockBudget, StepBudget, make_tracker
@@ -43,10 +44,12 @@ def tables_command(options: Namespace) -> None:
     preset = load_preset(options.preset, options.config, [*options.settings, *names])
     usual = TABLE_3 if options.beyond else TABLE_1
     methods = find_methods(options.method.split(",") if options.method else usual)
-    labels = dict(map(_label_of, preset.scenes.labels))  # what is wrong is told before any work
-    wording = tables.Wording(options.caption, options.label, labels)
+    # What is wrong is told before a room is made.
+    execution = Execution(options.workers, options.dask, keep_going=True)
+    labels = dict(map(_label_of, preset.scenes.labels))
+    wording = Wording(options.caption, options.label, labels)
     with output_folder(options.out):
-        results = _fill_tables(options, preset, methods, wording)
+        results = _fill_tables(options, preset, methods, execution, wording)
     failed = results[results["failure"] != ""]
     if len(failed):
         first, why = failed.iloc[0][["run", "failure"]]
@@ -55,15 +58,14 @@ def tables_command(options: Namespace) -> None:
 
 
 def _fill_tables(
-    options: Namespace, preset: Preset, methods: Methods, wording: tables.Wording
+    options: Namespace, preset: Preset, methods: Methods, execution: Execution, wording: Wording
 ) -> pd.DataFrame:
     """Track, print and write; the results, a row a run."""
     clock = options.budget == "clock"
     scenes = open_scenes(preset)
     results = track_scenes(
         scenes, methods, preset, RATES_3_HZ if options.beyond else None, clock=clock,
-        seeds=range(options.seeds),
-        execution=Execution(options.workers, options.dask, keep_going=True),
+        seeds=range(options.seeds), execution=execution,
     )  # fmt: skip
     shown = results.drop(columns="still_ate_m", errors="ignore") if options.no_still else results
     name = f"{preset.name}_clock" if clock else preset.name

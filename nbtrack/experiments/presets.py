@@ -120,7 +120,13 @@ class Preset:
 
     def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Values as their keys have them; ConfigError for unknown keys, wrong types and ranges."""
-        checked = flat(with_values(self.settings, values))
+        tree = self.settings
+        for key in values:
+            part, *names = key.split(".")
+            if names and isinstance(known := tree.get(part), dict):
+                # The nearest whole key would be something else's.
+                look_up(f"config key, {part} of", names[0], known)
+        checked = flat(with_values(tree, values))
         return {key: checked[key] for key in values}
 
     def with_values(self, values: Mapping[str, Any]) -> "Preset":
