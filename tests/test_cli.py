@@ -71,15 +71,6 @@ def test_a_second_run_finds_the_map(capsys: pytest.CaptureFixture, tmp_path: Pat
     assert said == ["map found", "no finished map"]
 
 
-def test_data_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """Catches a made room that its own check would not accept."""
-    out = tmp_path / "room"
-    size = ["--n-frames", "4", "--width", "48"]
-    assert main(["data", "make", "office", "--out", str(out), *size]) == 0
-    assert main(["data", "check", str(out)]) == 0
-    assert "4 frames" in capsys.readouterr().out
-
-
 def test_tracking_command_reads_any_format(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Catches a --format that the command line drops on its way to map and track."""
     folder = write_recording("tum", tmp_path / "r")

@@ -58,47 +58,24 @@ def _cut(path: str) -> Callable[[], object]:
     return lambda: Path(path).write_bytes(Path(path).read_bytes()[: Path(path).stat().st_size // 2])
 
 
-# Settings: in a file, on the command line, in the environment.
+# Settings in files, on the command line and in the environment; more kinds in test_settings.py.
 TOML = {
     "binary": (b"\x00\xff\xfe", "readable TOML"),
     "no TOML": (b"width: 3", "readable TOML"),
-    "half a line": (b"[mapping.neus]\niterations =", "readable TOML"),
     "twice": (b"name = 'a'\nname = 'b'", "readable TOML"),
     "unknown key": (b"[mapping.neus]\niteration = 3", "did you mean 'mapping.neus.iterations'"),
-    "unknown table": (b"[maping.neus]\niterations = 3", "unknown config key"),
     "value for a table": (b"mapping = 3", "unknown config key 'mapping'"),
-    "another name": (b"name = 'mine'", "unknown config key 'name'"),
-    "text for a number": (b"[mapping.neus]\niterations = 'many'", "must be int"),
-    "fraction": (b"[mapping.neus]\niterations = 1.5", "must be int"),
-    "truth": (b"[mapping.neus]\niterations = true", "must be int"),
     "date": (b"[mapping.neus]\niterations = 2020-01-01", "must be int"),
-    "zero": (b"[mapping.neus]\nn_rays = 0", "must be 1 to"),
     "not a number": (b"[mapping.neus]\nlearning_rate = nan", "must be 0 to"),
-    "infinite": (b"[mapping.neus]\nlearning_rate = inf", "must be 0 to"),
-    "list of words": (b"[tables]\nrates_hz = ['fast']", "must be float"),
-    "empty list": (b"[tables.pixels]\nsdf = []", "give at least one"),
     "deep list": (b"tables.rates_hz = " + b"[" * 5000, "readable TOML"),
     "deep table": (b".".join(5000 * [b"a"]) + b" = 1", "unknown config key 'a.a.a.a"),
     "no name": (b'[scenes]\nnames = ["a\\u0000b"]', "must be str"),
 }
-
-
 SET_TEXTS = {
     "no value": ("mapping.neus.iterations", "has no value"),
-    "empty value": ("mapping.neus.iterations=", "must be int"),
-    "no key": ("=3", "unknown config key"),
     "unknown": ("mapping.neus.iteration=3", "did you mean"),
-    "part of a tree": ("mapping.neus=3", "unknown config key 'mapping.neus'"),
-    "negative": ("mapping.neus.iterations=-5", "must be 1 to"),
     "broken list": ("tables.rates_hz=[1,", "is no TOML"),
-    "deep list": ("tables.rates_hz=" + 5000 * "[", "is no TOML"),
-    "empty list": ("tables.rates_hz=[]", "give at least one"),
-    "no budget": ("tables.budgets_ms=[0]", "must be 0.1 to"),
-    "giant": ("scenes.width=1000000000", "must be 11 to 4096"),
-    "blank inside": ("mapping.neus .iterations=5", "unknown config key"),
 }
-
-
 ENVIRONMENT = {
     "unclosed quote": ("SET", "'a=3", "cannot be split"),
     "preset": ("PRESET", "smok", "did you mean 'smoke'"),
@@ -190,40 +167,28 @@ FILES = {
     "an earlier map": (_earlier_map, [*GIVEN, "map"], "map holds no finished map of this nbtrack"),
     "checkpoint cut": (_unfinished(_cut(CHECKPOINT)), MAP, CUT),
     "checkpoint is text": (_unfinished(_write(CHECKPOINT, "text")), MAP, CUT),
-    "checkpoint is empty": (_unfinished(_resave(lambda c: {})), MAP, CUT),
     "checkpoint without state": (_unfinished(_resave(_no_generator)), MAP, "KeyError: 'gener"),
     "checkpoint of another optimiser": (_unfinished(_resave(lambda c: c | NO_OPTIMIZER)), MAP, CUT),
     "checkpoint of another field": (_unfinished(), IMAP, "with another field, network, settings"),
     "checkpoint of another seed": (_unfinished(), [*MAP, "--seed", "5"], "made with another seed"),
     "finished map of another seed": (_nothing, [*MAP, "--seed", "5"], "made with another seed"),
     "run checkpoint is a list": (_run_checkpoint([1]), OWN, "run.pt is " + CUT),
-    "run checkpoint is empty": (_run_checkpoint({}), OWN, "run.pt is " + CUT),
     "run checkpoint of words": (_run_checkpoint(RUN_OF_WORDS), OWN, "run.pt is " + CUT),
     "trajectory gone": (lambda: Path(TRAJECTORY).unlink(), KITTI, "no file run/traj"),
     "trajectory empty": (_write(TRAJECTORY, " "), KITTI, "trajectory.txt is empty"),
-    "trajectory of comments": (_write(TRAJECTORY, "# a\n# b\n"), KITTI, "is empty"),
     "a column less": (_write(TRAJECTORY, ROW[:-2]), KITTI, "readable table"),
-    "a column more": (_write(TRAJECTORY, f"{ROW} 1"), KITTI, "readable table"),
     "a word": (_write(TRAJECTORY, ROW.replace("3", "x")), KITTI, "readable table"),
     "a NaN": (_write(TRAJECTORY, ROW.replace("3", "nan")), KITTI, "not a finite pose"),
-    "no rotation": (_write(TRAJECTORY, ROW[:-1] + "0"), KITTI, "not a finite pose"),
     "another order": (_write(TRAJECTORY, "0.5 0 0 1 1 2 3 4"), KITTI, "of norm 5.48"),
-    "second line": (_write(TRAJECTORY, f"{ROW}\n{ROW[:-2]}"), KITTI, "at row 2"),
     "a map for a run": (_nothing, ["export", "map", "--to", "kitti", "p"], "no finished run"),
     "no frames": (
         _write("run/frames.csv", ""),
         ["export", "run", "--to", "kitti", "t.txt"],
         "run/frames.csv is not a readable table of frames",
     ),
-    "bytes for frames": (
-        _write("run/frames.csv", b"\x00\xff\xfe\n" * 9),
-        ["export", "run", "--to", "kitti", "t.txt"],
-        "run/frames.csv is not a readable table of frames",
-    ),
     "a run for a mesh": (_nothing, ["export", "run", "--to", "glb", "m.glb"], "run holds no"),
     "unfinished run": (lambda: Path("run/metrics.json").unlink(), KITTI, "no finished run in run"),
     "mesh cut": (_cut("map/mesh.ply"), MESH, "not a readable mesh"),
-    "mesh is text": (_write("map/mesh.ply", "ply"), MESH, "not a readable mesh"),
 }  # fmt: skip
 
 
@@ -250,16 +215,10 @@ ARGUMENTS = {
     "tracker not the map's": ([*GIVEN, "map", "--tracker", "icp"], "does not work on field 'neus'"),
     "steps that are none": ([*OWN, "--steps", "nan"], "steps_per_frame is nan"),
     "steps in words": ([*OWN, "--steps", "few"], "invalid float value: 'few'"),
-    "endless steps": ([*OWN, "--steps", "inf"], "steps_per_frame is inf"),
-    "no grid size": (
-        [*OWN, "--tracker", "lm", "--set", "tracking.lm.voxel=nan"],
-        "must be 0 to",
-    ),
     "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames out"),
     "an unknown option": ([*OWN, "--bake", "nan"], "unknown argument '--bake': "),
     "no frames to map": ([*OWN, "--map-frames", "10:20"], "0 of the"),
     "negative seed": ([*OWN, "--seed", "-1"], "is no whole number from 0"),
-    "giant seed": ([*OWN, "--seed", "9" * 30], "is no whole number from 0"),
     "unknown device": ([*OWN, "--device", "tpu"], "no device 'tpu'"),
     "no slice": ([*OWN, "--frames", "3"], "is no slice"),
     "no step": ([*OWN, "--frames", "::0"], "with S above 0"),
@@ -267,10 +226,6 @@ ARGUMENTS = {
     "nothing selected": ([*OWN, "--frames", "90:"], "0 of the"),
     "unknown motion": ([*OTHER, "--set", "tracking.sdf.motion_model=leap"], "unknown motion model"),
     "unknown start": ([*OTHER, "--start", "unknown"], "whose first pose is not known"),
-    "unknown start of lm": (
-        [*OTHER, "--tracker", "lm", "--start", "unknown"],
-        "whose first pose is not known",
-    ),
     "too many pixels": ([*OTHER, "--set", "tracking.sdf.n_pixels=16777216"], "must be 1 to"),
     "steps without end": ([*OTHER, "--steps", "1e12"], "steps_per_frame is 1e+12"),
     "frames without end": ([*NO_STEPS, "--rate", "1e-308"], "rate_hz is 1e-308"),
@@ -279,12 +234,9 @@ ARGUMENTS = {
     "too many seeds": (["tables", "--seeds", "1000000000"], "from 1 to 1000"),
     "empty folder name": ([*OWN, "--out", ""], "the path is empty"),
     "no seeds": (["tables", "--seeds", "0"], "seeds"),
-    "no workers": (["tables", "--workers", "0"], "from 1 to"),
     "unknown row": (["tables", "--method", "vr,sfd"], "did you mean 'sdf'"),
     "unknown budget": (["tables", "--budget", "tick"], "unknown 'tick'"),
-    "unknown command": (["trak", "living_room"], "did you mean 'track'"),
     "unknown action": (["data", "chekc", "room"], "did you mean 'check'"),
-    "unknown option": ([*OWN, "--stpes", "2"], "did you mean '--steps'"),
     "unknown room": (["track", "living_rom", *OWN[2:]], "did you mean 'living_room'"),
     "no folder": (["track", "does/not/exist", *OWN[2:]], "no sequence 'does/not/exist'"),
     "unknown field": ([*MAP, "--field", "imapp"], "did you mean 'imap'"),
@@ -293,24 +245,17 @@ ARGUMENTS = {
     "both budgets": ([*OWN, "--rate", "2"], "steps=2.0 and rate_hz=2.0: a frame has one budget"),
     "setting of old": ([*OWN, "--set", "tracking.lm.bake_voxel=1"], "mean 'tracking.lm.voxel'"),
     "rate of zero": ([*NO_STEPS, "--rate", "0"], "rate_hz is 0"),
-    "negative rate": ([*NO_STEPS, "--rate", "-1"], "rate_hz is -1"),
     "rate that is none": ([*NO_STEPS, "--rate", "nan"], "rate_hz is nan"),
-    "endless rate": ([*NO_STEPS, "--rate", "inf"], "rate_hz is inf"),
     "no steps": ([*OWN, "--steps", "0"], "steps_per_frame is 0"),
-    "negative steps": ([*OWN, "--steps", "-1"], "steps_per_frame is -1"),
     "room onto a folder": (["data", "make", "office", "--out", "run"], "exists"),
 }
 
 
 OUTPUTS = {
     "run into a file": [*OWN, "--out", "room"],
-    "run below a file": [*OWN, "--out", "room/run"],
-    "map into a file": [*MAP, "--out", "room"],
-    "map below a file": [*MAP, "--out", "room/map"],
     "export onto a folder": ["export", "map", "--to", "ply", "run"],
     "export below a file": ["export", "run", "--to", "kitti", "room/poses.txt"],
     "export into the kernel": ["export", "run", "--to", "kitti", "/proc/nbtrack/poses.txt"],
-    "run into the kernel": [*OWN, "--out", "/proc/nbtrack"],
     "room onto a file": ["data", "make", "office", "--out", "room", "--n-frames", "2"],
 }
 
@@ -362,7 +307,7 @@ def files_limited_to(n_bytes: int) -> Any:
         signal.signal(signal.SIGXFSZ, ignored)
 
 
-@pytest.mark.parametrize("n_bytes", [0, 200, 1500])
+@pytest.mark.parametrize("n_bytes", [0, 1500])
 def test_a_disk_that_fills_up_while_results_are_written(
     n_bytes: int, work: Path, capsys: pytest.CaptureFixture
 ) -> None:
@@ -405,7 +350,7 @@ def test_a_full_disk_while_a_room_is_made(work: Path, capsys: pytest.CaptureFixt
     assert "new" in error
 
 
-@pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])
 def test_a_file_system_without_locks(
     code: int, work: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

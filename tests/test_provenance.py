@@ -11,11 +11,7 @@ import pytest
 
 from nbtrack import provenance
 from nbtrack.core import files
-from nbtrack.core.settings import with_settings
-from nbtrack.experiments.map_jobs import MapJob
-from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.scenes import Scene
-from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.fields import NeuSField
 from nbtrack.synthetic import make_room
 from nbtrack.tracking import SdfTracker
@@ -119,29 +115,7 @@ def test_cells_count(more: str, counts: bool, monkeypatch: pytest.MonkeyPatch) -
     assert (provenance.code_fingerprint(mine) != before) == counts
 
 
-def test_versions_count() -> None:
-    """Catches results that do not tell the torch they were made with."""
-    assert {"nbtrack", "torch", "python", "numba", "scipy"} <= set(provenance.versions())
-
-
 def test_numbers_count_by_their_value() -> None:
     """Catches results that are made twice because a step count was written 30 and 30.0."""
     assert files.fingerprint(30, {"a": [1]}) == files.fingerprint(30.0, {"a": [1.0]})
     assert files.fingerprint(30) != files.fingerprint(31)
-
-
-def test_keys_hold_all_that_makes_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches keys that miss versions, and points fused anew for another width of a network."""
-    scene = Scene("office", make_room("office", tmp_path / "office", 2, 16, 12))
-    preset = load_preset("smoke")
-
-    def keys(preset: Preset = preset) -> tuple[str, str, str]:
-        made = MapJob.of(scene, "neus", preset)
-        points = MapJob.of(scene, "points", preset)
-        return made.key, TrackJob(made, scene, "sdf", preset.tracking_of("sdf"), 2).key, points.key
-
-    before = keys()
-    assert keys() == before
-    assert keys(with_settings(preset, "network.neus.width=7"))[2] == before[2]
-    monkeypatch.setattr(provenance, "versions", lambda: {"torch": "another"})
-    assert all(a != b for a, b in zip(keys(), before, strict=True))

@@ -142,6 +142,40 @@ def test_values_take_the_type_of_the_preset(monkeypatch: pytest.MonkeyPatch) -> 
     assert (scenes.n_frames, scenes.names) == (7, ("office", "bedroom"))
 
 
+REFUSED = {  # by key and value; how files and the environment are read: test_faults.py
+    # A misspelt or unused key that would be silently added, a whole branch, an attribute.
+    "tracking.sdf.npixels=5": "did you mean 'tracking.sdf.n_pixels'?",
+    "scene.names=5": "did you mean 'scenes.names'?",
+    "tracking.lm.lambda_color=5": "did you mean 'tracking.vr.lambda_color'?",  # LM has none
+    "mapping.neus=3": "unknown config key 'mapping.neus'",
+    "mapping.neus .iterations=5": "unknown config key",
+    "__class__=5": "unknown config key '__class__'",
+    "=3": "unknown config key",
+    # Values that would fail, or worse would not, somewhere in a run of hours.
+    "mapping.neus.iterations=": "it must be int",
+    "mapping.neus.learning_rate=false": "it must be float, for example",
+    "scenes.track_frames=10": "it must be str, for example",
+    "scenes.names=[1, 2]": "it must be str, for example",
+    "tables.pixels.vr=[1.5]": "it must be int, for example",
+    "tables.rates_hz=[]": "give at least one",
+    # A sign that turns a loss into a reward, and lists whose quotes or ends the shell ate.
+    "mapping.imap.learning_rate=-1e-3": "it must be 0",
+    "tables.rates_hz=[5, -1]": "it must be 0.01 to 100",
+    "scenes.width=1000000000": "it must be 11 to 4096",
+    "scenes.names=[office,bedroom]": "is no TOML",
+    "tables.rates_hz=" + 5000 * "[": "is no TOML",
+}
+
+
+@pytest.mark.parametrize("setting", REFUSED, ids=range(len(REFUSED)))
+def test_settings_that_are_refused(setting: str) -> None:
+    """Catches what is said beside each kind of them, and messages of several lines."""
+    with pytest.raises(ConfigError) as caught:
+        load_preset(settings=(setting,))
+    assert REFUSED[setting] in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_changed_settings_are_those_that_were_changed(name: str) -> None:
     """Catches settings that cannot be given again: every kind of value makes the round trip."""

@@ -29,6 +29,7 @@ from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, Method
 from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scenes
+from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.tables import table_1
 from nbtrack.tracking import make_tracker
 
@@ -87,8 +88,11 @@ def test_table_1_is_complete_cached_and_repeatable(
     assert elsewhere["ate_m"].tolist() == here["ate_m"].tolist()
 
 
-def test_keys_change_with_what_matters(preset: Preset, scenes: list[Scene]) -> None:
-    """Catches a cached result that is taken for one of another setting, seed or slice."""
+def test_keys_change_with_what_matters(
+    preset: Preset, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a cached result that is taken for one of another setting, seed, slice or version, and
+    one that is made anew for a setting that it does not read."""
     cells = [
         MapJob.of(scenes[0], "neus", preset),
         MapJob.of(scenes[0], "imap", preset),
@@ -98,8 +102,13 @@ def test_keys_change_with_what_matters(preset: Preset, scenes: list[Scene]) -> N
         MapJob.of(scenes[1], "neus", preset),
     ]
     assert len({cell.key for cell in cells}) == 6
-    untouched = with_settings(preset, "tracking.sdf.n_pixels=17")
-    assert MapJob.of(scenes[0], "neus", untouched).key == cells[0].key
+    other = with_settings(preset, "tracking.sdf.n_pixels=17", "network.neus.width=7")
+    assert MapJob.of(scenes[0], "points", other).key == MapJob.of(scenes[0], "points", preset).key
+    runs = [TrackJob(cells[0], scenes[0], "sdf", preset.tracking_of("sdf"), 2) for _ in range(2)]
+    assert runs[0].key == runs[1].key
+    monkeypatch.setattr("nbtrack.provenance.versions", lambda: {"torch": "another"})
+    assert MapJob.of(scenes[0], "neus", preset).key != cells[0].key
+    assert replace(runs[0]).key != runs[1].key
 
 
 def test_maps_and_their_scores(preset: Preset, scenes: list[Scene]) -> None:
@@ -109,7 +118,8 @@ def test_maps_and_their_scores(preset: Preset, scenes: list[Scene]) -> None:
     assert scores[["seconds", "sdf_near_m", "sdf_free_m"]].notna().all().all()
     found = map_scene(scenes[1], "neus", preset)
     assert found.record["seconds"] == scores["seconds"][0]
-    assert {"torch", "nbtrack"} <= set(found.record["versions"])  # where it comes from
+    versions = {"nbtrack", "torch", "python", "numba", "scipy"}
+    assert versions <= set(found.record["versions"])  # where it comes from
     assert len(found.history) == 6
 
 
@@ -187,6 +197,7 @@ def test_a_second_path_is_tracked_in_the_map_of_the_first(
     mapped = track_scenes(scenes[1:], ["sdf"], preset, [10])
     found = track_scenes(scenes[1:], ["sdf"], preset, [10], tracked=second)
     assert found["ate_m"][0] != mapped["ate_m"][0]
+    assert found["scene"][0] == scenes[1].name  # the mapped one
     T_true = second[0].read().T_world_camera[1:]
     np.testing.assert_allclose(read_run(found["run"][0]).T_true, T_true, atol=1e-12)
     monkeypatch.chdir(tmp_path)
