@@ -44,10 +44,8 @@ def run(monkeypatch: pytest.MonkeyPatch, dataset: Path, folder: Path) -> int:
     return main(["tables", "--preset", "paper", *words])
 
 
-def test_nine_columns_and_seven(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    """Catches a preset that stops at a missing scene, or leaves a gap without a word."""
+def test_nine_columns(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a preset that loses a scene of the dataset, or reads its frames in another order."""
     assert run(monkeypatch, dataset, tmp_path) == 0
     cells = pd.read_csv(tmp_path / "out" / "table_1.csv")
     assert set(cells["scene"]) == set(DATASET_SCENES.values())
@@ -63,15 +61,3 @@ def test_nine_columns_and_seven(
     ours, paper, difference, _ = beside["Thin Geo."]
     assert paper == 0.031
     assert difference == pytest.approx(ours - paper, abs=1e-6)
-
-    for name in ("staircase", "kitchen"):
-        (dataset / name).rename(dataset / f"away_{name}")
-    capsys.readouterr()
-    assert run(monkeypatch, dataset, tmp_path) == 0
-    errors = capsys.readouterr().err
-    assert "missing, and left out: kitchen, staircase" in errors
-    seven = pd.read_csv(tmp_path / "out" / "table_1.csv")
-    assert seven["scene"].nunique() == 7
-    pd.testing.assert_frame_equal(
-        seven, cells[~cells["scene"].isin(["Kitchen", "Staircase"])].reset_index(drop=True)
-    )

@@ -316,9 +316,7 @@ def test_millimetres_where_metres_tie(tmp_path: Path) -> None:
     assert shown(styler).loc[10].to_dict("index") == {
         "ICP, n = 64": {"a": "1.4", "b": "200.4"}, "LM, n = 64": {"a": "0.6", "b": "200.1"},
     }  # fmt: skip
-    spread = style_table_1(SEEDS, unit="mm")
-    assert shown(spread)["x"].tolist() == ["200.0 ± 100.0", "1000.0 ± 0.0"]
-    assert r"1000.0$^\dagger_{\pm0.0}$ \\" in latex(spread)
+    assert r"1000.0$^\dagger_{\pm0.0}$ \\" in latex(style_table_1(SEEDS, unit="mm"))
     _, path = write_table_3(tmp_path, cells, NOTE)
     _, icp, lm = tabular_rows(text := path.read_text())
     assert icp[1:] == ["ICP, $n = 64$", "1.4", r"\color{red} 200.4\rlap{$^\dagger$}"]

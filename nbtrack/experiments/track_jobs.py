@@ -15,7 +15,7 @@ import torch
 from nbtrack import provenance
 from nbtrack.checks.in_map import check_belongs, in_world_of_map, look_in_map
 from nbtrack.core import files
-from nbtrack.core.arrays import Pose
+from nbtrack.core.arrays import Pose, Poses
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.settings import as_dict, changed_settings
@@ -117,24 +117,29 @@ class TrackJob(Job):
         """Whether the run is finished; in a folder of the user's it is always made anew."""
         return self.out is None and (self.folder / METRICS_FILE).is_file()
 
-    def check(self) -> None:
-        """Raises ConfigError or DataError, before anything is made, where a run cannot begin."""
+    def _true_path(self) -> Poses:
+        """Of the frames (m), NaN where it is not known. Raises as `select_frames` does."""
         recording = self.scene.recording
         frame_ids = select_frames(recording, parse_frames(self.frames), needs_poses=False)
+        return recording.T_world_camera[frame_ids]
+
+    def check(self) -> None:
+        """Raises ConfigError or DataError, before anything is made, where a run cannot begin."""
+        is_known = self.start == "given" and np.isfinite(self._true_path()[0]).all()
         expected_poses(self.settings.motion_model, [np.eye(4)])
-        if self.start == "unknown" or not recording.has_pose[frame_ids[0]]:
+        if not is_known:
             tracker_class(self.tracker).check_finds(in_corrected=self.needs.correction > 0)
 
     def expected_reach(self) -> dict[str, float]:
         """What `reach_metrics` will say of it; nothing where its steps are not known before."""
         if self.steps is not None:
             with contextlib.suppress(NbtrackError):  # the run itself will say what is wrong
-                recording = self.scene.recording
-                frame_ids = select_frames(recording, parse_frames(self.frames), needs_poses=False)
-                path = recording.T_world_camera[frame_ids]
-                reach = self.settings.reach(self.steps, self.needs.metres_per_unit)
-                return reach_metrics(reach, path, self.settings.motion_model)
+                return self._reach(self.steps, self.needs.metres_per_unit, self._true_path())
         return {}
+
+    def _reach(self, steps: float, metres_per_unit: float, T_true: Poses) -> dict[str, float]:
+        reach = self.settings.reach(steps, metres_per_unit)
+        return reach_metrics(reach, T_true, self.settings.motion_model)
 
     def result(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""
@@ -215,16 +220,15 @@ class TrackJob(Job):
         """What is to be said of a run beside its errors."""
         T_true = sequence.T_world_camera
         metres_per_unit = finished.field.bounds.metres_per_unit
-        reach = self.settings.reach(tracked.frames["steps"].mean(), metres_per_unit)
         notes = {"metres_per_unit": metres_per_unit, "map_warning": start.warning}
-        notes |= {"start": "given" if start.is_known else "unknown"}
+        notes["start"] = "given" if start.is_known else "unknown"
         if isinstance(self.needs, GivenMap):
             followed = sequence.select(slice(len(sequence) - len(tracked.frames), None))
             if start.is_in_other_world:
                 followed = replace(followed, T_world_camera=tracked.T_estimated)
             notes |= look_in_map(finished.field, followed, tracked.T_estimated)
-        motion_model = self.settings.motion_model
-        return notes | still_metrics(T_true) | reach_metrics(reach, T_true, motion_model)
+        reach = self._reach(tracked.frames["steps"].mean(), metres_per_unit, T_true)
+        return notes | still_metrics(T_true) | reach
 
     def _provenance(self, finished: Map) -> dict[str, Any]:
         """Where a run comes from: data, map, method, settings, machine; how to make it again."""
