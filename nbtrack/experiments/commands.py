@@ -237,13 +237,12 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
     tracked = read_trajectory(source)
     metrics, n_frames = tracked.metrics, len(tracked.frames)
     stored = read_map(metrics["map"])
-    field = stored.field
     if metrics.get("map_key") != stored.key:
         raise DataError(f"{metrics['map']} is not the map of this run any more: track again")
     shown = np.unique(np.linspace(0, n_frames - 1, _MOVIE_FRAMES).round().astype(int))
     seen = _seen(tracked, shown, open_recording(metrics["recording"], metrics["format"]))
-    surface = _surface(field, seen, 2 * _CELLS)
-    title = f"{metrics['scene']}: {metrics['tracker']} in {field.label}"
+    surface = _surface(stored.field, seen, 2 * _CELLS)
+    title = f"{metrics['scene']}: {metrics['tracker']} in {stored.field.label}"
     if format_name == "rrd":
         content = rerun_bytes(surface, seen, tracked, title)
     else:
@@ -262,11 +261,8 @@ def _export_trajectory(source: Path, format_name: str) -> tuple[str, str]:
     return number_lines(T_world_camera[:, :3].reshape(-1, 12)), f"{n_poses} poses, {what}; {given}"
 
 
-_EXPORTS = {
-    "kitti": _export_trajectory,
-    **dict.fromkeys(("ply", "glb"), _export_map),
-    **dict.fromkeys(("gif", "rrd"), _export_run),
-}
+_EXPORTS = {"kitti": _export_trajectory, "ply": _export_map, "glb": _export_map}
+_EXPORTS |= {"gif": _export_run, "rrd": _export_run}
 
 
 def make_command(options: Namespace) -> None:

@@ -1,4 +1,4 @@
-"""Finished runs: their scores, what their folders hold, and means of errors over rooms."""
+"""Finished runs: their scores, the files of their folders, and means of errors over rooms."""
 
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,29 @@ from nbtrack.beyond.verdict import score_detection
 from nbtrack.core import files
 from nbtrack.core.errors import MissingError
 from nbtrack.tracking.metrics import trajectory_metrics
-from nbtrack.tracking.trajectories import Trajectory, read_tum, shifted
+from nbtrack.tracking.trajectories import Trajectory, read_tum, shifted, tum_text
 
 METRICS_FILE = "metrics.json"  # written last: where it stands, a run is complete
+
+
+def write_run(folder: Path, run: Trajectory) -> None:
+    """Writes the files of a finished run, whose metrics tell the origin that its poses refer to.
+
+    `trajectory.txt` and `groundtruth.txt` (TUM) hold the tracked frames, without a first one whose
+    pose was given: so public tools report the error of the paper's formula. Where no true pose is
+    known there is no `groundtruth.txt`.
+    """
+    times, origin = run.frames["time"].to_numpy(), np.array(run.metrics["origin"])
+    texts = {
+        "trajectory.txt": tum_text(times, shifted(run.T_estimated, origin)),
+        "groundtruth.txt": tum_text(times, shifted(run.T_true, origin)),
+        "frames.csv": run.frames.to_csv(index=False),
+        METRICS_FILE: files.json_text(run.metrics),
+    }
+    if "ate_rmse_m" not in run.metrics:
+        del texts["groundtruth.txt"]
+        (folder / "groundtruth.txt").unlink(missing_ok=True)
+    files.write_together(folder, texts)
 
 
 def read_trajectory(folder: Path) -> Trajectory:

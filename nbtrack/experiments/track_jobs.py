@@ -24,7 +24,7 @@ from nbtrack.experiments import IMPORTED
 from nbtrack.experiments.jobs import Job, Report
 from nbtrack.experiments.map_jobs import PLAIN_PRESET, GivenMap, MapJob, setting_tree
 from nbtrack.experiments.presets import PRESETS, SIZES
-from nbtrack.experiments.runs import METRICS_FILE, scores_of
+from nbtrack.experiments.runs import METRICS_FILE, scores_of, write_run
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
 from nbtrack.mapping.files import Map
@@ -34,7 +34,6 @@ from nbtrack.tracking.metrics import still_metrics
 from nbtrack.tracking.reach import reach_metrics
 from nbtrack.tracking.starts import expected_poses
 from nbtrack.tracking.tracker import TrackerSettings
-from nbtrack.tracking.trajectories import shifted, tum_text
 
 RUN_FILE = "run.pt"
 _OTHER_WORLD = (
@@ -152,10 +151,7 @@ class TrackJob(Job):
     def compute(self, report: Report) -> dict[str, Any]:
         """Track, or take a killed run up where its last checkpoint stands; write the files.
 
-        `trajectory.txt` and `groundtruth.txt` (TUM) hold the tracked frames, without the first
-        one, whose pose was given: so public tools report the error of the paper's formula. Where no
-        true pose is known there is no `groundtruth.txt`. Raises DataError where a given map does
-        not fit the first frame at its given pose.
+        Raises DataError where a given map does not fit the first frame at its given pose.
         """
         finished = self.needs.map()
         origin = np.array(finished.record["origin"])
@@ -167,17 +163,7 @@ class TrackJob(Job):
             tracked, is_explained = in_world_of_map(tracked)
             notes["map_warning"] = _OTHER_WORLD if is_explained else None
         metrics = scores_of(tracked) | self._provenance(finished) | notes
-        times = tracked.frames["time"].to_numpy()
-        texts = {
-            "trajectory.txt": tum_text(times, shifted(tracked.T_estimated, origin)),
-            "groundtruth.txt": tum_text(times, shifted(tracked.T_true, origin)),
-            "frames.csv": tracked.frames.to_csv(index=False),
-            METRICS_FILE: files.json_text(metrics),
-        }
-        if "ate_rmse_m" not in metrics:
-            del texts["groundtruth.txt"]
-            (self.folder / "groundtruth.txt").unlink(missing_ok=True)
-        files.write_together(self.folder, texts)
+        write_run(self.folder, replace(tracked, metrics=metrics))
         (self.cache / RUN_FILE).unlink(missing_ok=True)
         return metrics
 
