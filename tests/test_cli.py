@@ -96,10 +96,11 @@ def test_a_traceback_for_who_asks(
 
 
 def test_a_map_is_taken_with_the_settings_that_made_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a refusal of the very settings that a map was made with, because a method set others
     beside them; and settings that the map does not have, which no run could follow."""
+    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
     folder, out = write_recording("plain", tmp_path / "r"), str(tmp_path / "m")
     made = ["map", str(folder), "--field", "neus", *TINY, "--set", "correction.neus=0.3"]
     assert main([*made, "--out", out]) == 0
