@@ -71,8 +71,7 @@ def track_scenes(
     check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
     rates = [None] if steps else rates_hz or preset.tables.rates_hz
     frames = str(frames or preset.scenes.track_frames)
-    pairs = [*zip(scenes, tracked or scenes, strict=True)]
-    jobs, rows = [], []
+    jobs, rows, pairs = [], [], [*zip(scenes, tracked or scenes, strict=True)]
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
         settings = own.tracking_of(method.tracker)
@@ -81,15 +80,13 @@ def track_scenes(
         by_clock = rate_hz if clock else None
         job = TrackJob(made, seen, method.tracker, settings, n_steps, by_clock, frames, seed)
         jobs.append(job)
-        # The scene is the mapped one; metrics name the one that was tracked.
-        of_job = {"scene": scene.name, "seed": seed, "run": job.folder.name}
-        of_job["n_pixels"] = settings.n_pixels
-        rows.append({"rate_hz": rate_hz, "steps": n_steps, "method": method.label} | of_job)
+        row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
+        rows.append(row | {"seed": seed, "run": job.folder.name, "n_pixels": settings.n_pixels})
     return pd.DataFrame(map(_row_of, rows, _run(jobs, clock, execution)))
 
 
 def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[str, Any]:
-    """A whole row: its place, and the metrics or the failure."""
+    """A whole row: its place, whose scene is the mapped one, and the metrics or the failure."""
     if isinstance(result, NbtrackError):
         return {**row, "failure": str(result), "ate_m": float("nan")}
     metrics = {k: v for k, v in result.items() if k not in ("config", "map_record", "versions")}
