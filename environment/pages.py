@@ -6,6 +6,7 @@ They begin at FOLDER/index.html and show the stored outputs, or, with --execute,
 """
 
 import argparse
+import os
 import re
 import shutil
 import sys
@@ -70,8 +71,11 @@ def read_source(path: Path, execute: bool) -> nbformat.NotebookNode:
     return notebook
 
 
-def html_of(notebook: nbformat.NotebookNode) -> str:
-    """The page of a notebook, whose title is its first heading."""
+def html_of(notebook: nbformat.NotebookNode, index: str) -> str:
+    """The page of a notebook, whose title is its first heading, beside its contents.
+
+    `index` is the address of the first page; it is empty on that page itself.
+    """
     notebook.metadata["title"] = re.search(r"^# (.+)", notebook.cells[0].source, re.M)[1]
     exporter = HTMLExporter(
         template_name="pages", extra_template_basedirs=[str(ROOT / "environment")],
@@ -80,7 +84,17 @@ def html_of(notebook: nbformat.NotebookNode) -> str:
     )  # fmt: skip
     remover = TagRemovePreprocessor(remove_all_outputs_tags={NEEDS_KERNEL})
     exporter.register_preprocessor(remover, enabled=True)
-    return exporter.from_notebook_node(notebook)[0].replace("color: red;", RED)
+    page = exporter.from_notebook_node(notebook)[0].replace("color: red;", RED)
+    return page.replace("<main>", contents_of(page, index) + "<main>", 1)
+
+
+def contents_of(page: str, index: str) -> str:
+    """Links to the index and to the second-level headings of a page."""
+    home = f'<a href="{index}">← All notebooks</a>' if index else ""
+    links = ""
+    for name, heading in re.findall(r'<h2 id="(.+?)">(.+?)</h2>', page):
+        links += f'<li><a href="#{name}">{re.sub("<.*?>", "", heading)}</a></li>'
+    return f'<nav aria-label="Contents">{home}<ul>{links}</ul></nav>'
 
 
 def named_files(notebook: nbformat.NotebookNode, folder: Path) -> list[Path]:
@@ -103,7 +117,9 @@ def write_pages(folder: Path, sources: list[Path], execute: bool) -> None:
             continue
         print(f"{source.relative_to(ROOT)} ...", flush=True)
         notebook = read_source(source, execute)
-        target.write_text(html_of(notebook), encoding="utf-8")
+        index = os.path.relpath(folder / "index.html", target.parent)
+        is_index = source == ROOT / "README.md"
+        target.write_text(html_of(notebook, "" if is_index else index), encoding="utf-8")
         named = dict.fromkeys(named_files(notebook, source.parent))
         sources += [path for path in named if path not in sources]
 

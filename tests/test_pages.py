@@ -48,6 +48,17 @@ def test_a_page_loads_nothing_and_tells_what_it_is(pages: dict[Path, bs4.Beautif
     assert "interactive(" not in page.text
 
 
+def test_each_page_has_contents_and_a_way_back(pages: dict[Path, bs4.BeautifulSoup]) -> None:
+    """Catches a page whose contents lack a heading, and one that does not lead to the index."""
+    (root,) = (path for path in pages if path.parent == min(p.parent for p in pages))
+    for path, page in pages.items():
+        headings = [f"#{heading['id']}" for heading in page.select("h2")]
+        links = [link["href"] for link in page.nav.select("a")]
+        assert links[-len(headings) :] == headings or not headings, path
+        back = [(path.parent / link).resolve() for link in links if "#" not in link]
+        assert back == ([root] if path != root else []), path
+
+
 def test_formulas_are_mathml() -> None:
     """Catches letters that are not bold, one bar unlike the other, and TeX left over."""
     made = PAGES.mathml(r"\lVert\hat{\mathbf c}_k\rVert_1", "block")

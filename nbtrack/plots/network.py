@@ -1,5 +1,7 @@
 """The network that all fields share, as a diagram with shapes."""
 
+from itertools import pairwise
+
 from matplotlib.figure import Figure
 
 from nbtrack.fields.mlp import FourierMlp
@@ -28,7 +30,7 @@ def plot_network(network: FourierMlp, value: str, title: str = "") -> Figure:
         edge = PALETTE[0] if 0 < place <= len(texts) else "none"
         box = {"boxstyle": "square,pad=0.6", "facecolor": "white", "edgecolor": edge}
         boxes.append(axes.text(place, 0, text, bbox=box, **_CENTRED).get_bbox_patch())
-    for place, (start, end) in enumerate(zip(boxes, boxes[1:], strict=False)):
+    for place, (start, end) in enumerate(pairwise(boxes)):
         arrow = _ARROW | {"patchA": start, "patchB": end}
         axes.annotate("", (place + 1, 0), (place, 0), arrowprops=arrow)
     arrow = _ARROW | {"connectionstyle": "bar,fraction=-0.12", "patchA": boxes[1]}
