@@ -30,7 +30,7 @@ KEY = "mapping.neus.iterations"
 
 
 # What a camera that stands still must be off (m) in the frames that a preset tracks.
-FLOORS = [("smoke", 0.5), ("nine_rooms", 1.0)]
+FLOORS = [("smoke", 0.3), ("nine_rooms", 1.0)]
 
 
 def iterations(preset: Preset) -> int:
