@@ -1,6 +1,7 @@
 """Run every test with array shapes and types checked at each call of the package."""
 
 import importlib
+import os
 
 import pytest
 from jaxtyping import install_import_hook
@@ -13,9 +14,18 @@ LIBRARIES = (
 )  # fmt: skip
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Notebooks that are compared side by side have a core each: their jobs then need no further
+    processes, which would only import the package once more and wait for each other."""
+    worker = getattr(config, "workerinput", {}).get("workerid", "")
+    if worker and config.getoption("nbval", False) and hasattr(os, "sched_setaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
+
+
 def pytest_collectstart(collector: pytest.Collector) -> None:
-    """Only where tests run, not in a process that hands them out: this takes seconds."""
-    if isinstance(collector, pytest.Session):
+    """Only where tests of the package run: this takes seconds, and notebooks have own processes."""
+    if isinstance(collector, pytest.Session) and not collector.config.getoption("nbval", False):
         for library in LIBRARIES:
             importlib.import_module(library)
         install_import_hook("nbtrack", "beartype.beartype")
