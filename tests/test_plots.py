@@ -24,6 +24,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.output import save_picture
 from nbtrack.plots.movie import view_of
+from nbtrack.plots.network import plot_network
 from nbtrack.plots.pose_losses import move_sideways
 from nbtrack.plots.scene import screen_axes
 from nbtrack.plots.style import PALETTE, method_colors
@@ -75,7 +76,9 @@ def room_mesh() -> trimesh.Trimesh:
 
 
 FAR = torch.linspace(-0.05, 0.05, 12 * 16 - 1)  # m, of the measured pixels of a frame
+IMAP_MLP = make_field("imap", NetworkSettings(width=8), CUBE, seed=0).mlp
 FIGURES = {
+    "network": lambda s: plot_network(IMAP_MLP, "density (1/m)", "eight wide"),
     "frame": lambda s: plots.plot_frame(s, 3, "one"),
     "views": lambda s: plots.plot_views(s, [0, 3], [(s.color(0), s.depth(0) + 0.02)] * 2, "x"),
     "ray": lambda s: plots.plot_along_ray(AT, {"a (1/m)": RAY, "b (m)": RAY[:-1]}, 1.2, "end"),
