@@ -23,6 +23,7 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.output import save_picture
+from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.plots.movie import view_of
 from nbtrack.plots.network import plot_network
 from nbtrack.plots.pose_losses import move_sideways
