@@ -61,6 +61,16 @@ def with_noise(data: Source) -> Source:
     return data._replace(depths_mm=np.stack(depths))
 
 
+def thinned(data: Source, step: int) -> Source:
+    """Every `step`-th pixel along both sides; the principal point moves with the first one kept."""
+    first, c = step // 2, data.camera
+    kept = (slice(None), slice(first, None, step), slice(first, None, step))
+    colors, depths_mm = data.colors[kept], data.depths_mm[kept]
+    middle = [(place - first - 0.5) / step + 0.5 for place in (c.cx, c.cy)]
+    camera = Intrinsics(*depths_mm.shape[:0:-1], c.fx / step, c.fy / step, *middle)
+    return Source(colors, depths_mm, data.poses, camera)
+
+
 def depth(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     return lambda data: data._replace(depths_mm=np.rint(change(data.depths_mm)).astype(np.uint16))
 

@@ -21,6 +21,7 @@ from recordings import (
     matrix_text,
     positions,
     source,
+    thinned,
     with_noise,
     write_matrices,
     write_neural_rgbd,
@@ -33,7 +34,6 @@ from nbtrack.checks import check as check_module
 from nbtrack.checks.check import DataReport, check_recording, quick_warning
 from nbtrack.checks.conventions import AXES, axes_name
 from nbtrack.cli import main
-from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.settings import with_settings
 from nbtrack.data.sequence import observed_bounds
@@ -190,9 +190,9 @@ def test_nothing_to_look_at(box: Path, tmp_path: Path) -> None:
 def test_a_long_recording_is_read_in_parts(tmp_path: Path, monkeypatch) -> None:
     """Catches 18 GB that 12,000 frames would take, images that are lost between two parts, and a
     repeated image that is not seen since it begins one."""
-    folder = write_box(tmp_path / "box", walk(70))
-    (folder / "depth_filtered/depth32.png").write_bytes(
-        (folder / "depth_filtered/depth31.png").read_bytes()
+    folder = write_box(tmp_path / "box", walk(20))
+    (folder / "depth_filtered/depth8.png").write_bytes(
+        (folder / "depth_filtered/depth7.png").read_bytes()
     )
     whole, sizes, read = check(folder), [], check_module.read_frames
 
@@ -201,11 +201,11 @@ def test_a_long_recording_is_read_in_parts(tmp_path: Path, monkeypatch) -> None:
         return read(recording, frames, *more)
 
     monkeypatch.setattr(check_module, "read_frames", counted)
+    monkeypatch.setattr(check_module, "_FRAMES_AT_ONCE", 8)
     report = check(folder)
-    assert max(sizes) < 70
-    assert sum(sizes) == 70
+    assert sizes == [8, 8, 4]
     assert report.frames.equals(whole.frames)
-    assert list(report.frames.index[report.frames.is_repeated]) == [32]
+    assert list(report.frames.index[report.frames.is_repeated]) == [8]
     assert report.conventions[0].median_m == whole.conventions[0].median_m
     assert report.best.name == whole.best.name
 
@@ -249,12 +249,8 @@ def seen(name: str) -> Source:
     """A room with a Kinect's noise, or the real recording at a quarter of its size."""
     if name == "real_room":
         sequence = read_sequence(REAL_ROOM, slice(0, 36, 2))
-        K = sequence.intrinsics
-        # The middle of four pixels is the corner of one: the principal point moves with it.
-        camera = Intrinsics(80, 60, 0.25 * K.fx, 0.25 * K.fy, 39.875, 29.875)
-        quarter = (slice(None), slice(2, None, 4), slice(2, None, 4))
-        colors, depths = sequence.colors[quarter], sequence.depths_mm[quarter]
-        return Source(colors, depths, sequence.T_world_camera, camera)
+        images = sequence.colors, sequence.depths_mm
+        return thinned(Source(*images, sequence.T_world_camera, sequence.intrinsics), 4)
     return with_noise(source(name, 18, 5))
 
 
@@ -332,9 +328,10 @@ def write(folder: Path, name: str, case: Case) -> Path:
 @pytest.mark.parametrize("name", SEEN)
 def test_every_mistake_is_named_and_nothing_else(tmp_path: Path, name: str) -> None:
     """Catches a mistake that passes, or that is taken for another one, and warnings about what is
-    right, however it is declared; by the whole check and by a quick look before mapping."""
+    right, however it is declared; by the whole check and by a quick look before mapping. Half of
+    the cases in other places too, so that none is told in one synthetic room alone."""
     wrong = {}
-    for number, case in enumerate([*MISTAKES, *RIGHT]):
+    for number, case in enumerate([*MISTAKES, *RIGHT][:: 1 if name == "living_room" else 2]):
         recording = open_recording(write(tmp_path / str(number), name, case))
         wanted = f"your (poses look|(depth|calibration) looks) like {case.says}"
         first = next(iter(check_recording(recording).warnings), "")

@@ -1,5 +1,6 @@
 """Adding a field or a tracker: a short file or cell registers it, and it has rows in the tables."""
 
+import contextlib
 import importlib
 import json
 import os
@@ -14,6 +15,7 @@ from unittest import mock
 
 import nbformat
 import pytest
+from forked import forking
 from nbconvert.preprocessors import ExecutePreprocessor
 from tiny import TINY, tiny_words
 
@@ -84,21 +86,20 @@ def test_the_field_of_the_notebook_in_every_command(grid_file: None, tmp_path: P
     in a command: mapped, read, tracked in again, corrected, and a row of a table."""
     words = tiny_words(
         "scenes.names=['office']", "network.neus_grid.finest=0.3", "mapping.neus_grid.iterations=4",
-        "mapping.neus_grid.n_rays=8", "tracking.huber.n_pixels=8",
+        "mapping.neus_grid.n_rays=8", "tracking.huber.n_pixels=8", "tables.rates_hz=[10]",
     )  # fmt: skip
-    made = str(tmp_path / "map")
+    made, run = str(tmp_path / "map"), ["--steps", "1", "--out", str(tmp_path / "run")]
     assert main(["map", "office", "--field", "neus_grid", *words, "--out", made]) == 0
-    for tracker in ("sdf", "huber", "gauss_newton", "vr", "lm"):
-        own = ["--tracker", tracker, "--steps", "1", "--out", str(tmp_path / tracker)]
-        assert main(["track", "office", "--map-from", made, *own, *words]) == 0
-        assert (tmp_path / tracker / "trajectory.txt").is_file()
-    METHODS["grid"] = Method("Grid", "neus_grid", "sdf", ("correction.neus_grid=0.2",))
-    try:
-        rows = ["--method", "sdf,grid", "--workers", "1", "--out", str(tmp_path / "out")]
-        assert main(["tables", *rows, *words, "--set", "tables.rates_hz=[10]"]) == 0
-    finally:
-        del METHODS["grid"]
-    assert (tmp_path / "out/table_1.csv").read_text().count("Grid,office") == 1
+    assert main(["track", "office", "--map-from", made, "--tracker", "huber", *run, *words]) == 0
+    assert (tmp_path / "run/trajectory.txt").is_file()
+    trackers = ("sdf", "huber", "gauss_newton", "vr", "lm")
+    own = {f"grid_{name}": Method(f"Grid {name}", "neus_grid", name) for name in trackers}
+    own["grid"] = Method("Grid corrected", "neus_grid", "sdf", ("correction.neus_grid=0.2",))
+    with mock.patch.dict(METHODS, own):
+        rows = ["--method", ",".join(own), "--workers", "1", "--out", str(tmp_path / "out")]
+        assert main(["tables", *rows, *words]) == 0
+    table = (tmp_path / "out/table_1.csv").read_text()
+    assert re.findall(r"Grid (\w+),office", table) == [*trackers, "corrected"]
 
 
 def test_an_installed_package_joins_by_its_entry_point(tmp_path: Path) -> None:
@@ -108,16 +109,25 @@ def test_an_installed_package_joins_by_its_entry_point(tmp_path: Path) -> None:
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: own-method\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[nbtrack]\nmine = own_method\n")
-    found = nbtrack_there(tmp_path, "methods")
+    paths = os.pathsep.join([str(Path(__file__).parents[1]), str(tmp_path)])
+    command = [sys.executable, "-m", "nbtrack", "methods"]
+    found = subprocess.run(
+        command, env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True
+    )
     assert "Mine" in found.stdout, found.stderr
 
 
-def nbtrack_there(folder: Path, *words: str) -> subprocess.CompletedProcess:
-    """The command in a process of its own, which starts anew."""
-    command = [sys.executable, "-m", "nbtrack", *words]
-    package = str(Path(__file__).parents[1])
-    environment = os.environ | {"PYTHONPATH": package, "NBTRACK_RUNS": str(folder / "runs")}
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+@contextlib.contextmanager
+def importing() -> Iterator[None]:
+    """What a command imports is known in the block alone, as in a process of its own."""
+    with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
+        for registry in (FIELDS, TRACKERS, METHODS):
+            stack.enter_context(mock.patch.dict(registry))
+        patch.setattr(sys, "path", [*sys.path])
+        yield
+        experiments.IMPORTED.clear()
+        for name in ("my-method", "helper"):
+            sys.modules.pop(name, None)
 
 
 def test_a_file_joins_by_an_option_of_every_command(
@@ -137,27 +147,27 @@ def test_a_file_joins_by_an_option_of_every_command(
         "--set", "tracking.distance.n_pixels=8", "--set", "mapping.fading.decay=0.1",
     ]  # fmt: skip
     grid = ["--method", "mine", "--workers", "2", "--scenes", "office,bedroom", "--out", "out"]
-    done = nbtrack_there(tmp_path, "tables", *own, *grid, *words)
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(tmp_path)
+    with importing(), forking():
+        assert main(["tables", *own, *grid, *words]) == 0
     assert (tmp_path / "out/table_1.csv").read_text().count("Mine,") == 2
     assert "DISTANCE,8," in (tmp_path / "out/table_2.csv").read_text()
     (made,) = (tmp_path / "runs/maps").glob("office-fading-*")
     run = ["track", "office", "--map-from", str(made), "--steps", "1", "--out", "run", *words]
-    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
     assert main(run) == 2
     refused = capsys.readouterr().err
     assert "'fading', which is not registered" in refused
     assert "--import" in refused
     assert refused.count("\n") == 1
-    with mock.patch.dict(FIELDS), mock.patch.dict(TRACKERS), mock.patch.dict(METHODS):
-        monkeypatch.setattr(sys, "path", [*sys.path])
+    with importing():
         assert main([*run, "--tracker", "distance", *own]) == 0
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     assert f"--import={far / 'my-method.py'}" in metrics["command"]
-    done = nbtrack_there(
-        far, "export", str(made), "--to", "ply", "room.ply", "--import", "my-method"
-    )
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(far)
+    monkeypatch.syspath_prepend(far)  # as for `python -m nbtrack`
+    with importing():
+        assert main(["export", str(made), "--to", "ply", "room.ply", "--import", "my-method"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -366,8 +376,9 @@ mine = nbtrack.Method("Mine", "neus", "mine", ("tracking.mine.n_pixels=8",))
 scenes = nbtrack.open_scenes(preset)
 """
     tracking = [  # two runs are left for the two workers
-        f"print(*nbtrack.track_scenes(scenes, [mine], preset, {how})['run'])"
-        for how in ("[10]", "[10, 8, 5], execution=Execution(workers=2)")
+        f"print(*nbtrack.track_scenes(scenes, [mine], preset, {rates}, "
+        f"execution=Execution(workers={workers}))['run'])"
+        for rates, workers in (([10], 1), ([10, 8, 5], 2))
     ]
     cells = [nbformat.v4.new_code_cell(text) for text in (CELL, setting, *tracking)]
     notebook = nbformat.v4.new_notebook(cells=cells)

@@ -4,8 +4,10 @@ import re
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import bs4
+import nbformat
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -15,9 +17,18 @@ FIRST = ROOT / "notebooks/01_map_imap.ipynb"
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, bs4.BeautifulSoup]:
-    """The pages of the first notebook and of all that it names, with stored outputs."""
+    """The pages of the first notebook, with stored outputs, and of all that it names, without."""
+
+    def read_source(path: Path, execute: bool) -> nbformat.NotebookNode:
+        notebook = PAGES.read_source(path, execute)
+        for cell in notebook.cells if path != FIRST else []:
+            if cell.cell_type == "code":
+                cell.outputs = []
+        return notebook
+
     folder = tmp_path_factory.mktemp("pages")
-    PAGES.write_pages(folder, [FIRST], execute=False)
+    with mock.patch.dict(PAGES.write_pages.__globals__, read_source=read_source):
+        PAGES.write_pages(folder, [FIRST], execute=False)
     texts = {path: path.read_text(encoding="utf-8") for path in folder.rglob("*.html")}
     return {path: bs4.BeautifulSoup(text, "html.parser") for path, text in texts.items()}
 

@@ -112,10 +112,9 @@ def test_every_axis_has_a_unit_and_nothing_leaks(name: str, sequence) -> None:
     before = dict(matplotlib.rcParams)
     figure = FIGURES[name](sequence)
     assert dict(matplotlib.rcParams) == before
-    png = figure._repr_png_()
-    assert png.startswith(b"\x89PNG")
-    assert len(png) < 150_000
-    _, described = DisplayFormatter().format(figure)
+    shown, described = DisplayFormatter().format(figure)
+    assert shown["image/png"].startswith(b"\x89PNG")
+    assert len(shown["image/png"]) < 150_000
     assert described["image/png"]["alt"] == figure.get_suptitle() != ""
     assert " at 0x" not in repr(figure)
     for axes in figure.axes:

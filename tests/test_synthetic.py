@@ -52,12 +52,12 @@ def test_rays_and_distances_find_the_first_surface(body):
         points = points[body.sdf(points) > 1e-3]  # where bodies overlap it is a bound
         nearby = np.minimum(body.sdf(points), 0.3)
         np.testing.assert_allclose(body.sdf(points, 0.3), nearby, atol=1e-12)
-        origins = np.repeat(points, 500, axis=0)
+        origins = np.repeat(points, 250, axis=0)
         directions = rng.normal(size=origins.shape)
     else:
         hit, points = body.hit, rng.uniform(-1.2, 1.2, (200, 3))
         # Chords of a sphere, and rays from within the shell, reach all of a convex surface.
-        origins, ends = rng.normal(size=(2, 200_000, 3))
+        origins, ends = rng.normal(size=(2, 100_000, 3))
         origins *= (0.4 if body is SOLIDS["shell"] else 1.2) / norms(origins)
         directions = 1.2 * ends / norms(ends) - origins
     t = hit(origins, directions)
