@@ -367,6 +367,11 @@ def test_one_thing_in_place_of_several() -> None:
 def test_a_method_in_a_notebook(tmp_path: Path) -> None:
     """Catches a class in a cell that has no source for a key, or another one in workers."""
     setting = f"""
+import sys
+sys.path.append({str(Path(__file__).parent)!r})
+from forked import forking
+forked = forking()  # kept
+forked.__enter__()
 import nbtrack
 from nbtrack.experiments.grid import Execution
 from nbtrack.tracking import TRACKERS

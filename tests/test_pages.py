@@ -17,13 +17,12 @@ FIRST = ROOT / "notebooks/01_map_imap.ipynb"
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, bs4.BeautifulSoup]:
-    """The pages of the first notebook, with stored outputs, and of all that it names, without."""
+    """The pages of the first notebook, with stored outputs, and of the texts that it names."""
 
     def read_source(path: Path, execute: bool) -> nbformat.NotebookNode:
         notebook = PAGES.read_source(path, execute)
-        for cell in notebook.cells if path != FIRST else []:
-            if cell.cell_type == "code":
-                cell.outputs = []
+        if path != FIRST:
+            notebook.cells = [cell for cell in notebook.cells if cell.cell_type == "markdown"]
         return notebook
 
     folder = tmp_path_factory.mktemp("pages")

@@ -57,7 +57,7 @@ def test_rays_and_distances_find_the_first_surface(body):
     else:
         hit, points = body.hit, rng.uniform(-1.2, 1.2, (200, 3))
         # Chords of a sphere, and rays from within the shell, reach all of a convex surface.
-        origins, ends = rng.normal(size=(2, 100_000, 3))
+        origins, ends = rng.normal(size=(2, 200_000, 3))
         origins *= (0.4 if body is SOLIDS["shell"] else 1.2) / norms(origins)
         directions = 1.2 * ends / norms(ends) - origins
     t = hit(origins, directions)
