@@ -16,7 +16,7 @@ os.environ["NBTRACK_DEVICE"] = "cpu"  # where there is a GPU too: what is tested
 os.environ["OMP_NUM_THREADS"] = "1"  # images are so small that threads would only wait for others
 LONG = [
     "test_lm_solver", "test_grid", "test_misfits", "test_own_method", "test_tables_of_runs",
-    "test_data_check", "test_settings",
+    "test_data_check", "test_settings", "test_synthetic", "test_plots", "test_map_files",
 ]  # fmt: skip
 
 
@@ -32,7 +32,7 @@ def cheap_defaults() -> Iterator[None]:
     """Most tests do not look at what their maps are worth; and where none says how many workers it
     wants, jobs run here: each worker would import torch for seconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbtrack.experiments.grid.usable_cores", lambda: 1)
+        patch.setattr("nbtrack.experiments.jobs.usable_cores", lambda: 1)
         patch.setattr("nbtrack.experiments.quality.POINTS_SCORED", 200)
         patch.setattr("nbtrack.mapping.holdout._MISFIT_FRAMES", 1)
         yield

@@ -141,11 +141,10 @@ def test_a_file_joins_by_an_option_of_every_command(
     (tmp_path / "own/my-method.py").write_text("from helper import *\n" + OWN)
     (tmp_path / "own/helper.py").write_text("")
     own, far = ["--import", "own/my-method.py"], tmp_path / "own"
-    words = [
-        *tiny_words("tables.rates_hz=[10]", "mapping.fading.iterations=6", "scenes.n_frames=3"),
-        "--set", "mapping.fading.n_rays=8", "--set", "network.neus.width=16",
-        "--set", "tracking.distance.n_pixels=8", "--set", "mapping.fading.decay=0.1",
-    ]  # fmt: skip
+    words = tiny_words(
+        "scenes.n_frames=3", "tables.rates_hz=[10]", "tracking.distance.n_pixels=8",
+        "mapping.fading.iterations=6", "mapping.fading.n_rays=8", "mapping.fading.decay=0.1",
+    )  # fmt: skip
     grid = ["--method", "mine", "--workers", "2", "--scenes", "office,bedroom", "--out", "out"]
     monkeypatch.chdir(tmp_path)
     with importing(), forking():
