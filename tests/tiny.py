@@ -1,7 +1,8 @@
 """Settings so small that a whole grid is made in seconds; they show nothing but that it runs."""
 
 TINY = (
-    "scenes.n_frames=5", "scenes.width=32", "tables.rates_hz=[10,8]", "tables.budgets_ms=[20]",
+    "scenes.n_frames=5", "scenes.width=32", "scenes.track_frames=:",
+    "tables.rates_hz=[10,8]", "tables.budgets_ms=[20]",
     "mapping.imap.iterations=6", "mapping.imap.n_rays=8", "network.imap.width=16",
     "mapping.neus.iterations=6", "mapping.neus.n_rays=8", "network.neus.width=16",
     "mapping.neus_plus.iterations=6", "mapping.neus_plus.n_rays=8",
