@@ -285,6 +285,16 @@ def test_wrong_scenes_are_told_before_anything_is_made(
         open_scenes(load_preset("paper"))
 
 
+def test_frames_that_a_scene_lacks_are_told_before_it_is_mapped(
+    preset: Preset, scenes: list[Scene]
+) -> None:
+    """Catches minutes of mapping before a recording turns out to be shorter than the part that the
+    preset tracks."""
+    with pytest.raises(DataError, match=r"none of the 5 .*scenes.track_frames"):
+        track_scenes(scenes, ["sdf"], preset, frames="90:140", seeds=[7])
+    assert not MapJob.of(scenes[0], "neus", preset, seed=7).is_done
+
+
 def test_a_scene_whose_tracked_part_has_no_pose(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

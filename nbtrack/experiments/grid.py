@@ -71,6 +71,8 @@ def track_scenes(
     check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
     rates = [None] if steps else rates_hz or preset.tables.rates_hz
     frames = str(frames or preset.scenes.track_frames)
+    for scene in tracked or scenes:
+        scene.count(frames, needs_poses=False)  # raises before anything is mapped
     jobs, rows, pairs = [], [], [*zip(scenes, tracked or scenes, strict=True)]
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
