@@ -290,7 +290,7 @@ def test_frames_that_a_scene_lacks_are_told_before_it_is_mapped(
 ) -> None:
     """Catches minutes of mapping before a recording turns out to be shorter than the part that the
     preset tracks."""
-    with pytest.raises(DataError, match=r"none of the 5 .*scenes.track_frames"):
+    with pytest.raises(DataError, match=r"0 of the 5 .*scenes.track_frames"):
         track_scenes(scenes, ["sdf"], preset, frames="90:140", seeds=[7])
     assert not MapJob.of(scenes[0], "neus", preset, seed=7).is_done
 

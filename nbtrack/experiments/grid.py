@@ -71,8 +71,6 @@ def track_scenes(
     check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
     rates = [None] if steps else rates_hz or preset.tables.rates_hz
     frames = str(frames or preset.scenes.track_frames)
-    for scene in tracked or scenes:
-        scene.count(frames, needs_poses=False)  # raises before anything is mapped
     jobs, rows, pairs = [], [], [*zip(scenes, tracked or scenes, strict=True)]
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
@@ -98,6 +96,8 @@ def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[
 def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:
     """Side by side; by the clock one after the other, here: a neighbour would slow a clock down."""
     missing = [job for job in jobs if not job.is_done]
+    for job in missing:
+        job.scene.count(job.frames, needs_poses=False)  # raises before anything is mapped
     if 0 < len(missing) < len(jobs):
         tell(f"{len(jobs) - len(missing)} of {len(jobs)} runs are cached")
     for warning in reach_warnings(missing):

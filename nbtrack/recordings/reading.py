@@ -88,8 +88,8 @@ def select_frames(recording: Recording, frames: slice, needs_poses: bool = True)
     selected = frame_ids = np.arange(len(recording))[frames]
     if not len(selected):
         raise DataError(
-            f"the slice of frames selects none of the {len(recording)} in {recording.folder}: "
-            "choose others (--frames of map and track, scenes.track_frames of tables)"
+            f"0 of the {len(recording)} frames in {recording.folder} are selected: choose others "
+            "(--frames of map and track, scenes.track_frames of tables)"
         )
     if needs_poses and recording.pose_file is None:
         raise MissingError(
