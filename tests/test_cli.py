@@ -22,6 +22,7 @@ from nbtrack.core.errors import DataError
 from nbtrack.core.files import naming_damaged, runs_folder
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import open_scene
+from nbtrack.mapping.files import read_map
 from nbtrack.recordings.recording import open_recording
 from nbtrack.tracking.trajectories import read_tum
 
@@ -250,10 +251,15 @@ def test_the_home_folder_is_meant_by_its_sign(tmp_path: Path, monkeypatch) -> No
     """Catches a folder called `~` where a shell leaves it as it is, after `=` and in variables."""
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("NBTRACK_RUNS", "~/runs")
+    monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.chdir(tmp_path)
     made = ["data", "make", "living_room", "--out=~/room", "--n-frames=2", "--width=16"]
     assert main(made) == 0
     assert (tmp_path / "room" / "poses.txt").is_file()
     assert open_scene("~/room", load_preset("smoke")).folder == (tmp_path / "room").resolve()
     assert runs_folder() == (tmp_path / "runs").resolve()
+    (tmp_path / "own_nothing.py").write_text("")
+    mapped = ["map", "~/room", "--field", "points", "--out=~/map", "--import=~/own_nothing.py"]
+    assert main(mapped) == 0
+    assert read_map("~/map").field.name == "points"
     assert not (tmp_path / "~").exists()

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import nbtrack.beyond  # registers its fields and trackers
 from nbtrack.core.errors import ConfigError, MissingError
+from nbtrack.core.files import resolved
 from nbtrack.core.progress import tell
 
 for plugin in entry_points(group="nbtrack"):
@@ -34,7 +35,7 @@ def import_own(source: str) -> None:
     such file, and ConfigError for whatever the import raises, and where another module has the
     file's name.
     """
-    file = Path(source).resolve()
+    file = resolved(source)
     name = source
     if file.suffix == ".py":
         if not file.is_file():

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from nbtrack.core.errors import NbtrackError, check_lists
-from nbtrack.core.files import runs_folder
+from nbtrack.core.files import absolute, runs_folder
 from nbtrack.core.progress import tell
 from nbtrack.experiments.jobs import Execution, run_jobs
 from nbtrack.experiments.map_jobs import MapJob
@@ -110,4 +110,5 @@ def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[An
 
 def read_run(name: str | Path) -> Trajectory:
     """A run by its name in the column `run`, or by its folder; MissingError if there is none."""
-    return read_trajectory(Path(name) if Path(name).is_dir() else runs_folder() / "tracks" / name)
+    folder = absolute(name)
+    return read_trajectory(folder if folder.is_dir() else runs_folder() / "tracks" / name)

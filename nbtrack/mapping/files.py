@@ -58,7 +58,7 @@ def write_map(path: Path, finished: Map) -> None:
 
     Weights keep every bit, so that tracking in the file gives the trajectory of the map itself.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     tensors = _tensors(finished.field)
     bounds = finished.field.bounds
     header = {
@@ -86,7 +86,7 @@ def read_map(path: Path | str) -> Map:
     DataError where a file is damaged, of another format version, or no map at all; ConfigError
     where its field is not registered.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     file = path / MAP_FILE if path.is_dir() else path
     history = path / HISTORY_FILE
     if not file.is_file():
