@@ -183,25 +183,29 @@ def plot_curves(
 
     Columns x and y are named as the axes are to be labelled, "time a frame (ms)". Text on x keeps
     the order of its first appearance; its points stand side by side, without lines. Methods among
-    the labels get their colours. Where there are columns `from` and `to`, thin lines span that
-    interval of y. The mean of a column `standing still`, in the unit of y, is the dotted line of a
-    camera that stands still. Axes of `log` are logarithmic.
+    the labels get their colours; of several columns the first has the colours, the last the marks.
+    Where there are columns `from` and `to`, thin lines span that interval of y. The mean of a
+    column `standing still`, in the unit of y, is the dotted line of a camera that stands still.
+    Axes of `log` are logarithmic.
     """
     axes = style.new_axes(title, 3.6)[0, 0]
-    labels = table[[group] if isinstance(group, str) else group].agg(", ".join, axis=1)
+    names = table[[group] if isinstance(group, str) else group]
+    labels = names.agg(", ".join, axis=1)
     is_text = not pd.api.types.is_numeric_dtype(table[x])
-    colors = style.method_colors(labels)
+    first, last = names.iloc[:, 0], names.iloc[:, -1]
+    colors = dict(zip(labels, first.map(style.method_colors(first)), strict=True))
+    marks = dict(zip(labels, pd.factorize(last)[0], strict=True))
     group_of_row = labels.map([*colors].index)
     places = table[x]
     if is_text:
-        codes, names = pd.factorize(table[x])
+        codes, ticks = pd.factorize(table[x])
         places = codes + (group_of_row - (len(colors) - 1) / 2) * 0.5 / max(len(colors), 4)
-        turned = {"rotation": 20, "ha": "right"} if sum(map(len, names)) > 90 else {}
-        axes.set_xticks(range(len(names)), names, **turned)
+        turned = {"rotation": 20, "ha": "right"} if sum(map(len, ticks)) > 90 else {}
+        axes.set_xticks(range(len(ticks)), ticks, **turned)
     for number, (label, color) in enumerate(colors.items()):
         own, line = group_of_row == number, "none" if is_text else "-"
-        look = {"color": color, "marker": "os^Dv"[number % 5], "linestyle": line, "label": label}
-        axes.plot(places[own], table[y][own], **look)
+        look = {"color": color, "marker": "os^Dv"[marks[label] % 5], "linestyle": line}
+        axes.plot(places[own], table[y][own], label=label, **look)
         if "from" in table:
             spans = table.loc[own, "from"], table.loc[own, "to"]
             axes.vlines(places[own], *spans, color=color, linewidth=0.8)

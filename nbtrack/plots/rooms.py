@@ -1,6 +1,6 @@
 """Figures of rooms: a slice, a mesh, the paper's Figure 1, and an overview of a run."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -22,25 +22,34 @@ _TRUE_LINE = {"colors": method_colors(["true"])["true"], "linestyles": "--"}
 
 @styled
 def plot_slice(
-    field: Field, sequence: RgbdSequence, height: float, room: Room | None = None, title: str = ""
+    fields: Field | Sequence[Field],
+    sequence: RgbdSequence,
+    height: float,
+    room: Room | None = None,
+    title: str = "",
 ) -> Figure:
     """A field's values on the horizontal plane `height` metres up, drawn as `draw_slice` does.
 
-    Dashed green is the true surface. `sequence` are the frames that the map was made of, `room` is
-    the exact scene, if it is a synthetic one.
+    Fields of one recording stand side by side, with the colours of the first. Dashed green is the
+    true surface. `sequence` are the frames that the maps were made of, `room` is the exact scene,
+    if it is a synthetic one.
     """
-    axes = new_axes(title, 5.4)[0, 0]
-    up, page = scene.draw_from_above(axes, {"camera path": sequence.T_world_camera})
-    low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
-    step = (high - low).max() / _POINTS_ALONG
-    points, places = _level_grid(page, low, high + step, step, height * up)
-    scene.draw_slice(axes, field, points, places, sequence, aspect=25, pad=0.015)
-    axes.plot([], [], "k-", label="surface")
-    if room is not None:
-        true = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:2])
-        scene.draw_levels(axes, places, true, [0.0], zorder=3, **_TRUE_LINE)
-        axes.plot([], [], "--", color=_TRUE_LINE["colors"], label="true surface")
-    axes.set_title(f"{field.label} at height {height:.2f} m; pale: never seen")
+    fields = [fields] if isinstance(fields, Field) else fields
+    norm = None
+    panels = new_axes(title, 5.4 - 0.9 * (len(fields) - 1), 1, len(fields))[0]
+    for axes, field in zip(panels, fields, strict=True):
+        up, page = scene.draw_from_above(axes, {"camera path": sequence.T_world_camera})
+        low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
+        step = (high - low).max() / _POINTS_ALONG
+        points, places = _level_grid(page, low, high + step, step, height * up)
+        look = {"ax": panels, "aspect": 25, "pad": 0.015}
+        norm = scene.draw_slice(axes, field, points, places, sequence, norm, **look)
+        axes.plot([], [], "k-", label="surface")
+        if room is not None:
+            true = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:2])
+            scene.draw_levels(axes, places, true, [0.0], zorder=3, **_TRUE_LINE)
+            axes.plot([], [], "--", color=_TRUE_LINE["colors"], label="true surface")
+        axes.set_title(f"{field.label} at height {height:.2f} m; pale: never seen")
     axes.figure.legend_below()
     return axes.figure
 

@@ -146,24 +146,28 @@ def draw_slice(
     points: Float[np.ndarray, "rows columns 3"],
     places: Float[np.ndarray, "rows columns 2"],
     sequence: RgbdSequence | None = None,
+    norm: Normalize | None = None,
     **bar: object,
-) -> None:
+) -> Normalize:
     """A field's values at a grid of points (m, world frame), drawn at places on the page.
 
     A signed distance is blue in free space and red in matter, with thin lines 0.25 m apart; a
     density or an occupancy has a logarithmic scale. Black is the surface (the field's
-    `surface_level`). What no frame of a sequence has seen is pale: there the field invents.
+    `surface_level`). What no frame of a sequence has seen is pale: there the field invents. The
+    scale is returned; with that of another slice as `norm` no bar is drawn.
     """
     values = query_field(field, points)[1]
     level = field.surface_level
-    norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
+    own, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
     if field.is_distance:
         limit = np.clip(np.quantile(np.abs(values), 0.98), 0.2, 1.5)
-        norm, colors = Normalize(-limit, limit), "RdBu"
+        own, colors = Normalize(-limit, limit), "RdBu"
     grid = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
     page = np.moveaxis(places, -1, 0)
-    image = axes.pcolormesh(*page, values, cmap=colors, norm=norm, **grid)
-    axes.figure.colorbar(image, ax=axes, label=field.value_label, extend="both", **bar)
+    image = axes.pcolormesh(*page, values, cmap=colors, norm=norm or own, **grid)
+    if norm is None:
+        bar = {"ax": axes, "label": field.value_label, "extend": "both"} | bar
+        axes.figure.colorbar(image, **bar)
     if field.is_distance:
         draw_levels(axes, places, values, _LINES_M, colors="0.35", linewidths=0.4, linestyles="-")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
@@ -172,6 +176,7 @@ def draw_slice(
         pale += _DIMMED * (1 - pale)
         pale[..., 3] = ~seen_by(points.reshape(-1, 3), sequence).reshape(values.shape)
         axes.pcolormesh(*page, pale, gid="unseen", zorder=2.5, **grid)  # above the map's lines
+    return image.norm
 
 
 def draw_levels(axes: Axes, places: np.ndarray, values: np.ndarray, levels, **look: object) -> None:
