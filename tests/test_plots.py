@@ -132,8 +132,8 @@ def test_curves_along_a_ray_share_their_depths() -> None:
 
 
 def test_curves_of_methods_and_sweeps() -> None:
-    """Catches a group without its own line or colour, text sorted by letters, spans and a camera
-    that stands still drawn elsewhere."""
+    """Catches a group without its own line, colour or mark, a method of two colours, text sorted by
+    letters, spans and a camera that stands still drawn elsewhere."""
     table = SWEEP.assign(**{"from": 0.5, "to": 4.0, "standing still": 6.0})
     axes = plots.plot_curves(table, *SWEEP).axes[0]
     assert [line.get_color() for line in axes.lines[:2]] == [*PALETTE[:2]]
@@ -142,7 +142,8 @@ def test_curves_of_methods_and_sweeps() -> None:
     words = SWEEP.assign(method="A", how=["b", "a"]).replace({"time (ms)": {1.0: "b", 9.0: "a"}})
     axes = plots.plot_curves(words, "time (ms)", "ATE (cm)", ["method", "how"], log="y").axes[0]
     assert [label.get_text() for label in axes.get_xticklabels()] == ["b", "a"]
-    assert [line.get_label() for line in axes.lines] == ["A, b", "A, a"]
+    looks = [(line.get_label(), line.get_color(), line.get_marker()) for line in axes.lines]
+    assert looks == [("A, b", PALETTE[2], "o"), ("A, a", PALETTE[2], "s")]
     assert axes.get_yscale() == "log"
 
 
@@ -187,6 +188,12 @@ def test_the_true_surface_is_drawn_too(sequence) -> None:
     _, line = contours(plots.plot_slice(SPHERE, sequence, 0.4, room))
     # Between grid points, 2 cm apart, the line is straight.
     assert np.abs(room.sdf(np.insert(line, 1, 0.4, axis=1))).max() < 0.02
+
+
+def test_slices_side_by_side_share_their_colours(sequence) -> None:
+    """Catches maps that are compared in two scales."""
+    left, right, _ = plots.plot_slice([SPHERE, NEAR], sequence, 0.0, title="two").axes
+    assert left.collections[0].norm is right.collections[0].norm
 
 
 def test_what_was_not_seen_is_pale(sequence) -> None:

@@ -200,7 +200,8 @@ def plot_curves(
     if is_text:
         codes, ticks = pd.factorize(table[x])
         places = codes + (group_of_row - (len(colors) - 1) / 2) * 0.5 / max(len(colors), 4)
-        turned = {"rotation": 20, "ha": "right"} if sum(map(len, ticks)) > 90 else {}
+        letters = sum(max(map(len, tick.split("\n"))) for tick in ticks)
+        turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}
         axes.set_xticks(range(len(ticks)), ticks, **turned)
     for number, (label, color) in enumerate(colors.items()):
         own, line = group_of_row == number, "none" if is_text else "-"

@@ -25,6 +25,7 @@ _FIXED = {
     # (Okabe and Ito).
     "true": "#009e73",
     "tracked": "#d55e00",
+    "reference": "#7f7f7f",  # the poses that came with a recording: no method of ours
 }
 WIDTH = 9.0  # inches of every figure: a notebook's text width
 DASHED = {"color": "0.3", "linestyle": "--", "linewidth": 1}
