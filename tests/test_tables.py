@@ -11,7 +11,7 @@ import pytest
 from nbtrack import tables
 from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.data.dataset import DATASET_SCENES
-from nbtrack.experiments.runs import over_rooms
+from nbtrack.experiments.runs import over_rooms, shares
 from nbtrack.latex import Wording, latex_file
 from nbtrack.tables import (
     STANDING_STILL,
@@ -338,6 +338,17 @@ def test_means_over_rooms() -> None:
     (found,) = over_rooms(results.assign(method="A"), ["method"]).itertuples(index=False)
     assert found[:2] == ("A", pytest.approx(0.02))
     assert found[2:] == pytest.approx((0.02 / 2**12.7062, 0.02 * 2**12.7062), rel=1e-3)
+
+
+def test_shares_of_rows() -> None:
+    """Catches intervals that leave 0 to 100 % or have no width where nothing is lost.
+
+    By hand, with z = 1.96: z²/(10 + z²) of 0 in 10, and 1/2 ± z √(2.5 + z²/4)/(10 + z²) of 5 in 10.
+    """
+    results = pd.DataFrame({"method": ["A"] * 10 + ["B"] * 10, "lost": [False] * 15 + [True] * 5})
+    never, half = shares(results, ["method"], "lost").itertuples(index=False)
+    assert (never[:2], half[:2], never[-2:]) == (("A", 0), ("B", 50), (0, 10))
+    assert [*never[2:4], *half[2:4]] == pytest.approx([0, 27.75, 23.66, 76.34], abs=0.01)
 
 
 def test_two_values_for_a_cell() -> None:

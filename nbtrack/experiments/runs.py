@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import stdtrit
+from scipy.special import ndtri, stdtrit
 
 from nbtrack.beyond.verdict import score_detection
 from nbtrack.core import files
@@ -88,3 +88,17 @@ def over_rooms(results: pd.DataFrame, by: list[str], value: str = "ate_m") -> pd
     rooms = of_rooms.groupby([*by, "scene"], sort=False).mean().groupby(by, sort=False)
     mean, half = rooms.mean(), rooms.sem() * stdtrit(rooms.size() - 1, 0.975)
     return np.exp(pd.DataFrame({value: mean, "from": mean - half, "to": mean + half})).reset_index()
+
+
+def shares(results: pd.DataFrame, by: list[str], value: str) -> pd.DataFrame:
+    """Share (%) of rows whose value is true, by groups, and its 95 % interval: `from`, `to` (%).
+
+    The interval is Wilson's (1927), as if rows were independent. Columns `true` and `size` count.
+    """
+    groups = results.groupby(by, sort=False, observed=True)[value]
+    true, size, z = groups.sum(), groups.size(), ndtri(0.975)
+    middle = (true + z**2 / 2) / (size + z**2)
+    half = z / (size + z**2) * np.sqrt(true * (size - true) / size + z**2 / 4)
+    spans = {"from": 100 * (middle - half), "to": 100 * (middle + half)}
+    columns = {value: 100 * true / size, **spans, "true": true, "size": size}
+    return pd.DataFrame(columns).reset_index()

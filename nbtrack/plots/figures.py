@@ -177,7 +177,7 @@ def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
 
 @style.styled
 def plot_curves(
-    table: pd.DataFrame, x: str, y: str, group: str | list[str], title: str = "", log: str = "xy"
+    table: pd.DataFrame, x: str, y: str, group: str | list[str], title="", log="xy", line="-"
 ) -> Figure:
     """One column over another, a line a group; groups of one row are points with their labels.
 
@@ -186,7 +186,7 @@ def plot_curves(
     the labels get their colours; of several columns the first has the colours, the last the marks.
     Where there are columns `from` and `to`, thin lines span that interval of y. The mean of a
     column `standing still`, in the unit of y, is the dotted line of a camera that stands still.
-    Axes of `log` are logarithmic.
+    Axes of `log` are logarithmic. A line "none" leaves points alone.
     """
     axes = style.new_axes(title, 3.6)[0, 0]
     names = table[[group] if isinstance(group, str) else group]
@@ -204,9 +204,9 @@ def plot_curves(
         turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}
         axes.set_xticks(range(len(ticks)), ticks, **turned)
     for number, (label, color) in enumerate(colors.items()):
-        own, line = group_of_row == number, "none" if is_text else "-"
-        look = {"color": color, "marker": "os^Dv"[marks[label] % 5], "linestyle": line}
-        axes.plot(places[own], table[y][own], label=label, **look)
+        own = group_of_row == number
+        look = {"color": color, "marker": "os^Dv"[marks[label] % 5], "label": label}
+        axes.plot(places[own], table[y][own], **look, linestyle="none" if is_text else line)
         if "from" in table:
             spans = table.loc[own, "from"], table.loc[own, "to"]
             axes.vlines(places[own], *spans, color=color, linewidth=0.8)
