@@ -280,7 +280,7 @@ def with_maps(rows: pd.DataFrame, scene: Scene, preset: Preset, seed: int) -> pd
 
 
 def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
-    """What notebook 5 judges by: a row a path and rate, intervals of 95 %.
+    """Reach, accuracy and sequences lost: a row a path and rate, intervals of 95 %.
 
     VR's error over SDF's is paired by room and seed; a room counts once, with the mean of its
     seeds' logarithms, and rooms are drawn anew (bootstrap). Shares of sequences lost (ATE above

@@ -99,6 +99,6 @@ def shares(results: pd.DataFrame, by: list[str], value: str) -> pd.DataFrame:
     true, size, z = groups.sum(), groups.size(), ndtri(0.975)
     middle = (true + z**2 / 2) / (size + z**2)
     half = z / (size + z**2) * np.sqrt(true * (size - true) / size + z**2 / 4)
-    spans = {"from": 100 * (middle - half), "to": 100 * (middle + half)}
-    columns = {value: 100 * true / size, **spans, "true": true, "size": size}
-    return pd.DataFrame(columns).reset_index()
+    columns = {value: true / size, "from": middle - half, "to": middle + half}
+    table = 100 * pd.DataFrame(columns).clip(0, 1)
+    return table.assign(true=true, size=size).reset_index()
