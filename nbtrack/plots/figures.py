@@ -87,6 +87,7 @@ def _image_grid(title: str, rows: list[list[Panel]], far: float | None = None) -
         for image in images:
             image.set_clim(0, limit)
         bar = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max", "label": unit}
+        bar["panchor"] = False  # else panels with a bar are lower than those without
         image.figure.colorbar(image, ax=[image.axes for image in images], **bar)
     return grid[0, 0].figure
 
@@ -204,12 +205,12 @@ def plot_curves(
         turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}
         axes.set_xticks(range(len(ticks)), ticks, **turned)
     for number, (label, color) in enumerate(colors.items()):
-        own, line = group_of_row == number, "none" if is_text else "-"
-        look = {"color": color, "marker": "os^Dv"[marks[label] % 5], "linestyle": line}
-        axes.plot(places[own], table[y][own], label=label, **look)
+        own, n_alike = group_of_row == number, [*colors.values()][:number].count(color)
+        look = {"color": color, "marker": "os^Dv"[marks[label] % 5], "label": label}
+        look["linestyle"] = "none" if is_text else ("-", "--", ":")[n_alike % 3]
+        axes.plot(places[own], table[y][own], **look)
         if "from" in table:
-            spans = table.loc[own, "from"], table.loc[own, "to"]
-            axes.vlines(places[own], *spans, color=color, linewidth=0.8)
+            axes.vlines(places[own], table["from"][own], table["to"][own], color, linewidth=0.8)
     if STANDING_STILL in table:
         axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **style.DOTTED)
     axes.set(xlabel=x, ylabel=y)
