@@ -59,6 +59,12 @@ class NotebookFigure(Figure):
 
         It is shown at the figure's own size (pixels), at half that of the picture.
         """
+        from IPython import get_ipython  # it asks for this, and others may lack it
+
+        if shell := get_ipython():
+            # Sliders load pyplot's inline backend, which draws all figures anew, cropped and small.
+            pictures = shell.display_formatter.formatters["image/png"]
+            pictures.for_type(NotebookFigure, NotebookFigure._repr_png_)
         width, height = (round(pixels) for pixels in self.bbox.size)
         alt = self.get_suptitle().replace("\n", " ")
         return {}, {"image/png": {"alt": alt, "width": width, "height": height}}
@@ -108,7 +114,7 @@ def label_points(
 
     A label that would cover another or leave the axes is moved up or down.
     """
-    axes.margins(x=0.3, y=0.1)
+    axes.margins(x=0.4, y=0.1)
     axes.figure.draw_without_rendering()
     rows = sorted(zip(x, y, colors, strict=True), key=lambda row: row[1])
     pixels = axes.transData.transform([row[:2] for row in rows])
