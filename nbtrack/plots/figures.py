@@ -197,13 +197,7 @@ def plot_curves(
     colors = dict(zip(labels, first.map(style.method_colors(first)), strict=True))
     marks = dict(zip(labels, pd.factorize(last)[0], strict=True))
     group_of_row = labels.map([*colors].index)
-    places = table[x]
-    if is_text:
-        codes, ticks = pd.factorize(table[x])
-        places = codes + (group_of_row - (len(colors) - 1) / 2) * 0.5 / max(len(colors), 4)
-        letters = sum(max(map(len, tick.split("\n"))) for tick in ticks)
-        turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}
-        axes.set_xticks(range(len(ticks)), ticks, **turned)
+    places = _side_by_side(axes, table[x], group_of_row) if is_text else table[x]
     for number, (label, color) in enumerate(colors.items()):
         own, n_alike = group_of_row == number, [*colors.values()][:number].count(color)
         look = {"color": color, "marker": "os^Dv"[marks[label] % 5], "label": label}
@@ -215,10 +209,20 @@ def plot_curves(
         axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **style.DOTTED)
     axes.set(xlabel=x, ylabel=y)
     style.log_axes(axes, log.replace("x", "") if is_text else log)
-    if labels.is_unique and not is_text and len(labels) > 1:
-        style.label_points(axes, table[x], table[y], colors)
-        if STANDING_STILL in table:
-            axes.legend(handles=axes.lines[-1:])
-    else:
+    if is_text or not labels.is_unique or len(labels) == 1:
         axes.figure.legend(loc="outside right center")
+        return axes.figure
+    style.label_points(axes, table[x], table[y], colors)
+    if STANDING_STILL in table:
+        axes.legend(handles=axes.lines[-1:])
     return axes.figure
+
+
+def _side_by_side(axes: Axes, texts: pd.Series, group_of_row: pd.Series) -> pd.Series:
+    """Where points of the groups (numbers) lie on x, whose ticks are texts; long ones turn."""
+    codes, ticks = pd.factorize(texts)
+    letters = sum(max(map(len, tick.split("\n"))) for tick in ticks)
+    turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}
+    axes.set_xticks(range(len(ticks)), ticks, **turned)
+    n_groups = group_of_row.max() + 1
+    return codes + (group_of_row - (n_groups - 1) / 2) * 0.5 / max(n_groups, 4)
