@@ -24,6 +24,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.output import save_picture
 from nbtrack.fields import NetworkSettings, make_field
+from nbtrack.plots.idea import plot_idea
 from nbtrack.plots.movie import view_of
 from nbtrack.plots.network import plot_network
 from nbtrack.plots.pose_losses import move_sideways
@@ -77,9 +78,9 @@ def room_mesh() -> trimesh.Trimesh:
 
 
 FAR = torch.linspace(-0.05, 0.05, 12 * 16 - 1)  # m, of the measured pixels of a frame
-IMAP_MLP = make_field("imap", NetworkSettings(width=8), CUBE, seed=0).mlp
+IMAP_FIELD = make_field("imap", NetworkSettings(width=8), CUBE, seed=0)
 FIGURES = {
-    "network": lambda s: plot_network(IMAP_MLP, "density (1/m)", "eight wide"),
+    "network": lambda s: plot_network(IMAP_FIELD.mlp, "density (1/m)", "eight wide"),
     "frame": lambda s: plots.plot_frame(s, 3, "one"),
     "views": lambda s: plots.plot_views(s, [0, 3], [(s.color(0), s.depth(0) + 0.02)] * 2, "x"),
     "ray": lambda s: plots.plot_along_ray(AT, {"a (1/m)": RAY, "b (m)": RAY[:-1]}, 1.2, "end"),
@@ -95,6 +96,8 @@ FIGURES = {
     "overview": lambda s: plots.plot_overview(CLOUD, {"SDF": s.T_world_camera}, FRAMES, "near"),
     "errors": lambda s: plots.plot_errors({"VR": FRAMES, "SDF": FRAMES}, "lost"),
     "curves": lambda s: plots.plot_curves(SWEEP, *SWEEP, "fast"),
+    "samples": lambda s: plot_idea(IMAP_FIELD, s[0], s.T_world_camera[0], 6, 8, "44 samples"),
+    "queries": lambda s: plot_idea(SPHERE, s[0], s.T_world_camera[0], 6, 8, "one query"),
 }  # fmt: skip
 
 
@@ -272,8 +275,9 @@ def test_the_viewer_holds_mesh_and_paths_and_stays_small(sequence) -> None:
 
 
 def test_a_method_keeps_its_color() -> None:
-    """Catches colours of the paper's methods that depend on the company they are in."""
+    """Catches colours of methods that depend on the company they are in, or on a setting."""
     colors = method_colors(["new", "NeuS with SDF", "iMAP with VR", "SDF", "NeuS", "newer"])
+    assert method_colors(["new", "ICP, n = 512"])["ICP, n = 512"] == method_colors(["ICP"])["ICP"]
     assert colors["NeuS with SDF"] == colors["SDF"] == colors["NeuS"]
     assert colors["new"] == method_colors(["SDF", "new"])["new"]
     assert len(set(colors.values())) == 4

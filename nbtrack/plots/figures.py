@@ -87,6 +87,7 @@ def _image_grid(title: str, rows: list[list[Panel]], far: float | None = None) -
         for image in images:
             image.set_clim(0, limit)
         bar = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max", "label": unit}
+        bar["panchor"] = False  # else panels with a bar are lower than those without
         image.figure.colorbar(image, ax=[image.axes for image in images], **bar)
     return grid[0, 0].figure
 
@@ -177,16 +178,15 @@ def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
 
 @style.styled
 def plot_curves(
-    table: pd.DataFrame, x: str, y: str, group: str | list[str], title="", log="xy", line="-"
+    table: pd.DataFrame, x: str, y: str, group: str | list[str], title="", log="xy", line=""
 ) -> Figure:
     """One column over another, a line a group; groups of one row are points with their labels.
 
-    Columns x and y are named as the axes are to be labelled, "time a frame (ms)". Text on x keeps
-    the order of its first appearance; its points stand side by side, without lines. Methods among
-    the labels get their colours; of several columns the first has the colours, the last the marks.
-    Where there are columns `from` and `to`, thin lines span that interval of y. The mean of a
-    column `standing still`, in the unit of y, is the dotted line of a camera that stands still.
-    Axes of `log` are logarithmic. A line "none" leaves points alone.
+    Axes are labelled by the names of x and y, "time a frame (ms)". Text on x keeps the order of its
+    first appearance; its points stand side by side, without lines. Of several columns of groups the
+    first has the colours, which are the methods' own, the last the marks; dashes tell methods of
+    one colour apart. Columns `from` and `to` are drawn as intervals of y, and the mean of a column
+    `standing still` as a dotted line. Axes of `log` are logarithmic; line "none" leaves points.
     """
     axes = style.new_axes(title, 3.6)[0, 0]
     names = table[[group] if isinstance(group, str) else group]
@@ -198,26 +198,32 @@ def plot_curves(
     group_of_row = labels.map([*colors].index)
     places = table[x]
     if is_text:
-        codes, ticks = pd.factorize(table[x])
-        places = codes + (group_of_row - (len(colors) - 1) / 2) * 0.5 / max(len(colors), 4)
-        letters = sum(max(map(len, tick.split("\n"))) for tick in ticks)
-        turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}
-        axes.set_xticks(range(len(ticks)), ticks, **turned)
+        places, line = _side_by_side(axes, table[x], group_of_row), "none"
     for number, (label, color) in enumerate(colors.items()):
-        own = group_of_row == number
+        own, n_alike = group_of_row == number, [*colors.values()][:number].count(color)
         look = {"color": color, "marker": "os^Dv"[marks[label] % 5], "label": label}
-        axes.plot(places[own], table[y][own], **look, linestyle="none" if is_text else line)
+        look["linestyle"] = line or ("-", "--", ":")[n_alike % 3]
+        axes.plot(places[own], table[y][own], **look)
         if "from" in table:
-            spans = table.loc[own, "from"], table.loc[own, "to"]
-            axes.vlines(places[own], *spans, color=color, linewidth=0.8)
+            axes.vlines(places[own], table["from"][own], table["to"][own], color, linewidth=0.8)
     if STANDING_STILL in table:
         axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **style.DOTTED)
     axes.set(xlabel=x, ylabel=y)
     style.log_axes(axes, log.replace("x", "") if is_text else log)
-    if labels.is_unique and not is_text and len(labels) > 1:
-        style.label_points(axes, table[x], table[y], colors)
-        if STANDING_STILL in table:
-            axes.legend(handles=axes.lines[-1:])
-    else:
+    if is_text or not labels.is_unique or len(labels) == 1:
         axes.figure.legend(loc="outside right center")
+        return axes.figure
+    style.label_points(axes, table[x], table[y], colors)
+    if STANDING_STILL in table:
+        axes.legend(handles=axes.lines[-1:])
     return axes.figure
+
+
+def _side_by_side(axes: Axes, texts: pd.Series, group_of_row: pd.Series) -> pd.Series:
+    """Where points of the groups (numbers) lie on x, whose ticks are texts; long ones turn."""
+    codes, ticks = pd.factorize(texts)
+    letters = sum(max(map(len, tick.split("\n"))) for tick in ticks)
+    turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}
+    axes.set_xticks(range(len(ticks)), ticks, **turned)
+    n_groups = group_of_row.max() + 1
+    return codes + (group_of_row - (n_groups - 1) / 2) * 0.5 / max(n_groups, 4)

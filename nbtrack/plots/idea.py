@@ -1,93 +1,100 @@
-"""The idea of the paper in one picture: many queries along a ray against one at its end."""
+"""What both trackers ask a map for: samples along a ray, or measured points."""
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from nbtrack.core.arrays import Pose
-from nbtrack.core.camera import pixel_directions
 from nbtrack.core.geometry import transform_points
 from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
-from nbtrack.fields import Field, LearnedField
+from nbtrack.fields import LearnedField
 from nbtrack.plots.scene import draw_slice
-from nbtrack.plots.style import new_axes, styled
+from nbtrack.plots.style import method_colors, new_axes, styled
 
-_STEP = 0.02  # m, between the grid points of a slice
-_N_STRATIFIED, _N_IMPORTANCE = 32, 12  # samples a ray (iMAP)
+_STEP = 0.01  # m, between the grid points of a slice
+_BEFORE, _BEHIND, _ASIDE = 1.25, 0.45, 0.3  # m, what is drawn around the measured point
 _DOT = {"edgecolors": "black", "linewidths": 0.5, "zorder": 4}
+_COLORS = method_colors(["VR", "SDF", "true"])
 
 
 @styled
 def plot_idea(
-    density: LearnedField,
-    distance: Field,
+    field: LearnedField,
     frame: Frame,
     T_world_camera: Pose,
     row: int,
     column: int,
     title: str = "",
 ) -> Figure:
-    """What VR and SDF tracking ask a map for one pixel (row, column) of a frame.
+    """What a tracker asks a map around the measured point of one pixel (row, column) of a frame.
 
-    Both panels show the plane in which all rays of the pixel's row lie, from the camera at
-    `T_world_camera` (m), an estimate that may be off. Left, in a map of a density: the 44 samples
-    of iMAP along the ray; the larger a dot, the larger its weight. Right, in a map of a signed
-    distance: the measured point, its distance d, and the way of length d against the gradient.
+    The slice is the plane of all rays of the pixel's row, from the camera at `T_world_camera` (m),
+    an estimate that may be off; the pixel's ray runs to the right. In a map of a density it shows
+    the samples of iMAP along this ray, the larger the more they weigh, and the distance that they
+    render. In one of a signed distance d it shows the row's measured points, one query each, and
+    from each a step of length |d| against the gradient.
     """
-    left, right = new_axes(title, 4.3, 1, 2, sharex=True, sharey=True)[0]
-    point_camera = frame.points(torch.tensor([row]), torch.tensor([column]))[0]
-    x, _, z = point_camera[0].tolist()
-    pose = torch.from_numpy(T_world_camera).float()
-    for axes, field in ((left, density), (right, distance)):
-        _draw_row(axes, field, frame, T_world_camera, row)
-        axes.plot([0, x], [0, z], color="0.2", linewidth=0.8)
-    _draw_samples(left, density, pose, point_camera / z)
-    _draw_query(right, distance, pose, point_camera)
-    for axes in (left, right):
-        axes.legend(loc="upper left", frameon=True)
-    return left.figure
-
-
-def _draw_row(axes: Axes, field: Field, frame: Frame, T_world_camera: Pose, row: int) -> None:
-    """A field's values on the plane of a row of pixels, the camera, and what the row measured."""
-    columns = torch.arange(frame.camera.width)
+    axes = new_axes(title, 3.8)[0, 0]
+    rows, columns = frame.measured_pixels()
+    columns = columns[rows == row]
     points, _ = frame.points(torch.full_like(columns, row), columns)
-    sides = pixel_directions(frame.camera, columns[[0, -1]], torch.full((2,), row)).numpy()
-    far = 1.15 * points[:, 2].max().item()
-    across = np.arange(far * sides[0, 0], far * sides[1, 0], _STEP)
-    x, z = np.meshgrid(across, np.arange(0.0, far, _STEP))
-    grid = np.stack([x, z * sides[0, 1], z], axis=-1)
-    grid_world = grid @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    draw_slice(axes, field, grid_world, grid[..., [0, 2]], location="bottom", aspect=30)
-    axes.plot(points[:, 0], points[:, 2], ".", color="#009e73", markersize=3)
-    axes.plot(0, 0, "k^", markersize=9)
-    axes.set_ylim(bottom=-0.2)
-    axes.set(xlabel="to the right of the camera (m)", ylabel="ahead (m)", aspect="equal")
-    axes.set_title(field.label)
+    (point,) = points[columns == column]
+    end = point.norm().item()
+    along = point / end
+    left = along * along[0] - torch.tensor([1.0, 0, 0])  # the row's plane has the camera's x
+    to_page = torch.stack([along, left / left.norm()])
+    across = np.arange(-_ASIDE, _ASIDE + _STEP, _STEP)
+    places = np.stack(np.meshgrid(np.arange(end - _BEFORE, end + _BEHIND, _STEP), across), axis=-1)
+    grid_world = places @ to_page.numpy() @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    draw_slice(axes, field, grid_world, places, aspect=25, pad=0.015)
+    pose = torch.from_numpy(T_world_camera).float()
+    axes.axhline(0, color="0.2", linewidth=0.8)
+    if field.is_distance:
+        _draw_queries(axes, field, pose, points, to_page)
+    else:
+        _draw_samples(axes, field, pose, point)
+    axes.plot([], [], "k-", label=f"surface of {field.label}")
+    limits = {"xlim": (end - _BEFORE, end + _BEHIND), "ylim": (-_ASIDE, _ASIDE)}
+    axes.set(**limits, xlabel="along the ray (m)", ylabel="to its left (m)", aspect="equal")
+    axes.figure.legend_below()
+    return axes.figure
 
 
-def _draw_samples(axes: Axes, field: LearnedField, pose: Tensor, ray: Tensor) -> None:
-    """The samples of a ray (1 x 3, camera frame, z = 1), by their weights."""
+def _draw_samples(axes: Axes, field: LearnedField, pose: Tensor, point: Tensor) -> None:
+    """iMAP's samples on the ray to a measured point (m, camera frame), and what they render."""
+    ray = point[None] / point[2]
     unknown = torch.zeros(1, 3)
     rays = Rays(pose[None, :3, 3], ray @ pose[:3, :3].T, unknown, unknown[:, 0])
-    depths = field.hierarchical_depths(rays, _N_STRATIFIED, _N_IMPORTANCE)
-    sizes = 8 + 400 * field.render(rays, depths).weights[0].detach()
-    label = f"{len(sizes)} samples, by weight"
-    x, z = depths[0] * ray[0, 0], depths[0]
-    axes.scatter(x, z, s=sizes, label=label, color="#3b6fb6", **_DOT)
+    with torch.no_grad():
+        depths = field.hierarchical_depths(rays, 32, 12)
+        rendered = field.render(rays, depths)
+    to_length = ray.norm().item()
+    x = depths[0] * to_length
+    sizes = 12 + 400 * rendered.weights[0]
+    label = f"{len(x)} samples, by weight"
+    axes.scatter(x, 0 * x, s=sizes, label=label, color=_COLORS["VR"], **_DOT)
+    start, end = point.norm().item(), rendered.depth.item() * to_length
+    axes.axvline(end, linestyle="--", color=_COLORS["VR"], label="rendered distance")
+    axes.scatter(start, 0, s=60, label="measured point", color=_COLORS["true"], **_DOT)
+    axes.annotate("", (end, 0.1), (start, 0.1), arrowprops={"arrowstyle": "<->"})
+    error = f"error {100 * abs(end - start):.0f} cm"
+    axes.annotate(error, ((start + end) / 2, 0.11), ha="center", va="bottom")
 
 
-def _draw_query(axes: Axes, field: Field, pose: Tensor, point_camera: Tensor) -> None:
-    """The measured point (1 x 3, m), its distance, and the way against its gradient."""
-    point_world = transform_points(pose, point_camera).requires_grad_()
-    d = field(point_world)[1]
-    (gradient,) = torch.autograd.grad(d.sum(), point_world)
-    foot = point_camera - d.detach() * (gradient @ pose[:3, :3])
-    start, end = (point[0, [0, 2]].tolist() for point in (point_camera, foot))
-    arrow = {"arrowstyle": "-|>", "linewidth": 2, "shrinkA": 0, "shrinkB": 0}
-    axes.annotate("", end, start, arrowprops=arrow, zorder=5)
-    label = f"one query: d = {100 * d.item():.0f} cm"
-    axes.scatter(*start, s=25, label=label, color="#e08214", **_DOT)
+def _draw_queries(
+    axes: Axes, field: LearnedField, pose: Tensor, points: Tensor, to_page: Tensor
+) -> None:
+    """Measured points (m, camera frame), and steps of length |d| against the gradient."""
+    points_world = transform_points(pose, points).requires_grad_()
+    sdf = field(points_world)[1]
+    (gradient,) = torch.autograd.grad(sdf.sum(), points_world)
+    feet = points - sdf.detach()[:, None] * normalize(gradient) @ pose[:3, :3]
+    start, end = (points @ to_page.T).numpy(), (feet @ to_page.T).numpy()
+    axes.scatter(*start.T, s=40, label="measured points", color=_COLORS["true"], **_DOT)
+    axes.plot([], [], color=_COLORS["SDF"], label="|d| against the gradient")
+    look = {"color": _COLORS["SDF"], "angles": "xy", "scale_units": "xy", "scale": 1, "zorder": 5}
+    axes.quiver(*start.T, *(end - start).T, width=0.003, **look)

@@ -93,11 +93,12 @@ def plot_map_and_slice(
 
     The surface is drawn as `plot_mesh` draws it, from a grid of `voxel` metres. The slice lies at
     the cameras' mean height and is drawn beside the room, in the same projection. What no frame of
-    `sequence` has seen is pale. The camera-to-world poses (m) by label are drawn in both.
+    `sequence` has seen is pale. The camera-to-world poses (m) by label are drawn in both, and
+    larger beside them.
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
-    axes = new_axes(title, 4.6)[0, 0]
+    axes, enlarged = new_axes(title, 4.6, 1, 2, width_ratios=[5, 1])[0]
     to_screen = scene.draw_mesh(axes, mesh, up)
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
     # From the room to where the slice is drawn; it is above the middle of the room's height.
@@ -105,11 +106,16 @@ def plot_map_and_slice(
     aside -= (height - (mesh.vertices @ up).mean()) * up
     page = np.eye(3)[up == 0]
     points, _ = _level_grid(page, *mesh.bounds @ page.T, voxel, height * up)
-    scene.draw_slice(axes, field, points, (points + aside) @ to_screen[:2].T, sequence, shrink=0.6)
-    scene.draw_paths(axes, T_paths, to_screen[:2], width=0.5)
+    places = (points + aside) @ to_screen[:2].T
+    bar = {"location": "bottom", "shrink": 0.4, "aspect": 30, "pad": 0.0}
+    scene.draw_slice(axes, field, points, places, sequence, **bar)
+    scene.draw_paths(axes, T_paths, to_screen[:2], 0.7)
     axes.figure.legend_below()
-    scene.draw_paths(axes, T_paths, to_screen[:2], 0.5, aside)
+    scene.draw_paths(axes, T_paths, to_screen[:2], 0.7, aside)
     axes.set_axis_off()
+    scene.draw_paths(enlarged, T_paths, to_screen[:2])
+    scene.look_through(enlarged)
+    enlarged.set_title("The path, larger")
     return axes.figure
 
 

@@ -21,6 +21,10 @@ PALETTE = (
 _FIXED = {
     **dict.fromkeys(["iMAP with VR", "iMAP", "VR"], PALETTE[0]),
     **dict.fromkeys(["NeuS with SDF", "NeuS", "SDF"], PALETTE[1]),
+    **dict.fromkeys(["NeuS+ baked (LM)", "NeuS+"], PALETTE[2]),
+    **dict.fromkeys(["NeuS+ corrected (LM)", "NeuS+ corrected"], PALETTE[3]),
+    "ICP": PALETTE[4],
+    "NeuS+ grid": PALETTE[5],
     # Green and red as in the paper's first figure, of tones that colour-blind readers tell apart
     # (Okabe and Ito).
     "true": "#009e73",
@@ -55,6 +59,12 @@ class NotebookFigure(Figure):
 
         It is shown at the figure's own size (pixels), at half that of the picture.
         """
+        from IPython import get_ipython  # it asks for this, and others may lack it
+
+        if shell := get_ipython():
+            # Sliders load pyplot's inline backend, which draws all figures anew, cropped and small.
+            pictures = shell.display_formatter.formatters["image/png"]
+            pictures.for_type(NotebookFigure, NotebookFigure._repr_png_)
         width, height = (round(pixels) for pixels in self.bbox.size)
         alt = self.get_suptitle().replace("\n", " ")
         return {}, {"image/png": {"alt": alt, "width": width, "height": height}}
@@ -87,9 +97,14 @@ def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **share
 
 
 def method_colors(labels: Iterable[str]) -> dict[str, str]:
-    """One colour a label: those of the paper's methods stay, others get the next that is free."""
-    free = cycle(color for color in PALETTE if color not in _FIXED.values())
-    return {label: _FIXED.get(label) or next(free) for label in dict.fromkeys(labels)}
+    """One colour a label: that of its method, if it has one in all figures, else a free one.
+
+    A label begins with its method; what it says behind a comma does not change the colour. Those of
+    the paper's methods are never free.
+    """
+    known = {label: _FIXED.get(label.split(",")[0]) for label in labels}
+    free = cycle(color for color in PALETTE[2:] if color not in known.values())
+    return {label: color or next(free) for label, color in known.items()}
 
 
 def label_points(
@@ -99,14 +114,14 @@ def label_points(
 
     A label that would cover another or leave the axes is moved up or down.
     """
-    axes.margins(x=0.3, y=0.1)
+    axes.margins(x=0.4, y=0.1)
     axes.figure.draw_without_rendering()
     rows = sorted(zip(x, y, colors, strict=True), key=lambda row: row[1])
     pixels = axes.transData.transform([row[:2] for row in rows])
     taken = [Bbox.from_bounds(left - 5, bottom - 5, 10, 10) for left, bottom in pixels]
     for x_point, y_point, label in rows:
         text = axes.annotate(label, (x_point, y_point), (0, 0), textcoords="offset points")
-        text.set(fontsize="small", color=colors[label])
+        text.set(color=colors[label])
         shifts = sorted(range(-60, 61, 3), key=abs)
         for shift, (right, align) in product(shifts, {6: "left", -6: "right"}.items()):
             text.set(position=(right, shift - 3), horizontalalignment=align)
@@ -118,8 +133,13 @@ def label_points(
 
 
 def log_axes(axes: Axes, names: str) -> None:
-    """Make "x", "y" or "xy" logarithmic, with plain numbers at 1, 2 and 5."""
+    """Make "x", "y" or "xy" logarithmic, with plain numbers at 1, 2 and 5.
+
+    What spans less than a factor of ten has more of them.
+    """
     for name in names:
         axes.set(**{f"{name}scale": "log"})
-        plain = {"major_formatter": "{x:g}", "minor_formatter": ""}
-        getattr(axes, f"{name}axis").set(major_locator=LogLocator(subs=(1, 2, 5)), **plain)
+        axis = getattr(axes, f"{name}axis")
+        low, high = axis.get_view_interval()
+        ticks = LogLocator(subs=(1, 2, 5) if high > 10 * low else (1, 1.5, 2, 3, 4, 5, 6, 8))
+        axis.set(major_locator=ticks, major_formatter="{x:g}", minor_formatter="")
