@@ -26,7 +26,7 @@ from nbtrack.checks.in_map import check_belongs
 from nbtrack.cli import main
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import ConfigError, DataError
-from nbtrack.experiments.output import LOCK_FILE
+from nbtrack.experiments.output import MARK
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.mapping.files import MAP_FILE, Map, _digest, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
@@ -224,7 +224,7 @@ def test_a_file_gives_the_same_trajectory_elsewhere(
     assert (metrics["map_record"]["scene"], metrics["field"]) == ("living_room", "neus")
     assert metrics["map_record"]["network"]["width"] == 16
     names = {path.name for path in (work / "map").iterdir()}
-    assert names == {MAP_FILE, "history.csv", "mesh.ply", LOCK_FILE}
+    assert names == {MAP_FILE, "history.csv", "mesh.ply", MARK}
     assert (work / "room").read_bytes() == (work / "map" / MAP_FILE).read_bytes()
     assert len(read_map("map").history) == 30
 

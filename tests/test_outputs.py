@@ -14,7 +14,6 @@ import pandas as pd
 import pytest
 import torch
 import trimesh
-from filelock import FileLock
 from finished import GIVEN, MAP, OWN, SET
 from recordings import write_recording
 from test_faults import assert_refused, contents
@@ -26,7 +25,6 @@ from nbtrack.core.device import threads
 from nbtrack.core.errors import DataError
 from nbtrack.experiments import map_jobs
 from nbtrack.experiments.grid import track_scenes
-from nbtrack.experiments.output import LOCK_FILE
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.recordings.recording import open_recording
@@ -40,7 +38,7 @@ def test_a_map_is_read_once(work: Path) -> None:
     """Catches a command that reads its map again and again: a corrected one takes seconds."""
     map_jobs._read.cache_clear()
     with mock.patch.object(map_jobs, "read_map", wraps=map_jobs.read_map) as read:
-        assert main([*OWN, "--seed", "0"]) == 0
+        assert main([*OWN, "--frames", "1:"]) == 0
     assert read.call_count == 1
 
 
@@ -88,15 +86,6 @@ def test_files_of_others_stay(work: Path, capsys: pytest.CaptureFixture) -> None
         (work / "paper" / name).unlink()
 
 
-def test_one_command_at_a_time_writes_to_a_folder(
-    work: Path, capsys: pytest.CaptureFixture
-) -> None:
-    """Catches two processes with one --out, of which the last one won in silence."""
-    with FileLock(work / "run" / LOCK_FILE):
-        assert_refused(work, capsys, OWN, "another nbtrack command is writing to run")
-    assert main(OWN) == 0
-
-
 def test_places_are_told_before_the_work(work: Path, capsys: pytest.CaptureFixture) -> None:
     """Catches hours of mapping that end at a place where nothing can be written."""
     with mock.patch("nbtrack.experiments.commands.run_jobs") as run_jobs:
@@ -104,35 +93,6 @@ def test_places_are_told_before_the_work(work: Path, capsys: pytest.CaptureFixtu
             new = ["--set", "mapping.neus.n_rays=31"]
             assert_refused(work, capsys, [*OWN, *new, "--out", place], place.split("/")[-1])
         run_jobs.assert_not_called()
-
-
-def _killed(command: list[str]) -> None:
-    with mock.patch("safetensors.torch.save", side_effect=OSError(28, "No space left on device")):
-        assert main(command) == 2
-
-
-def test_maps_of_other_data_are_not_mixed(work: Path, capsys: pytest.CaptureFixture) -> None:
-    """Catches a map that begins with one recording's frames and ends with another's: poses that
-    were corrected in between, another recording of the same name and length, other frames."""
-    write_recording("plain", work / "one/rec")
-    command = ["map", "one/rec", *MAP[2:4], *SET, "--out", "m"]
-    _killed(command)
-    says = "mapping.pt was made with another "
-    assert_refused(work, capsys, [*command, "--frames", "1:"], f"{says}n frames, first and last")
-    poses = work / "one/rec/trajectory.txt"
-    kept, lines = poses.read_text(), poses.read_text().splitlines()
-    first = lines[1].split()
-    first[1] = str(float(first[1]) + 0.01)
-    poses.write_text("\n".join([lines[0], " ".join(first), *lines[2:]]) + "\n")
-    assert_refused(work, capsys, command, f"{says}data")
-    poses.write_text(kept)
-    shutil.copytree(work / "one/rec", work / "two/rec")
-    image = next((work / "two/rec/color").iterdir())
-    cv2.imwrite(str(image), 255 - cv2.imread(str(image)))
-    assert_refused(work, capsys, ["map", "two/rec", *command[2:]], f"{says}data")
-    assert main(command) == 0
-    says = "m/map.safetensors was made with another n frames, first and last frame, data"
-    assert_refused(work, capsys, [*command, "--frames", "1:"], says)
 
 
 def test_a_flipped_bit_in_a_checkpoint_is_noticed(tmp_path: Path) -> None:
@@ -195,6 +155,9 @@ def test_an_image_mended_in_place_counts(tmp_path: Path, kind: str) -> None:
     cv2.imwrite(str(image), pixels, uncompressed)
     shutil.copytree(tmp_path / "rec", tmp_path / "copy")
     assert Scene("rec", tmp_path / "copy").fingerprint == before
+    poses = tmp_path / "rec/trajectory.txt"
+    poses.write_text(poses.read_text().replace(" 0.", " 0.1", 1))
+    assert Scene("rec", tmp_path / "rec").fingerprint != before
 
 
 def test_a_room_is_made_anew_where_its_maker_changes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,9 +238,3 @@ def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
     assert victim.read_text() == "precious"
     assert (tmp_path / "result.txt").read_text() == "new"
     assert not (tmp_path / "result.txt").is_symlink()
-
-
-def test_a_motion_names_no_folder(work: Path, capsys: pytest.CaptureFixture) -> None:
-    """Catches folders that are made outside of the cache before a wrong name is refused."""
-    command = [*MAP, "--set", "scenes.motion=tour/../../../x"]
-    assert_refused(work, capsys, command, "'tour/../../../x': write 'keyframes' or ")

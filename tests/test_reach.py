@@ -21,7 +21,7 @@ from nbtrack.synthetic import make_room
 from nbtrack.tables import published_table_1
 from nbtrack.tracking import SdfSettings, StepBudget, VrSettings, make_tracker
 from nbtrack.tracking.metrics import trajectory_metrics
-from nbtrack.tracking.reach import best_follower, least_ate, motion_of, reach, reach_metrics
+from nbtrack.tracking.reach import greedy_follower, least_ate, motion_of, reach, reach_metrics
 
 METHODS = {"vr": "iMAP with VR", "sdf": "NeuS with SDF"}
 # Of the dataset's path, by method and rate (Hz): the bound (m) with rates in metres, with rates in
@@ -88,11 +88,11 @@ def test_reach_by_hand() -> None:
     assert of_frame.orientation == pytest.approx(20e-3)
 
 
-def test_the_best_follower_by_hand() -> None:
+def test_the_greedy_follower_by_hand() -> None:
     """Catches a follower that overshoots, cuts a corner or looks at the wrong axis: with 2 mm of
     reach for 3 mm of motion it falls behind by 1 mm a frame; with 3 mm it never does."""
     path = straight(0.003)
-    followed = best_follower(path, 0.002)
+    followed = greedy_follower(path, 0.002)
     assert_allclose(followed[:, 0, 3], 0.002 * np.arange(11), atol=1e-12)
     behind = 1e-3 * np.arange(1, 11)
     assert least_ate(path, 0.002) == pytest.approx(np.sqrt(np.mean(behind**2)))

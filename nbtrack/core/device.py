@@ -3,8 +3,9 @@
 import contextlib
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -68,38 +69,33 @@ def usual_modes() -> Iterator[None]:
 
     Also in a program that has switched gradients off, or has another default type.
     """
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float32)
-    try:
-        with torch.inference_mode(False), torch.enable_grad():
-            yield
-    finally:
-        torch.set_default_dtype(before)
+    usual_type = _restored(torch.set_default_dtype, torch.get_default_dtype(), torch.float32)
+    with usual_type, torch.inference_mode(False), torch.enable_grad():
+        yield
 
 
-@contextlib.contextmanager
-def matrix_products(tf32: bool) -> Iterator[None]:
+def matrix_products(tf32: bool) -> contextlib.AbstractContextManager[None]:
     """Run a block with matrix products in single precision, or on NVIDIA's GPUs in TF32.
 
     TF32 keeps 10 of the mantissa's 23 bits, and is several times as fast.
     """
     before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high" if tf32 else "highest")
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
+    return _restored(torch.set_float32_matmul_precision, before, "high" if tf32 else "highest")
+
+
+def threads(number: int) -> contextlib.AbstractContextManager[None]:
+    """Run a block with so many CPU threads."""
+    return _restored(torch.set_num_threads, torch.get_num_threads(), number)
 
 
 @contextlib.contextmanager
-def threads(number: int) -> Iterator[None]:
-    """Run a block with so many CPU threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(number)
+def _restored(change: Callable[[Any], object], before: Any, within: Any) -> Iterator[None]:
+    """Run a block with another value of a setting of PyTorch's."""
+    change(within)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        change(before)
 
 
 def suitable_threads(width: int) -> contextlib.AbstractContextManager[None]:

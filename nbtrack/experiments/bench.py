@@ -17,7 +17,7 @@ from nbtrack.core.settings import changed_settings
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.experiments.grid import Execution, map_scene, track_scenes
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
-from nbtrack.experiments.output import output_folder
+from nbtrack.experiments.output import prepare
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.latex import Wording
@@ -48,8 +48,8 @@ def tables_command(options: Namespace) -> None:
     execution = Execution(options.workers, options.dask, keep_going=True)
     labels = dict(map(_label_of, preset.scenes.labels))
     wording = Wording(options.caption, options.label, labels)
-    with output_folder(options.out):
-        results = _fill_tables(options, preset, methods, execution, wording)
+    prepare(options.out)
+    results = _fill_tables(options, preset, methods, execution, wording)
     failed = results[results["failure"] != ""]
     if len(failed):
         first, why = failed.iloc[0][["run", "failure"]]
@@ -103,10 +103,10 @@ def bench_command(options: Namespace) -> None:
     # One image is enough, and hardly a map: a step costs the same whatever the weights are.
     quick = ("scenes.n_frames=2", "mapping.imap.iterations=1", "mapping.neus.iterations=1")
     preset = load_preset(name, options.config, [*options.settings, *quick])
-    with output_folder(options.out):
-        steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset))
-        folder = options.out or runs_folder() / "bench" / preset.name
-        print(tables.write_csv(folder / "table_2.csv", steps))
+    prepare(options.out)
+    steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset))
+    folder = options.out or runs_folder() / "bench" / preset.name
+    print(tables.write_csv(folder / "table_2.csv", steps))
 
 
 def _table_2(

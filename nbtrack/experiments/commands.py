@@ -21,7 +21,7 @@ from nbtrack.experiments.jobs import run_jobs
 from nbtrack.experiments.map_jobs import OF_MAPS, GivenMap, MapJob, setting_tree
 from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
 from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
-from nbtrack.experiments.runs import read_trajectory
+from nbtrack.experiments.runs import METRICS_FILE, read_trajectory
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
@@ -60,14 +60,17 @@ def map_command(options: Namespace) -> None:
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     scene = _opened(options, preset)
     scene.count(options.frames)
-    job = MapJob.of(scene, method.field, preset, options.frames, options.seed, options.out)
-    with output.output_folder(options.out):
-        _map(job)
-        finished = job.map()
-        print(f"{job.folder}: {finished.field.label} map of {scene.name}")
-        print(f"  mapped in {finished.record['seconds']:.0f} s on {finished.record['device']}")
-        _print_numbers(finished.record["quality"])
-        _write_mesh(job, finished)
+    job = MapJob.of(scene, method.field, preset, options.frames, options.seed)
+    output.prepare(options.out)
+    _map(job)
+    finished = job.map()
+    _write_mesh(job, finished)
+    folder = output.deliver(job.folder, output.FILES_OF_MAP, options.out)
+    print(f"{folder}: {finished.field.label} map of {scene.name}")
+    print(f"  mapped in {finished.record['seconds']:.0f} s on {finished.record['device']}")
+    _print_numbers(finished.record["quality"])
+    if (folder / MESH_FILE).is_file():
+        print(f"  mesh of what was seen: {folder / MESH_FILE}")
 
 
 def _write_mesh(job: MapJob, finished: Map) -> None:
@@ -82,7 +85,6 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
         return
     origin = np.array(finished.record["origin"])
     write_atomic(job.folder / MESH_FILE, mesh_bytes(mesh, "ply", origin))
-    print(f"  mesh of what was seen: {job.folder / MESH_FILE}")
 
 
 def track_command(options: Namespace) -> None:
@@ -104,18 +106,22 @@ def track_command(options: Namespace) -> None:
     run = TrackJob(
         job, scene, method.tracker, preset.tracking_of(method.tracker),
         steps=steps, rate_hz=options.rate, frames=options.frames, seed=options.seed,
-        out=options.out, start=options.start,
+        start=options.start,
     )  # fmt: skip
     run.check()
     for warning in reach_warnings([run]):
         tell(f"nbtrack: warning: {warning}")
-    with output.output_folder(options.out):
-        if not given:
-            _map(job)
-        run = replace(run, out=run.folder)  # made anew, whatever the cache holds
-        (metrics,) = run_jobs([run])
-        _draw_overview(run)
-    print(f"{run.folder}: {method.tracker} in {job.map().field.label}, {budget}")
+    output.prepare(options.out)
+    if not given:
+        _map(job)
+    if options.rate:  # what the clock says is measured again
+        (run.folder / METRICS_FILE).unlink(missing_ok=True)
+    if run.is_done:
+        print(f"run found in {run.folder}")
+    (metrics,) = run_jobs([run])
+    _draw_overview(run)
+    folder = output.deliver(run.folder, output.FILES_OF_RUN, options.out)
+    print(f"{folder}: {method.tracker} in {job.map().field.label}, {budget}")
     _print_run(metrics)
 
 
@@ -192,7 +198,6 @@ def _draw_overview(run: TrackJob) -> None:
     paths["tracked"] = tracked.T_estimated
     figure = plot_overview(cloud_of(surface), paths, tracked.frames, title)
     output.save_picture(figure, run.folder / output.OVERVIEW_FILE, dpi=120)
-    print(f"  picture: {run.folder / output.OVERVIEW_FILE}")
 
 
 def _seen(tracked: Trajectory, rows: np.ndarray, recording: Recording) -> RgbdSequence:
@@ -277,16 +282,16 @@ def make_command(options: Namespace) -> None:
 
 def check_command(options: Namespace) -> None:
     """Validate a recording; print what it holds and what is wrong, and draw it if asked to."""
-    with output.output_folder(options.out):
-        recording = _recording_of(options)
-        report = check_recording(recording, progress=True)
-        print(report)
-        if options.out:
-            apart_mm = 1e3 * report.conventions[0].median_m
-            title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart (median)"
-            figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)
-            output.save_picture(figure, options.out / output.CHECK_FILE)
-            print(f"  picture         {options.out / output.CHECK_FILE}")
+    output.prepare(options.out)
+    recording = _recording_of(options)
+    report = check_recording(recording, progress=True)
+    print(report)
+    if options.out:
+        apart_mm = 1e3 * report.conventions[0].median_m
+        title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart (median)"
+        figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)
+        output.save_picture(figure, options.out / output.CHECK_FILE)
+        print(f"  picture         {options.out / output.CHECK_FILE}")
 
 
 def convert_command(options: Namespace) -> None:

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.connection import Connection
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -48,21 +47,15 @@ class Job:
     key: str  # changes with everything that the result depends on
     doing: str = "computing"  # what its progress is called
     work: float = 1.0  # queries of a field, about, for the time that is left
-    out: Path | None = None  # where to keep it instead of in the cache
     needs: "Job | None"
     is_done: bool
     result: Callable[[], Any]  # what a finished job has kept
     compute: Callable[[Report], Any]  # makes it, or takes a killed attempt up; returns `result`
 
     @property
-    def cache(self) -> Path:
-        """Its folder in the cache."""
-        return runs_folder() / self.kind / f"{self.name}-{self.key}"
-
-    @property
     def folder(self) -> Path:
-        """Where its files are kept."""
-        return self.out or self.cache
+        """Where its files are kept, in the cache."""
+        return runs_folder() / self.kind / f"{self.name}-{self.key}"
 
     def outcome(self, needed: Any, report: Report) -> Any:
         """Its `result`, made where it is missing, or the user's mistake that kept it from that.
@@ -72,7 +65,7 @@ class Job:
         """
         if isinstance(needed, NbtrackError):
             return NbtrackError(f"not run, because {self.needs.name} failed: {needed}")
-        path = runs_folder() / "locks" / f"{self.cache.name}.lock"
+        path = runs_folder() / "locks" / f"{self.folder.name}.lock"
         report(0.0, "begins, or waits for another process that makes the same")
         try:
             check_no_recording(path)
@@ -203,19 +196,18 @@ def _outcome_there(
 def _pool(workers: int) -> Iterator[Executor]:
     """Processes of this machine, which end with the block, or with this process if it is killed."""
     context = multiprocessing.get_context(_START)
-    theirs, ours = context.Pipe(duplex=False)
-    with ProcessPoolExecutor(workers, context, _end_with, (theirs,)) as executor, ours:
+    with ProcessPoolExecutor(workers, context, _end_with_parent) as executor:
         with _spared():
             for _ in range(workers):
                 executor.submit(int)  # a process is begun for each, since none is idle yet
         yield executor
 
 
-def _end_with(pipe: Connection) -> None:
-    """End this worker, whatever it does, as soon as the other end of a pipe is closed."""
+def _end_with_parent() -> None:
+    """End this worker, whatever it does, as soon as the process that began it has ended."""
 
     def watch() -> None:
-        pipe.poll(None)
+        multiprocessing.parent_process().join()
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

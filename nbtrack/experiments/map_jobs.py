@@ -20,7 +20,7 @@ from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
-from nbtrack.mapping.fit import check_recipe, map_sequence, recipe_of
+from nbtrack.mapping.fit import map_sequence
 from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
 
 OF_MAPS = ("network.", "mapping.", "correction.")
@@ -52,20 +52,17 @@ class MapJob(Job):
     frames: str = ":"
     seed: int = 0
     correction: float = 0.0  # cells (m) in which the fitted map is corrected; 0: it is not
-    out: Path | None = None
     # Cells (m) in which the job that needs this map will correct it.
     is_corrected_in: float = field(default=0.0, compare=False)
 
     kind, doing = "maps", "mapping"
 
     @classmethod
-    def of(
-        cls, scene: Scene, field: str, preset: Preset, frames=":", seed=0, out: Path | None = None
-    ) -> "MapJob":
+    def of(cls, scene: Scene, field: str, preset: Preset, frames=":", seed=0) -> "MapJob":
         """The map of a scene with the settings of a preset."""
         network, settings = preset.network_of(field), preset.mapping_of(field)
         correction = preset.correction.get(field, 0.0)
-        return cls(scene, field, network, settings, frames, seed, correction, out)
+        return cls(scene, field, network, settings, frames, seed, correction)
 
     @cached_property
     def key(self) -> str:
@@ -87,14 +84,12 @@ class MapJob(Job):
         """The map that this one corrects, if it is a corrected one."""
         if not self.correction:
             return None
-        return replace(self, correction=0.0, out=None, is_corrected_in=self.correction)
+        return replace(self, correction=0.0, is_corrected_in=self.correction)
 
     @property
     def is_done(self) -> bool:
-        """Whether the map is finished and scored; in a folder of the user's, whether it is this."""
-        if not (self.folder / MAP_FILE).is_file():
-            return False
-        return self.out is None or self._stored().record.get("key") == self.key
+        """Whether the map is finished and scored."""
+        return (self.folder / MAP_FILE).is_file()
 
     @property
     def work(self) -> float:
@@ -124,7 +119,6 @@ class MapJob(Job):
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Map and score, or resume; write the map's files."""
-        path = self.folder / MAP_FILE
         checkpoint = self.folder / CHECKPOINT_FILE
 
         def tell(share: float, losses: dict[str, float | int]) -> None:
@@ -134,10 +128,6 @@ class MapJob(Job):
         if self.is_corrected_in:  # what would fail after minutes of mapping is told now
             setting = f"correction.{self.field}"
             checked_size(observed_bounds(sequence), self.is_corrected_in, setting)
-        if path.is_file():  # a folder of the user's, with another finished map
-            recipe = recipe_of(self.field, sequence, self.network, self.settings, self.seed)
-            recipe["correction"] = self.correction
-            check_recipe(path, self._stored().record, recipe)
         if self.needs:
             finished = correct_map(self.needs.map(), sequence, self.correction)
         else:
@@ -153,17 +143,17 @@ class MapJob(Job):
             "versions": provenance.versions(),
         }
         finished = replace(finished, record=finished.record | record)
-        write_map(path, finished)
+        write_map(self.folder / MAP_FILE, finished)
         checkpoint.unlink(missing_ok=True)
         return finished.record
 
 
 @dataclass(frozen=True, eq=False)
-class GivenMap(Job):
-    """A map that was made before, and is only read."""
+class GivenMap:
+    """What a run needs of a finished `MapJob`, of a map that is only read."""
 
     finished: Map
-    out: Path  # its folder, or its file
+    folder: Path  # or its file
 
     needs = None
     is_done = True

@@ -1,34 +1,61 @@
 """Where commands write: never into a recording, and never over files that nbtrack did not write."""
 
-import contextlib
 import io
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
 
-from filelock import Timeout
 from matplotlib.figure import Figure
 
 from nbtrack.core.errors import ConfigError
-from nbtrack.core.files import resolved, write_atomic
+from nbtrack.core.files import resolved, write_atomic, write_together
 from nbtrack.experiments.runs import METRICS_FILE
-from nbtrack.locks import locked
-from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, MESH_FILE
+from nbtrack.mapping.files import HISTORY_FILE, MAP_FILE, MESH_FILE
 from nbtrack.plots.style import in_house_style
 from nbtrack.recordings.formats import holds_recording
 
 OVERVIEW_FILE = "overview.png"
 CHECK_FILE = "check.png"
-LOCK_FILE = ".nbtrack.lock"
-"""It stays in every folder that was given with --out, and tells that nbtrack wrote there."""
-_RESULTS = (
-    *("trajectory.txt", "groundtruth.txt", "frames.csv", METRICS_FILE, OVERVIEW_FILE, CHECK_FILE),
-    *(MAP_FILE, CHECKPOINT_FILE, HISTORY_FILE, MESH_FILE, "table_[123]*"),
-)
+MARK = ".nbtrack"
+"""An empty file in every folder given with --out, where nbtrack may replace its results."""
+# The last one of each tells that the others are there.
+FILES_OF_RUN = ("trajectory.txt", "groundtruth.txt", "frames.csv", OVERVIEW_FILE, METRICS_FILE)
+FILES_OF_MAP = (HISTORY_FILE, MESH_FILE, MAP_FILE)
+_RESULTS = (*FILES_OF_RUN, *FILES_OF_MAP, CHECK_FILE, "table_[123]*")
 
 
 def is_own_output(folder: Path) -> bool:
     """Whether nbtrack has written results into a folder."""
-    return any((folder / n).exists() for n in (LOCK_FILE, METRICS_FILE, MAP_FILE, CHECKPOINT_FILE))
+    return (folder / MARK).exists()
+
+
+def prepare(folder: Path | None) -> None:
+    """Mark a folder, before the work, as one for nbtrack's results. None stands for the cache.
+
+    Raises ConfigError where it holds a recording, or files of somebody else that are named like
+    results; OSError where nothing can be written.
+    """
+    if folder is None:
+        return
+    check_no_recording(folder)
+    foreign = [path.name for name in _RESULTS for path in sorted(folder.glob(name))]
+    if foreign and not is_own_output(folder):
+        raise ConfigError(f"{folder} has a {foreign[0]} that nbtrack did not write: move it away")
+    write_atomic(folder / MARK, "")
+
+
+def deliver(cached: Path, names: Sequence[str], folder: Path | None) -> Path:
+    """Copy a result's files from the cache to a folder, if one is given; where the result then is.
+
+    A file that an earlier result left there, and that this one lacks, is removed.
+    """
+    if folder is None:
+        return cached
+    contents = {name: (cached / name).read_bytes() for name in names if (cached / name).is_file()}
+    write_together(folder, contents)
+    for name in names:
+        if name not in contents:
+            (folder / name).unlink(missing_ok=True)
+    return folder
 
 
 def check_new(path: Path) -> None:
@@ -38,36 +65,6 @@ def check_new(path: Path) -> None:
         raise ConfigError(f"{path} exists: choose another file to write, or remove it first")
 
 
-def save_picture(figure: Figure, path: Path, dpi: float | str = "figure") -> None:
-    """Writes a figure as a PNG."""
-    content = io.BytesIO()
-    with in_house_style():
-        figure.savefig(content, dpi=dpi)
-    write_atomic(path, content.getvalue())
-
-
-@contextlib.contextmanager
-def output_folder(folder: Path | None) -> Iterator[None]:
-    """Keep a folder for this process alone while results are written there.
-
-    None stands for the cache, whose jobs are kept apart already. Raises ConfigError where it holds
-    a recording, or files of somebody else that are named like results, or where another process
-    writes; OSError where nothing can be written.
-    """
-    if folder is None:
-        yield
-        return
-    check_no_recording(folder)
-    foreign = [path.name for name in _RESULTS for path in sorted(folder.glob(name))]
-    if foreign and not is_own_output(folder):
-        raise ConfigError(f"{folder} has a {foreign[0]} that nbtrack did not write: move it away")
-    try:
-        with locked(folder / LOCK_FILE, timeout=0):
-            yield
-    except Timeout:
-        raise ConfigError(f"another nbtrack command is writing to {folder}: wait for it") from None
-
-
 def check_no_recording(path: Path) -> None:
     """Raises ConfigError if a path that is to be written is a recording, or lies within one."""
     for folder in (path, *resolved(path).parents):
@@ -75,3 +72,11 @@ def check_no_recording(path: Path) -> None:
             raise ConfigError(
                 f"{folder} holds a recording, where nothing is written: choose another"
             )
+
+
+def save_picture(figure: Figure, path: Path, dpi: float | str = "figure") -> None:
+    """Writes a figure as a PNG."""
+    content = io.BytesIO()
+    with in_house_style():
+        figure.savefig(content, dpi=dpi)
+    write_atomic(path, content.getvalue())

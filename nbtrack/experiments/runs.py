@@ -32,7 +32,6 @@ def write_run(folder: Path, run: Trajectory) -> None:
     }
     if "ate_rmse_m" not in run.metrics:
         del texts["groundtruth.txt"]
-        (folder / "groundtruth.txt").unlink(missing_ok=True)
     files.write_together(folder, texts)
 
 

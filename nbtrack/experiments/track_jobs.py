@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,7 +40,7 @@ _OTHER_WORLD = (
     "rigid motion that explains the difference, and errors are those that remain"
 )
 # A user is warned of larger ones. Hands start and stop, and a search catches up (our choice).
-_LEAST_ATE = 0.01  # m, of the best that follows a camera
+_GREEDY_ATE = 0.01  # m, of a greedy follower
 _SHARE = 0.5  # of the frames, in which it moves farther than a search reaches
 # For the work of runs, measured with `smoke` on one core.
 _QUERIES_A_SECOND = 60_000  # of a network
@@ -70,7 +69,6 @@ class TrackJob(Job):
     rate_hz: float | int | None = None
     frames: str = ":"
     seed: int = 0
-    out: Path | None = None
     start: str = "given"  # the first frame's true pose, where known; or "unknown"
 
     kind, doing = "tracks", "tracking"
@@ -113,8 +111,8 @@ class TrackJob(Job):
 
     @property
     def is_done(self) -> bool:
-        """Whether the run is finished; in a folder of the user's it is always made anew."""
-        return self.out is None and (self.folder / METRICS_FILE).is_file()
+        """Whether the run is finished."""
+        return (self.folder / METRICS_FILE).is_file()
 
     def _true_path(self) -> Poses:
         """Of the frames (m), NaN where it is not known. Raises as `select_frames` does."""
@@ -164,7 +162,7 @@ class TrackJob(Job):
             notes["map_warning"] = _OTHER_WORLD if is_explained else None
         metrics = scores_of(tracked) | self._provenance(finished) | notes
         write_run(self.folder, replace(tracked, metrics=metrics))
-        (self.cache / RUN_FILE).unlink(missing_ok=True)
+        (self.folder / RUN_FILE).unlink(missing_ok=True)
         return metrics
 
     def _begin(self, finished: Map, sequence: RgbdSequence) -> _Start:
@@ -196,7 +194,7 @@ class TrackJob(Job):
         tracker = make_tracker(
             self.tracker, finished.field, start.T_world_camera, budget, self.settings, self.seed
         )
-        checkpoint = self.cache / RUN_FILE  # a folder of the user's holds results alone
+        checkpoint = self.folder / RUN_FILE
         tracked = track_sequence(tracker, sequence, checkpoint, tell, start.is_known)
         return tracked, device_name(tracker.device)  # LM and ICP run on the host
 
@@ -264,28 +262,25 @@ class TrackJob(Job):
 
 
 def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
-    """A line for each kind of run whose search falls behind its camera, whatever the map is."""
-    kinds: dict[tuple, list[TrackJob]] = {}
+    """A line for each kind of run whose search falls behind its camera, whatever the map is.
+
+    It tells of the scene where a greedy follower is off by most.
+    """
+    short: dict[tuple, dict[str, dict[str, float]]] = {}
     for run in runs:
-        kinds.setdefault((run.tracker, run.settings, run.steps), []).append(run)
-    for (tracker, settings, steps), alike in kinds.items():
-        reaches = {run.scene.name: run.expected_reach() for run in alike}
-        short = {
-            name: reach
-            for name, reach in reaches.items()
-            if reach.get("least_ate_m", 0.0) > _LEAST_ATE
-            or reach.get("beyond_reach_share", 0.0) > _SHARE
-        }
-        if not short:
-            continue
-        scene, worst = max(short.items(), key=lambda pair: pair[1]["least_ate_m"])
-        others = f" (of {len(short)} scenes)" if len(short) > 1 else ""
-        bound = f", and the best that follows it has an ATE of {worst['least_ate_m']:.3f} m there"
-        velocity = f"--set tracking.{tracker}.motion_model=constant_velocity, "
+        reach = run.expected_reach()
+        is_behind = reach.get("least_ate_m", 0.0) > _GREEDY_ATE
+        if is_behind or reach.get("beyond_reach_share", 0.0) > _SHARE:
+            short.setdefault((run.tracker, run.settings, run.steps), {})[run.scene.name] = reach
+    for (tracker, settings, steps), reaches in short.items():
+        scene, worst = max(reaches.items(), key=lambda pair: pair[1]["least_ate_m"])
+        others = f" (of {len(reaches)} scenes)" if len(reaches) > 1 else ""
+        advice = "take more steps, a lower rate, "
+        if settings.motion_model == "previous_pose":
+            advice += f"--set tracking.{tracker}.motion_model=constant_velocity, "
         yield (
             f"{steps:g} steps of {tracker} move the camera by at most {1e3 * worst['reach_m']:.1f} "
             f"mm along an axis and {worst['reach_deg']:.2f} deg about it; it moves farther in "
-            f"{worst['beyond_reach_share']:.0%} of the frames of {scene}{others}"
-            f"{bound if worst['least_ate_m'] > _LEAST_ATE else ''}: take more steps, a lower rate, "
-            f"{velocity if settings.motion_model == 'previous_pose' else ''}or --method corrected"
+            f"{worst['beyond_reach_share']:.0%} of the frames of {scene}{others}, where a greedy "
+            f"follower has an ATE of {worst['least_ate_m']:.3f} m: {advice}or --method corrected"
         )

@@ -108,7 +108,7 @@ def check_recipe(path: Path, recipe: dict[str, Any], wanted: dict[str, Any]) -> 
     changed = [name.replace("_", " ") for name in wanted if recipe.get(name) != wanted[name]]
     if changed:
         raise DataError(
-            f"{path} was made with another {', '.join(changed)}: remove it, or choose another --out"
+            f"{path} was made with another {', '.join(changed)}: remove it, or name another"
         )
 
 

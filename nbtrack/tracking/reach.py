@@ -1,4 +1,4 @@
-"""How far a frame's steps can move a camera, and what the best search with that reach would score.
+"""How far a frame's steps can move a camera, and what a greedy search with that reach scores.
 
 Adam with a fresh state moves a coordinate by about its learning rate a step, whatever the loss is:
 its steps are those of the gradient's sign as long as the gradient keeps it. So N steps from a start
@@ -57,13 +57,13 @@ def motion_of(
     return offsets, turns
 
 
-def best_follower(
+def greedy_follower(
     T_world_camera: Poses, reach_m: float, motion_model: str = "previous_pose"
 ) -> Poses:
-    """The path of the best search with a reach (m): it ends each frame as near as it can.
+    """The path of a greedy search with a reach (m): it ends each frame as near as it can.
 
     It knows the true pose, moves towards it by at most the reach along each axis, and turns at
-    will. It begins at the first pose.
+    will. It begins at the first pose. A search that ends a frame farther off may be nearer later.
     """
     followed = [T_world_camera[0]]
     for T_true in T_world_camera[1:]:
@@ -75,15 +75,15 @@ def best_follower(
 
 
 def least_ate(T_world_camera: Poses, reach_m: float, motion_model: str = "previous_pose") -> float:
-    """The bound: the ATE (m) of the best follower on a path of known poses, given the first."""
-    followed = best_follower(T_world_camera, reach_m, motion_model)
+    """The ATE (m) of the greedy follower on a path of known poses, given the first."""
+    followed = greedy_follower(T_world_camera, reach_m, motion_model)
     return trajectory_metrics(followed[1:], T_world_camera[1:])["ate_rmse_m"]
 
 
 def reach_metrics(
     reach: Reach | None, T_world_camera: Poses, motion_model: str
 ) -> dict[str, float]:
-    """The reach of a run, the share of its frames that ask for more, and the bound of its ATE (m).
+    """The reach of a run, the share of its frames that ask for more, and the greedy ATE (m).
 
     Nothing of a search without a bound; the reach alone where a pose (m) of the path, the given
     first one included, is not known.
