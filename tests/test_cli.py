@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from finished import GIVEN
 from recordings import write_recording
 from scipy.spatial.transform import Rotation
 from tiny import tiny_words
 
 import nbtrack
 from nbtrack.cli import main
+from nbtrack.core import files
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import naming_damaged, runs_folder
 from nbtrack.experiments.presets import load_preset
@@ -154,13 +154,6 @@ def test_times_are_the_recordings_own(tmp_path: Path) -> None:
     assert open_recording(tmp_path / "c").times == pytest.approx([0, 0.2, 0.4])
 
 
-def test_version(capsys: pytest.CaptureFixture) -> None:
-    """Catches a package that cannot say which one it is."""
-    with pytest.raises(SystemExit, match="0"):
-        main(["--version"])
-    assert capsys.readouterr().out == f"nbtrack {nbtrack.__version__}\n"
-
-
 def test_what_completion_offers() -> None:
     """Catches `nbtrack.<Tab>` that offers imports of the module and none of the public names."""
     assert dir(nbtrack) == sorted(nbtrack.__all__)
@@ -207,18 +200,12 @@ def test_a_recording_without_poses_is_tracked_in_a_map(
         assert cv2.imread(str(work / name / "overview.png")).shape[1] > 800
     assert main(["export", "found", "--to", "gif", "found.gif"]) == 0
     assert "12 of 12 frames" in capsys.readouterr().out
-    (work / "corrected").rename(work / "moved")
+    shutil.rmtree(work / "corrected")
     shutil.copytree(work / "map", work / "corrected")
     assert main(["export", "found", "--to", "gif", "again.gif"]) == 2
     assert "is not the map of this run any more" in capsys.readouterr().err
-    shutil.rmtree(work / "corrected")
-    assert main(["export", "found", "--to", "gif", "again.gif"]) == 2
-    assert "corrected" in capsys.readouterr().err
-    (work / "moved").rename(work / "corrected")
     assert main(["track", str(recording), "--out", "own"]) == 2
     assert "or track in a map of the same place with --map-from" in capsys.readouterr().err
-    assert main([*GIVEN, "map", "--start", "unknown"]) == 2
-    assert "cannot find a camera whose first pose is not known" in capsys.readouterr().err
 
 
 def test_a_pipe_that_nobody_reads() -> None:
@@ -245,6 +232,7 @@ def test_names_that_are_no_text(
     assert main(["export", run, "--to", "gif", f"{run}.gif"]) == 0
     assert main(["data", "check", folder, "--out", run]) == 0
     assert (tmp_path / run / "check.png").is_file()
+    assert folder in files.read_json(tmp_path / run / "metrics.json")["command"]
 
 
 def test_the_home_folder_is_meant_by_its_sign(tmp_path: Path, monkeypatch) -> None:

@@ -199,23 +199,18 @@ def test_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixture) -> N
     """Catches positions in map coordinates that single precision rounds to half a metre, and one
     pose that is far from all others."""
     utm, found = np.array([4.5e5, 5.4e6, 100.0]), {}
-    words = [*SET, "--set", "network.neus.width=32", "--set", "mapping.neus.iterations=200"]
     for name, offset in (("near", 0 * utm), ("far", utm)):
         folder = write_recording("plain", tmp_path / name / "rec")
         rows = np.loadtxt(folder / "trajectory.txt")
         rows[:, 1:4] += offset
         np.savetxt(folder / "trajectory.txt", rows, fmt="%.17g")
-        for tracker, field in (("lm", "neus"), ("icp", "points")):
-            made, out = tmp_path / name / field, tmp_path / name / tracker
-            assert main(["map", str(folder), "--field", field, *words, "--out", str(made)]) == 0
-            given = ["track", str(folder), "--map-from", str(made), "--out", str(out)]
-            assert main(given) == 0
-            found[name, tracker] = read_tum(out / "trajectory.txt")[1]
-    off = {t: found["far", t][:, :3, 3] - found["near", t][:, :3, 3] - utm for t in ("lm", "icp")}
-    assert np.abs(off["icp"]).max() < 1e-4
-    assert np.abs(off["lm"]).max() < 0.06  # a network that is trained elsewhere is another one
+        made, run = str(tmp_path / name / "map"), str(tmp_path / name / "run")
+        assert main(["map", str(folder), "--field", "points", *SET, "--out", made]) == 0
+        assert main(["track", str(folder), "--map-from", made, "--out", run]) == 0
+        found[name] = read_tum(tmp_path / name / "run/trajectory.txt")[1][:, :3, 3]
+    assert np.abs(found["far"] - found["near"] - utm).max() < 1e-4
     # What leaves the package is in the recording's world; recordings of one place share an origin.
-    assert np.abs(trimesh.load(made / "mesh.ply").bounds - utm).max() < 20
+    assert np.abs(trimesh.load(tmp_path / "far/map/mesh.ply").bounds - utm).max() < 20
     origin = open_recording(folder).origin.tolist()
     rows[:, 1:4] += [30.0, -40.0, 2.0]  # another end of the building
     np.savetxt(folder / "trajectory.txt", rows, fmt="%.17g")
@@ -223,9 +218,7 @@ def test_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixture) -> N
     rows[2, 1] = 1e6 + 5e5
     np.savetxt(folder / "trajectory.txt", rows, fmt="%.17g")
     assert main(["map", str(folder), "--field", "points", *SET]) == 2
-    said = capsys.readouterr().err
-    assert "frame 2 is no rigid transform" in said
-    assert "near the other frames'" in said
+    assert "frame 2 is no rigid transform" in capsys.readouterr().err
 
 
 def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:

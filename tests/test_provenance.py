@@ -12,7 +12,7 @@ import pytest
 from nbtrack import provenance
 from nbtrack.core import files
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import NeuSField
+from nbtrack.fields import NetworkSettings, NeuSField
 from nbtrack.synthetic import make_room
 from nbtrack.tracking import SdfTracker
 
@@ -115,7 +115,11 @@ def test_cells_count(more: str, counts: bool, monkeypatch: pytest.MonkeyPatch) -
     assert (provenance.code_fingerprint(mine) != before) == counts
 
 
-def test_numbers_count_by_their_value() -> None:
-    """Catches results that are made twice because a step count was written 30 and 30.0."""
-    assert files.fingerprint(30, {"a": [1]}) == files.fingerprint(30.0, {"a": [1.0]})
-    assert files.fingerprint(30) != files.fingerprint(31)
+def test_what_a_fingerprint_tells_apart() -> None:
+    """Catches a cache that mixes up settings, or makes results twice because a step count was
+    written 30 and 30.0, or settings in another order."""
+    assert files.fingerprint(30, {"a": [1], "b": 2}) == files.fingerprint(
+        30.0, {"b": 2.0, "a": [1.0]}
+    )
+    wide, narrow = NetworkSettings(), NetworkSettings(width=255)
+    assert len({files.fingerprint(*parts) for parts in ((wide, 0), (wide, 1), (narrow, 0))}) == 3

@@ -10,13 +10,11 @@ from tiny import TINY
 
 from nbtrack.beyond.correction import correct_map
 from nbtrack.core.errors import ConfigError, NbtrackError
-from nbtrack.core.files import fingerprint
 from nbtrack.core.settings import changed_settings, flat, with_settings
 from nbtrack.experiments.bench import measure_steps
 from nbtrack.experiments.methods import METHODS, TABLE_1
 from nbtrack.experiments.presets import PRESETS, Preset, claim, load_preset
 from nbtrack.experiments.scenes import open_scene, open_scenes
-from nbtrack.fields import NetworkSettings
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.recordings.reading import parse_frames
@@ -188,15 +186,6 @@ def test_changed_settings_are_those_that_were_changed(name: str) -> None:
     assert len(changed) == len(settings)
     assert with_settings(PRESETS[name], *changed) == preset
     assert load_preset(name) == PRESETS[name]
-
-
-def test_fingerprint() -> None:
-    """Catches a cache that mixes up settings, or forgets them between two runs."""
-    found = {fingerprint(NetworkSettings(), 0) for _ in range(2)}
-    found |= {fingerprint(NetworkSettings(), 1), fingerprint(NetworkSettings(width=255), 0)}
-    assert len(found) == 3
-    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
-    assert {len(text) for text in found} == {12}
 
 
 EVERY_KEY = flat(PRESETS["smoke"].settings)
