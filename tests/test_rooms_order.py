@@ -8,7 +8,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "nbtrack"
 ORDER = [
     *("core", "data", "fields", "mapping", "tracking", "latex", "tables"),  # what the paper needs
-    *("locks", "recordings", "checks", "beyond", "provenance", "synthetic", "plots"),
+    *("recordings", "checks", "beyond", "provenance", "synthetic", "plots"),
     *("experiments", "cli", "__main__"),
 ]  # fmt: skip
 MODULES = {

@@ -1,4 +1,4 @@
-"""The folder of results, and atomic writes.
+"""The folder of results, atomic writes, and locks.
 
 Two processes may use the same folder, and either may be killed. A reader must never see half a
 file, so every result is written to a temporary file, which is then moved into place.
@@ -6,17 +6,20 @@ file, so every result is written to a temporary file, which is then moved into p
 
 import contextlib
 import dataclasses
+import errno
 import hashlib
 import io
 import json
 import os
 import tempfile
+import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock
 
 import nbtrack
 from nbtrack.core.errors import DataError, NbtrackError
@@ -29,6 +32,7 @@ _NOT_BY_CONTENT = (
     NbtrackError, MemoryError, torch.OutOfMemoryError, torch.AcceleratorError, NameError,
     AttributeError, AssertionError,
 )  # fmt: skip
+_NO_LOCKS = errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP  # what their lack is called
 
 
 def project_folder() -> Path:
@@ -150,3 +154,25 @@ def naming_damaged(
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:120]
         raise DataError(f"{path} is not a readable {kind} ({reason}): {advice}") from error
+
+
+@contextlib.contextmanager
+def locked(path: Path, timeout: float = -1) -> Iterator[bool]:
+    """Keep other processes out of a block by a lock file, and tell whether that was possible.
+
+    The system frees the lock when this process ends, however it ends. Some file systems know none:
+    there two processes may do the same work, and either's files stay whole. Raises filelock's
+    Timeout where others keep it for `timeout` s; less than 0 waits as long as they do.
+    """
+    lock = FileLock(path, timeout=timeout)
+    try:
+        # It warns before it takes another kind, which would wait for files that locks have left.
+        with warnings.catch_warnings(action="error"):
+            lock.acquire()
+    except (OSError, UserWarning) as error:
+        if getattr(error, "errno", errno.ENOSYS) not in _NO_LOCKS:
+            raise
+    try:
+        yield lock.is_locked
+    finally:
+        lock.release()

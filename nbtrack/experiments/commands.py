@@ -215,7 +215,9 @@ def _surface(field: Any, seen: RgbdSequence, n_cells: int) -> Any:
 def export_command(options: Namespace) -> None:
     """Write a run's trajectory, or a map (of folders or files), in another format; print what."""
     export = look_up("format", options.to, _EXPORTS)
-    output.check_new(options.out)
+    output.check_no_recording(options.out)
+    if options.out.exists():
+        raise ConfigError(f"{options.out} exists: choose another file to write, or remove it first")
     content, summary = export(options.source, options.to)
     write_atomic(options.out, content)
     print(f"{options.out}: {summary}")

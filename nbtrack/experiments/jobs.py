@@ -25,11 +25,10 @@ import torch
 
 from nbtrack.core.device import advise_on_memory, choose_device, threads, usable_cores
 from nbtrack.core.errors import MissingError, NbtrackError
-from nbtrack.core.files import data_folder, runs_folder
+from nbtrack.core.files import data_folder, locked, runs_folder
 from nbtrack.core.progress import ProgressBar
 from nbtrack.experiments.output import check_no_recording
 from nbtrack.fields import FIELDS
-from nbtrack.locks import locked
 from nbtrack.tracking import TRACKERS
 
 _START = "spawn"  # how worker processes begin: forked ones would lack the threads of libraries
@@ -46,7 +45,7 @@ class Job:
     name: str  # for readers
     key: str  # changes with everything that the result depends on
     doing: str = "computing"  # what its progress is called
-    work: float = 1.0  # queries of a field, about, for the time that is left
+    work: float = 1.0  # its share of the time that is left, in runs
     needs: "Job | None"
     is_done: bool
     result: Callable[[], Any]  # what a finished job has kept

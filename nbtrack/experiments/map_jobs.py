@@ -1,6 +1,5 @@
 """Maps as jobs: made from a scene, or given."""
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -28,7 +27,6 @@ OF_MAPS = ("network.", "mapping.", "correction.")
 PLAIN_PRESET = "synthetic"
 """The preset whose settings are the classes' own."""
 _FRAMES_LOOKED_AT = 20  # that tell a map's unit before there is a map
-_AROUND_MAPS = 1e6  # queries of a network in the time of a map's scores, or of its correction
 
 
 def setting_tree(field: str, network: Any, settings: Any, correction: float) -> dict[str, Any]:
@@ -55,7 +53,7 @@ class MapJob(Job):
     # Cells (m) in which the job that needs this map will correct it.
     is_corrected_in: float = field(default=0.0, compare=False)
 
-    kind, doing = "maps", "mapping"
+    kind, doing, work = "maps", "mapping", 4.0  # with `smoke`
 
     @classmethod
     def of(cls, scene: Scene, field: str, preset: Preset, frames=":", seed=0) -> "MapJob":
@@ -90,13 +88,6 @@ class MapJob(Job):
     def is_done(self) -> bool:
         """Whether the map is finished and scored."""
         return (self.folder / MAP_FILE).is_file()
-
-    @property
-    def work(self) -> float:
-        """Iterations x (rays x samples, and surface points); a correction and scores have none."""
-        own = Counter() if self.correction else Counter(vars(self.settings))
-        a_batch = own["n_rays"] * (own["n_stratified"] + own["n_surface"]) + own["n_surface_points"]
-        return _AROUND_MAPS + own["iterations"] * a_batch
 
     def result(self) -> dict[str, Any]:
         """How the finished map was made, and its scores."""

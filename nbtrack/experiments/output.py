@@ -58,13 +58,6 @@ def deliver(cached: Path, names: Sequence[str], folder: Path | None) -> Path:
     return folder
 
 
-def check_new(path: Path) -> None:
-    """Raises ConfigError if a path that is to be written exists, or lies in a recording."""
-    check_no_recording(path)
-    if path.exists():
-        raise ConfigError(f"{path} exists: choose another file to write, or remove it first")
-
-
 def check_no_recording(path: Path) -> None:
     """Raises ConfigError if a path that is to be written is a recording, or lies within one."""
     for folder in (path, *resolved(path).parents):

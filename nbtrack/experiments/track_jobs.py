@@ -2,7 +2,6 @@
 
 import contextlib
 import shlex
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -42,9 +41,6 @@ _OTHER_WORLD = (
 # A user is warned of larger ones. Hands start and stop, and a search catches up (our choice).
 _GREEDY_ATE = 0.01  # m, of a greedy follower
 _SHARE = 0.5  # of the frames, in which it moves farther than a search reaches
-# For the work of runs, measured with `smoke` on one core.
-_QUERIES_A_SECOND = 60_000  # of a network
-_NO_NETWORK = 0.05  # of a query's time: where a grid or points are asked
 
 
 @dataclass(frozen=True)
@@ -91,17 +87,6 @@ class TrackJob(Job):
         elsewhere = "-unmapped" if self.is_elsewhere else ""
         name = f"{self.scene.name}-{self.needs.field}-{self.tracker}{elsewhere}-{budget}"
         return f"{name}-seed{self.seed}" if self.seed else name
-
-    @property
-    def work(self) -> float:
-        """Frames x steps x pixels x samples of a ray; by the clock, its seconds."""
-        own = Counter(vars(self.settings))
-        n_frames = len(self.scene.recording.times[parse_frames(self.frames)])
-        if self.rate_hz:
-            return n_frames / self.rate_hz * _QUERIES_A_SECOND
-        a_step = own["n_pixels"] * max(1, own["n_stratified"] + own["n_importance"])
-        price = _NO_NETWORK if tracker_class(self.tracker).converges else 1.0
-        return n_frames * self.steps * a_step * price
 
     @property
     def is_elsewhere(self) -> bool:
