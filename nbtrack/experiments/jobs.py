@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -195,18 +196,19 @@ def _outcome_there(
 def _pool(workers: int) -> Iterator[Executor]:
     """Processes of this machine, which end with the block, or with this process if it is killed."""
     context = multiprocessing.get_context(_START)
-    with ProcessPoolExecutor(workers, context, _end_with_parent) as executor:
+    theirs, ours = context.Pipe(duplex=False)
+    with ProcessPoolExecutor(workers, context, _end_with, (theirs,)) as executor, ours:
         with _spared():
             for _ in range(workers):
                 executor.submit(int)  # a process is begun for each, since none is idle yet
         yield executor
 
 
-def _end_with_parent() -> None:
-    """End this worker, whatever it does, as soon as the process that began it has ended."""
+def _end_with(pipe: Connection) -> None:
+    """End this worker, whatever it does, as soon as the other end of a pipe is closed."""
 
     def watch() -> None:
-        multiprocessing.parent_process().join()
+        pipe.poll(None)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
