@@ -114,10 +114,8 @@ def track_command(options: Namespace) -> None:
     output.prepare(options.out)
     if not given:
         _map(job)
-    if options.rate:  # what the clock says is measured again
-        (run.folder / METRICS_FILE).unlink(missing_ok=True)
-    if run.is_done:
-        print(f"run found in {run.folder}")
+    # Made anew: recording and map may lie elsewhere now, and clocks differ.
+    (run.folder / METRICS_FILE).unlink(missing_ok=True)
     (metrics,) = run_jobs([run])
     _draw_overview(run)
     folder = output.deliver(run.folder, output.FILES_OF_RUN, options.out)
