@@ -117,7 +117,11 @@ FILES = {
     "map checkpoint cut": (_killed(*KILLED_MAP, {}), MAP, "KeyError: 'recipe'"),
     "run checkpoint is a list": (_killed(*KILLED_RUN, [1]), OWN, "run.pt is " + CUT),
     "run checkpoint of words": (_killed(*KILLED_RUN, RUN_OF_WORDS), OWN, "run.pt is " + CUT),
-    "trajectory gone": (lambda: Path(TRAJECTORY).unlink(), KITTI, "no file run/traj"),
+    "trajectory gone": (
+        lambda: Path(TRAJECTORY).unlink(),
+        KITTI,
+        "run/trajectory.txt: give a traj",
+    ),
     "trajectory empty": (_write(TRAJECTORY, " "), KITTI, "trajectory.txt is empty"),
     "a word": (_write(TRAJECTORY, ROW.replace("3", "x")), KITTI, "readable table"),
     "a NaN": (_write(TRAJECTORY, ROW.replace("3", "nan")), KITTI, "not a finite pose"),
