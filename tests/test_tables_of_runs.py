@@ -40,7 +40,6 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("runs")
         patch.setenv("NBTRACK_RUNS", str(folder))
-        patch.setattr("nbtrack.experiments.jobs.usable_cores", lambda: 1)
         yield folder
 
 
