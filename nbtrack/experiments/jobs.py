@@ -46,7 +46,7 @@ class Job:
     name: str  # for readers
     key: str  # changes with everything that the result depends on
     doing: str = "computing"  # what its progress is called
-    work: float = 1.0  # its share of the time that is left, in runs
+    work: float = 1.0  # how long it takes, in runs: it weighs so much in the time that is left
     needs: "Job | None"
     is_done: bool
     result: Callable[[], Any]  # what a finished job has kept

@@ -53,7 +53,8 @@ class MapJob(Job):
     # Cells (m) in which the job that needs this map will correct it.
     is_corrected_in: float = field(default=0.0, compare=False)
 
-    kind, doing, work = "maps", "mapping", 4.0  # with `smoke`
+    kind, doing = "maps", "mapping"
+    work = 4.0  # by the queries of a field with `smoke`
 
     @classmethod
     def of(cls, scene: Scene, field: str, preset: Preset, frames=":", seed=0) -> "MapJob":
