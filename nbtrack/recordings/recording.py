@@ -1,7 +1,6 @@
 """A recording: its files found and paired, its texts read, before any pixel is decoded."""
 
 import hashlib
-import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +16,6 @@ from nbtrack.recordings.calibration import Calibration
 from nbtrack.recordings.formats import FORMATS, Declaration, Format, declaration, files_of
 from nbtrack.recordings.pairing import TIMES_FILE, Moments, check_paired, pair_lists, stamp_in
 
-_PNG = b"\x89PNG\r\n\x1a\n"  # how its files begin
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 
 
@@ -64,27 +62,11 @@ class Recording:
         """What changes when a recording does: of every image its name and a digest, one of times,
         poses and camera, and the declaration."""
         files = self.color_files + self.depth_files
-        images = [(file.parent.name, file.name, image_digest(file)) for file in files]
+        digests = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+        images = [(f.parent.name, f.name, d) for f, d in zip(files, digests, strict=True)]
         digest = hashlib.sha256(repr(replace(self.calibration, source=Path())).encode())
         digest.update(self.times.tobytes() + self.file_poses.tobytes())
         return images, digest.hexdigest(), self.declared
-
-
-def image_digest(file: Path) -> str:
-    """A digest of an image file that is cheap for long recordings.
-
-    Each chunk of a PNG has its length, its name and a checksum, which are read alone; what does not
-    begin as a PNG, whatever it is called, is read whole.
-    """
-    with file.open("rb") as opened:
-        signature = opened.read(len(_PNG))
-        digest = hashlib.blake2b(signature, digest_size=8)
-        if signature != _PNG:
-            digest.update(opened.read())
-        while head := opened.read(8):
-            opened.seek(int.from_bytes(head[:4], "big"), os.SEEK_CUR)
-            digest.update(head + opened.read(4))
-        return digest.hexdigest()
 
 
 def open_recording(
