@@ -404,18 +404,15 @@ def test_images_as_cameras_write_them(plain: Path) -> None:
         path.unlink()
     after = read_sequence(plain)
     assert np.abs(after.colors.astype(int) - before.colors).mean() < 3
-    whole = jpeg.read_bytes()
-    jpeg.write_bytes(whole[: len(whole) // 2 - 2048])
+    depth = before.depths_mm[0].copy()
+    depth[:9] = 65535
+    write_image(plain / "depth/000000.png", depth)
+    after = read_sequence(plain)
+    assert (after.depths_mm[0, :9] == 0).all()
+    assert (after.depths_mm[0, 9:] == before.depths_mm[0, 9:]).all()
+    jpeg.write_bytes(jpeg.read_bytes()[: jpeg.stat().st_size // 2 - 2048])
     with pytest.raises(DataError, match="readable PNG or JPEG"):
         read_sequence(plain)
-    jpeg.write_bytes(whole)
-    for path in (plain / "depth").iterdir():
-        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        depth[:9] = 65535
-        cv2.imwrite(str(path), depth)
-    after = read_sequence(plain)
-    assert (after.depths_mm[:, :9] == 0).all()
-    assert (after.depths_mm[:, 9:] == before.depths_mm[:, 9:]).all()
 
 
 @pytest.mark.parametrize("lost", ["0 0 0 0 0 0 0", "1.5 1 2 0 0 0 0", "nan 1 2 0 0 0 1"])
