@@ -1,6 +1,6 @@
 """One short recording of a synthetic room, written as every format has it, by its documentation.
 
-Nothing of the readers is used here: a convention that both got wrong would go unnoticed.
+Writing uses nothing of the readers: a convention that both got wrong would go unnoticed.
 """
 
 import json
@@ -12,9 +12,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.camera import Intrinsics
+from nbtrack.recordings.reading import read_sequence
 from nbtrack.synthetic import (
     add_kinect_noise,
     build_room,
@@ -69,6 +71,18 @@ def thinned(data: Source, step: int) -> Source:
     middle = [(place - first - 0.5) / step + 0.5 for place in (c.cx, c.cy)]
     camera = Intrinsics(*depths_mm.shape[:0:-1], c.fx / step, c.fy / step, *middle)
     return Source(colors, depths_mm, data.poses, camera)
+
+
+def real(name: str, frames: slice, step: int) -> Source:
+    """Every `step`-th pixel of a real recording; where there is none, the test is skipped."""
+    folder = Path(__file__).resolve().parents[2] / "shared/data" / name
+    if not folder.is_dir():
+        pytest.skip("no real recording here")
+    sequence = read_sequence(folder, frames)
+    # The layout of the office is that of a format with other axes.
+    axes = [1.0, -1, -1, 1] if name == "real_office" else [1.0, 1, 1, 1]
+    images, poses = (sequence.colors, sequence.depths_mm), sequence.T_world_camera @ np.diag(axes)
+    return thinned(Source(*images, poses, sequence.intrinsics), step)
 
 
 def depth(change: Callable[[np.ndarray], np.ndarray]) -> Change:

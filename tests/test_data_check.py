@@ -19,8 +19,8 @@ from recordings import (
     depth,
     matrix_text,
     positions,
+    real,
     source,
-    thinned,
     with_noise,
     write_matrices,
     write_neural_rgbd,
@@ -42,9 +42,6 @@ from nbtrack.recordings.formats import WORLD_TO_CAMERA
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.recording import open_recording
 
-REAL_ROOM = Path(__file__).resolve().parents[2] / "shared/data/real_room"
-NEEDS_REAL = pytest.mark.skipif(not REAL_ROOM.is_dir(), reason="no real recording here")
-SEEN = ["living_room", "long_hall", pytest.param("real_room", marks=NEEDS_REAL)]
 N_FRAMES = 16
 MOVED_MM = 30 * np.linalg.norm([0.55, -0.4, 0.73])
 TURNED_DEG = 2 * np.linalg.norm([0.35, 0.8, 0.49])
@@ -209,9 +206,7 @@ def test_far_outliers(tmp_path: Path) -> None:
 def seen(name: str) -> Source:
     """A room with a Kinect's noise, or the real recording at a quarter of its size."""
     if name == "real_room":
-        sequence = read_sequence(REAL_ROOM, slice(0, 36, 2))
-        images = sequence.colors, sequence.depths_mm
-        return thinned(Source(*images, sequence.T_world_camera, sequence.intrinsics), 4)
+        return real(name, slice(0, 36, 2), 4)
     return with_noise(source(name, 18, 5))
 
 
@@ -284,7 +279,7 @@ def write(folder: Path, name: str, case: Case) -> Path:
     return write_matrices(folder, case.change(seen(name)), case.settings)
 
 
-@pytest.mark.parametrize("name", SEEN)
+@pytest.mark.parametrize("name", ["living_room", "long_hall", "real_room"])
 def test_every_mistake_is_named_and_nothing_else(tmp_path: Path, name: str) -> None:
     """Catches a mistake that passes, that is taken for another one, or whose advice does not help,
     and warnings about what is right, however it is declared; by the whole check and by a quick look

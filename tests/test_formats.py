@@ -193,11 +193,17 @@ def with_mark_and_crlf(text: str) -> str:
     return "\ufeff# timestamp ...\r\n" + text.replace("\n", "\r\n")
 
 
+def with_heads(T: np.ndarray) -> str:
+    """As Open3D writes them: three numbers before each matrix."""
+    return "".join(f"{i} {i} {i + 1}\n{matrix_text(pose)}" for i, pose in enumerate(T))
+
+
 PLAIN_TEXTS: dict[str, Callable[[np.ndarray], str]] = {
     "4x4 in a line": lambda T: matrix_text(T.reshape(-1, 16)),
     "3x4 in a line": lambda T: matrix_text(T[:, :3].reshape(-1, 12)).replace(" ", ", "),
     "rows of 4x4": lambda T: matrix_text(T.reshape(-1, 4)),
     "BOM and CRLF": lambda T: with_mark_and_crlf(tum_lines(np.zeros(N_FRAMES), T)),
+    "trajectory.log": with_heads,
     "a file a frame": lambda T: "",
 }
 
@@ -208,22 +214,12 @@ def test_poses_of_a_plain_folder(tmp_path: Path, case: str) -> None:
     write_images(tmp_path, source())
     (tmp_path / "intrinsics.txt").write_text(matrix_text(camera_matrix(CAMERA)))
     if text := PLAIN_TEXTS[case](source().poses):
-        (tmp_path / "poses.txt").write_bytes(text.encode())
+        name = case if case.endswith(".log") else "poses.txt"
+        (tmp_path / name).write_bytes(text.encode())
     else:
         (tmp_path / "poses").mkdir()
         for i, pose in enumerate(source().poses):
             (tmp_path / f"poses/{i:04}.txt").write_text(matrix_text(pose))
-    check_equal(read_sequence(tmp_path), source())
-
-
-def test_open3d(tmp_path: Path) -> None:
-    """Catches heads of matrices taken for their rows, and files that are not known by name."""
-    write_images(tmp_path, source(), "image/{:06}.png")
-    blocks = (f"{i} {i} {i + 1}\n{matrix_text(T)}" for i, T in enumerate(source().poses))
-    (tmp_path / "trajectory.log").write_text("".join(blocks))
-    matrix = camera_matrix(CAMERA).T.ravel().tolist()
-    words = {"width": 48, "height": 36, "intrinsic_matrix": matrix}
-    (tmp_path / "camera_primesense.json").write_text(json.dumps(words))
     check_equal(read_sequence(tmp_path), source())
 
 
@@ -269,12 +265,12 @@ def test_everything_declared_otherwise(tmp_path: Path) -> None:
     """Catches a key of `sequence.toml` that is ignored, or applied the wrong way round."""
     data = source()
     raw = np.where(data.depths_mm == 0, np.uint16(60000), along_rays(data, 4).depths_mm)
-    write_images(tmp_path, data._replace(depths_mm=raw))
+    write_images(tmp_path, data._replace(depths_mm=raw), "image/{:06}.png")
     opengl = np.linalg.inv(data.poses @ np.diag([1.0, -1, -1, 1]))
     (tmp_path / "poses.txt").write_text(tum_lines(np.arange(N_FRAMES) / 10, opengl, "wxyz"))
     matrix = camera_matrix(CAMERA).T.ravel().tolist()  # by columns, as Open3D writes it
     open3d = {"width": 48, "height": 36, "intrinsic_matrix": matrix}
-    (tmp_path / "camera_intrinsic.json").write_text(json.dumps(open3d))
+    (tmp_path / "camera_primesense.json").write_text(json.dumps(open3d))
     (tmp_path / "sequence.toml").write_text(
         'depth_scale = 4000\nno_depth = 60000\ndepth_along = "ray"\ncamera_axes = "opengl"\n'
         'poses = "world-to-camera"\nquaternion = "wxyz"\nframe_rate = 10\n'

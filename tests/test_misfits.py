@@ -14,18 +14,16 @@ from recordings import (
     color,
     depth,
     positions,
+    real,
     source,
-    thinned,
     with_noise,
     write_matrices,
 )
 
 from nbtrack.checks.check import check_recording
-from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.recording import open_recording
 
-DATA = Path(__file__).resolve().parents[2] / "shared/data"
-REAL = {"real_room": "opengl", "real_office": "opencv"}  # and the axes of their cameras
+REAL = ["real_room", "real_office"]
 ROOMS = ["living_room", "office", "gallery", "grey_studio"]
 N_FRAMES = 120
 
@@ -42,16 +40,7 @@ def room(name: str) -> Source:
 @cache
 def recorded(name: str) -> Source:
     """A room, or a real recording at half its size, without which the test is skipped."""
-    if name not in REAL:
-        return room(name)
-    if not (DATA / name).is_dir():
-        pytest.skip("no real recording here")
-    sequence = read_sequence(DATA / name, slice(N_FRAMES))
-    poses = sequence.T_world_camera
-    if name == "real_office":  # whose layout is that of a format with other axes
-        poses = poses @ np.diag([1.0, -1, -1, 1])
-    images = sequence.colors, sequence.depths_mm
-    return thinned(Source(*images, poses, sequence.intrinsics), 2)
+    return real(name, slice(N_FRAMES), 2) if name in REAL else room(name)
 
 
 def late(images: np.ndarray, n_frames: int) -> np.ndarray:
