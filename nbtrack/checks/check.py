@@ -194,9 +194,11 @@ def check_recording(
         misfits, correlation = find_misfits(compared, best.reading)
     cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))
     is_far = cloud.depth > far_limit(cloud.depth)
-    of_points = cloud[~is_far], cloud[is_far]
-    agreement = conventions, best, misfits, correlation
-    return DataReport(recording, frames, poses, *of_points, *agreement, is_whole)
+    return DataReport(
+        recording, frames, poses, cloud=cloud[~is_far], outliers=cloud[is_far],
+        conventions=conventions, best=best, misfits=misfits, correlation=correlation,
+        is_whole=is_whole,
+    )  # fmt: skip
 
 
 def quick_warning(recording: Recording) -> str:

@@ -70,14 +70,18 @@ def read_frames(
 
     Raises DataError if an image cannot be read, or no frame is left.
     """
-    is_slice = isinstance(frames, slice)
-    frame_ids = select_frames(recording, frames, needs_poses) if is_slice else frames
-    images = decode(recording, frame_ids, progress)
-    poses, times = recording.T_world_camera[frame_ids], recording.times[frame_ids]
+    frame_ids = frames
+    if isinstance(frames, slice):
+        frame_ids = select_frames(recording, frames, needs_poses)
+    camera, colors, depths_mm = decode(recording, frame_ids, progress)
     origin = recording.origin if origin is None else origin
+    poses = recording.T_world_camera[frame_ids]
     poses[:, :3, 3] -= origin
-    unit = recording.declared.metres_per_unit or None
-    return RgbdSequence(recording.name, *images, poses, frame_ids, times, origin, unit)
+    return RgbdSequence(
+        recording.name, camera, colors, depths_mm, T_world_camera=poses, frame_ids=frame_ids,
+        times=recording.times[frame_ids], origin=origin,
+        declared_unit=recording.declared.metres_per_unit or None,
+    )  # fmt: skip
 
 
 def select_frames(recording: Recording, frames: slice, needs_poses: bool = True) -> Frames:

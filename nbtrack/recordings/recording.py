@@ -96,19 +96,18 @@ def open_recording(
     if camera.depth_scale:
         declared = declaration(folder, declared.format, depth_scale=camera.depth_scale)
     moments = Moments(colors, own_times, declared.frame_rate, layout.counts_from_0)
-    images = colors, depths, moments.times
-    no_poses = np.full((len(colors), 4, 4), np.nan)
-    name = folder.name
-    recording = Recording(folder, name, layout, declared, *images, camera, notes, no_poses)
-    names = (pose_file,) if pose_file else layout.poses
-    there = [pattern for pattern in names if files_of(folder, pattern)]
-    if len(there) > 1:
-        both = " and ".join(there)
-        raise DataError(f"{folder} has {both}: keep one, or choose by `data convert --poses FILE`")
-    if not there and not pose_file:
+    pattern = pose_file or _pose_pattern(folder, layout)
+    poses, times = np.full((len(colors), 4, 4), np.nan), moments.times
+    if pattern:
+        files = layout.files(folder, (pattern,), "poses")
+        poses, times = _poses_and_times(files, folder / pattern, layout, declared, moments, notes)
+    else:
         notes.append("no poses")
-        return recording
-    return _with_poses(recording, moments, layout.files(folder, names, "poses"), folder / there[0])
+    return Recording(
+        folder, folder.name, layout, declared, color_files=colors, depth_files=depths, times=times,
+        calibration=camera, notes=notes, file_poses=poses,
+        pose_file=folder / pattern if pattern else None,
+    )  # fmt: skip
 
 
 def _own_times(folder: Path, colors: list[Path]) -> Times | None:
@@ -139,21 +138,34 @@ def _calibration(folder: Path, layout: Format, notes: list[str]) -> Calibration:
     return camera
 
 
-def _with_poses(recording: Recording, moments: Moments, files: list[Path], path: Path) -> Recording:
-    """The recording with a pose a frame; `path` names the files, with `*` where each has one."""
-    declared = recording.declared
-    tables = [recording.format.read_poses(file, declared.quaternion) for file in files]
+def _pose_pattern(folder: Path, layout: Format) -> str | None:
+    """Which of a format's files of poses is there, with `*` where every frame has one."""
+    there = [pattern for pattern in layout.poses if files_of(folder, pattern)]
+    if len(there) > 1:
+        both = " and ".join(there)
+        raise DataError(f"{folder} has {both}: keep one, or choose by `data convert --poses FILE`")
+    return there[0] if there else None
+
+
+def _poses_and_times(
+    files: list[Path], path: Path, layout: Format, declared: Declaration, moments: Moments,
+    notes: list[str],
+) -> tuple[Poses, Times]:  # fmt: skip
+    """A pose a frame, and times; `path` names the files, with `*` where each frame has one."""
+    tables = [layout.read_poses(file, declared.quaternion) for file in files]
     poses = checked_poses(np.concatenate([T for T, _ in tables]), path)
-    has_stamps = all(times is not None for _, times in tables)
-    stamps = np.concatenate([times for _, times in tables]) if has_stamps else None
-    times = recording.times
+    stamps = None
+    if all(times is not None for _, times in tables):
+        stamps = np.concatenate([times for _, times in tables])
+    times = moments.times
     # Frames without times of their own have those of the poses, if there is one for each.
-    if moments.own is None and has_stamps and len(stamps) == len(times):
+    if moments.own is None and stamps is not None and len(stamps) == len(times):
         times = stamps if (np.diff(stamps) > 0).all() else times
     if "*" in path.name:
-        check_paired(recording.color_files, files)
-    else:
-        stamps = stamps if recording.format.stamps_tell else None
-        poses, note = moments.poses_of(path, poses, stamps, declared.turned_round)
-        recording.notes.extend([f"{path.name}: {note}"] * bool(note))
-    return replace(recording, times=times, file_poses=poses, pose_file=path)
+        check_paired(moments.images, files)
+        return poses, times
+    told = stamps if layout.stamps_tell else None
+    poses, note = moments.poses_of(path, poses, told, declared.turned_round)
+    if note:
+        notes.append(f"{path.name}: {note}")
+    return poses, times
