@@ -197,7 +197,8 @@ def _is_larger(color: np.ndarray, depth: np.ndarray, recording: Recording) -> bo
             "for: write a JSON file with fx, fy, cx, cy and their width and height"
         )
     note = f"colour is made as small as depth: {sizes}"
-    recording.notes.extend([note] * (note not in recording.notes))
+    if note not in recording.notes:
+        recording.notes.append(note)
     return True
 
 

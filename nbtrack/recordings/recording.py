@@ -61,9 +61,10 @@ class Recording:
     def contents(self) -> tuple[list[tuple[str, str, str]], str, Declaration]:
         """What changes when a recording does: of every image its name and a digest, one of times,
         poses and camera, and the declaration."""
-        files = self.color_files + self.depth_files
-        digests = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
-        images = [(f.parent.name, f.name, d) for f, d in zip(files, digests, strict=True)]
+        images = [
+            (file.parent.name, file.name, hashlib.sha256(file.read_bytes()).hexdigest())
+            for file in self.color_files + self.depth_files
+        ]
         digest = hashlib.sha256(repr(replace(self.calibration, source=Path())).encode())
         digest.update(self.times.tobytes() + self.file_poses.tobytes())
         return images, digest.hexdigest(), self.declared
