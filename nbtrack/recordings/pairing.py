@@ -165,9 +165,10 @@ class Moments:
         list's, and the other way round. Raises DataError where nothing tells it.
         """
         is_known = np.isfinite(poses).all(axis=(1, 2))
+        stamps = stamps if is_known.any() else None
         found = None
         is_other_clock = False
-        if stamps is not None and is_known.any():
+        if stamps is not None:
             found = self._by_time(poses[is_known], stamps[is_known], flip)
             # Of two clocks equal counts alone prove nothing, unless stamps only count the lines.
             is_other_clock = self.own is not None and not _are_even(stamps[is_known])
