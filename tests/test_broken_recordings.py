@@ -130,7 +130,7 @@ BROKEN: dict[str, dict[str, tuple[Damage, str | None]]] = {
         "another camera": (camera(cx=100.0), r"cx, cy then at \(100, \d+\): images"),
         "no poses": (without("trajectory.txt"), "0 of these .*trajectory.txt or poses.txt"),
         "two pose files": (text("poses.txt", "1 2 3"), "keep one, or choose by `data convert"),
-        "decimal commas": (text("trajectory.txt", "0,5 0 0 0 0 0 0 1\n"), "9 columns.*points"),
+        "decimal commas": (text("trajectory.txt", "0,5 0 0 0 0 0 0 1\n"), "points, not commas"),
     },
     "neural_rgbd": {
         "two rows": (text("intrinsics.txt", "5 0 1\n0 5 1\n"), "intrinsics.txt holds 6 numbers"),

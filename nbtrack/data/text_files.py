@@ -1,6 +1,7 @@
 """Text files, read strictly: objects, tables of numbers, poses."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from nbtrack.core.files import naming_damaged
 
 Times = Float[np.ndarray, "_"]  # s
 _TOLERANT = {"encoding": "utf-8-sig", "errors": "replace"}  # of a byte-order mark, and of any bytes
+_DECIMAL_COMMA = re.compile(r"(?<!\S)[-+]?\d+,\d+(e[-+]?\d+)?(?!\S)")
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
 _FARTHEST = 1e7  # m from the origin: beyond map coordinates, within what floats can square
 _ALONE = 1000.0  # m from the middle, and so many times as far as nine in ten: no camera went there
@@ -46,7 +48,9 @@ def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np
     lines = read_lines(path)
     if path.suffix == ".log":  # Open3D's, with a head of three numbers before each matrix
         lines = [line for line in lines if len(line.split()) != 3]
-    with naming_damaged(path, "table", f"every line holds {meaning}, with decimal points"):
+    with naming_damaged(path, "table", f"every line holds {meaning}"):
+        if any(map(_DECIMAL_COMMA.search, lines)):
+            raise ValueError("write decimal points, not commas")
         numbers = np.loadtxt([line.replace(",", " ") for line in lines], ndmin=2)
         if numbers.shape[1] not in columns:
             raise ValueError(f"there are {numbers.shape[1]} columns")
