@@ -1,20 +1,22 @@
 """One short recording of a synthetic room, written as every format has it, by its documentation.
 
-Nothing of the readers is used here: a convention that both got wrong would go unnoticed.
+Writing uses nothing of the readers: a convention that both got wrong would go unnoticed.
 """
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, astuple, replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.camera import Intrinsics
+from nbtrack.recordings.reading import read_sequence
 from nbtrack.synthetic import (
     add_kinect_noise,
     build_room,
@@ -69,6 +71,25 @@ def thinned(data: Source, step: int) -> Source:
     middle = [(place - first - 0.5) / step + 0.5 for place in (c.cx, c.cy)]
     camera = Intrinsics(*depths_mm.shape[:0:-1], c.fx / step, c.fy / step, *middle)
     return Source(colors, depths_mm, data.poses, camera)
+
+
+def larger(data: Source, factor: int) -> Source:
+    """Colours so many times as large as depth, and their camera, whose lengths are pixels."""
+    colors = data.colors.repeat(factor, axis=1).repeat(factor, axis=2)
+    camera = Intrinsics(*(factor * length for length in astuple(data.camera)))
+    return data._replace(colors=colors, camera=camera)
+
+
+def real(name: str, frames: slice, step: int) -> Source:
+    """Every `step`-th pixel of a real recording; where there is none, the test is skipped."""
+    folder = Path(__file__).resolve().parents[2] / "shared/data" / name
+    if not folder.is_dir():
+        pytest.skip("no real recording here")
+    sequence = read_sequence(folder, frames)
+    # The layout of the office is that of a format with other axes.
+    axes = [1.0, -1, -1, 1] if name == "real_office" else [1.0, 1, 1, 1]
+    images, poses = (sequence.colors, sequence.depths_mm), sequence.T_world_camera @ np.diag(axes)
+    return thinned(Source(*images, poses, sequence.intrinsics), step)
 
 
 def depth(change: Callable[[np.ndarray], np.ndarray]) -> Change:
@@ -210,8 +231,7 @@ def write_seven_scenes(folder: Path, data: Source) -> None:
 
 def write_scannet(folder: Path, data: Source) -> None:
     """Colour twice as large as depth, as the real export's is larger."""
-    large = data.colors.repeat(2, axis=1).repeat(2, axis=2)
-    write_images(folder, data._replace(colors=large), "color/{}.jpg", "depth/{}.png")
+    write_images(folder, larger(data, 2), "color/{}.jpg", "depth/{}.png")
     (folder / "pose").mkdir()
     for i, pose in enumerate(data.poses):
         (folder / f"pose/{i}.txt").write_text(matrix_text(pose))
@@ -229,35 +249,30 @@ def write_plain(folder: Path, data: Source) -> None:
 
 def write_record3d(folder: Path, data: Source) -> None:
     """An unpacked .r3d file: colour four times as large as depth, which is not packed."""
-    K = camera_matrix(data.camera)
-    K[:2] *= 4
-    K[:2, 2] += 2  # from the image's corner, as Apple counts
-    for i, (color, depth_mm) in enumerate(zip(data.colors, data.depths_mm, strict=True)):
-        write_image(folder / f"rgbd/{i}.jpg", color.repeat(4, axis=0).repeat(4, axis=1))
+    large = larger(data, 4)
+    for i, depth_mm in enumerate(data.depths_mm):
+        write_image(folder / f"rgbd/{i}.jpg", large.colors[i])
         (folder / f"rgbd/{i}.depth").write_bytes((depth_mm / 1000).astype("<f4").tobytes())
     T = data.poses @ np.diag([1.0, -1, -1, 1])
     rows = np.hstack([Rotation.from_matrix(T[:, :3, :3]).as_quat(), T[:, :3, 3]])
-    size = {"w": 4 * data.camera.width, "h": 4 * data.camera.height, "fps": 60}
-    content = {"K": K.T.ravel().tolist(), "poses": rows.tolist(), **size}
+    c = large.camera  # in the file from the image's corner, as Apple counts, column by column
+    K = [c.fx, 0, 0, 0, c.fy, 0, c.cx, c.cy, 1]
+    content = {"K": K, "poses": rows.tolist(), "w": c.width, "h": c.height, "fps": 60}
     (folder / "metadata").write_text(json.dumps(content))
 
 
 def write_polycam(folder: Path, data: Source) -> None:
     """Named in microseconds; the app's first estimates of the poses must not be taken."""
-    size = data.camera.width * 4, data.camera.height * 4
-    K = camera_matrix(data.camera)
-    K[:2] *= 4
-    camera = {"width": size[0], "height": size[1], "fx": K[0, 0], "fy": K[1, 1]}
-    camera |= {"cx": K[0, 2] + 2, "cy": K[1, 2] + 2, "blur_score": 99.0}
+    large = larger(data, 4)
     for i, T in enumerate(data.poses @ np.diag([1.0, -1, -1, 1])):
         name = 638443502 + 33333 * i
-        large = data.colors[i].repeat(4, axis=0).repeat(4, axis=1)
-        write_image(folder / f"keyframes/corrected_images/{name}.jpg", large)
+        write_image(folder / f"keyframes/corrected_images/{name}.jpg", large.colors[i])
         write_image(folder / f"keyframes/depth/{name}.png", data.depths_mm[i])
         for kind, pose in (("cameras", np.eye(4)), ("corrected_cameras", T)):
             t = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
             (folder / "keyframes" / kind).mkdir(exist_ok=True)
-            (folder / f"keyframes/{kind}/{name}.json").write_text(json.dumps(camera | t))
+            content = json.dumps(asdict(large.camera) | t | {"blur_score": 99.0})
+            (folder / f"keyframes/{kind}/{name}.json").write_text(content)
 
 
 WRITERS: dict[str, Callable[[Path, Source], None]] = {

@@ -2,7 +2,6 @@
 
 import json
 import sys
-import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +19,8 @@ from recordings import (
     Source,
     along_rays,
     camera_matrix,
+    camera_words,
+    larger,
     matrix_text,
     source,
     tum_lines,
@@ -31,13 +32,14 @@ from recordings import (
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError, DataError, MissingError
-from nbtrack.data.sequence import RgbdSequence, observed_bounds
+from nbtrack.data.sequence import RgbdSequence
 from nbtrack.recordings.formats import FORMATS
 from nbtrack.recordings.reading import parse_frames, read_frames, read_sequence, select_frames
-from nbtrack.recordings.recording import image_digest, open_recording
+from nbtrack.recordings.recording import open_recording
 from nbtrack.recordings.writer import convert_sequence
 
 LOSSY = ("replica", "scannet", "record3d", "polycam")  # colour is JPEG
+STEPS = {"tum": 0.1, "record3d": 1 / 60, "polycam": 0.033333}  # s between frames, else 1/30
 
 
 def check_equal(sequence: RgbdSequence, data: Source, lossy: bool = False) -> None:
@@ -71,8 +73,9 @@ def plain(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("format", WRITERS)
 def test_round_trip(tmp_path: Path, format: str) -> None:
     """Catches wrong axes, a wrong depth factor, half a pixel, swapped colours, a wrong guess; depth
-    or poses that change on their way into the Neural RGB-D layout; and maps that are not made anew
-    when poses, calibration or declaration change."""
+    or poses that change on their way into the Neural RGB-D layout; times by the images' numbers
+    where a phone gives others; and maps that are not made anew when images, times, poses,
+    calibration or declaration change."""
     folder, out = write_recording(format, tmp_path / "recording"), tmp_path / "out"
     assert open_recording(folder).declared.format == format
     check_equal(read_sequence(folder), source(), format in LOSSY)
@@ -85,9 +88,11 @@ def test_round_trip(tmp_path: Path, format: str) -> None:
     assert (out / "focal.txt").is_file()
     assert not (out / "intrinsics.txt").exists()
     recording = open_recording(folder)
+    assert np.diff(recording.times) == pytest.approx(STEPS.get(format, 1 / 30), abs=1e-6)
+    other = recording.color_files[1:] + recording.color_files[:1]
     changes = (
         {"times": recording.times + 1}, {"file_poses": 2 * recording.file_poses},
-        {"calibration": replace(recording.calibration, fx=9.0)},
+        {"calibration": replace(recording.calibration, fx=9.0)}, {"color_files": other},
         {"declared": replace(recording.declared, depth_scale=9.0)},
     )  # fmt: skip
     seen = {str(replace(recording, **change).contents()) for change in changes}
@@ -95,32 +100,21 @@ def test_round_trip(tmp_path: Path, format: str) -> None:
     assert len(seen) == len(changes) + 1
 
 
-@pytest.mark.parametrize(("format", "step"), [("record3d", 1 / 60), ("polycam", 0.033333)])
-def test_times_of_a_phone(tmp_path: Path, format: str, step: float) -> None:
-    """Catches times by the images' numbers where the app gives others."""
-    recording = open_recording(write_recording(format, tmp_path / "r"))
-    assert np.diff(recording.times) == pytest.approx(step)
-
-
-def test_a_cut_recording_of_a_phone(tmp_path: Path) -> None:
-    """Catches images that get the poses of others, where stamps have another rate than numbers."""
+def test_depth_and_poses_of_a_phone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches compressed depth that is read as numbers, or refused without a way out; and images
+    of a cut recording that get the poses of others, where stamps have another rate than numbers."""
     folder = write_recording("record3d", tmp_path / "r")
     for path in folder.glob("rgbd/[345].*"):
         path.unlink()
     np.testing.assert_allclose(open_recording(folder).T_world_camera, source().poses[:3], atol=1e-9)
-
-
-def test_compressed_depth_of_a_phone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches compressed depth that is read as numbers, or refused without a way out."""
-    folder = write_recording("record3d", tmp_path / "r")
     for path in (folder / "rgbd").glob("*.depth"):
         path.write_bytes(b"bvx2" + path.read_bytes())
     monkeypatch.setitem(sys.modules, "liblzfse", None)
-    with pytest.raises(MissingError, match=r"LZFSE.*pip install pyliblzfse.* 16-bit PNG"):
+    with pytest.raises(MissingError, match="pip install pyliblzfse"):
         read_sequence(folder)
     reader = SimpleNamespace(decompress=lambda content: content[4:])
     monkeypatch.setitem(sys.modules, "liblzfse", reader)
-    assert np.array_equal(read_sequence(folder).depths_mm, source().depths_mm)
+    assert np.array_equal(read_sequence(folder).depths_mm, source().depths_mm[:3])
 
 
 def test_natural_order_with_unpadded_and_padded_numbers(tmp_path: Path) -> None:
@@ -137,7 +131,6 @@ def test_natural_order_with_unpadded_and_padded_numbers(tmp_path: Path) -> None:
 def test_a_sequence(scene: Path) -> None:
     """Catches units mixed up, frames selected in file order, and copies of what could be shared."""
     sequence = read_sequence(scene)
-    assert repr(sequence) == "RgbdSequence('scene', 6 frames of 48x36)"
     np.testing.assert_allclose(sequence.depth(1), sequence.depths_mm[1] / 1000.0, rtol=1e-6)
     np.testing.assert_allclose(sequence.color(1) * 255, sequence.colors[1], atol=1e-4)
     chosen = sequence.select(np.array([2, 0]))
@@ -160,13 +153,10 @@ def test_frames_without_a_pose_are_left_out_and_counted(scene: Path, tmp_path: P
         assert np.isfinite(sequence.T_world_camera).all()
         assert np.array_equal(sequence.colors, source().colors[[0, 2, 3, 5]])
     assert read_sequence(scene, slice(0, 3)).frame_ids.tolist() == [0, 2]
-    recording = open_recording(scene)
-    ids = select_frames(recording, slice(None))
-    assert read_frames(recording, ids[::2]).frame_ids.tolist() == [0, 3]  # of those with a pose
-    assert len(select_frames(recording, slice(None), needs_poses=False)) == 6
+    assert len(select_frames(open_recording(scene), slice(None), needs_poses=False)) == 6
 
 
-@pytest.mark.parametrize("text", [":", "2:", ":3", "1:5:2", "-2:", "::3", "3:100"])
+@pytest.mark.parametrize("text", [":", "2:", "1:5:2", "-2:", "3:100"])
 def test_frame_slices_are_pythons(scene: Path, text: str) -> None:
     """Catches a slice that is applied after NaN frames are gone, or an end that is included."""
     sequence = read_sequence(scene, parse_frames(text))
@@ -174,14 +164,11 @@ def test_frame_slices_are_pythons(scene: Path, text: str) -> None:
     assert np.array_equal(sequence.depths_mm, source().depths_mm[sequence.frame_ids])
 
 
-@pytest.mark.parametrize("text", ["", "5", "a:b", "1:2:3:4", "1.5:2", "0:10:0", "0:10:-1", "1-5"])
-def test_text_that_is_no_slice(scene: Path, text: str) -> None:
-    """Catches a misread range: a single number, a dash, a step that stands still or goes back; and
-    one that selects nothing, which would fail somewhere in the mathematics later."""
+@pytest.mark.parametrize("text", ["", "5", "a:b", "1:2:3:4", "1.5:2", "0:10:0", "0:10:-1"])
+def test_text_that_is_no_slice(text: str) -> None:
+    """Catches a misread range: a single number, a step that stands still or goes back."""
     with pytest.raises(DataError, match=f"^frames '{text}' .*: "):
         parse_frames(text)
-    with pytest.raises(DataError, match=r"0 of the 6 frames .*: choose others"):
-        read_sequence(scene, slice(7, 9))
 
 
 def test_depth_folder_and_pose_file_are_chosen(scene: Path) -> None:
@@ -205,11 +192,17 @@ def with_mark_and_crlf(text: str) -> str:
     return "\ufeff# timestamp ...\r\n" + text.replace("\n", "\r\n")
 
 
+def with_heads(T: np.ndarray) -> str:
+    """As Open3D writes them: three numbers before each matrix."""
+    return "".join(f"{i} {i} {i + 1}\n{matrix_text(pose)}" for i, pose in enumerate(T))
+
+
 PLAIN_TEXTS: dict[str, Callable[[np.ndarray], str]] = {
     "4x4 in a line": lambda T: matrix_text(T.reshape(-1, 16)),
     "3x4 in a line": lambda T: matrix_text(T[:, :3].reshape(-1, 12)).replace(" ", ", "),
     "rows of 4x4": lambda T: matrix_text(T.reshape(-1, 4)),
     "BOM and CRLF": lambda T: with_mark_and_crlf(tum_lines(np.zeros(N_FRAMES), T)),
+    "trajectory.log": with_heads,
     "a file a frame": lambda T: "",
 }
 
@@ -220,22 +213,12 @@ def test_poses_of_a_plain_folder(tmp_path: Path, case: str) -> None:
     write_images(tmp_path, source())
     (tmp_path / "intrinsics.txt").write_text(matrix_text(camera_matrix(CAMERA)))
     if text := PLAIN_TEXTS[case](source().poses):
-        (tmp_path / "poses.txt").write_bytes(text.encode())
+        name = case if case.endswith(".log") else "poses.txt"
+        (tmp_path / name).write_bytes(text.encode())
     else:
         (tmp_path / "poses").mkdir()
         for i, pose in enumerate(source().poses):
             (tmp_path / f"poses/{i:04}.txt").write_text(matrix_text(pose))
-    check_equal(read_sequence(tmp_path), source())
-
-
-def test_open3d(tmp_path: Path) -> None:
-    """Catches heads of matrices taken for their rows, and files that are not known by name."""
-    write_images(tmp_path, source(), "image/{:06}.png")
-    blocks = (f"{i} {i} {i + 1}\n{matrix_text(T)}" for i, T in enumerate(source().poses))
-    (tmp_path / "trajectory.log").write_text("".join(blocks))
-    matrix = camera_matrix(CAMERA).T.ravel().tolist()
-    words = {"width": 48, "height": 36, "intrinsic_matrix": matrix}
-    (tmp_path / "camera_primesense.json").write_text(json.dumps(words))
     check_equal(read_sequence(tmp_path), source())
 
 
@@ -257,7 +240,7 @@ def test_times_of_tum(tmp_path: Path) -> None:
     """Catches streams paired by position: odd images, and poses of other moments, are left out."""
     folder = write_recording("tum", tmp_path / "r")
     recording = open_recording(folder)
-    np.testing.assert_allclose(recording.times, START + np.arange(N_FRAMES) / 10, atol=1e-5)
+    assert recording.times[0] == pytest.approx(START, abs=1e-5)
     lines = (folder / "groundtruth.txt").read_text().splitlines()
     (folder / "groundtruth.txt").write_text("\n".join(lines[:2] + lines[4:]) + "\n")
     assert "1 of the 7 images in rgb.txt are left out: no depth map of depth.txt" in convert(folder)
@@ -265,29 +248,28 @@ def test_times_of_tum(tmp_path: Path) -> None:
     check_equal(read_sequence(folder), Source(*(a[1:] for a in source()[:3])))
 
 
-@pytest.mark.parametrize(("camera", "fx", "cy"), [("1", 517.3, 255.3), ("3", 535.4, 247.6)])
-def test_calibration_by_the_folders_name(tmp_path: Path, camera: str, fx: float, cy: float) -> None:
+def test_calibration_by_the_folders_name(tmp_path: Path) -> None:
     """Catches another camera's numbers, the half pixel, a lens taken out of depth, where the
     benchmark has a pinhole camera, and an assumption in silence."""
-    folder = write_recording("tum", tmp_path / f"rgbd_dataset_freiburg{camera}_desk")
+    folder = write_recording("tum", tmp_path / "rgbd_dataset_freiburg3_desk")
     (folder / "calibration.txt").unlink()
     sequence = read_sequence(folder)
-    assert sequence.intrinsics.fx == pytest.approx(fx * 48 / 640)
-    assert sequence.intrinsics.cy == pytest.approx((cy + 0.5) * 48 / 640)
+    assert sequence.intrinsics.fx == pytest.approx(535.4 * 48 / 640)
+    assert sequence.intrinsics.cy == pytest.approx((247.6 + 0.5) * 48 / 640)
     assert np.array_equal(sequence.depths_mm, source().depths_mm)
-    assert f"assumed for TUM RGB-D, {fx} px at 640x480" in convert(folder)
+    assert "assumed for TUM RGB-D, 535.4 px at 640x480" in convert(folder)
 
 
 def test_everything_declared_otherwise(tmp_path: Path) -> None:
     """Catches a key of `sequence.toml` that is ignored, or applied the wrong way round."""
     data = source()
     raw = np.where(data.depths_mm == 0, np.uint16(60000), along_rays(data, 4).depths_mm)
-    write_images(tmp_path, data._replace(depths_mm=raw))
+    write_images(tmp_path, data._replace(depths_mm=raw), "image/{:06}.png")
     opengl = np.linalg.inv(data.poses @ np.diag([1.0, -1, -1, 1]))
     (tmp_path / "poses.txt").write_text(tum_lines(np.arange(N_FRAMES) / 10, opengl, "wxyz"))
     matrix = camera_matrix(CAMERA).T.ravel().tolist()  # by columns, as Open3D writes it
     open3d = {"width": 48, "height": 36, "intrinsic_matrix": matrix}
-    (tmp_path / "camera_intrinsic.json").write_text(json.dumps(open3d))
+    (tmp_path / "camera_primesense.json").write_text(json.dumps(open3d))
     (tmp_path / "sequence.toml").write_text(
         'depth_scale = 4000\nno_depth = 60000\ndepth_along = "ray"\ncamera_axes = "opengl"\n'
         'poses = "world-to-camera"\nquaternion = "wxyz"\nframe_rate = 10\n'
@@ -321,8 +303,7 @@ def test_a_lens_is_corrected(tmp_path: Path) -> None:
 def test_images_of_other_sizes_and_kinds(plain: Path) -> None:
     """Catches full-size intrinsics used for reduced images (of cropped ones: BROKEN), gray images
     refused or copied into one channel, and whole JPEG files refused."""
-    large = {"width": 96, "height": 72, "fx": 2 * CAMERA.fx, "fy": 2 * CAMERA.fy}
-    change_camera(plain, **large, cx=47.5, cy=35.5)
+    change_camera(plain, **camera_words(larger(source(), 2).camera, "width", "height"))
     check_equal(read_sequence(plain), source())
     cv2.imwrite(str(plain / "color/000000.png"), np.full((36, 48), 77, np.uint8))
     (plain / "color/000001.png").unlink()
@@ -356,16 +337,11 @@ def test_a_new_format_is_one_entry(plain: Path, monkeypatch: pytest.MonkeyPatch)
     assert open_recording(plain).declared.format == "own"
 
 
-LENS = [-0.28, 0.08, 0.0, 0.0]
-RATIONAL = [0.5, -2.7, 0.001, -0.002, 1.6, 0.4, -2.5, 1.5]
-NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
-
-
-@pytest.mark.parametrize("lens", [LENS, RATIONAL], ids=["four numbers", "eight numbers"])
-def test_a_lens_by_any_name(plain: Path, lens: list[float]) -> None:
+def test_a_lens_by_any_name(plain: Path) -> None:
     """Catches a lens that a camera file gives under another name and that is ignored in silence."""
     seen = [read_sequence(plain).depths_mm]
-    named = dict(zip(NAMES, lens, strict=False))
+    lens = [0.5, -2.7, 0.001, -0.002, 1.6, 0.4, -2.5, 1.5]
+    named = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), lens, strict=True))
     for words in (
         {"distortion": lens},
         {"distortion": None, "coeffs": lens},
@@ -393,12 +369,9 @@ def test_colour_larger_than_depth(plain: Path) -> None:
     """Catches the refusal of what LiDAR phones record, a calibration that is taken for the other
     size, and one of no size that is taken for any."""
     before = read_sequence(plain)
-    for file in (plain / "color").iterdir():
-        image = cv2.imread(str(file))
-        cv2.imwrite(str(file), cv2.resize(image, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST))
-    K = camera_matrix(CAMERA)
-    large = {"width": 192, "height": 144, "fx": 4 * K[0, 0], "fy": 4 * K[1, 1]}
-    change_camera(plain, **large, cx=4 * K[0, 2] + 1.5, cy=4 * K[1, 2] + 1.5)
+    large = larger(source(), 4)
+    write_images(plain, large)
+    change_camera(plain, **camera_words(large.camera, "width", "height"))
     recording = open_recording(plain)
     sequence = read_frames(recording)
     assert sequence.intrinsics == before.intrinsics
@@ -422,20 +395,15 @@ def test_images_as_cameras_write_them(plain: Path) -> None:
         path.unlink()
     after = read_sequence(plain)
     assert np.abs(after.colors.astype(int) - before.colors).mean() < 3
-    whole = jpeg.read_bytes()
-    jpeg.write_bytes(whole[: len(whole) // 2 - 2048])
+    depth = before.depths_mm[0].copy()
+    depth[:9] = 65535
+    write_image(plain / "depth/000000.png", depth)
+    after = read_sequence(plain)
+    assert (after.depths_mm[0, :9] == 0).all()
+    assert (after.depths_mm[0, 9:] == before.depths_mm[0, 9:]).all()
+    jpeg.write_bytes(jpeg.read_bytes()[: jpeg.stat().st_size // 2 - 2048])
     with pytest.raises(DataError, match="readable PNG or JPEG"):
         read_sequence(plain)
-    jpeg.write_bytes(whole)
-    for path in (plain / "depth").iterdir():
-        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        depth[:9] = 65535
-        cv2.imwrite(str(path), depth)
-    after = read_sequence(plain)
-    assert (after.depths_mm[:, :9] == 0).all()
-    assert (after.depths_mm[:, 9:] == before.depths_mm[:, 9:]).all()
-    size = np.subtract(observed_bounds(after).maximum, observed_bounds(after).minimum)
-    assert size.max() < 8
 
 
 @pytest.mark.parametrize("lost", ["0 0 0 0 0 0 0", "1.5 1 2 0 0 0 0", "nan 1 2 0 0 0 1"])
@@ -446,22 +414,3 @@ def test_a_lost_frame_among_poses(plain: Path, lost: str) -> None:
     lines[2] = f"{lines[2].split()[0]} {lost}"
     path.write_text("\n".join(lines))
     assert np.flatnonzero(~open_recording(plain).has_pose).tolist() == [2]
-
-
-def test_images_content_behind_their_pixels_differ(tmp_path: Path) -> None:
-    """Catches a changed image that the cache takes for the old one, where a PNG ends with text, or
-    is none."""
-    digests = set()
-    for depth_mm in (1000, 2000):
-        file = tmp_path / f"{depth_mm}.png"
-        image = Image.fromarray(np.full((4, 4), depth_mm, np.uint16))
-        image.save(file)
-        content = file.read_bytes()
-        chunk = b"tEXt" + b"note\0" + b"x" * 200
-        length, checksum = (n.to_bytes(4, "big") for n in (len(chunk) - 4, zlib.crc32(chunk)))
-        end = content.rindex(b"IEND") - 4
-        file.write_bytes(content[:end] + length + chunk + checksum + content[end:])
-        digests.add(image_digest(file))
-        cv2.imwrite(str(tmp_path / "image.jpg"), np.full((64, 64), depth_mm // 20, np.uint8))
-        digests.add(image_digest((tmp_path / "image.jpg").rename(tmp_path / "image.png")))
-    assert len(digests) == 4

@@ -37,12 +37,9 @@ def test_units_and_types_are_what_they_say() -> None:
 
 
 WRONG_IMAGES: dict[str, tuple[Callable, str]] = {
-    "depth as integers": (lambda c, d: (c, d.astype(np.int32)), "depth is int32 of shape"),
     "millimetres as float": (lambda c, d: (c, d.astype(float)), "or floating point in metres"),
     "colour as integers": (lambda c, d: (c.astype(np.int64), d), "color is int64 of shape"),
-    "colour as float": (lambda c, d: (c / 255, d), "color is float64 of shape"),
     "grey": (lambda c, d: (c[..., 0], d), "color is uint8 of shape (24, 32"),
-    "alpha": (lambda c, d: (np.dstack([c, c[..., 0]]), d), "color is uint8 of shape (24, 32"),
     "other size": (lambda c, d: (c, d[::2, ::2]), "depth is uint16 of shape (12, 16)"),
 }
 

@@ -14,19 +14,17 @@ from recordings import (
     color,
     depth,
     positions,
+    real,
     source,
-    thinned,
     with_noise,
     write_matrices,
 )
 
 from nbtrack.checks.check import check_recording
-from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.recording import open_recording
 
-DATA = Path(__file__).resolve().parents[2] / "shared/data"
-REAL = {"real_room": "opengl", "real_office": "opencv"}  # and the axes of their cameras
-ROOMS = ["living_room", "office", "gallery", "trellis_room", "stairwell", "grey_studio"]
+REAL = ["real_room", "real_office"]
+ROOMS = ["living_room", "office", "gallery", "grey_studio"]
 N_FRAMES = 120
 
 
@@ -42,16 +40,7 @@ def room(name: str) -> Source:
 @cache
 def recorded(name: str) -> Source:
     """A room, or a real recording at half its size, without which the test is skipped."""
-    if name not in REAL:
-        return room(name)
-    if not (DATA / name).is_dir():
-        pytest.skip("no real recording here")
-    sequence = read_sequence(DATA / name, slice(N_FRAMES))
-    poses = sequence.T_world_camera
-    if name == "real_office":  # whose layout is that of a format with other axes
-        poses = poses @ np.diag([1.0, -1, -1, 1])
-    images = sequence.colors, sequence.depths_mm
-    return thinned(Source(*images, poses, sequence.intrinsics), 2)
+    return real(name, slice(N_FRAMES), 2) if name in REAL else room(name)
 
 
 def late(images: np.ndarray, n_frames: int) -> np.ndarray:
@@ -65,6 +54,10 @@ def line(n: int) -> np.ndarray:
 
 def noise(t: np.ndarray) -> np.ndarray:
     return np.random.default_rng(0).normal(scale=0.01, size=t.shape)
+
+
+def five_times(images: np.ndarray) -> np.ndarray:
+    return images[np.arange(len(images)) // 5 * 5]
 
 
 def saturated(depths: np.ndarray) -> np.ndarray:
@@ -81,13 +74,11 @@ def of_elsewhere(colors: np.ndarray) -> np.ndarray:
 # What is said begins so; of numbers in braces the first must be as near as the second says.
 CASES: dict[str, tuple[Change, str, float, float]] = {
     "depth one frame late": (depth(lambda d: late(d, 1)), "depth comes after", 1, 0.2),
-    "depth three frames late": (depth(lambda d: late(d, 3)), "depth comes after", 3, 0.2),
     "poses one frame late": (
         lambda data: data._replace(poses=late(data.poses, 1)), "depth comes after", -1, 0.2
     ),
     "focal length 5 % short": (camera(0.95), "focal lengths should change", 5.26, 0.7),
     "depth 5 % long": (depth(lambda d: 1.05 * d), "depths should change", -4.76, 1),
-    "depth 2 % short": (depth(lambda d: 0.98 * d), "depths should change", 2.04, 0.8),
     "depth growing by 4 %": (
         depth(lambda d: d * (1 + 0.04 * line(len(d))[..., None])), "depths grow", 4, 1.2
     ),
@@ -101,10 +92,7 @@ CASES: dict[str, tuple[Change, str, float, float]] = {
         positions(lambda t: t + 0.3 * line(len(t)) * [0, 1, 0]), "poses drift along y", 0.3, 0.05
     ),
     "every image five times": (
-        lambda data: data._replace(
-            colors=data.colors[np.arange(len(data.colors)) // 5 * 5],
-            depths_mm=data.depths_mm[np.arange(len(data.colors)) // 5 * 5],
-        ),
+        lambda d: d._replace(colors=five_times(d.colors), depths_mm=five_times(d.depths_mm)),
         "", 80, 1,
     ),
     "depth in steps of 64 mm": (depth(lambda d: d // 64 * 64), "depths come in steps of", 6.4, 0),
@@ -117,9 +105,7 @@ CASES: dict[str, tuple[Change, str, float, float]] = {
         color(lambda c: np.roll(c, round(c.shape[2] / 25), 2)), "colours lie too far right", 4, 1
     ),
     "colours three frames late": (color(lambda c: late(c, 3)), "colours come after depth", 3, 0.2),
-    "colours of elsewhere": (
-        color(of_elsewhere), "colours do not belong to the depth images", 0, 0
-    ),
+    "colours of elsewhere": (color(of_elsewhere), "colours do not belong to the depth", 0, 0),
 }  # fmt: skip
 SILENT = {
     "right": lambda data: data,

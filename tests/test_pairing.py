@@ -55,47 +55,33 @@ def test_names_are_told_by_what_varies(
         np.testing.assert_allclose(sequence.times, (np.array(numbers) - numbers[0]) / 30)
 
 
-def lost_ones(folder: Path) -> None:
-    """One image has no depth map, and another depth map no image."""
-    for kind in ("color", "depth"):
-        rename(folder / kind, [f"{i:04}_cam0" for i in RUN])
-    (folder / "color/0001_cam0.png").unlink()
-    (folder / "depth/0004_cam0.png").unlink()
+SESSIONS = ["A_0", "A_1", "A_2", "B_0", "B_1", "B_2"]
+DOUBLE = ["0", "1", "2", "3", "000003", "4"]
+# Names of the images and of the depth maps, and what is said of them.
+UNPAIRED = {
+    "one of each lost": (
+        [f"{i:04}_cam0" for i in RUN if i != 1], [f"{i:04}_cam0" for i in RUN if i != 4],
+        "the 2 that .*: 0004_cam0.png, 0001_cam0.png",
+    ),
+    "each camera counts for itself": (
+        [f"{i}_1305031102.{i}33" for i in RUN], [f"{i}_1305031102.{i + 1}33" for i in RUN],
+        "the 12 that .*: 0_1305031102.033.png, ",
+    ),
+    "two of a number": (DOUBLE, DOUBLE, "000003.png, 3.png, 000003.png, 3.png"),
+    "two sessions": (SESSIONS, SESSIONS, "a folder one session; .*: A_0.png, B_0.png, "),
+    "no numbers": (["a", "b", "c"], ["a", "b", "c"], ": a.png, b.png"),
+}  # fmt: skip
 
 
-def shifted(folder: Path) -> None:
-    """Each camera counts for itself, and one of them began a frame later."""
-    for late, kind in enumerate(("color", "depth")):
-        rename(folder / kind, [f"{i}_1305031102.{i + late}33" for i in RUN])
-
-
-def named(*names: str) -> object:
-    """Colour and depth have these names."""
-
-    def change(folder: Path) -> None:
-        for kind in ("color", "depth"):
-            rename(folder / kind, names)
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (lost_ones, r"2 without .*0004_cam0.png, 0001_cam0.png\)"),
-        (shifted, r"12 without .* 0_1305031102.033.png, "),
-        (named("0", "1", "2", "3", "000003", "4"), r"000003.png, 3.png, 000003.png, 3.png\)"),
-        (named("A_0", "A_1", "A_2", "B_0", "B_1", "B_2"), "A_0.png, B_0.png,.* a folder one sess"),
-        (named("a", "b", "c"), "a.png, b.png"),
-    ],
-)
-def test_images_that_cannot_be_paired_are_named(plain: Path, change, expected: str) -> None:
+@pytest.mark.parametrize("case", UNPAIRED)
+def test_images_that_cannot_be_paired_are_named(plain: Path, case: str) -> None:
     """Catches images with their neighbours' depth where one of each is lost, two files of a number
     that shift all poses behind them, and two sessions that are shuffled into one."""
-    change(plain)
-    with pytest.raises(DataError, match=expected) as caught:
+    colors, depths, says = UNPAIRED[case]
+    rename(plain / "color", colors)
+    rename(plain / "depth", depths)
+    with pytest.raises(DataError, match=says):
         open_recording(plain)
-    assert "\n" not in str(caught.value)
 
 
 # Images' numbers, whole multiples of the frame's time with which poses are stamped (None: without
@@ -104,12 +90,10 @@ LISTS = {
     "from 0, cut": (RUN[:4], None, "plain", RUN[:4]),
     "from 1": (range(1, 7), None, "plain", RUN),
     "from 1, stamped": (range(1, 7), RUN, "plain", RUN),
-    "from 1, cut": (range(1, 5), None, "plain", None),
     "from 1, cut, stamped": (range(1, 5), RUN, "plain", None),
     "from 1, cut, of a dataset": (range(1, 5), None, "neural_rgbd", None),
     "chosen, of a dataset": ((2, 3, 5), None, "neural_rgbd", (2, 3, 5)),
     "chosen": ((2, 3, 5), None, "plain", None),
-    "chosen, all stamped": ((12, 13, 15), range(10, 16), "plain", None),
     "chosen, stamped": ((12, 13, 15), (10, 12, 13, 15, 17, 20), "plain", (1, 2, 3)),
     "from 1, one lost, stamped": ((1, 2, 4, 5, 6), RUN, "plain", (0, 1, 3, 4, 5)),
     "one pose lost, stamped": (RUN, (0, 1, 2, 4, 5), "plain", (0, 1, 2, -1, 3, 4)),
@@ -121,7 +105,6 @@ LISTS = {
     "another clock, cut": (RUN[:4], range(90, 96), "plain", None),
     "another rate, the first lost": (RUN, (1.2, 2.4, 3.6, 4.8, 6.0), "plain", None),
     "the first lost, stamped": (RUN, (1, 2, 3, 4, 5), "plain", (-1, 0, 1, 2, 3, 4)),
-    "another rate, cut": (RUN[:4], (0, 1.3, 2.6, 3.9, 5.2, 6.5), "plain", None),
 }
 
 
@@ -133,10 +116,9 @@ def listed(folder: Path, case: str) -> Recording:
         rename(folder / kind, [f"{i:06}" for i in numbers])
     if stamps is not None:
         times = np.array(stamps) / 30
-        name, axes = (
-            ("poses.txt", [1, -1, -1, 1]) if format == "neural_rgbd" else ("trajectory.txt", 1)
-        )
-        poses = source().poses[: len(times)] * axes
+        is_plain = format == "plain"
+        poses = source().poses[: len(times)] * (1 if is_plain else [1, -1, -1, 1])
+        name = "trajectory.txt" if is_plain else "poses.txt"
         (folder / name).write_text(tum_lines(times, poses))
     elif format == "plain":
         (folder / "trajectory.txt").write_text(matrix_text(source().poses.reshape(-1, 16)))
@@ -149,9 +131,8 @@ def test_poses_of_a_list_without_names(tmp_path: Path, case: str) -> None:
     one that lost some; as many poses as images prove nothing where stamps say otherwise."""
     numbers, _, _, expected = LISTS[case]
     if expected is None:
-        with pytest.raises(DataError, match="poses but there are") as caught:
+        with pytest.raises(DataError, match=r"poses but there are .*, or timestamps\.txt"):
             listed(tmp_path / "r", case)
-        assert "\n" not in str(caught.value)
         return
     recording = listed(tmp_path / "r", case)
     has_pose = np.array(expected) >= 0
@@ -166,45 +147,40 @@ def test_poses_of_a_list_without_names(tmp_path: Path, case: str) -> None:
 def test_times_of_images_settle_it(tmp_path: Path) -> None:
     """Catches advice that does not help: where poses are refused, a file of times is enough, and
     an own trajectory of images that count from 1 is known by its times to the last digit."""
-    with pytest.raises(DataError, match=r"write timestamps\.txt"):
-        listed(tmp_path / "r", "from 1, cut, stamped")
+    case = "from 1, cut, stamped"
+    with pytest.raises(DataError, match=r"timestamps\.txt"):
+        listed(tmp_path / "r", case)
     (tmp_path / "r/timestamps.txt").write_text(matrix_text(np.arange(4)[:, None] / 30))
     np.testing.assert_allclose(open_recording(tmp_path / "r").T_world_camera, source().poses[:4])
-    recording = listed(tmp_path / "own", "from 1")
-    fast = np.arange(N_FRAMES) / 200
-    for times in (recording.times, fast):
-        if times is fast:
-            (tmp_path / "own/timestamps.txt").write_text(matrix_text(fast[:, None]))
-        lines = tum_lines(times[1:], source().poses[1:])
-        (tmp_path / "own/trajectory.txt").write_text(lines)
-        own = open_recording(tmp_path / "own")
-        assert np.flatnonzero(~own.has_pose).tolist() == [0]
-        np.testing.assert_allclose(own.T_world_camera[1:], source().poses[1:])
+    times = listed(tmp_path / "own", "from 1").times
+    lines = tum_lines(times[1:], source().poses[1:])
+    (tmp_path / "own/trajectory.txt").write_text(lines)
+    own = open_recording(tmp_path / "own")
+    assert np.flatnonzero(~own.has_pose).tolist() == [0]
+    np.testing.assert_allclose(own.T_world_camera[1:], source().poses[1:])
 
 
-@pytest.mark.parametrize("per_second", [1, 10**3, 10**6, 10**9])
+@pytest.mark.parametrize("per_second", [1, 10**3, 10**9])
 def test_one_unit_of_times_wherever_they_stand(plain: Path, per_second: int) -> None:
-    """Catches nanoseconds that are taken for seconds, in files of times and of poses, and a time
-    beyond all others, which only the last command would refuse."""
-    seconds = 1403636579.0 + np.arange(N_FRAMES) / 4
-    lines = [str(round(s * per_second)) if per_second > 1 else f"{s}" for s in seconds]
-    (plain / "timestamps.txt").write_text("\n".join(lines))
+    """Catches nanoseconds that are taken for seconds, in files of times, of poses and in names, a
+    time beyond all others, and frame numbers in place of a recording's own times."""
+    seconds = 1403636579.25 + np.arange(N_FRAMES) / 4
+    stamps = [str(round(s * per_second)) if per_second > 1 else f"{s}" for s in seconds]
     rows = tum_lines(seconds, source().poses).splitlines()
-    stamped = [f"{t} {row.split(maxsplit=1)[1]}" for t, row in zip(lines, rows, strict=True)]
+    stamped = [f"{t} {row.split(maxsplit=1)[1]}" for t, row in zip(stamps, rows, strict=True)]
     (plain / "trajectory.txt").write_text("\n".join(stamped))
+    of_poses = open_recording(plain).times
+    (plain / "timestamps.txt").write_text("\n".join(stamps))
     recording = open_recording(plain)
-    np.testing.assert_allclose(recording.times, seconds, atol=1e-3)
     np.testing.assert_allclose(recording.T_world_camera, source().poses, atol=1e-9)
-    (plain / "timestamps.txt").write_text("\n".join([*lines[:-1], "1e30"]))
-    with pytest.raises(DataError, match="one each, rising, in seconds, or since 1970 in milli-"):
+    (plain / "timestamps.txt").write_text("\n".join([*stamps[:-1], "1e30"]))
+    with pytest.raises(DataError, match="one each, rising, in seconds"):
         open_recording(plain)
-
-
-def test_times_of_stamped_poses(plain: Path) -> None:
-    """Catches frame numbers in place of a recording's own times, which evaluation tools need."""
-    times = START + np.arange(N_FRAMES) / 15
-    (plain / "trajectory.txt").write_text(tum_lines(times, source().poses))
-    assert open_recording(plain).times == pytest.approx(times, abs=1e-6)
+    (plain / "timestamps.txt").unlink()
+    for kind in ("color", "depth"):
+        rename(plain / kind, stamps)
+    for times in (of_poses, recording.times, open_recording(plain).times):
+        np.testing.assert_allclose(times, seconds, atol=1e-3)
 
 
 def test_times_in_names(plain: Path) -> None:
@@ -224,11 +200,6 @@ def test_times_in_names(plain: Path) -> None:
     lines = tum_lines(recording.times + 0.001, source().poses).splitlines()
     (plain / "trajectory.txt").write_text("\n".join([*lines[:2], "nan " * 8, *lines[3:]]))
     assert np.flatnonzero(~open_recording(plain).has_pose).tolist() == [2]
-    (plain / "trajectory.txt").write_text("\n".join(lines))
-    for per_second in (10**3, 10**9):
-        for kind in ("color", "depth"):
-            rename(plain / kind, [str(int((1305031102.175 + 0.033 * i) * per_second)) for i in RUN])
-        assert np.diff(open_recording(plain).times) == pytest.approx(0.033, abs=1e-3)
     # Two clocks: as many poses as images, each with a moment of its own, prove nothing.
     uneven = np.array([3.0, 3.1, 3.4, 3.5, 3.9, 4.0])
     (plain / "trajectory.txt").write_text(tum_lines(uneven, source().poses))

@@ -25,23 +25,17 @@ def frames(number: int) -> Iterator[WrittenFrame]:
         yield COLOR + np.uint8(i), depths, source().poses[i]
 
 
-def test_camera_that_the_layout_cannot_say(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """Catches a focal length or a principal point that is dropped in silence."""
+def test_converter(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Catches a focal length or a principal point that is dropped in silence where the layout
+    cannot say it, a slice that is ignored, and a folder without frames."""
     camera = Intrinsics(48, 36, 43.0, 44.5, 25.25, 17.0)
     folder = write_recording("plain", tmp_path / "r", source()._replace(camera=camera))
-    out = tmp_path / "out"
-    assert main(["data", "convert", str(folder), str(out)]) == 0
-    assert "more than focal.txt can say: it is in intrinsics.txt" in capsys.readouterr().out
+    out, convert = tmp_path / "out", ["data", "convert", str(folder)]
+    assert main([*convert, str(out), "--frames", "2:5"]) == 0
+    assert "it is in intrinsics.txt" in capsys.readouterr().out
     assert not (out / "focal.txt").exists()
     assert read_sequence(out).intrinsics == camera
-
-
-def test_converter_selects(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """Catches a slice that is ignored, and a folder without frames."""
-    folder = write_recording("7scenes", tmp_path / "r")
-    convert = ["data", "convert", str(folder)]
-    assert main([*convert, str(tmp_path / "out"), "--frames", "2:5"]) == 0
-    assert np.array_equal(read_sequence(tmp_path / "out").depths_mm, source().depths_mm[2:5])
+    assert np.array_equal(read_sequence(out).depths_mm, source().depths_mm[2:5])
     assert main([*convert, str(tmp_path / "new"), "--frames", "9:"]) == 2
     assert "0 of the 6 frames" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
@@ -63,16 +57,12 @@ def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 def test_two_writers_of_one_scene(tmp_path: Path) -> None:
-    """Catches commands that spoil each other's files of one room, or take up what a killed one
-    left: the first to finish stands."""
+    """Catches commands that spoil each other's files of one room: the first to finish stands."""
 
     def late() -> Iterator[WrittenFrame]:
         yield from frames(1)
         write_sequence(tmp_path / "room", CAMERA, frames(2))
 
-    killed = tmp_path / ".room.killed.unfinished/scene/images"
-    killed.mkdir(parents=True)
-    (killed / "img7.png").write_bytes(b"")
     with pytest.raises(OSError, match="not empty"):
         write_sequence(tmp_path / "room", CAMERA, late())
     assert len(read_sequence(tmp_path / "room")) == 2

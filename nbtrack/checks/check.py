@@ -2,6 +2,7 @@
 
 import math
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -65,15 +66,13 @@ class DataReport:
                 "no pixel that was looked at has a depth: all are 0, or saturated (65535); check "
                 "the depth folder, and no_depth in sequence.toml"
             ]
-        found = _of_depth_images(self)
-        needs_proof = self.is_whole and not any(found.values())
+        warnings = [*_of_depth_images(self)]
+        needs_proof = self.is_whole and not warnings
         misread = diagnosis(self.conventions, self.best, self.recording, needs_proof)
-        sentence = main_misfit(self.misfits) or misread
-        found[sentence] = bool(sentence)
+        warnings += filter(None, [main_misfit(self.misfits) or misread])
         if self.best is self.conventions[0]:
-            found |= _of_poses_and_depths(self)
-        found |= _of_colors(self)
-        return [text for text, is_so in found.items() if is_so]
+            warnings += _of_poses_and_depths(self)
+        return [*warnings, *_of_colors(self)]
 
     def __str__(self) -> str:
         cloud = self.cloud
@@ -105,61 +104,73 @@ class DataReport:
         return "\n".join(lines)
 
 
-def _of_depth_images(report: DataReport) -> dict[str, bool]:
-    """What may be wrong with them, whatever their numbers mean, and whether it is."""
+def _of_depth_images(report: DataReport) -> Iterator[str]:
+    """What is wrong with them, whatever their numbers mean."""
     frames, depth = report.frames, report.cloud.depth
     step = np.gcd.reduce(frames.depth_step) / report.recording.declared.depth_scale
+    if _MAX_STEP * depth.median() < step < depth.max() / 8:
+        yield (
+            f"depths come in steps of {100 * step:.1f} cm: look for those that the camera gave, or "
+            "expect no better poses"
+        )
     repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()  # below 1: the first is not
-    return {
-        f"depths come in steps of {100 * step:.1f} cm: look for those that the camera gave, or "
-        "expect no better poses": _MAX_STEP * depth.median() < step < depth.max() / 8,
-        f"{repeated:.0%} of the depth images repeat the one before, though the poses move: "
-        f"leave them out, as with --frames ::{round(1 / (1 - repeated))} of map and "
-        "track": repeated > _MIN_REPEATED,
-    }
+    if repeated > _MIN_REPEATED:
+        yield (
+            f"{repeated:.0%} of the depth images repeat the one before, though the poses move: "
+            f"leave them out, as with --frames ::{round(1 / (1 - repeated))} of map and track"
+        )
 
 
-def _of_poses_and_depths(report: DataReport) -> dict[str, bool]:
-    """What may be wrong with numbers that are read rightly, and whether it is."""
+def _of_poses_and_depths(report: DataReport) -> Iterator[str]:
+    """What is wrong with numbers that are read rightly."""
     off = report.frames.off_mm / 1e3
     is_odd = off > max(_OFF, _OFF_STEPS * report.frames.moved_mm.median() / 1e3)
     # The neighbours of a pose that is off are off by half.
     odd = off[is_odd & (off == off.rolling(3, 1, center=True).max())]
-    first = "".join(report.recording.color_files[i].name for i in odd.index[:1])
+    if len(odd):
+        first = report.recording.color_files[odd.index[0]].name
+        yield (
+            f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path of "
+            f"their neighbours, first {first}: check the poses there, or leave frames out with "
+            "--frames of map and track"
+        )
+    outliers = report.outliers.depth
+    if len(outliers):
+        share = len(outliers) / (len(outliers) + len(report.cloud))
+        yield (
+            f"{share:.2%} of the depths are outliers, {outliers.min():.3g} to {outliers.max():.3g} "
+            f"m away, more than {FAR:g} times as far as nine in ten: maps and tracking leave them "
+            "out; check the camera, or set no_depth in sequence.toml to what it gives for none"
+        )
     near, far = PLAUSIBLE_DEPTH
-    depth, outliers = report.cloud.depth.median(), report.outliers.depth
-    share = len(outliers) / (len(outliers) + len(report.cloud))
-    return {
-        f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path of "
-        f"their neighbours, first {first}: check the poses there, or leave frames out with "
-        "--frames of map and track": len(odd) > 0,
-        f"{share:.2%} of the depths are outliers, {outliers.min():.3g} to {outliers.max():.3g} "
-        f"m away, more than {FAR:g} times as far as nine in ten: maps and tracking leave them "
-        "out; check the camera, or set no_depth in sequence.toml to what it gives for "
-        "none": share > 0,
-        f"the median depth is {depth:.3g} m, outside {near:g} to {far:g} m: set depth_scale, "
-        "the depth values a metre, in sequence.toml": not near <= depth <= far,
-    }
+    depth = report.cloud.depth.median()
+    if not near <= depth <= far:
+        yield (
+            f"the median depth is {depth:.3g} m, outside {near:g} to {far:g} m: set depth_scale, "
+            "the depth values a metre, in sequence.toml"
+        )
 
 
-def _of_colors(report: DataReport) -> dict[str, bool]:
-    """What may be wrong with the colour images, and whether it is."""
+def _of_colors(report: DataReport) -> Iterator[str]:
+    """What is wrong with the colour images."""
     frames = report.frames
-    flicker = frames.flicker[frames.turned_deg < _SAME_VIEW_DEG].max()
-    is_elsewhere = report.correlation < MIN_CORRELATION and not main_misfit(report.misfits)
     no_color = (
         "track without colour: --set tracking.lm.lambda_intensity=0, or "
         "tracking.sdf.lambda_color=0 for sdf"
     )
-    return {
-        f"the colour images are black: check their folder, or {no_color}": (
-            frames.brightness.median() < _BLACK
-        ),
-        "colours do not belong to the depth images: of points that two frames see they "
-        f"correlate by {report.correlation:.2f}; check their folder and order": is_elsewhere,
-        f"brightness changes by {flicker:.0%} between two frames: fix exposure and white "
-        f"balance when recording, or {no_color}": flicker > _FLICKER,
-    }
+    if frames.brightness.median() < _BLACK:
+        yield f"the colour images are black: check their folder, or {no_color}"
+    if report.correlation < MIN_CORRELATION and not main_misfit(report.misfits):
+        yield (
+            "colours do not belong to the depth images: of points that two frames see they "
+            f"correlate by {report.correlation:.2f}; check their folder and order"
+        )
+    flicker = frames.flicker[frames.turned_deg < _SAME_VIEW_DEG].max()
+    if flicker > _FLICKER:
+        yield (
+            f"brightness changes by {flicker:.0%} between two frames: fix exposure and white "
+            f"balance when recording, or {no_color}"
+        )
 
 
 def check_recording(
@@ -194,9 +205,11 @@ def check_recording(
         misfits, correlation = find_misfits(compared, best.reading)
     cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))
     is_far = cloud.depth > far_limit(cloud.depth)
-    of_points = cloud[~is_far], cloud[is_far]
-    agreement = conventions, best, misfits, correlation
-    return DataReport(recording, frames, poses, *of_points, *agreement, is_whole)
+    return DataReport(
+        recording, frames, poses, cloud=cloud[~is_far], outliers=cloud[is_far],
+        conventions=conventions, best=best, misfits=misfits, correlation=correlation,
+        is_whole=is_whole,
+    )  # fmt: skip
 
 
 def quick_warning(recording: Recording) -> str:

@@ -157,14 +157,13 @@ def naming_damaged(
 
 
 @contextlib.contextmanager
-def locked(path: Path, timeout: float = -1) -> Iterator[bool]:
-    """Keep other processes out of a block by a lock file, and tell whether that was possible.
+def locked(path: Path) -> Iterator[None]:
+    """Keep other processes out of a block by a lock file.
 
     The system frees the lock when this process ends, however it ends. Some file systems know none:
-    there two processes may do the same work, and either's files stay whole. Raises filelock's
-    Timeout where others keep it for `timeout` s; less than 0 waits as long as they do.
+    there two processes may do the same work, and either's files stay whole.
     """
-    lock = FileLock(path, timeout=timeout)
+    lock = FileLock(path)
     try:
         # It warns before it takes another kind, which would wait for files that locks have left.
         with warnings.catch_warnings(action="error"):
@@ -173,6 +172,6 @@ def locked(path: Path, timeout: float = -1) -> Iterator[bool]:
         if getattr(error, "errno", errno.ENOSYS) not in _NO_LOCKS:
             raise
     try:
-        yield lock.is_locked
+        yield
     finally:
         lock.release()

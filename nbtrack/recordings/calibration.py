@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
+from nbtrack.core.files import naming_damaged
 from nbtrack.data.text_files import read_numbers, read_object
 
 _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
@@ -24,9 +25,10 @@ _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
 _OTHER_NAMES = {"w": "width", "h": "height", "coeffs": "distortion", "scale": "depth_scale"}
 _COUNTS = dict.fromkeys(("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *_LENS), (1,))
 _COUNTS |= {"intrinsic_matrix": (9,), "distortion": (0, 4, 5, 8, 12, 14)}
-# What else a number must be.
-_LIMITS = dict.fromkeys(("width", "height"), ", whole pixels above 0")
-_LIMITS |= {"depth_scale": ", above 0: the depth values that make a metre"}
+_ADVICE = (
+    "write finite numbers: width and height in whole pixels, both or none, depth_scale above 0, "
+    f"OpenCV's lens as distortion or by {', '.join(_LENS)}, and undistort images of another lens"
+)
 # Other entries that tell of the camera, and the words that say what holds anyway.
 _TELLING = re.compile(
     r"([kpsb]\d+|tau.*|xi|alpha|skew|gamma)$|.*(radial|tangential|dist|lens|fish|model|unit)", re.I
@@ -55,18 +57,15 @@ class Calibration:
         point lies outside.
         """
         factor = width / self.size[0] if self.size else 1.0
-        if self.size and abs(factor * self.size[1] - height) > 1:
-            raise DataError(
-                f"{image} is {width}x{height} but {self.source} is for {self.size[0]}x"
-                f"{self.size[1]}: images may be resized but not cropped; give their calibration"
-            )
         cx, cy = self.principal_point or (width / factor / 2, height / factor / 2)
         fx, fy, cx, cy = (factor * length for length in (self.fx, self.fy, cx, cy))
-        if not (0 <= cx <= width and 0 <= cy <= height):
+        is_alike = not self.size or abs(factor * self.size[1] - height) <= 1
+        if not (is_alike and 0 <= cx <= width and 0 <= cy <= height):
+            size = "{}x{}".format(*self.size) if self.size else "any size"
             raise DataError(
-                f"{self.source} has its cx, cy at ({cx:.0f}, {cy:.0f}), outside of {image} of "
-                f"{width}x{height} pixels: it is another camera's, or for images of about "
-                f"{2 * cx:.0f}x{2 * cy:.0f}, whose width and height are then to be given with it"
+                f"{image} is {width}x{height} but {self.source} is for {size}, with cx, cy then at "
+                f"({cx:.0f}, {cy:.0f}): images may be resized but not cropped; give the camera of "
+                "these images, or the width and height that its numbers hold for"
             )
         return Intrinsics(width, height, fx, fy, cx, cy)
 
@@ -87,15 +86,10 @@ def calibration(path: Path, K: Float[np.ndarray, "3 3"], **others: Any) -> Calib
     is_camera &= min(fx, fy) >= _MIN_FOCAL and np.abs(K).max() < _LARGEST
     if is_camera and min(others.get("size", (1,))) >= 1:
         return Calibration(path, fx, fy, **{"principal_point": (cx + 0.5, cy + 0.5), **others})
-    advice = "calibrate anew"
-    if fy < 0:  # as in ICL-NUIM
-        advice = (
-            "a negative fy is that of a camera whose y axis points up: write it positive, and "
-            "if `data check` then finds other axes, the camera_axes that it names"
-        )
     raise DataError(
         f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
-        f"pixels, without skew, the focal lengths positive, all finite; {advice}"
+        "pixels, without skew, the focal lengths positive, all finite; calibrate anew, or write a "
+        "negative fy (of a y axis that points up) positive and take the axes from `data check`"
     )
 
 
@@ -127,46 +121,40 @@ def _from_json(path: Path) -> Calibration:
     content = read_object(path)
     camera = content["camera"] if isinstance(content.get("camera"), dict) else content
     camera = {_OTHER_NAMES.get(key, key): value for key, value in camera.items()}
-    unused = sorted(camera.keys() - _COUNTS.keys())
-    for key in unused:
-        _check_unused(path, key, camera[key])
-    found = {key: _numbers(path, key, camera[key]) for key in camera.keys() & _COUNTS.keys()}
-    others: dict[str, Any] = {"unused": tuple(unused)}
-    if "distortion" in found or found.keys() & _LENS:
-        named = [found.get(key, [0.0])[0] for key in _LENS]
-        others["distortion"] = tuple(found.get("distortion", named))
-    if "depth_scale" in found:
-        (value,) = found["depth_scale"]
-        others["depth_scale"] = value if value >= 1 else 1 / value
-    if found.keys() & {"width", "height"}:
-        if not {"width", "height"} <= found.keys():
-            raise DataError(f"{path} gives one side of the image: write width and height, or none")
-        others["size"] = int(*found["width"]), int(*found["height"])
-    if "intrinsic_matrix" in found:
-        return calibration(path, np.array(found["intrinsic_matrix"]).reshape(3, 3).T, **others)
-    numbers = (found.get(key, [np.nan])[0] for key in ("fx", "fy", "cx", "cy"))
-    return calibration(path, camera_matrix(*numbers), **others)
+    unused = tuple(sorted(camera.keys() - _COUNTS.keys()))
+    others: dict[str, Any] = {"unused": unused}
+    with naming_damaged(path, "description of a camera", _ADVICE):
+        for key in unused:
+            _check_unused(key, camera[key])
+        found = {key: _numbers(key, camera[key]) for key in camera.keys() & _COUNTS.keys()}
+        lens = [found.get(key, [0.0])[0] for key in _LENS]
+        others["distortion"] = tuple(found.get("distortion", lens))
+        if "depth_scale" in found:
+            (scale,) = found["depth_scale"]
+            others["depth_scale"] = scale if scale >= 1 else 1 / scale
+        if found.keys() & {"width", "height"}:
+            others["size"] = int(*found["width"]), int(*found["height"])
+        if "intrinsic_matrix" in found:
+            return calibration(path, np.reshape(found["intrinsic_matrix"], (3, 3)).T, **others)
+        numbers = (found.get(key, [np.nan])[0] for key in ("fx", "fy", "cx", "cy"))
+        return calibration(path, camera_matrix(*numbers), **others)
 
 
-def _numbers(path: Path, key: str, value: Any) -> list[float]:
-    """The numbers of an entry. Raises DataError where they are too few, or none."""
+def _numbers(key: str, value: Any) -> list[float]:
+    """The numbers of an entry. Raises ValueError where they are others than it may have."""
     values = value if isinstance(value, list) else [value]
     # NaN is not below anything, and True is no number here.
     is_valid = all(type(v) in (int, float) and abs(v) < _LARGEST for v in values)
     is_valid = is_valid and len(values) in _COUNTS[key]
-    if key in _LIMITS:
-        is_valid = is_valid and values[0] > 0 and (key == "depth_scale" or values[0] % 1 == 0)
-    if not is_valid:
-        wanted = f"{' or '.join(map(str, _COUNTS[key]))} finite number(s){_LIMITS.get(key, '')}"
-        raise DataError(f"{path}: {key} is {str(value)[:40]!r}: write {wanted}")
+    if key in ("width", "height"):
+        is_valid = is_valid and values[0] % 1 == 0
+    if not is_valid or (key == "depth_scale" and values[0] <= 0):
+        raise ValueError(f"{key} is {str(value)[:40]!r}")
     return [float(v) for v in values]
 
 
-def _check_unused(path: Path, key: str, value: Any) -> None:
-    """Raises DataError where an entry that is not used tells of another lens or unit."""
+def _check_unused(key: str, value: Any) -> None:
+    """Raises ValueError where an entry that is not used tells of another lens or unit."""
     is_usual = value.lower() in _USUAL if isinstance(value, str) else not np.any(value)
     if _TELLING.match(key) and not is_usual:
-        raise DataError(
-            f"{path}: {key} is {str(value)[:40]!r}, which is not used: undistort the images, "
-            f"and describe a pinhole camera, or OpenCV's lens by {', '.join(_LENS)}"
-        )
+        raise ValueError(f"{key} is {str(value)[:40]!r}, which is not used")

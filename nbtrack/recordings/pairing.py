@@ -86,9 +86,9 @@ def check_paired(colors: list[Path], others: list[Path]) -> None:
         odd = [path.name for path, key in both if count[key] != 2]
         raise DataError(
             f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
-            f"{len(others)} {others[0].suffix} files ({len(odd)} without a partner, or with two: "
-            f"{', '.join(odd[:4])}): every image needs one of its number, and a folder one "
-            "session; rename or remove them"
+            f"{len(others)} {others[0].suffix} files: every image needs one of its number, and a "
+            f"folder one session; rename or remove the {len(odd)} that have none, or two: "
+            f"{', '.join(odd[:4])}"
         )
 
 
@@ -106,12 +106,12 @@ def pair_lists(
     closest = nearest(color_times, depth_times, _TOLERANCE)
     back = nearest(depth_times, color_times, _TOLERANCE)
     kept = np.flatnonzero((closest >= 0) & (back[closest] == np.arange(len(colors))))
-    left_out = f"no depth map of {depth_list.name} is within {_TOLERANCE} s"
+    left_out = f"{len(colors) - len(kept)} of the {len(colors)} images in {color_list.name} are "
+    left_out += f"left out: no depth map of {depth_list.name} is within {_TOLERANCE} s"
     if not len(kept):
-        raise DataError(f"{left_out} of any time in {color_list}: both need the same clock")
-    if n_left_out := len(colors) - len(kept):
-        of = f"{n_left_out} of the {len(colors)} images in {color_list.name}"
-        notes.append(f"{of} are left out: {left_out}")
+        raise DataError(f"{color_list.parent}: {left_out}; both lists need the same clock")
+    if len(kept) < len(colors):
+        notes.append(left_out)
     return [colors[i] for i in kept], [depths[i] for i in closest[kept]], color_times[kept]
 
 
@@ -165,21 +165,22 @@ class Moments:
         list's, and the other way round. Raises DataError where nothing tells it.
         """
         is_known = np.isfinite(poses).all(axis=(1, 2))
-        has_stamps = stamps is not None and is_known.any()
-        found = has_stamps and self._by_time(poses[is_known], stamps[is_known], flip)
-        # Of two clocks equal counts alone prove nothing, unless stamps only count the lines.
-        is_other_clock = self.own is not None and has_stamps and not _are_even(stamps[is_known])
+        stamps = stamps if is_known.any() else None
+        found = None
+        is_other_clock = False
+        if stamps is not None:
+            found = self._by_time(poses[is_known], stamps[is_known], flip)
+            # Of two clocks equal counts alone prove nothing, unless stamps only count the lines.
+            is_other_clock = self.own is not None and not _are_even(stamps[is_known])
         if not found and not is_other_clock:
-            is_stamped = has_stamps and np.isfinite(stamps).all()
+            is_stamped = stamps is not None and np.isfinite(stamps).all()
             found = self._by_number(poses, stamps if is_stamped else None)
         if found:
             return found
-        first, last = self.images[0].name, self.images[-1].name
         raise DataError(
-            f"{path} has {len(poses)} poses but there are {len(self.images)} images, {first} to "
-            f"{last}, and nothing tells whose each is: every image needs one, 'nan' where it has "
-            f"none, and every pose an image; remove what is odd, or write {TIMES_FILE}, a time (s) "
-            "an image on the clock of the poses' stamps"
+            f"{path} has {len(poses)} poses but there are {len(self.images)} images, and nothing "
+            "tells whose each is: write one for every image, 'nan' where there is none, or "
+            f"{TIMES_FILE}, a time (s) an image on the clock of the poses' stamps"
         )
 
     def _by_time(
@@ -226,15 +227,14 @@ class Moments:
         n_frames, n_poses = len(self.images), len(poses)
         clock = np.arange(n_poses) / self.rate_hz if stamps is None else stamps
         tolerance = min(_ON_TIME, 0.25 / self.rate_hz)
-        ways = [nearest(times, clock, tolerance) for times in self._counted()]
-        n_found = [(way >= 0).sum() for way in ways]
-        n_whole = min(n_frames, n_poses)
-        whole = {tuple(way) for way, n in zip(ways, n_found, strict=True) if n == n_whole}
+        ways = {tuple(nearest(times, clock, tolerance)) for times in self._counted()}
+        n_found = {way: n_frames - way.count(-1) for way in ways}  # frames that have a pose
+        whole = [way for way, n in n_found.items() if n == min(n_frames, n_poses)]
         if len(whole) == 1 and (n_poses > n_frames or stamps is not None):
             note = f"of {n_poses} poses those of the images' numbers" if n_poses > n_frames else ""
-            return _at(poses, np.array(whole.pop())), note
+            return _at(poses, np.array(whole[0])), note
         # Stamps of most frames leave out others than the frames do; even ones only count the lines.
-        is_odd = stamps is not None and max(n_found, default=0) > _MOST * n_frames
+        is_odd = stamps is not None and max(n_found.values(), default=0) > _MOST * n_frames
         if n_poses != n_frames or (is_odd and not _are_even(stamps)):
             return None
         is_plain = np.array_equal(self.numbers, np.arange(n_frames))

@@ -66,9 +66,8 @@ def _record3d_depth(path: Path, camera: Calibration) -> DepthImage:
             import liblzfse
         except ImportError:
             raise MissingError(
-                f"{path} is compressed by LZFSE, which nbtrack does not read alone: run `pip "
-                "install pyliblzfse`, or put 16-bit PNG files in millimetres into depth/ in place "
-                "of the .depth files"
+                f"{path} is compressed by LZFSE: run `pip install pyliblzfse`, or put 16-bit PNG "
+                "files in millimetres into depth/ in place of the .depth files"
             ) from None
         with naming_damaged(path, "LZFSE file", _ADVICE):
             content = liblzfse.decompress(content)

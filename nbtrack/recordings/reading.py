@@ -15,7 +15,7 @@ from PIL import Image
 
 from nbtrack.core.arrays import Frames, Position
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError, MissingError
+from nbtrack.core.errors import DataError
 from nbtrack.core.files import naming_damaged
 from nbtrack.core.progress import ProgressBar
 from nbtrack.data.sequence import RgbdSequence
@@ -68,16 +68,20 @@ def read_frames(
     """The frames of an opened recording of some numbers, or that a slice selects and, where needed,
     that have a pose. Poses are relative to an origin (m), by default the recording's.
 
-    Raises MissingError or DataError if an image cannot be read, or no frame is left.
+    Raises DataError if an image cannot be read, or no frame is left.
     """
-    is_slice = isinstance(frames, slice)
-    frame_ids = select_frames(recording, frames, needs_poses) if is_slice else frames
-    images = decode(recording, frame_ids, progress)
-    poses, times = recording.T_world_camera[frame_ids], recording.times[frame_ids]
+    frame_ids = frames
+    if isinstance(frames, slice):
+        frame_ids = select_frames(recording, frames, needs_poses)
+    camera, colors, depths_mm = decode(recording, frame_ids, progress)
     origin = recording.origin if origin is None else origin
+    poses = recording.T_world_camera[frame_ids]
     poses[:, :3, 3] -= origin
-    unit = recording.declared.metres_per_unit or None
-    return RgbdSequence(recording.name, *images, poses, frame_ids, times, origin, unit)
+    return RgbdSequence(
+        recording.name, camera, colors, depths_mm, T_world_camera=poses, frame_ids=frame_ids,
+        times=recording.times[frame_ids], origin=origin,
+        declared_unit=recording.declared.metres_per_unit or None,
+    )  # fmt: skip
 
 
 def select_frames(recording: Recording, frames: slice, needs_poses: bool = True) -> Frames:
@@ -85,24 +89,16 @@ def select_frames(recording: Recording, frames: slice, needs_poses: bool = True)
 
     Raises DataError if there is none.
     """
-    selected = frame_ids = np.arange(len(recording))[frames]
-    if not len(selected):
-        raise DataError(
-            f"0 of the {len(recording)} frames in {recording.folder} are selected: choose others "
-            "(--frames of map and track, scenes.track_frames of tables)"
-        )
-    if needs_poses and recording.pose_file is None:
-        raise MissingError(
-            f"no poses in {recording.folder}: {recording.format.label} needs "
-            f"{' or '.join(recording.format.poses)}; add it, or track in a map of the same place "
-            "with --map-from"
-        )
+    frame_ids = np.arange(len(recording))[frames]
+    found = f"{len(frame_ids)} of the {len(recording)} frames in {recording.folder} are selected"
     if needs_poses:
-        frame_ids = selected[recording.has_pose[selected]]
+        frame_ids = frame_ids[recording.has_pose[frame_ids]]
+        found += f", and {len(frame_ids)} of these have a pose"
     if not len(frame_ids):
         raise DataError(
-            f"{len(selected)} of the {len(recording)} frames in {recording.folder} are selected, "
-            f"but no pose in {recording.pose_file} that is not NaN: choose others, or other poses"
+            f"{found}: choose others (--frames of map and track, scenes.track_frames of tables), "
+            f"add poses ({recording.pose_file or ' or '.join(recording.format.poses)}), or track "
+            "in a map of the same place with --map-from, which needs none"
         )
     return frame_ids
 
@@ -201,7 +197,8 @@ def _is_larger(color: np.ndarray, depth: np.ndarray, recording: Recording) -> bo
             "for: write a JSON file with fx, fy, cx, cy and their width and height"
         )
     note = f"colour is made as small as depth: {sizes}"
-    recording.notes.extend([note] * (note not in recording.notes))
+    if note not in recording.notes:
+        recording.notes.append(note)
     return True
 
 

@@ -1,7 +1,6 @@
 """A recording: its files found and paired, its texts read, before any pixel is decoded."""
 
 import hashlib
-import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +16,6 @@ from nbtrack.recordings.calibration import Calibration
 from nbtrack.recordings.formats import FORMATS, Declaration, Format, declaration, files_of
 from nbtrack.recordings.pairing import TIMES_FILE, Moments, check_paired, pair_lists, stamp_in
 
-_PNG = b"\x89PNG\r\n\x1a\n"  # how its files begin
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 
 
@@ -63,28 +61,13 @@ class Recording:
     def contents(self) -> tuple[list[tuple[str, str, str]], str, Declaration]:
         """What changes when a recording does: of every image its name and a digest, one of times,
         poses and camera, and the declaration."""
-        files = self.color_files + self.depth_files
-        images = [(file.parent.name, file.name, image_digest(file)) for file in files]
+        images = [
+            (file.parent.name, file.name, hashlib.sha256(file.read_bytes()).hexdigest())
+            for file in self.color_files + self.depth_files
+        ]
         digest = hashlib.sha256(repr(replace(self.calibration, source=Path())).encode())
         digest.update(self.times.tobytes() + self.file_poses.tobytes())
         return images, digest.hexdigest(), self.declared
-
-
-def image_digest(file: Path) -> str:
-    """A digest of an image file that is cheap for long recordings.
-
-    Each chunk of a PNG has its length, its name and a checksum, which are read alone; what does not
-    begin as a PNG, whatever it is called, is read whole.
-    """
-    with file.open("rb") as opened:
-        signature = opened.read(len(_PNG))
-        digest = hashlib.blake2b(signature, digest_size=8)
-        if signature != _PNG:
-            digest.update(opened.read())
-        while head := opened.read(8):
-            opened.seek(int.from_bytes(head[:4], "big"), os.SEEK_CUR)
-            digest.update(head + opened.read(4))
-        return digest.hexdigest()
 
 
 def open_recording(
@@ -114,19 +97,18 @@ def open_recording(
     if camera.depth_scale:
         declared = declaration(folder, declared.format, depth_scale=camera.depth_scale)
     moments = Moments(colors, own_times, declared.frame_rate, layout.counts_from_0)
-    images = colors, depths, moments.times
-    no_poses = np.full((len(colors), 4, 4), np.nan)
-    name = folder.name
-    recording = Recording(folder, name, layout, declared, *images, camera, notes, no_poses)
-    names = (pose_file,) if pose_file else layout.poses
-    there = [pattern for pattern in names if files_of(folder, pattern)]
-    if len(there) > 1:
-        both = " and ".join(there)
-        raise DataError(f"{folder} has {both}: keep one, or choose by `data convert --poses FILE`")
-    if not there and not pose_file:
+    pattern = pose_file or _pose_pattern(folder, layout)
+    poses, times = np.full((len(colors), 4, 4), np.nan), moments.times
+    if pattern:
+        files = layout.files(folder, (pattern,), "poses")
+        poses, times = _poses_and_times(files, folder / pattern, layout, declared, moments, notes)
+    else:
         notes.append("no poses")
-        return recording
-    return _with_poses(recording, moments, layout.files(folder, names, "poses"), folder / there[0])
+    return Recording(
+        folder, folder.name, layout, declared, color_files=colors, depth_files=depths, times=times,
+        calibration=camera, notes=notes, file_poses=poses,
+        pose_file=folder / pattern if pattern else None,
+    )  # fmt: skip
 
 
 def _own_times(folder: Path, colors: list[Path]) -> Times | None:
@@ -157,21 +139,34 @@ def _calibration(folder: Path, layout: Format, notes: list[str]) -> Calibration:
     return camera
 
 
-def _with_poses(recording: Recording, moments: Moments, files: list[Path], path: Path) -> Recording:
-    """The recording with a pose a frame; `path` names the files, with `*` where each has one."""
-    declared = recording.declared
-    tables = [recording.format.read_poses(file, declared.quaternion) for file in files]
+def _pose_pattern(folder: Path, layout: Format) -> str | None:
+    """Which of a format's files of poses is there, with `*` where every frame has one."""
+    there = [pattern for pattern in layout.poses if files_of(folder, pattern)]
+    if len(there) > 1:
+        both = " and ".join(there)
+        raise DataError(f"{folder} has {both}: keep one, or choose by `data convert --poses FILE`")
+    return there[0] if there else None
+
+
+def _poses_and_times(
+    files: list[Path], path: Path, layout: Format, declared: Declaration, moments: Moments,
+    notes: list[str],
+) -> tuple[Poses, Times]:  # fmt: skip
+    """A pose a frame, and times; `path` names the files, with `*` where each frame has one."""
+    tables = [layout.read_poses(file, declared.quaternion) for file in files]
     poses = checked_poses(np.concatenate([T for T, _ in tables]), path)
-    has_stamps = all(times is not None for _, times in tables)
-    stamps = np.concatenate([times for _, times in tables]) if has_stamps else None
-    times = recording.times
+    stamps = None
+    if all(times is not None for _, times in tables):
+        stamps = np.concatenate([times for _, times in tables])
+    times = moments.times
     # Frames without times of their own have those of the poses, if there is one for each.
-    if moments.own is None and has_stamps and len(stamps) == len(times):
+    if moments.own is None and stamps is not None and len(stamps) == len(times):
         times = stamps if (np.diff(stamps) > 0).all() else times
     if "*" in path.name:
-        check_paired(recording.color_files, files)
-    else:
-        stamps = stamps if recording.format.stamps_tell else None
-        poses, note = moments.poses_of(path, poses, stamps, declared.turned_round)
-        recording.notes.extend([f"{path.name}: {note}"] * bool(note))
-    return replace(recording, times=times, file_poses=poses, pose_file=path)
+        check_paired(moments.images, files)
+        return poses, times
+    told = stamps if layout.stamps_tell else None
+    poses, note = moments.poses_of(path, poses, told, declared.turned_round)
+    if note:
+        notes.append(f"{path.name}: {note}")
+    return poses, times

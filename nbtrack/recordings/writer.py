@@ -1,8 +1,5 @@
 """Write frames, or a recording of any format, in the Neural RGB-D layout."""
 
-import contextlib
-import glob
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import astuple
 from pathlib import Path
@@ -10,13 +7,12 @@ from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
-from filelock import Timeout
 from jaxtyping import Float
 
 from nbtrack.core.arrays import ColorImage, DepthImage, Frames, Pose, Poses
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
-from nbtrack.core.files import locked, write_atomic
+from nbtrack.core.files import write_atomic
 from nbtrack.core.progress import ProgressBar
 from nbtrack.recordings.calibration import camera_matrix
 from nbtrack.recordings.formats import FORMATS
@@ -27,7 +23,6 @@ from nbtrack.recordings.recording import Recording
 # RGB colour, depth maps (mm) by depth folder, and pose with OpenCV camera axes.
 WrittenFrame = tuple[ColorImage, dict[str, DepthImage], Pose]
 _FRAMES_AT_ONCE = 32  # converted: 50 MB at 640x480
-_LOCK = ".lock"  # beside what is being written
 _SAME_CAMERA = 1e-6  # pixels: rounding, not another camera
 
 
@@ -40,21 +35,16 @@ def write_sequence(
 ) -> None:
     """Write frames, and notes (texts of further files, by name), as a scene in the layout.
 
-    It is put in place when it is complete: a run that is killed leaves no half-written scene, and
-    the next one removes what it has left aside.
+    It is put in place when it is complete, so that a run that is killed leaves no half-written
+    scene; only if the system ends it at once, a hidden folder `.NAME....unfinished` stays beside.
     `progress` is called after each frame with how many are written; one is needed. Raises DataError
     if the folder exists.
     """
     if folder.exists():
         raise DataError(f"{folder} exists: choose another folder or remove it first")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    for left in folder.parent.glob(f".{glob.escape(folder.name)}.*.unfinished"):
-        with contextlib.suppress(Timeout), locked(left / _LOCK, timeout=0) as is_held:
-            if is_held:  # nobody writes there any more
-                shutil.rmtree(left, ignore_errors=True)
     # A sibling, so that the final rename stays within one file system.
-    aside = TemporaryDirectory(".unfinished", f".{folder.name}.", folder.parent)
-    with aside as hidden, locked(Path(hidden) / _LOCK):
+    with TemporaryDirectory(".unfinished", f".{folder.name}.", folder.parent) as hidden:
         unfinished = Path(hidden) / "scene"
         unfinished.mkdir()
         poses = []
