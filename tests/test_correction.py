@@ -196,7 +196,7 @@ def test_a_room_that_was_never_mapped_is_told(found: CorrectedField) -> None:
 def test_views_are_told_apart_and_spread(found: CorrectedField, sequence: RgbdSequence) -> None:
     """Catches views of the wrong frame or unit, turns of the wrong sign, and poses that are kept by
     time: a camera that stood still for most of a recording would fill them all."""
-    cameras = found.T_world_cameras.double().numpy()
+    cameras = found.viewpoints.T_world_camera
     assert found.views.shape == (len(sequence), 2, 15, 20)
     ahead = sequence[2].depth_mm[45:51, 61:67].float().mean().item() / 50  # in units of 5 cm
     nearest = np.linalg.norm(cameras - sequence.T_world_camera[2], axis=(1, 2)).argmin()
@@ -204,7 +204,7 @@ def test_views_are_told_apart_and_spread(found: CorrectedField, sequence: RgbdSe
     off = np.eye(4)
     off[:3, :3] = Rotation.from_rotvec([0.0, 0.12, 0.0]).as_matrix()
     turned = box_sequence((sequence.T_world_camera[2] @ off)[None], ROOM, 96)[0]
-    (guess,) = retrieve(view_of(turned), found.views, cameras, 1)
+    (guess,) = retrieve(view_of(turned), found.viewpoints, 1)
     angle = Rotation.from_matrix(guess[:3, :3].T @ turned.T_world_camera[:3, :3]).magnitude()
     assert angle < 0.06
     still = np.concatenate([np.tile(np.eye(4), (500, 1, 1)), sequence.T_world_camera])
@@ -223,9 +223,9 @@ def test_the_minimum_scales_follow_the_sensor(
 ) -> None:
     """Catches a tracker that takes a noisy camera's residuals for outliers, or a good one's for
     noise: 5.5 medians of normal noise are 3.7 of its standard deviations."""
-    assert found.residual_sigma == pytest.approx((0.01, 0.05))  # nearly exact: no less than these
+    assert found.accuracy.residual_sigma == pytest.approx((0.01, 0.05))  # nearly exact: no less than these
     noise = np.random.default_rng(0).normal(scale=6.0, size=sequence.depths_mm.shape)
     noisy = replace(sequence, depths_mm=(sequence.depths_mm + noise).astype(np.uint16))
     field = corrected(found.source, noisy, np.arange(12), VOXEL)
     # Walls are mostly seen at an angle, where less of the noise is along the normal.
-    assert 0.5 * 3.7 * 0.006 < field.residual_sigma[0] < 3.7 * 0.006
+    assert 0.5 * 3.7 * 0.006 < field.accuracy.residual_sigma[0] < 3.7 * 0.006

@@ -8,8 +8,9 @@ import torch
 from box_room import BoxRoom, box_sequence, narrow_room, sequence_of, walk
 
 from nbtrack.beyond import LmSettings, LmTracker
-from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.grid import Accuracy, BakedField
 from nbtrack.beyond.lm_solver import retract
+from nbtrack.beyond.views import Viewpoints, view_of
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
@@ -111,7 +112,7 @@ def test_a_restart_forgets_the_past() -> None:
 def test_without_restarts_no_hypotheses_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a thousand poses that are compared and dropped in every lost frame."""
     known = BakedField(narrow_room(), 0.04)
-    known.T_world_cameras = torch.eye(4)[None]
+    known.viewpoints = Viewpoints(T_TRUE[None], view_of(FRAME)[None])
     tracker = LmTracker(known, T_TRUE, StepBudget(1), LmSettings(n_restarts=0))
     monkeypatch.setattr(tracker, "_other_starts", lambda *_: pytest.fail("evaluated"))
     assert run(tracker, retract(T_TRUE, FAR), 200)
@@ -161,7 +162,7 @@ def test_intensities_speak_against_a_pose_by_what_is_usual(monkeypatch: pytest.M
     pictures = {"same": FRAME.color, "blended": BLENDED, "dark": 0 * BLENDED}
     told = {}
     for usual_mad in (0.002, 0.02):
-        monkeypatch.setattr(ROOM, "intensity_mad", usual_mad)
+        monkeypatch.setattr(ROOM, "accuracy", Accuracy(intensity_mad=usual_mad))
         for name, color in pictures.items():
             tracker = begun(n_restarts=0, lambda_intensity=1e-6)  # which no pose follows
             run(tracker, T_TRUE, 20, replace(FRAME, color=color))
@@ -174,7 +175,8 @@ def test_intensities_speak_against_a_pose_by_what_is_usual(monkeypatch: pytest.M
 def test_a_lost_camera_is_looked_for_at_its_last_good_pose_too() -> None:
     """Catches a camera that stood still, lost for good: hypotheses lie near mapped poses alone."""
     known = BakedField(narrow_room(), 0.04)
-    known.T_world_cameras = torch.from_numpy(retract(T_TRUE, np.array([0, 0, 0, 5.0, 5, 5])))[None]
+    T_far = retract(T_TRUE, np.array([0, 0, 0, 5.0, 5, 5]))
+    known.viewpoints = Viewpoints(T_far[None], view_of(FRAME)[None])
     tracker = LmTracker(known, T_TRUE, StepBudget(1), LmSettings())
     assert not run(tracker, T_TRUE, 20)
     assert not run(tracker, retract(T_TRUE, FAR), 60)

@@ -6,8 +6,8 @@ import torch
 from box_room import BoxRoom, Formula, narrow_room, walk
 
 from nbtrack.beyond.grid import BakedField
-from nbtrack.beyond.lm_optimizer import COARSE, LmOptimizer
-from nbtrack.beyond.lm_residuals import Grid, Problem, grid_of, residual_terms
+from nbtrack.beyond.lm_optimizer import COARSE, FINE, LmOptimizer
+from nbtrack.beyond.lm_residuals import Grid, Problem, Stage, grid_of, residual_terms
 from nbtrack.beyond.lm_solver import (
     damped_step,
     normal_equations,
@@ -43,13 +43,13 @@ def asked(field: BakedField, points: np.ndarray) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("field", [ROOM, NETWORK], ids=["room", "network"])
-@pytest.mark.parametrize("is_fine", [False, True])
-def test_terms_and_sums_are_the_formulas(field: BakedField, is_fine: bool) -> None:
+@pytest.mark.parametrize("stage", [COARSE, FINE])
+def test_terms_and_sums_are_the_formulas(field: BakedField, stage: Stage) -> None:
     """Catches a swapped axis or channel, points that pull from outside or towards a surface that
     faces elsewhere, distances that grow too fast taken as they are, another weight, scale, cost or
     prior than the module states; once with normals, once with confidences."""
-    normals, weight, grid = NONE if is_fine else NORMALS, 0.7, grid_of(field)
-    problem = Problem(Observed(POINTS, LUMAS, normals), grid, is_fine, weight, START)
+    normals, weight, grid = NONE if stage.is_fine else NORMALS, 0.7, grid_of(field)
+    problem = Problem(Observed(POINTS, LUMAS, normals), grid, stage, weight, START)
     terms = residual_terms(problem, POSE)
     R, t = POSE[:3, :3], POSE[:3, 3]
     a = POINTS @ R.T
@@ -60,14 +60,14 @@ def test_terms_and_sums_are_the_formulas(field: BakedField, is_fine: bool) -> No
     w = ((x > low - 0.3) & (x < high + 0.3)).all(axis=1) & (g > 0.3) & (g < 2)
     assert 0.1 < w.mean() < 0.95
     w = w / (1 + ((g - 1) / 0.5) ** 2) ** 2
-    if is_fine:
+    if stage.is_fine:
         w = w * field.confidence(torch.from_numpy(x).float()).numpy()
     else:
         w = w * ((normals @ R.T * df).sum(axis=1) / np.maximum(g, 0.3)).clip(0) ** 2
     g = np.maximum(g, 0.3)[:, None]
     r, q = np.stack([f / g[:, 0], intensity - LUMAS]), np.stack([df / g, di])
     np.testing.assert_allclose([*terms.residuals, terms.reliability], [*r, w], atol=2e-5)
-    scales = robust_scales(terms.residuals, np.full(2, np.inf), grid.residual_sigma, 3.0)
+    scales = robust_scales(terms.residuals, np.full(2, np.inf), grid.accuracy.residual_sigma, 3.0)
     np.testing.assert_allclose(scales, 3 * np.median(abs(r), axis=1), rtol=0.02)
     square = (r / scales[:, None]) ** 2
     rho = square / (1 + square)
@@ -177,14 +177,14 @@ def test_a_rejected_step_leaves_the_pose_unchanged(optimizer: LmOptimizer) -> No
             T, damping = optimizer.T_world_camera, optimizer.damping
             optimizer.step()
             assert (optimizer.damping > damping) == (optimizer.T_world_camera is T)
-        assert optimizer.stage.is_fine is is_fine
+        assert optimizer.problem.stage.is_fine is is_fine
         optimizer.refine()
     assert abs(optimizer.T_world_camera - ORIGIN).max() < 2e-3
 
 
 def test_a_coarse_stage_that_leads_astray_is_undone(optimizer: LmOptimizer) -> None:
     """Catches a good start that is given up for a worse pose."""
-    assert optimizer.stage is COARSE
+    assert optimizer.problem.stage is COARSE
     optimizer.T_world_camera = POSE
     optimizer.terms = residual_terms(optimizer.problem, POSE)
     optimizer.refine()
@@ -207,11 +207,11 @@ def test_normals_of_planes() -> None:
 def test_what_is_no_number_stays_none() -> None:
     """Catches compiled sums that turn NaN into a pose, and reads outside of the grid."""
     grid = grid_of(ROOM)
-    problem = Problem(Observed(POINTS, LUMAS, NONE), grid, True, 1.0, ORIGIN)
+    problem = Problem(Observed(POINTS, LUMAS, NONE), grid, FINE, 1.0, ORIGIN)
     terms = residual_terms(problem, np.full((4, 4), np.nan))
-    cost = robust_cost(terms.residuals, terms.reliability, grid.residual_sigma, 1.0)
+    cost = robust_cost(terms.residuals, terms.reliability, grid.accuracy.residual_sigma, 1.0)
     assert np.isnan(cost) or not terms.reliability.any()
-    sums = normal_equations(terms, grid.residual_sigma, 1.0)
+    sums = normal_equations(terms, grid.accuracy.residual_sigma, 1.0)
     assert np.isnan(sums[0]).any() or not terms.reliability.any()
 
 

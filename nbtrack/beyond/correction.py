@@ -12,18 +12,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.beyond.grid import BakedField
-from nbtrack.beyond.least_squares import (
-    corrected_vertices,
-    interpolation,
-    regularisation_of,
-    solve,
-)
+from nbtrack.beyond.grid import Accuracy, BakedField
+from nbtrack.beyond.least_squares import corrected_vertices, interpolation, regularisation_of, solve
 from nbtrack.beyond.observed import LUMA
-from nbtrack.beyond.views import Views, spread_out, view_of
+from nbtrack.beyond.views import Viewpoints, spread_out, view_of
 from nbtrack.core.arrays import Frames
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.errors import DataError
@@ -52,6 +46,7 @@ _COLOR_ROUNDS = 3
 # are 1.8 mm and 0.002, and 4 mm and 0.02.
 _MEDIANS = np.array([5.5, 2.3])
 _MIN_SCALES = np.array([0.01, 0.05])
+_INLIER_DISTANCE = 0.025  # m
 _UNMEASURED = 0.1  # confidence where nothing was measured, and the network interpolates
 CORRECTIONS = ("numbers", "corrections", "cameras", "views", "residual_medians")
 """What a file keeps of a correction, besides the field: see `CorrectedField`."""
@@ -70,7 +65,6 @@ class CorrectedField(BakedField):
     """
 
     form = "corrected"
-    inlier_distance = 0.025
 
     def __init__(self, source: Field, voxel: float) -> None:
         """Sample a field as `BakedField` does; `add` then corrects it."""
@@ -84,15 +78,15 @@ class CorrectedField(BakedField):
         for name in CORRECTIONS:
             self.register_buffer(name, correction[name])
         medians = self.residual_medians.double().numpy()
-        self.residual_sigma = tuple(np.maximum(_MEDIANS * medians, _MIN_SCALES).tolist())
-        self.intensity_mad = float(medians[1])
+        sigma = tuple(np.maximum(_MEDIANS * medians, _MIN_SCALES).tolist())
+        self.accuracy = Accuracy(sigma, _INLIER_DISTANCE, float(medians[1]))
         self.volume[4] = _UNMEASURED
         self.volume[:, self.numbers.long()] += self.corrections.float().T
 
     @property
-    def T_world_cameras(self) -> Float[Tensor, "cameras 4 4"]:
-        """Some of the poses that it was mapped from, spread by place and direction."""
-        return self.cameras
+    def viewpoints(self) -> Viewpoints:
+        """Some of the poses that it was mapped from, and their views."""
+        return Viewpoints(self.cameras.double().numpy(), self.views)
 
     def state(self) -> State:
         """That of the field as mapped, and the corrections."""
@@ -168,7 +162,7 @@ def corrected(
     return field
 
 
-def _views(sequence: RgbdSequence, frames: Frames) -> tuple[Tensor, Views]:
+def _views(sequence: RgbdSequence, frames: Frames) -> tuple[Tensor, Tensor]:
     """Some of the frames' poses, T_world_camera (n x 4 x 4), and what the camera saw from them."""
     kept = frames[spread_out(sequence.T_world_camera[frames])]
     views = torch.stack([view_of(sequence[index]) for index in kept.tolist()])

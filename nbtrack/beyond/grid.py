@@ -5,12 +5,14 @@ its gradient is exact, and jumps from cell to cell.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nbtrack.beyond.views import Viewpoints
 from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.device import constant
@@ -22,6 +24,17 @@ _MAX_BYTES = 500_000_000  # 25 million vertices, sampled in some minutes (our ch
 _BYTES_PER_VERTEX = 4 * (3 + 1 + 1)  # colour, value and confidence
 
 
+class Accuracy(NamedTuple):
+    """How far off a map is at surfaces, together with depth cameras: the scales of LM's residuals.
+
+    The defaults are for small networks, where nothing was measured (our choice).
+    """
+
+    residual_sigma: tuple[float, float] = (0.02, 0.05)  # of distance (m), luma: larger count less
+    inlier_distance: float = 0.05  # m from its surface within which a point fits
+    intensity_mad: float = 0.02  # median residual of luma at what was mapped
+
+
 class BakedField(Field):
     """A frozen copy of another field on a regular grid over its bounds. Our choice.
 
@@ -30,12 +43,8 @@ class BakedField(Field):
 
     name = "baked"
     width = 0  # one thread serves a grid, even one that keeps the network it was made from
-    # By how much its distance (m) and intensity are off at surfaces, together with depth cameras:
-    # larger residuals are down-weighted in second-order tracking. Our choice, for small networks.
-    residual_sigma: tuple[float, float] = (0.02, 0.05)
-    inlier_distance: float = 0.05  # m from its surface within which a point fits
-    intensity_mad: float = 0.02  # median residual of luma at what was mapped; a guess where unknown
-    T_world_cameras: Float[Tensor, "cameras 4 4"] | None = None  # some that mapped it
+    accuracy = Accuracy()
+    viewpoints: Viewpoints | None = None  # from where a lost camera is looked for
 
     @torch.no_grad()
     def __init__(self, source: Field, voxel: float | int) -> None:
@@ -60,12 +69,6 @@ class BakedField(Field):
         volume = torch.cat([color.T, value[None], torch.ones_like(value)[None]])
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("volume", volume, persistent=False)
-        self.register_buffer("views", None)  # of `T_world_cameras`, where the map keeps any
-
-    @property
-    def n_bytes(self) -> int:
-        """Memory of all buffers (bytes): 20 a vertex in single precision."""
-        return sum(buffer.nbytes for buffer in self.buffers())
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour in [0, 1] and value (m for a signed distance) at points (m); differentiable."""

@@ -1,6 +1,6 @@
 """LM: second-order steps on signed distance and colour at observed points, and restarts."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
@@ -101,8 +101,8 @@ class LmTracker(Tracker):
 
     def restart_anywhere(self) -> None:
         """Look for the camera near all poses that the map was made from; see `_other_starts`."""
-        self.check_finds(in_corrected=self.field.T_world_cameras is not None)
-        self.restart(self.field.T_world_cameras[0].double().numpy())
+        self.check_finds(in_corrected=self.field.viewpoints is not None)
+        self.restart(self.field.viewpoints.T_world_camera[0])
         self.was_lost = True
 
     def track(self, frame: Frame, budget: Budget | None = None) -> Estimate:
@@ -159,7 +159,7 @@ class LmTracker(Tracker):
         if self.best is None:
             return {"inlier_ratio": 0.0, "p_lost": 1.0, "lost": True}
         said = self.best.certainty()
-        usual_mad = max(self.field.intensity_mad, _ROUNDING)
+        usual_mad = max(self.field.accuracy.intensity_mad, _ROUNDING)
         innovation = _apart(self.trusted, self.best.T_world_camera)
         said |= {
             "intensity_ratio": said["intensity_mad"] / usual_mad if self.weight else 1.0,
@@ -206,35 +206,34 @@ class LmTracker(Tracker):
         """Where else the camera may be, the likeliest first; all that can be thought of where no
         pose is trusted."""
         anchor = T_expected if self.last_good is None else self.last_good.numpy()
-        n_restarts = self.settings.n_restarts
-        if self.field.views is None:
+        n_restarts, viewpoints = self.settings.n_restarts, self.field.viewpoints
+        if viewpoints is None:
             # The last good pose itself, then turned about x, y and z both ways, and wider.
             turns = _RESTART_ANGLE * np.kron(np.eye(6)[:3], [[1], [-1]])
             twists = (factor * turn for factor in range(1, n_restarts) for turn in turns)
             starts = [anchor, *(retract(anchor, twist) for twist in twists)]
         else:
-            cameras = self.field.T_world_cameras.double().numpy()
-            alike = retrieve(view_of(frame), self.field.views, cameras, _ALIKE)
-            random = [self.descent_from(T) for T in self._random_poses(cameras)]
-            tried = [self.descent_from(T) for T in (anchor, *alike)] + _by_cost(random)[:_TRIED]
+            alike = retrieve(view_of(frame), viewpoints, _ALIKE)
+            random = map(self.descent_from, self._random_poses(viewpoints.T_world_camera))
+            tried = [*map(self.descent_from, [anchor, *alike]), *_by_cost(random)[:_TRIED]]
             for descent in tried:
                 descent.run_stage(_TRIED_STEPS)
             starts = [descent.T_world_camera for descent in _by_cost(tried)]
         return starts[:n_restarts] if len(self.trusted) else starts
 
-    def _random_poses(self, T_world_cameras: Poses) -> Poses:
+    def _random_poses(self, T_world_camera: Poses) -> Poses:
         """Where else a camera may be: near the known ones, turned about the vertical they share."""
         seed = torch.randint(2**62, (), generator=self.generator)
         random = np.random.default_rng(int(seed))
-        poses = T_world_cameras[random.integers(len(T_world_cameras), size=_RANDOM)]
-        down = T_world_cameras[:, :3, 1].mean(axis=0)
+        poses = T_world_camera[random.integers(len(T_world_camera), size=_RANDOM)]
+        down = T_world_camera[:, :3, 1].mean(axis=0)
         turns = random.uniform(0, 2 * np.pi, (_RANDOM, 1)) * down / np.linalg.norm(down)
         poses[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix() @ poses[:, :3, :3]
         poses[:, :3, 3] += random.normal(scale=_RANDOM_STD, size=(_RANDOM, 3))
         return poses
 
 
-def _by_cost(descents: Sequence[LmOptimizer]) -> list[LmOptimizer]:
+def _by_cost(descents: Iterable[LmOptimizer]) -> list[LmOptimizer]:
     """Descents in the order of their robust costs, all at equal scales."""
     return sorted(descents, key=lambda descent: descent.cost(_WIDE_SCALES))
 

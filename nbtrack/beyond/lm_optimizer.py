@@ -1,19 +1,10 @@
 """The search for a frame's pose from one start: steps of Levenberg-Marquardt in two stages."""
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Float
 
-from nbtrack.beyond.lm_residuals import Grid, Problem, residual_terms
-from nbtrack.beyond.lm_solver import (
-    PRIOR_WEIGHT,
-    normal_equations,
-    point_costs,
-    robust_cost,
-    robust_scales,
-    try_step,
-)
+from nbtrack.beyond import lm_solver
+from nbtrack.beyond.lm_residuals import Grid, Problem, Stage, residual_terms
 from nbtrack.beyond.observed import Observed
 from nbtrack.beyond.verdict import MAD_FACTOR, SIGMAS, std_when_moved
 from nbtrack.core.arrays import Pose
@@ -28,14 +19,6 @@ _DAMPING_DOWN = 0.2
 _MAX_STEPS = 60  # of a stage
 # The coarse stage may lead away from a good start: the better of both goes on, at these scales.
 NEAR_SCALES = np.array([0.02, 0.05])
-
-
-class Stage(NamedTuple):
-    """Which residuals count in a part of a search, and when it ends."""
-
-    is_fine: bool  # all points, both residuals and confidence; else some points' distances, normals
-    mad_factor: float  # medians of |r| in a robust scale
-    min_step: float  # rad and m: a shorter twist ends the stage
 
 
 # From afar distances say where the camera is; intensities mislead: their basin is as wide as the
@@ -57,16 +40,15 @@ class LmOptimizer:
         self, grid: Grid, some: Observed, all: Observed, lambda_intensity: float, T_start: Pose
     ) -> None:
         """Begin with some points, for the coarse stage, and all, for the fine one."""
-        self.lambda_intensity = lambda_intensity
         self.T_world_camera = T_start
         self.last_step = np.inf  # rad or m, whichever is more
-        self.fine_problem = Problem(all, grid, True, lambda_intensity, T_start)
-        self._begin(COARSE, Problem(some, grid, False, 0.0, T_start))
+        self.fine_problem = Problem(all, grid, FINE, lambda_intensity, T_start)
+        self._begin(Problem(some, grid, COARSE, 0.0, T_start))
         self._start_cost = self.cost(NEAR_SCALES)
 
     def step(self) -> float:
         """One step, taken or refused; returns the robust cost before it."""
-        step = try_step(
+        step = lm_solver.try_step(
             self.problem, self.T_world_camera, self.terms, self.scales, self.damping, self.twist
         )
         self.T_world_camera, self.terms, self.twist = step.T_world_camera, step.terms, step.twist
@@ -76,7 +58,7 @@ class LmOptimizer:
             self.damping = max(self.damping * _DAMPING_DOWN, _MIN_DAMPING)
         else:
             self.damping *= _DAMPING_UP
-        self.is_ended = step.length < self.stage.min_step or self.damping > _MAX_DAMPING
+        self.is_ended = step.length < self.problem.stage.min_step or self.damping > _MAX_DAMPING
         return step.cost_before
 
     def run_stage(self, max_steps: int = _MAX_STEPS) -> None:
@@ -90,27 +72,27 @@ class LmOptimizer:
         """Go on with all points from where the coarse stage ended, or from the start if better."""
         if self.cost(NEAR_SCALES) > self._start_cost:
             self.T_world_camera = self.problem.T_start
-        self._begin(FINE, self.fine_problem)
+        self._begin(self.fine_problem)
 
     def run(self) -> None:
         """The rest of the search."""
         self.run_stage()
-        if self.stage is COARSE:
+        if not self.problem.stage.is_fine:
             self.refine()
             self.run_stage()
 
     @property
     def is_finished(self) -> bool:
         """Whether further steps would change nothing."""
-        return self.is_ended and self.stage is FINE
+        return self.is_ended and self.problem.stage.is_fine
 
     def cost(self, scales: Float[np.ndarray, "2"]) -> float:
         """The robust cost of both residuals at given scales, by which searches are compared.
 
         Intensities have the weight of the fine stage, in the coarse one too.
         """
-        residuals, reliability = self.terms.residuals, self.terms.reliability
-        return robust_cost(residuals, reliability, scales, self.lambda_intensity)
+        weight = self.fine_problem.lambda_intensity
+        return lm_solver.robust_cost(self.terms.residuals, self.terms.reliability, scales, weight)
 
     def certainty(self) -> dict[str, float]:
         """The share of points that fit, and how well the curvature of their cost holds the pose.
@@ -127,14 +109,14 @@ class LmOptimizer:
         distance, intensity = self.terms.residuals
         reliability = self.terms.reliability
         # A picture that is darker as a whole says nothing against a pose.
-        off = np.abs(intensity - _median(intensity)) * (self.lambda_intensity > 0)
-        is_inlier = (np.abs(distance) < self.problem.grid.inlier_distance) & (reliability > 0)
-        is_inlier &= off < _INLIER_INTENSITY
+        off = np.abs(intensity - _median(intensity)) * (self.fine_problem.lambda_intensity > 0)
+        is_near = np.abs(distance) < self.problem.grid.accuracy.inlier_distance
+        is_inlier = is_near & (reliability > 0) & (off < _INLIER_INTENSITY)
         known_ratio = float(reliability.mean())
         fitting = float((reliability * is_inlier).mean())
-        H, _ = normal_equations(self.terms, self.scales, self.problem.lambda_intensity)
+        H, _ = lm_solver.normal_equations(self.terms, self.scales, self.problem.lambda_intensity)
         values = np.linalg.eigvalsh(H)
-        covariance = np.linalg.inv(H + PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2  # rad, m
+        covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2  # rad, m
         blocks = np.stack([covariance[:3, :3], covariance[3:, 3:]])
         rotation, position = np.linalg.eigvalsh(blocks)[:, -1] ** 0.5
         position = max(position, std_when_moved(self._costs_at, self.T_world_camera, covariance))
@@ -150,10 +132,9 @@ class LmOptimizer:
 
     def _costs_at(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
         terms = residual_terms(self.problem, T_world_camera)
-        return point_costs(terms, self.scales, self.problem.lambda_intensity)
+        return lm_solver.point_costs(terms, self.scales, self.problem.lambda_intensity)
 
-    def _begin(self, stage: Stage, problem: Problem) -> None:
-        self.stage = stage
+    def _begin(self, problem: Problem) -> None:
         self.problem = problem
         self.damping = _FIRST_DAMPING
         self.is_ended = False
@@ -163,8 +144,8 @@ class LmOptimizer:
         self._narrow()
 
     def _narrow(self) -> None:
-        sigma = self.problem.grid.residual_sigma
-        self.scales = robust_scales(self.terms.residuals, self.scales, sigma, self.stage.mad_factor)
+        sigma, factor = self.problem.grid.accuracy.residual_sigma, self.problem.stage.mad_factor
+        self.scales = lm_solver.robust_scales(self.terms.residuals, self.scales, sigma, factor)
 
 
 def _median(values: Float[np.ndarray, "n"]) -> float:

@@ -29,7 +29,7 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 import torch
 
-from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.grid import Accuracy, BakedField
 from nbtrack.beyond.observed import LUMA, Observed, compiled
 from nbtrack.core.arrays import Pose
 
@@ -50,8 +50,15 @@ class Grid(NamedTuple):
     voxel: float
     usable_low: np.ndarray  # 3, corners of the box whose points are usable
     usable_high: np.ndarray
-    residual_sigma: np.ndarray  # 2, of distance and intensity
-    inlier_distance: float
+    accuracy: Accuracy
+
+
+class Stage(NamedTuple):
+    """Which residuals count in a part of a search, and when it ends."""
+
+    is_fine: bool  # all points, both residuals and confidence; else some points' distances, normals
+    mad_factor: float  # medians of |r| in a robust scale
+    min_step: float  # rad and m: a shorter twist ends the stage
 
 
 class Problem(NamedTuple):
@@ -59,7 +66,7 @@ class Problem(NamedTuple):
 
     observed: Observed
     grid: Grid
-    is_fine: bool  # whether confidences count
+    stage: Stage
     lambda_intensity: float
     T_start: Pose
 
@@ -84,8 +91,7 @@ def grid_of(field: BakedField) -> Grid:
         voxel=field.voxel,
         usable_low=np.array(field.bounds.minimum) - MARGIN,
         usable_high=np.array(field.bounds.maximum) + MARGIN,
-        residual_sigma=np.array(field.residual_sigma),
-        inlier_distance=field.inlier_distance,
+        accuracy=field.accuracy,
     )
 
 
@@ -105,7 +111,7 @@ def residual_terms(problem, T):
     step_x, step_y = np.uintp(grid.n_vertices[1] * grid.n_vertices[2]), np.uintp(grid.n_vertices[2])
     for i in range(n_points):
         v, x, y, z = np.uintp(cells[i]), in_cell[0, i], in_cell[1, i], in_cell[2, i]
-        for k in range(3 if problem.is_fine else 2):
+        for k in range(3 if problem.stage.is_fine else 2):
             # Eight corners of the cell: a, b are neighbours along z, ab and cd along y, the rest
             # along x.
             a, b = vertices[v, k], vertices[v + one, k]

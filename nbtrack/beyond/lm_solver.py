@@ -172,7 +172,7 @@ def try_step(problem, T, terms, scales, damping, last_twist):
         T_after = retract(T, factor * twist)
         after = residual_terms(problem, T_after)
         reliability = after.reliability
-        if problem.is_fine:
+        if problem.stage.is_fine:
             reliability = np.where(reliability > 0, terms.reliability, _ZERO)
         cost = robust_cost(after.residuals, reliability, scales, problem.lambda_intensity)
         if cost < before:

@@ -1,7 +1,7 @@
 """Points: the measured pixels of posed frames, averaged by voxel, for classical registration."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -127,11 +127,17 @@ def cells_of(
     return np.ravel_multi_index(tuple(cells[inside].T), tuple(shape)), inside
 
 
-def depth_behind(frame: Frame, points_world: Points) -> Values:
-    """How far (z-depth, m) points (m) lie behind what a posed frame measured in their direction.
+def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frames) -> Values:
+    """How far (z-depth, m) points (m) lie at least behind what frames measured in their direction.
 
-    Negative in front of it; infinite out of view and where nothing was measured.
+    Negative in front of it; infinite out of view and where nothing was measured. Every fifth of the
+    frames is asked: neighbours see the same.
     """
+    asked = frames[::_ASKED_EVERY].tolist()
+    return reduce(torch.minimum, (_depth_behind(sequence[i], points_world) for i in asked))
+
+
+def _depth_behind(frame: Frame, points_world: Points) -> Values:
     T_world_camera = torch.from_numpy(frame.T_world_camera).to(points_world)
     points_camera = (points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     columns, rows, depth = project(frame.camera, points_camera)
@@ -142,11 +148,3 @@ def depth_behind(frame: Frame, points_world: Points) -> Values:
     behind = torch.full_like(depth, torch.inf)
     behind[inside] = torch.where(measured > 0, depth[inside] - measured, torch.inf)
     return behind
-
-
-def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frames) -> Values:
-    """The minimum of `depth_behind` over every fifth of the frames: neighbours see the same."""
-    minimum = torch.full_like(points_world[:, 0], torch.inf)
-    for index in frames[::_ASKED_EVERY].tolist():
-        minimum = torch.minimum(minimum, depth_behind(sequence[index], points_world))
-    return minimum

@@ -5,6 +5,8 @@ Source: the small blurry images of PTAM (Klein and Murray 2008); views spread by
 direction, and depth in them, as in Glocker et al. 2015. Sizes, weights and numbers: our choice.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -29,6 +31,13 @@ _DEPTH_WEIGHT = 2.0  # of the depths' unlikeness against the luma's
 _MIN_OVERLAP = 30  # cells with both depths; below, they say nothing
 View = UInt8[Tensor, "2 15 20"]
 Views = UInt8[Tensor, "n 2 15 20"]
+
+
+class Viewpoints(NamedTuple):
+    """Some of the poses that a map was made from, and what the camera saw from them."""
+
+    T_world_camera: Poses
+    views: Views
 
 
 def view_of(frame: Frame) -> View:
@@ -66,18 +75,18 @@ def spread_out(T_world_camera: Poses) -> Int[np.ndarray, "_"]:
     return np.array(chosen)
 
 
-def retrieve(view: View, views: Views, T_world_camera: Poses, n: int) -> Poses:
+def retrieve(view: View, viewpoints: Viewpoints, n: int) -> Poses:
     """Where a camera may be that saw a view: the poses of the `n` views most like it, in order.
 
     Each is turned about the camera's x and y as it fits best.
     """
     turns = [(down, across) for across in _TURNS_ACROSS for down in _TURNS_DOWN]
-    here, there = view.float(), views.float()
+    here, there = view.float(), viewpoints.views.float()
     unlikeness = [_unlikeness(_moved(here, *t), _moved(there, -t[0], -t[1])) for t in turns]
     minimum, best = torch.stack(unlikeness).min(dim=0)
     order = minimum.argsort()[:n].numpy()
     rotations = _STEP * np.array([[down, -across, 0.0] for down, across in turns])
-    poses = T_world_camera[order].copy()
+    poses = viewpoints.T_world_camera[order]
     poses[:, :3, :3] @= Rotation.from_rotvec(rotations[best[order].numpy()]).as_matrix()
     return poses
 

@@ -90,9 +90,9 @@ def query_field(
 def seen_by(
     points_world: WorldPoints, sequence: RgbdSequence, frames: Frames | None = None
 ) -> Bool[np.ndarray, "n"]:
-    """Whether a point (m) lies in some frame's view and not behind what that frame measured.
+    """Whether points (m) lie in view of given frames, by default all, before what was measured.
 
-    Of the given frames, by default all, every fifth is asked: neighbours see the same.
+    See `min_depth_behind`.
     """
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32))
     frames = np.arange(len(sequence)) if frames is None else frames
