@@ -105,16 +105,6 @@ def test_retract_turns_about_the_camera_and_is_finite_at_zero() -> None:
     np.testing.assert_allclose(turned[:3, 0], [-POSE[1, 0], POSE[0, 0], POSE[2, 0]], atol=1e-12)
 
 
-def test_a_single_plane_leaves_three_directions_open() -> None:
-    """Catches a covariance or condition that hides a slide along the only wall in view."""
-    seen = Observed(0.6 * POINTS, LUMAS, NONE)
-    wall = grid_of(BakedField(Formula(lambda p: 0.5 - p[:, 2], BOX), 0.1))
-    found = LmOptimizer(wall, seen, seen, 0.0, POSE).certainty()
-    assert found["condition_number"] > 1e6
-    # Along the wall the position is as uncertain as the prior allows.
-    assert found["position_std_m"] == pytest.approx(0.5 / (3 * 0.6745), rel=0.01)
-
-
 def rippled(surface, amplitude: float) -> Grid:
     """Surfaces by their distance, with a colour that ripples by noise, as a learned one does."""
     field = BakedField(Formula(surface, BOX, lambda p: 0.5 + 0 * p), 0.05)

@@ -17,4 +17,4 @@ for kind in (NeuSPlusField, GridPlusField, VolSdfField, OccupancyField, PointClo
     FIELDS[kind.name] = kind
 for tracker in (LmTracker, IcpTracker):
     TRACKERS[tracker.name] = tracker
-FORMS[CorrectedField.form] = CorrectedField
+FORMS["corrected"] = CorrectedField

@@ -64,8 +64,6 @@ class CorrectedField(BakedField):
     residuals.
     """
 
-    form = "corrected"
-
     def __init__(self, source: Field, voxel: float) -> None:
         """Sample a field as `BakedField` does; `add` then corrects it."""
         super().__init__(source, voxel)
@@ -73,10 +71,10 @@ class CorrectedField(BakedField):
         self.label = f"{source.label} corrected"
         self.source = source
 
-    def add(self, correction: dict[str, Tensor]) -> None:
+    def add(self, *correction: Tensor) -> None:
         """Add to what the field gives at vertices; the correction's tensors are `CORRECTIONS`."""
-        for name in CORRECTIONS:
-            self.register_buffer(name, correction[name])
+        for name, tensor in zip(CORRECTIONS, correction, strict=True):
+            self.register_buffer(name, tensor)
         medians = self.residual_medians.double().numpy()
         sigma = tuple(np.maximum(_MEDIANS * medians, _MIN_SCALES).tolist())
         self.accuracy = Accuracy(sigma, _INLIER_DISTANCE, float(medians[1]))
@@ -101,7 +99,7 @@ class CorrectedField(BakedField):
         source = {n.removeprefix(_SOURCE): x for n, x in state.items() if n.startswith(_SOURCE)}
         mapped = field_class(made["field"]).from_state(source, made, bounds)
         field = cls(mapped, float(made["correction"]))
-        field.add({name: state[name] for name in CORRECTIONS})
+        field.add(*(state[name] for name in CORRECTIONS))
         return field
 
 
@@ -132,7 +130,7 @@ def corrected(
     around; see `solve`. Raises DataError where no frame shows a plane.
     """
     field = CorrectedField(copy.deepcopy(source).cpu(), voxel)
-    points, normals, depth, color = _enough_planes(sequence, frames, field)
+    points, normals, depth, color = _measured_planes(sequence, frames, field)
     asked = np.concatenate([points + offset * normals for offset in _OFFSETS])
     numbers, matrix = corrected_vertices(*interpolation(asked, field), field.n_vertices)
     regularisation = regularisation_of(numbers, field.n_vertices)
@@ -157,8 +155,7 @@ def corrected(
     medians = [float(np.median(np.abs(residual))) for residual in (left, left_luma)]
     corrections = torch.from_numpy(np.column_stack([colors, distance, confidence])).float().half()
     cameras, views = _views(sequence, frames)
-    kept = torch.from_numpy(numbers).int(), corrections, cameras, views, torch.tensor(medians)
-    field.add(dict(zip(CORRECTIONS, kept, strict=True)))
+    field.add(torch.from_numpy(numbers).int(), corrections, cameras, views, torch.tensor(medians))
     return field
 
 
@@ -169,27 +166,17 @@ def _views(sequence: RgbdSequence, frames: Frames) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(sequence.T_world_camera[kept]).float(), views
 
 
-def _enough_planes(
-    sequence: RgbdSequence, frames: Frames, grid: BakedField
-) -> tuple[np.ndarray, ...]:
-    """`_measured_planes`, as many as the cells that they lie in ask for."""
-    planes = _measured_planes(sequence, frames, grid, _N_POINTS)
-    n_cells = len(np.unique(interpolation(planes[0], grid)[0][:, 0]))
-    times = min(_POINTS_A_CELL * n_cells / len(planes[0]), _MAX_TIMES)
-    if times <= 1:
-        return planes
-    return _measured_planes(sequence, frames, grid, round(times * _N_POINTS))
-
-
 def _measured_planes(
-    sequence: RgbdSequence, frames: Frames, grid: BakedField, n_points: int
+    sequence: RgbdSequence, frames: Frames, grid: BakedField, times: float = 1.0
 ) -> tuple[np.ndarray, ...]:
     """Random measured points (n x 3, m) with normals, their z-depths (n, m) and colours (n x 3).
 
-    Neighbours come one after another: their vertices are then still in the processor's cache.
+    They are `_N_POINTS`, or so many times more as the cells that they lie in ask for. Neighbours
+    come one after another: their vertices are then still in the processor's cache.
     """
     sampler = PixelSampler(sequence, torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
+    n_points = round(times * _N_POINTS)
     rays = sampler.draw(n_points, generator, torch.from_numpy(frames), tangent_planes=True)
     has_plane = rays.normals_world.any(dim=-1)
     if not has_plane.any():
@@ -197,5 +184,9 @@ def _measured_planes(
     points = rays.points(rays.depth[:, None])[:, 0]
     parts = points, rays.normals_world, rays.depth, rays.color
     parts = [part[has_plane].double().numpy() for part in parts]
-    order = np.argsort(interpolation(parts[0], grid)[0][:, 0], kind="stable")
+    cells = interpolation(parts[0], grid)[0][:, 0]
+    wanted = min(_POINTS_A_CELL * len(np.unique(cells)) / len(cells), _MAX_TIMES)
+    if times == 1.0 < wanted:
+        return _measured_planes(sequence, frames, grid, wanted)
+    order = np.argsort(cells, kind="stable")
     return tuple(part[order] for part in parts)

@@ -122,15 +122,14 @@ class LmTracker(Tracker):
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
         R = starts[:, :3, :3]
         R[:] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
+        # Poses that a right one is near: after a lost frame the last good one, if there was any.
+        self.trusted = starts[len(T_starts) :] if self.was_lost else starts
         self.T_start, self.best, self.search = starts[0], None, iter(())
         observed = draw_points(frame, self.settings.n_pixels, self.generator)
         n_points = len(observed.points)
         self.is_converged = n_points < _MIN_POINTS
         if self.is_converged:
             return
-        # Poses that a right one is near: after a lost frame the last good one, if there was any.
-        n_good = int(self.last_good is not None)
-        self.trusted = starts[len(starts) - n_good :] if self.was_lost else starts
         some = with_normals(frame, observed, max(_MIN_COARSE, n_points // _COARSE_SHARE))
         has_contrast = observed.intensity.std() > _MIN_CONTRAST  # else the picture says nothing
         self.weight = self.settings.lambda_intensity if has_contrast else 0.0

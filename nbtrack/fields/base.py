@@ -62,7 +62,6 @@ class Field(nn.Module, abc.ABC):
     value_label: str = "signed distance (m)"  # on axes
     surface_level: float  # the value whose isosurface is drawn as the scene's surface
     Settings: type = MappingSettings  # of mapping
-    form: str = ""  # what a finished map was made of the field as mapped, by its name in map files
 
     def __init__(self, bounds: SceneBounds) -> None:
         super().__init__()

@@ -29,7 +29,7 @@ CHECKPOINT_FILE = "mapping.pt"  # of a map in the making
 _FORMAT = "nbtrack map"
 _VERSION = 4
 FORMS: dict[str, type[Field]] = {}
-"""What may be made of a finished map's field, by name; see `Field.form`."""
+"""What may be made of a finished map's field, by its name in map files."""
 _AGAIN = "map again, and give the folder or its map.safetensors; an earlier nbtrack's are none"
 
 
@@ -49,7 +49,7 @@ class Map:
     def key(self) -> str:
         """Twelve hexadecimal digits that change with the field, its bounds and its weights."""
         field, network = self.field, self.record["network"]
-        plain = [field.name, field.form, network, asdict(field.bounds)]
+        plain = [field.name, _form_of(field), network, asdict(field.bounds)]
         return _digest(plain, _tensors(field))[:12]
 
 
@@ -64,7 +64,7 @@ def write_map(path: Path, finished: Map) -> None:
     header = {
         "format_version": _VERSION,
         "field": finished.field.name,
-        "form": finished.field.form,
+        "form": _form_of(finished.field),
         "bounds": [list(bounds.minimum), list(bounds.maximum)],
         "declared_unit": bounds.declared_unit,
         "camera": asdict(finished.camera),
@@ -144,6 +144,11 @@ def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise ValueError(f"{name} is not finite")
+
+
+def _form_of(mapped: Field) -> str:
+    """The name of what was made of the field as mapped, in `FORMS`; empty for that field itself."""
+    return next((name for name, kind in FORMS.items() if isinstance(mapped, kind)), "")
 
 
 def _tensors(mapped: Field) -> dict[str, Tensor]:
