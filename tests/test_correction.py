@@ -223,9 +223,8 @@ def test_the_minimum_scales_follow_the_sensor(
 ) -> None:
     """Catches a tracker that takes a noisy camera's residuals for outliers, or a good one's for
     noise: 5.5 medians of normal noise are 3.7 of its standard deviations."""
-    assert found.accuracy.residual_sigma == pytest.approx(
-        (0.01, 0.05)
-    )  # nearly exact: no less than these
+    # What is nearly exact has the least scales.
+    assert found.accuracy.residual_sigma == pytest.approx((0.01, 0.05))
     noise = np.random.default_rng(0).normal(scale=6.0, size=sequence.depths_mm.shape)
     noisy = replace(sequence, depths_mm=(sequence.depths_mm + noise).astype(np.uint16))
     field = corrected(found.source, noisy, np.arange(12), VOXEL)

@@ -14,6 +14,7 @@ from nbtrack.beyond.views import Viewpoints, view_of
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
+from nbtrack.fields import Field
 from nbtrack.tracking import StepBudget
 from nbtrack.tracking.metrics import pose_errors
 
@@ -24,8 +25,15 @@ BLENDED = FRAME.color // 4 * 3 + FRAME.color.flip(1) // 4
 FAR = np.array([0.0, 1.2, 0.5, 0.3, 0.2, 0.5])  # rad, m: a start that leads nowhere
 
 
-def begun(**settings: float) -> LmTracker:
-    return LmTracker(ROOM, T_TRUE, StepBudget(1), LmSettings(**settings))
+def begun(field: Field = ROOM, **settings: float) -> LmTracker:
+    return LmTracker(field, T_TRUE, StepBudget(1), LmSettings(**settings))
+
+
+def mapped_from(T_world_camera: np.ndarray) -> BakedField:
+    """The room as a map that was made from one pose."""
+    field = BakedField(narrow_room(), 0.04)
+    field.viewpoints = Viewpoints(T_world_camera[None], view_of(FRAME)[None])
+    return field
 
 
 def run(tracker: LmTracker, T_start: np.ndarray, steps: int, frame: Frame = FRAME) -> bool:
@@ -60,16 +68,13 @@ def test_every_start_in_the_basin_reaches_the_true_pose(seed: int) -> None:
 def test_without_colour_no_picture_counts(twist: np.ndarray) -> None:
     """Catches intensities that choose between starts, stages or restarts, or that make a verdict,
     where their weight is 0: of an inverted and a dark picture everything must be the same."""
-    pictures = [FRAME.color, 255 - FRAME.color, FRAME.color // 50]
-    told = []
-    for color in pictures:
-        tracker = begun(lambda_intensity=0.0)
-        assert not run(tracker, T_TRUE, 20, replace(FRAME, color=color))
-        run(tracker, retract(T_TRUE, twist), 200, replace(FRAME, color=color))
-        told.append(
-            (tracker.T_world_camera.tolist(), tracker.best.cost(np.ones(2)), tracker.report())
-        )
-    assert told[0] == told[1] == told[2]
+    results = []
+    for color in (FRAME.color, 255 - FRAME.color, FRAME.color // 50):
+        tracker, frame = begun(lambda_intensity=0.0), replace(FRAME, color=color)
+        assert not run(tracker, T_TRUE, 20, frame)
+        run(tracker, retract(T_TRUE, twist), 200, frame)
+        results.append((tracker.T_world_camera.tolist(), tracker.report()))
+    assert results[0] == results[1] == results[2]
 
 
 def test_in_a_corridor_the_axis_is_flagged_and_the_pose_stays() -> None:
@@ -77,7 +82,7 @@ def test_in_a_corridor_the_axis_is_flagged_and_the_pose_stays() -> None:
     corridor = BoxRoom(half=(1.0, 1.0, 50.0), contrast=0.0)
     sequence = box_sequence([[0.0, 0.0, 0.0]], corridor, 72)
     sequence.depths_mm[sequence.depths_mm > 5000] = 0  # the open end is not measured
-    tracker = LmTracker(corridor, np.eye(4), StepBudget(1))
+    tracker = begun(corridor)
     offset = np.array([0.02, 0.0, 0.03, 0.03, -0.02, 0.05])
     assert run(tracker, retract(T_TRUE, offset), 40, sequence[0])
     position = tracker.T_world_camera[:3, 3]
@@ -111,9 +116,7 @@ def test_a_restart_forgets_the_past() -> None:
 
 def test_without_restarts_no_hypotheses_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a thousand poses that are compared and dropped in every lost frame."""
-    known = BakedField(narrow_room(), 0.04)
-    known.viewpoints = Viewpoints(T_TRUE[None], view_of(FRAME)[None])
-    tracker = LmTracker(known, T_TRUE, StepBudget(1), LmSettings(n_restarts=0))
+    tracker = begun(mapped_from(T_TRUE), n_restarts=0)
     monkeypatch.setattr(tracker, "_other_starts", lambda *_: pytest.fail("evaluated"))
     assert run(tracker, retract(T_TRUE, FAR), 200)
     assert tracker.is_converged
@@ -122,11 +125,11 @@ def test_without_restarts_no_hypotheses_are_evaluated(monkeypatch: pytest.Monkey
 def test_a_field_is_asked_on_a_grid_of_the_voxel_that_is_set() -> None:
     """Catches a setting without effect, and a grid, perhaps corrected, that is sampled again."""
     assert begun().field is ROOM
-    tracker = LmTracker(narrow_room(), T_TRUE, StepBudget(1), LmSettings(voxel=0.1))
+    tracker = begun(narrow_room(), voxel=0.1)
     assert isinstance(tracker.field, BakedField)
     assert tracker.field.voxel == 0.1
     with pytest.raises(ConfigError, match=r"^voxel is 0.0 m, .* set voxel=.* or more"):
-        LmTracker(narrow_room(), T_TRUE, StepBudget(1), LmSettings(voxel=0.0))
+        begun(narrow_room(), voxel=0.0)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 5), (3, 2)])
@@ -174,10 +177,7 @@ def test_intensities_speak_against_a_pose_by_what_is_usual(monkeypatch: pytest.M
 
 def test_a_lost_camera_is_looked_for_at_its_last_good_pose_too() -> None:
     """Catches a camera that stood still, lost for good: hypotheses lie near mapped poses alone."""
-    known = BakedField(narrow_room(), 0.04)
-    T_far = retract(T_TRUE, np.array([0, 0, 0, 5.0, 5, 5]))
-    known.viewpoints = Viewpoints(T_far[None], view_of(FRAME)[None])
-    tracker = LmTracker(known, T_TRUE, StepBudget(1), LmSettings())
+    tracker = begun(mapped_from(retract(T_TRUE, np.array([0, 0, 0, 5.0, 5, 5]))))
     assert not run(tracker, T_TRUE, 20)
     assert not run(tracker, retract(T_TRUE, FAR), 60)
     assert errors(tracker)[0] < 0.01
@@ -185,8 +185,7 @@ def test_a_lost_camera_is_looked_for_at_its_last_good_pose_too() -> None:
 
 def test_poses_keep_their_digits() -> None:
     """Catches double poses that pass through single precision at every frame."""
-    T_start = np.eye(4)
-    T_start[:3, 3] = [1 / 3, 1 / 7, -1 / 9]
+    T_start = retract(T_TRUE, np.array([0, 0, 0, 1 / 3, 1 / 7, -1 / 9]))
     tracker = LmTracker(ROOM, T_start, StepBudget(1))
     blank = replace(FRAME, depth_mm=0 * FRAME.depth_mm)  # where nothing is seen the start stays
     np.testing.assert_allclose(tracker.track(blank).T_world_camera, T_start, rtol=0, atol=1e-15)
