@@ -12,7 +12,6 @@ from nbtrack.beyond.grid import Accuracy, BakedField
 from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.views import Viewpoints, view_of
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
 from nbtrack.tracking import StepBudget
@@ -128,8 +127,6 @@ def test_a_field_is_asked_on_a_grid_of_the_voxel_that_is_set() -> None:
     tracker = begun(narrow_room(), voxel=0.1)
     assert isinstance(tracker.field, BakedField)
     assert tracker.field.voxel == 0.1
-    with pytest.raises(ConfigError, match=r"^voxel is 0.0 m, .* set voxel=.* or more"):
-        begun(narrow_room(), voxel=0.0)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 5), (3, 2)])

@@ -1,17 +1,24 @@
-"""Direct supervision of the signed distance: its targets, and the field that they teach."""
+"""Direct supervision of the signed distance: its targets, and the fields that they teach."""
+
+from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from box_room import sequence_of
 
 from nbtrack.beyond import NeusPlusMapping
+from nbtrack.beyond.feature_grid import FeatureGrid, GridNetwork, GridPlusMapping
 from nbtrack.beyond.neus_plus import ObservedDistance, distance_targets
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
+from nbtrack.core.errors import ConfigError
 from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
+from nbtrack.experiments.presets import load_preset
 from nbtrack.fields import NetworkSettings
 from nbtrack.fields.neus import guided_depths
+from nbtrack.mapping.files import read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
 
@@ -99,15 +106,40 @@ def test_targets_in_a_furnished_room() -> None:
     assert error[true_sdf[known > 0].abs() < 0.1].abs().mean() < 0.007
 
 
-def test_distances_are_learned_sooner_than_by_rendering_alone() -> None:
-    """Catches supervision that is not wired in: after a few steps it must be nearer the truth."""
-    settings = NeusPlusMapping(
-        25, n_rays=32, n_stratified=8, n_surface=8, learning_rate=3e-3, n_surface_points=64
-    )
-    depth, errors = torch.linspace(0.5, 2.1, 17), []
+def test_distances_are_learned_sooner_than_by_rendering_alone(tmp_path: Path) -> None:
+    """Catches supervision that is not wired in: after a few steps it must be nearer the truth; and
+    a file that does not keep grids of features."""
+    few = {"iterations": 25, "n_rays": 32, "n_stratified": 8, "n_surface": 8}
+    few |= {"n_surface_points": 64}
+    settings = NeusPlusMapping(**few, learning_rate=3e-3)
+    network = NetworkSettings(width=32, n_frequencies=32)
+    kinds = {"neus": (network, settings), "neus_plus": (network, settings)}
+    kinds["grid_plus"] = GridNetwork(), GridPlusMapping(**few)
+    depth, errors = torch.linspace(0.5, 2.1, 17), {}
     points = torch.stack([torch.zeros(17), torch.zeros(17), depth], dim=-1)
-    for name in ("neus", "neus_plus"):
-        network = NetworkSettings(width=32, n_frequencies=32)
-        field = map_sequence(name, slanted_wall(4), network, settings).field
-        errors.append((field(points)[1] - (2 - depth) / 2**0.5).abs().mean().item())
-    assert errors[1] < 0.5 * errors[0]
+    for name, how in kinds.items():
+        made = map_sequence(name, slanted_wall(4), *how)
+        found = made.field(points)[1]
+        errors[name] = (found - (2 - depth) / 2**0.5).abs().mean().item()
+    assert max(errors["neus_plus"], errors["grid_plus"]) < 0.5 * errors["neus"]
+    write_map(tmp_path / "map.safetensors", made)
+    assert torch.equal(read_map(tmp_path).field(points)[1], found)
+
+
+def test_features_by_hand() -> None:
+    """Catches a level that is left out or read in another's cells: at a vertex of the coarsest one
+    the features are its own, and those of the vertices of the finer ones that lie there."""
+    box = SceneBounds((-1.0, -0.5, 0.0), (1.0, 0.5, 3.0))
+    grid = FeatureGrid(GridNetwork(finest=0.1, levels=3), box, torch.Generator().manual_seed(0))
+    vertex = torch.tensor([[-1.0 + 0.4, -0.5 + 0.8, 1.2]])  # number 1, 2, 3 of the coarsest
+    levels = zip(grid.volumes, (4, 2, 1), strict=True)
+    expected = [volume[:, k, 2 * k, 3 * k] for volume, k in levels]
+    normalized = (vertex[0] - grid.low) / box.metres_per_unit - 1
+    hidden = torch.nn.functional.silu(grid.layer(torch.cat([*expected, normalized])))
+    torch.testing.assert_close(grid.features(vertex)[0], hidden)
+
+
+def test_the_eikonal_term_of_grids_is_refused() -> None:
+    """Catches a setting that ends in the middle of mapping: grids have no second derivative."""
+    with pytest.raises(ConfigError, match="lambda_eikonal"):
+        load_preset(settings=["mapping.grid_plus.lambda_eikonal=0.1"])
