@@ -325,7 +325,7 @@ def test_a_movie_shows_every_frame(sequence) -> None:
     wall.visual.vertex_colors = (200, 0, 0, 255)
     frames = FRAMES.iloc[:2].assign(frame_id=[3, 8], translation_error_m=[0.01, np.nan])
     poses = np.stack([np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])])  # ahead, and turned about y
-    seen = [view_of(wall, sequence.intrinsics, pose, 16) for pose in poses]
+    seen = [view_of(wall, sequence.intrinsics, pose) for pose in poses]
     assert (seen[0] == (200, 0, 0)).all()
     assert (seen[1] == 255).all()
     pictures = plots.movie_pictures(wall, sequence, frames, poses, "A wall")

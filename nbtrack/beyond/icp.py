@@ -20,7 +20,8 @@ from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 # How far from the map a point may be to have a partner there, m: first wide, to get home from
 # where the motion model errs, then so narrow that what was not mapped pulls no more.
-_MAX_CORRESPONDENCE_DISTANCES = (0.3, 0.1)
+_WIDE = 0.3
+_NARROW = 0.1
 _FAR_APART = 0.06  # m, rad; starts that differ by less are taken for one, as by LM
 _EDGE_JUMP = np.inf  # points at depth edges are taken too (docs/tried.md)
 _SOURCE_VOXEL = 0.01  # m: points that are closer count once
@@ -71,8 +72,8 @@ class IcpTracker(Tracker):
         self.small_gicp = importlib.import_module(self.package)
         field = deepcopy(field).cpu()
         points = field.points.double().numpy()
-        self.low = points.min(axis=0) - _MAX_CORRESPONDENCE_DISTANCES[0]
-        self.high = points.max(axis=0) + _MAX_CORRESPONDENCE_DISTANCES[0]
+        self.low = points.min(axis=0) - _WIDE
+        self.high = points.max(axis=0) + _WIDE
         self.target, self.target_tree = self._with_planes(self.small_gicp.PointCloud(points))
         self.map_points, self.map_normals = points, self.target.normals()[:, :3]
         return field
@@ -107,9 +108,8 @@ class IcpTracker(Tracker):
             return float("nan")  # of points so far away the tree finds no partner, in seconds
         if np.abs(self.T_starts - self.T_starts[0]).max() < _FAR_APART:
             starts = starts[:1]
-        wide, narrow = _MAX_CORRESPONDENCE_DISTANCES
-        found = max((self._align(T, wide) for T in starts), key=lambda result: result.num_inliers)
-        found = self._align(found.T_target_source, narrow) if found.num_inliers else found
+        found = max((self._align(T, _WIDE) for T in starts), key=lambda result: result.num_inliers)
+        found = self._align(found.T_target_source, _NARROW) if found.num_inliers else found
         if not found.num_inliers or not np.isfinite(found.T_target_source).all():
             return float("nan")
         self.T_world_camera = torch.from_numpy(found.T_target_source.copy())
@@ -130,13 +130,11 @@ class IcpTracker(Tracker):
     def _distances(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
         """How far (m) the points lie from their partners' planes; infinite where none is near."""
         points = (self.source.points() @ T_world_camera.T)[:, :3]
-        narrow = _MAX_CORRESPONDENCE_DISTANCES[1]
-        _, partners = self.field.tree.query(points, distance_upper_bound=narrow)
-        has_partner = partners < len(self.map_points)
-        partners = partners[has_partner]
-        offsets = points[has_partner] - self.map_points[partners]
+        _, partners = self.field.tree.query(points, distance_upper_bound=_NARROW)
+        near = partners < len(self.map_points)
+        offsets = points[near] - self.map_points[partners[near]]
         distances = np.full(len(points), np.inf)
-        distances[has_partner] = np.abs((offsets * self.map_normals[partners]).sum(axis=1))
+        distances[near] = np.abs((offsets * self.map_normals[partners[near]]).sum(axis=1))
         return distances
 
     def report(self) -> dict[str, float | bool]:

@@ -177,12 +177,12 @@ class LmTracker(Tracker):
             cost = self.best.step()
             if number == _MAX_FOLLOWING:
                 self.best.run()
-            elif self.best.is_ended and not self.best.is_finished:
-                self.best.refine()
+                break
             if self.best.is_finished:
                 break
-            if number < _MAX_FOLLOWING:
-                yield cost
+            if self.best.is_ended:
+                self.best.refine()
+            yield cost
         max_p_lost, others = _DOUBTFUL, None
         while self.settings.n_restarts and others != [] and self.report()["p_lost"] >= max_p_lost:
             yield cost

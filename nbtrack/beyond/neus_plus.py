@@ -62,15 +62,15 @@ class NeuSPlusField(NeuSField):
         colors, sdf = self.query_along(rays, depths)
         nearest, is_free = self.observed(rays.points(depths))
         target, known = distance_targets(rays, depths, nearest, is_free, settings)
-        lambdas = settings.lambda_color, settings.lambda_depth
-        lambdas = (settings.lambda_rendering * weight for weight in lambdas)
+        lambda_color = settings.lambda_rendering * settings.lambda_color
+        lambda_depth = settings.lambda_rendering * settings.lambda_depth
         rendering = self.composite(colors, sdf, rays, depths)
         # At measured points the distance is zero, and the colour is that of the pixel.
         surface_color, surface_sdf = self(surface.points(surface.depth[:, None])[:, 0])
         measured = (surface.depth > 0).float()
         color_error = (surface_color - surface.color).abs().mean(dim=-1)
         losses = {
-            **rendered_losses(rendering, rays, *lambdas),
+            **rendered_losses(rendering, rays, lambda_color, lambda_depth),
             "sdf": settings.lambda_sdf * measured_mean((sdf - target).abs(), known),
             "surface": settings.lambda_sdf * measured_mean(surface_sdf.abs(), measured),
             "surface_color": settings.lambda_color * measured_mean(color_error, measured),
@@ -95,18 +95,15 @@ def distance_targets(
     Source: distances along the ray as iSDF (Ortiz et al. 2022), nearest points as its "pc" bounds,
     but over all frames rather than one batch; the choice between them is ours.
     """
-    behind = (rays.depth[:, None] - depths).neg()
+    before = rays.depth[:, None] - depths  # z-depth from a sample to the surface; negative behind
     cosine = (rays.normals_world * rays.directions_world).sum(dim=-1).abs()[:, None]
-    plane = -behind * cosine
-    has_depth = rays.depth[:, None] > 0
-    has_plane = cosine > 0
-    is_plane_nearest = has_plane & ((plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
-    in_front = behind < 0
-    just_behind = (behind >= 0) & (plane > -settings.behind_band)
+    plane = before * cosine
+    is_plane_nearest = (cosine > 0) & ((plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
     target = torch.where(is_plane_nearest, plane, nearest)
-    in_front &= is_plane_nearest | (-behind > settings.surface_band)
-    known = has_depth & (in_front | (just_behind & is_plane_nearest & ~is_free))
-    return target, known.float()
+    in_front = (before > 0) & (is_plane_nearest | (before > settings.surface_band))
+    just_behind = (before <= 0) & (plane > -settings.behind_band)
+    known = in_front | (just_behind & is_plane_nearest & ~is_free)
+    return target, (known & (rays.depth[:, None] > 0)).float()
 
 
 class ObservedDistance:

@@ -76,16 +76,14 @@ def movie_bytes(pictures: Iterator[Image.Image]) -> bytes:
     return content.getvalue()
 
 
-def view_of(
-    surface: Mesh, camera: Intrinsics, T_world_camera: Pose, width: int = _WIDTH
-) -> np.ndarray:
+def view_of(surface: Mesh, camera: Intrinsics, T_world_camera: Pose) -> np.ndarray:
     """The surface (m, world frame) as a camera sees it, (height, width, 3; uint8); white elsewhere.
 
-    The picture's width need not be the camera's. Faces, and squares in place of points, are painted
-    from the farthest to the nearest; those that show their back are left out of no picture, since
-    the fields differ in the side that they call the front.
+    The picture is `_WIDTH` pixels wide. Faces, and squares in place of points, are painted from the
+    farthest to the nearest, also those that show their back: the fields differ in the side that
+    they call the front.
     """
-    scale = width / camera.width
+    scale = _WIDTH / camera.width
     points = (np.asarray(surface.vertices) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     parts = getattr(surface, "faces", np.arange(len(points))[:, None])
     corners = points[parts]  # m, camera frame
