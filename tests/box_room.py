@@ -106,3 +106,18 @@ def walk(n_frames: int, *room_and_height: BoxRoom | int) -> RgbdSequence:
 def narrow_room() -> BoxRoom:
     """One of which the camera sees five walls: they hold its pose without their colours."""
     return BoxRoom(half=(0.6, 0.45, 1.2))
+
+
+PLANES = {  # how far (m) they lie in a direction; and whether they hold a camera without colours
+    "wall": ({(0, 0, 1): 1.5}, False),
+    "floor": ({(0, 1, 0): 1.0}, False),
+    "corridor": ({(1, 0, 0): 0.8, (-1, 0, 0): 0.9, (0, 1, 0): 1.0}, False),
+    "corner": ({(1, 0, 0): 0.8, (0, 1, 0): 1.0, (0, 0, 1): 1.5}, True),
+}
+
+
+def plane_depths(planes: dict[tuple[int, ...], float], rays: np.ndarray) -> np.ndarray:
+    """Z-depths (m) of planes along rays (... x 3, z = 1) from the origin; infinite for none."""
+    closeness = np.max([rays @ normal / far for normal, far in planes.items()], axis=0)
+    with np.errstate(divide="ignore"):
+        return 1 / closeness.clip(0)
