@@ -35,7 +35,9 @@ def plot_slice(
     if it is a synthetic one.
     """
     fields = [fields] if isinstance(fields, Field) else fields
-    norm = None
+    norm, where = None, f"height {height:.2f} m; pale: never seen"
+    if len(fields) > 1:  # once for all, since panels side by side are narrow
+        title = f"{title}, {where}"
     panels = new_axes(title, 5.4 - 0.9 * (len(fields) - 1), 1, len(fields))[0]
     for axes, field in zip(panels, fields, strict=True):
         up, page = scene.draw_from_above(axes, {"camera path": sequence.T_world_camera})
@@ -49,7 +51,7 @@ def plot_slice(
             true = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:2])
             scene.draw_levels(axes, places, true, [0.0], zorder=3, **_TRUE_LINE)
             axes.plot([], [], "--", color=_TRUE_LINE["colors"], label="true surface")
-        axes.set_title(f"{field.label} at height {height:.2f} m; pale: never seen")
+        axes.set_title(field.label if len(fields) > 1 else f"{field.label} at {where}")
     axes.figure.legend_below()
     return axes.figure
 
