@@ -94,6 +94,7 @@ FACTS = {
     "1,200": "frames of a walk, paper_tables/README.md",
     "860": "first frame of a fast part of breakfast_room, benchmarks/evidence.py",
     "06": "a notebook's number",
+    "13": "cm, ATE of the command that A3 ends with",
 }
 NUMBER = r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?![\w.]*\d)"
 
