@@ -196,6 +196,14 @@ def test_slices_side_by_side_share_their_colours(sequence) -> None:
     assert left.figure.get_suptitle() == "two, height 0.00 m; pale: never seen"
 
 
+def test_the_exact_distance_stands_beside_the_map(sequence) -> None:
+    """Catches a room with another sign, frame or scale than its map."""
+    room = SimpleNamespace(sdf=lambda points: 1.5 - np.linalg.norm(points, axis=1))
+    panels = plots.plot_slice(SPHERE, sequence, 0.0, room).axes[:2]
+    mapped, exact = (np.asarray(axes.collections[0].get_array()) for axes in panels)
+    assert exact == pytest.approx(mapped, abs=1e-6)
+
+
 def test_what_was_not_seen_is_pale(sequence) -> None:
     """Catches a veil that is mirrored, shifted, or over what the frames have measured."""
     axes = plots.plot_slice(SPHERE, sequence, 0.0).axes[0]

@@ -51,7 +51,7 @@ def plot_views(
         observed = sequence.color(index)
         rows.append([
             (f"frame {sequence.frame_ids[index]}", observed, ""), ("rendered colour", color, ""),
-            ("depth", depth, DEPTH), ("rendered depth", rendered, DEPTH),
+            ("observed depth", depth, DEPTH), ("rendered depth", rendered, DEPTH),
             ("|error|", 100 * np.abs(rendered - depth), DEPTH_ERROR),
         ])  # fmt: skip
     return _image_grid(title, rows)

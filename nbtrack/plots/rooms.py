@@ -4,10 +4,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
+import torch
 import trimesh
 from matplotlib.figure import Figure
 
-from nbtrack.core.arrays import Poses
+from nbtrack.core.arrays import Colors, Points, Poses, Values
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.plots import scene
@@ -32,9 +33,11 @@ def plot_slice(
 
     Fields of one recording stand side by side, with the colours of the first. Dashed green is the
     true surface. `sequence` are the frames that the maps were made of, `room` is the exact scene,
-    if it is a synthetic one.
+    if it is a synthetic one: its distance stands beside that of a single field.
     """
     fields = [fields] if isinstance(fields, Field) else fields
+    if room is not None and len(fields) == 1 and fields[0].is_distance:
+        fields = [fields[0], _ExactDistance(room, fields[0])]
     norm, where = None, f"height {height:.2f} m; pale: never seen"
     if len(fields) > 1:  # once for all, since panels side by side are narrow
         title = f"{title}, {where}"
@@ -54,6 +57,21 @@ def plot_slice(
         axes.set_title(field.label if len(fields) > 1 else f"{field.label} at {where}")
     axes.figure.legend_below()
     return axes.figure
+
+
+class _ExactDistance(Field):
+    """The distance (m) of a known room, grey, within the bounds of its map."""
+
+    name, label, surface_level = "exact", "Exact distance", 0.0
+
+    def __init__(self, room: Room, mapped: Field) -> None:
+        super().__init__(mapped.bounds)
+        self.room = room
+
+    def forward(self, points_world: Points) -> tuple[Colors, Values]:
+        """Its value is that of the room."""
+        sdf = self.room.sdf(points_world.cpu().numpy().astype(float))
+        return torch.full_like(points_world, 0.5), torch.from_numpy(sdf).float()
 
 
 def _level_grid(

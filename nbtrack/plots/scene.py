@@ -84,7 +84,7 @@ def draw_mesh(axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
 
 def look_through(axes: Axes) -> None:
     """Axes of a parallel projection."""
-    axes.set(aspect="equal", xlabel="across the picture (m)", yticks=[])
+    axes.set(aspect="equal", xlabel="left to right (m)", yticks=[])
     axes.spines["left"].set_visible(False)
     axes.grid(False)
 
@@ -110,8 +110,7 @@ def draw_paths(
     width: float = 1.0,
     aside: np.ndarray | float = 0.0,
 ) -> None:
-    """Trajectories by label on a page, (2, 3), with a dot at the start of each; moved aside (m)."""
-    starts = []
+    """Trajectories by label on a page, (2, 3), with a dot at the first one's start; aside (m)."""
     styles = cycle(("--", "-.", ":"))
     for label, color in method_colors(T_paths).items():
         path = (T_paths[label][:, :3, 3] + aside) @ to_page.T
@@ -119,9 +118,9 @@ def draw_paths(
         dashes, own = ("-", 4.0) if label == "true" else (next(styles), 1.6)
         look = {"linewidth": own * width, "color": color, "label": label, "zorder": 3}
         axes.plot(*path.T, dashes, **look)
-        starts.append(path[0])
+    first = next(iter(T_paths.values()))[0, :3, 3] + aside
     look = {"color": "black", "markersize": 5 * width, "zorder": 4, "label": "start"}
-    axes.plot(*np.transpose(starts), "o", **look)
+    axes.plot(*to_page @ first, "o", **look)
 
 
 def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) -> np.ndarray:
