@@ -21,7 +21,7 @@ from nbtrack.experiments.jobs import run_jobs
 from nbtrack.experiments.map_jobs import OF_MAPS, GivenMap, MapJob, setting_tree
 from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
 from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
-from nbtrack.experiments.runs import METRICS_FILE, read_trajectory
+from nbtrack.experiments.runs import MEANINGS, METRICS_FILE, read_trajectory
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
@@ -33,15 +33,8 @@ from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.recordings.writer import convert_sequence
 from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.methods import METHODS
-from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 from nbtrack.tracking.trajectories import number_lines, read_tum
 
-_MEANINGS = {  # printed in place of names in metrics.json that say too little
-    "lost_frames": f"frames off by more than {LOST_THRESHOLD_M:g} m",
-    "flagged_frames": "frames that the tracker itself calls lost",
-    "frames_without_reference": "frames without a true pose, in no error",
-    "frames_without_depth": "frames without any depth, not searched",
-}
 _FRAMES_APART = 10  # of a mesh: neighbours see the same
 _FRAMES_SHOWN = 20  # of an overview: they tell what was seen
 _CELLS = 120  # across an overview
@@ -174,7 +167,7 @@ def _print_numbers(results: dict[str, Any]) -> None:
     """The numbers among some results, by name; zeros of lost frames alone."""
     for name, value in results.items():
         if isinstance(value, int | float) and (value or name in ("lost_frames", "flagged_frames")):
-            print(f"  {_MEANINGS.get(name, name)}: {value:.5g}")
+            print(f"  {MEANINGS.get(name, name)}: {value:.5g}")
 
 
 def _draw_overview(run: TrackJob) -> None:
