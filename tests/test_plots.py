@@ -215,6 +215,15 @@ def test_what_was_not_seen_is_pale(sequence) -> None:
     assert veil.get_array()[row, column, 3].tolist() == [0, 0, 1, 1, 1]  # bounds are [-2, 2]
 
 
+def test_a_slice_ends_around_what_was_seen(sequence) -> None:
+    """Catches a room that is lost in a wide, unseen surrounding, or cut off."""
+    axes = plots.plot_slice(SPHERE, sequence, 0.0).axes[0]
+    (veil,) = [c for c in axes.collections if c.get_gid() == "unseen"]
+    seen = np.flatnonzero((veil.get_array()[..., 3] == 0).any(axis=0)) / 240 * 4 - 2
+    x = np.concatenate([seen, sequence.T_world_camera[:, 0, 3]])
+    assert axes.get_xlim() == pytest.approx((x.min() - 0.1, x.max() + 0.1), abs=0.02)
+
+
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1, -1])
 def test_no_top_view_is_mirrored(axis: int, sign: int, sequence) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import torch
 import trimesh
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from nbtrack.core.arrays import Colors, Points, Poses, Values
@@ -33,7 +34,8 @@ def plot_slice(
 
     Fields of one recording stand side by side, with the colours of the first. Dashed green is the
     true surface. `sequence` are the frames that the maps were made of, `room` is the exact scene,
-    if it is a synthetic one: its distance stands beside that of a single field.
+    if it is a synthetic one: its distance stands beside that of a single field. The axes end
+    around the path and what the frames have seen, in the room if that is known.
     """
     fields = [fields] if isinstance(fields, Field) else fields
     if room is not None and len(fields) == 1 and fields[0].is_distance:
@@ -41,22 +43,34 @@ def plot_slice(
     norm, where = None, f"height {height:.2f} m; pale: never seen"
     if len(fields) > 1:  # once for all, since panels side by side are narrow
         title = f"{title}, {where}"
-    panels = new_axes(title, 5.4 - 0.9 * (len(fields) - 1), 1, len(fields))[0]
+    panels = new_axes(title, 5.4 - 0.9 * (len(fields) - 1), 1, len(fields), sharey=True)[0]
     for axes, field in zip(panels, fields, strict=True):
         up, page = scene.draw_from_above(axes, {"camera path": sequence.T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / _POINTS_ALONG
         points, places = _level_grid(page, low, high + step, step, height * up)
-        look = {"ax": panels, "aspect": 25, "pad": 0.015}
+        label = field.value_label.replace("(m)", "(m; thin lines: every 0.25 m)")
+        look = {"ax": panels, "aspect": 25, "pad": 0.015, "label": label}
         norm = scene.draw_slice(axes, field, points, places, sequence, norm, **look)
+        shown = axes.collections[-1].get_array()[..., 3] == 0  # the veil over the unseen
         axes.plot([], [], "k-", label="surface")
         if room is not None:
             true = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:2])
+            shown &= true > 0
             scene.draw_levels(axes, places, true, [0.0], zorder=3, **_TRUE_LINE)
             axes.plot([], [], "--", color=_TRUE_LINE["colors"], label="true surface")
         axes.set_title(field.label if len(fields) > 1 else f"{field.label} at {where}")
+        _end_around(axes, places[shown], sequence.T_world_camera[:, :3, 3] @ page.T)
     axes.figure.legend_below()
     return axes.figure
+
+
+def _end_around(axes: Axes, *places: np.ndarray) -> None:
+    """Axes 0.1 m around places on the page (n, 2); of panels side by side one has numbers on y."""
+    x, y = np.concatenate(places).T
+    axes.set_xbound(x.min() - 0.1, x.max() + 0.1)
+    axes.set_ybound(y.min() - 0.1, y.max() + 0.1)  # an axis that is turned around stays so
+    axes.label_outer()
 
 
 class _ExactDistance(Field):
