@@ -132,6 +132,17 @@ def test_curves_along_a_ray_share_their_depths() -> None:
         assert list(axes.lines[1].get_xdata()) == [1.2, 1.2]
 
 
+def test_panels_share_their_rows() -> None:
+    """Catches rows from the bottom, another panel's numbers, and a method in another's colour."""
+    rows = pd.DataFrame({"ICP": [1.0, 2.0], "standing still": [9.0, 8.0]}, index=["b", "a"])
+    panels = plots.plot_panels({"one": rows, "two": 2 * rows}, "ATE (cm)").axes
+    for axes, factor in zip(panels, (1, 2), strict=True):
+        icp, still = axes.lines
+        assert [icp.get_color(), still.get_linestyle()] == [PALETTE[4], ":"]
+        assert [*still.get_xdata()] == [9.0 * factor, 8.0 * factor]
+        assert axes.yaxis_inverted()
+
+
 def test_curves_of_methods_and_sweeps() -> None:
     """Catches a group without its own line, colour or mark, a method of two colours, text sorted by
     letters, spans and a camera that stands still drawn elsewhere."""

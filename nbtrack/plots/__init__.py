@@ -11,6 +11,7 @@ from nbtrack.plots.figures import (
     plot_errors,
     plot_frame,
     plot_losses,
+    plot_panels,
     plot_views,
 )
 from nbtrack.plots.movie import cloud_of, movie_bytes, movie_pictures

@@ -161,8 +161,7 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
         below.plot(line.get_xdata(), tracked["rotation_error_deg"], color=line.get_color())
     above.axhline(100 * LOST_THRESHOLD_M, label="lost above 0.2 m", **style.DASHED)
     below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
-    above.figure.legend_below()
-    return above.figure
+    return above.figure.legend_below()
 
 
 def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
@@ -174,6 +173,23 @@ def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
     axes.plot(seconds, 100 * tracked["still_error_m"], label=STANDING_STILL, **style.DOTTED)
     axes.set_ylabel("translation error (cm)")
     style.log_axes(axes, "y")
+
+
+@style.styled
+def plot_panels(panels: Mapping[str, pd.DataFrame], x: str, title: str = "") -> Figure:
+    """Numbers of methods (columns) at the texts of the index, by title, which has a panel.
+
+    Panels share these texts, from the top; x is logarithmic, and `standing still` a dotted line.
+    """
+    grid = style.new_axes(title, 3.4, 1, len(panels), sharey=True)[0]
+    for axes, (name, values) in zip(grid, panels.items(), strict=True):
+        for (label, color), mark in zip(style.method_colors(values).items(), "os^Dv", strict=False):
+            own = {"color": color, "marker": mark, "linestyle": ""}
+            look = style.DOTTED if label == STANDING_STILL else own
+            axes.plot(values[label], values.index, label=label, **look)
+        axes.set(title=name, xlabel=x, ylim=(len(values) - 0.5, -0.5))
+        style.log_axes(axes, "x")
+    return axes.figure.legend_below()
 
 
 @style.styled

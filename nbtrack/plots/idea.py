@@ -60,8 +60,7 @@ def plot_idea(
     axes.plot([], [], "k-", label=f"surface of {field.label}")
     limits = {"xlim": (end - _BEFORE, end + _BEHIND), "ylim": (-_ASIDE, _ASIDE)}
     axes.set(**limits, xlabel="along the ray (m)", ylabel="to its left (m)", aspect="equal")
-    axes.figure.legend_below()
-    return axes.figure
+    return axes.figure.legend_below()
 
 
 def _draw_samples(axes: Axes, field: LearnedField, pose: Tensor, point: Tensor) -> None:

@@ -75,5 +75,4 @@ def plot_pose_losses(
         axes.plot(x_cm, np.interp(x_cm, turned.index, turned[name]), "o", label="this pose")
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
-    axes.figure.legend_below()
-    return axes.figure
+    return axes.figure.legend_below()

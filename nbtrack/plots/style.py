@@ -77,11 +77,12 @@ class NotebookFigure(Figure):
         Image.open(drawn).convert("RGB").save(picture, "PNG", optimize=True)
         return picture.getvalue()
 
-    def legend_below(self) -> None:
-        """The first panel's legend for the whole figure."""
+    def legend_below(self) -> "NotebookFigure":
+        """The figure, with the first panel's legend for all."""
         handles, labels = self.axes[0].get_legend_handles_labels()
         ncols = 3 if sum(map(len, labels)) > 100 else len(labels)
         self.legend(handles, labels, loc="outside lower center", ncols=ncols)
+        return self
 
 
 def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **share) -> np.ndarray:
