@@ -20,7 +20,7 @@ PALETTE = (
 )  # fmt: skip
 _FIXED = {
     **dict.fromkeys(["iMAP with VR", "iMAP", "VR"], PALETTE[0]),
-    **dict.fromkeys(["NeuS with SDF", "NeuS", "SDF"], PALETTE[1]),
+    **dict.fromkeys(["NeuS with SDF", "NeuS", "SDF", "NeuS+ with SDF (Adam)"], PALETTE[1]),
     **dict.fromkeys(["NeuS+ baked (LM)", "NeuS+"], PALETTE[2]),
     **dict.fromkeys(["NeuS+ corrected (LM)", "NeuS+ corrected"], PALETTE[3]),
     "ICP": PALETTE[4],
