@@ -143,7 +143,8 @@ def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figur
             window = values.rolling(max(5, len(values) // 20), center=True, min_periods=1)
             axes.plot(values, color=color, alpha=0.22, linewidth=0.6)
             axes.plot(window.median(), color=color, label=label)
-        axes.set(yscale="log", xlabel="mapping iteration", ylabel=f"weighted {name} loss (no unit)")
+        term = name.replace("color", "colour")
+        axes.set(yscale="log", xlabel="mapping iteration", ylabel=f"weighted {term} loss (no unit)")
     panels[0].legend()
     return panels[0].figure
 

@@ -13,7 +13,7 @@ from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
 from nbtrack.fields import Field, LearnedField
 from nbtrack.fields.base import rendered_losses
-from nbtrack.plots.style import DASHED, new_axes, styled
+from nbtrack.plots.style import DASHED, method_colors, new_axes, styled
 from nbtrack.tracking.paper import sdf_loss
 
 _OFFSETS_CM = np.arange(-20, 21, 2)
@@ -62,17 +62,22 @@ def plot_pose_losses(
 ) -> Figure:
     """Where the losses of `pose_losses` are at a moved pose (dot), and their curves along x.
 
-    Grey is the curve without a turn; the dashed line is the true pose. With sliders:
-    `interact(plot_pose_losses, density=fixed(...), ..., x_cm=(-20, 20), y_deg=(-10, 10))`.
+    Curves have the colour of the map's method, pale without a turn; the dashed line is the true
+    pose. With sliders: `interact(plot_pose_losses, density=fixed(...), ..., x_cm=(-20, 20))`.
     """
     straight = pose_losses(density, distance, frame)
     turned = pose_losses(density, distance, frame, y_deg)
     title = f"The camera {x_cm:g} cm along its x and turned by {y_deg:g}° about its y"
     panels = new_axes(title, 2.9, 1, 3)[0]
-    for axes, name in zip(panels, turned, strict=True):
-        axes.plot(straight[name], color="0.7", label="not turned")
-        axes.plot(turned[name], label=f"turned by {y_deg:g}°")
-        axes.plot(x_cm, np.interp(x_cm, turned.index, turned[name]), "o", label="this pose")
+    colors = method_colors(["NeuS", "iMAP"])
+    for axes, name, method in zip(panels, turned, ["NeuS", "iMAP", "iMAP"], strict=True):
+        axes.plot(straight[name], color=colors[method], alpha=0.4, label="not turned")
+        axes.plot(turned[name], color=colors[method], label=f"turned by {y_deg:g}°")
+        pose = np.interp(x_cm, turned.index, turned[name])
+        axes.plot(x_cm, pose, "o", color="0.3", label="this pose")
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
-    return axes.figure.legend_below()
+    figure = axes.figure.legend_below()
+    for line in figure.legends[0].get_lines():  # of any method
+        line.set_color("0.3")
+    return figure
