@@ -69,7 +69,7 @@ def test_files_of_others_stay(work: Path, capsys: pytest.CaptureFixture) -> None
     """Catches an --out that overwrites what nbtrack did not write; other files beside are fine."""
     (work / "mine").mkdir()
     (work / "mine/trajectory.txt").write_text("0 1 2 3 0 0 0 1\n")
-    says = "mine has a trajectory.txt that nbtrack did not write"
+    says = "mine has a trajectory.txt that may not be nbtrack's"
     assert_refused(work, capsys, [*OWN, "--out", "mine"], says)
     assert_refused(
         work, capsys, ["export", "run", "--to", "kitti", "mine/trajectory.txt"], "exists"
@@ -81,7 +81,7 @@ def test_files_of_others_stay(work: Path, capsys: pytest.CaptureFixture) -> None
     (work / "paper").mkdir()
     for name in ("table_1.tex", "table_3_cells.csv"):
         (work / "paper" / name).write_text("mine\n")
-        says = f"paper has a {name} that nbtrack did not write"
+        says = f"paper has a {name} that may not be nbtrack's"
         assert_refused(work, capsys, ["tables", "--out", "paper"], says)
         (work / "paper" / name).unlink()
 

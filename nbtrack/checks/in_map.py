@@ -166,7 +166,9 @@ def _without_motion(field: Field, points: WorldPoints, T: Pose) -> Iterator[_Une
 def _misfits(frames: list[_Unexplained]) -> Iterator[Misfit]:
     """Of each explanation how far it is off, if frames tell: with up to three walls in view, a
     motion does the same."""
-    for i, (parameter, _) in enumerate(_EXPLANATIONS if len(frames) >= _MIN_FRAMES else ()):
+    if len(frames) < _MIN_FRAMES:
+        return
+    for i, (parameter, _) in enumerate(_EXPLANATIONS):
         left = sum((frame.shares[:, i] ** 2).sum() for frame in frames)
         if left > _MIN_LEFT**2 * sum(frame.squares for frame in frames):
             costs = [

@@ -39,7 +39,7 @@ def prepare(folder: Path | None) -> None:
     check_no_recording(folder)
     foreign = [path.name for name in _RESULTS for path in sorted(folder.glob(name))]
     if foreign and not is_own_output(folder):
-        raise ConfigError(f"{folder} has a {foreign[0]} that nbtrack did not write: move it away")
+        raise ConfigError(f"{folder} has a {foreign[0]} that may not be nbtrack's: move it away")
     write_atomic(folder / MARK, "")
 
 

@@ -208,25 +208,24 @@ def plot_curves(
     axes = style.new_axes(title, 3.6)[0, 0]
     names = table[[group] if isinstance(group, str) else group]
     labels = names.agg(", ".join, axis=1)
-    is_text = not pd.api.types.is_numeric_dtype(table[x])
     first, last = names.iloc[:, 0], names.iloc[:, -1]
     colors = dict(zip(labels, first.map(style.method_colors(first)), strict=True))
     marks = dict(zip(labels, pd.factorize(last)[0], strict=True))
-    group_of_row = labels.map([*colors].index)
-    places = table[x]
+    is_text = not pd.api.types.is_numeric_dtype(table[x])
     if is_text:
-        places, line = _side_by_side(axes, table[x], group_of_row), "none"
-    for number, (label, color) in enumerate(colors.items()):
-        own, n_alike = group_of_row == number, [*colors.values()][:number].count(color)
-        look = {"color": color, "marker": "os^Dv"[marks[label] % 5], "label": label}
+        table = table.assign(**{x: _side_by_side(axes, table[x], labels)})
+        line, log = "none", log.replace("x", "")
+    for label, rows in table.groupby(labels, sort=False):
+        look = {"color": colors[label], "marker": "os^Dv"[marks[label] % 5], "label": label}
+        n_alike = sum(drawn.get_color() == colors[label] for drawn in axes.lines)
         look["linestyle"] = line or ("-", "--", ":")[n_alike % 3]
-        axes.plot(places[own], table[y][own], **look)
+        axes.plot(rows[x], rows[y], **look)
         if "from" in table:
-            axes.vlines(places[own], table["from"][own], table["to"][own], color, linewidth=0.8)
+            axes.vlines(rows[x], rows["from"], rows["to"], colors[label], linewidth=0.8)
     if STANDING_STILL in table:
         axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **style.DOTTED)
     axes.set(xlabel=x, ylabel=y)
-    style.log_axes(axes, log.replace("x", "") if is_text else log)
+    style.log_axes(axes, log)
     if is_text or not labels.is_unique or len(labels) == 1:
         axes.figure.legend(loc="outside right center")
         return axes.figure
@@ -236,11 +235,11 @@ def plot_curves(
     return axes.figure
 
 
-def _side_by_side(axes: Axes, texts: pd.Series, group_of_row: pd.Series) -> pd.Series:
-    """Where points of the groups (numbers) lie on x, whose ticks are texts; long ones turn."""
+def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray:
+    """Where points of labelled groups lie on x, whose ticks are texts; long ones turn."""
     codes, ticks = pd.factorize(texts)
     letters = sum(max(map(len, tick.split("\n"))) for tick in ticks)
     turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}
     axes.set_xticks(range(len(ticks)), ticks, **turned)
-    n_groups = group_of_row.max() + 1
-    return codes + (group_of_row - (n_groups - 1) / 2) * 0.5 / max(n_groups, 4)
+    groups, names = pd.factorize(labels)
+    return codes + (groups - (len(names) - 1) / 2) * 0.5 / max(len(names), 4)
