@@ -13,11 +13,7 @@ from scipy.spatial.transform import Rotation
 from nbtrack.beyond import LmSettings, LmTracker
 from nbtrack.beyond.correction import CorrectedField, correct_map, corrected
 from nbtrack.beyond.grid import BakedField
-from nbtrack.beyond.least_squares import (
-    corrected_vertices,
-    regularisation_of,
-    solve,
-)
+from nbtrack.beyond.least_squares import corrected_vertices, regularisation_of, solve
 from nbtrack.beyond.views import retrieve, spread_out, view_of
 from nbtrack.core.errors import DataError
 from nbtrack.data.frame import Frame

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/*.ipynb"))
@@ -73,29 +74,7 @@ def test_no_two_tables_share_an_id(cells: list[dict[str, Any]]) -> None:
 
 
 # Numbers in the prose of the notebooks that judge, which no cell of theirs shows, and their source.
-FACTS = {
-    "240": "frames of every synthetic recording, nbtrack/experiments/smoke.toml",
-    "0.45": "degrees a frame of the motion `keyframes`, nbtrack/synthetic/keyframes.py",
-    "0.78": "degrees, reach of VR at 10 Hz, paper_tables/nine_rooms/table_1_cells.csv",
-    "44": "samples a ray, nbtrack/fields/base.py",
-    "95": "percent, of every interval",
-    "3.6": "m, the least error of VR in Staircase, the paper's Table I (3.582)",
-    "79": "steps of SDF in 500 ms, the paper's Table II",
-    "1.9": "steps of VR at 30 Hz, on the line through the paper's Table II",
-    "1,167": "poses of the dataset's breakfast_room",
-    "14.2": "mm a frame of the same",
-    "1,400": "iterations of NeuS+, nbtrack/experiments/smoke.toml",
-    "300,000": "points of a correction, nbtrack/beyond/correction.py",
-    "2,048": "points a frame of LM, nbtrack/beyond/methods.py",
-    "30": "steps a frame of LM at most, benchmarks/corrected.py",
-    "120": "frames of Red Kitchen, paper_tables/README.md",
-    "373": "frames of an office, as above",
-    "4.6": "degrees a frame of this office, as above",
-    "1,200": "frames of a walk, paper_tables/README.md",
-    "860": "first frame of a fast part of breakfast_room, benchmarks/evidence.py",
-    "06": "a notebook's number",
-    "13": "cm, ATE of the command that A3 ends with",
-}
+FACTS = {*pd.read_csv(Path(__file__).parent / "data/prose_numbers.csv", dtype=str)["number"]}
 NUMBER = r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?![\w.]*\d)"
 
 

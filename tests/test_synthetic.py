@@ -2,8 +2,10 @@
 
 import filecmp
 from functools import cache
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial import cKDTree
 
@@ -97,19 +99,8 @@ def test_values_by_hand():
     assert rod.hit(origin + np.array([0.3, 0.0, 0.0]), along)[0] == np.inf
 
 
-RECORDED = {  # camera's position (m), mean depth (m) and mean color of one view
-    "living_room": (0.1974888552, 1.3920152201, 0.7061650376, 2.463884668, 137.78),
-    "office": (0.0283176511, 1.3507459715, 0.4793741832, 2.076743049, 149.30),
-    "bedroom": (0.3449605182, 1.4231772347, 0.5006187373, 1.935738936, 156.36),
-    "kitchen_nook": (-0.0723938188, 1.2639580412, 0.2977869741, 1.893454068, 151.38),
-    "trellis_room": (0.2068472167, 1.5091494824, 0.4373132437, 2.515932144, 149.99),
-    "gallery": (-0.0151128567, 1.3354420125, 0.5927174805, 3.192115476, 143.30),
-    "stairwell": (-0.5808279900, 1.4482844768, 0.7543449966, 2.442283805, 136.16),
-    "patchwork_den": (0.1523414187, 1.3225939529, 0.3700793168, 2.110522454, 123.97),
-    "grey_studio": (0.3024760847, 1.4185966307, 0.5089367455, 2.293428650, 153.59),
-    "two_rooms": (0.3791080733, 1.3821784647, 0.4072598389, 2.168862857, 135.32),
-    "long_hall": (0.2768280556, 1.4460694760, 0.5984042072, 1.866435905, 133.57),
-}
+# Of one view: the camera's position (m), mean depth (m) and mean colour.
+RECORDED = pd.read_csv(Path(__file__).parent / "data/room_views.csv", index_col="room")
 
 
 @each_room
@@ -117,9 +108,10 @@ def test_views_are_exact_and_stay_as_they_are(room):
     """Catches distance for z-depth, surfaces lost by culling, changes without a `ROOM_VERSION`."""
     camera, pose = room_intrinsics(32, 24), path_of(room, 120, 0)[100]
     color, depth, index = render_frame(room, camera, pose)
-    recorded = [*pose[:3, 3], depth.mean()]
-    np.testing.assert_allclose(recorded, RECORDED[room.name][:4], rtol=0, atol=1e-8)
-    assert color.mean() == pytest.approx(RECORDED[room.name][4], abs=0.05)
+    recorded = RECORDED.loc[room.name]
+    found = [*pose[:3, 3], depth.mean()]
+    np.testing.assert_allclose(found, recorded[["x", "y", "z", "depth"]], rtol=0, atol=1e-8)
+    assert color.mean() == pytest.approx(recorded["color"], abs=0.05)
     rows, columns = np.indices(depth.shape)
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
     points_camera = np.stack([depth * x, depth * y, depth], axis=-1).reshape(-1, 3)

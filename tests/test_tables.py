@@ -12,25 +12,12 @@ from nbtrack import tables
 from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.experiments.runs import over_rooms, shares
 from nbtrack.latex import Wording, latex_file
-from nbtrack.tables import (
-    STANDING_STILL,
-    average_over_seeds,
-    beside,
-    beside_published,
-    published_table_1,
-    published_table_2,
-    style_table_1,
-    style_table_2,
-    table_1,
-    table_2,
-    write_table_1,
-    write_table_3,
-    write_tables,
-)
+from nbtrack.tables import style_table_1, style_table_2, table_1, table_2, write_tables
 
 PROJECT = Path(__file__).parent.parent
 PAPER_SOURCE = PROJECT / ".." / "shared" / "reference" / "paper.tex"
 
+PUBLISHED_1, PUBLISHED_2 = tables.published_table_1(), tables.published_table_2()
 COLUMNS_1 = ["rate_hz", "method", "scene", "ate_m"]
 COLUMNS_2 = ["tracker", "n_pixels", "budget_ms", "steps"]
 OURS_1 = pd.DataFrame(
@@ -88,7 +75,7 @@ def test_published_tables_cell_by_cell(number: int, tmp_path: Path) -> None:
     """Catches a mistyped published value, a rule for bold or red that is not the paper's, and a
     committed table that was edited by hand."""
     note = "Values as published by Bruns, Zangeneh and Jensfelt."
-    write_tables(tmp_path / "published", published_table_1(), published_table_2(), note)
+    write_tables(tmp_path / "published", PUBLISHED_1, PUBLISHED_2, note)
     name = f"published/table_{number}.tex"
     written = (tmp_path / name).read_text(encoding="utf-8")
     assert written == (PROJECT / "paper_tables" / name).read_text(encoding="utf-8")
@@ -100,7 +87,7 @@ def test_published_tables_cell_by_cell(number: int, tmp_path: Path) -> None:
 def test_marks_stand_without_the_style_sheet() -> None:
     """Catches marks that only a style sheet holds, which pages drop that do not trust a notebook,
     mark-up where one hides the other, and signs that no caption explains."""
-    styler = style_table_1(published_table_1(), "Caption")
+    styler = style_table_1(PUBLISHED_1, "Caption")
     assert r"& \color{red} \bfseries 0.215\rlap{$^\dagger$} &" in latex(styler)
     style, html = styler.to_html().split("</style>")
     assert re.search(r"row1_col2 \{\s*color: red;\s*font-weight: bold;", style)
@@ -112,7 +99,7 @@ def test_marks_stand_without_the_style_sheet() -> None:
     legend = "bold: best at this rate; † and red: above 0.2 m"
     assert f"<caption>Caption; {legend}</caption>" in html
     assert f"<caption>{legend}</caption>" in style_table_1(OURS_1).to_html()
-    style, html = style_table_2(published_table_2()).to_html().split("</style>")
+    style, html = style_table_2(PUBLISHED_2).to_html().split("</style>")
     bold = re.search(r"([^}]*)\{\s*font-weight: bold;", style).group(1)
     assert re.findall(r"level1_row(\d)", bold) == ["1", "4"]
     labels = re.findall(r'<th [^>]*class="row_heading level1[^>]*>(.*?)</th>', html)
@@ -125,8 +112,8 @@ def test_styled_tables_are_the_same_every_time() -> None:
     that tables share: on one page the style sheets of all of them then colour each."""
 
     def styled() -> list:
-        tables = [style_table_1(OURS_1), style_table_1(OURS_1, "A"), style_table_1(OURS_1[1:])]
-        return tables + [style_table_2(OURS_2, default_pixels={"LM": n}) for n in (64, 65)]
+        errors = [style_table_1(OURS_1), style_table_1(OURS_1, "A"), style_table_1(OURS_1[1:])]
+        return errors + [style_table_2(OURS_2, default_pixels={"LM": n}) for n in (64, 65)]
 
     first, second = styled(), styled()
     latex(first[0])  # must not change what the notebook shows
@@ -185,7 +172,7 @@ def test_steps_of_our_own_cells() -> None:
 
 def test_mean_and_deviation_over_seeds() -> None:
     """Catches a population's deviation, seeds mixed between cells, a failed seed averaged away."""
-    cells = average_over_seeds(SEEDS)
+    cells = tables.average_over_seeds(SEEDS)
     assert cells["method"].tolist() == ["A", "B"]
     assert cells["ate_m"].tolist() == pytest.approx([0.2, 1.0])
     assert cells["ate_std_m"].tolist() == pytest.approx([0.1, 0.0])
@@ -194,7 +181,7 @@ def test_mean_and_deviation_over_seeds() -> None:
     assert r"\bfseries 0.200$_{\pm0.100}$" in latex(styler)
     assert "Small: std over seeds." in latex(styler)
     failed = SEEDS.assign(ate_m=[0.1, 1.0, None, 1.0, 0.3, 1.0])
-    assert average_over_seeds(failed)["ate_m"].isna().tolist() == [True, False]
+    assert tables.average_over_seeds(failed)["ate_m"].isna().tolist() == [True, False]
     assert shown(style_table_1(failed))["x"].tolist() == ["–", "1.000 ± 0.000"]
     assert "±" not in repr(style_table_1(OURS_1))
 
@@ -207,37 +194,35 @@ def test_standing_still_is_a_row() -> None:
     assert wide["x"].to_dict() == {
         (10, "A"): pytest.approx(0.2),
         (10, "B"): pytest.approx(1.0),
-        (10, STANDING_STILL): 0.25,
+        (10, tables.STANDING_STILL): 0.25,
     }
-    assert f" & {STANDING_STILL} & " in latex(style_table_1(still))
+    assert f" & {tables.STANDING_STILL} & " in latex(style_table_1(still))
     assert shown(style_table_1(still))["x"].tolist() == ["0.200 ± 0.100", "1.000 ± 0.000", "0.250"]
-    assert STANDING_STILL not in table_1(published_table_1()).index.get_level_values("method")
+    assert tables.STANDING_STILL not in table_1(PUBLISHED_1).index.get_level_values("method")
 
 
 def test_comparison_scene_by_scene() -> None:
     """Catches our row, or our steps of one n, beside published values of another."""
-    published = published_table_1()
-    ours = published.assign(ate_m=published["ate_m"] + 1).replace({"iMAP with VR": "new"})
+    ours = PUBLISHED_1.assign(ate_m=PUBLISHED_1["ate_m"] + 1).replace({"iMAP with VR": "new"})
     ours = ours[(ours["rate_hz"] == 10) & ours["scene"].isin(["Kitchen", "Breakfast"])][::-1]
-    both = beside_published(ours)
+    both = tables.beside_published(ours)
     sources = [("NeuS with SDF", s) for s in ("ours", "paper", "difference")] + [("new", "ours")]
     assert list(both.index) == [(10, *source) for source in sources]
     assert list(both.columns) == ["Kitchen", "Breakfast"]
     assert both["Breakfast"].tolist() == pytest.approx([1.096, 0.096, 1.0, 2.575])
-    steps = table_2(published_table_2())
-    assert beside(2 * steps, steps)[500].loc[("VR", 512)].tolist() == pytest.approx(
-        [72.2, 36.1, 36.1]
-    )
+    steps = table_2(PUBLISHED_2)
+    both = tables.beside(2 * steps, steps)[500]
+    assert both.loc[("VR", 512)].tolist() == pytest.approx([72.2, 36.1, 36.1])
 
 
 def test_comparison_of_other_rooms_by_hand() -> None:
     """Catches shares over the wrong total: of 0.1, 0.3 and a failed run, two of three are lost."""
     cells = pd.DataFrame({"rate_hz": 10, "method": "A", "scene": list("xyz")})
-    summary = beside_published(cells.assign(ate_m=[0.1, 0.3, float("nan")]))
+    summary = tables.beside_published(cells.assign(ate_m=[0.1, 0.3, float("nan")]))
     assert summary.index.tolist() == [(10, "A")]
     assert summary.iloc[0].tolist()[::2] == pytest.approx([0.2, 2 / 3])
-    renamed = published_table_1().assign(scene=lambda cells: "our " + cells["scene"])
-    paper = beside_published(renamed).loc[(10, "iMAP with VR")]
+    renamed = PUBLISHED_1.assign(scene=lambda cells: "our " + cells["scene"])
+    paper = tables.beside_published(renamed).loc[(10, "iMAP with VR")]
     assert paper.tolist() == pytest.approx([1.575, 1.575, 7 / 9, 7 / 9])
 
 
@@ -256,7 +241,7 @@ def test_written_files(tmp_path: Path) -> None:
     assert "10,C,room_a,\n" in paths[0].read_text()
     assert r"\label{tab:ate-smoke}" in paths[1].read_text()
     assert [path.name for path in paths if "By the clock." in path.read_text()] == ["table_2.tex"]
-    _, third = write_table_3(tmp_path / "smoke", ours.assign(n_pixels=512), NOTE)
+    _, third = tables.write_table_3(tmp_path / "smoke", ours.assign(n_pixels=512), NOTE)
     assert r"\label{tab:beyond-smoke}" in third.read_text()
     assert "C, $n = 512$ &" in third.read_text()
 
@@ -284,7 +269,7 @@ def test_millimetres_where_metres_tie(tmp_path: Path) -> None:
         "ICP, n = 64": {"a": "1.4", "b": "200.4"}, "LM, n = 64": {"a": "0.6", "b": "200.1"},
     }  # fmt: skip
     assert r"1000.0$^\dagger_{\pm0.0}$ \\" in latex(style_table_1(SEEDS, unit="mm"))
-    _, path = write_table_3(tmp_path, cells, NOTE)
+    _, path = tables.write_table_3(tmp_path, cells, NOTE)
     _, icp, lm = tabular_rows(text := path.read_text())
     assert icp[1:] == ["ICP, $n = 64$", "1.4", r"\color{red} 200.4\rlap{$^\dagger$}"]
     assert lm[2:] == [r"\bfseries 0.6", r"\color{red} \bfseries 200.1\rlap{$^\dagger$}"]
@@ -339,11 +324,11 @@ def latex_is_installed() -> bool:
 def test_tables_compile(tmp_path: Path) -> None:
     """Catches a table that needs more than its comment says: the document there is compiled."""
     steps = OURS_2.assign(steps_std=0.5)
-    nine = published_table_1().assign(still_ate_m=0.5)
+    nine = PUBLISHED_1.assign(still_ate_m=0.5)
     nine = pd.concat([nine.assign(seed=seed, ate_m=nine["ate_m"] + seed / 100) for seed in (0, 1)])
     paths = [
         *write_tables(tmp_path, SEEDS, steps, NOTE),
-        *write_table_1(tmp_path / "9", nine, NOTE),
+        *tables.write_table_1(tmp_path / "9", nine, NOTE),
     ]
     for path in (p for p in paths if p.suffix == ".tex"):
         comments = re.findall(r"^%   (.*)$", path.read_text(), re.MULTILINE)
@@ -360,7 +345,7 @@ def test_names_are_text_on_a_page_and_in_latex(tmp_path: Path) -> None:
     """Catches markup in the name of a recording that a page runs, and a folder's name that ends a
     label of LaTeX."""
     cells = [{"rate_hz": 10, "method": "<b>m</b>", "scene": "<script>x</script>", "ate_m": 0.1}]
-    page = tables.style_table_1(pd.DataFrame(cells), caption="<i>caption</i>").to_html()
+    page = style_table_1(pd.DataFrame(cells), caption="<i>caption</i>").to_html()
     assert not [tag for tag in ("<script>", "<b>m", "<i>") if tag in page]
     (tmp_path / "a%b").mkdir()
     paths = tables.write_table_1(tmp_path / "a%b", pd.DataFrame(cells), "a note")
