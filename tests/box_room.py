@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
@@ -69,13 +70,21 @@ class BoxRoom(Formula):
         super().__init__(density if as_density else distance, bounds, color, as_density)
 
 
+def poses_at(positions, turns=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """Poses (n x 4 x 4) at positions (n x 3, m), turned by one rotation vector (rad) or by n."""
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+    poses[:, :3, 3] = positions
+    return poses
+
+
 def sequence_of(
     depths_mm: np.ndarray, camera: Intrinsics, colors=None, poses=None, name="room"
 ) -> RgbdSequence:
     """Depth maps (frames, height, width) with grey images, from the origin along z, if not said."""
     n, *size = depths_mm.shape
     colors = np.full((n, *size, 3), 128, np.uint8) if colors is None else colors
-    poses = np.tile(np.eye(4), (n, 1, 1)) if poses is None else poses
+    poses = poses_at(np.zeros((n, 3))) if poses is None else poses
     depths_mm = depths_mm.round().astype(np.uint16)
     return RgbdSequence(name, camera, colors, depths_mm, poses, np.arange(n), np.arange(n) / 30)
 
@@ -84,8 +93,7 @@ def box_sequence(places, room: BoxRoom | None = None, height: int = 24) -> RgbdS
     """Exact images of a box room, from offsets (n x 3, m) of its middle or poses (n x 4 x 4)."""
     room, width, poses = room or BoxRoom(), height * 4 // 3, np.asarray(places, dtype=float)
     if poses.ndim == 2:
-        poses = np.tile(np.eye(4), (len(places), 1, 1))
-        poses[:, :3, 3] = places
+        poses = poses_at(places)
     camera = Intrinsics.from_focal(width, height, float(height))
     rows, columns = torch.ones(height, width).nonzero().T.view(2, height, width)
     T_world_camera = torch.from_numpy(poses).float()[:, None, None]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from box_room import BoxRoom, Formula, box_sequence
+from box_room import BoxRoom, Formula, box_sequence, poses_at
 from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond import LmSettings, LmTracker
@@ -35,10 +35,7 @@ def wavy(points: torch.Tensor) -> torch.Tensor:
 def sequence() -> RgbdSequence:
     """Views all around from the middle: turns about the vertical axis."""
     angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    poses = np.tile(np.eye(4), (12, 1, 1))
-    poses[:, 0, 0] = poses[:, 2, 2] = np.cos(angles)
-    poses[:, 0, 2], poses[:, 2, 0] = np.sin(angles), -np.sin(angles)
-    poses[:, 0, 3] = 0.01 * np.arange(12)
+    poses = poses_at(np.outer(0.01 * np.arange(12), [1, 0, 0]), np.outer(angles, [0, 1, 0]))
     return box_sequence(poses, ROOM, 96)
 
 

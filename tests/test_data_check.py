@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from box_room import BoxRoom, box_sequence
+from box_room import BoxRoom, box_sequence, poses_at
 from recordings import (
     Change,
     Source,
@@ -53,11 +53,9 @@ def check(folder: Path) -> DataReport:
 
 def walk(n_frames: int, step_m: float = 0.03, step_deg: float = 2.0) -> np.ndarray:
     """Poses that move and turn about no special axis, so that no convention is like another."""
-    steps, poses = np.arange(n_frames)[:, None], np.tile(np.eye(4), (n_frames, 1, 1))
-    turn = np.radians(step_deg) * steps * np.array([0.35, 0.8, 0.49])
-    poses[:, :3, :3] = Rotation.from_rotvec(turn).as_matrix()
-    poses[:, :3, 3] = [0, 0, -0.5] + step_m * steps * np.array([0.55, -0.4, 0.73])
-    return poses
+    steps = np.arange(n_frames)
+    turns = np.outer(np.radians(step_deg) * steps, [0.35, 0.8, 0.49])
+    return poses_at(np.outer(step_m * steps, [0.55, -0.4, 0.73]) - [0, 0, 0.5], turns)
 
 
 def write_box(folder: Path, poses: np.ndarray, depth_scale: float = 1.0) -> Path:

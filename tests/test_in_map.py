@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from box_room import BoxRoom, Formula, box_sequence
-from scipy.spatial.transform import Rotation
+from box_room import BoxRoom, Formula, box_sequence, poses_at
 
 from nbtrack.checks.in_map import look_in_map
 from nbtrack.core.bounds import SceneBounds
@@ -21,11 +20,8 @@ ROOM = BoxRoom(half=(1.5, 1.2, 2.0))
 def seen(n_frames: int = 12) -> RgbdSequence:
     """From near the middle, turned to all sides a little."""
     random = np.random.default_rng(0)
-    poses = np.tile(np.eye(4), (n_frames, 1, 1))
-    poses[:, :3, :3] = Rotation.from_rotvec(
-        random.normal(scale=0.4, size=(n_frames, 3))
-    ).as_matrix()
-    poses[:, :3, 3] = random.uniform(-0.5, 0.5, (n_frames, 3))
+    turns = random.normal(scale=0.4, size=(n_frames, 3))
+    poses = poses_at(random.uniform(-0.5, 0.5, (n_frames, 3)), turns)
     return box_sequence(poses, ROOM, 20)  # wide: with three walls a motion does the same
 
 
@@ -68,8 +64,7 @@ def test_nothing_is_told_before_a_wall() -> None:
         return 1 + 0.0005 * (10 * points[:, 0]).sin() - points[:, 2]
 
     flat = BoxRoom(half=(9.0, 9.0, 1.0))
-    poses = np.tile(np.eye(4), (12, 1, 1))
-    poses[:, 0, 3] = np.linspace(-0.2, 0.2, 12)
+    poses = poses_at(np.outer(np.linspace(-0.2, 0.2, 12), [1, 0, 0]))
     sequence = box_sequence(poses, flat, 48)
     longer = replace(sequence, depths_mm=np.rint(1.03 * sequence.depths_mm).astype(np.uint16))
     assert look_in_map(Formula(distance, flat.bounds), longer, poses)["map_misfit"] == ""
@@ -78,9 +73,8 @@ def test_nothing_is_told_before_a_wall() -> None:
 def test_frames_outside_of_what_was_mapped() -> None:
     """Catches a camera in a part that no map holds, without a word: the map ends at x = 0, and half
     of the frames look to where it is not, known by their true poses alone."""
-    poses = np.tile(np.eye(4), (10, 1, 1))
-    poses[:5, :3, :3] = Rotation.from_rotvec([0, np.pi / 2, 0]).as_matrix()  # towards x
-    poses[5:, :3, :3] = Rotation.from_rotvec([0, -np.pi / 2, 0]).as_matrix()
+    towards_x = np.outer([1] * 5 + [-1] * 5, [0, np.pi / 2, 0])
+    poses = poses_at(np.zeros((10, 3)), towards_x)
     half = BoxRoom(half=(1.5, 1.2, 2.0))
     half.bounds = SceneBounds((-1.6, -1.3, -2.1), (0.0, 1.3, 2.1))
     astray = np.tile(poses[9], (10, 1, 1))

@@ -17,6 +17,7 @@ import pytest
 import safetensors
 import torch
 import trimesh
+from box_room import poses_at
 from finished import GIVEN
 from safetensors.torch import save
 from test_mapping import NETWORK, finished_wall, map_wall, wall_sequence
@@ -171,10 +172,7 @@ def test_map_bytes(case: str, sound: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 def moved(metres: float, turned: float = 0.0) -> np.ndarray:
     """A pose shifted along the view, and turned about the vertical by an angle."""
-    T, (c, s) = np.eye(4), (np.cos(turned), np.sin(turned))
-    T[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
-    T[2, 3] = metres
-    return T
+    return poses_at([[0, 0, metres]], [0, turned, 0])[0]
 
 
 BELONGS = {

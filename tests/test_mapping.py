@@ -7,7 +7,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
-from box_room import sequence_of
+from box_room import poses_at, sequence_of
 
 from nbtrack.beyond import PointMapping
 from nbtrack.core.camera import Intrinsics
@@ -29,8 +29,7 @@ def settings_of(field_name: str, **changes: float) -> MappingSettings:
 
 def wall_sequence(n_frames: int = 6, distance: float = 2.0) -> RgbdSequence:
     """Cameras side by side that look straight at a grey wall, `distance` metres ahead."""
-    poses = np.tile(np.eye(4), (n_frames, 1, 1))
-    poses[:, 0, 3] = np.linspace(-0.5, 0.5, n_frames)
+    poses = poses_at(np.outer(np.linspace(-0.5, 0.5, n_frames), [1, 0, 0]))
     depths_mm = np.full((n_frames, 12, 16), 1000 * distance)
     return sequence_of(depths_mm, Intrinsics.from_focal(16, 12, 14.0), poses=poses, name="wall")
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from box_room import poses_at
 from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond.verdict import score_detection
@@ -15,27 +16,19 @@ from nbtrack.tracking.metrics import align_rigidly, pose_errors, still_metrics, 
 from nbtrack.tracking.trajectories import read_tum, tum_text
 
 
-def poses(positions: list[list[float]]) -> np.ndarray:
-    """Unrotated cameras at these positions."""
-    T_world_camera = np.tile(np.eye(4), (len(positions), 1, 1))
-    T_world_camera[:, :3, 3] = positions
-    return T_world_camera
-
-
 def wandering(frames: int, seed: int = 0) -> np.ndarray:
     """Random positions and orientations."""
     generator = np.random.default_rng(seed)
-    T_world_camera = poses(generator.normal(size=(frames, 3)).tolist())
-    T_world_camera[:, :3, :3] = Rotation.random(frames, rng=generator).as_matrix()
-    return T_world_camera
+    positions = generator.normal(size=(frames, 3))
+    return poses_at(positions, Rotation.random(frames, rng=generator).as_rotvec())
 
 
 def test_values_by_hand() -> None:
     """Catches a wrong mean, a frame without reference that counts, a shifted threshold; radians for
     degrees, half angles, and transposed rotations that add instead."""
-    true = poses([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]])
+    true = poses_at([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]])
     true[:, :3, :3] = Rotation.from_euler("x", 50, degrees=True).as_matrix()
-    estimated = poses([[1, 0.1, 0], [2, 0, 0.2], [3, 0.4, 0], [9, 9, 9]])
+    estimated = poses_at([[1, 0.1, 0], [2, 0, 0.2], [3, 0.4, 0], [9, 9, 9]])
     turned = Rotation.from_euler("x", [[53], [46], [50], [90]], degrees=True)
     estimated[:, :3, :3] = turned.as_matrix()
     np.testing.assert_allclose(pose_errors(estimated, true)[1], [3, 4, 0, 40], atol=1e-9)
@@ -57,14 +50,16 @@ def test_values_by_hand() -> None:
 
 def test_standing_still_by_hand() -> None:
     """Catches a baseline that counts the first frame, or a path over frames that are not known."""
-    true = poses([[1, 0, 0], [1, 3, 0], [0, 0, 0], [1, 3, 4]])
+    true = poses_at([[1, 0, 0], [1, 3, 0], [0, 0, 0], [1, 3, 4]])
     true[2] = np.nan
     # Distances from the first pose: 3 and 5. Steps: 3 and 4.
     assert still_metrics(true) == {"still_ate_m": pytest.approx(np.sqrt(17)), "path_m": 7.0}
     assert still_metrics(true[:1]) == {}
 
 
-@pytest.mark.parametrize("true", [wandering(20), poses([[1, 2, 3]] * 5), poses([[1, 2, 3]] * 2)])
+@pytest.mark.parametrize(
+    "true", [wandering(20), poses_at([[1, 2, 3]] * 5), poses_at([[1, 2, 3]] * 2)]
+)
 def test_an_offset_counts_unless_aligned(true: np.ndarray) -> None:
     """Catches an alignment that slipped into the paper's formula, and NaN where nothing moves."""
     estimated = true.copy()

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from box_room import poses_at
 from recordings import N_FRAMES, START, matrix_text, source, tum_lines, write_recording
-from scipy.spatial.transform import Rotation
 
 from nbtrack.core.errors import DataError
 from nbtrack.data.text_files import read_poses
@@ -224,10 +224,8 @@ def test_few_poses_and_names_that_tell_no_number(tmp_path: Path) -> None:
 
 def moving(times: np.ndarray) -> np.ndarray:
     """Poses far from the origin that go straight and turn evenly."""
-    poses = np.tile(np.eye(4), (len(times), 1, 1))
-    poses[:, :3, :3] = Rotation.from_rotvec(times[:, None] * [0.3, 0.9, -0.2]).as_matrix()
-    poses[:, :3, 3] = [9, -4, 7] + times[:, None] * [0.4, -0.3, 0.5]
-    return poses
+    positions = np.outer(times, [0.4, -0.3, 0.5]) + [9, -4, 7]
+    return poses_at(positions, np.outer(times, [0.3, 0.9, -0.2]))
 
 
 @pytest.mark.parametrize("direction", ["camera-to-world", "world-to-camera"])

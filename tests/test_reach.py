@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from box_room import BoxRoom, box_sequence, walk
+from box_room import BoxRoom, box_sequence, poses_at, walk
 from numpy.testing import assert_allclose
 
 from nbtrack.core.files import tables_folder
@@ -33,11 +33,9 @@ BOUNDS = {
 READINGS = "metre", "map", "metre, constant velocity"
 
 
-def straight(speed_m: float, n_frames: int = 11) -> np.ndarray:
-    """Poses that move evenly along x."""
-    poses = np.tile(np.eye(4), (n_frames, 1, 1))
-    poses[:, 0, 3] = speed_m * np.arange(n_frames)
-    return poses
+def straight(speed_m: float) -> np.ndarray:
+    """Eleven poses that move evenly along x."""
+    return poses_at(np.outer(speed_m * np.arange(11), [1, 0, 0]))
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.5])

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from box_room import Formula, sequence_of
-from scipy.spatial.transform import Rotation
+from box_room import Formula, poses_at, sequence_of
 from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
@@ -33,9 +32,7 @@ def wall(signed: bool) -> Formula:
 def random_sequence(n_frames: int) -> RgbdSequence:
     rng = np.random.default_rng(0)
     shape = (n_frames, CAMERA.height, CAMERA.width)
-    poses = np.tile(np.eye(4), (n_frames, 1, 1))
-    poses[:, :3, :3] = Rotation.random(n_frames, random_state=rng).as_matrix()
-    poses[:, :3, 3] = rng.normal(size=(n_frames, 3))
+    poses = poses_at(*rng.normal(size=(2, n_frames, 3)))
     colors = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
     return sequence_of(rng.integers(0, 1 << 16, shape), CAMERA, colors, poses)
 

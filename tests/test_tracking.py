@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from box_room import BoxRoom, box_sequence, walk
-from scipy.spatial.transform import Rotation
+from box_room import BoxRoom, box_sequence, poses_at, walk
 
 from nbtrack.beyond.grid import BakedField
 from nbtrack.core.errors import ConfigError, DataError, NumericalError
@@ -205,9 +204,7 @@ def test_a_frame_without_depth_keeps_the_expected_pose_and_is_marked(name: str) 
 
 def test_motion_models() -> None:
     """Catches velocities of the world, which leave a circle along its tangent, or of nothing."""
-    step = np.eye(4)
-    step[:3, :3] = Rotation.from_rotvec([0, 0.1, 0]).as_matrix()
-    step[0, 3] = 0.05
+    (step,) = poses_at([[0.05, 0, 0]], [0, 0.1, 0])
     poses = [np.linalg.matrix_power(step, k) for k in range(4)]
     models = ("previous_pose", "constant_velocity", "better_of_both")
     for model in models:
