@@ -49,6 +49,14 @@ def settings_stay_inside(tmp_path: Path) -> Iterator[None]:
     torch.set_num_threads(1)
 
 
+@pytest.fixture
+def plain(tmp_path: Path) -> Path:
+    """A recording as a plain folder."""
+    from recordings import write_recording
+
+    return write_recording("plain", tmp_path / "plain")
+
+
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results: a small map (`map`), the same as one file (`room`), a run in the map (`run`), and a

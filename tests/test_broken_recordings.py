@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from recordings import N_FRAMES, WRITERS, write_recording
+from test_faults import assert_refused
 
 from nbtrack.cli import main
 from nbtrack.core.errors import NbtrackError
@@ -194,10 +195,7 @@ def test_command(whole, tmp_path: Path, capfd, format: str) -> None:
     assert main(["data", "check", str(folder)]) == 0
     assert capfd.readouterr().err == ""
     toml("depth_scal = 1")(folder)
-    assert main(["data", "check", str(folder)]) == 2
-    error = capfd.readouterr().err
-    assert error.startswith("nbtrack: ")
-    assert error.count("\n") == 1
+    assert_refused(folder, capfd, ["data", "check", str(folder)], "depth_scal")
 
 
 def test_files_of_the_system(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from recordings import write_recording
 from scipy.spatial.transform import Rotation
+from test_faults import assert_refused
 from tiny import tiny_words
 
 import nbtrack
@@ -76,8 +77,7 @@ def test_tracking_command_reads_any_format(tmp_path: Path, capsys: pytest.Captur
     """Catches a --format that the command line drops on its way to map and track."""
     folder = write_recording("tum", tmp_path / "r")
     assert main(track(folder, "--format", "tum")) == 0
-    assert main(track(folder, "--format", "plain")) == 2
-    assert "nbtrack: no colour images " in capsys.readouterr().err
+    assert_refused(tmp_path, capsys, track(folder, "--format", "plain"), "no colour images ")
 
 
 def test_a_traceback_for_who_asks(
@@ -107,9 +107,8 @@ def test_a_map_is_taken_with_the_settings_that_made_it(
     assert main([*made, "--out", out]) == 0
     given = ["track", str(folder), "--map-from", out, "--tracker", "lm", "--steps", "2", *TINY]
     assert main([*given, "--out", str(tmp_path / "run")]) == 0
-    assert main([*given, "--set", "mapping.neus.n_rays=77"]) == 2
-    said = capsys.readouterr().err
-    assert "was made with other settings than --set mapping.neus.n_rays=77" in said
+    says = "was made with other settings than --set mapping.neus.n_rays=77"
+    assert_refused(tmp_path, capsys, [*given, "--set", "mapping.neus.n_rays=77"], says)
     assert main([*given, "--set", "mapping.imap.n_rays=77", "--out", str(tmp_path / "run")]) == 0
 
 
@@ -202,10 +201,10 @@ def test_a_recording_without_poses_is_tracked_in_a_map(
     assert "12 of 12 frames" in capsys.readouterr().out
     shutil.rmtree(work / "corrected")
     shutil.copytree(work / "map", work / "corrected")
-    assert main(["export", "found", "--to", "gif", "again.gif"]) == 2
-    assert "is not the map of this run any more" in capsys.readouterr().err
-    assert main(["track", str(recording), "--out", "own"]) == 2
-    assert "or track in a map of the same place with --map-from" in capsys.readouterr().err
+    again = ["export", "found", "--to", "gif", "again.gif"]
+    assert_refused(work, capsys, again, "is not the map of this run any more")
+    says = "or track in a map of the same place with --map-from"
+    assert_refused(work, capsys, ["track", str(recording)], says)
 
 
 def test_a_pipe_that_nobody_reads() -> None:

@@ -65,11 +65,6 @@ def scene(tmp_path: Path) -> Path:
     return write_recording("neural_rgbd", tmp_path / "scene")
 
 
-@pytest.fixture
-def plain(tmp_path: Path) -> Path:
-    return write_recording("plain", tmp_path / "plain")
-
-
 @pytest.mark.parametrize("format", WRITERS)
 def test_round_trip(tmp_path: Path, format: str) -> None:
     """Catches wrong axes, a wrong depth factor, half a pixel, swapped colours, a wrong guess; depth

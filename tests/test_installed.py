@@ -9,10 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from test_faults import assert_refused
 from tiny import TINY
 
 from nbtrack.beyond import observed
-from nbtrack.cli import main
 from nbtrack.core import files
 
 
@@ -50,10 +50,7 @@ def test_a_missing_extra_is_told_before_any_work(
     monkeypatch.setattr(
         "importlib.util.find_spec", lambda name, *a: None if name == missing else found(name, *a)
     )
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
+    assert_refused(elsewhere, capsys, arguments, message)
     assert not list(elsewhere.iterdir())
 
 

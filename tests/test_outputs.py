@@ -217,8 +217,8 @@ def test_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixture) -> N
     assert open_recording(folder).origin.tolist() == origin == [450_000.0, 5_400_000.0, 0.0]
     rows[2, 1] = 1e6 + 5e5
     np.savetxt(folder / "trajectory.txt", rows, fmt="%.17g")
-    assert main(["map", str(folder), "--field", "points", *SET]) == 2
-    assert "frame 2 is no rigid transform" in capsys.readouterr().err
+    command = ["map", str(folder), "--field", "points", *SET]
+    assert_refused(tmp_path, capsys, command, "frame 2 is no rigid transform")
 
 
 def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import nbformat
 import pytest
 from forked import forking
 from nbconvert.preprocessors import ExecutePreprocessor
+from test_faults import assert_refused
 from tiny import TINY, tiny_words
 
 import nbtrack
@@ -156,12 +157,8 @@ def test_a_file_joins_by_an_option_of_every_command(
     assert "DISTANCE,8," in (tmp_path / "out/table_2.csv").read_text()
     (made,) = (tmp_path / "runs/maps").glob("office-fading-*")
     run = ["track", "office", "--map-from", str(made), "--steps", "1", "--out", "run", *words]
-    capsys.readouterr()
-    assert main(run) == 2
-    refused = capsys.readouterr().err
-    assert "'fading', which is not registered" in refused
-    assert "--import" in refused
-    assert refused.count("\n") == 1
+    error = assert_refused(tmp_path, capsys, run, "'fading', which is not registered")
+    assert "--import" in error
     with importing():
         assert main([*run, "--tracker", "distance", *own]) == 0
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
@@ -193,10 +190,7 @@ def test_a_file_that_cannot_be_imported(
     monkeypatch.delitem(sys.modules, "own", raising=False)
     if text is not None:
         Path(name).write_text(text)
-    assert main(["methods", "--import", name]) == 2
-    error = capsys.readouterr().err
-    assert says in error
-    assert error.count("\n") == 1
+    assert_refused(tmp_path, capsys, ["methods", "--import", name], says)
     monkeypatch.setenv("NBTRACK_DEBUG", "1")
     assert main(["methods", "--import", name]) == 2
     assert "Traceback" in capsys.readouterr().err

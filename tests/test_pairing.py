@@ -16,11 +16,6 @@ from nbtrack.recordings.recording import Recording, open_recording
 RUN = tuple(range(N_FRAMES))
 
 
-@pytest.fixture
-def plain(tmp_path: Path) -> Path:
-    return write_recording("plain", tmp_path / "plain")
-
-
 def rename(files: Path, names: Sequence[str]) -> None:
     """Give the images of a folder other names, and take away those for which there is none."""
     contents = [(path.suffix, path.read_bytes()) for path in sorted(files.iterdir())]
@@ -224,7 +219,7 @@ def test_few_poses_and_names_that_tell_no_number(tmp_path: Path) -> None:
 
 def moving(times: np.ndarray) -> np.ndarray:
     """Poses far from the origin that go straight and turn evenly."""
-    positions = np.outer(times, [0.4, -0.3, 0.5]) + [9, -4, 7]
+    positions = np.outer(times, [0.4, -0.3, 0.5]) - [9, 4, 7]
     return poses_at(positions, np.outer(times, [0.3, 0.9, -0.2]))
 
 

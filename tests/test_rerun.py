@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from test_faults import assert_refused
 
 from nbtrack.cli import main
 from nbtrack.experiments.runs import read_trajectory
@@ -31,11 +32,8 @@ def test_without_rerun(
     """Catches a traceback of imports, or minutes of meshing before it is told."""
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.setattr("nbtrack.experiments.commands.extract_mesh", None)
-    assert main(["export", str(finished / "run"), "--to", "rrd", str(finished / "run.rrd")]) == 2
-    error = capsys.readouterr().err
-    assert "pip install 'nbtrack[rerun]'" in error
-    assert error.count("\n") == 1
-    assert not (finished / "run.rrd").exists()
+    command = ["export", str(finished / "run"), "--to", "rrd", str(finished / "run.rrd")]
+    assert_refused(finished, capsys, command, "pip install 'nbtrack[rerun]'")
 
 
 def test_what_the_file_holds(finished: Path, tmp_path: Path) -> None:
