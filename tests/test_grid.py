@@ -72,13 +72,9 @@ def address() -> Iterator[str]:
 @pytest.fixture(params=["here", "in processes", "on a cluster"])
 def execution(request: pytest.FixtureRequest, address: str) -> Iterator[dict[str, Any]]:
     """All ways of running jobs."""
-    ways = {
-        "here": {"workers": 1},
-        "in processes": {"workers": 2},
-        "on a cluster": {"dask": address},
-    }
+    ways = {"here": {"workers": 1}, "in processes": {"workers": 2}}
     with forking():
-        yield ways[request.param]
+        yield ways.get(request.param, {"dask": address})
 
 
 def test_results_come_in_order(execution: dict, capsys: pytest.CaptureFixture) -> None:
@@ -123,18 +119,13 @@ def test_the_bar_moves(monkeypatch: pytest.MonkeyPatch, execution: dict) -> None
         assert any(done == 1.5 and "half" in status for done, status in seen)
 
 
-def words(folder: Path, *options: str) -> list[str]:
-    """The command for two rooms, and trackers of first and second order."""
-    settings = tiny_words("tables.rates_hz=[10]", "scenes.track_frames=:4")
-    out = ["--out", str(folder / "out")]
-    return ["tables", "--method", "sdf,baked", *out, *settings, *options]
-
-
 def tables(folder: Path, *options: str) -> int:
-    """The command in this process, with its own cache."""
+    """The command for two rooms, and trackers of first and second order, with its own cache."""
+    words = tiny_words("tables.rates_hz=[10]", "scenes.track_frames=:4")
+    words += ["--method", "sdf,baked", "--out", str(folder / "out"), *options]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NBTRACK_RUNS", str(folder / "runs"))
-        return main(words(folder, *options))
+        return main(["tables", *words])
 
 
 @pytest.fixture(scope="module")

@@ -269,17 +269,6 @@ def test_a_record_that_could_not_be_read_is_not_written(work: Path, tmp_path: Pa
     assert not (tmp_path / MAP_FILE).exists()
 
 
-def test_tracking_in_the_map_of_another_room(work: Path, capsys: pytest.CaptureFixture) -> None:
-    """Catches a room that the camera is not in."""
-    # The map itself is poor: what is usual in it is said to be what a good map shows.
-    stored = read_map("map")
-    write_map(work / "good" / MAP_FILE, replace(stored, record={**stored.record, "misfit_m": 0.01}))
-    assert main(["track", "long_hall", *GIVEN[2:], "good", "--frames", "2:6"]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("nbtrack: at its given pose frame 2 of long_hall is off the map of")
-    assert "usual in this map 0.010 m, allowed 0.050 m" in error
-
-
 def test_the_readmes_example(work: Path, capsys: pytest.CaptureFixture) -> None:
     """Catches a README that shows what no longer runs."""
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")

@@ -16,13 +16,16 @@ from nbtrack.recordings.recording import Recording, open_recording
 RUN = tuple(range(N_FRAMES))
 
 
-def rename(files: Path, names: Sequence[str]) -> None:
-    """Give the images of a folder other names, and take away those for which there is none."""
-    contents = [(path.suffix, path.read_bytes()) for path in sorted(files.iterdir())]
-    for path in files.iterdir():
-        path.unlink()
-    for name, (suffix, content) in zip(names, contents, strict=False):
-        (files / (name + suffix)).write_bytes(content)
+def rename(recording: Path, colors: Sequence[str], depths: Sequence[str] | None = None) -> None:
+    """Give images and depth maps other names, and take away those for which there is none."""
+    is_plain = (recording / "color").is_dir()
+    kinds = ("color", "depth") if is_plain else ("images", "depth_filtered")
+    for kind, names in zip(kinds, (colors, depths or colors), strict=True):
+        contents = [(path, path.read_bytes()) for path in sorted((recording / kind).iterdir())]
+        for path, _ in contents:
+            path.unlink()
+        for name, (path, content) in zip(names, contents, strict=False):
+            path.with_name(name + path.suffix).write_bytes(content)
 
 
 @pytest.mark.parametrize(
@@ -40,8 +43,7 @@ def test_names_are_told_by_what_varies(
 ) -> None:
     """Catches a number of the camera, the bits or the date that is taken for the frame's, and an
     image that is refused, or put in another place, for it."""
-    rename(plain / "color", [color.format(i) for i in numbers])
-    rename(plain / "depth", [depth.format(i) for i in numbers])
+    rename(plain, [color.format(i) for i in numbers], [depth.format(i) for i in numbers])
     (plain / "poses.txt").write_text(matrix_text(source().poses.reshape(-1, 16)))
     sequence = read_sequence(plain, pose_file="poses.txt")
     assert np.array_equal(sequence.colors, source().colors)
@@ -73,8 +75,7 @@ def test_images_that_cannot_be_paired_are_named(plain: Path, case: str) -> None:
     """Catches images with their neighbours' depth where one of each is lost, two files of a number
     that shift all poses behind them, and two sessions that are shuffled into one."""
     colors, depths, says = UNPAIRED[case]
-    rename(plain / "color", colors)
-    rename(plain / "depth", depths)
+    rename(plain, colors, depths)
     with pytest.raises(DataError, match=says):
         open_recording(plain)
 
@@ -106,9 +107,7 @@ LISTS = {
 def listed(folder: Path, case: str) -> Recording:
     numbers, stamps, format, _ = LISTS[case]
     write_recording(format, folder)
-    colors, depths = {"plain": ("color", "depth")}.get(format, ("images", "depth_filtered"))
-    for kind in (colors, depths):
-        rename(folder / kind, [f"{i:06}" for i in numbers])
+    rename(folder, [f"{i:06}" for i in numbers])
     if stamps is not None:
         times = np.array(stamps) / 30
         is_plain = format == "plain"
@@ -172,8 +171,7 @@ def test_one_unit_of_times_wherever_they_stand(plain: Path, per_second: int) -> 
     with pytest.raises(DataError, match="one each, rising, in seconds"):
         open_recording(plain)
     (plain / "timestamps.txt").unlink()
-    for kind in ("color", "depth"):
-        rename(plain / kind, stamps)
+    rename(plain, stamps)
     for times in (of_poses, recording.times, open_recording(plain).times):
         np.testing.assert_allclose(times, seconds, atol=1e-3)
 
@@ -183,8 +181,7 @@ def test_times_in_names(plain: Path) -> None:
     that are named after theirs, whatever the poses are stamped with."""
     names = ["1305031102.175304", "1305031102.2", "1305031102.25"]
     names += ["1305031103.0", "1305031103.040", "1305031103.5"]
-    for kind in ("color", "depth"):
-        rename(plain / kind, names)
+    rename(plain, names)
     lines = tum_lines(np.arange(N_FRAMES) / 30, source().poses)
     (plain / "trajectory.txt").write_text(lines)
     recording, sequence = open_recording(plain), read_sequence(plain)
@@ -208,8 +205,7 @@ def test_few_poses_and_names_that_tell_no_number(tmp_path: Path) -> None:
     (folder / "groundtruth.txt").write_text(tum_lines(np.array([START]) + 0.1, source().poses[:1]))
     assert np.flatnonzero(open_recording(folder).has_pose).tolist() == [1]
     plain = write_recording("plain", tmp_path / "plain")
-    for kind in ("color", "depth"):
-        rename(plain / kind, [f"{i // 3}_{i % 3}" for i in RUN])
+    rename(plain, [f"{i // 3}_{i % 3}" for i in RUN])
     (plain / "trajectory.txt").write_text(tum_lines(np.array(RUN) / 7, source().poses))
     assert "one after another" in open_recording(plain).notes[0]
     (plain / "trajectory.txt").write_text(tum_lines(np.arange(5) / 7, source().poses[:5]))

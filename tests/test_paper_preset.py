@@ -31,22 +31,17 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(monkeypatch: pytest.MonkeyPatch, dataset: Path, folder: Path) -> int:
-    """The preset in one process: every scene, one tracker, at one rate."""
-    monkeypatch.setenv("NBTRACK_RUNS", str(folder / "runs"))
+def test_nine_columns(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a preset that loses a scene of the dataset, or reads its frames in another order:
+    every scene, one tracker, at one rate."""
     monkeypatch.setenv("NBTRACK_DATA", str(dataset))
     kept = [s for s in TINY if not s.startswith(("scenes.", "tables.rates"))]
     kept += ["scenes.track_frames=9:12", "tables.rates_hz=10"]
     for field in ("imap", "neus"):
         kept += [f"mapping.{field}.holdout_every=0", f"mapping.{field}.iterations=2"]
     words = [word for setting in kept for word in ("--set", setting)]
-    words += ["--method", "sdf", "--workers", "1", "--out", str(folder / "out")]
-    return main(["tables", "--preset", "paper", *words])
-
-
-def test_nine_columns(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a preset that loses a scene of the dataset, or reads its frames in another order."""
-    assert run(monkeypatch, dataset, tmp_path) == 0
+    words += ["--method", "sdf", "--workers", "1", "--out", str(tmp_path / "out")]
+    assert main(["tables", "--preset", "paper", *words]) == 0
     cells = pd.read_csv(tmp_path / "out" / "table_1.csv")
     assert set(cells["scene"]) == set(DATASET_SCENES.values())
     assert cells["ate_m"].notna().all()

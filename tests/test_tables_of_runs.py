@@ -65,6 +65,15 @@ def own_scenes(
     return open_scenes(preset)
 
 
+@pytest.fixture
+def coarse_methods(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A grid of a whole room in cells of 4 cm takes seconds to fill."""
+    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
+    for name, method in METHODS.items():
+        settings = tuple(text.replace("=0.04", "=0.3") for text in method.settings)
+        monkeypatch.setitem(METHODS, name, replace(method, settings=settings))
+
+
 def test_table_1_is_complete_cached_and_repeatable(
     preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -142,17 +151,12 @@ def test_methods_carry_their_settings(preset: Preset, own_scenes: list[Scene]) -
     assert len(list(own_scenes[1].folder.parents[2].glob("maps/*/map.safetensors"))) == 1
 
 
-def test_table_3(tmp_path: Path, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table_3(tmp_path: Path, coarse_methods: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches rows of Table III that are other runs than those of Table I, or go without a map."""
     assert set(TABLE_1) < set(TABLE_3)
     assert RATES_3_HZ[0] == 30
     monkeypatch.setattr("nbtrack.experiments.bench.RATES_3_HZ", RATES_3_HZ[:1])
-    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
-    for name in TABLE_3:  # a grid of a whole room in cells of 4 cm takes seconds to fill
-        settings = tuple(text.replace("=0.04", "=0.3") for text in METHODS[name].settings)
-        settings += ("tracking.lm.voxel=0.3",)
-        monkeypatch.setitem(METHODS, name, replace(METHODS[name], settings=settings))
-    words = tiny_words("scenes.names=office", "scenes.track_frames=:2")
+    words = tiny_words("scenes.names=office", "scenes.track_frames=:2", "tracking.lm.voxel=0.3")
     words += ["--no-still", "--set", "scenes.labels=['office=Mine']", "--caption"]
     assert main(["tables", "--beyond", "--workers", "1", "--out", str(tmp_path), *words]) == 0
     assert len(pd.read_csv(tmp_path / "table_3.csv")) == len(TABLE_3)
@@ -162,16 +166,13 @@ def test_table_3(tmp_path: Path, scenes: list[Scene], monkeypatch: pytest.Monkey
 
 
 def test_every_method_is_made_again_from_its_command(
-    preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    preset: Preset, scenes: list[Scene], tmp_path: Path, coarse_methods: None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     """Catches a command that lacks a setting, a seed or a slice, or is refused; of the first method
     the map is made anew too."""
-    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
     few = [f"mapping.{field}.iterations=6" for field in ("volsdf", "occupancy")]
     coarse = with_settings(preset, "tracking.lm.voxel=0.3", *few)
-    for name, method in METHODS.items():
-        settings = tuple(text.replace("=0.04", "=0.3") for text in method.settings)
-        monkeypatch.setitem(METHODS, name, replace(method, settings=settings))
     how = {"steps": 2, "frames": "1:4", "seeds": [1], "execution": Execution(workers=1)}
     runs = track_scenes(scenes[1:], [*METHODS], coarse, **how)
     assert runs["failure"].eq("").all()
