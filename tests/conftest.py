@@ -1,4 +1,4 @@
-"""Fixtures that several test modules ask for by name."""
+"""Fixtures that several test modules ask for by name. Those of pytest itself go without types."""
 
 import os
 import shutil
@@ -58,7 +58,7 @@ def plain(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(tmp_path_factory) -> Path:
     """Results: a small map (`map`), the same as one file (`room`), a run in the map (`run`), and a
     cache (`runs`)."""
     from nbtrack.cli import main
@@ -73,7 +73,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def work(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def work(finished: Path, tmp_path: Path, monkeypatch) -> Path:
     """A copy of the finished results as the working folder."""
     shutil.copytree(finished, tmp_path / "work")
     isolate(tmp_path / "work", monkeypatch)

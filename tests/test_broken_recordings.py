@@ -158,7 +158,7 @@ CASES = [(format, case) for format, cases in BROKEN.items() for case in cases]
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Path], Path]:
+def whole(tmp_path_factory) -> Callable[[str, Path], Path]:
     """Copies of whole recordings, written once."""
     base = tmp_path_factory.mktemp("whole")
     for format in WRITERS:

@@ -76,9 +76,7 @@ def test_mean_is_over_the_whole_frame() -> None:
     assert clock.steps(1 / 8) == resumed.steps(1 / 8) == 0
 
 
-def test_the_trackers_device_is_waited_for_before_each_reading(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_trackers_device_is_waited_for_before_each_reading(monkeypatch) -> None:
     """Catches GPU steps that look free because they are only queued, perhaps on another device than
     the first one."""
     events, device = [], torch.device("cuda:1")

@@ -37,7 +37,7 @@ def track(path: Path | str, *more: str) -> list[str]:
     return [*words, *TINY, *more]
 
 
-def test_track_writes_what_it_promises(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_track_writes_what_it_promises(tmp_path: Path, capsys) -> None:
     """Catches missing files and keys, and an error that the trajectories do not bear out."""
     out = tmp_path / "result"
     assert main(track("living_room", "--out", str(out), "--seed", "3")) == 0
@@ -60,7 +60,7 @@ def test_track_writes_what_it_promises(tmp_path: Path, capsys: pytest.CaptureFix
     assert len(rows) == 6
 
 
-def test_a_second_run_finds_the_map(capsys: pytest.CaptureFixture, tmp_path: Path) -> None:
+def test_a_second_run_finds_the_map(capsys, tmp_path: Path) -> None:
     """Catches maps that are made again although nothing changed, or not although it did, and a map
     whose quality or folder is not printed."""
     assert main(["map", "living_room", "--field", "neus", *TINY]) == 0
@@ -73,16 +73,14 @@ def test_a_second_run_finds_the_map(capsys: pytest.CaptureFixture, tmp_path: Pat
     assert said == ["map found", "no finished map"]
 
 
-def test_tracking_command_reads_any_format(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_tracking_command_reads_any_format(tmp_path: Path, capsys) -> None:
     """Catches a --format that the command line drops on its way to map and track."""
     folder = write_recording("tum", tmp_path / "r")
     assert main(track(folder, "--format", "tum")) == 0
     assert_refused(tmp_path, capsys, track(folder, "--format", "plain"), "no colour images ")
 
 
-def test_a_traceback_for_who_asks(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_traceback_for_who_asks(tmp_path: Path, capsys, monkeypatch) -> None:
     """Catches a mistake of the program that looks like one of a file, and tracebacks unasked."""
     wrong = ["data", "check", str(tmp_path / "nothing")]
     assert main(wrong) == 2
@@ -96,9 +94,7 @@ def test_a_traceback_for_who_asks(
         tmp_path.no_such_method()
 
 
-def test_a_map_is_taken_with_the_settings_that_made_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_is_taken_with_the_settings_that_made_it(tmp_path: Path, capsys, monkeypatch) -> None:
     """Catches a refusal of the very settings that a map was made with, because a method set others
     beside them; and settings that the map does not have, which no run could follow."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
@@ -112,7 +108,7 @@ def test_a_map_is_taken_with_the_settings_that_made_it(
     assert main([*given, "--set", "mapping.imap.n_rays=77", "--out", str(tmp_path / "run")]) == 0
 
 
-def test_only_the_first_pose_is_known(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_only_the_first_pose_is_known(tmp_path: Path, capsys) -> None:
     """Catches a recording that is refused because nothing is known to compare with, an error that
     is made up, and a reference of an earlier run that stays beside a trajectory without one."""
     folder, out = write_recording("plain", tmp_path / "r"), tmp_path / "result"
@@ -159,9 +155,7 @@ def test_what_completion_offers() -> None:
     assert all(hasattr(nbtrack, name) for name in dir(nbtrack))
 
 
-def test_a_recording_without_poses_is_tracked_in_a_map(
-    work: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recording_without_poses_is_tracked_in_a_map(work: Path, capsys, monkeypatch) -> None:
     """Catches `no poses in ...` where a map of the room is given: the camera is found first, every
     frame is tracked, and nothing is said of errors; and a picture that is not there."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 20_000)
@@ -217,9 +211,7 @@ def test_a_pipe_that_nobody_reads() -> None:
     assert (found.returncode, found.stderr) == (1, "")
 
 
-def test_names_that_are_no_text(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_names_that_are_no_text(tmp_path: Path, monkeypatch, capsys) -> None:
     """Catches a recording or result whose name is not UTF-8 and that can be made but not read."""
     monkeypatch.chdir(tmp_path)
     folder, out, run = (os.fsdecode(name + b"\xff") for name in (b"r", b"m", b"t"))

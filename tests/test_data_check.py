@@ -308,7 +308,7 @@ def test_absurd_numbers_before_mapping(tmp_path: Path) -> None:
         assert case.says in said
 
 
-def test_map_and_track_warn(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_map_and_track_warn(tmp_path: Path, capsys) -> None:
     """Catches 153 s of work on wrong axes that end at 5 m with status 0; and frames without a pose
     that are left out in silence."""
     folder = write(tmp_path / "r", "office", Case("", change=poses("opengl")))

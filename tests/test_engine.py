@@ -25,7 +25,7 @@ def frozen_field(name: str) -> Field:
 
 
 @pytest.mark.parametrize("name", ["imap", "neus"])
-def test_parts_answer_as_the_whole(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_answer_as_the_whole(name: str, monkeypatch) -> None:
     """Catches a part that is lost, and training in parts, whose sums would be rounded otherwise."""
     field, found, rows = frozen_field(name), [], []
     field.mlp.layer_1.register_forward_hook(lambda *call: rows.append(len(call[2])))
@@ -40,7 +40,7 @@ def test_parts_answer_as_the_whole(name: str, monkeypatch: pytest.MonkeyPatch) -
         torch.testing.assert_close(parts, whole, rtol=1e-4, atol=1e-5)
 
 
-def test_cores_are_those_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cores_are_those_that_may_be_used(monkeypatch) -> None:
     """Catches a process a core of a shared machine, of which a scheduler has left one."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3}, raising=False)
     assert usable_cores() == 1

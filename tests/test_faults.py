@@ -25,7 +25,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def assert_refused(work: Path, capsys: pytest.CaptureFixture, command: list[str], says: str) -> str:
+def assert_refused(work: Path, capsys, command: list[str], says: str) -> str:
     """The command fails as a user's mistake must: one line, status 2, nothing changed."""
     before = contents(work)
     capsys.readouterr()
@@ -172,7 +172,7 @@ for case, (name, value, says) in ENVIRONMENT.items():
 
 
 @pytest.mark.parametrize("case", FAULTS)
-def test_faults(case: str, work: Path, capsys: pytest.CaptureFixture) -> None:
+def test_faults(case: str, work: Path, capsys) -> None:
     """Catches tracebacks, also of the system and for root, whom no permission bit stops; settings
     that are guessed, ignored or checked less in one place; results that are half there and taken
     for whole or repaired in silence; and mistakes that are met after earlier results are gone."""
@@ -195,9 +195,7 @@ def files_limited_to(n_bytes: int) -> Any:
 
 
 @pytest.mark.parametrize("n_bytes", [0, 1500])
-def test_a_disk_that_fills_up_while_results_are_written(
-    n_bytes: int, work: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_disk_that_fills_up_while_results_are_written(n_bytes: int, work: Path, capsys) -> None:
     """Catches a run of which half is new and half is old: all of it stays old."""
     with files_limited_to(n_bytes):
         error = assert_refused(work, capsys, [*OWN, "--seed", "0", "--frames", "1:"], "run")
@@ -223,7 +221,7 @@ def test_streams_and_letters(tmp_path: Path) -> None:
     assert (tmp_path / "Küche/poses.txt").is_file()
 
 
-def test_a_full_disk_while_a_room_is_made(work: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_full_disk_while_a_room_is_made(work: Path, capsys) -> None:
     """Catches "122684 requested and 36864 written", which names no cause and no folder."""
     command = ["data", "make", "office", "--out", "new", "--n-frames", "2", "--width", "64"]
     with files_limited_to(400):
@@ -232,9 +230,7 @@ def test_a_full_disk_while_a_room_is_made(work: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])
-def test_a_file_system_without_locks(
-    code: int, work: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_system_without_locks(code: int, work: Path, monkeypatch) -> None:
     """Catches "No locks available", which no user can mend, in place of a room, a map and a run."""
 
     def no_lock(descriptor: int, operation: int) -> None:

@@ -95,7 +95,7 @@ def test_round_trip(tmp_path: Path, format: str) -> None:
     assert len(seen) == len(changes) + 1
 
 
-def test_depth_and_poses_of_a_phone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_depth_and_poses_of_a_phone(tmp_path: Path, monkeypatch) -> None:
     """Catches compressed depth that is read as numbers, or refused without a way out; and images
     of a cut recording that get the poses of others, where stamps have another rate than numbers."""
     folder = write_recording("record3d", tmp_path / "r")
@@ -324,7 +324,7 @@ def test_formats_are_told_apart(plain: Path, tmp_path: Path) -> None:
         read_sequence(tmp_path / "seven")
 
 
-def test_a_new_format_is_one_entry(plain: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_format_is_one_entry(plain: Path, monkeypatch) -> None:
     """Catches formats listed anywhere but in the table."""
     monkeypatch.setitem(FORMATS, "own", replace(FORMATS["plain"], color=("rgb/*",)))
     (plain / "color").rename(plain / "rgb")

@@ -102,7 +102,7 @@ def test_a_spoilt_frame_is_survived_and_flagged(case: str) -> None:
     assert error_m(estimate.T_world_camera, sequence, index) < 0.01
 
 
-def test_images_and_poses_that_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_and_poses_that_are_none(monkeypatch) -> None:
     """Catches a traceback for what a camera's driver returns when it has no image, where types are
     not checked at each call."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)

@@ -18,7 +18,7 @@ AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, -2, 3], [-1, 1e-9, 0]]
 
 
 @pytest.fixture(params=[(), (1,), (7,), (2, 3), (0,)], ids=str)
-def shape(request: pytest.FixtureRequest) -> tuple[int, ...]:
+def shape(request) -> tuple[int, ...]:
     return request.param
 
 

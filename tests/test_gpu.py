@@ -25,7 +25,7 @@ cuda = pytest.param("cuda", marks=pytest.mark.gpu)
 
 
 @pytest.fixture
-def device(request: pytest.FixtureRequest) -> torch.device:
+def device(request) -> torch.device:
     if not torch.cuda.is_available():
         pytest.skip("no GPU")
     return torch.device(request.param)
@@ -61,7 +61,7 @@ def test_tracking_on_a_device(name: str, field_name: str, device: torch.device) 
 @pytest.mark.parametrize("device", [cuda], indirect=True)
 @pytest.mark.parametrize(("name", "field_name"), [("sdf", "neus"), ("vr", "imap"), ("vr", "neus")])
 def test_recorded_steps_are_the_steps(
-    name: str, field_name: str, device: torch.device, monkeypatch: pytest.MonkeyPatch
+    name: str, field_name: str, device: torch.device, monkeypatch
 ) -> None:
     """Catches recorded steps that draw other numbers, or keep what changes."""
     recorded = poses(name, field_name, device)
@@ -72,7 +72,7 @@ def test_recorded_steps_are_the_steps(
 @pytest.mark.parametrize("device", [cuda], indirect=True)
 @pytest.mark.parametrize("name", ["imap", "neus", "neus_plus"])
 def test_recorded_iterations_are_the_iterations(
-    name: str, device: torch.device, monkeypatch: pytest.MonkeyPatch
+    name: str, device: torch.device, monkeypatch
 ) -> None:
     """Catches tensors left on the host, losses that are not finite, and recorded iterations that
     draw other numbers, or keep what changes."""
@@ -104,7 +104,7 @@ def test_a_device_that_fails_is_no_damage(kind: type, tmp_path: Path) -> None:
         raise kind("CUDA error: out of memory")
 
 
-def test_the_device_is_the_named_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_device_is_the_named_one(monkeypatch) -> None:
     """Catches tests that run commands on a GPU because there is one."""
     assert choose_device().type == "cpu"
     monkeypatch.setenv("NBTRACK_DEVICE", "cpu:1")

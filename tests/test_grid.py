@@ -70,14 +70,14 @@ def address() -> Iterator[str]:
 
 
 @pytest.fixture(params=["here", "in processes", "on a cluster"])
-def execution(request: pytest.FixtureRequest, address: str) -> Iterator[dict[str, Any]]:
+def execution(request, address: str) -> Iterator[dict[str, Any]]:
     """All ways of running jobs."""
     ways = {"here": {"workers": 1}, "in processes": {"workers": 2}}
     with forking():
         yield ways.get(request.param, {"dask": address})
 
 
-def test_results_come_in_order(execution: dict, capsys: pytest.CaptureFixture) -> None:
+def test_results_come_in_order(execution: dict, capsys) -> None:
     """Catches results in the order of their completion, twins computed twice, and early noise."""
     jobs = [Square(3), Square(1, needs=Square(4)), Square(3), Square(5, is_done=True)]
     assert run_jobs(jobs, Execution(**execution)) == [9, 1, 9, 25]
@@ -106,7 +106,7 @@ def test_a_worker_that_dies_is_explained(execution: dict) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_the_bar_moves(monkeypatch: pytest.MonkeyPatch, execution: dict) -> None:
+def test_the_bar_moves(monkeypatch, execution: dict) -> None:
     """Catches a bar that stands still for as long as a map takes, or misses jobs elsewhere."""
     seen = []
     monkeypatch.setattr(
@@ -129,7 +129,7 @@ def tables(folder: Path, *options: str) -> int:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def undisturbed(tmp_path_factory) -> bytes:
     """The table as one process makes it."""
     folder = tmp_path_factory.mktemp("here")
     assert tables(folder, "--workers", "1") == 0
@@ -184,9 +184,7 @@ def test_killed_and_started_again(tmp_path: Path, undisturbed: bytes) -> None:
     assert (tmp_path / "out/table_1_cells.csv").read_bytes() == undisturbed
 
 
-def test_no_scheduler(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_no_scheduler(capsys, monkeypatch, tmp_path: Path) -> None:
     """Catches a traceback of sockets where the address is wrong."""
     monkeypatch.setattr("nbtrack.experiments.jobs._SECONDS_TO_CONNECT", 0.5)
     assert tables(tmp_path, "--dask", "tcp://127.0.0.1:9") == 2

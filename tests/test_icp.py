@@ -49,7 +49,7 @@ def tracker_in(room: Room) -> Tracker:
     return make_tracker("icp", room[1].field, np.eye(4), StepBudget(1), settings)
 
 
-def test_points_of_a_voxel_are_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_points_of_a_voxel_are_averaged(monkeypatch) -> None:
     """Catches sums that are not divided, voxels mixed up, and a mean of means, where frames are
     merged in blocks: the mean is worked out by hand."""
     monkeypatch.setattr("nbtrack.beyond.points._FRAMES_AT_ONCE", 2)
@@ -73,7 +73,7 @@ def test_only_the_frames_asked_for_and_what_lies_inside_are_fused() -> None:
     torch.testing.assert_close(found, torch.tensor([0.3, 0.4]))
 
 
-def test_scores_of_points(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scores_of_points(room: Room, monkeypatch) -> None:
     """Catches images asked of points, and points off the exact surface: depth here is clean."""
     monkeypatch.setattr("nbtrack.experiments.quality.POINTS_SCORED", 4000)
     sequence, made = room
@@ -115,7 +115,7 @@ def test_icp_says_when_it_is_lost(room: Room) -> None:
     assert tracker.report() == {"inlier_ratio": 0.0, "lost": True}
 
 
-def test_missing_package_is_one_line(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_is_one_line(room: Room, monkeypatch) -> None:
     """Catches a traceback where the optional package is not installed."""
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     with pytest.raises(MissingError, match=r"^tracker icp needs .* 'nbtrack\[icp\]'$"):

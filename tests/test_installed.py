@@ -17,7 +17,7 @@ from nbtrack.core import files
 
 
 @pytest.fixture
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def elsewhere(tmp_path: Path, monkeypatch) -> Path:
     """An empty current folder, and no checkout around the package."""
     monkeypatch.delenv("NBTRACK_RUNS")
     monkeypatch.setattr(files, "PACKAGE", tmp_path / "site-packages" / "nbtrack")
@@ -42,9 +42,8 @@ def test_folders(elsewhere: Path) -> None:
     ],
 )  # fmt: skip
 def test_a_missing_extra_is_told_before_any_work(
-    elsewhere: Path, missing: str, arguments: list[str], message: str,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture,
-) -> None:  # fmt: skip
+    elsewhere: Path, missing: str, arguments: list[str], message: str, monkeypatch, capsys
+) -> None:
     """Catches minutes of work that end in a traceback of imports."""
     found = importlib.util.find_spec
     monkeypatch.setattr(
@@ -63,7 +62,7 @@ def test_help_is_quick_and_needs_no_torch(tmp_path: Path) -> None:
     assert "--map-from" in done.stdout
 
 
-def test_without_a_place_for_compiled_code(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_place_for_compiled_code(monkeypatch) -> None:
     """Catches commands that end because numba can write its cache nowhere."""
     real = observed.njit
 

@@ -79,7 +79,7 @@ def by_calls(work: Callable, generator: torch.Generator) -> tuple[Callable, torc
 
 
 @pytest.fixture(autouse=True)
-def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def as_on_a_gpu(monkeypatch) -> None:
     watching = ExitStack()
     modes = {"warn": lambda: watching.enter_context(Waits()), "default": watching.close}
     monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", lambda mode: modes[mode]())
@@ -119,9 +119,7 @@ PAIRS = (SdfTracker, "neus"), (VrTracker, "imap"), (VrTracker, "neus"), (Own, "n
 
 
 @pytest.mark.parametrize(("kind", "field_name"), PAIRS)
-def test_a_replayed_step_is_the_step(
-    kind: type[AdamTracker], field_name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_replayed_step_is_the_step(kind: type[AdamTracker], field_name: str, monkeypatch) -> None:
     """Catches a step that keeps the pixels, images, moments or random numbers of the recording, and
     one that reads a value on the host."""
     found = []
@@ -133,7 +131,7 @@ def test_a_replayed_step_is_the_step(
 
 
 @pytest.mark.parametrize("name", ["imap", "neus", "neus_plus"])
-def test_a_replayed_iteration_is_the_iteration(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replayed_iteration_is_the_iteration(name: str, monkeypatch) -> None:
     """Catches a batch or a learning rate that stays, and values read on the host."""
     found = []
     for record in (on_tape, by_calls):
@@ -148,14 +146,14 @@ def test_a_replayed_iteration_is_the_iteration(name: str, monkeypatch: pytest.Mo
     assert len(set(found[0])) == 12
 
 
-def test_what_waits_is_called(capsys: pytest.CaptureFixture, monkeypatch) -> None:
+def test_what_waits_is_called(capsys, monkeypatch) -> None:
     """Catches a loss that cannot be recorded and is; and one that is told of at every step."""
     monkeypatch.setattr(launches, "record", None)
     tracked(Choosy, "neus")
     assert capsys.readouterr().err.count("tracker own waits for a value of the GPU") == 1
 
 
-def test_results_are_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_are_kept_apart(monkeypatch) -> None:
     """Catches a loss that the next replay writes over."""
     monkeypatch.setattr(launches, "record", by_calls)
     recording, count = Recording("counter", torch.Generator()), torch.zeros(())

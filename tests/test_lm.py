@@ -113,7 +113,7 @@ def test_a_restart_forgets_the_past() -> None:
     assert (tracker.was_lost, tracker.last_good) == (False, None)
 
 
-def test_without_restarts_no_hypotheses_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_restarts_no_hypotheses_are_evaluated(monkeypatch) -> None:
     """Catches a thousand poses that are compared and dropped in every lost frame."""
     tracker = begun(mapped_from(T_TRUE), n_restarts=0)
     monkeypatch.setattr(tracker, "_other_starts", lambda *_: pytest.fail("evaluated"))
@@ -156,7 +156,7 @@ def test_a_pose_that_still_moves_when_the_budget_ends_is_lost() -> None:
     assert not run(begun(), offset, 40)
 
 
-def test_intensities_speak_against_a_pose_by_what_is_usual(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_intensities_speak_against_a_pose_by_what_is_usual(monkeypatch) -> None:
     """Catches a pose on a surface that the map made up: points fit there, but intensities are off
     by several times what is usual in the map; and a dark picture that is taken for one."""
     pictures = {"same": FRAME.color, "blended": BLENDED, "dark": 0 * BLENDED}

@@ -162,7 +162,7 @@ MAP_BYTES: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("case", MAP_BYTES)
-def test_map_bytes(case: str, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_map_bytes(case: str, sound: Path, monkeypatch) -> None:
     """Catches code that is run from a file, and damage that gives a traceback."""
     monkeypatch.chdir(sound.parent)
     sound.write_bytes(MAP_BYTES[case](sound.read_bytes()))
@@ -210,7 +210,7 @@ def test_a_frame_without_depth_tells_nothing() -> None:
 
 
 def test_a_file_gives_the_same_trajectory_elsewhere(
-    work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    work: Path, tmp_path: Path, monkeypatch
 ) -> None:
     """Catches weights that lose a bit on the way, a file that needs what is not in it, a folder of
     twice the size, and a map's parts that are not written together."""
@@ -269,7 +269,7 @@ def test_a_record_that_could_not_be_read_is_not_written(work: Path, tmp_path: Pa
     assert not (tmp_path / MAP_FILE).exists()
 
 
-def test_the_readmes_example(work: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_readmes_example(work: Path, capsys) -> None:
     """Catches a README that shows what no longer runs."""
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", readme, flags=re.DOTALL)

@@ -40,7 +40,7 @@ def quality_of(sequence: RgbdSequence, shift: float) -> dict:
     return score_map(Map(shifted(sequence, shift), sequence.intrinsics, made), sequence, ROOM)
 
 
-def test_scores(sequence: RgbdSequence, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scores(sequence: RgbdSequence, monkeypatch) -> None:
     """Catches scores that punish an exact map, blind scores and wrong units: of the truth, within
     half a cell, and of a surface 8 cm inside the room, which is beyond 5 cm."""
     monkeypatch.setattr("nbtrack.experiments.quality.POINTS_SCORED", 4000)

@@ -106,9 +106,7 @@ def test_targets_in_a_furnished_room() -> None:
     assert error[true_sdf[known > 0].abs() < 0.1].abs().mean() < 0.007
 
 
-def test_distances_are_learned_sooner_than_by_rendering_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_distances_are_learned_sooner_than_by_rendering_alone(tmp_path: Path, monkeypatch) -> None:
     """Catches supervision that is not wired in: after a few steps it must be nearer the truth; and
     a file that does not keep grids of features."""
     monkeypatch.setattr("nbtrack.beyond.neus_plus._MIN_VOXEL", 0.1)  # a second in place of four

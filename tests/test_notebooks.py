@@ -12,7 +12,7 @@ NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/*.ipynb"))
 
 
 @pytest.fixture(params=NOTEBOOKS, ids=lambda path: path.stem)
-def cells(request: pytest.FixtureRequest) -> list[dict[str, Any]]:
+def cells(request) -> list[dict[str, Any]]:
     """Each committed notebook in turn; a cell's source is one text."""
     found = json.loads(request.param.read_text(encoding="utf-8"))["cells"]
     return [cell | {"source": "".join(cell["source"])} for cell in found]
@@ -25,7 +25,7 @@ def test_there_are_five() -> None:
     ]  # fmt: skip
 
 
-def test_complete_and_small(request: pytest.FixtureRequest, cells: list[dict[str, Any]]) -> None:
+def test_complete_and_small(request, cells: list[dict[str, Any]]) -> None:
     """Catches cells without a stored run, which strict checking would execute but not compare, and
     code that belongs in the package: long cells, functions, shell and magics. A4 is about code of
     one's own, and has classes."""
@@ -78,9 +78,7 @@ FACTS = {*pd.read_csv(Path(__file__).parent / "data/prose_numbers.csv", dtype=st
 NUMBER = r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?![\w.]*\d)"
 
 
-def test_numbers_in_prose_are_computed(
-    request: pytest.FixtureRequest, cells: list[dict[str, Any]]
-) -> None:
+def test_numbers_in_prose_are_computed(request, cells: list[dict[str, Any]]) -> None:
     """Catches a sentence whose number is no longer what the cells of its notebook hold or print:
     each with a decimal, or of two digits and more, is that of a cell, rounded, or one in m that
     the sentence has in cm or mm."""

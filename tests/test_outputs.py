@@ -43,9 +43,7 @@ def test_a_map_is_read_once(work: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["tum", "neural_rgbd"])
-def test_a_recording_is_never_written_to(
-    kind: str, work: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recording_is_never_written_to(kind: str, work: Path, capsys, monkeypatch) -> None:
     """Catches `track REC --out REC`, which replaced the recording's own poses by the estimate."""
     write_recording(kind, work / "rec")
     commands = [
@@ -65,7 +63,7 @@ def test_a_recording_is_never_written_to(
         assert_refused(work, capsys, command, "rec holds a recording, where nothing is written")
 
 
-def test_files_of_others_stay(work: Path, capsys: pytest.CaptureFixture) -> None:
+def test_files_of_others_stay(work: Path, capsys) -> None:
     """Catches an --out that overwrites what nbtrack did not write; other files beside are fine."""
     (work / "mine").mkdir()
     (work / "mine/trajectory.txt").write_text("0 1 2 3 0 0 0 1\n")
@@ -86,7 +84,7 @@ def test_files_of_others_stay(work: Path, capsys: pytest.CaptureFixture) -> None
         (work / "paper" / name).unlink()
 
 
-def test_places_are_told_before_the_work(work: Path, capsys: pytest.CaptureFixture) -> None:
+def test_places_are_told_before_the_work(work: Path, capsys) -> None:
     """Catches hours of mapping that end at a place where nothing can be written."""
     with mock.patch("nbtrack.experiments.commands.run_jobs") as run_jobs:
         for place in ("room", "room/run", "/proc/nbtrack"):
@@ -108,7 +106,7 @@ def test_a_flipped_bit_in_a_checkpoint_is_noticed(tmp_path: Path) -> None:
         pass
 
 
-def test_tables_do_not_touch_the_evidence(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_tables_do_not_touch_the_evidence(tmp_path: Path, capsys) -> None:
     """Catches a command that writes into `paper_tables`, which holds committed evidence."""
     before = contents(PROJECT / "paper_tables")
     words = tiny_words("scenes.names=['office']", "scenes.track_frames=:2")
@@ -118,9 +116,7 @@ def test_tables_do_not_touch_the_evidence(tmp_path: Path, capsys: pytest.Capture
     assert {path.name for path in written.iterdir()} >= {"table_1.csv", "table_1.tex"}
 
 
-def test_a_folder_comes_before_a_room_of_its_name(
-    work: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_folder_comes_before_a_room_of_its_name(work: Path, capsys) -> None:
     """Catches an own recording `office/` in whose place the synthetic room is tracked, an own
     `kitchen/` that is to be downloaded, and results in `office/` that are taken for a recording."""
     preset = load_preset(settings=["scenes.n_frames=2", "scenes.width=32"])
@@ -160,7 +156,7 @@ def test_an_image_mended_in_place_counts(tmp_path: Path, kind: str) -> None:
     assert Scene("rec", tmp_path / "rec").fingerprint != before
 
 
-def test_a_room_is_made_anew_where_its_maker_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_room_is_made_anew_where_its_maker_changes(monkeypatch) -> None:
     """Catches runs in a room that `rooms.toml` no longer describes, and other rooms made anew."""
     names = ("office", "living_room")
     before = [make.room_version(name) for name in names]
@@ -169,7 +165,7 @@ def test_a_room_is_made_anew_where_its_maker_changes(monkeypatch: pytest.MonkeyP
     assert [make.room_version(n) == b for n, b in zip(names, before, strict=True)] == [False, True]
 
 
-def test_flagged_and_wrong_frames_are_told_apart(work: Path, capsys: pytest.CaptureFixture) -> None:
+def test_flagged_and_wrong_frames_are_told_apart(work: Path, capsys) -> None:
     """Catches "lost frames" that mean errors in one place and the tracker's verdict in another."""
     small = ["--set", "tracking.lm.n_pixels=64", "--set", "tracking.lm.n_restarts=0"]
     assert main([*GIVEN, "map", "--tracker", "lm", *small, "--out", "by_lm"]) == 0
@@ -195,7 +191,7 @@ def test_threads_belong_to_a_run_by_the_clock_and_its_key(work: Path) -> None:
     assert found[0]["run"][0] != found[1]["run"][0]
 
 
-def test_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_far_from_the_origin(tmp_path: Path, capsys) -> None:
     """Catches positions in map coordinates that single precision rounds to half a metre, and one
     pose that is far from all others."""
     utm, found = np.array([4.5e5, 5.4e6, 100.0]), {}

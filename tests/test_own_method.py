@@ -67,7 +67,7 @@ nbtrack.METHODS["mine"] = nbtrack.Method("Mine", "fading", "distance")
 
 
 @pytest.fixture
-def grid_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def grid_file(tmp_path: Path, monkeypatch) -> Iterator[None]:
     """The classes of notebook A4 as a file of one's own."""
     notebook = Path(__file__).parents[1] / "notebooks/A4_a_field_of_your_own.ipynb"
     cells = [c.source for c in nbformat.read(notebook, 4).cells if c.cell_type == "code"]
@@ -113,9 +113,7 @@ def importing() -> Iterator[None]:
             sys.modules.pop(name, None)
 
 
-def test_installed_packages_join_by_their_entry_points(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_installed_packages_join_by_their_entry_points(tmp_path: Path, monkeypatch, capsys) -> None:
     """Catches a package whose methods no command knows unless somebody imports it, and a traceback
     from every command because of somebody else's broken one."""
     (tmp_path / "own_method.py").write_text(OWN)
@@ -134,9 +132,7 @@ def test_installed_packages_join_by_their_entry_points(
     assert "plug-in own_broken is left out (ZeroDivisionError: division by zero)" in said.err
 
 
-def test_a_file_joins_by_an_option_of_every_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_file_joins_by_an_option_of_every_command(tmp_path: Path, monkeypatch, capsys) -> None:
     """Catches an extension that needs more than its own file: presets, layouts, registries; a file
     that some command, or a worker process, does not know; a map of its field that can be read only
     where it was made, and a command that does not make a run again."""
@@ -180,9 +176,8 @@ def test_a_file_joins_by_an_option_of_every_command(
     ],
 )
 def test_a_file_that_cannot_be_imported(
-    name: str, text: str | None, says: str, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture,
-) -> None:  # fmt: skip
+    name: str, text: str | None, says: str, tmp_path: Path, monkeypatch, capsys
+) -> None:
     """Catches a traceback, an error that does not say where the file is wrong, and a file that is
     passed over in silence for a module of its name."""
     monkeypatch.chdir(tmp_path)
@@ -197,9 +192,7 @@ def test_a_file_that_cannot_be_imported(
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
-def test_settings_of_own_classes_whenever_they_are_registered(
-    when: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_settings_of_own_classes_whenever_they_are_registered(when: str, monkeypatch) -> None:
     """Catches other settings of one class in a file, in a notebook and in an installed package: its
     own defaults, with what smoke changes in NeuS or SDF, and without a user's values of those; and
     a class written anew, as a cell run again does, that loses what was chosen for it."""
@@ -266,9 +259,7 @@ class Blank(nbtrack.Field):
         (FIELDS, Blank, "no tracker works on field 'mine'"),
     ],
 )
-def test_classes_that_lack_something(
-    registry: dict, kind: type, says: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_classes_that_lack_something(registry: dict, kind: type, says: str, monkeypatch) -> None:
     """Catches an AttributeError in the middle of a command, and a StopIteration where no tracker of
     the package's works in an own field."""
     monkeypatch.setitem(registry, "mine", kind)
@@ -296,9 +287,7 @@ def test_a_place_too_large_for_a_correction() -> None:
         ),
     ],
 )
-def test_losses_that_are_no_terms(
-    spoilt: Callable, says: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_losses_that_are_no_terms(spoilt: Callable, says: str, monkeypatch) -> None:
     """Catches torch's words about sizes or sparse tensors where a field returns the sum of its
     terms, or a term only now and then."""
 

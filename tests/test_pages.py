@@ -16,7 +16,7 @@ FIRST = ROOT / "notebooks/01_map_imap.ipynb"
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, bs4.BeautifulSoup]:
+def pages(tmp_path_factory) -> dict[Path, bs4.BeautifulSoup]:
     """The pages of the first notebook, with stored outputs, and of the texts that it names."""
 
     def read_source(path: Path, execute: bool) -> nbformat.NotebookNode:

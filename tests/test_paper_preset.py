@@ -19,7 +19,7 @@ WIDTH, HEIGHT = 32, 24
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(tmp_path_factory) -> Path:
     """Nine folders in the dataset's layout, under its names; what they show is one room of ours."""
     folder = tmp_path_factory.mktemp("neural_rgbd")
     frames = list(room_frames(build_room("living_room"), N_FRAMES, WIDTH, HEIGHT, seed=0))
@@ -31,7 +31,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_nine_columns(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nine_columns(dataset: Path, tmp_path: Path, monkeypatch) -> None:
     """Catches a preset that loses a scene of the dataset, or reads its frames in another order:
     every scene, one tracker, at one rate."""
     monkeypatch.setenv("NBTRACK_DATA", str(dataset))

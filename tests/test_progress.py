@@ -15,13 +15,13 @@ class Clock:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+def clock(monkeypatch) -> Clock:
     """That of the bars."""
     monkeypatch.setattr("tqdm.std.time", clock := Clock())
     return clock
 
 
-def test_a_line_now_and_then(clock: Clock, capsys: pytest.CaptureFixture) -> None:
+def test_a_line_now_and_then(clock: Clock, capsys) -> None:
     """Catches output that is silent until the end, or never, and an ETA that is not from the mean
     speed: 2 of 8 parts in 31 seconds leave 93."""
     with ProgressBar("mapping", 8) as bar:
@@ -32,7 +32,7 @@ def test_a_line_now_and_then(clock: Clock, capsys: pytest.CaptureFixture) -> Non
     assert {*others} == {"mapping: 100 %, 01:30 gone, 00:00 left, loss 0.5"}
 
 
-def test_a_warm_up_is_left_out(clock: Clock, capsys: pytest.CaptureFixture) -> None:
+def test_a_warm_up_is_left_out(clock: Clock, capsys) -> None:
     """Catches hours that are left for half an hour, because the first frame was compiled."""
     with ProgressBar("tracking", 60) as bar:
         clock.now = 600
@@ -45,7 +45,7 @@ def test_a_warm_up_is_left_out(clock: Clock, capsys: pytest.CaptureFixture) -> N
     assert "29:58 left" in second  # 58 times 31 s
 
 
-def test_short_and_hidden_work_is_silent(clock: Clock, capsys: pytest.CaptureFixture) -> None:
+def test_short_and_hidden_work_is_silent(clock: Clock, capsys) -> None:
     """Catches noise about what takes no time, and about what nobody asked to see."""
     with ProgressBar("short", 1) as bar:
         bar.move_to(1)

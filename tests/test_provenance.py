@@ -18,7 +18,7 @@ from nbtrack.tracking import SdfTracker
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def package(tmp_path: Path, monkeypatch) -> Iterator[Path]:
     """A copy of the package's sources, to be edited."""
     copy = tmp_path / "nbtrack"
     shutil.copytree(provenance.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
@@ -60,9 +60,7 @@ def test_reading_counts(package: Path, tmp_path: Path) -> None:
     assert Scene("office", folder).fingerprint != before
 
 
-def test_own_files_count_with_their_helpers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_own_files_count_with_their_helpers(tmp_path: Path, monkeypatch) -> None:
     """Catches a tracker of a user's whose loss, in a second file or a base class, is edited and
     answered from the cache."""
     monkeypatch.syspath_prepend(tmp_path)
@@ -104,7 +102,7 @@ class Mine(SdfTracker):
         ('class Mine(SdfTracker):\n    name = "my"', True),
     ],
 )  # fmt: skip
-def test_cells_count(more: str, counts: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_count(more: str, counts: bool, monkeypatch) -> None:
     """Catches an edited cell that is answered from the cache, and maps made anew in each cell."""
     main = ModuleType("__main__")
     monkeypatch.setitem(sys.modules, "__main__", main)

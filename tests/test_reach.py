@@ -58,7 +58,7 @@ def test_a_step_is_a_share_of_the_unit(name: str, settings: type, scale: float) 
         assert q_wxyz.norm().item() == pytest.approx(1.0, abs=1e-6)
 
 
-def test_units_of_the_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_units_of_the_dataset(tmp_path: Path, monkeypatch) -> None:
     """Catches a scene of the dataset in another unit than its authors', where a data manager keeps
     it under a digest too, by path, by scene name and in the folder; and one that a user cannot
     change. Other folders have the unit of their map."""

@@ -81,7 +81,7 @@ def changed(draw: Callable, original: bytes) -> bytes:
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
 @given(data=st.data())
-def test_only_our_own_errors(tmp_path_factory: pytest.TempPathFactory, data) -> None:
+def test_only_our_own_errors(tmp_path_factory, data) -> None:
     """Catches any other exception or warning, and poses or pixels that are no numbers."""
     format = data.draw(st.sampled_from(list(TEXTS)))
     folder = recordings(tmp_path_factory.getbasetemp() / "fuzz")[format]

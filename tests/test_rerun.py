@@ -26,9 +26,7 @@ def rows_of(file: Path) -> Counter[tuple[str, bool]]:
     return rows
 
 
-def test_without_rerun(
-    finished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_without_rerun(finished: Path, monkeypatch, capsys) -> None:
     """Catches a traceback of imports, or minutes of meshing before it is told."""
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.setattr("nbtrack.experiments.commands.extract_mesh", None)

@@ -31,7 +31,7 @@ def iterations(preset: Preset) -> int:
     return preset.mapping_of("neus").iterations
 
 
-def test_presets_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_presets_by_name(monkeypatch) -> None:
     """Catches another default than smoke, and an environment that outdoes an explicit name."""
     assert load_preset() == PRESETS["smoke"]
     monkeypatch.setenv("NBTRACK_PRESET", "synthetic")
@@ -69,7 +69,7 @@ def test_figures_of_the_presets() -> None:
     assert {*PRESETS["smoke"].scenes.names} <= {*REPORTED_ROOMS}
 
 
-def test_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_precedence(tmp_path: Path, monkeypatch) -> None:
     """Catches a wrong order: preset < file < environment < explicit; presets never change."""
     before = copy.deepcopy(PRESETS)
     path = tmp_path / "settings.toml"
@@ -91,9 +91,7 @@ def test_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("source", ["file", "environment", "set"])
-def test_a_method_gives_way_to_the_user(
-    source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_method_gives_way_to_the_user(source: str, tmp_path: Path, monkeypatch) -> None:
     """Catches a method's settings that are applied last, so that a run has another n than the one
     that was asked for and that its caption names: preset < method < file < environment < --set."""
     method, key = METHODS["corrected"], "tracking.lm.n_pixels"
@@ -118,7 +116,7 @@ def test_a_preset_that_is_changed_later_stays_so() -> None:
     assert changed.mapping_of("imap").iterations == 4
 
 
-def test_values_take_the_type_of_the_preset(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_take_the_type_of_the_preset(monkeypatch) -> None:
     """Catches integers left in real settings, single values where several are allowed, and, in the
     environment, a split at commas or within quotes."""
     settings = (
@@ -243,7 +241,7 @@ class Small:
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Small]:
+def small(tmp_path_factory) -> Iterator[Small]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NBTRACK_RUNS", str(tmp_path_factory.mktemp("small")))
         patch.setattr("nbtrack.beyond.correction._N_POINTS", 1000)
@@ -267,7 +265,7 @@ def test_every_key_at_its_limits(key: str, small: Small) -> None:
             small.use(with_settings(small.preset, f"{key}={text}"), key)
 
 
-def test_claims_of_results(capsys: pytest.CaptureFixture) -> None:
+def test_claims_of_results(capsys) -> None:
     """Catches a claim that stops a reader who changed a setting, and one that is never checked."""
     changed = load_preset(settings=["mapping.imap.iterations=300"])
     claim(changed, True, "it is sharp")

@@ -35,9 +35,7 @@ SEEDS = pd.DataFrame(
     columns=[*COLUMNS_1, "seed"],
 )
 NOTE = r"Preset: smoke; budget: the paper's step counts; device: CPU_1 & 50% #1 $x {y} ~ ^ \z."
-END_IN_LATEX = (
-    r"CPU\_1 \& 50\% \#1 \$x \{y\} \textasciitilde{} \textasciicircum{} \textbackslash{}z.}"
-)
+ESCAPED = r"CPU\_1 \& 50\% \#1 \$x \{y\} \textasciitilde{} \textasciicircum{} \textbackslash{}z.}"
 
 
 def shown(styler) -> pd.DataFrame:
@@ -147,7 +145,7 @@ def test_marks_and_gaps_by_hand() -> None:
     ]
     assert text.count(r"\midrule") == 2
     assert "best at this rate). Preset: smoke; budget: the paper's step counts; device: " in text
-    assert END_IN_LATEX in text
+    assert ESCAPED in text
     assert f"% {NOTE}\n" in text
     named = OURS_1.replace({"room_a": "grey_white_room", "room_b": "thin_geometry"})
     assert list(table_1(named).columns) == ["Thin Geo.", "Grey-white"]

@@ -35,7 +35,7 @@ from nbtrack.tracking import make_tracker
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def cache(tmp_path_factory) -> Iterator[Path]:
     """One cache for all tests here, so that rooms and maps are made once, and one process."""
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("runs")
@@ -56,9 +56,8 @@ def scenes(preset: Preset) -> list[Scene]:
 
 @pytest.fixture
 def own_scenes(
-    cache: Path, scenes: list[Scene], preset: Preset, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> list[Scene]:  # fmt: skip
+    cache: Path, scenes: list[Scene], preset: Preset, tmp_path: Path, monkeypatch
+) -> list[Scene]:
     """The rooms in an otherwise empty cache, to be spoilt."""
     shutil.copytree(cache / "rooms", tmp_path / "rooms")
     monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path))
@@ -66,7 +65,7 @@ def own_scenes(
 
 
 @pytest.fixture
-def coarse_methods(monkeypatch: pytest.MonkeyPatch) -> None:
+def coarse_methods(monkeypatch) -> None:
     """A grid of a whole room in cells of 4 cm takes seconds to fill."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
     for name, method in METHODS.items():
@@ -75,7 +74,7 @@ def coarse_methods(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_table_1_is_complete_cached_and_repeatable(
-    preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch
 ) -> None:
     """Catches missing cells, runs that are made again, and hidden randomness anywhere."""
     cells = track_scenes(scenes, TABLE_1, preset)
@@ -96,9 +95,7 @@ def test_table_1_is_complete_cached_and_repeatable(
     assert elsewhere["ate_m"].tolist() == here["ate_m"].tolist()
 
 
-def test_keys_change_with_what_matters(
-    preset: Preset, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_keys_change_with_what_matters(preset: Preset, scenes: list[Scene], monkeypatch) -> None:
     """Catches a cached result that is taken for one of another setting, seed, slice or version, and
     one that is made anew for a setting that it does not read."""
     cells = [
@@ -151,7 +148,7 @@ def test_methods_carry_their_settings(preset: Preset, own_scenes: list[Scene]) -
     assert len(list(own_scenes[1].folder.parents[2].glob("maps/*/map.safetensors"))) == 1
 
 
-def test_table_3(tmp_path: Path, coarse_methods: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table_3(tmp_path: Path, coarse_methods: None, monkeypatch) -> None:
     """Catches rows of Table III that are other runs than those of Table I, or go without a map."""
     assert set(TABLE_1) < set(TABLE_3)
     assert RATES_3_HZ[0] == 30
@@ -166,9 +163,8 @@ def test_table_3(tmp_path: Path, coarse_methods: None, monkeypatch: pytest.Monke
 
 
 def test_every_method_is_made_again_from_its_command(
-    preset: Preset, scenes: list[Scene], tmp_path: Path, coarse_methods: None,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    preset: Preset, scenes: list[Scene], tmp_path: Path, coarse_methods: None, monkeypatch
+) -> None:
     """Catches a command that lacks a setting, a seed or a slice, or is refused; of the first method
     the map is made anew too."""
     few = [f"mapping.{field}.iterations=6" for field in ("volsdf", "occupancy")]
@@ -190,7 +186,7 @@ def test_every_method_is_made_again_from_its_command(
 
 
 def test_a_second_path_is_tracked_in_the_map_of_the_first(
-    preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch
 ) -> None:
     """Catches a run on the mapped path, one taken for it in the cache, and a wrong command."""
     second = open_scenes(with_settings(preset, "scenes.seed=1"))[1:]
@@ -243,7 +239,7 @@ def test_table_2_of_this_machine(preset: Preset, scenes: list[Scene]) -> None:
 
 
 def test_table_2_measures_what_a_method_uses(
-    tmp_path: Path, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, scenes: list[Scene], monkeypatch
 ) -> None:
     """Catches points without a map, and settings of a method that Table II does not know: then raw,
     untrained networks are measured in place of corrected maps, and another n."""
@@ -269,7 +265,7 @@ def test_table_2_measures_what_a_method_uses(
 
 
 def test_wrong_scenes_are_told_before_anything_is_made(
-    preset: Preset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    preset: Preset, tmp_path: Path, monkeypatch
 ) -> None:
     """Catches a misspelt column that is left out in silence, a column counted as two seeds, and an
     unhelpful error where the dataset was not downloaded."""
@@ -295,9 +291,7 @@ def test_frames_that_a_scene_lacks_are_told_before_it_is_mapped(
     assert not MapJob.of(scenes[0], "neus", preset, seed=7).is_done
 
 
-def test_a_scene_whose_tracked_part_has_no_pose(
-    tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_scene_whose_tracked_part_has_no_pose(tmp_path: Path, capsys) -> None:
     """Catches a whole scene whose results are lost, because the first frame of the one beside it,
     on which steps are counted, has no pose."""
     lost, whole = (write_recording("neural_rgbd", tmp_path / name) for name in ("lost", "whole"))
@@ -314,9 +308,7 @@ def test_a_scene_whose_tracked_part_has_no_pose(
     assert len(pd.read_csv(tmp_path / "out/table_2.csv")) == 1
 
 
-def test_a_damaged_scene_leaves_the_others(
-    preset: Preset, own_scenes: list[Scene], capsys: pytest.CaptureFixture
-) -> None:
+def test_a_damaged_scene_leaves_the_others(preset: Preset, own_scenes: list[Scene], capsys) -> None:
     """Catches one bad folder, or one scene that was not downloaded, that stops the whole grid."""
     broken = own_scenes[0].folder.rename(own_scenes[0].folder.with_name("broken"))
     (broken / "images" / "img2.png").unlink()
@@ -342,9 +334,7 @@ def test_a_failed_map_tells_why_in_every_cell(preset: Preset, own_scenes: list[S
         track_scenes(own_scenes, ["sdf"], preset)
 
 
-def test_searches_from_afar(
-    preset: Preset, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_searches_from_afar(preset: Preset, scenes: list[Scene], monkeypatch) -> None:
     """Catches starts that are off by another amount than they say, and shares without a verdict."""
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
     basin = importlib.import_module("basin")

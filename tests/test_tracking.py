@@ -118,7 +118,7 @@ def test_where_a_frame_starts() -> None:
 
 @pytest.mark.parametrize("name", ["vr", "sdf"])
 def test_a_killed_run_goes_on_as_if_it_had_not_stopped(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, tmp_path: Path, monkeypatch
 ) -> None:
     """Catches pixels drawn twice, a budget that forgets its fractions, frames done again."""
     sequence, frames = walk(6), []
@@ -141,7 +141,7 @@ def test_a_killed_run_goes_on_as_if_it_had_not_stopped(
     pd.testing.assert_frame_equal(resumed.frames[kept], whole.frames[kept])
 
 
-def test_an_unknown_start_is_searched_beyond_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_start_is_searched_beyond_the_budget(monkeypatch) -> None:
     """Catches a search for a camera somewhere in the map that ends with the budget of a frame."""
     monkeypatch.setattr("nbtrack.tracking.trajectories.STEPS_TO_FIND", 9)
     tracker = tracker_of("sdf", 2)

@@ -26,7 +26,7 @@ def frames(number: int) -> Iterator[WrittenFrame]:
         yield COLOR + np.uint8(i), depths, source().poses[i]
 
 
-def test_converter(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_converter(tmp_path: Path, capsys) -> None:
     """Catches a focal length or a principal point that is dropped in silence where the layout
     cannot say it, a slice that is ignored, and a folder without frames."""
     camera = Intrinsics(48, 36, 43.0, 44.5, 25.25, 17.0)
