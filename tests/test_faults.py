@@ -46,6 +46,10 @@ def _write(path: str, content: str | bytes) -> Callable[[], object]:
     return lambda: Path(path).write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def _gone(path: str) -> Callable[[], None]:
+    return lambda: Path(path).unlink()
+
+
 def _environment(name: str, value: str) -> Callable[[], None]:
     return lambda: os.environ.update({f"NBTRACK_{name}": value})
 
@@ -117,17 +121,13 @@ FILES = {
     "map checkpoint cut": (_killed(*KILLED_MAP, {}), MAP, "KeyError: 'recipe'"),
     "run checkpoint is a list": (_killed(*KILLED_RUN, [1]), OWN, "run.pt is " + CUT),
     "run checkpoint of words": (_killed(*KILLED_RUN, RUN_OF_WORDS), OWN, "run.pt is " + CUT),
-    "trajectory gone": (
-        lambda: Path(TRAJECTORY).unlink(),
-        KITTI,
-        "run/trajectory.txt: give a traj",
-    ),
+    "trajectory gone": (_gone(TRAJECTORY), KITTI, "run/trajectory.txt: give a traj"),
     "trajectory empty": (_write(TRAJECTORY, " "), KITTI, "trajectory.txt is empty"),
     "a word": (_write(TRAJECTORY, ROW.replace("3", "x")), KITTI, "readable table"),
     "a NaN": (_write(TRAJECTORY, ROW.replace("3", "nan")), KITTI, "not a finite pose"),
     "another order": (_write(TRAJECTORY, "0.5 0 0 1 1 2 3 4"), KITTI, "of norm 5.48"),
     "a run for a mesh": (_nothing, ["export", "run", "--to", "glb", "m.glb"], "run holds no"),
-    "unfinished run": (lambda: Path(RUN).unlink(), KITTI, "no finished run in run"),
+    "unfinished run": (_gone(RUN), KITTI, "no finished run in run"),
     "mesh cut": (_cut("map/mesh.ply"), MESH, "not a readable mesh"),
 }
 ARGUMENTS = {

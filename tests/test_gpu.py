@@ -1,6 +1,5 @@
 """What a GPU must do as a CPU does, on a real one, if any; and what its errors mean."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,9 +39,8 @@ def poses(name: str, field_name: str, device: torch.device) -> np.ndarray:
 
 
 def fit_on(device: torch.device, name: str) -> _Fit:
-    settings = replace(field_class(name).Settings(), iterations=20, n_rays=16)
-    if name == "neus_plus":
-        settings = replace(settings, n_surface_points=8)
+    extra = {"n_surface_points": 8} if name == "neus_plus" else {}
+    settings = field_class(name).Settings(iterations=20, n_rays=16, **extra)
     field = make_field(name, NetworkSettings(width=32), BOUNDS, seed=3).to(device)
     return _Fit({"seed": 0}, settings, field, SEQUENCE, np.arange(3))
 

@@ -69,9 +69,8 @@ def test_files_of_others_stay(work: Path, capsys) -> None:
     (work / "mine/trajectory.txt").write_text("0 1 2 3 0 0 0 1\n")
     says = "mine has a trajectory.txt that may not be nbtrack's"
     assert_refused(work, capsys, [*OWN, "--out", "mine"], says)
-    assert_refused(
-        work, capsys, ["export", "run", "--to", "kitti", "mine/trajectory.txt"], "exists"
-    )
+    export = ["export", "run", "--to", "kitti", "mine/trajectory.txt"]
+    assert_refused(work, capsys, export, "exists")
     (work / "mine/trajectory.txt").rename(work / "mine/notes.txt")
     for _ in range(2):  # what it wrote itself, it replaces
         assert main([*OWN, "--out", "mine"]) == 0
