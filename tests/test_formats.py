@@ -105,7 +105,7 @@ def test_depth_and_poses_of_a_phone(tmp_path: Path, monkeypatch) -> None:
     for path in (folder / "rgbd").glob("*.depth"):
         path.write_bytes(b"bvx2" + path.read_bytes())
     monkeypatch.setitem(sys.modules, "liblzfse", None)
-    with pytest.raises(MissingError, match="pip install pyliblzfse"):
+    with pytest.raises(DataError, match="pip install pyliblzfse"):
         read_sequence(folder)
     reader = SimpleNamespace(decompress=lambda content: content[4:])
     monkeypatch.setitem(sys.modules, "liblzfse", reader)
@@ -320,7 +320,7 @@ def test_formats_are_told_apart(plain: Path, tmp_path: Path) -> None:
     assert open_recording(plain).declared.format == "plain"
     with pytest.raises(ConfigError, match="did you mean 'replica'"):
         read_sequence(plain, format="replika")
-    with pytest.raises(MissingError, match=r"needs the files of neural_rgbd"):
+    with pytest.raises(MissingError, match=r"lists the files of neural_rgbd"):
         read_sequence(tmp_path / "seven")
 
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from nbtrack.checks.conventions import PLAUSIBLE_DEPTH, Convention, diagnosis, fit_all
+from nbtrack.checks.conventions import Convention, diagnosis, fit_all
 from nbtrack.checks.misfits import MAX_SHIFT, MIN_CORRELATION, Misfit, find_misfits, main_misfit
 from nbtrack.checks.readings import FramePairs, Pairs, Reading, on_grid
 from nbtrack.core.arrays import Frames, Poses
@@ -23,14 +22,12 @@ from nbtrack.recordings.recording import Recording
 _FRAMES_AT_ONCE = 32  # 50 MB at 640x480
 _CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
-_N_PAIRS = 20  # of frames that are compared for conventions
+_N_PAIRS = 60  # of frames that are compared
 _QUICK_PAIRS = 6  # the same in a quick look
-_FIT_PAIRS = 60  # the same for small misfits
+_MIN_FRAMES = 30  # without which pairs share too much to tell a small misfit
 _GAPS = (5, 10, 20, 40)  # frames between the two: they moved, and still see the same,
 _TURNED_DEG = 60  # which they do where the camera has not turned by more in between
 _CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
-_FLICKER = 0.35  # share by which brightness may change between frames (our choice)
-_SAME_VIEW_DEG = 10  # where they are turned by no more
 # A pose so far (m) from the middle of its neighbours, and so many usual steps: real recordings, and
 # rooms thinned to every twentieth frame, have 1.1. Half as far is a pose before or after a jump.
 _OFF = 0.05
@@ -38,9 +35,8 @@ _OFF_STEPS = 2.5
 _MIN_REPEATED = 0.05  # share of frames whose depth is that of the frame before, though they moved
 _MAX_STEP = 0.01  # share of the depth between depths that a camera can tell (our choice)
 _BLACK = 0.02  # brightness, in [0, 1]
-_PRINTED = ["measured", "brightness", "moved_mm", "turned_deg", "flicker"]
+_PRINTED = ["measured", "brightness", "moved_mm", "turned_deg"]
 _XYZ = ["x", "y", "z"]
-_RGB = ["red", "green", "blue"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,39 +46,19 @@ class DataReport:
     recording: Recording
     frames: pd.DataFrame  # what `_read` tells of each
     T_world_camera: Poses  # of the frames that have one, as declared
-    cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m)
-    outliers: pd.DataFrame  # the same of depths beyond `far_limit`
+    cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m); no outliers
     conventions: list[Convention]  # the declared one first
     best: Convention  # the declared one unless another is clearly better
     misfits: list[Misfit]  # of depth and poses, then of colours; where conventions are right
-    correlation: float  # of intensities that two frames see; NaN where not looked at
-    is_whole: bool  # every frame was looked at
-
-    @property
-    def warnings(self) -> list[str]:
-        """What is wrong, each in a sentence; first of all how the numbers are read."""
-        if not self.frames.measured.any():
-            return [
-                "no pixel that was looked at has a depth: all are 0, or saturated (65535); check "
-                "the depth folder, and no_depth in sequence.toml"
-            ]
-        warnings = [*_of_depth_images(self)]
-        needs_proof = self.is_whole and not warnings
-        misread = diagnosis(self.conventions, self.best, self.recording, needs_proof)
-        warnings += filter(None, [main_misfit(self.misfits) or misread])
-        if self.best is self.conventions[0]:
-            warnings += _of_poses_and_depths(self)
-        return [*warnings, *_of_colors(self)]
+    warnings: list[str]  # what is wrong, each in a sentence; how numbers are read comes first
 
     def __str__(self) -> str:
-        cloud = self.cloud
-        recording = self.recording
-        own, *others = self.conventions
-        rivals = sorted((r for r in others if r.overlap > 0), key=lambda r: r.relative)[:3]
+        recording, cloud, own = self.recording, self.cloud, self.conventions[0]
         c = own.reading.camera
         wide = 2 * np.degrees(np.arctan(c.width / 2 / c.fx))
         near, far = cloud.depth.quantile([0.01, 0.99])
         x, y, z = np.ptp(cloud[_XYZ].quantile(_CUT), axis=0)
+        facts = self.frames[_PRINTED].agg(["mean", "min", "max"]).T
         lines = [
             f"{recording.name}: {recording.format.label}, {len(self.frames)} of {len(recording)} "
             f"frames have a pose, {c.width} x {c.height} px",
@@ -91,86 +67,15 @@ class DataReport:
             *(f"  note: {text}" for text in recording.notes),
             f"  depth: {near:.2f} to {far:.2f} m (1% and 99%)",
             f"  scene: {x:.2f} x {y:.2f} x {z:.2f} m",
-            self.frames[_PRINTED]
-            .agg(["mean", "min", "max"])
-            .T.to_string(float_format="{:10.2f}".format),
-            "  overlap of two frames' surfaces (median distance, share of points), read as",
-            *(f"{1e3 * r.median_m:12.1f} mm {r.overlap:5.0%}  {r.name}" for r in (own, *rivals)),
+            facts.to_string(float_format="{:10.2f}".format),
+            f"  overlap of two frames' surfaces: {1e3 * own.median_m:.1f} mm apart (median), "
+            f"{own.overlap:.0%} of points, read as {own.name}",
             f"  misfits, as pairs of frames tell them (95 %): {len(self.misfits)} looked for",
             *(f"    {misfit}" for misfit in self.misfits),
             *(f"  warning: {text}" for text in self.warnings),
             f"  start with: track {recording.folder}",
         ]
         return "\n".join(lines)
-
-
-def _of_depth_images(report: DataReport) -> Iterator[str]:
-    """What is wrong with them, whatever their numbers mean."""
-    frames, depth = report.frames, report.cloud.depth
-    step = np.gcd.reduce(frames.depth_step) / report.recording.declared.depth_scale
-    if _MAX_STEP * depth.median() < step < depth.max() / 8:
-        yield (
-            f"depths come in steps of {100 * step:.1f} cm: look for those that the camera gave, or "
-            "expect no better poses"
-        )
-    repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()  # below 1: the first is not
-    if repeated > _MIN_REPEATED:
-        yield (
-            f"{repeated:.0%} of the depth images repeat the one before, though the poses move: "
-            f"leave them out, as with --frames ::{round(1 / (1 - repeated))} of map and track"
-        )
-
-
-def _of_poses_and_depths(report: DataReport) -> Iterator[str]:
-    """What is wrong with numbers that are read rightly."""
-    off = report.frames.off_mm / 1e3
-    is_odd = off > max(_OFF, _OFF_STEPS * report.frames.moved_mm.median() / 1e3)
-    # The neighbours of a pose that is off are off by half.
-    odd = off[is_odd & (off == off.rolling(3, 1, center=True).max())]
-    if len(odd):
-        first = report.recording.color_files[odd.index[0]].name
-        yield (
-            f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path of "
-            f"their neighbours, first {first}: check the poses there, or leave frames out with "
-            "--frames of map and track"
-        )
-    outliers = report.outliers.depth
-    if len(outliers):
-        share = len(outliers) / (len(outliers) + len(report.cloud))
-        yield (
-            f"{share:.2%} of the depths are outliers, {outliers.min():.3g} to {outliers.max():.3g} "
-            f"m away, more than {FAR:g} times as far as nine in ten: maps and tracking leave them "
-            "out; check the camera, or set no_depth in sequence.toml to what it gives for none"
-        )
-    near, far = PLAUSIBLE_DEPTH
-    depth = report.cloud.depth.median()
-    if not near <= depth <= far:
-        yield (
-            f"the median depth is {depth:.3g} m, outside {near:g} to {far:g} m: set depth_scale, "
-            "the depth values a metre, in sequence.toml"
-        )
-
-
-def _of_colors(report: DataReport) -> Iterator[str]:
-    """What is wrong with the colour images."""
-    frames = report.frames
-    no_color = (
-        "track without colour: --set tracking.lm.lambda_intensity=0, or "
-        "tracking.sdf.lambda_color=0 for sdf"
-    )
-    if frames.brightness.median() < _BLACK:
-        yield f"the colour images are black: check their folder, or {no_color}"
-    if report.correlation < MIN_CORRELATION and not main_misfit(report.misfits):
-        yield (
-            "colours do not belong to the depth images: of points that two frames see they "
-            f"correlate by {report.correlation:.2f}; check their folder and order"
-        )
-    flicker = frames.flicker[frames.turned_deg < _SAME_VIEW_DEG].max()
-    if flicker > _FLICKER:
-        yield (
-            f"brightness changes by {flicker:.0%} between two frames: fix exposure and white "
-            f"balance when recording, or {no_color}"
-        )
 
 
 def check_recording(
@@ -186,11 +91,8 @@ def check_recording(
     poses = recording.T_world_camera[ids]
     poses[:, :3, 3] -= recording.origin
     pairs = _pairs(poses, _N_PAIRS if is_whole else _QUICK_PAIRS)
-    fitted = _pairs(poses, _FIT_PAIRS if is_whole else 0, MAX_SHIFT)
-    around = np.add.outer(fitted, np.arange(-MAX_SHIFT, MAX_SHIFT + 1))
-    shown = np.arange(0, len(ids), max(1, round(len(ids) / _CLOUD_FRAMES)))
-    shown = shown if is_whole else np.unique(pairs)
-    kept = ids[np.union1d(np.union1d(pairs, around), shown)]
+    shown, kept = _kept(pairs, len(ids), is_whole)
+    kept = ids[kept]
     # Depth values as they stand in the files, so that any unit can be tried.
     in_files = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
     in_files = replace(recording, declared=in_files)
@@ -198,17 +100,24 @@ def check_recording(
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     own = Reading(recording.declared, sequence.intrinsics)
-    conventions, best = fit_all(FramePairs(recording, ids, sequence, pairs), own)
-    misfits, correlation = [], math.nan
-    if best is conventions[0] and fitted.size:
-        compared = FramePairs(recording, ids, sequence, fitted)
-        misfits, correlation = find_misfits(compared, best.reading)
+    seen = FramePairs(recording, ids, sequence, pairs)
+    conventions, best = fit_all(seen, own)
     cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))
+    is_right = best is conventions[0]
+    misfits, correlation = [], math.nan
+    if is_right and is_whole and len(ids) >= _MIN_FRAMES:
+        misfits, correlation = find_misfits(seen, best.reading)
     is_far = cloud.depth > far_limit(cloud.depth)
+    warnings = [*_of_depth_images(frames, cloud, recording)]
+    main = main_misfit(misfits)
+    warnings.append(main or diagnosis(conventions, best, recording, is_whole and not warnings))
+    if is_right:
+        warnings += [*_of_poses(frames, recording), *_of_outliers(cloud.depth, is_far)]
+    if not main:
+        warnings += _of_colors(frames.brightness, correlation)
     return DataReport(
-        recording, frames, poses, cloud=cloud[~is_far], outliers=cloud[is_far],
-        conventions=conventions, best=best, misfits=misfits, correlation=correlation,
-        is_whole=is_whole,
+        recording, frames, poses, cloud[~is_far], conventions=conventions, best=best,
+        misfits=misfits, warnings=[*filter(None, warnings)],
     )  # fmt: skip
 
 
@@ -219,24 +128,97 @@ def quick_warning(recording: Recording) -> str:
     return next(iter(check_recording(recording, is_whole=False).warnings), "")
 
 
+def _of_depth_images(
+    frames: pd.DataFrame, cloud: pd.DataFrame, recording: Recording
+) -> Iterator[str]:
+    """What is wrong with them, whatever their numbers mean."""
+    if not frames.measured.any():
+        yield (
+            "no pixel that was looked at has a depth: all are 0, or saturated (65535); check "
+            "the depth folder, and no_depth in sequence.toml"
+        )
+    step = np.gcd.reduce(frames.depth_step) / recording.declared.depth_scale
+    if _MAX_STEP * cloud.depth.median() < step < cloud.depth.max() / 8:
+        yield (
+            f"depths come in steps of {100 * step:.1f} cm: look for those that the camera gave, or "
+            "expect no better poses"
+        )
+    repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()  # below 1: the first is not
+    if repeated > _MIN_REPEATED:
+        yield (
+            f"{repeated:.0%} of the depth images repeat the one before, though the poses move: "
+            f"leave them out, as with --frames ::{round(1 / (1 - repeated))} of map and track"
+        )
+
+
+def _of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
+    """Which poses, read rightly, lie beside the path of their neighbours."""
+    off = frames.off_mm / 1e3
+    is_odd = off > max(_OFF, _OFF_STEPS * frames.moved_mm.median() / 1e3)
+    # The neighbours of a pose that is off are off by half.
+    odd = off[is_odd & (off == off.rolling(3, 1, center=True).max())]
+    if len(odd):
+        first = recording.color_files[odd.index[0]].name
+        yield (
+            f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path of "
+            f"their neighbours, first {first}: check the poses there, or leave frames out with "
+            "--frames of map and track"
+        )
+
+
+def _of_outliers(depth: pd.Series, is_far: pd.Series) -> Iterator[str]:
+    if is_far.any():
+        low, high = depth[is_far].min(), depth[is_far].max()
+        yield (
+            f"{is_far.mean():.2%} of the depths are outliers, {low:.3g} to {high:.3g} m away, more "
+            f"than {FAR:g} times as far as nine in ten: maps and tracking leave them out; check "
+            "the camera, or set no_depth in sequence.toml to what it gives for none"
+        )
+
+
+def _of_colors(brightness: pd.Series, correlation: float) -> Iterator[str]:
+    if brightness.median() < _BLACK:
+        yield (
+            "the colour images are black: check their folder, or track without colour: --set "
+            "tracking.lm.lambda_intensity=0, or tracking.sdf.lambda_color=0 for sdf"
+        )
+    if correlation < MIN_CORRELATION:
+        yield (
+            "colours do not belong to the depth images: of points that two frames see they "
+            f"correlate by {correlation:.2f}; check their folder and order"
+        )
+
+
 def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:
     """How far the camera turns from frame to frame."""
-    turns = T_world_camera[:-1, :3, :3].mT @ T_world_camera[1:, :3, :3]
-    return np.degrees(Rotation.from_matrix(turns).magnitude())
+    R = T_world_camera[:, :3, :3]
+    cosine = ((R[:-1] * R[1:]).sum(axis=(1, 2)) - 1) / 2  # from the trace of their product
+    return np.degrees(np.arccos(cosine.clip(-1, 1)))
 
 
-def _pairs(T_world_camera: Poses, maximum: int, margin: int = 0) -> Pairs:
+def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:
     """Positions of frames that see much the same, spread over a sequence, with all gaps alike.
 
-    None are within the margin of its ends. How far the camera turns is the same in all conventions.
+    How far the camera turns is the same in all conventions.
     """
-    n_frames = len(T_world_camera) - 2 * margin
+    n_frames = len(T_world_camera)
     if n_frames < 2:
         return np.empty((2, 0), int)
     turn = max(1.0, np.median(_turned_deg(T_world_camera)))
     gaps = np.minimum(np.resize(_GAPS, maximum), max(1, min(n_frames - 1, int(_TURNED_DEG / turn))))
-    first = margin + np.rint(np.linspace(0, 1, maximum) * (n_frames - 1 - gaps)).astype(int)
+    first = np.rint(np.linspace(0, 1, maximum) * (n_frames - 1 - gaps)).astype(int)
     return np.unique([first, first + gaps], axis=1)
+
+
+def _kept(pairs: Pairs, n_frames: int, is_whole: bool) -> tuple[Frames, Frames]:
+    """Positions of frames whose points are shown, and of all whose images are looked at again."""
+    compared = np.unique(pairs)
+    if not is_whole:
+        return compared, compared
+    shown = np.unique(np.linspace(0, n_frames - 1, _CLOUD_FRAMES).astype(int))
+    shifts = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
+    beside = np.add.outer(compared, shifts).clip(0, n_frames - 1)
+    return shown, np.union1d(beside, shown)
 
 
 def _read(
@@ -246,30 +228,27 @@ def _read(
 
     The row holds the share that is measured, the brightness in [0, 1], the number that divides all
     depths, whether these are those of the row before, by what the frame differs from the one before
-    it, and how far it is off the middle of its neighbours; NaN where these are not looked at.
+    it, and how far it is off the middle of its neighbours; NaN where one of these has no pose.
     """
     parts = []
     rows = []
     with ProgressBar("reading frames", len(looked_at), progress) as bar:
-        for first in range(0, len(looked_at), _FRAMES_AT_ONCE):
-            part = read_frames(recording, looked_at[first : first + _FRAMES_AT_ONCE])
+        for ids in np.split(looked_at, range(_FRAMES_AT_ONCE, len(looked_at), _FRAMES_AT_ONCE)):
+            part = read_frames(recording, ids)
             for depth, color in zip(part.depths_mm, part.colors, strict=True):
                 step, checksum = np.gcd.reduce(depth, None), zlib.crc32(depth)
                 rows.append(((depth > 0).mean(), color.mean() / 255, step, checksum))
-            parts.append(part.select(np.isin(part.frame_ids, kept)))
-            bar.move_to(first + len(part))
+            parts.append(part.select(np.isin(ids, kept)))
+            bar.update(len(part))
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
     frames = pd.DataFrame(rows, looked_at, ["measured", "brightness", "depth_step", "checksum"])
     frames["is_repeated"] = frames.pop("checksum").diff() == 0
-    T_world_camera = recording.T_world_camera[looked_at]
-    follows = frames.index.diff() == 1
-    moves_mm = 1e3 * pd.DataFrame(T_world_camera[:, :3, 3], looked_at).diff()
-    moves_mm[~follows] = np.nan
-    frames["moved_mm"] = np.linalg.norm(moves_mm, axis=1)
-    frames["turned_deg"] = np.where(follows, [np.nan, *_turned_deg(T_world_camera)], np.nan)
-    levels = np.log(frames.brightness + 1e-3)  # 0 has none
-    frames["flicker"] = np.expm1(levels.diff().abs()).where(follows)  # share of the darker one
-    frames["off_mm"] = np.linalg.norm(moves_mm.diff().shift(-1), axis=1) / 2
+    T_world_camera = recording.T_world_camera
+    moves_mm = 1e3 * np.diff(T_world_camera[:, :3, 3], axis=0, prepend=np.nan)
+    off_mm = np.diff(moves_mm, axis=0, append=np.nan) / 2
+    frames["moved_mm"] = np.linalg.norm(moves_mm, axis=1)[looked_at]
+    frames["turned_deg"] = np.array([np.nan, *_turned_deg(T_world_camera)])[looked_at]
+    frames["off_mm"] = np.linalg.norm(off_mm, axis=1)[looked_at]
     return replace(parts[0], **arrays), frames
 
 
@@ -281,5 +260,5 @@ def _cloud(own: Reading, sequence: RgbdSequence) -> pd.DataFrame:
     world = points @ T[:, :3, :3].mT + T[:, None, :3, 3]
     colors = sequence.colors[:, ::stride, ::stride].reshape(*points.shape)
     cloud = np.concatenate([world, colors, points[..., 2:]], axis=-1).reshape(-1, 7)
-    cloud = pd.DataFrame(cloud, columns=[*_XYZ, *_RGB, "depth"])
+    cloud = pd.DataFrame(cloud, columns=[*_XYZ, "red", "green", "blue", "depth"])
     return cloud[cloud.depth > 0]

@@ -12,8 +12,8 @@ from nbtrack.core.settings import changed_settings
 from nbtrack.recordings.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA
 from nbtrack.recordings.recording import Recording
 
-_CLEARLY_BETTER = 0.5  # of the distance as declared (our choice)
-_MIN_GAIN = 5e-4  # of the depth: 1 mm at 2 m, depth's resolution on disk
+_CLEARLY_BETTER = 1.3  # times as many points agree (our choice)
+_ALIKE = 0.95  # of the highest agreement: the first so good is named
 PLAUSIBLE_DEPTH = (0.2, 20.0)  # m, of a depth camera's median: units in doubt are told by it
 _FAR_APART = 0.05  # m, median distance above which a map of the scene would be blurred (our choice)
 _MIN_OVERLAP = 0.15  # share of points below which a median tells nothing (our choice)
@@ -43,13 +43,13 @@ class Convention:
     name: str  # completes "your ... look like"
     reading: Reading
     median_m: float  # median |z difference| over the points that overlap
-    relative: float  # the same as a share of the depth, which no unit makes small
     depth_m: float  # their median depth
     overlap: float  # share of all points that fall onto a measured, not nearer, surface
+    agreement: float  # the same, where surfaces that coincide count 1 and those far apart 0
 
     def is_clearly_better(self, other: "Convention") -> bool:
-        """Whether surfaces are at most half as far apart as in the other."""
-        return self.relative <= min(_CLEARLY_BETTER * other.relative, other.relative - _MIN_GAIN)
+        """Whether clearly more surfaces coincide than in the other."""
+        return self.agreement > _CLEARLY_BETTER * other.agreement
 
 
 def fit_all(pairs: FramePairs, own: Reading) -> tuple[list[Convention], Convention]:
@@ -63,10 +63,13 @@ def fit_all(pairs: FramePairs, own: Reading) -> tuple[list[Convention], Conventi
     for subject, name, reading in (declared, *_hypotheses(own)):
         if conventions and reading == own:
             continue
-        residual, measured, is_valid, _ = pairs.compare(reading)
-        apart, depth = residual[is_valid].abs(), measured[is_valid]
-        overlap = is_valid.sum() / (pairs.values > 0).sum().clamp(1)
-        numbers = apart.median(), (apart / depth).median(), depth.median(), overlap
+        compared = pairs.compare(reading)
+        is_valid = compared.is_valid
+        n_points = (pairs.values > 0).sum().clamp(1)
+        numbers = (
+            compared.residual[is_valid].abs().median(), compared.measured[is_valid].median(),
+            is_valid.sum() / n_points, compared.agreement.sum() / n_points,
+        )  # fmt: skip
         conventions.append(Convention(subject, name, reading, *map(float, numbers)))
     return conventions, _best_of(conventions)
 
@@ -106,20 +109,16 @@ def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
 def _best_of(conventions: list[Convention]) -> Convention:
     """The declared convention (the first), unless another fits clearly better.
 
-    Surfaces must overlap at least half as much, since cameras that are turned away from each other
-    may agree on the few points that remain. The median depth must be that of a depth camera, since
-    no other number tells a unit of depth from one of positions.
+    The median depth must be that of a depth camera, since no other number tells a unit of depth
+    from one of positions.
     """
     own = conventions[0]
-    half = max(convention.overlap for convention in conventions) / 2
     near, far = PLAUSIBLE_DEPTH
-    meeting = [c for c in conventions if c.overlap >= half and c.median_m < _FAR_APART]
-    rivals = [c for c in meeting if c.overlap >= _MIN_OVERLAP and near <= c.depth_m <= far]
-    closest = min(rivals, key=lambda c: c.relative, default=own)
-    if own.overlap >= half and not closest.is_clearly_better(own):
-        return own
-    alike = max(1.1 * closest.relative, closest.relative + _MIN_GAIN)
-    return next((c for c in rivals if c.relative <= alike), own)
+    meeting = [c for c in conventions if c.overlap >= _MIN_OVERLAP and c.median_m < _FAR_APART]
+    rivals = [c for c in meeting if near <= c.depth_m <= far]
+    most = max((c.agreement for c in rivals), default=0.0)
+    best = next((c for c in rivals if c.agreement >= _ALIKE * most), own)
+    return best if best.is_clearly_better(own) else own
 
 
 def diagnosis(
@@ -134,27 +133,18 @@ def diagnosis(
     apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
     if best is not own:
         look = "look" if best.subject == "poses" else "looks"
-        # Depth upside down, or turned by 180 degrees, fits like mirrored or turned axes.
-        is_rare = "axes" in best.name and not best.name.startswith(("Open", "robot"))
-        turned = "; or the depth images are turned against the colour images" if is_rare else ""
         return (
             f"your {best.subject} {look} like {best.name}; {_remedy(best.reading, own.reading)} "
             f"(surfaces that two frames see then lie {1e3 * best.median_m:.0f} mm apart; as "
-            f"declared they {apart}){turned}"
+            f"declared they {apart})"
         )
-    if own.overlap < _MIN_OVERLAP:
+    if own.overlap < _MIN_OVERLAP or own.median_m > _FAR_APART:
         return (
-            f"{file} is not proved: two frames see too little of the same ({own.overlap:.0%} of "
-            f"the points, whose surfaces {apart}): check it, and a piece with smaller steps"
+            f"{file} is not proved: surfaces of two frames {apart} ({own.overlap:.0%} of points "
+            f"overlap) and no other convention fits: check it, {recording.calibration.source.name} "
+            "and the depth unit, or a piece with smaller steps"
         )
-    if own.median_m > _FAR_APART:
-        return (
-            f"surfaces that two frames see {apart} (median, {own.overlap:.0%} of the points "
-            f"overlap) and no other convention fits: check {recording.calibration.source.name}, "
-            f"the depth unit and {file}, and that image, depth and pose belong to one moment"
-        )
-    poses = [c for c in others if c.subject == "poses" and c.overlap >= own.overlap / 2]
-    alike = [c.name for c in poses if not own.is_clearly_better(c)]
+    alike = [c.name for c in others if c.subject == "poses" and not own.is_clearly_better(c)]
     if not (needs_proof and alike):
         return ""
     little = f"{file} is not proved: the camera moves too little to tell {len(alike)} other"

@@ -1,24 +1,12 @@
-"""Whether a map and a recording belong together, share a world, and where they misfit.
-
-Of depths that misfit: at a pose that is right but for a little, a measured point p (camera frame)
-has a distance r in the map, whose gradient is q (camera frame). If all depths of the recording are
-too long by a share s, r = s (q . p) plus what a small motion of the camera explains; if its focal
-lengths are too long, p changes across the axis alone. The motions are projected out of each frame,
-and the share that leaves the least of r is estimated as `data check` estimates its misfits.
-"""
+"""Whether a map and a recording belong together, share a world, and see the same."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-import torch
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from nbtrack.checks.misfits import SHARES, Misfit, Parameter, estimate, main_misfit
-from nbtrack.core.arrays import Pose, Poses, WorldPoints
+from nbtrack.core.arrays import Pose, Poses
 from nbtrack.core.errors import DataError
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
@@ -30,32 +18,11 @@ from nbtrack.tracking.trajectories import Trajectory
 
 # A map is refused where its misfit exceeds both. Measured on nine maps of three rooms (one a real
 # recording): frames of the same room 0.024 m at most, of other rooms 0.095 m at least.
-MISFIT_FACTOR = 3.0  # times what is usual in the map's own frames
-MISFIT_ALLOWED = 0.05  # m
-_N_POINTS = 500  # measured ones of a frame
-_MAX_DISTANCE = 0.1  # m; points farther from any surface tell nothing
+_MISFIT_FACTOR = 3.0  # times what is usual in the map's own frames
+_MISFIT_ALLOWED = 0.05  # m
 _N_FRAMES = 40  # looked at
-_MIN_FRAMES = 8  # that an estimate needs
-_MIN_POINTS = 50  # the same, of each frame
+_STRIDE = 4  # pixels between two that are looked at
 _MOSTLY = 0.5  # share of a frame's points outside of the map's bounds, where the frame lies outside
-# What motions leave of an explanation, as a share of the points' distances from the camera: before
-# a flat wall 1 %, which is noise of the map's gradients; in rooms 10 % and more.
-_MIN_LEFT = 0.03
-_SENTENCE = "residuals in the map grow with depth, as if {} were off by"
-_ADVICE = "the share may be larger; compare both recordings by `data check`"
-# What misfits, and how a point changes with it: factors of its x, y and z.
-_EXPLANATIONS = [
-    (Parameter("", _SENTENCE.format(name), "+.1%", "", SHARES, 0.01, _ADVICE), np.array(factors))
-    for name, factors in (("depths", (1, 1, 1)), ("focal lengths", (-1, -1, 0)))
-]
-
-
-class _Unexplained(NamedTuple):
-    """What no motion of the camera explains of a frame: (points) of each."""
-
-    residuals: Float[np.ndarray, "n"]  # m
-    shares: Float[np.ndarray, "n explanations"]  # by how much (m) each changes them
-    squares: float  # of the points' distances from the camera, their sum
 
 
 def check_belongs(finished: Map, frame: Frame) -> str | None:
@@ -69,7 +36,7 @@ def check_belongs(finished: Map, frame: Frame) -> str | None:
     misfit_m = depth_residual_of(finished.field, frame)
     if np.isnan(misfit_m):
         return f"{frame.name} has no depth: whether {name} belongs to it cannot be told"
-    allowed = max(MISFIT_ALLOWED, MISFIT_FACTOR * usual)
+    allowed = max(_MISFIT_ALLOWED, _MISFIT_FACTOR * usual)
     if misfit_m > allowed:
         raise DataError(
             f"at its given pose {frame.name} is off {name} by {misfit_m:.3f} m (usual in this map "
@@ -116,63 +83,16 @@ def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
     return T_map_world if explained and np.median(before) > LOST_THRESHOLD_M else None
 
 
-def look_in_map(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> dict[str, float | str]:
-    """Look at some frames, spread evenly: whether what they measured lies outside of the map, at
-    their true poses where known, and how it misfits at the estimated ones.
-
-    Returns `outside_map_share`, that of the frames that saw little of what was mapped, and
-    `map_misfit`, a sentence, which is empty where nothing misfits.
-    """
+def outside_map_share(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> float:
+    """The share of some frames, spread evenly, that saw little of what was mapped: most of their
+    points lie outside of the map, at their true poses where known, else at the estimated ones."""
     outside = []
-    unexplained = []
-    low, high = np.array([field.bounds.minimum, field.bounds.maximum])
     for index in range(0, len(sequence), math.ceil(len(sequence) / _N_FRAMES)):
         frame = sequence[index]
-        pixels = frame.measured_pixels()
-        if not pixels.shape[1]:
-            continue
-        drawn = np.random.default_rng(index).permutation(pixels.shape[1])[:_N_POINTS]
-        points = frame.points(*pixels[:, drawn])[0].double().numpy()
-        T = sequence.T_world_camera[index]
-        world = _moved(points, T if np.isfinite(T).all() else T_estimated[index])
-        outside.append(((world < low) | (world > high)).any(axis=1).mean() > _MOSTLY)
-        if field.is_distance:
-            unexplained.extend(_without_motion(field, points, T_estimated[index]))
-    misfit = main_misfit([*_misfits(unexplained)])
-    return {"outside_map_share": float(np.mean(outside or [0.0])), "map_misfit": misfit}
-
-
-def _moved(points: WorldPoints, T_world_camera: Pose) -> WorldPoints:
-    return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-
-
-def _without_motion(field: Field, points: WorldPoints, T: Pose) -> Iterator[_Unexplained]:
-    """What motions leave of points (m, camera frame) of a frame at its pose; nothing of few."""
-    x = torch.from_numpy(_moved(points, T)).float().to(field.device).requires_grad_()
-    distance = field(x)[1]
-    (gradient,) = torch.autograd.grad(distance.sum(), x)
-    r = distance.detach().cpu().double().numpy()
-    near = np.abs(r) < _MAX_DISTANCE
-    if near.sum() < _MIN_POINTS:
-        return
-    q = (gradient.cpu().double().numpy() @ T[:3, :3])[near]
-    p = points[near]
-    motions, _ = np.linalg.qr(np.hstack([np.cross(p, q), q]))
-    columns = np.column_stack([r[near], *((q * p) @ factors for _, factors in _EXPLANATIONS)])
-    columns -= motions @ (motions.T @ columns)
-    yield _Unexplained(columns[:, 0], columns[:, 1:], (p**2).sum())
-
-
-def _misfits(frames: list[_Unexplained]) -> Iterator[Misfit]:
-    """Of each explanation how far it is off, if frames tell: with up to three walls in view, a
-    motion does the same."""
-    if len(frames) < _MIN_FRAMES:
-        return
-    for i, (parameter, _) in enumerate(_EXPLANATIONS):
-        left = sum((frame.shares[:, i] ** 2).sum() for frame in frames)
-        if left > _MIN_LEFT**2 * sum(frame.squares for frame in frames):
-            costs = [
-                ((frame.residuals[:, None] - frame.shares[:, i, None] * SHARES) ** 2).sum(axis=0)
-                for frame in frames
-            ]
-            yield estimate(parameter, np.array(costs))
+        points, _ = frame.points(*frame.measured_pixels(_STRIDE))
+        T = T_estimated[index] if frame.T_world_camera is None else frame.T_world_camera
+        world = points.numpy() @ T[:3, :3].T + T[:3, 3]
+        is_outside = (world < field.bounds.minimum) | (world > field.bounds.maximum)
+        if len(world):
+            outside.append(is_outside.any(axis=1).mean() > _MOSTLY)
+    return float(np.mean(outside or [0.0]))

@@ -8,28 +8,26 @@ best is the estimate; its interval comes from drawing the pairs anew (bootstrap)
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
-import cv2
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch.nn.functional import grid_sample
+from scipy.interpolate import CubicSpline
 
-from nbtrack.checks.readings import FramePairs, Reading
+from nbtrack.checks.readings import Costs, FramePairs, Reading
 
-MAX_SHIFT = 3  # frames by which depth or colours may be late or early (our choice)
-SHARES = np.linspace(-0.15, 0.15, 13)  # by which lengths may be off
+MAX_SHIFT = 4  # frames by which depth or colours may be late or early (our choice)
+_SHARES = np.linspace(-0.15, 0.15, 13)  # by which lengths may be off
 _METRES = np.linspace(-0.6, 0.6, 13)  # by which poses may drift along an axis, over the recording
 _PIXELS = np.linspace(-0.06, 0.06, 13)  # by which colours may be off, as a share of the width
 _FRAMES = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
 _NO_YES = np.array([0, 1])
 _SCATTER = np.linspace(-0.02, 0.04, 13)  # m, by which positions may scatter; below 0 for symmetry
 _GAIN = 0.98  # share of the cost as declared, above which an estimate tells nothing (our choice)
-_MIN_OVERLAP = 0.1  # share of a pair's points that an estimate needs
-_MIN_PAIRS = 8  # with as many points
+_MIN_PAIRS = 8  # that an estimate needs
 MIN_CORRELATION = 0.75  # of intensities that pairs of a right recording have (our choice)
-_MIN_CONTRAST = 0.02  # standard deviation of intensities in [0, 1], below which nothing is seen
+_FINER = 20  # places between two values at which costs are interpolated
 _RESAMPLED = 200  # draws of a bootstrap
 _INTERVAL = [0.025, 0.975]  # its quantiles
 
@@ -50,11 +48,11 @@ _POSES = "record or register the poses anew"
 _DEPTH_PARAMETERS = [
     Parameter("depth_shift", "depth comes after the poses by", "+.1f", " frames", _FRAMES, 0.3,
               "shift one of them against the other"),
-    Parameter("focal_share", "focal lengths should change by", "+.1%", "", SHARES, 0.01,
+    Parameter("focal_share", "focal lengths should change by", "+.1%", "", _SHARES, 0.01,
               "calibrate anew, or multiply them by {factor:.3f}"),
-    Parameter("depth_share", "depths should change against the poses by", "+.1%", "", SHARES, 0.01,
+    Parameter("depth_share", "depths should change against the poses by", "+.1%", "", _SHARES, 0.01,
               "divide depth_scale, or the positions, by {factor:.3f}"),
-    Parameter("depth_growth", "depths grow over the recording by", "+.1%", "", SHARES, 0.02,
+    Parameter("depth_growth", "depths grow over the recording by", "+.1%", "", _SHARES, 0.02,
               "let the camera warm up before recording"),
     *(Parameter(f"drift_{axis}", f"poses drift along {axis} by", "+.2f", " m", _METRES, 0.1, _POSES)
       for axis in "xyz"),
@@ -100,14 +98,14 @@ def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
     The frames up to MAX_SHIFT around those of the pairs must be kept too. Misfits of colours are
     looked for where depth is right.
     """
-    costs = _Costs(pairs, own)
-    found = [*_estimates(_DEPTH_PARAMETERS, own, costs.of_depth)]
-    unlike = costs.of_color(own)
+    found = [*_estimates(_DEPTH_PARAMETERS, own, pairs.depth_costs)]
+    color_costs = partial(pairs.color_costs, pairs.compare(own))
+    unlike = color_costs(own)
     correlation = float(1 - np.nanmedian(unlike)) if np.isfinite(unlike).any() else math.nan
     if not any(misfit.is_significant for misfit in found):
         # What leaves them unlike is none: they are of another place.
         least = (1 - MIN_CORRELATION) / max(1e-9, 1 - correlation)
-        colors = _estimates(_COLOR_PARAMETERS, own, costs.of_color)
+        colors = _estimates(_COLOR_PARAMETERS, own, color_costs)
         found += [misfit for misfit in colors if misfit.gain < least]
     return found, correlation
 
@@ -121,82 +119,28 @@ def main_misfit(misfits: list[Misfit]) -> str:
     return f"{main}; without it frames differ {main.gain:.0%} as much: {advice}"
 
 
-class _Costs:
-    """How little the frames of pairs agree, as a recording is read."""
-
-    def __init__(self, pairs: FramePairs, own: Reading) -> None:
-        """See `find_misfits`."""
-        self.pairs = pairs
-        residual, measured, is_valid, self.seen_at = pairs.compare(own)
-        relative = (residual / measured).abs()
-        self.scale = 3 * relative[is_valid].median()
-        self.agree = is_valid & (relative < self.scale)
-
-    def of_depth(self, reading: Reading) -> Float[np.ndarray, "pairs"]:
-        """Geman-McClure's of the differences; NaN of pairs that see little of the same."""
-        residual, measured, is_valid, _ = self.pairs.compare(reading)
-        square = (residual / measured / self.scale) ** 2
-        total = torch.where(is_valid, square / (1 + square), 0.0).sum(dim=1)
-        enough = is_valid.sum(dim=1) >= _MIN_OVERLAP * is_valid.shape[1]
-        return torch.where(enough, total / is_valid.sum(dim=1), torch.nan).numpy()
-
-    def of_color(self, reading: Reading) -> Float[np.ndarray, "pairs"]:
-        """1 - the correlation of intensities of points whose depths agree; exposures may differ.
-
-        NaN of few points, and without contrast.
-        """
-        last = self.pairs.colors.shape[2] - 1
-        columns = self.pairs.columns + reading.color_right * (last + 1)
-        at = self.seen_at.clone()
-        at[..., 0] += 2 * reading.color_right
-        if reading.is_mirrored:
-            columns = last - columns
-            at[..., 0] *= -1
-        places = self.pairs.places + reading.color_shift
-        gray = [cv2.cvtColor(self.pairs.colors[i], cv2.COLOR_RGB2GRAY) for i in places.ravel()]
-        first, second = torch.from_numpy(np.stack(gray)).float().div(255).chunk(2)
-        seen = grid_sample(second[:, None], at, "bilinear", align_corners=True)[:, 0, 0]
-        own = first[:, self.pairs.rows, columns.round().long().clamp(0, last)]
-        mask = self.agree & (at.abs() <= 1).all(dim=-1)[:, 0]
-        costs = np.full(len(mask), np.nan)
-        for i, row in enumerate(mask):
-            a, b = own[i, row].numpy(), seen[i, row].numpy()
-            has_many = len(a) >= _MIN_OVERLAP * len(row)
-            if has_many and min(a.std(), b.std()) >= _MIN_CONTRAST:
-                costs[i] = 1 - np.corrcoef(a, b)[0, 1]
-        return costs
-
-
 def _estimates(
-    parameters: list[Parameter], own: Reading, cost: Callable[[Reading], Float[np.ndarray, "pairs"]]
+    parameters: list[Parameter], own: Reading, cost: Callable[[Reading], Costs]
 ) -> Iterator[Misfit]:
-    """Of parameters at all of whose values enough pairs see enough of the same."""
+    """The values at which pairs agree best, of parameters at all of whose values enough pairs see
+    enough of the same. Intervals are a bootstrap's, which draws the pairs anew."""
     for parameter in parameters:
-        readings = [replace(own, **{parameter.key: value}) for value in parameter.values]
+        values = parameter.values
+        readings = [replace(own, **{parameter.key: value}) for value in values]
         costs = np.stack([cost(reading) for reading in readings], axis=1)
         costs = costs[np.isfinite(costs).all(axis=1)]
-        if len(costs) >= _MIN_PAIRS:
-            yield estimate(parameter, costs)
-
-
-def estimate(parameter: Parameter, costs: Float[np.ndarray, "n values"]) -> Misfit:
-    """The value of a parameter at which `n` observations agree best; its interval is a bootstrap's,
-    which draws the observations anew."""
-    values, mean = parameter.values, costs.mean(axis=0)
-    drawn = np.random.default_rng(0).integers(len(costs), size=(_RESAMPLED, len(costs)))
-    low, high = np.quantile(_lowest(values, costs[drawn].mean(axis=1)), _INTERVAL)
-    gain = float(mean.min() / mean[np.abs(values).argmin()])
-    return Misfit(parameter, float(_lowest(values, mean)), low, high, gain)
+        if len(costs) < _MIN_PAIRS:
+            continue
+        mean = costs.mean(axis=0)
+        drawn = np.random.default_rng(0).integers(len(costs), size=(_RESAMPLED, len(costs)))
+        low, high = np.quantile(_lowest(values, costs[drawn].mean(axis=1)), _INTERVAL)
+        gain = float(mean.min() / mean[np.abs(values).argmin()])
+        yield Misfit(parameter, float(_lowest(values, mean)), low, high, gain)
 
 
 def _lowest(
     values: Float[np.ndarray, "values"], costs: Float[np.ndarray, "*n values"]
 ) -> Float[np.ndarray, "*n"]:
-    """The place of the lowest of costs at equal steps, by a parabola through three of them."""
-    at, last = costs.argmin(axis=-1), len(values) - 1
-    around = np.clip(at[..., None] + [-1, 0, 1], 0, last)
-    before, middle, after = np.moveaxis(np.take_along_axis(costs, around, axis=-1), -1, 0)
-    bend = before - 2 * middle + after
-    is_inside = (at > 0) & (at < last) & (bend > 0)
-    offset = np.where(is_inside, (before - after) / 2 / np.where(is_inside, bend, 1), 0)
-    return values[at] + offset * (values[1] - values[0])
+    """Where costs are lowest, also between the values, by cubic splines."""
+    fine = np.linspace(values[0], values[-1], _FINER * (len(values) - 1) + 1)
+    return fine[CubicSpline(values, costs, axis=-1)(fine).argmin(axis=-1)]

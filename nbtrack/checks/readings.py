@@ -7,9 +7,10 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Int, UInt16
+from jaxtyping import Float, Int, UInt16
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -23,9 +24,14 @@ from nbtrack.recordings.recording import Recording
 
 _HIDDEN_BEHIND = 0.25  # m behind a surface points are hidden: several times a camera's noise
 _SAME_SURFACE = 0.025  # of the depth: where neighbours blend to more, they lie on two surfaces
+_SCALE = 0.01  # of the depth: surfaces so far apart agree by half, several times a camera's noise
+_SAME = 0.2  # agreement of points whose colours are compared: twice as far apart
+_MIN_OVERLAP = 0.1  # share of a pair's points without which its cost is none
+_MIN_CONTRAST = 0.02  # standard deviation of intensities in [0, 1], below which nothing is seen
 _POINTS_PER_FRAME = 1000  # 20 pairs of frames have enough for a median
 _SMOOTHED = 5  # frames, over which positions are averaged
 Pairs = Int[np.ndarray, "2 pairs"]  # of frames
+Costs = Float[np.ndarray, "pairs"]
 
 
 @dataclass(frozen=True)
@@ -90,6 +96,7 @@ class Comparison(NamedTuple):
     residual: Tensor  # m, by which points lie behind the surface that was measured
     measured: Tensor  # m, the depth of that surface
     is_valid: Tensor  # False where hidden, outside, or between two surfaces
+    agreement: Tensor  # 1 where both coincide, 0 where they are far apart or not valid
     seen_at: Tensor  # (pairs, 1, points, 2): -1 at the first pixel, 1 at the last
 
 
@@ -114,22 +121,60 @@ class FramePairs:
 
         Depth is interpolated between four pixels, in 1/z, which is exact for planes.
         """
-        growth = reading.depth_growth * (self.pairs / len(self.file_poses) - 0.5)
+        n_frames = len(self.file_poses)
+        growth = reading.depth_growth * (self.pairs / n_frames - 0.5)
         longer_a, longer_b = torch.from_numpy(1 + growth[..., None]).float()
         points_a = reading.points(self.columns, self.rows, self.values / longer_a)
         poses = reading.T_world_camera(self.file_poses, self.order)
-        T_world_a, T_world_b = poses[self.pairs - reading.depth_shift]
+        T_world_a, T_world_b = poses[(self.pairs - reading.depth_shift).clip(0, n_frames - 1)]
         T_b_a = torch.from_numpy(np.linalg.solve(T_world_b, T_world_a)).float()
         points_b = points_a @ T_b_a[:, :3, :3].mT + T_b_a[:, None, :3, 3]
         columns, rows, depth = project(reading.calibration, points_b)
-        height, width = self.inverse.shape[2:]
-        at = 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1)[:, None] - 1
+        at = self._on_images(columns, rows)[:, None]
         blended, nearest = (
             1 / grid_sample(self.inverse, at, mode, align_corners=True)[:, 0, 0]
             for mode in ("bilinear", "nearest")
         )
         measured = reading.points(columns, rows, blended / longer_b)[..., 2]
+        residual = depth - measured
         valid = (self.values > 0) & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
         valid &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
-        valid &= depth - measured < _HIDDEN_BEHIND  # but in front is a contradiction, however far
-        return Comparison(depth - measured, measured, valid, at)
+        valid &= residual < _HIDDEN_BEHIND  # but in front is a contradiction, however far
+        # Geman-McClure's of the differences.
+        agreement = torch.where(valid, 1 / (1 + (residual / measured / _SCALE) ** 2), 0.0)
+        return Comparison(residual, measured, valid, agreement, at)
+
+    def _on_images(self, columns: Tensor, rows: Tensor) -> Tensor:
+        """Pixels as `grid_sample` has them: -1 is the first, 1 the last."""
+        height, width = self.inverse.shape[2:]
+        return 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1) - 1
+
+    def depth_costs(self, reading: Reading) -> Costs:
+        """How little the depths of pairs agree; NaN of pairs that see little of the same."""
+        compared = self.compare(reading)
+        overlap = compared.is_valid.float().mean(dim=1)
+        costs = 1 - compared.agreement.mean(dim=1) / overlap
+        return torch.where(overlap >= _MIN_OVERLAP, costs, torch.nan).numpy()
+
+    def color_costs(self, compared: Comparison, reading: Reading) -> Costs:
+        """1 - the correlation of intensities of points whose depths agree; exposures may differ.
+
+        NaN of pairs with few points, and without contrast.
+        """
+        own = self._on_images(self.columns, self.rows).expand_as(compared.seen_at[:, 0])
+        at = torch.cat([own[:, None], compared.seen_at])
+        at[..., 0] += 2 * reading.color_right
+        if reading.is_mirrored:
+            at[..., 0] *= -1
+        places = (self.places + reading.color_shift).clip(0, len(self.colors) - 1)
+        gray = [cv2.cvtColor(self.colors[i], cv2.COLOR_RGB2GRAY) for i in places.ravel()]
+        gray = torch.from_numpy(np.stack(gray))[:, None].float() / 255
+        seen = grid_sample(gray, at, align_corners=True)[:, 0, 0].numpy()
+        is_inside = (at.abs() <= 1).all(dim=-1)[:, 0].view(2, *self.values.shape).all(dim=0)
+        mask = ((compared.agreement > _SAME) & is_inside).numpy()
+        costs = np.full(len(mask), np.nan)
+        for i, (row, a, b) in enumerate(zip(mask, *np.split(seen, 2), strict=True)):
+            a, b = a[row], b[row]
+            if row.mean() >= _MIN_OVERLAP and min(a.std(), b.std()) >= _MIN_CONTRAST:
+                costs[i] = 1 - np.corrcoef(a, b)[0, 1]
+        return costs

@@ -90,9 +90,9 @@ class Format:
     counts_from_0: bool = False  # a number is the place of the frame's pose in a list
     stamps_tell: bool = True  # whose a pose of a list is; else places alone do
     resize_color: bool = False  # colour has another size than depth and shows the same view
-    # Own readers: of a file of poses, their quaternions' order given, with times (s) where it says
-    # them; of a calibration; of a depth map in `depth_scale`, where that is no PNG or JPEG file.
-    read_poses: Callable[[Path, str], tuple[Poses, Times | None]] = read_poses
+    # Own readers: of a file of poses, their quaternions' order given, with times (s), NaN for none;
+    # of a calibration; of a depth map in `depth_scale`, where that is no PNG or JPEG file.
+    read_poses: Callable[[Path, str], tuple[Poses, Times]] = read_poses
     read_camera: Callable[[Path], Calibration] = read_calibration
     read_depth: Callable[[Path, Calibration], DepthImage] | None = None
 
@@ -211,8 +211,8 @@ def _told_by_files(folder: Path) -> str:
     maximum = max(shares.values())
     best = [name for name, share in shares.items() if share == maximum]
     if maximum == 0:
-        files = (f"{name} ({', '.join(p[0] for p in FORMATS[name].needs)})" for name in best)
-        raise MissingError(f"{folder} is no recording: it needs the files of {'; '.join(files)}")
+        names = ", ".join(FORMATS)
+        raise MissingError(f"{folder} is no recording: data/README.md lists the files of {names}")
     if len(best) > 1 and maximum == 1:
         raise DataError(
             f"{folder} can be read as {' or '.join(best)}: choose with --format, or by "

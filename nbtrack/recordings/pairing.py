@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import interp1d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -94,6 +95,8 @@ def check_paired(colors: list[Path], others: list[Path]) -> None:
 
 def nearest(times: Times, others: Times, tolerance: float) -> Frames:
     """For every time the index of the nearest other one; -1 if none is within the tolerance (s)."""
+    if not len(others):
+        return np.full(len(times), -1)
     apart, closest = cKDTree(others[:, None]).query(times[:, None], p=1)
     return np.where(apart <= tolerance, closest, -1)
 
@@ -156,67 +159,31 @@ class Moments:
         return (numbers - numbers[0]) / self.rate_hz
 
     def poses_of(
-        self, path: Path, poses: Poses, stamps: Times | None, flip: Callable[[Poses], Poses]
+        self, path: Path, poses: Poses, stamps: Times, flip: Callable[[Poses], Poses]
     ) -> tuple[Poses, str]:
         """A pose a frame of those of a list, NaN without one, and a note.
 
-        Stamps (s) of the list count where they are the very times of frames, or are of the clock
-        of their own times; else frames' numbers do. `flip` makes camera-to-world poses of the
-        list's, and the other way round. Raises DataError where nothing tells it.
+        Stamps (s; NaN: none) of the list count where they are the very times of frames, or are of
+        the clock of their own times; else frames' numbers do. `flip` makes camera-to-world poses
+        of the list's, and the other way round. Raises DataError where nothing tells it.
         """
-        is_known = np.isfinite(poses).all(axis=(1, 2))
-        stamps = stamps if is_known.any() else None
-        found = None
-        is_other_clock = False
-        if stamps is not None:
-            found = self._by_time(poses[is_known], stamps[is_known], flip)
-            # Of two clocks equal counts alone prove nothing, unless stamps only count the lines.
-            is_other_clock = self.own is not None and not _are_even(stamps[is_known])
-        if not found and not is_other_clock:
-            is_stamped = stamps is not None and np.isfinite(stamps).all()
-            found = self._by_number(poses, stamps if is_stamped else None)
-        if found:
-            return found
+        is_known = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(stamps)
+        known, clock = poses[is_known], stamps[is_known]
+        exact, near = (nearest(self.times, clock, within) for within in (0.0, _TOLERANCE))
+        if 0 < len(clock) == (exact >= 0).sum():  # as in trajectories that nbtrack wrote
+            return _at(known, exact), ""
+        if self.own is not None and (near >= 0).any():
+            return _interpolated(self.times, known, clock, flip)
+        # Of two clocks equal counts alone prove nothing, unless stamps only count the lines.
+        if self.own is None or _are_even(clock):
+            is_stamped = is_known.any() and np.isfinite(stamps).all()
+            if found := self._by_number(poses, stamps if is_stamped else None):
+                return found
         raise DataError(
             f"{path} has {len(poses)} poses but there are {len(self.images)} images, and nothing "
             "tells whose each is: write one for every image, 'nan' where there is none, or "
             f"{TIMES_FILE}, a time (s) an image on the clock of the poses' stamps"
         )
-
-    def _by_time(
-        self, poses: Poses, stamps: Times, flip: Callable[[Poses], Poses]
-    ) -> tuple[Poses, str] | None:
-        """The nearest poses; between two that are close to each other, the one between them.
-
-        The camera goes straight there, and turns about one axis. A pose of a frame's very time
-        stays as it is.
-        """
-        exact = nearest(self.times, stamps, 0.0)
-        if (exact >= 0).sum() == len(stamps):  # as in trajectories that nbtrack wrote
-            return _at(poses, exact), ""
-        near = nearest(self.times, stamps, _TOLERANCE)
-        if self.own is None or not (near >= 0).any():
-            return None
-        found = _at(poses, near)
-        stamps, first = np.unique(stamps, return_index=True)
-        later = np.searchsorted(stamps, self.times).clip(1, len(stamps) - 1)
-        before = self.times - stamps[later - 1]
-        after = stamps[later] - self.times
-        apart = np.minimum(before, after)
-        is_between = (before + after <= _GAP) & (apart > _SAME_TIME)
-        if not is_between.any():
-            return found, ""
-        later = later[is_between]
-        share = (before / (before + after))[is_between]
-        T = flip(poses[first])
-        between = T[later - 1]
-        between[:, :3, 3] += share[:, None] * (T[later] - T[later - 1])[:, :3, 3]
-        turns = Slerp(stamps, Rotation.from_matrix(T[:, :3, :3]))
-        between[:, :3, :3] = turns(self.times[is_between]).as_matrix()
-        found[is_between] = flip(between)
-        far_ms = 1e3 * apart[is_between].max()
-        note = f"{is_between.sum()} of {len(found)} poses are interpolated, the nearest"
-        return found, f"{note} up to {far_ms:.1f} ms away"
 
     def _by_number(self, poses: Poses, stamps: Times | None) -> tuple[Poses, str] | None:
         """Poses whose stamps (s), or places in a longer list, are frames' numbers over the rate.
@@ -225,9 +192,9 @@ class Moments:
         many as frames.
         """
         n_frames, n_poses = len(self.images), len(poses)
-        clock = np.arange(n_poses) / self.rate_hz if stamps is None else stamps
-        tolerance = min(_ON_TIME, 0.25 / self.rate_hz)
-        ways = {tuple(nearest(times, clock, tolerance)) for times in self._counted()}
+        clock = np.arange(n_poses) if stamps is None else stamps * self.rate_hz
+        tolerance = min(_ON_TIME * self.rate_hz, 0.25)
+        ways = {tuple(nearest(numbers, clock, tolerance)) for numbers in self._counted()}
         n_found = {way: n_frames - way.count(-1) for way in ways}  # frames that have a pose
         whole = [way for way, n in n_found.items() if n == min(n_frames, n_poses)]
         if len(whole) == 1 and (n_poses > n_frames or stamps is not None):
@@ -240,14 +207,38 @@ class Moments:
         is_plain = np.array_equal(self.numbers, np.arange(n_frames))
         return poses, "" if is_plain else "images have the poses one after another"
 
-    def _counted(self) -> list[Times]:
-        """Times (s) of frames by their numbers, for each number that the count may begin with."""
+    def _counted(self) -> list[Frames]:
+        """Numbers of frames, less each that the count may begin with."""
         if self.numbers is None:
             return []
         first = self.numbers[0]
         is_cut = first != 1 or np.ptp(self.numbers) != len(self.numbers) - 1
         starts = {0} if self.counts_from_0 and is_cut else {0, min(first, 1), first}
-        return [(self.numbers - start) / self.rate_hz for start in starts]
+        return [self.numbers - start for start in starts]
+
+
+def _interpolated(
+    times: Times, poses: Poses, stamps: Times, flip: Callable[[Poses], Poses]
+) -> tuple[Poses, str]:
+    """The nearest poses, or those between two that are close to each other, and a note.
+
+    The camera goes straight there, and turns about one axis. A pose of a frame's very time stays.
+    """
+    found = _at(poses, nearest(times, stamps, _TOLERANCE))
+    stamps, first = np.unique(stamps, return_index=True)
+    later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
+    before, after = times - stamps[later - 1], stamps[later] - times
+    apart = np.minimum(before, after)
+    is_between = (before + after <= _GAP) & (apart > _SAME_TIME)
+    if not is_between.any():
+        return found, ""
+    T, at = flip(poses[first]), times[is_between]
+    between = np.tile(np.eye(4), (len(at), 1, 1))
+    between[:, :3, 3] = interp1d(stamps, T[:, :3, 3], axis=0)(at)
+    between[:, :3, :3] = Slerp(stamps, Rotation.from_matrix(T[:, :3, :3]))(at).as_matrix()
+    found[is_between] = flip(between)
+    note = f"{len(at)} of {len(found)} poses are interpolated, the nearest up to"
+    return found, f"{note} {1e3 * apart[is_between].max():.1f} ms away"
 
 
 def _are_even(stamps: Times) -> bool:

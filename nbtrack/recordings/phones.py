@@ -17,70 +17,70 @@ the rows of a pose; `corrected_cameras` the same after the app's optimisation, w
 github.com/PolyCam/polyform, README and `core/capture_folder.py`.
 """
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from nbtrack.core.arrays import DepthImage, Poses
-from nbtrack.core.errors import DataError, MissingError
 from nbtrack.core.files import naming_damaged
 from nbtrack.data.text_files import Times, from_quaternions, read_object
 from nbtrack.recordings.calibration import Calibration, calibration, camera_matrix
 from nbtrack.recordings.formats import FORMATS, Declaration, Format
 
 _ADVICE = "export the recording again, as .r3d which is to be unpacked, or as raw data"
+_ADVICE_ON_DEPTH = (
+    "run `pip install pyliblzfse`, or put 16-bit PNG files in millimetres into depth/ in place of "
+    "the .depth files"
+)
 
 
-def _camera(path: Path, numbers: list[float], size: tuple[float, float]) -> Calibration:
-    """The camera of fx, fy, cx, cy as the apps write them, for images of a width and height."""
-    fx, fy, cx, cy = numbers
+@contextmanager
+def _content(path: Path) -> Iterator[dict[str, Any]]:
+    """What an app's JSON file holds; DataError, also for what is made of it within the block."""
+    with naming_damaged(path, "file of the app", _ADVICE):
+        yield read_object(path, "JSON")
+
+
+def _camera(path: Path, numbers: Sequence[float]) -> Calibration:
+    """The camera of fx, fy, cx, cy, width and height as the apps write them."""
+    fx, fy, cx, cy, width, height = numbers
     K = camera_matrix(fx, fy, cx - 0.5, cy - 0.5)
-    return calibration(path, K, size=(int(size[0]), int(size[1])))
+    return calibration(path, K, size=(int(width), int(height)))
 
 
-def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times | None]:
+def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times]:
     """The poses, and the times (s) of their frames; the `order` of quaternions is the app's."""
-    content = read_object(path, "JSON")
-    with naming_damaged(path, "Record3D metadata", _ADVICE):
+    with _content(path) as content:
         rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
         times = np.array(content.get("frameTimestamps", ()), dtype=np.float64)
         if times.shape != (len(rows),) or not np.isfinite(times).all():
             times = np.arange(len(rows)) / float(content["fps"])
-        rows = np.column_stack([times, rows[:, 4:], rows[:, :4]])
-        return from_quaternions(rows, "xyzw", path), times
+        return from_quaternions(np.column_stack([times, rows[:, 4:], rows[:, :4]]), "xyzw", path)
 
 
 def _record3d_camera(path: Path) -> Calibration:
     """The first frame's, as the app writes it; later ones move by a pixel or two."""
-    content = read_object(path, "JSON")
-    with naming_damaged(path, "Record3D metadata", _ADVICE):
-        fx, _, _, _, fy, _, cx, cy, _ = map(float, content["K"])
-        return _camera(path, [fx, fy, cx, cy], (content["w"], content["h"]))
+    with _content(path) as content:
+        K = np.array(content["K"], dtype=np.float64)
+        return _camera(path, [*K[[0, 4, 6, 7]], content["w"], content["h"]])
 
 
 def _record3d_depth(path: Path, camera: Calibration) -> DepthImage:
     """Millimetres. LZFSE is no part of Python: `liblzfse` reads it, where that is installed."""
     content = path.read_bytes()
-    if content[:3] == b"bvx":  # how LZFSE's blocks begin
-        try:
+    kind = "file of float32 depth, plain or by LZFSE, in the proportions of colour"
+    with naming_damaged(path, kind, _ADVICE_ON_DEPTH):
+        if content[:3] == b"bvx":  # how LZFSE's blocks begin
             import liblzfse
-        except ImportError:
-            raise MissingError(
-                f"{path} is compressed by LZFSE: run `pip install pyliblzfse`, or put 16-bit PNG "
-                "files in millimetres into depth/ in place of the .depth files"
-            ) from None
-        with naming_damaged(path, "LZFSE file", _ADVICE):
+
             content = liblzfse.decompress(content)
-    width, height = camera.size
-    columns = round(np.sqrt(len(content) / 4 * width / height))
-    rows = round(columns * height / width)
-    if not columns or rows * columns * 4 != len(content):
-        raise DataError(
-            f"{path} holds {len(content)} bytes: it must be float32 depth in the proportions of "
-            f"{width}x{height}; {_ADVICE}"
-        )
-    depth_mm = 1000 * np.nan_to_num(np.frombuffer(content, "<f4").reshape(rows, columns))
-    return np.rint(depth_mm.clip(0, 65535)).astype(np.uint16)
+        metres = np.frombuffer(content, "<f4")
+        width, height = camera.size
+        depth_mm = 1000 * metres.reshape(round(np.sqrt(metres.size * height / width)), -1)
+        return np.rint(np.nan_to_num(depth_mm).clip(0, 65535)).astype(np.uint16)
 
 
 def _corrected(path: Path) -> Path:
@@ -89,10 +89,9 @@ def _corrected(path: Path) -> Path:
     return corrected if corrected.is_file() else path
 
 
-def _polycam_pose(path: Path, order: str) -> tuple[Poses, Times | None]:
+def _polycam_pose(path: Path, order: str) -> tuple[Poses, Times]:
     """A frame's pose and its time (s); there are no quaternions whose `order` would count."""
-    content = read_object(_corrected(path))
-    with naming_damaged(path, "Polycam camera", _ADVICE):
+    with _content(_corrected(path)) as content:
         pose = np.eye(4)
         pose[:3] = [[float(content[f"t_{i}{j}"]) for j in range(4)] for i in range(3)]
         return pose[None], np.array([int(path.stem) / 1e6])
@@ -100,12 +99,12 @@ def _polycam_pose(path: Path, order: str) -> tuple[Poses, Times | None]:
 
 def _polycam_camera(path: Path) -> Calibration:
     """The median of all frames' cameras, which differ by a pixel or two."""
-    contents = [read_object(_corrected(file)) for file in sorted(path.parent.glob("*.json"))]
-    with naming_damaged(path, "Polycam camera", _ADVICE):
-        names = ("fx", "fy", "cx", "cy", "width", "height")
-        numbers = [[float(content[name]) for name in names] for content in contents]
-        *numbers, width, height = np.median(numbers, axis=0).tolist()
-        return _camera(path, numbers, (width, height))
+    rows = []
+    for file in sorted(path.parent.glob("*.json")):
+        with _content(_corrected(file)) as content:
+            names = "fx", "fy", "cx", "cy", "width", "height"
+            rows.append([float(content[name]) for name in names])
+    return _camera(path, np.median(rows, axis=0).tolist())
 
 
 _FILES = ("keyframes/cameras/*.json",)

@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Int, Shaped, UInt8, UInt16
 from PIL import Image
 
-from nbtrack.core.arrays import Frames, Position
+from nbtrack.core.arrays import DepthImage, Frames, Position
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import naming_damaged
 from nbtrack.core.progress import ProgressBar
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.recordings.calibration import camera_matrix
-from nbtrack.recordings.formats import IMAGE_SUFFIXES
+from nbtrack.recordings.formats import IMAGE_SUFFIXES, Declaration
 from nbtrack.recordings.recording import Recording, open_recording
 
 _FARTHEST_MM = _SATURATED = 65535  # what 16 bits hold; a camera's "farther than I can say"
@@ -147,7 +147,7 @@ def decode(
             # Interpolation would invent points between a table and the wall behind.
             depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
         depth[(depth == recording.declared.no_depth) | (depth == _SATURATED)] = 0
-        depths[index] = _in_millimetres(depth, recording, camera, depth_file)
+        depths[index] = _in_millimetres(depth, recording.declared, camera, depth_file)
         colors[index] = color
 
     # Decoding releases the interpreter lock, so a few threads suffice.
@@ -211,22 +211,19 @@ def _check(path: Path, image: np.ndarray, wanted: np.ndarray, first: Path) -> No
 
 
 def _in_millimetres(
-    depth: np.ndarray, recording: Recording, camera: Intrinsics, file: Path
-) -> np.ndarray:
+    depth: np.ndarray, declared: Declaration, camera: Intrinsics, file: Path
+) -> DepthImage:
     """Millimetres along the optical axis."""
-    scale = recording.declared.depth_scale
-    along_ray = recording.declared.depth_along == "ray"
-    if scale == 1000 and not along_ray:
-        return depth
-    depth_mm = depth * (1000 / scale)
-    if along_ray:
-        x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-        y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-        depth_mm = depth_mm / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
+    depth_mm = depth * (1000 / declared.depth_scale)
+    if declared.depth_along == "ray":
+        y, x = np.indices(depth.shape) + 0.5
+        squares = ((x - camera.cx) / camera.fx) ** 2 + ((y - camera.cy) / camera.fy) ** 2
+        depth_mm /= np.sqrt(1 + squares)
     if depth_mm.max() > _FARTHEST_MM:
         raise DataError(
-            f"{file} holds {depth_mm.max() / 1000:.4g} m with {scale:g} depth values a metre: at "
-            "most 65.535 m can be kept; set depth_scale or no_depth in sequence.toml"
+            f"{file} holds {depth_mm.max() / 1000:.4g} m with {declared.depth_scale:g} depth "
+            "values a metre: at most 65.535 m can be kept; set depth_scale or no_depth in "
+            "sequence.toml"
         )
     return np.rint(depth_mm).astype(np.uint16)
 

@@ -154,19 +154,16 @@ def _poses_and_times(
 ) -> tuple[Poses, Times]:  # fmt: skip
     """A pose a frame, and times; `path` names the files, with `*` where each frame has one."""
     tables = [layout.read_poses(file, declared.quaternion) for file in files]
-    poses = checked_poses(np.concatenate([T for T, _ in tables]), path)
-    stamps = None
-    if all(times is not None for _, times in tables):
-        stamps = np.concatenate([times for _, times in tables])
-    times = moments.times
+    poses, stamps = map(np.concatenate, zip(*tables, strict=True))
+    poses, times = checked_poses(poses, path), moments.times
     # Frames without times of their own have those of the poses, if there is one for each.
-    if moments.own is None and stamps is not None and len(stamps) == len(times):
-        times = stamps if (np.diff(stamps) > 0).all() else times
+    if moments.own is None and len(stamps) == len(times) and (np.diff(stamps) > 0).all():
+        times = stamps
     if "*" in path.name:
         check_paired(moments.images, files)
         return poses, times
-    told = stamps if layout.stamps_tell else None
-    poses, note = moments.poses_of(path, poses, told, declared.turned_round)
+    stamps = stamps if layout.stamps_tell else np.full(len(stamps), np.nan)
+    poses, note = moments.poses_of(path, poses, stamps, declared.turned_round)
     if note:
         notes.append(f"{path.name}: {note}")
     return poses, times

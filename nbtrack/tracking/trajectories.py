@@ -141,6 +141,6 @@ def read_tum(path: Path) -> tuple[Float[np.ndarray, "n"], Poses]:
     if not path.is_file():
         raise MissingError(f"no file {path}: give a trajectory in TUM format, as `track` writes it")
     T_world_camera, times = read_poses(path)
-    if times is None or not np.isfinite(T_world_camera).all():
+    if not (np.isfinite(times).all() and np.isfinite(T_world_camera).all()):
         raise DataError(f"{path}: not a finite pose in every line, `{_COLUMNS}`; write it anew")
     return times, T_world_camera
