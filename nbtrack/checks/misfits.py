@@ -13,11 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import CubicSpline
 
 from nbtrack.checks.readings import Costs, FramePairs, Reading
 
-MAX_SHIFT = 4  # frames by which depth or colours may be late or early (our choice)
+MAX_SHIFT = 3  # frames by which depth or colours may be late or early (our choice)
 _SHARES = np.linspace(-0.15, 0.15, 13)  # by which lengths may be off
 _METRES = np.linspace(-0.6, 0.6, 13)  # by which poses may drift along an axis, over the recording
 _PIXELS = np.linspace(-0.06, 0.06, 13)  # by which colours may be off, as a share of the width
@@ -27,7 +26,6 @@ _SCATTER = np.linspace(-0.02, 0.04, 13)  # m, by which positions may scatter; be
 _GAIN = 0.98  # share of the cost as declared, above which an estimate tells nothing (our choice)
 _MIN_PAIRS = 8  # that an estimate needs
 MIN_CORRELATION = 0.75  # of intensities that pairs of a right recording have (our choice)
-_FINER = 20  # places between two values at which costs are interpolated
 _RESAMPLED = 200  # draws of a bootstrap
 _INTERVAL = [0.025, 0.975]  # its quantiles
 
@@ -141,6 +139,11 @@ def _estimates(
 def _lowest(
     values: Float[np.ndarray, "values"], costs: Float[np.ndarray, "*n values"]
 ) -> Float[np.ndarray, "*n"]:
-    """Where costs are lowest, also between the values, by cubic splines."""
-    fine = np.linspace(values[0], values[-1], _FINER * (len(values) - 1) + 1)
-    return fine[CubicSpline(values, costs, axis=-1)(fine).argmin(axis=-1)]
+    """The place of the lowest of costs at equal steps, by a parabola through three of them."""
+    at, last = costs.argmin(axis=-1), len(values) - 1
+    around = np.clip(at[..., None] + [-1, 0, 1], 0, last)
+    before, middle, after = np.moveaxis(np.take_along_axis(costs, around, axis=-1), -1, 0)
+    bend = before - 2 * middle + after
+    is_inside = (at > 0) & (at < last) & (bend > 0)
+    offset = np.where(is_inside, (before - after) / 2 / np.where(is_inside, bend, 1), 0)
+    return values[at] + offset * (values[1] - values[0])
