@@ -114,7 +114,11 @@ ONE_WARNING = {
     "still": (walk(8, 0.0, 0.0), 1.0, NOT_PROVED + "the camera moves too little to tell"),
     "one frame": (walk(1), 1.0, NOT_PROVED + "surfaces of two frames never meet"),
     "turned away": (walk(6, 0.03, 120.0), 1.0, NOT_PROVED + "surfaces of two frames never meet"),
-    "no convention": (walk(N_FRAMES), 2.0, "no other convention fits: check it, focal.txt and the"),
+    "no convention": (
+        walk(N_FRAMES),
+        2.0,
+        "no other convention fits better: check it, focal.txt and",
+    ),
     "jump": (off(*range(8, N_FRAMES), metres=0.5), 1.0, "1 of 16 poses .* 25 cm .*img[78].png"),
     "outliers": (off(3, 8, 12), 1.0, "3 of 16 poses lie up to .*, first img3.png"),
 }
