@@ -117,7 +117,7 @@ ONE_WARNING = {
     "no convention": (
         walk(N_FRAMES),
         2.0,
-        "no other convention fits better: check it, focal.txt and",
+        "no other convention fits better: .* focal.txt",
     ),
     "jump": (off(*range(8, N_FRAMES), metres=0.5), 1.0, "1 of 16 poses .* 25 cm .*img[78].png"),
     "outliers": (off(3, 8, 12), 1.0, "3 of 16 poses lie up to .*, first img3.png"),

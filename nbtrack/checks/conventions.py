@@ -141,8 +141,8 @@ def diagnosis(
     if own.overlap < _MIN_OVERLAP or own.median_m > _FAR_APART:
         return (
             f"{file} is not proved: surfaces of two frames {apart} ({own.overlap:.0%} of points "
-            f"overlap) and no other convention fits better: check it, {recording.calibration.source.name} "
-            "and the depth unit, or a piece with smaller steps"
+            "overlap), and no other convention fits better: check it, the depth unit and "
+            f"{recording.calibration.source.name}, or a piece with smaller steps"
         )
     alike = [c.name for c in others if c.subject == "poses" and not own.is_clearly_better(c)]
     if not (needs_proof and alike):
