@@ -91,8 +91,7 @@ def check_recording(
     poses = recording.T_world_camera[ids]
     poses[:, :3, 3] -= recording.origin
     pairs = _pairs(poses, _N_PAIRS if is_whole else _QUICK_PAIRS)
-    shown, kept = _kept(pairs, len(ids), is_whole)
-    kept = ids[kept]
+    shown, kept = _kept(pairs, ids, is_whole)
     # Depth values as they stand in the files, so that any unit can be tried.
     in_files = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
     in_files = replace(recording, declared=in_files)
@@ -210,15 +209,15 @@ def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:
     return np.unique([first, first + gaps], axis=1)
 
 
-def _kept(pairs: Pairs, n_frames: int, is_whole: bool) -> tuple[Frames, Frames]:
-    """Positions of frames whose points are shown, and of all whose images are looked at again."""
+def _kept(pairs: Pairs, ids: Frames, is_whole: bool) -> tuple[Frames, Frames]:
+    """Positions in `ids` of frames whose points are shown, and ids of all whose images are kept."""
     compared = np.unique(pairs)
     if not is_whole:
-        return compared, compared
-    shown = np.unique(np.linspace(0, n_frames - 1, _CLOUD_FRAMES).astype(int))
+        return compared, ids[compared]
+    last = len(ids) - 1
+    shown = np.unique(np.linspace(0, last, _CLOUD_FRAMES).astype(int))
     shifts = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
-    beside = np.add.outer(compared, shifts).clip(0, n_frames - 1)
-    return shown, np.union1d(beside, shown)
+    return shown, ids[np.union1d(np.add.outer(compared, shifts).clip(0, last), shown)]
 
 
 def _read(
