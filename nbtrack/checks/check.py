@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from nbtrack.checks.conventions import Convention, diagnosis, fit_all
+from nbtrack.checks.conventions import PLAUSIBLE_DEPTH, Convention, diagnosis, fit_all
 from nbtrack.checks.misfits import MAX_SHIFT, MIN_CORRELATION, Misfit, find_misfits, main_misfit
 from nbtrack.checks.readings import FramePairs, Pairs, Reading, on_grid
 from nbtrack.core.arrays import Frames, Poses
@@ -53,7 +53,8 @@ class DataReport:
     warnings: list[str]  # what is wrong, each in a sentence; how numbers are read comes first
 
     def __str__(self) -> str:
-        recording, cloud, own = self.recording, self.cloud, self.conventions[0]
+        recording, cloud, (own, *others) = self.recording, self.cloud, self.conventions
+        rivals = sorted((r for r in others if r.overlap > 0), key=lambda r: -r.agreement)[:3]
         c = own.reading.camera
         wide = 2 * np.degrees(np.arctan(c.width / 2 / c.fx))
         near, far = cloud.depth.quantile([0.01, 0.99])
@@ -68,8 +69,8 @@ class DataReport:
             f"  depth: {near:.2f} to {far:.2f} m (1% and 99%)",
             f"  scene: {x:.2f} x {y:.2f} x {z:.2f} m",
             facts.to_string(float_format="{:10.2f}".format),
-            f"  overlap of two frames' surfaces: {1e3 * own.median_m:.1f} mm apart (median), "
-            f"{own.overlap:.0%} of points, read as {own.name}",
+            "  overlap of two frames' surfaces (median distance, share of points), read as",
+            *(f"{1e3 * r.median_m:12.1f} mm {r.overlap:5.0%}  {r.name}" for r in (own, *rivals)),
             f"  misfits, as pairs of frames tell them (95 %): {len(self.misfits)} looked for",
             *(f"    {misfit}" for misfit in self.misfits),
             *(f"  warning: {text}" for text in self.warnings),
@@ -111,7 +112,7 @@ def check_recording(
     main = main_misfit(misfits)
     warnings.append(main or diagnosis(conventions, best, recording, is_whole and not warnings))
     if is_right:
-        warnings += [*_of_poses(frames, recording), *_of_outliers(cloud.depth, is_far)]
+        warnings += [*_of_poses(frames, recording), *_of_depths(cloud.depth, is_far)]
     if not main:
         warnings += _of_colors(frames.brightness, correlation)
     return DataReport(
@@ -165,13 +166,20 @@ def _of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
         )
 
 
-def _of_outliers(depth: pd.Series, is_far: pd.Series) -> Iterator[str]:
+def _of_depths(depth: pd.Series, is_far: pd.Series) -> Iterator[str]:
+    """Which depths, read rightly, no camera measures."""
     if is_far.any():
         low, high = depth[is_far].min(), depth[is_far].max()
         yield (
             f"{is_far.mean():.2%} of the depths are outliers, {low:.3g} to {high:.3g} m away, more "
             f"than {FAR:g} times as far as nine in ten: maps and tracking leave them out; check "
             "the camera, or set no_depth in sequence.toml to what it gives for none"
+        )
+    median, (near, far) = depth[~is_far].median(), PLAUSIBLE_DEPTH
+    if median < near or median > far:
+        yield (
+            f"the median depth is {median:.3g} m, outside {near:g} to {far:g} m: set depth_scale, "
+            "the depth values a metre, in sequence.toml"
         )
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from nbtrack.checks.readings import Costs, FramePairs, Reading
 
 MAX_SHIFT = 3  # frames by which depth or colours may be late or early (our choice)
-_SHARES = np.linspace(-0.15, 0.15, 13)  # by which lengths may be off
+SHARES = np.linspace(-0.15, 0.15, 13)  # by which lengths may be off
 _METRES = np.linspace(-0.6, 0.6, 13)  # by which poses may drift along an axis, over the recording
 _PIXELS = np.linspace(-0.06, 0.06, 13)  # by which colours may be off, as a share of the width
 _FRAMES = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
@@ -46,11 +46,11 @@ _POSES = "record or register the poses anew"
 _DEPTH_PARAMETERS = [
     Parameter("depth_shift", "depth comes after the poses by", "+.1f", " frames", _FRAMES, 0.3,
               "shift one of them against the other"),
-    Parameter("focal_share", "focal lengths should change by", "+.1%", "", _SHARES, 0.01,
+    Parameter("focal_share", "focal lengths should change by", "+.1%", "", SHARES, 0.01,
               "calibrate anew, or multiply them by {factor:.3f}"),
-    Parameter("depth_share", "depths should change against the poses by", "+.1%", "", _SHARES, 0.01,
+    Parameter("depth_share", "depths should change against the poses by", "+.1%", "", SHARES, 0.01,
               "divide depth_scale, or the positions, by {factor:.3f}"),
-    Parameter("depth_growth", "depths grow over the recording by", "+.1%", "", _SHARES, 0.02,
+    Parameter("depth_growth", "depths grow over the recording by", "+.1%", "", SHARES, 0.02,
               "let the camera warm up before recording"),
     *(Parameter(f"drift_{axis}", f"poses drift along {axis} by", "+.2f", " m", _METRES, 0.1, _POSES)
       for axis in "xyz"),
@@ -120,20 +120,23 @@ def main_misfit(misfits: list[Misfit]) -> str:
 def _estimates(
     parameters: list[Parameter], own: Reading, cost: Callable[[Reading], Costs]
 ) -> Iterator[Misfit]:
-    """The values at which pairs agree best, of parameters at all of whose values enough pairs see
-    enough of the same. Intervals are a bootstrap's, which draws the pairs anew."""
+    """Of parameters at all of whose values enough pairs see enough of the same."""
     for parameter in parameters:
-        values = parameter.values
-        readings = [replace(own, **{parameter.key: value}) for value in values]
+        readings = [replace(own, **{parameter.key: value}) for value in parameter.values]
         costs = np.stack([cost(reading) for reading in readings], axis=1)
         costs = costs[np.isfinite(costs).all(axis=1)]
-        if len(costs) < _MIN_PAIRS:
-            continue
-        mean = costs.mean(axis=0)
-        drawn = np.random.default_rng(0).integers(len(costs), size=(_RESAMPLED, len(costs)))
-        low, high = np.quantile(_lowest(values, costs[drawn].mean(axis=1)), _INTERVAL)
-        gain = float(mean.min() / mean[np.abs(values).argmin()])
-        yield Misfit(parameter, float(_lowest(values, mean)), low, high, gain)
+        if len(costs) >= _MIN_PAIRS:
+            yield estimate(parameter, costs)
+
+
+def estimate(parameter: Parameter, costs: Float[np.ndarray, "n values"]) -> Misfit:
+    """The value of a parameter at which `n` observations agree best; its interval is a bootstrap's,
+    which draws the observations anew."""
+    values, mean = parameter.values, costs.mean(axis=0)
+    drawn = np.random.default_rng(0).integers(len(costs), size=(_RESAMPLED, len(costs)))
+    low, high = np.quantile(_lowest(values, costs[drawn].mean(axis=1)), _INTERVAL)
+    gain = float(mean.min() / mean[np.abs(values).argmin()])
+    return Misfit(parameter, float(_lowest(values, mean)), low, high, gain)
 
 
 def _lowest(

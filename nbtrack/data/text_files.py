@@ -19,6 +19,7 @@ _TOLERANT = {"encoding": "utf-8-sig", "errors": "replace"}  # of a byte-order ma
 _DECIMAL_COMMA = re.compile(r"(?<!\S)[-+]?\d+,\d+(e[-+]?\d+)?(?!\S)")
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
 _FARTHEST = 1e7  # m from the origin: beyond map coordinates, within what floats can square
+_ALONE = 1000.0  # m from the middle, and so many times as far as nine in ten: no camera went there
 _LATEST = 1e11  # s: no timestamp is larger; since 1970 even milliseconds are
 _RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 
@@ -96,7 +97,12 @@ def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> 
     times = in_seconds(rows[:, 0])
     # Clipped, so that absurd numbers are refused and overflow nothing here.
     q_xyzw = rows[:, [4 + order.index(axis) for axis in "xyzw"]].clip(-1e6, 1e6)
-    is_known = np.isfinite(rows).all(axis=1) & np.isfinite(times) & (q_xyzw != 0).any(axis=1)
+    is_known = np.isfinite(rows[:, 1:]).all(axis=1) & (q_xyzw != 0).any(axis=1)
+    for i in np.flatnonzero(is_known & np.isnan(times)):
+        raise DataError(
+            f"{path} pose {i} has the time {rows[i, 0]:.13g}: it must be finite, in seconds; write "
+            "nan in the whole line for a frame that is lost"
+        )
     q_xyzw[~is_known] = 0.5
     norms = np.linalg.norm(q_xyzw, axis=1)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -121,12 +127,16 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
     is_wrong |= np.abs(np.linalg.det(R) - 1) > _RIGID
     is_wrong |= (np.abs(T[:, 3] - [0, 0, 0, 1]) > _RIGID).any(axis=1)
     is_wrong |= (np.abs(T[:, :3, 3]) > _FARTHEST).any(axis=1)
+    if is_known.any():
+        away = np.linalg.norm(T[:, :3, 3] - np.median(T[is_known, :3, 3], axis=0), axis=1)
+        usual = np.quantile(away[is_known], 0.9, method="lower")
+        is_wrong |= is_known & (away > _ALONE * max(1.0, usual))
     for i in np.flatnonzero(is_wrong):
         frame = f" frame {i}" if len(poses) > 1 else ""
         numbers = " ".join(f"{number:.4g}" for number in poses[i].flat)
         raise DataError(
             f"{path}{frame} is no rigid transform in metres ({numbers}): rows must be [R | t], "
-            f"right-handed rotation R (of a unit quaternion) and t up to {_FARTHEST:g}, and "
-            "0 0 0 1; write nan for a frame that is lost"
+            f"right-handed rotation R (of a unit quaternion) and t up to {_FARTHEST:g} "
+            "and near the other frames', and 0 0 0 1; write nan for a frame that is lost"
         )
     return np.where(is_known[:, None, None], poses, np.nan)

@@ -124,7 +124,7 @@ def _print_run(metrics: dict[str, Any]) -> None:
     print(f"  on {metrics['device']}")
     outside = metrics.get("outside_map_share", 0.0)
     is_outside = f"{outside:.0%} of the frames saw little of what was mapped" * (outside > 0)
-    for said in filter(None, (metrics["map_warning"], is_outside)):
+    for said in filter(None, (metrics["map_warning"], is_outside, metrics.get("map_misfit"))):
         tell(f"nbtrack: warning: {said}")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from nbtrack import provenance
-from nbtrack.checks.in_map import check_belongs, in_world_of_map, outside_map_share
+from nbtrack.checks.in_map import check_belongs, in_world_of_map, map_misfit, outside_map_share
 from nbtrack.core import files
 from nbtrack.core.arrays import Pose, Poses
 from nbtrack.core.device import choose_device, device_name
@@ -195,8 +195,9 @@ class TrackJob(Job):
             followed = sequence.select(slice(len(sequence) - len(tracked.frames), None))
             if start.is_in_other_world:
                 followed = replace(followed, T_world_camera=tracked.T_estimated)
-            outside = outside_map_share(finished.field, followed, tracked.T_estimated)
-            notes["outside_map_share"] = outside
+            seen = finished.field, followed, tracked.T_estimated
+            notes["outside_map_share"] = outside_map_share(*seen)
+            notes["map_misfit"] = map_misfit(*seen)
         reach = self._reach(tracked.frames["steps"].mean(), metres_per_unit, T_true)
         return notes | still_metrics(T_true) | reach
 
