@@ -114,11 +114,7 @@ ONE_WARNING = {
     "still": (walk(8, 0.0, 0.0), 1.0, NOT_PROVED + "the camera moves too little to tell"),
     "one frame": (walk(1), 1.0, NOT_PROVED + "surfaces of two frames never meet"),
     "turned away": (walk(6, 0.03, 120.0), 1.0, NOT_PROVED + "surfaces of two frames never meet"),
-    "no convention": (
-        walk(N_FRAMES),
-        2.0,
-        "no other convention fits better: .* focal.txt",
-    ),
+    "no convention": (walk(N_FRAMES), 2.0, "no other convention fits better: .* focal.txt"),
     "jump": (off(*range(8, N_FRAMES), metres=0.5), 1.0, "1 of 16 poses .* 25 cm .*img[78].png"),
     "outliers": (off(3, 8, 12), 1.0, "3 of 16 poses lie up to .*, first img3.png"),
 }
@@ -132,6 +128,16 @@ def test_one_warning(tmp_path: Path, case: str) -> None:
     assert report.best is report.conventions[0]
     assert len(report.warnings) == 1
     assert re.search(f"  warning: .*{says}", str(report))
+
+
+def test_a_unit_that_only_the_depth_tells(tmp_path: Path) -> None:
+    """Catches depths and positions that are ten times too short alike."""
+    poses = walk(N_FRAMES)
+    folder = write_box(tmp_path / "box", poses, 0.1)
+    poses[:, :3, 3] /= 10
+    rewrite_poses(folder, as_written(poses, "opengl"))
+    (said,) = check(folder).warnings
+    assert said.startswith("the median depth is 0.188 m")
 
 
 def test_frames_without_pose(box: Path, tmp_path: Path) -> None:
