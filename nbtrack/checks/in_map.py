@@ -127,7 +127,8 @@ def map_misfit(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> str:
         distance = field(x)[1]
         (gradient,) = torch.autograd.grad(distance.sum(), x)
         r, q = distance.numpy(force=True), gradient.numpy(force=True) @ T[:3, :3]
-        r, q, p = (values[np.abs(r) < _MAX_DISTANCE] for values in (r, q, p))
+        near = np.abs(r) < _MAX_DISTANCE
+        r, q, p = r[near], q[near], p[near]
         motions, _ = np.linalg.qr(np.hstack([np.cross(p, q), q]))
         both = np.column_stack([r, (q * p).sum(axis=1)])
         r, longer = (both - motions @ (motions.T @ both)).T
