@@ -133,16 +133,24 @@ def diagnosis(
     apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
     if best is not own:
         look = "look" if best.subject == "poses" else "looks"
+        # Depth upside down, or turned by 180 degrees, fits like mirrored or turned axes.
+        is_rare = "axes" in best.name and not best.name.startswith(("Open", "robot"))
+        turned = "; or the depth images are turned against the colour images" if is_rare else ""
         return (
             f"your {best.subject} {look} like {best.name}; {_remedy(best.reading, own.reading)} "
             f"(surfaces that two frames see then lie {1e3 * best.median_m:.0f} mm apart; as "
-            f"declared they {apart})"
+            f"declared they {apart}){turned}"
         )
-    if own.overlap < _MIN_OVERLAP or own.median_m > _FAR_APART:
+    if own.overlap < _MIN_OVERLAP:
         return (
-            f"{file} is not proved: surfaces of two frames {apart} ({own.overlap:.0%} of points "
-            "overlap), and no other convention fits better: check it, the depth unit and "
-            f"{recording.calibration.source.name}, or a piece with smaller steps"
+            f"{file} is not proved: two frames see too little of the same ({own.overlap:.0%} of "
+            f"the points, whose surfaces {apart}): check it, and a piece with smaller steps"
+        )
+    if own.median_m > _FAR_APART:
+        return (
+            f"surfaces that two frames see {apart} (median, {own.overlap:.0%} of the points "
+            f"overlap) and no other convention fits: check {recording.calibration.source.name}, "
+            f"the depth unit and {file}, and that image, depth and pose belong to one moment"
         )
     alike = [c.name for c in others if c.subject == "poses" and not own.is_clearly_better(c)]
     if not (needs_proof and alike):
