@@ -29,6 +29,7 @@ _NEIGHBOURS = 20  # points that tell a point's plane
 _MIN_POINTS = 20  # with fewer a frame keeps its start
 _MIN_INLIERS = 0.5  # share of the points; below, a frame is lost
 _MIN_SCALE = 0.005  # m, of robust costs: what a voxel's points scatter by
+_INDEPENDENT = 128  # points: with 256 half of the wrong poses before a flat wall pass
 _LOST = 0.5  # a pose is lost if the probability that it is right is less
 # A move of less than the epsilons (rad, m) ends a search.
 _OPTIONS = {"registration_type": "GICP", "num_threads": 1, "max_iterations": 30}
@@ -156,6 +157,7 @@ class IcpTracker(Tracker):
             T_found,
             np.linalg.inv(H_world + PRIOR_WEIGHT * np.eye(6)),
             n_directions=2,  # of a wall, where nothing but its planes counts
+            n_independent=_INDEPENDENT,
         )
         inlier_ratio = self.found.num_inliers / self.source.size()
         is_held = p_within(CORRELATED * position_std_m) > _LOST

@@ -17,6 +17,10 @@ _MAX_DAMPING = 1e3
 _DAMPING_UP = 10.0
 _DAMPING_DOWN = 0.2
 _MAX_STEPS = 60  # of a stage
+# Along which a camera may be held by nothing, and points that tell so independently: with 384 some
+# wrong poses before a flat wall pass (docs/tried.md).
+_DIRECTIONS = 1
+_INDEPENDENT = 256
 # The coarse stage may lead away from a good start: the better of both goes on, at these scales.
 NEAR_SCALES = np.array([0.02, 0.05])
 
@@ -119,7 +123,8 @@ class LmOptimizer:
         covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2  # rad, m
         blocks = np.stack([covariance[:3, :3], covariance[3:, 3:]])
         rotation, position = np.linalg.eigvalsh(blocks)[:, -1] ** 0.5
-        position = max(position, std_when_moved(self._costs_at, self.T_world_camera, covariance))
+        where = self._costs_at, self.T_world_camera, covariance
+        position = max(position, std_when_moved(*where, _DIRECTIONS, _INDEPENDENT))
         return {
             "inlier_ratio": float(is_inlier.mean()),
             "known_ratio": known_ratio,

@@ -26,6 +26,8 @@ _COEFFICIENTS = np.array([-2.06, -0.28, 2.8, 1.39])
 MAD_FACTOR = 3.0
 SIGMAS = 0.6745 * MAD_FACTOR
 CORRELATED = 2.0  # by how much stds that take errors for independent are too small
+# Where a pose is held, its cost grows both ways, but within 5 cm often one way alone.
+_MOVED_M = 2 * WRONG_M
 
 
 def features(said: Mapping[str, float]) -> Float[np.ndarray, "4"]:
@@ -70,27 +72,27 @@ def std_when_moved(
     costs_at: Callable[[Pose], Float[np.ndarray, "n"]],
     T_world_camera: Pose,
     covariance: Float[np.ndarray, "6 6"],
-    n_directions: int = 1,
+    n_directions: int,
+    n_independent: int,
 ) -> float:
-    """The position's standard deviation (m), by what the points' costs grow `WRONG_M` away.
+    """The position's standard deviation (m), by how the points' costs grow `_MOVED_M` away.
 
     The pose moves both ways along the position's least certain directions, and turns as the
     covariance (world frame, rad and m, as `lm_solver.retract` takes twists) says; the smallest
     growth counts. Curvature alone is not enough: ripples in the map of a flat wall have gradients,
-    too, but the frame fits as well all along the wall. A standard error over the points is taken
-    off (our choice: two would call more right poses lost). Costs are Geman-McClure's, at scales of
-    `MAD_FACTOR` medians.
+    too, but the frame fits as well all along the wall. Errors of a map are alike at neighbouring
+    points, so many points tell no more than `n_independent`. Costs are Geman-McClure's, at scales
+    of `MAD_FACTOR` medians.
     """
     variances, directions = np.linalg.eigh(covariance[3:, 3:])
     here = costs_at(T_world_camera)
     growths = []
     for k in range(1, n_directions + 1):
-        twist = WRONG_M * covariance[:, 3:] @ directions[:, -k] / variances[-k]
+        twist = _MOVED_M * covariance[:, 3:] @ directions[:, -k] / variances[-k]
         for way in (1, -1):
-            growth = costs_at(retract(T_world_camera, way * twist)) - here
-            growths.append(growth.sum() - growth.std() * len(growth) ** 0.5)
-    information = max(min(growths), 0.0) / WRONG_M**2 + PRIOR_WEIGHT
-    return 1 / (SIGMAS * information**0.5)
+            growths.append((costs_at(retract(T_world_camera, way * twist)) - here).mean())
+    growth = max(min(growths), 0.0) * min(len(here), n_independent)
+    return 1 / (SIGMAS * (growth / _MOVED_M**2 + PRIOR_WEIGHT) ** 0.5)
 
 
 def score_detection(
