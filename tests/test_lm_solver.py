@@ -1,5 +1,7 @@
 """The compiled solver against its formulas in plain numpy, differences, and values by hand."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -17,6 +19,7 @@ from nbtrack.beyond.lm_solver import (
     robust_scales,
 )
 from nbtrack.beyond.observed import LUMA, Observed, draw_points, with_normals
+from nbtrack.beyond.verdict import std_when_moved
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.fields import NetworkSettings, make_field
 
@@ -103,6 +106,23 @@ def test_retract_turns_about_the_camera_and_is_finite_at_zero() -> None:
     turned = retract(POSE, np.array([0.0, 0.0, np.pi / 2, 0.1, 0.0, 0.0]))
     np.testing.assert_allclose(turned[:3, 3], POSE[:3, 3] + [0.1, 0, 0])
     np.testing.assert_allclose(turned[:3, 0], [-POSE[1, 0], POSE[0, 0], POSE[2, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(("free_m", "low", "high"), [(0.07, 0, 0.02), (0.2, 0.1, 0.3)])
+def test_a_pose_is_held_where_it_cannot_slide_far(free_m: float, low: float, high: float) -> None:
+    """Catches doubts about a pose that may slide one way by less than 10 cm, certainty about one
+    that may slide farther, and a certainty that grows with points beyond the independent ones."""
+
+    def costs_at(T: np.ndarray, n_points: int) -> np.ndarray:
+        return np.full(n_points, 0.0 if -1e-9 <= T[0, 3] <= free_m else 0.5)
+
+    covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-2, 1e-6, 1e-6])
+    stds = [
+        std_when_moved(partial(costs_at, n_points=n), np.eye(4), covariance, 1, 256)
+        for n in (256, 4096)
+    ]
+    assert low < stds[0] < high
+    assert stds[0] == stds[1]
 
 
 @pytest.mark.parametrize(
