@@ -22,7 +22,7 @@ class AdamSettings(TrackerSettings):
     """Adam's learning rates (paper, implementation details).
 
     The paper does not say what its position is measured in. In metres two cells of its Table I
-    could not be reached (see `reach`), so that it is the unit of the map (notebook 5).
+    could not be reached (see `reach`), so that it is the unit of the map (notebook A1).
     """
 
     position_rate: float = 5e-4  # of the position, in units of the map, or in metres
