@@ -320,7 +320,7 @@ def test_formats_are_told_apart(plain: Path, tmp_path: Path) -> None:
     assert open_recording(plain).declared.format == "plain"
     with pytest.raises(ConfigError, match="did you mean 'replica'"):
         read_sequence(plain, format="replika")
-    with pytest.raises(MissingError, match=r"lists the files of neural_rgbd"):
+    with pytest.raises(MissingError, match=r"needs the files of neural_rgbd"):
         read_sequence(tmp_path / "seven")
 
 

@@ -81,11 +81,13 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times]:
     numbers = read_numbers(path, (4, 8, 12, 16), _POSE_LINE)
     if numbers.shape[1] == 8:
         return from_quaternions(numbers, quaternion, path)
-    with naming_damaged(path, "list of poses", f"every line holds {_POSE_LINE}"):
-        if numbers.shape[1] == 12 or numbers.shape == (3, 4):
-            top = numbers.reshape(-1, 3, 4)
-            numbers = np.concatenate([top, np.tile([[[0.0, 0, 0, 1]]], (len(top), 1, 1))], axis=1)
-        poses = checked_poses(numbers.reshape(-1, 4, 4), path)
+    if numbers.shape == (3, 4):
+        numbers = numbers.reshape(1, 12)
+    if numbers.shape[1] == 12:
+        numbers = np.hstack([numbers, np.tile([0.0, 0, 0, 1], (len(numbers), 1))])
+    if numbers.size % 16:
+        raise DataError(f"{path} has {len(numbers)} rows: it needs the four of each 4x4 matrix")
+    poses = checked_poses(numbers.reshape(-1, 4, 4), path)
     return poses, np.full(len(poses), np.nan)
 
 
@@ -98,18 +100,17 @@ def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> 
     # Clipped, so that absurd numbers are refused and overflow nothing here.
     q_xyzw = rows[:, [4 + order.index(axis) for axis in "xyzw"]].clip(-1e6, 1e6)
     is_known = np.isfinite(rows[:, 1:]).all(axis=1) & (q_xyzw != 0).any(axis=1)
-    for i in np.flatnonzero(is_known & np.isnan(times)):
-        raise DataError(
-            f"{path} pose {i} has the time {rows[i, 0]:.13g}: it must be finite, in seconds; write "
-            "nan in the whole line for a frame that is lost"
-        )
     q_xyzw[~is_known] = 0.5
     norms = np.linalg.norm(q_xyzw, axis=1)
+    for i in np.flatnonzero((np.abs(norms - 1) > _RIGID) | (is_known & np.isnan(times))):
+        raise DataError(
+            f"{path} pose {i} has the time {rows[i, 0]:.13g} and a quaternion of norm "
+            f"{norms[i]:.3g}: columns must be finite timestamps (s), tx ty tz and a unit "
+            f"quaternion ({' '.join('q' + axis for axis in order)})"
+        )
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(q_xyzw).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]
-    # Another length makes no rotation, which the check tells.
-    poses[:, :3, :3] *= np.where(np.abs(norms - 1) > _RIGID, norms, 1)[:, None, None]
     poses[~is_known] = np.nan
     return checked_poses(poses, path), times
 
@@ -135,8 +136,8 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
         frame = f" frame {i}" if len(poses) > 1 else ""
         numbers = " ".join(f"{number:.4g}" for number in poses[i].flat)
         raise DataError(
-            f"{path}{frame} is no rigid transform in metres ({numbers}): rows must be [R | t], "
-            f"right-handed rotation R (of a unit quaternion) and t up to {_FARTHEST:g} "
-            "and near the other frames', and 0 0 0 1; write nan for a frame that is lost"
+            f"{path}{frame} is no rigid transform in metres ({numbers}): "
+            f"rows must be [R | t], right-handed rotation R and t up to {_FARTHEST:g} and near the "
+            "other frames', and 0 0 0 1; write nan for a frame that is lost"
         )
     return np.where(is_known[:, None, None], poses, np.nan)
