@@ -17,9 +17,9 @@ _MAX_DAMPING = 1e3
 _DAMPING_UP = 10.0
 _DAMPING_DOWN = 0.2
 _MAX_STEPS = 60  # of a stage
-# Along which a camera may be held by nothing, and points that tell so independently: with 384 some
-# wrong poses before a flat wall pass (docs/tried.md).
-_DIRECTIONS = 1
+_DIRECTIONS = 1  # the least certain ones, along which a pose is moved to see whether it is held
+# Points that count as independent then: with 384 some wrong poses before a flat wall pass
+# (docs/tried.md).
 _INDEPENDENT = 256
 # The coarse stage may lead away from a good start: the better of both goes on, at these scales.
 NEAR_SCALES = np.array([0.02, 0.05])
