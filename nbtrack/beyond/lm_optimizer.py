@@ -17,9 +17,8 @@ _MAX_DAMPING = 1e3
 _DAMPING_UP = 10.0
 _DAMPING_DOWN = 0.2
 _MAX_STEPS = 60  # of a stage
-_DIRECTIONS = 1  # the least certain ones, along which a pose is moved to see whether it is held
-# Points that count as independent then: with 384 some wrong poses before a flat wall pass
-# (docs/tried.md).
+# Points that count as independent where it is asked whether a pose is held: with 384 some wrong
+# poses before a flat wall pass (docs/tried.md).
 _INDEPENDENT = 256
 # The coarse stage may lead away from a good start: the better of both goes on, at these scales.
 NEAR_SCALES = np.array([0.02, 0.05])
@@ -123,14 +122,19 @@ class LmOptimizer:
         covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2  # rad, m
         blocks = np.stack([covariance[:3, :3], covariance[3:, 3:]])
         rotation, position = np.linalg.eigvalsh(blocks)[:, -1] ** 0.5
-        where = self._costs_at, self.T_world_camera, covariance
-        position = max(position, std_when_moved(*where, _DIRECTIONS, _INDEPENDENT))
+        moved_std_m = std_when_moved(
+            self._costs_at,
+            self.T_world_camera,
+            covariance,
+            n_directions=1,
+            n_independent=_INDEPENDENT,
+        )
         return {
             "inlier_ratio": float(is_inlier.mean()),
             "known_ratio": known_ratio,
             "fitting_ratio": fitting / max(known_ratio, 1e-6),
             "intensity_mad": float(_median(off)),
-            "position_std_m": float(position),
+            "position_std_m": float(max(position, moved_std_m)),
             "rotation_std_deg": float(np.rad2deg(rotation)),
             "condition_number": float(values[-1] / max(values[0], 1e-9)),
         }
