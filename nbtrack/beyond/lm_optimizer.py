@@ -106,8 +106,7 @@ class LmOptimizer:
         of those (MAD), 0 where they have no weight. Standard deviations are along the least certain
         direction, that of the position also by `std_when_moved`; the condition number is without
         the pose prior, rotations are at a lever arm of 1 m.
-        Errors of the map are not independent, as residuals are here taken to be: these are lower
-        bounds, good for telling poses apart, not for error bars.
+        Residuals are taken to be independent, which a map's errors are not: these are lower bounds.
         """
         distance, intensity = self.terms.residuals
         reliability = self.terms.reliability
