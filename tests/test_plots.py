@@ -77,11 +77,13 @@ def room_mesh() -> trimesh.Trimesh:
 
 FAR = torch.linspace(-0.05, 0.05, 12 * 16 - 1)  # m, of the measured pixels of a frame
 IMAP_FIELD = make_field("imap", NetworkSettings(width=8), CUBE, seed=0)
+COLUMNS = pd.DataFrame({"a (m)": [1.0, 2.0], "b (cm)": [3.0, 4.0]}).rename_axis("step (s)")
 FIGURES = {
     "network": lambda s: plot_network(IMAP_FIELD.mlp, "density (1/m)", "eight wide"),
     "frame": lambda s: plots.plot_frame(s, 3, "one"),
     "views": lambda s: plots.plot_views(s, [0, 3], [(s.color(0), s.depth(0) + 0.02)] * 2, "x"),
     "ray": lambda s: plots.plot_along_ray(AT, {"a (1/m)": RAY, "b (m)": RAY[:-1]}, 1.2, "end"),
+    "columns": lambda s: plots.plot_columns([COLUMNS, 2 * COLUMNS], "rise"),
     "losses": lambda s: plots.plot_losses(HISTORIES, "fall"),
     "slice": lambda s: plots.plot_slice(SPHERE, s, 0.0, title="round"),
     "density": lambda s: plots.plot_slice(FOG, s, 0.0, title="round"),

@@ -6,6 +6,7 @@ paper's method names, and a title that states the finding.
 
 from nbtrack.plots.figures import (
     plot_along_ray,
+    plot_columns,
     plot_curves,
     plot_distances,
     plot_errors,

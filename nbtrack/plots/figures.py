@@ -113,15 +113,29 @@ def plot_along_ray(
 
     The last samples may be left out, as by the weights of sections between samples.
     """
-    panels = style.new_axes(title, 0.9 + 1.3 * len(curves), len(curves), sharex=True)[:, 0]
-    for axes, (label, color) in zip(panels, style.method_colors(curves).items(), strict=True):
-        values = curves[label].detach().cpu()
-        axes.plot(depths.cpu()[: len(values)], values, ".-", markersize=4, color=color)
+    at = depths.cpu().numpy()
+    shown = {label: pd.Series(c.detach().cpu(), at[: len(c)]) for label, c in curves.items()}
+    figure = plot_columns([pd.DataFrame(shown).rename_axis("depth (m)")], title)
+    for axes in figure.axes:
         axes.axvline(measured_depth, label="measured depth", **style.DASHED)
-        axes.set_ylabel(label)
-    panels[0].legend()
-    panels[-1].set_xlabel("depth (m)")
-    return panels[0].figure
+    figure.axes[0].legend()
+    return figure
+
+
+@style.styled
+def plot_columns(tables: Sequence[pd.DataFrame], title: str = "") -> Figure:
+    """Columns of a table below each other, over its index, whose name labels x.
+
+    Tables of the same columns, which are named with their units, stand side by side.
+    """
+    n = len(tables[0].columns)
+    grid = style.new_axes(title, 0.9 + 1.3 * n, n, len(tables), sharex="col", sharey="row")
+    for column, table in zip(grid.T, tables, strict=True):
+        for axes, (name, color) in zip(column, style.method_colors(table).items(), strict=True):
+            axes.plot(table[name].dropna(), ".-", markersize=4, color=color)
+            axes.set(xlabel=table.index.name, ylabel=name)
+            axes.label_outer()
+    return axes.figure
 
 
 @style.styled
@@ -160,7 +174,8 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     draw_errors(above, frames)
     for tracked, line in zip(frames.values(), above.lines, strict=False):
         below.plot(line.get_xdata(), tracked["rotation_error_deg"], color=line.get_color())
-    above.axhline(100 * LOST_THRESHOLD_M, label="lost above 0.2 m", **style.DASHED)
+    above.axhline(100 * LOST_THRESHOLD_M, **style.DASHED)
+    above.text(0, 100 * LOST_THRESHOLD_M, "lost above 0.2 m", va="bottom")
     below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
     return above.figure.legend_below()
 

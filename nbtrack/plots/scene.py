@@ -119,8 +119,9 @@ def draw_paths(
         look = {"linewidth": own * width, "color": color, "label": label, "zorder": 3}
         axes.plot(*path.T, dashes, **look)
     first = next(iter(T_paths.values()))[0, :3, 3] + aside
-    look = {"color": "black", "markersize": 5 * width, "zorder": 4, "label": "start"}
-    axes.plot(*to_page @ first, "o", **look)
+    look = {"color": "black", "markersize": 5 * width, "zorder": 4}
+    # A legend has four keys at most.
+    axes.plot(*to_page @ first, "o", label="start" if len(T_paths) < 4 else "", **look)
 
 
 def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) -> np.ndarray:
