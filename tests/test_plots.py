@@ -18,7 +18,6 @@ from matplotlib.axis import Axis
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from PIL import Image, ImageSequence
-from scipy.spatial import cKDTree
 
 from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
@@ -29,10 +28,10 @@ from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.plots.idea import plot_idea
 from nbtrack.plots.movie import view_of
 from nbtrack.plots.network import plot_network
-from nbtrack.plots.pose_losses import move_sideways
+from nbtrack.plots.pose_losses import move_sideways, plot_density, plot_pose_losses, pose_losses
 from nbtrack.plots.scene import screen_axes
 from nbtrack.plots.style import PALETTE, method_colors
-from nbtrack.plots.viewer import viewer_scene
+from nbtrack.tracking import SdfSettings, StepBudget, Tracker, make_tracker
 
 CUBE = SceneBounds((-2.0,) * 3, (2.0,) * 3)
 
@@ -75,6 +74,12 @@ def room_mesh() -> trimesh.Trimesh:
     return mesh
 
 
+def steps_of(sequence: RgbdSequence) -> Tracker:
+    """A tracker that starts 5 cm beside the first frame."""
+    own = sequence.T_world_camera[5], StepBudget(3), SdfSettings(n_pixels=8)
+    return make_tracker("sdf", NEAR, *own)
+
+
 FAR = torch.linspace(-0.05, 0.05, 12 * 16 - 1)  # m, of the measured pixels of a frame
 IMAP_FIELD = make_field("imap", NetworkSettings(width=8), CUBE, seed=0)
 COLUMNS = pd.DataFrame({"a (m)": [1.0, 2.0], "b (cm)": [3.0, 4.0]}).rename_axis("step (s)")
@@ -97,6 +102,9 @@ FIGURES = {
     "errors": lambda s: plots.plot_errors({"VR": FRAMES, "SDF": FRAMES}, "lost"),
     "curves": lambda s: plots.plot_curves(SWEEP, *SWEEP, "fast"),
     "samples": lambda s: plot_idea(IMAP_FIELD, s[0], s.T_world_camera[0], 6, 8, "44 samples"),
+    "both losses": lambda s: plot_pose_losses(IMAP_FIELD, NEAR, s[0], 4.0),
+    "no density": lambda s: plot_density(pose_losses(IMAP_FIELD, NEAR, s[0]), "elsewhere"),
+    "steps": lambda s: plots.plot_steps({"SDF": steps_of(s)}, s[0], s.T_world_camera[5], 0.02),
     "queries": lambda s: plot_idea(SPHERE, s[0], s.T_world_camera[0], 6, 8, "one query"),
 }  # fmt: skip
 
@@ -105,7 +113,7 @@ def is_labelled(axis: Axis) -> bool:
     """Whether an axis without numbers, or with a label that names a unit or what it counts."""
     shows_numbers = any(t.get_text() and t.get_visible() for t in axis.get_ticklabels())
     label = axis.label.get_text()
-    return not shows_numbers or label.endswith(")") or label == "mapping iteration"
+    return not shows_numbers or label.endswith(")") or label in ("mapping iteration", "step")
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -280,23 +288,12 @@ def test_the_slice_stands_beside_the_room_in_its_projection(sequence, tmp_path) 
     assert (tmp_path / "figure_1.pdf").read_bytes().startswith(b"%PDF")
 
 
-def test_the_viewer_holds_mesh_and_paths_and_stays_small(sequence) -> None:
-    """Catches paths lost on the way to the viewer, a mesh that is black from the side or inside
-    out, and notebooks of many megabytes."""
-    fine = trimesh.creation.icosphere(subdivisions=6, radius=2.0)  # 81,920 faces
-    fine.visual.vertex_colors = np.full((len(fine.vertices), 4), 200, np.uint8)
-    scene = viewer_scene(fine, {"true": sequence.T_world_camera})
-    room, tube = scene.geometry["mesh"], scene.geometry["true"]
-    ends = sequence.T_world_camera[[0, -1], :3, 3]
-    assert cKDTree(tube.vertices).query(ends)[0].max() < 0.005 * fine.scale
-    assert 4_000 < len(room.faces) < 12_000
-    assert np.linalg.norm(room.vertices, axis=1) == pytest.approx(2.0, abs=1e-3)
-    faces_inside = (room.face_normals * room.triangles_center).sum(axis=1) < 0
-    assert faces_inside.mean() > 0.9  # merging turns a few around
-    assert b"KHR_materials_unlit" in scene.export(file_type="glb")
-    page = plots.mesh_viewer(fine, {"true": sequence.T_world_camera}).data
-    assert "stopImmediatePropagation()" in page
-    assert len(page) < 1_300_000
+def test_steps_begin_at_their_start(sequence) -> None:
+    """Catches a path of steps in the world's axes, in another unit, or without its first pose."""
+    plane, by_step = FIGURES["steps"](sequence).axes[:2]
+    assert plane.lines[0].get_xydata()[0] == pytest.approx([5, 0], abs=1e-6)
+    assert by_step.lines[0].get_ydata()[0] == pytest.approx(50)
+    assert len(by_step.lines[0].get_ydata()) == 4
 
 
 def test_a_method_keeps_its_color() -> None:

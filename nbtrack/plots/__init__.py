@@ -16,5 +16,5 @@ from nbtrack.plots.figures import (
     plot_views,
 )
 from nbtrack.plots.movie import cloud_of, movie_bytes, movie_pictures
+from nbtrack.plots.pose_losses import plot_steps
 from nbtrack.plots.rooms import plot_map_and_slice, plot_mesh, plot_overview, plot_slice
-from nbtrack.plots.viewer import mesh_viewer

@@ -1,20 +1,24 @@
 """Both trackers' losses of one frame around its true pose, to look at and to play with."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import pandas as pd
 import torch
 import trimesh
 from matplotlib.figure import Figure
 
-from nbtrack.core.arrays import Transform
+from nbtrack.core.arrays import Pose, Transform
 from nbtrack.core.camera import pixel_directions
 from nbtrack.core.geometry import transform_points
 from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
 from nbtrack.fields import Field, LearnedField
 from nbtrack.fields.base import rendered_losses
+from nbtrack.plots.meshes import query_field
 from nbtrack.plots.style import DASHED, method_colors, new_axes, styled
 from nbtrack.tracking.paper import sdf_loss
+from nbtrack.tracking.tracker import Tracker
 
 _OFFSETS_CM = np.arange(-20, 21, 2)
 _N_PIXELS = 128  # enough for smooth curves, and fast enough for a slider
@@ -58,26 +62,91 @@ def pose_losses(
 
 @styled
 def plot_pose_losses(
-    density: LearnedField, distance: Field, frame: Frame, x_cm: float = 0.0, y_deg: float = 0.0
+    density: LearnedField, distance: Field, frame: Frame, y_deg: float = 0.0
 ) -> Figure:
-    """Where the losses of `pose_losses` are at a moved pose (dot), and their curves along x.
+    """Both trackers' losses of `pose_losses` along x, turned about y, and their lowest places.
 
     Curves have the colour of the map's method, pale without a turn; the dashed line is the true
-    pose. With sliders: `interact(plot_pose_losses, density=fixed(...), ..., x_cm=(-20, 20))`.
+    pose. With a slider: `interact(plot_pose_losses, density=fixed(...), ..., y_deg=(-10, 10))`.
     """
     straight = pose_losses(density, distance, frame)
     turned = pose_losses(density, distance, frame, y_deg)
-    title = f"The camera {x_cm:g} cm along its x and turned by {y_deg:g}° about its y"
-    panels = new_axes(title, 2.9, 1, 3)[0]
-    colors = method_colors(["NeuS", "iMAP"])
-    for axes, name, method in zip(panels, turned, ["NeuS", "iMAP", "iMAP"], strict=True):
-        axes.plot(straight[name], color=colors[method], alpha=0.4, label="not turned")
-        axes.plot(turned[name], color=colors[method], label=f"turned by {y_deg:g}°")
-        pose = np.interp(x_cm, turned.index, turned[name])
-        axes.plot(x_cm, pose, "o", color="0.3", label="this pose")
+    lowest = turned.idxmin()
+    title = "Turned by {:g}°: SDF's loss is lowest at {} cm along x, VR's at {} cm"
+    panels = new_axes(title.format(y_deg, *lowest), 2.9, 1, 2)[0]
+    colors = method_colors(["SDF", "VR"]).values()
+    for axes, name, color in zip(panels, turned, colors, strict=False):  # not the density
+        axes.plot(straight[name], color=color, alpha=0.4, label="not turned")
+        axes.plot(turned[name], color=color, label=f"turned by {y_deg:g}°")
+        axes.plot(lowest[name], turned[name].min(), "o", color="0.3", label="lowest")
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
     figure = axes.figure.legend_below()
     for line in figure.legends[0].get_lines():  # of any method
         line.set_color("0.3")
     return figure
+
+
+@styled
+def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
+    """SDF's loss and the mean density of `pose_losses`, and where each would pull the camera."""
+    panels = new_axes(title, 2.9, 1, 2)[0]
+    best = {curves.columns[0]: ("lowest", np.argmin), curves.columns[2]: ("highest", np.argmax)}
+    for axes, name, color in zip(panels, best, method_colors(["SDF", "VR"]).values(), strict=True):
+        told, find = best[name]
+        place = curves.index[find(curves[name])]
+        axes.plot(curves[name], color=color)
+        axes.plot(place, curves[name][place], "o", color="0.3", label=f"{told}, at {place} cm")
+        axes.axvline(0, label="the true pose", **DASHED)
+        axes.set(xlabel="camera off along x (cm)", ylabel=name)
+        axes.legend()
+    return axes.figure
+
+
+@styled
+def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, near: float) -> Figure:
+    """Steps of trackers in one map, by label, on the mean |d| of a frame, and their errors.
+
+    The title says after how many steps of its budget each is `near` (m). |d| is the mean of at most
+    2000 measured points, on the plane of the true camera's x and z, with the true orientation;
+    trackers also turn.
+    """
+    T_true = frame.T_world_camera
+    paths = {label: _path_cm(tracker, frame, T_start) for label, tracker in trackers.items()}
+    errors_mm = {label: 10 * np.linalg.norm(path, axis=1) for label, path in paths.items()}
+    found = {label: np.flatnonzero(e < 1000 * near) for label, e in errors_mm.items()}
+    told = [f"{k} {f'after {n[0]} steps' if len(n) else 'never'}" for k, n in found.items()]
+    ends = " and ".join(f"{errors[-1]:.0f}" for errors in errors_mm.values())
+    title = f"Within {1000 * near:.0f} mm: {', '.join(told)}; at their ends {ends} mm"
+    plane, by_step = new_axes(title, 3.6, 1, 2, width_ratios=[1.2, 1])[0]
+    spread = np.concatenate([*paths.values(), [[0, 0, 0]]])
+    x, z = (np.linspace(spread[:, k].min() - 1, spread[:, k].max() + 1, 21) for k in (0, 2))
+    pixels = frame.measured_pixels()
+    points = frame.points(*pixels[:, :: 1 + pixels.shape[1] // 2000])[0].numpy()
+    moved = points + np.stack(np.meshgrid(x, 0, z), axis=-1)[0][:, :, None] / 100
+    field = next(iter(trackers.values())).field
+    values = query_field(field, moved @ T_true[:3, :3].T + T_true[:3, 3])[1]
+    mean_cm = 100 * np.abs(values).mean(axis=-1)
+    filled = plane.contourf(x, z, mean_cm.T, np.arange(0, mean_cm.max() + 0.25, 0.25), cmap="Greys")
+    plane.figure.colorbar(filled, ax=plane, label="mean |d| (cm)")
+    for label, color in method_colors(paths).items():
+        look = {"color": color, "marker": ".", "label": label}
+        plane.plot(paths[label][:, 0], paths[label][:, 2], **look)
+        by_step.plot(errors_mm[label], **look)
+    plane.plot(0, 0, "*", color="black", markersize=10, linestyle="", label="true pose")
+    plane.set(xlabel="camera off along x (cm)", ylabel="off along z (cm)", aspect="equal")
+    by_step.set(xlabel="step", ylabel="position error (mm)")
+    return plane.figure.legend_below()
+
+
+def _path_cm(tracker: Tracker, frame: Frame, T_start: Pose) -> np.ndarray:
+    """Positions of a tracker's steps (steps + 1, 3), in the true camera's frame (cm)."""
+    tracker.begin(frame.to(tracker.device), torch.from_numpy(T_start)[None])
+    poses = [T_start]
+    for _ in tracker.budget.frame():
+        tracker.step()
+        poses.append(tracker.T_world_camera.detach().cpu().double().numpy())
+        if tracker.is_converged:
+            break
+    offsets = np.stack(poses)[:, :3, 3] - frame.T_world_camera[:3, 3]
+    return 100 * offsets @ frame.T_world_camera[:3, :3]

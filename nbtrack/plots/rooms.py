@@ -143,6 +143,10 @@ def plot_map_and_slice(
     places = (points + aside) @ to_screen[:2].T
     bar = {"location": "bottom", "shrink": 0.4, "aspect": 30, "pad": 0.0}
     scene.draw_slice(axes, field, points, places, sequence, **bar)
+    names = "Mesh: the zero level", "Slice at the cameras' height; pale: never seen"
+    for name, drawn in zip(names, (mesh.vertices @ to_screen[:2].T, places), strict=True):
+        x, y = drawn.reshape(-1, 2).T
+        axes.text((x.min() + x.max()) / 2, y.max() + 2 * voxel, name, ha="center")
     scene.draw_paths(axes, T_paths, to_screen[:2], 0.7)
     axes.figure.legend_below()
     scene.draw_paths(axes, T_paths, to_screen[:2], 0.7, aside)
