@@ -102,7 +102,7 @@ FIGURES = {
     "errors": lambda s: plots.plot_errors({"VR": FRAMES, "SDF": FRAMES}, "lost"),
     "curves": lambda s: plots.plot_curves(SWEEP, *SWEEP, "fast"),
     "samples": lambda s: plot_idea(IMAP_FIELD, s[0], s.T_world_camera[0], 6, 8, "44 samples"),
-    "both losses": lambda s: plot_pose_losses(IMAP_FIELD, NEAR, s[0], 4.0),
+    "both losses": lambda s: plot_pose_losses(IMAP_FIELD, NEAR, s[0], 8.0, 4.0),
     "no density": lambda s: plot_density(pose_losses(IMAP_FIELD, NEAR, s[0]), "elsewhere"),
     "steps": lambda s: plots.plot_steps({"SDF": steps_of(s)}, s[0], s.T_world_camera[5], 0.02),
     "queries": lambda s: plot_idea(SPHERE, s[0], s.T_world_camera[0], 6, 8, "one query"),

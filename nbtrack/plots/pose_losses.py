@@ -62,23 +62,30 @@ def pose_losses(
 
 @styled
 def plot_pose_losses(
-    density: LearnedField, distance: Field, frame: Frame, y_deg: float = 0.0
+    density: LearnedField, distance: Field, frame: Frame, x_cm: float = 0.0, y_deg: float = 0.0
 ) -> Figure:
-    """Both trackers' losses of `pose_losses` along x, turned about y, and their lowest places.
+    """The view of a density at a moved pose, and both losses of `pose_losses` along x, turned.
 
-    Curves have the colour of the map's method, pale without a turn; the dashed line is the true
-    pose. With a slider: `interact(plot_pose_losses, density=fixed(...), ..., y_deg=(-10, 10))`.
+    Curves have the colour of the map's method, pale without a turn. With sliders:
+    `interact(plot_pose_losses, density=fixed(...), ..., x_cm=(-20, 20), y_deg=(-10, 10))`.
     """
     straight = pose_losses(density, distance, frame)
     turned = pose_losses(density, distance, frame, y_deg)
-    lowest = turned.idxmin()
     title = "Turned by {:g}°: SDF's loss is lowest at {} cm along x, VR's at {} cm"
-    panels = new_axes(title.format(y_deg, *lowest), 2.9, 1, 2)[0]
+    *panels, view = new_axes(title.format(y_deg, *turned.idxmin()), 2.9, 1, 3)[0]
+    T_world_camera = move_sideways(frame, x_cm, y_deg).double().numpy()
+    view.imshow(density.render_view(frame.camera, T_world_camera)[0])
+    view.set_title(f"the view {x_cm:g} cm along x")
+    view.axis("off")
+    along = np.array([-5, 0, 5])  # cm, of the tangent
     colors = method_colors(["SDF", "VR"]).values()
     for axes, name, color in zip(panels, turned, colors, strict=False):  # not the density
         axes.plot(straight[name], color=color, alpha=0.4, label="not turned")
         axes.plot(turned[name], color=color, label=f"turned by {y_deg:g}°")
-        axes.plot(lowest[name], turned[name].min(), "o", color="0.3", label="lowest")
+        slopes = np.gradient(turned[name], turned.index)
+        loss, slope = (np.interp(x_cm, turned.index, curve) for curve in (turned[name], slopes))
+        look = {"marker": "o", "markevery": [1], "label": "this pose and the gradient"}
+        axes.plot(x_cm + along, loss + slope * along, color="0.3", **look)
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
     figure = axes.figure.legend_below()
