@@ -166,27 +166,37 @@ def _views(sequence: RgbdSequence, frames: Frames) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(sequence.T_world_camera[kept]).float(), views
 
 
-def _measured_planes(
-    sequence: RgbdSequence, frames: Frames, grid: BakedField, times: float = 1.0
-) -> tuple[np.ndarray, ...]:
-    """Random measured points (n x 3, m) with normals, their z-depths (n, m) and colours (n x 3).
+def _measured_planes(sequence: RgbdSequence, frames: Frames, grid: BakedField) -> list[np.ndarray]:
+    """Random measured points (n x 3, m, world frame), their normals, z-depths (n, m) and colours.
 
-    They are `_N_POINTS`, or so many times more as the cells that they lie in ask for. Neighbours
-    come one after another: their vertices are then still in the processor's cache.
+    They are `_N_POINTS`. Where the grid's cells would hold too few of them, as many more are drawn
+    anew as the cells lack, up to `_MAX_TIMES` as many.
+    """
+    cells, *planes = _draw_planes(sequence, frames, grid, _N_POINTS)
+    times = min(_POINTS_A_CELL * len(np.unique(cells)) / len(cells), _MAX_TIMES)
+    if times > 1:
+        _, *planes = _draw_planes(sequence, frames, grid, round(times * _N_POINTS))
+    return planes
+
+
+def _draw_planes(
+    sequence: RgbdSequence, frames: Frames, grid: BakedField, n_points: int
+) -> list[np.ndarray]:
+    """Numbers of the cells in which so many random measured points lie, and what is known of these.
+
+    Points without a plane are left out. Neighbours come one after another: their vertices are then
+    still in the processor's cache.
     """
     sampler = PixelSampler(sequence, torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
-    n_points = round(times * _N_POINTS)
     rays = sampler.draw(n_points, generator, torch.from_numpy(frames), tangent_planes=True)
     has_plane = rays.normals_world.any(dim=-1)
     if not has_plane.any():
         raise DataError(f"{sequence.name} shows no surface to correct a map by: check its depth")
-    points = rays.points(rays.depth[:, None])[:, 0]
-    parts = points, rays.normals_world, rays.depth, rays.color
-    parts = [part[has_plane].double().numpy() for part in parts]
-    cells = interpolation(parts[0], grid)[0][:, 0]
-    wanted = min(_POINTS_A_CELL * len(np.unique(cells)) / len(cells), _MAX_TIMES)
-    if times == 1.0 < wanted:
-        return _measured_planes(sequence, frames, grid, wanted)
+    points_world = rays.points(rays.depth[:, None])[:, 0]
+    measured = points_world, rays.normals_world, rays.depth, rays.color
+    planes = [part[has_plane].double().numpy() for part in measured]
+    vertices, _ = interpolation(planes[0], grid)
+    cells = vertices[:, 0]  # a cell has the number of its first vertex
     order = np.argsort(cells, kind="stable")
-    return tuple(part[order] for part in parts)
+    return [part[order] for part in (cells, *planes)]
