@@ -72,11 +72,9 @@ class IcpTracker(Tracker):
             )
         self.small_gicp = importlib.import_module(self.package)
         field = deepcopy(field).cpu()
-        points = field.points.double().numpy()
-        self.low = points.min(axis=0) - _WIDE
-        self.high = points.max(axis=0) + _WIDE
-        self.target, self.target_tree = self._with_planes(self.small_gicp.PointCloud(points))
-        self.map_points, self.map_normals = points, self.target.normals()[:, :3]
+        cloud = self.small_gicp.PointCloud(field.points.double().numpy())
+        self.target, self.target_tree = self._with_planes(cloud)
+        self.map_normals = self.target.normals()[:, :3]
         return field
 
     @classmethod
@@ -120,7 +118,8 @@ class IcpTracker(Tracker):
     def _is_near(self, T_world_camera: Pose) -> bool:
         """Whether any point lies near the map's box at a pose."""
         points_world = (self.source.points() @ T_world_camera.T)[:, :3]
-        return bool(((points_world > self.low) & (points_world < self.high)).all(axis=1).any())
+        low, high = self.field.tree.mins - _WIDE, self.field.tree.maxes + _WIDE
+        return bool(((points_world > low) & (points_world < high)).all(axis=1).any())
 
     def _align(self, T_start: Pose, distance: float) -> Any:
         """The frame aligned with the map, where partners are so near (m)."""
@@ -130,12 +129,14 @@ class IcpTracker(Tracker):
 
     def _distances(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
         """How far (m) the points lie from their partners' planes; infinite where none is near."""
-        points = (self.source.points() @ T_world_camera.T)[:, :3]
-        _, partners = self.field.tree.query(points, distance_upper_bound=_NARROW)
-        near = partners < len(self.map_points)
-        offsets = points[near] - self.map_points[partners[near]]
-        distances = np.full(len(points), np.inf)
-        distances[near] = np.abs((offsets * self.map_normals[partners[near]]).sum(axis=1))
+        points_world = (self.source.points() @ T_world_camera.T)[:, :3]
+        tree = self.field.tree
+        apart, partners = tree.query(points_world, distance_upper_bound=_NARROW)
+        is_near = np.isfinite(apart)
+        offsets = points_world[is_near] - tree.data[partners[is_near]]
+        normals = self.map_normals[partners[is_near]]
+        distances = np.full(len(points_world), np.inf)
+        distances[is_near] = np.abs((offsets * normals).sum(axis=1))
         return distances
 
     def report(self) -> dict[str, float | bool]:
