@@ -183,23 +183,28 @@ class LmTracker(Tracker):
             if self.best.is_ended:
                 self.best.refine()
             yield cost
-        max_p_lost, others = _DOUBTFUL, None
-        while self.settings.n_restarts and others != [] and self.report()["p_lost"] >= max_p_lost:
+        max_p_lost = _DOUBTFUL
+        others = None if self.settings.n_restarts else []  # None: not looked for yet
+        while others != [] and self.report()["p_lost"] >= max_p_lost:
             yield cost
             cost = self.best.cost(NEAR_SCALES)
-            others = self._other_starts(frame, T_expected) if others is None else others
-            max_p_lost = _LOST if self._relocalise(others.pop(0)) else _DOUBTFUL
+            if others is None:
+                others = self._other_starts(frame, T_expected)
+            is_confirmed = self._descend_from(others.pop(0))
+            max_p_lost = _LOST if is_confirmed else _DOUBTFUL
         self.is_converged = True
         yield cost
 
-    def _relocalise(self, T_start: Pose) -> bool:
-        """Whether one more descent ends at the pose; what it finds takes over if clearly better."""
-        descent = self.descent_from(T_start)
-        descent.run()
-        is_confirmed = _apart(descent.T_world_camera, self.best.T_world_camera) < _SAME
-        if descent.cost(NEAR_SCALES) < _CLEARLY * self.best.cost(NEAR_SCALES):
-            self.best = descent
-        return bool(is_confirmed)
+    def _descend_from(self, T_start: Pose) -> bool:
+        """Run a whole descent, which becomes the best one if its pose is clearly better.
+
+        Returns whether it ended at the pose of the best one so far, and so confirms that.
+        """
+        other, best_so_far = self.descent_from(T_start), self.best
+        other.run()
+        if other.cost(NEAR_SCALES) < _CLEARLY * best_so_far.cost(NEAR_SCALES):
+            self.best = other
+        return bool(_apart(other.T_world_camera, best_so_far.T_world_camera) < _SAME)
 
     def _other_starts(self, frame: Frame, T_expected: Pose) -> list[Pose]:
         """Where else the camera may be, the likeliest first; all that can be thought of where no
