@@ -101,18 +101,21 @@ def _moved(view: Tensor, down: int, across: int) -> Tensor:
 def _unlikeness(
     here: Float[Tensor, "2 _ _"], there: Float[Tensor, "n 2 _ _"]
 ) -> Float[Tensor, "n"]:
-    """One less the correlation of luma, and how far depths are apart; 0 for the same."""
+    """One less the correlation of luma, and how far depths are apart, 0 to 1; 0 for the same."""
     is_seen = ((here[0] > 0) & (there[:, 0] > 0)).float()
-    count = is_seen.sum(dim=(1, 2), keepdim=True).clamp(min=1)
-    first, second = (
-        (luma - (luma * is_seen).sum(dim=(1, 2), keepdim=True) / count) * is_seen
-        for luma in (here[0].expand_as(is_seen), there[:, 0])
-    )
+    first, second = _centred(here[0], is_seen), _centred(there[:, 0], is_seen)
     norms = first.norm(dim=(1, 2)) * second.norm(dim=(1, 2))
     correlation = (first * second).sum(dim=(1, 2)) / norms.clamp(min=1e-3)
     are_measured = ((here[1] > 0) & (there[:, 1] > 0)).float()
-    ratio = (here[1].clamp(min=1) / there[:, 1].clamp(min=1)).log().abs()
-    apart = (ratio / _MAX_LOG_RATIO).clamp(max=1) * are_measured
-    count = are_measured.sum(dim=(1, 2))
-    depth = torch.where(count > _MIN_OVERLAP, apart.sum(dim=(1, 2)) / count, 1.0)
-    return 1 - correlation + _DEPTH_WEIGHT * depth
+    n_measured = are_measured.sum(dim=(1, 2))
+    log_ratio = (here[1].clamp(min=1) / there[:, 1].clamp(min=1)).log().abs()
+    apart = (log_ratio / _MAX_LOG_RATIO).clamp(max=1) * are_measured
+    mean_apart = torch.where(n_measured > _MIN_OVERLAP, apart.sum(dim=(1, 2)) / n_measured, 1.0)
+    return 1 - correlation + _DEPTH_WEIGHT * mean_apart
+
+
+def _centred(luma: Tensor, is_seen: Float[Tensor, "n _ _"]) -> Float[Tensor, "n _ _"]:
+    """Luma less its mean over the cells that both views see (1, else 0); 0 in the others."""
+    n_seen = is_seen.sum(dim=(1, 2), keepdim=True).clamp(min=1)
+    mean = (luma * is_seen).sum(dim=(1, 2), keepdim=True) / n_seen
+    return (luma - mean) * is_seen
