@@ -94,17 +94,17 @@ def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
     the correlation of intensities of points that both see, NaN without contrast.
 
     The frames up to MAX_SHIFT around those of the pairs must be kept too. Misfits of colours are
-    looked for where depth is right.
+    looked for where depth is right. Those that even at their best leave colours less alike than
+    MIN_CORRELATION are left out: such colours are of another place.
     """
     found = [*_estimates(_DEPTH_PARAMETERS, own, pairs.depth_costs)]
     color_costs = partial(pairs.color_costs, pairs.compare(own))
-    unlike = color_costs(own)
-    correlation = float(1 - np.nanmedian(unlike)) if np.isfinite(unlike).any() else math.nan
+    unlikeness = color_costs(own)
+    correlation = float(1 - np.nanmedian(unlikeness)) if np.isfinite(unlikeness).any() else math.nan
     if not any(misfit.is_significant for misfit in found):
-        # What leaves them unlike is none: they are of another place.
-        least = (1 - MIN_CORRELATION) / max(1e-9, 1 - correlation)
-        colors = _estimates(_COLOR_PARAMETERS, own, color_costs)
-        found += [misfit for misfit in colors if misfit.gain < least]
+        max_gain = (1 - MIN_CORRELATION) / max(1e-9, 1 - correlation)
+        of_colors = _estimates(_COLOR_PARAMETERS, own, color_costs)
+        found += [misfit for misfit in of_colors if misfit.gain < max_gain]
     return found, correlation
 
 
