@@ -152,19 +152,20 @@ class LearnedField(Field):
 
         Without a generator nothing is random. Source: iMAP, Sec. 3.2 (32 and 12 samples).
         """
-        coarse, _, fine = self._hierarchical(rays, n_stratified, n_importance, generator)
+        coarse, _, _, fine = self._two_passes(rays, n_stratified, n_importance, generator)
         return torch.cat([coarse, fine], dim=-1).sort(dim=-1).values
 
     def render_hierarchically(
         self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None = None
     ) -> Rendering:
         """What `render` gives at `hierarchical_depths`, with every sample asked for once."""
-        coarse, answers, fine = self._hierarchical(rays, n_stratified, n_importance, generator)
+        coarse, colors, values, fine = self._two_passes(rays, n_stratified, n_importance, generator)
         depths, order = torch.cat([coarse, fine], dim=-1).sort(dim=-1)
-        both = zip(answers, self.query_along(rays, fine), strict=True)
-        colors, values = (torch.cat(parts, dim=1) for parts in both)
+        fine_colors, fine_values = self.query_along(rays, fine)
+        colors = torch.cat([colors, fine_colors], dim=1)
         colors = colors.gather(1, order[..., None].expand_as(colors))
-        return self.composite(colors, values.gather(1, order), rays, depths)
+        values = torch.cat([values, fine_values], dim=1).gather(1, order)
+        return self.composite(colors, values, rays, depths)
 
     def render_view(self, camera: Intrinsics, T_world_camera: Pose) -> View:
         """Colour in [0, 1] and z-depth (m) from a camera pose. Nothing in it is random."""
@@ -187,18 +188,20 @@ class LearnedField(Field):
         color = torch.cat([part.color.clamp(0, 1) for part in parts])
         return color, torch.cat([part.depth for part in parts])
 
-    def _hierarchical(self, rays: Rays, n_stratified: int, n_importance: int, generator) -> tuple:
-        """Z-depths (m) of the first pass, the field's answers there, and z-depths of the second."""
+    def _two_passes(
+        self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None
+    ) -> tuple[RaySamples, RayColors, RaySamples, RaySamples]:
+        """Z-depths (m) of the first pass, colours and values there, and z-depths of the second."""
         with torch.no_grad():  # where samples lie is given: a pose does not move them along
             far = rays_end(rays, self.bounds)
             coarse = rendering.stratified_depths(NEAR, far, n_stratified, generator)
-        answers = self.query_along(rays, coarse)
+        colors, values = self.query_along(rays, coarse)
         with torch.no_grad():
-            weights = self.weights(answers[1], rays, coarse)
+            weights = self.weights(values, rays, coarse)
             if weights.shape != coarse.shape:  # of sections: both ends of one get a share
                 weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
             fine = rendering.importance_depths(coarse, weights, n_importance, generator)
-        return coarse, answers, fine
+        return coarse, colors, values, fine
 
 
 def rays_end(rays: Rays, bounds: SceneBounds) -> Values:
