@@ -186,23 +186,27 @@ class Moments:
         )
 
     def _by_number(self, poses: Poses, stamps: Times | None) -> tuple[Poses, str] | None:
-        """Poses whose stamps (s), or places in a longer list, are frames' numbers over the rate.
+        """A pose a frame by the frames' numbers, and a note; None where these tell nothing.
 
-        That must be so in just one way to count. Else poses follow one another, if there are as
-        many as frames.
+        A pose has the number of its stamp (s) times the rate or, without stamps, of its place in a
+        list longer than the frames. As many as can must then find each other, in just one way to
+        count. Else poses follow one another, if there are as many as frames, unless stamps show
+        that some were left out.
         """
         n_frames, n_poses = len(self.images), len(poses)
-        clock = np.arange(n_poses) if stamps is None else stamps * self.rate_hz
+        pose_numbers = np.arange(n_poses) if stamps is None else stamps * self.rate_hz
         tolerance = min(_ON_TIME * self.rate_hz, 0.25)
-        ways = {tuple(nearest(numbers, clock, tolerance)) for numbers in self._counted()}
-        n_found = {way: n_frames - way.count(-1) for way in ways}  # frames that have a pose
-        whole = [way for way, n in n_found.items() if n == min(n_frames, n_poses)]
-        if len(whole) == 1 and (n_poses > n_frames or stamps is not None):
+        # For each way to count the place of every frame's pose, -1 without one.
+        ways = {tuple(nearest(numbers, pose_numbers, tolerance)) for numbers in self._counted()}
+        n_paired = {way: n_frames - way.count(-1) for way in ways}
+        complete = [way for way, n in n_paired.items() if n == min(n_frames, n_poses)]
+        if len(complete) == 1 and (n_poses > n_frames or stamps is not None):
             note = f"of {n_poses} poses those of the images' numbers" if n_poses > n_frames else ""
-            return _at(poses, np.array(whole[0])), note
-        # Stamps of most frames leave out others than the frames do; even ones only count the lines.
-        is_odd = stamps is not None and max(n_found.values(), default=0) > _MOST * n_frames
-        if n_poses != n_frames or (is_odd and not _are_even(stamps)):
+            return _at(poses, np.array(complete[0])), note
+        # Even stamps only count the lines; others, if they tell most frames' poses, leave some out.
+        is_most = max(n_paired.values(), default=0) > _MOST * n_frames
+        has_gaps = is_most and stamps is not None and not _are_even(stamps)
+        if n_poses != n_frames or has_gaps:
             return None
         is_plain = np.array_equal(self.numbers, np.arange(n_frames))
         return poses, "" if is_plain else "images have the poses one after another"

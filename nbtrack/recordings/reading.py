@@ -126,7 +126,7 @@ def decode(
     """
     files = [(recording.color_files[i], recording.depth_files[i]) for i in frame_ids]
     color, depth = _read_image(files[0][0], is_color=True), _read_depth(files[0][1], recording)
-    resize = recording.format.resize_color or _is_larger(color, depth, recording)
+    resize = _resizes_color(color, depth, recording)
     first = files[0][1 if resize else 0]  # the size is its
     height, width = (depth if resize else color).shape[:2]
     camera = recording.calibration.for_size(width, height, first)
@@ -179,17 +179,20 @@ def _read_depth(path: Path, recording: Recording) -> Shaped[np.ndarray, "height 
     return _read_image(path, is_color=False)
 
 
-def _is_larger(color: np.ndarray, depth: np.ndarray, recording: Recording) -> bool:
-    """Whether colour is larger than depth, in the same proportions, as phones with LiDAR give it.
+def _resizes_color(color: np.ndarray, depth: np.ndarray, recording: Recording) -> bool:
+    """Whether colour is given the size of depth, since its format says so, or it is larger in the
+    same proportions, as phones with LiDAR give it.
 
-    It is then made as small, and a note says so. Raises DataError where the calibration does not
-    say which of both it is for.
+    The latter is noted in the recording; DataError where its calibration does not say which of both
+    it is for.
     """
-    of_color, of_depth = color.shape[1::-1], depth.shape[1::-1]
-    factor = of_color[0] / of_depth[0]
-    if factor <= 1 or abs(factor * of_depth[1] - of_color[1]) > 1:
+    if recording.format.resize_color:
+        return True
+    (height, width), (depth_height, depth_width) = color.shape[:2], depth.shape[:2]
+    factor = width / depth_width
+    if factor <= 1 or abs(factor * depth_height - height) > 1:
         return False
-    sizes = " and ".join("x".join(map(str, size)) for size in (of_color, of_depth))
+    sizes = f"{width}x{height} and {depth_width}x{depth_height}"
     camera = recording.calibration
     if not camera.size:
         raise DataError(

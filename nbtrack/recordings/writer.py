@@ -64,7 +64,7 @@ def write_sequence(
 
 def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
     """The camera and the poses, by file."""
-    # Turning OpenCV's axes into the layout's is what turns those into OpenCV's.
+    # The layout's y and z point the other way: the same turn leads to OpenCV's axes and back.
     T_file = FORMATS["neural_rgbd"].declared.poses_to_opencv(T_world_camera)
     poses = _text(T_file.reshape(-1, 4))
     texts = {"poses.txt": poses, "trainval_poses.txt": poses}
