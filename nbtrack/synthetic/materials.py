@@ -114,10 +114,12 @@ def framed(
     points: Points, center: Vector3, size: Pair, axis: int, colors: tuple[Color, ...], seed: int
 ) -> Points:
     """A picture across `axis`: a frame of the first color, 5 cm wide, around soft shapes in two."""
+    frame, first, second = colors
     offset = np.abs(points - np.asarray(center))
-    inset = np.minimum(size[0] / 2 - offset[:, 2 - axis], size[1] / 2 - offset[:, 1])
-    shapes = _mix(*colors[1:], _squared(np.sin(2.5 * _smooth_noise(points, 0.25, seed))))
-    return np.where((inset < 0.05)[:, None], np.asarray(colors[0]), shapes)
+    sideways = 2 - axis  # z of a picture across x, x of one across z
+    inset = np.minimum(size[0] / 2 - offset[:, sideways], size[1] / 2 - offset[:, 1])
+    shapes = _mix(first, second, _squared(np.sin(2.5 * _smooth_noise(points, 0.25, seed))))
+    return np.where((inset < 0.05)[:, None], np.asarray(frame), shapes)
 
 
 def lining(

@@ -44,15 +44,14 @@ def render_frame(
         return room.cast(T_world_camera[:3, 3], directions_camera @ T_world_camera[:3, :3].T)
 
     depth, colors, index = cast(columns, rows)
-    image = colors.reshape(height, width, 3)
     surfaces = index.reshape(height, width)
-    rough = np.flatnonzero(_rough(image, surfaces))
+    rough = np.flatnonzero(_rough(colors.reshape(height, width, 3), surfaces))
     # One call for all samples: culling and shading cost per call, not only per ray.
     dx, dy = np.array(_SUBPIXELS).T[:, :, None]
     _, samples, _ = cast((columns[rough] + dx).ravel(), (rows[rough] + dy).ravel())
     colors[rough] = samples.reshape(4, -1, 3).mean(axis=0)
-    pixels = np.round(255.0 * image).astype(np.uint8)
-    return pixels, depth.reshape(height, width), surfaces
+    pixels = np.round(255.0 * colors).astype(np.uint8)
+    return pixels.reshape(height, width, 3), depth.reshape(height, width), surfaces
 
 
 def _rough(image: Float[np.ndarray, "h w 3"], surfaces: Surfaces) -> Bool[np.ndarray, "h w"]:
