@@ -122,12 +122,9 @@ class LmOptimizer:
         blocks = np.stack([covariance[:3, :3], covariance[3:, 3:]])
         rotation, position = np.linalg.eigvalsh(blocks)[:, -1] ** 0.5
         moved_std_m = std_when_moved(
-            self._costs_at,
-            self.T_world_camera,
-            covariance,
-            n_directions=1,
-            n_independent=_INDEPENDENT,
-        )
+            self._costs_at, self.T_world_camera, covariance,
+            n_directions=1, n_independent=_INDEPENDENT,
+        )  # fmt: skip
         return {
             "inlier_ratio": float(is_inlier.mean()),
             "known_ratio": known_ratio,

@@ -39,14 +39,10 @@ def features(said: Mapping[str, float]) -> Float[np.ndarray, "4"]:
     """
     fitting = _within(said["fitting_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
     known = _within(said["known_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
-    return np.array(
-        [
-            math.log(fitting / (1 - fitting)),
-            math.log(known / (1 - known)),
-            math.log(_within(said["intensity_ratio"], 0.5, 10)),
-            math.log(_within(said["innovation"], 0.02, 1)),
-        ]
-    )
+    intensity = _within(said["intensity_ratio"], 0.5, 10)
+    innovation = _within(said["innovation"], 0.02, 1)
+    numbers = fitting / (1 - fitting), known / (1 - known), intensity, innovation
+    return np.array([math.log(number) for number in numbers])
 
 
 def _within(value: float, low: float, high: float) -> float:

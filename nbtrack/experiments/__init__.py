@@ -37,11 +37,9 @@ def import_own(source: str) -> None:
     """
     file = resolved(source)
     name = source
+    if file.suffix == ".py" and not file.is_file():
+        raise MissingError(f"no file {source} to import: give a Python file, or a module's name")
     if file.suffix == ".py":
-        if not file.is_file():
-            raise MissingError(
-                f"no file {source} to import: give a Python file, or a module's name"
-            )
         sys.path.insert(0, str(file.parent))
         name = file.stem
     try:

@@ -90,10 +90,8 @@ def read_map(path: Path | str) -> Map:
     file = path / MAP_FILE if path.is_dir() else path
     history = path / HISTORY_FILE
     if not file.is_file():
-        advice = (
-            "give a folder or file that it wrote, or run the `map` command of that folder again"
-        )
-        raise MissingError(f"{path} holds no finished map of this nbtrack: {advice}")
+        hint = "give a folder or file that it wrote, or run the `map` command of that folder again"
+        raise MissingError(f"{path} holds no finished map of this nbtrack: {hint}")
     with naming_damaged(file, "map file", _AGAIN):
         stored = _read_file(file)
     if not history.is_file():
@@ -127,7 +125,7 @@ def _read_file(file: Path) -> Map:
 
 
 def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
-    """Raises ValueError or KeyError for what a digest of its own makes no better.
+    """Raises ValueError or KeyError for content that is not sound, even if its digest fits.
 
     Names may hold what moves a terminal's cursor, and one NaN among weights spreads to every pose.
     """

@@ -166,14 +166,13 @@ class _Fit:
     def _descend(self) -> torch.Tensor:
         draw = partial(self.sampler.draw, generator=self.generator, frames=self.frames)
         terms = self.field.mapping_losses(draw, self.settings, self.generator)
+        found = f"mapping_losses of {self.field.name} gave"
         if not isinstance(terms, dict):
-            raise ConfigError(
-                f"mapping_losses of {self.field.name} gave no dict: give terms by name"
-            )
+            raise ConfigError(f"{found} no dict: give terms by name")
         if [*terms] != (self.terms or [*terms]):
             raise ConfigError(
-                f"mapping_losses of {self.field.name} gave {', '.join(terms)} after "
-                f"{', '.join(self.terms)}: give the same terms every time, 0 where one is not used"
+                f"{found} {', '.join(terms)} after {', '.join(self.terms)}: give the same terms "
+                "every time, 0 where one is not used"
             )
         self.terms = [*terms]
         losses = torch.stack([*terms.values()])

@@ -87,10 +87,10 @@ class AdamTracker(Tracker):
     def _allocate(self, frame: Frame) -> None:
         """Make room for all that a step reads and changes, for frames of one size."""
         self.frame = replace(frame, color=frame.color.clone(), depth_mm=frame.depth_mm.clone())
-        like = {"device": self.device}
-        self.pixels = torch.empty(2, self.settings.n_pixels, dtype=torch.int64, **like)
-        self.position = torch.zeros(3, **like).requires_grad_()
-        self.q_wxyz = torch.zeros(4, **like).requires_grad_()
+        n_pixels = self.settings.n_pixels
+        self.pixels = torch.empty(2, n_pixels, dtype=torch.int64, device=self.device)
+        self.position = torch.zeros(3, device=self.device, requires_grad=True)
+        self.q_wxyz = torch.zeros(4, device=self.device, requires_grad=True)
         position_rate = self.settings.position_rate_m(self.field.bounds.metres_per_unit)
         position = {"params": [self.position], "lr": position_rate}
         orientation = {"params": [self.q_wxyz], "lr": self.settings.orientation_rate}
