@@ -175,10 +175,8 @@ class LmTracker(Tracker):
         """
         for number in range(1, _MAX_FOLLOWING + 1):
             cost = self.best.step()
-            if number == _MAX_FOLLOWING:
-                self.best.run()
-                break
-            if self.best.is_finished:
+            if number == _MAX_FOLLOWING or self.best.is_finished:
+                self.best.run()  # its rest, if any
                 break
             if self.best.is_ended:
                 self.best.refine()
