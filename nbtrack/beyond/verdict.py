@@ -37,16 +37,12 @@ def features(said: Mapping[str, float]) -> Float[np.ndarray, "4"]:
     `intensity_ratio` (median difference over the usual one) and `innovation` (how far from where
     the frames before led to, rad or m).
     """
-    fitting = _within(said["fitting_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
-    known = _within(said["known_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
-    intensity = _within(said["intensity_ratio"], 0.5, 10)
-    innovation = _within(said["innovation"], 0.02, 1)
+    fitting = np.clip(said["fitting_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
+    known = np.clip(said["known_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
+    intensity = np.clip(said["intensity_ratio"], 0.5, 10)
+    innovation = np.clip(said["innovation"], 0.02, 1)
     numbers = fitting / (1 - fitting), known / (1 - known), intensity, innovation
     return np.array([math.log(number) for number in numbers])
-
-
-def _within(value: float, low: float, high: float) -> float:
-    return min(max(value, low), high)
 
 
 def p_lost(said: Mapping[str, float]) -> float:

@@ -93,8 +93,8 @@ def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
     # From orientations too, which tell it where the camera moves along a line.
     turns = Rotation.from_matrix(T_estimated[:, :3, :3] @ T_true[:, :3, :3].mT)
     T_map_world = np.eye(4)
-    is_usual = (turns.mean().inv() * turns).magnitude()
-    is_usual = is_usual <= np.median(is_usual)  # lost frames say nothing of it
+    off_mean = (turns.mean().inv() * turns).magnitude()
+    is_usual = off_mean <= np.median(off_mean)  # lost frames say nothing of it
     T_map_world[:3, :3] = turns[is_usual].mean().as_matrix()
     moved = T_true[:, :3, 3] @ T_map_world[:3, :3].T
     T_map_world[:3, 3] = np.median(T_estimated[:, :3, 3] - moved, axis=0)
