@@ -32,11 +32,11 @@ def method_of(name: str | None, field: str | None, tracker: str | None) -> Metho
         return find_methods([name or DEFAULT_METHOD])[0]
     if tracker is None:
         kind = field_class(field)
-        fits = [name for name in ("lm", "icp", "vr") if TRACKERS[name].works_in(kind)]
-        own = [name for name in TRACKERS if tracker_class(name).works_in(kind)]
-        if not fits + own:
+        known = ("lm", "icp", "vr", *TRACKERS)
+        fits = [name for name in known if tracker_class(name).works_in(kind)]
+        if not fits:
             raise ConfigError(f"no tracker works on field {field!r}: register one of your own")
-        tracker = (fits + own)[0]
+        tracker = fits[0]
     if field is None:
         field = next((row.field for row in METHODS.values() if row.tracker == tracker), "neus")
     return find_methods([Method(f"{field_class(field).label} with {tracker}", field, tracker)])[0]
