@@ -132,7 +132,8 @@ def corrected(
     field = CorrectedField(copy.deepcopy(source).cpu(), voxel)
     points, normals, depth, color = _measured_planes(sequence, frames, field)
     asked = np.concatenate([points + offset * normals for offset in _OFFSETS])
-    numbers, matrix = corrected_vertices(*interpolation(asked, field), field.n_vertices)
+    vertices, weights = interpolation(asked, field)
+    numbers, matrix = corrected_vertices(vertices, weights, field.n_vertices)
     regularisation = regularisation_of(numbers, field.n_vertices)
     values = field.volume[:4].T.double().numpy()[numbers]
     reliability = (depth.mean() / depth) ** 2

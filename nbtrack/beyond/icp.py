@@ -124,8 +124,7 @@ class IcpTracker(Tracker):
     def _align(self, T_start: Pose, distance: float) -> Any:
         """The frame aligned with the map, where partners are so near (m)."""
         options = {**_OPTIONS, "max_correspondence_distance": distance}
-        map_and_frame = self.target, self.source, self.target_tree
-        return self.small_gicp.align(*map_and_frame, T_start, **options)
+        return self.small_gicp.align(self.target, self.source, self.target_tree, T_start, **options)
 
     def _distances(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
         """How far (m) the points lie from their partners' planes; infinite where none is near."""
@@ -153,13 +152,12 @@ class IcpTracker(Tracker):
         scale = max(MAD_FACTOR * usual, _MIN_SCALE)
         turn = np.kron(np.eye(2), T_found[:3, :3])  # small_gicp's twists are in the camera's frame
         H_world = turn @ self.found.H @ turn.T
+        covariance = np.linalg.inv(H_world + PRIOR_WEIGHT * np.eye(6))
+        # Two directions, those of a wall, since nothing but planes counts.
         position_std_m = std_when_moved(
-            lambda T: 1 - 1 / (1 + (self._distances(T) / scale) ** 2),
-            T_found,
-            np.linalg.inv(H_world + PRIOR_WEIGHT * np.eye(6)),
-            n_directions=2,  # of a wall, where nothing but its planes counts
-            n_independent=_INDEPENDENT,
-        )
+            lambda T: 1 - 1 / (1 + (self._distances(T) / scale) ** 2), T_found, covariance,
+            n_directions=2, n_independent=_INDEPENDENT,
+        )  # fmt: skip
         inlier_ratio = self.found.num_inliers / self.source.size()
         is_held = p_within(CORRELATED * position_std_m) > _LOST
         lost = inlier_ratio < _MIN_INLIERS or not is_held

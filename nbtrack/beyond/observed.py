@@ -50,9 +50,9 @@ def draw_points(
     measured, fewer points come back.
     """
     starts = torch.randint(_MODULUS, (2,), generator=generator).numpy()
-    images = frame.depth_mm.numpy(), frame.color.numpy()
-    drawn = _drawn_points(*images, _pinhole(frame), n_points, starts, edge_jump)
-    return Observed(*drawn, normals=np.empty((0, 3)))
+    depth_mm, color = frame.depth_mm.numpy(), frame.color.numpy()
+    points, intensity = _drawn_points(depth_mm, color, _pinhole(frame), n_points, starts, edge_jump)
+    return Observed(points, intensity, normals=np.empty((0, 3)))
 
 
 def with_normals(frame: Frame, observed: Observed, n_points: int) -> Observed:

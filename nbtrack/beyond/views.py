@@ -82,7 +82,7 @@ def retrieve(view: View, viewpoints: Viewpoints, n: int) -> Poses:
     """
     turns = [(down, across) for across in _TURNS_ACROSS for down in _TURNS_DOWN]
     here, there = view.float(), viewpoints.views.float()
-    unlikeness = [_unlikeness(_moved(here, *t), _moved(there, -t[0], -t[1])) for t in turns]
+    unlikeness = [_unlikeness(_moved(here, y, x), _moved(there, -y, -x)) for y, x in turns]
     minimum, best = torch.stack(unlikeness).min(dim=0)
     order = minimum.argsort()[:n].numpy()
     rotations = _STEP * np.array([[down, -across, 0.0] for down, across in turns])

@@ -66,11 +66,14 @@ def fit_all(pairs: FramePairs, own: Reading) -> tuple[list[Convention], Conventi
         compared = pairs.compare(reading)
         is_valid = compared.is_valid
         n_points = (pairs.values > 0).sum().clamp(1)
-        numbers = (
-            compared.residual[is_valid].abs().median(), compared.measured[is_valid].median(),
-            is_valid.sum() / n_points, compared.agreement.sum() / n_points,
+        convention = Convention(
+            subject, name, reading,
+            median_m=float(compared.residual[is_valid].abs().median()),
+            depth_m=float(compared.measured[is_valid].median()),
+            overlap=float(is_valid.sum() / n_points),
+            agreement=float(compared.agreement.sum() / n_points),
         )  # fmt: skip
-        conventions.append(Convention(subject, name, reading, *map(float, numbers)))
+        conventions.append(convention)
     return conventions, _best_of(conventions)
 
 

@@ -98,9 +98,10 @@ class PixelSampler:
             torch.randint(limit, (n_rays,), generator=generator, device=generator.device)
             for limit in (len(frames), height, width)
         )
-        pixels = frames[chosen], rows, columns
-        rays = self.rays(*pixels)
+        frames = frames[chosen]
+        rays = self.rays(frames, rows, columns)
         if not tangent_planes:
             return rays
-        normals = self.T_world_camera[pixels[0], :3, :3] @ self.normals_camera(*pixels)[..., None]
+        normals_camera = self.normals_camera(frames, rows, columns)
+        normals = self.T_world_camera[frames, :3, :3] @ normals_camera[..., None]
         return replace(rays, normals_world=normals.squeeze(-1))

@@ -195,9 +195,9 @@ class TrackJob(Job):
             followed = sequence.select(slice(len(sequence) - len(tracked.frames), None))
             if start.is_in_other_world:
                 followed = replace(followed, T_world_camera=tracked.T_estimated)
-            seen = finished.field, followed, tracked.T_estimated
-            notes["outside_map_share"] = outside_map_share(*seen)
-            notes["map_misfit"] = map_misfit(*seen)
+            field, T_estimated = finished.field, tracked.T_estimated
+            notes["outside_map_share"] = outside_map_share(field, followed, T_estimated)
+            notes["map_misfit"] = map_misfit(field, followed, T_estimated)
         reach = self._reach(tracked.frames["steps"].mean(), metres_per_unit, T_true)
         return notes | still_metrics(T_true) | reach
 

@@ -67,8 +67,8 @@ class NeuSField(LearnedField):
         """Colour L1, depth L1 and the eikonal term (NeuS, Eq. 15, with RGB-D's depth added)."""
         rays = draw(settings.n_rays)
         depths = guided_depths(rays, self.bounds, settings, generator)
-        lambdas = settings.lambda_color, settings.lambda_depth
-        losses = rendered_losses(self.render(rays, depths), rays, *lambdas)
+        rendered = self.render(rays, depths)
+        losses = rendered_losses(rendered, rays, settings.lambda_color, settings.lambda_depth)
         return losses | {"eikonal": self._eikonal(rays.points(depths), settings, generator)}
 
     def _eikonal(self, points_world: Tensor, settings: NeusMapping, generator: Generator) -> Scalar:

@@ -205,8 +205,7 @@ def camera_poses(placed: Placed) -> Poses:
     Yaw 0 looks along -z and positive turns left; positive pitch looks up.
     """
     pitch, yaw, roll = placed.T[3:, :, None]
-    forward = [-np.sin(yaw) * np.cos(pitch), np.sin(pitch), -np.cos(yaw) * np.cos(pitch)]
-    forward = np.hstack(forward)
+    forward = np.hstack([-np.sin(yaw) * np.cos(pitch), np.sin(pitch), -np.cos(yaw) * np.cos(pitch)])
     right = np.hstack([np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)])
     down = np.cross(forward, right)
     rolled = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right

@@ -178,8 +178,8 @@ class SdfTracker(AdamTracker):
         points_camera = directions_camera * depth[:, None]
         points_world = geometry.transform_points(T_world_camera, points_camera)
         field_color, field_sdf = self.field(points_world)
-        weights = self.settings.lambda_sdf, self.settings.lambda_color
-        return sdf_loss(field_sdf, field_color, color, *weights)
+        settings = self.settings
+        return sdf_loss(field_sdf, field_color, color, settings.lambda_sdf, settings.lambda_color)
 
 
 def sdf_loss(
