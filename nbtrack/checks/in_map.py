@@ -121,19 +121,19 @@ def map_misfit(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> str:
     Frames tell nothing that see up to three walls: there a motion does the same.
     """
     costs = []
-    for index, p in _some_points(sequence) if field.is_distance else ():
+    for index, points_camera in _some_points(sequence) if field.is_distance else ():
         T = T_estimated[index]
-        x = torch.from_numpy(_moved(p, T)).float().to(field.device).requires_grad_()
-        distance = field(x)[1]
-        (gradient,) = torch.autograd.grad(distance.sum(), x)
-        r, q = distance.numpy(force=True), gradient.numpy(force=True) @ T[:3, :3]
-        near = np.abs(r) < _MAX_DISTANCE
-        r, q, p = r[near], q[near], p[near]
+        points_world = torch.from_numpy(_moved(points_camera, T)).float().to(field.device)
+        distance = field(points_world.requires_grad_())[1]
+        (gradient,) = torch.autograd.grad(distance.sum(), points_world)
+        near = np.abs(distance.numpy(force=True)) < _MAX_DISTANCE
+        p, r = points_camera[near], distance.numpy(force=True)[near]
+        q = (gradient.numpy(force=True) @ T[:3, :3])[near]
         motions, _ = np.linalg.qr(np.hstack([np.cross(p, q), q]))
         both = np.column_stack([r, (q * p).sum(axis=1)])
-        r, longer = (both - motions @ (motions.T @ both)).T
-        if len(r) >= _MIN_POINTS and (longer**2).sum() > _MIN_LEFT**2 * (p**2).sum():
-            costs.append(((r - SHARES[:, None] * longer) ** 2).sum(axis=1))
+        residual, longer = (both - motions @ (motions.T @ both)).T  # what no motion explains
+        if len(p) >= _MIN_POINTS and (longer**2).sum() > _MIN_LEFT**2 * (p**2).sum():
+            costs.append(((residual - SHARES[:, None] * longer) ** 2).sum(axis=1))
     return main_misfit([estimate(_LONGER, np.array(costs))]) if len(costs) >= _MIN_FRAMES else ""
 
 

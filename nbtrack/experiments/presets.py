@@ -108,14 +108,16 @@ class Preset:
 
     def _usual(self, tree: dict[str, Any]) -> dict[str, Any]:
         """By dotted keys, what the preset changes in all that it does not name."""
+        named = {tuple(key.split(".")[:2]) for key in self.own}
         values = {}
-        for part, usual in _USUAL.items():
-            named = {key.split(".")[1] for key in self.own if key.startswith(f"{part}.")}
-            start = f"{part}.{usual}."
-            changes = {k.removeprefix(start): v for k, v in self.own.items() if k.startswith(start)}
-            for name in tree[part].keys() - named:
-                own = {k: v for k, v in changes.items() if hasattr(tree[part][name], k)}
-                values |= {f"{part}.{name}.{key}": value for key, value in own.items()}
+        for key, value in self.own.items():
+            part, _, rest = key.partition(".")
+            name, _, setting = rest.partition(".")
+            if name != _USUAL.get(part):
+                continue
+            for other, settings in tree[part].items():
+                if (part, other) not in named and hasattr(settings, setting):
+                    values[f"{part}.{other}.{setting}"] = value
         return values
 
     def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:

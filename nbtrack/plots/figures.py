@@ -79,17 +79,18 @@ def _image_grid(title: str, rows: list[list[Panel]], far: float | None = None) -
     grid = style.new_axes(title, inches, len(rows), len(rows[0]))
     shown: dict[str, list[AxesImage]] = {}
     for axes, (name, image, unit) in zip(grid.flat, chain(*rows), strict=True):
-        colors = "viridis" if unit == DEPTH else "magma"
-        shown.setdefault(unit, []).append(show_image(axes, image, name, colors))
-    del shown[""]
+        drawn = show_image(axes, image, name, "viridis" if unit == DEPTH else "magma")
+        if unit:  # colours have none
+            shown.setdefault(unit, []).append(drawn)
+    figure = grid[0, 0].figure
     for unit, images in shown.items():
         limit = far or _most(np.ma.stack([image.get_array() for image in images]))
         for image in images:
             image.set_clim(0, limit)
         bar = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max", "label": unit}
         bar["panchor"] = False  # else panels with a bar are lower than those without
-        image.figure.colorbar(image, ax=[image.axes for image in images], **bar)
-    return grid[0, 0].figure
+        figure.colorbar(images[0], ax=[image.axes for image in images], **bar)
+    return figure
 
 
 def _most(images: np.ndarray) -> float:

@@ -17,7 +17,7 @@ from nbtrack.fields import Field, LearnedField
 from nbtrack.fields.base import rendered_losses
 from nbtrack.plots.meshes import query_field
 from nbtrack.plots.style import DASHED, method_colors, new_axes, styled
-from nbtrack.tracking.paper import sdf_loss
+from nbtrack.tracking.paper import SdfSettings, VrSettings, sdf_loss
 from nbtrack.tracking.tracker import Tracker
 
 _OFFSETS_CM = np.arange(-20, 21, 2)
@@ -37,13 +37,14 @@ def pose_losses(
 ) -> pd.DataFrame:
     """Losses of the same pixels by the camera's offset along its x (cm), turned about its y.
 
-    SDF's is Eq. 2 in a map of a signed distance, VR's is iMAP's in one of a density, with nothing
-    random. The third column is the mean density at the observed points.
+    SDF's is Eq. 2 in a map of a signed distance, VR's is iMAP's in one of a density, with default
+    settings and nothing random. The third column is the mean density at the observed points.
     """
     measured = frame.measured_pixels()
     rows, columns = measured[:, :: 1 + measured.shape[1] // _N_PIXELS]
     directions_camera = pixel_directions(frame.camera, columns, rows)
     color, depth = frame.at(rows, columns)
+    vr, eq_2 = VrSettings(), SdfSettings()
     losses = []
     for x_cm in _OFFSETS_CM:
         T_world_camera = move_sideways(frame, x_cm, y_deg)
@@ -51,9 +52,9 @@ def pose_losses(
         field_color, sdf = distance(points)
         directions = directions_camera @ T_world_camera[:3, :3].T
         rays = Rays(T_world_camera[:3, 3].expand_as(directions), directions, color, depth)
-        rendered = density.render_hierarchically(rays, 32, 12)
-        terms = rendered_losses(rendered, rays, 5.0, 1.0, over_std=True)
-        of_sdf = sdf_loss(sdf, field_color, color, 1.0, 0.3)
+        rendered = density.render_hierarchically(rays, vr.n_stratified, vr.n_importance)
+        terms = rendered_losses(rendered, rays, vr.lambda_color, vr.lambda_depth, over_std=True)
+        of_sdf = sdf_loss(sdf, field_color, color, eq_2.lambda_sdf, eq_2.lambda_color)
         of_pose = of_sdf, sum(terms.values()), density(points)[1].mean()
         losses.append([value.item() for value in of_pose])
     names = ["SDF's loss (no unit)", "VR's loss (no unit)", "mean density (1/m)"]

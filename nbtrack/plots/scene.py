@@ -158,16 +158,17 @@ def draw_slice(
     """
     values = query_field(field, points)[1]
     level = field.surface_level
-    own, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
     if field.is_distance:
         limit = np.clip(np.quantile(np.abs(values), 0.98), 0.2, 1.5)
-        own, colors = Normalize(-limit, limit), "RdBu"
+        own_norm, colors = Normalize(-limit, limit), "RdBu"
+    else:
+        own_norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
     grid = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
     page = np.moveaxis(places, -1, 0)
-    image = axes.pcolormesh(*page, values, cmap=colors, norm=norm or own, **grid)
+    image = axes.pcolormesh(*page, values, cmap=colors, norm=norm or own_norm, **grid)
     if norm is None:
-        bar = {"ax": axes, "label": field.value_label, "extend": "both"} | bar
-        axes.figure.colorbar(image, **bar)
+        usual = {"ax": axes, "label": field.value_label, "extend": "both"}
+        axes.figure.colorbar(image, **(usual | bar))
     if field.is_distance:
         draw_levels(axes, places, values, _LINES_M, colors="0.35", linewidths=0.4, linestyles="-")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
