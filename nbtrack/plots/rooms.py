@@ -38,13 +38,16 @@ def plot_slice(
     around the path and what the frames have seen, in the room if that is known.
     """
     fields = [fields] if isinstance(fields, Field) else fields
-    if room is not None and len(fields) == 1 and fields[0].is_distance:
-        fields = [fields[0], _ExactDistance(room, fields[0])]
     norm, where = None, f"height {height:.2f} m; pale: never seen"
+    names = [field.label for field in fields]
     if len(fields) > 1:  # once for all, since panels side by side are narrow
         title = f"{title}, {where}"
+    else:
+        names = [f"{names[0]} at {where}", _ExactDistance.label]
+    if room is not None and len(fields) == 1 and fields[0].is_distance:
+        fields = [fields[0], _ExactDistance(room, fields[0])]
     panels = new_axes(title, 5.4 - 0.9 * (len(fields) - 1), 1, len(fields), sharey=True)[0]
-    for axes, field in zip(panels, fields, strict=True):
+    for axes, field, name in zip(panels, fields, names, strict=False):
         up, page = scene.draw_from_above(axes, {"camera path": sequence.T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / _POINTS_ALONG
@@ -59,7 +62,7 @@ def plot_slice(
             shown &= true > 0
             scene.draw_levels(axes, places, true, [0.0], zorder=3, **_TRUE_LINE)
             axes.plot([], [], "--", color=_TRUE_LINE["colors"], label="true surface")
-        axes.set_title(field.label if len(fields) > 1 else f"{field.label} at {where}")
+        axes.set_title(name)
         _end_around(axes, places[shown], sequence.T_world_camera[:, :3, 3] @ page.T)
     axes.figure.legend_below()
     return axes.figure
