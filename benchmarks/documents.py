@@ -47,8 +47,7 @@ def shown(rows: pd.DataFrame, columns: dict[str, tuple[str, str]]) -> pd.DataFra
 
 def tracking(runs: pd.DataFrame) -> pd.DataFrame:
     """ATE (cm) of every method in each place, and of a camera that stands still."""
-    still = runs.assign(method="standing still", ate_m=runs["still_ate_m"])
-    runs = pd.concat([runs, still])
+    runs = pd.concat([runs, runs.assign(method="standing still", ate_m=runs["still_ate_m"])])
     path = runs["path"].replace({"mapped": "", "second": ", 2nd"})
     path = path.replace("odd, mapped even", ", even mapped")
     runs["place"] = runs["scene"] + path + ", `" + runs["frames"] + "`"
@@ -65,6 +64,14 @@ def recordings(runs: pd.DataFrame) -> pd.DataFrame:
         table[name] = groups[name].agg(lambda counts: " / ".join(counts.astype(str)))
     places = [f"`{frames}`: {method}" for frames, method in table.index]
     return table.rename(columns={"median_error_m": "median, cm", **_COUNTS}).set_axis(places)
+
+
+def reference(rows: pd.DataFrame) -> pd.DataFrame:
+    """RMS distances (cm) of paths from the reference, the truth, and motions between frames."""
+    place = rows["scene"].replace({"living_room": "two rooms", "office": "two rooms"})
+    cm = 100 * rows.groupby([place, "path"]).mean(numeric_only=True).filter(like="from_")
+    cm = cm.set_axis(cm.index.map(": ".join)).rename(columns=lambda name: name[5:-2])
+    return cm.map("{:.2f}".format, na_action="ignore").fillna("")
 
 
 def searches(rows: pd.DataFrame) -> pd.DataFrame:
@@ -219,6 +226,7 @@ TABLES = {
     "gpu_recorded": (recorded, "benchmarks/gpu/steps.csv"),
     "gpu_kernels": (kernels, "benchmarks/gpu/kernels.csv"),
     "convergence": (convergence, "paper_tables/beyond/convergence.csv"),
+    "reference": (reference, "paper_tables/corrected/reference.csv"),
     "tracking": (tracking, "paper_tables/corrected/tracking.csv"),
     "recordings": (recordings, "paper_tables/corrected/tracking.csv"),
     "times": (times, "paper_tables/corrected/times.csv"),
