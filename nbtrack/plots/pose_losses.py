@@ -76,7 +76,7 @@ def plot_pose_losses(
     *panels, view = new_axes(title.format(y_deg, *turned.idxmin()), 2.9, 1, 3)[0]
     T_world_camera = move_sideways(frame, x_cm, y_deg).double().numpy()
     view.imshow(density.render_view(frame.camera, T_world_camera)[0])
-    view.set_title(f"the view {x_cm:g} cm along x")
+    view.set_title("the view from this pose")
     view.axis("off")
     along = np.array([-5, 0, 5])  # cm, of the tangent
     colors = method_colors(["SDF", "VR"]).values()
