@@ -5,7 +5,7 @@ datasets have it: the middle of 640 pixels is 319.5. Inside the package they lie
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from nbtrack.core.files import naming_damaged
 from nbtrack.data.text_files import read_numbers, read_object
 
 _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
-_LARGEST = 1e6  # pixels: no image is so wide
+_LARGEST = 1e6  # of any number of a camera: no image is so many pixels wide
 _MIN_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
 # Entries of a camera's JSON file, by names of this package, and how many numbers each may have.
@@ -29,7 +29,8 @@ _ADVICE = (
     "write finite numbers: width and height in whole pixels, both or none, depth_scale above 0, "
     f"OpenCV's lens as distortion or by {', '.join(_LENS)}, and undistort images of another lens"
 )
-# Other entries that tell of the camera, and the words that say what holds anyway.
+# Unused entries by whose names a camera may have another lens or unit than is read here, and the
+# values (small letters) with which it has not.
 _TELLING = re.compile(
     r"([kpsb]\d+|tau.*|xi|alpha|skew|gamma)$|.*(radial|tangential|dist|lens|fish|model|unit)", re.I
 )
@@ -56,18 +57,18 @@ class Calibration:
         Raises DataError, which names `image`, if the proportions are others, or the principal
         point lies outside.
         """
-        factor = width / self.size[0] if self.size else 1.0
-        cx, cy = self.principal_point or (width / factor / 2, height / factor / 2)
-        fx, fy, cx, cy = (factor * length for length in (self.fx, self.fy, cx, cy))
-        is_alike = not self.size or abs(factor * self.size[1] - height) <= 1
-        if not (is_alike and 0 <= cx <= width and 0 <= cy <= height):
-            size = "{}x{}".format(*self.size) if self.size else "any size"
+        own_width, own_height = self.size or (width, height)
+        factor = width / own_width
+        own_cx, own_cy = self.principal_point or (width / factor / 2, height / factor / 2)
+        cx, cy = factor * own_cx, factor * own_cy
+        if not (abs(factor * own_height - height) <= 1 and 0 <= cx <= width and 0 <= cy <= height):
+            size = f"{own_width}x{own_height}" if self.size else "any size"
             raise DataError(
                 f"{image} is {width}x{height} but {self.source} is for {size}, with cx, cy then at "
                 f"({cx:.0f}, {cy:.0f}): images may be resized but not cropped; give the camera of "
                 "these images, or the width and height that its numbers hold for"
             )
-        return Intrinsics(width, height, fx, fy, cx, cy)
+        return Intrinsics(width, height, factor * self.fx, factor * self.fy, cx, cy)
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
@@ -75,17 +76,17 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarra
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
 
 
-def calibration(path: Path, K: Float[np.ndarray, "3 3"], **others: Any) -> Calibration:
-    """The camera of OpenCV's matrix, and what else is known of it.
+def calibration(path: Path, K: Float[np.ndarray, "3 3"], size: tuple | None = None) -> Calibration:
+    """The camera of OpenCV's matrix, for images of a size (width, height), or of any.
 
     Raises DataError, which names the file, where the numbers are no camera's.
     """
-    fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
     # Also false for NaN.
-    is_camera = np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6)
-    is_camera &= min(fx, fy) >= _MIN_FOCAL and np.abs(K).max() < _LARGEST
-    if is_camera and min(others.get("size", (1,))) >= 1:
-        return Calibration(path, fx, fy, **{"principal_point": (cx + 0.5, cy + 0.5), **others})
+    has_form = np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6)
+    is_in_range = min(fx, fy) >= _MIN_FOCAL and np.abs(K).max() < _LARGEST
+    if has_form and is_in_range and (size is None or min(size) >= 1):
+        return Calibration(path, fx, fy, principal_point=(cx + 0.5, cy + 0.5), size=size)
     raise DataError(
         f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
         "pixels, without skew, the focal lengths positive, all finite; calibrate anew, or write a "
@@ -107,37 +108,37 @@ def read_calibration(path: Path) -> Calibration:
         return _from_json(path)
     numbers = read_numbers(path, (1, 3, 4, 9, 16), _CAMERA_LINE)
     if numbers.size == 1:
-        focal = numbers.item()
-        return calibration(path, camera_matrix(focal, focal, 0.0, 0.0), principal_point=None)
+        f = numbers.item()
+        return replace(calibration(path, camera_matrix(f, f, 0.0, 0.0)), principal_point=None)
     if numbers.size == 4:
         return calibration(path, camera_matrix(*numbers.flat))
-    columns = {9: 3, 12: 4, 16: 4}.get(numbers.size)
-    if not columns:
+    n_columns = {9: 3, 12: 4, 16: 4}.get(numbers.size)
+    if not n_columns:
         raise DataError(f"{path} holds {numbers.size} numbers: every line holds {_CAMERA_LINE}")
-    return calibration(path, numbers.reshape(-1, columns)[:3, :3])
+    return calibration(path, numbers.reshape(-1, n_columns)[:3, :3])
 
 
 def _from_json(path: Path) -> Calibration:
+    """As `read_calibration`; a missing number of the matrix is NaN, which `calibration` refuses."""
     content = read_object(path)
-    camera = content["camera"] if isinstance(content.get("camera"), dict) else content
-    camera = {_OTHER_NAMES.get(key, key): value for key, value in camera.items()}
-    unused = tuple(sorted(camera.keys() - _COUNTS.keys()))
-    others: dict[str, Any] = {"unused": unused}
+    entries = content["camera"] if isinstance(content.get("camera"), dict) else content
+    entries = {_OTHER_NAMES.get(key, key): value for key, value in entries.items()}
+    unused = tuple(sorted(entries.keys() - _COUNTS.keys()))
     with naming_damaged(path, "description of a camera", _ADVICE):
         for key in unused:
-            _check_unused(key, camera[key])
-        found = {key: _numbers(key, camera[key]) for key in camera.keys() & _COUNTS.keys()}
-        lens = [found.get(key, [0.0])[0] for key in _LENS]
-        others["distortion"] = tuple(found.get("distortion", lens))
-        if "depth_scale" in found:
-            (scale,) = found["depth_scale"]
-            others["depth_scale"] = scale if scale >= 1 else 1 / scale
-        if found.keys() & {"width", "height"}:
-            others["size"] = int(*found["width"]), int(*found["height"])
+            _check_unused(key, entries[key])
+        found = {key: _numbers(key, entries[key]) for key in entries.keys() & _COUNTS.keys()}
+        single = {key: numbers[0] for key, numbers in found.items() if len(numbers) == 1}
+        lens = tuple(found.get("distortion", [single.get(key, 0.0) for key in _LENS]))
+        scale = single.get("depth_scale")
+        if scale and scale < 1:  # metres a value
+            scale = 1 / scale
+        has_size = "width" in single or "height" in single
+        size = (int(single["width"]), int(single["height"])) if has_size else None
+        K = camera_matrix(*[single.get(key, np.nan) for key in ("fx", "fy", "cx", "cy")])
         if "intrinsic_matrix" in found:
-            return calibration(path, np.reshape(found["intrinsic_matrix"], (3, 3)).T, **others)
-        numbers = (found.get(key, [np.nan])[0] for key in ("fx", "fy", "cx", "cy"))
-        return calibration(path, camera_matrix(*numbers), **others)
+            K = np.reshape(found["intrinsic_matrix"], (3, 3)).T
+    return replace(calibration(path, K, size), distortion=lens, depth_scale=scale, unused=unused)
 
 
 def _numbers(key: str, value: Any) -> list[float]:
@@ -154,7 +155,10 @@ def _numbers(key: str, value: Any) -> list[float]:
 
 
 def _check_unused(key: str, value: Any) -> None:
-    """Raises ValueError where an entry that is not used tells of another lens or unit."""
+    """Raises ValueError where an entry that is not used tells of another lens or unit.
+
+    A usual word tells of none, and neither do zeros, false, null and an empty list.
+    """
     is_usual = value.lower() in _USUAL if isinstance(value, str) else not np.any(value)
     if _TELLING.match(key) and not is_usual:
         raise ValueError(f"{key} is {str(value)[:40]!r}, which is not used")

@@ -7,7 +7,6 @@ recording does otherwise than its format, it says in `sequence.toml`: any field 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 CAMERA_TO_WORLD = "camera-to-world"
 WORLD_TO_CAMERA = "world-to-camera"
 SPELLED_AXES = {"opencv": "right down forward", "opengl": "right up backward"}
-# Where an axis may point, seen from behind the camera, in OpenCV's x, y and z.
+# Where an axis may point, seen from behind the camera, in OpenCV's x, y and z. `0 -` gives no -0.0.
 _DIRECTIONS = dict(zip(("right", "down", "forward"), np.eye(3), strict=True))
 _DIRECTIONS |= dict(zip(("left", "up", "backward"), 0 - np.eye(3), strict=True))
 
@@ -53,26 +52,27 @@ class Declaration:
 
     @property
     def _axes(self) -> np.ndarray:
-        """The file's x, y and z axes with OpenCV's, one a row; zeros for unknown words."""
+        """The file's x, y and z axes (rows) in OpenCV's camera frame; zeros for unknown words."""
         words = SPELLED_AXES.get(self.camera_axes, self.camera_axes).split()
         return np.array([_DIRECTIONS.get(word, np.zeros(3)) for word in words])
 
-    def turned_round(self, poses: Poses) -> Poses:
-        """Camera-to-world poses of a file's, and the other way round; NaN stays NaN."""
-        T = poses.copy()
+    def inverted_if_world_to_camera(self, poses: Poses) -> Poses:
+        """Camera-to-world poses of a file's, and a file's of camera-to-world; NaN stays NaN."""
+        inverse = poses.copy()
         if self.poses == WORLD_TO_CAMERA:
             # A transpose, unlike a solver, takes NaN and never fails.
-            T[:, :3, :3] = poses[:, :3, :3].mT
-            T[:, :3, 3:] = -T[:, :3, :3] @ poses[:, :3, 3:]
-        return T
+            inverse[:, :3, :3] = poses[:, :3, :3].mT
+            inverse[:, :3, 3:] = -inverse[:, :3, :3] @ poses[:, :3, 3:]
+        return inverse
 
     def poses_to_opencv(self, file_poses: Poses) -> Poses:
         """Camera-to-world poses with OpenCV's camera axes, of a file's; NaN poses stay NaN."""
         axes = self._axes
-        T = self.turned_round(file_poses)
-        T[:, :3, :3] = T[:, :3, :3] @ axes
-        T[:, 2] *= np.linalg.det(axes)  # left-handed cameras come with a mirrored world
-        return T
+        T_world_camera = self.inverted_if_world_to_camera(file_poses)
+        T_world_camera[:, :3, :3] = T_world_camera[:, :3, :3] @ axes
+        # The determinant of left-handed axes is -1. They come with a left-handed world: z turns.
+        T_world_camera[:, 2] *= np.linalg.det(axes)
+        return T_world_camera
 
 
 @dataclass(frozen=True)
@@ -80,15 +80,15 @@ class Format:
     """One layout of recordings on disk. Paths are patterns within the recording's folder."""
 
     label: str  # for people
-    # Image files, the first whose folder is there; or a .txt with `timestamp file` a line.
+    # Image files, of the first pattern that finds any; or a .txt with `timestamp file` a line.
     color: tuple[str, ...]
     depth: tuple[str, ...]  # the same
     poses: tuple[str, ...]  # a file of all poses, or with `*` one a frame
     cameras: tuple[str, ...]  # calibration files; the first that is there
-    known_cameras: tuple[Calibration, ...] = ()  # without a file; `source` is in the folder's name
+    known_cameras: tuple[Calibration, ...] = ()  # without a file, if a folder's name holds `source`
     declared: Declaration = Declaration()  # what its numbers mean
     counts_from_0: bool = False  # a number is the place of the frame's pose in a list
-    stamps_tell: bool = True  # whose a pose of a list is; else places alone do
+    stamps_tell: bool = True  # times in a list tell whose a pose is; else only its place does
     resize_color: bool = False  # colour has another size than depth and shows the same view
     # Own readers: of a file of poses, their quaternions' order given, with times (s), NaN for none;
     # of a calibration; of a depth map in `depth_scale`, where that is no PNG or JPEG file.
@@ -122,8 +122,7 @@ def files_of(folder: Path, pattern: str) -> list[Path]:
     paths = (folder / pattern).parent.glob(Path(pattern).name)
     # Hidden files are the system's.
     files = [p for p in paths if p.suffix.lower() in suffixes and p.name[0] != "." and p.is_file()]
-    keys = dict(zip(files, frame_keys(files), strict=True))
-    return sorted(files, key=lambda path: (keys[path], path.name))
+    return [path for _, path in sorted(zip(frame_keys(files), files, strict=True))]
 
 
 _VGA = (640, 480)
@@ -180,26 +179,28 @@ FORMATS: dict[str, Format] = {
 }  # fmt: skip
 
 
-def declaration(folder: Path, format: str | None = None, **known: Any) -> Declaration:
+def declaration(folder: Path, format: str | None = None, depth_scale: float = 0.0) -> Declaration:
     """What a recording's numbers mean, with its format: named, declared, or told by the files.
 
-    What is known of them otherwise counts where the folder does not declare it. Where files are
-    missing, the format that the most are left of; reading says what is missing. Raises
-    MissingError, ConfigError or DataError for what it cannot tell.
+    The folder's `sequence.toml` comes first, then the depth scale given here (of a calibration
+    file; 0: none) and the unit of a scene of the dataset, then the format's. If files are missing,
+    it is the format that the most are left of; reading says what is missing. Raises MissingError,
+    ConfigError or DataError for what it cannot tell.
     """
     if not folder.is_dir():
         raise MissingError(f"no folder {folder}: give a recording's, or a synthetic room's name")
     path = folder / DECLARATION_FILE
-    said = read_object(path) if path.is_file() else {}
+    declared = read_object(path) if path.is_file() else {}
     try:
-        own_format = with_values(Declaration(), said).format
+        own_format = with_values(Declaration(), declared).format  # raises for a wrong key or value
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from None
     format = format or own_format or _told_by_files(folder)
     usual = look_up("format", format, FORMATS).declared
-    if format == "neural_rgbd" and (unit := DATASET_UNITS.get(absolute(folder).name)):
-        known["metres_per_unit"] = unit
-    return replace(with_values(replace(usual, **known), said), format=format)
+    usual = replace(usual, depth_scale=depth_scale or usual.depth_scale)
+    if format == "neural_rgbd" and absolute(folder).name in DATASET_UNITS:
+        usual = replace(usual, metres_per_unit=DATASET_UNITS[absolute(folder).name])
+    return replace(with_values(usual, declared), format=format)
 
 
 def _told_by_files(folder: Path) -> str:
@@ -223,9 +224,9 @@ def _told_by_files(folder: Path) -> str:
 
 def holds_recording(folder: Path) -> bool:
     """Whether a folder has both colour and depth of a known format."""
-    layouts = FORMATS.values()
-    return any(_is_there(folder, f.color) and _is_there(folder, f.depth) for f in layouts)
+    return any(_is_there(folder, f.color) and _is_there(folder, f.depth) for f in FORMATS.values())
 
 
 def _is_there(folder: Path, patterns: tuple[str, ...]) -> bool:
+    """Whether a folder has a file of any of the patterns."""
     return any(any(folder.glob(pattern)) for pattern in patterns)

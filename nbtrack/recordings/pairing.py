@@ -31,7 +31,7 @@ _SAME_TIME = 1e-6  # s: the last digit of lists
 _ON_TIME = 1e-3  # s between a stamp and the number, over the rate, of the same frame
 _GAP = 0.0505  # s between poses that are interpolated, 20 Hz: at a hand's 2 m/s² 0.6 mm off
 _UNEVEN = 0.1  # share of the median step by which steps of stamps that only count may differ
-_MOST = 0.75  # share of frames whose numbers stamps tell, where they are not of another clock
+_MOST = 0.75  # share of frames that find a pose by its stamp, if both are of one clock
 
 
 def stamp_in(path: Path) -> float | None:
@@ -47,6 +47,7 @@ def stamp_in(path: Path) -> float | None:
 
 
 def _seconds(stamp: str) -> float:
+    """The time (s) of a stamp: decimals, or an integer whose first ten digits are seconds."""
     return float(stamp) if "." in stamp else int(stamp) / 10 ** (len(stamp) - 10)
 
 
@@ -56,13 +57,14 @@ def _numbers_in(path: Path) -> tuple[int, ...]:
     >>> _numbers_in(Path("cam0_1305031102.5.png"))
     (0, 1305031102500000)
     """
-    # A dot ends the stem: frame-000001.color.png counts as 1. Of more digits no camera is capable.
     stem = _STAMP.sub(lambda match: str(round(1e6 * _seconds(match[0]))), path.stem)
+    # Numbers of 18 digits fit into 64 bits.
     return tuple(int(digits[-18:]) for digits in re.findall(r"[0-9]+", stem))
 
 
 def frame_keys(files: list[Path]) -> list[tuple[int, ...]]:
-    """The numbers that vary in the names of a folder's files, of each; all, where none does.
+    """Of each file the numbers in its name that vary over the files; all numbers, where none does,
+    or where names have different counts of them.
 
     >>> frame_keys([Path("0017_cam0.png"), Path("0018_cam0.png")])
     [(17,), (18,)]
@@ -80,11 +82,11 @@ def frame_keys(files: list[Path]) -> list[tuple[int, ...]]:
 
 def check_paired(colors: list[Path], others: list[Path]) -> None:
     """Raises DataError unless every image has its depth map or pose, with the same frame number."""
-    keys, other_keys = frame_keys(colors), frame_keys(others)
-    if keys != other_keys or len(set(keys)) < len(keys):
-        count = Counter([*keys, *other_keys])
-        both = zip((*colors, *others), (*keys, *other_keys), strict=True)
-        odd = [path.name for path, key in both if count[key] != 2]
+    color_keys, other_keys = frame_keys(colors), frame_keys(others)
+    if color_keys != other_keys or len(set(color_keys)) < len(color_keys):
+        keys = color_keys + other_keys
+        count = Counter(keys)
+        odd = [p.name for p, key in zip(colors + others, keys, strict=True) if count[key] != 2]
         raise DataError(
             f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
             f"{len(others)} {others[0].suffix} files: every image needs one of its number, and a "
@@ -104,18 +106,21 @@ def nearest(times: Times, others: Times, tolerance: float) -> Frames:
 def pair_lists(
     color_list: Path, depth_list: Path, notes: list[str]
 ) -> tuple[list[Path], list[Path], Times]:
-    """Images and depth maps of two lists that are each other's nearest in time, and the times."""
-    (color_times, colors), (depth_times, depths) = map(_read_list, (color_list, depth_list))
-    closest = nearest(color_times, depth_times, _TOLERANCE)
-    back = nearest(depth_times, color_times, _TOLERANCE)
-    kept = np.flatnonzero((closest >= 0) & (back[closest] == np.arange(len(colors))))
+    """Images and depth maps of two lists that are each other's nearest in time, and the images'
+    times (s). A sentence is added to the notes if images are left out; DataError if all are."""
+    color_times, colors = _read_list(color_list)
+    depth_times, depths = _read_list(depth_list)
+    depth_of_color = nearest(color_times, depth_times, _TOLERANCE)
+    color_of_depth = nearest(depth_times, color_times, _TOLERANCE)
+    is_mutual = color_of_depth[depth_of_color] == np.arange(len(colors))
+    kept = np.flatnonzero((depth_of_color >= 0) & is_mutual)
     left_out = f"{len(colors) - len(kept)} of the {len(colors)} images in {color_list.name} are "
     left_out += f"left out: no depth map of {depth_list.name} is within {_TOLERANCE} s"
     if not len(kept):
         raise DataError(f"{color_list.parent}: {left_out}; both lists need the same clock")
     if len(kept) < len(colors):
         notes.append(left_out)
-    return [colors[i] for i in kept], [depths[i] for i in closest[kept]], color_times[kept]
+    return [colors[i] for i in kept], [depths[i] for i in depth_of_color[kept]], color_times[kept]
 
 
 def _read_list(path: Path) -> tuple[Times, list[Path]]:
@@ -130,8 +135,8 @@ def _read_list(path: Path) -> tuple[Times, list[Path]]:
     files = [path.parent / name for _, name in rows]
     for file in files:
         if not os.path.isfile(file):  # unlike pathlib's, it takes names that no file can have
-            file = f"{str(file)[:200]!r}"
-            raise MissingError(f"{path} names {file}, which is not there: add it, or take it out")
+            named = f"{str(file)[:200]!r}"
+            raise MissingError(f"{path} names {named}, which is not there: add it, or take it out")
     return times, files
 
 
@@ -163,21 +168,26 @@ class Moments:
     ) -> tuple[Poses, str]:
         """A pose a frame of those of a list, NaN without one, and a note.
 
-        Stamps (s; NaN: none) of the list count where they are the very times of frames, or are of
-        the clock of their own times; else frames' numbers do. `flip` makes camera-to-world poses
-        of the list's, and the other way round. Raises DataError where nothing tells it.
+        The first of these rules that applies tells whose a pose is:
+        1. Each stamp (s; NaN: none) is the very time of a frame, as where nbtrack wrote the list.
+        2. Frames have times of their own, and some stamp is near one: it is the same clock, and
+           poses are interpolated.
+        3. Frames' numbers, see `_by_number`. If times and stamps are of two clocks, equal counts
+           prove nothing: then this holds only for even stamps, which just count the lines.
+
+        `flip` makes camera-to-world poses of the list's, and the other way round. Raises DataError
+        if no rule applies.
         """
-        is_known = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(stamps)
-        known, clock = poses[is_known], stamps[is_known]
-        exact, near = (nearest(self.times, clock, within) for within in (0.0, _TOLERANCE))
-        if 0 < len(clock) == (exact >= 0).sum():  # as in trajectories that nbtrack wrote
-            return _at(known, exact), ""
-        if self.own is not None and (near >= 0).any():
-            return _interpolated(self.times, known, clock, flip)
-        # Of two clocks equal counts alone prove nothing, unless stamps only count the lines.
-        if self.own is None or _are_even(clock):
-            is_stamped = is_known.any() and np.isfinite(stamps).all()
-            if found := self._by_number(poses, stamps if is_stamped else None):
+        has_both = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(stamps)
+        known_poses, known_stamps = poses[has_both], stamps[has_both]
+        same_time = nearest(self.times, known_stamps, 0.0)
+        if len(known_stamps) > 0 and (same_time >= 0).sum() == len(known_stamps):
+            return _at(known_poses, same_time), ""
+        if self.own is not None and (nearest(self.times, known_stamps, _TOLERANCE) >= 0).any():
+            return _interpolated(self.times, known_poses, known_stamps, flip)
+        if self.own is None or _are_even(known_stamps):
+            all_stamped = has_both.any() and np.isfinite(stamps).all()
+            if found := self._by_number(poses, stamps if all_stamped else None):
                 return found
         raise DataError(
             f"{path} has {len(poses)} poses but there are {len(self.images)} images, and nothing "
@@ -191,33 +201,35 @@ class Moments:
         A pose has the number of its stamp (s) times the rate or, without stamps, of its place in a
         list longer than the frames. As many as can must then find each other, in just one way to
         count. Else poses follow one another, if there are as many as frames, unless stamps show
-        that some were left out.
+        that some were left out: uneven ones, by which most frames find their pose.
         """
         n_frames, n_poses = len(self.images), len(poses)
         pose_numbers = np.arange(n_poses) if stamps is None else stamps * self.rate_hz
         tolerance = min(_ON_TIME * self.rate_hz, 0.25)
-        # For each way to count the place of every frame's pose, -1 without one.
-        ways = {tuple(nearest(numbers, pose_numbers, tolerance)) for numbers in self._counted()}
-        n_paired = {way: n_frames - way.count(-1) for way in ways}
-        complete = [way for way, n in n_paired.items() if n == min(n_frames, n_poses)]
+        # A row for each way to count: the place of every frame's pose, -1 without one.
+        ways = [nearest(numbers, pose_numbers, tolerance) for numbers in self._counted()]
+        places = np.unique(np.reshape(ways, (-1, n_frames)), axis=0)
+        n_paired = (places >= 0).sum(axis=1)
+        complete = places[n_paired == min(n_frames, n_poses)]
         if len(complete) == 1 and (n_poses > n_frames or stamps is not None):
             note = f"of {n_poses} poses those of the images' numbers" if n_poses > n_frames else ""
-            return _at(poses, np.array(complete[0])), note
-        # Even stamps only count the lines; others, if they tell most frames' poses, leave some out.
-        is_most = max(n_paired.values(), default=0) > _MOST * n_frames
-        has_gaps = is_most and stamps is not None and not _are_even(stamps)
-        if n_poses != n_frames or has_gaps:
+            return _at(poses, complete[0]), note
+        finds_most = (n_paired > _MOST * n_frames).any()
+        some_left_out = finds_most and stamps is not None and not _are_even(stamps)
+        if n_poses != n_frames or some_left_out:
             return None
-        is_plain = np.array_equal(self.numbers, np.arange(n_frames))
-        return poses, "" if is_plain else "images have the poses one after another"
+        counts_up = np.array_equal(self.numbers, np.arange(n_frames))
+        return poses, "" if counts_up else "images have the poses one after another"
 
     def _counted(self) -> list[Frames]:
-        """Numbers of frames, less each that the count may begin with."""
+        """The frames' numbers, counted from 0 in each way that may be meant: as they stand, from 1,
+        or from the first frame's. In a format that counts from 0 only as they stand, unless they
+        are just 1 to n."""
         if self.numbers is None:
             return []
         first = self.numbers[0]
-        is_cut = first != 1 or np.ptp(self.numbers) != len(self.numbers) - 1
-        starts = {0} if self.counts_from_0 and is_cut else {0, min(first, 1), first}
+        is_1_to_n = first == 1 and np.ptp(self.numbers) == len(self.numbers) - 1
+        starts = [0] if self.counts_from_0 and not is_1_to_n else [0, min(first, 1), first]
         return [self.numbers - start for start in starts]
 
 
@@ -229,23 +241,24 @@ def _interpolated(
     The camera goes straight there, and turns about one axis. A pose of a frame's very time stays.
     """
     found = _at(poses, nearest(times, stamps, _TOLERANCE))
-    stamps, first = np.unique(stamps, return_index=True)
-    later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
-    before, after = times - stamps[later - 1], stamps[later] - times
-    apart = np.minimum(before, after)
-    is_between = (before + after <= _GAP) & (apart > _SAME_TIME)
+    knots, places = np.unique(stamps, return_index=True)
+    later = np.searchsorted(knots, times).clip(1, len(knots) - 1)
+    before, after = times - knots[later - 1], knots[later] - times
+    to_nearest = np.minimum(before, after)  # negative outside of the list
+    is_between = (before + after <= _GAP) & (to_nearest > _SAME_TIME)
     if not is_between.any():
         return found, ""
-    T, at = flip(poses[first]), times[is_between]
-    between = np.tile(np.eye(4), (len(at), 1, 1))
-    between[:, :3, 3] = interp1d(stamps, T[:, :3, 3], axis=0)(at)
-    between[:, :3, :3] = Slerp(stamps, Rotation.from_matrix(T[:, :3, :3]))(at).as_matrix()
-    found[is_between] = flip(between)
+    T_knots, at = flip(poses[places]), times[is_between]
+    T_at = np.tile(np.eye(4), (len(at), 1, 1))
+    T_at[:, :3, 3] = interp1d(knots, T_knots[:, :3, 3], axis=0)(at)
+    T_at[:, :3, :3] = Slerp(knots, Rotation.from_matrix(T_knots[:, :3, :3]))(at).as_matrix()
+    found[is_between] = flip(T_at)
     note = f"{len(at)} of {len(found)} poses are interpolated, the nearest up to"
-    return found, f"{note} {1e3 * apart[is_between].max():.1f} ms away"
+    return found, f"{note} {1e3 * to_nearest[is_between].max():.1f} ms away"
 
 
 def _are_even(stamps: Times) -> bool:
+    """Whether all steps between stamps are the same, but for a tenth of the median step."""
     steps = np.diff(stamps)
     return len(steps) == 0 or np.ptp(steps) <= _UNEVEN * np.median(np.abs(steps))
 

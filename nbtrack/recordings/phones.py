@@ -47,8 +47,7 @@ def _content(path: Path) -> Iterator[dict[str, Any]]:
 def _camera(path: Path, numbers: Sequence[float]) -> Calibration:
     """The camera of fx, fy, cx, cy, width and height as the apps write them."""
     fx, fy, cx, cy, width, height = numbers
-    K = camera_matrix(fx, fy, cx - 0.5, cy - 0.5)
-    return calibration(path, K, size=(int(width), int(height)))
+    return calibration(path, camera_matrix(fx, fy, cx - 0.5, cy - 0.5), (int(width), int(height)))
 
 
 def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times]:
@@ -64,8 +63,8 @@ def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times]:
 def _record3d_camera(path: Path) -> Calibration:
     """The first frame's, as the app writes it; later ones move by a pixel or two."""
     with _content(path) as content:
-        K = np.array(content["K"], dtype=np.float64)
-        return _camera(path, [*K[[0, 4, 6, 7]], content["w"], content["h"]])
+        K = np.array(content["K"], dtype=np.float64)  # column by column
+        return _camera(path, [K[0], K[4], K[6], K[7], content["w"], content["h"]])
 
 
 def _record3d_depth(path: Path, camera: Calibration) -> DepthImage:
@@ -107,17 +106,17 @@ def _polycam_camera(path: Path) -> Calibration:
     return _camera(path, np.median(rows, axis=0).tolist())
 
 
-_FILES = ("keyframes/cameras/*.json",)
+_POLYCAM_FILES = ("keyframes/cameras/*.json",)
 FORMATS["polycam"] = Format(
     "Polycam raw data", color=("keyframes/corrected_images/*", "keyframes/images/*"),
-    depth=("keyframes/depth/*",), poses=_FILES, cameras=_FILES,
+    depth=("keyframes/depth/*",), poses=_POLYCAM_FILES, cameras=_POLYCAM_FILES,
     declared=Declaration(camera_axes="opengl"),
     read_poses=_polycam_pose, read_camera=_polycam_camera,
 )  # fmt: skip
-_FILES = ("metadata", "metadata.json")
+_RECORD3D_FILES = ("metadata", "metadata.json")
 FORMATS["record3d"] = Format(
-    "Record3D", color=("rgbd/*", "rgb/*"), depth=("rgbd/*.depth", "depth/*"), poses=_FILES,
-    cameras=_FILES, declared=Declaration(camera_axes="opengl"), counts_from_0=True,
-    stamps_tell=False, read_poses=_record3d_poses, read_camera=_record3d_camera,
-    read_depth=_record3d_depth,
+    "Record3D", color=("rgbd/*", "rgb/*"), depth=("rgbd/*.depth", "depth/*"),
+    poses=_RECORD3D_FILES, cameras=_RECORD3D_FILES,
+    declared=Declaration(camera_axes="opengl"), counts_from_0=True, stamps_tell=False,
+    read_poses=_record3d_poses, read_camera=_record3d_camera, read_depth=_record3d_depth,
 )  # fmt: skip

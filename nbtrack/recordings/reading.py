@@ -23,7 +23,7 @@ from nbtrack.recordings.calibration import camera_matrix
 from nbtrack.recordings.formats import IMAGE_SUFFIXES, Declaration
 from nbtrack.recordings.recording import Recording, open_recording
 
-_FARTHEST_MM = _SATURATED = 65535  # what 16 bits hold; a camera's "farther than I can say"
+_MAX_16_BITS = 65535  # also what cameras write for "farther than I can measure"
 _SLICE = r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?"
 # Beyond so many times the distance that nine in ten depths lie within, they are no measurement: of
 # eleven rooms and two real recordings the farthest was 2.1 times as far (our choice).
@@ -70,16 +70,14 @@ def read_frames(
 
     Raises DataError if an image cannot be read, or no frame is left.
     """
-    frame_ids = frames
-    if isinstance(frames, slice):
-        frame_ids = select_frames(recording, frames, needs_poses)
-    camera, colors, depths_mm = decode(recording, frame_ids, progress)
+    ids = select_frames(recording, frames, needs_poses) if isinstance(frames, slice) else frames
+    camera, colors, depths_mm = decode(recording, ids, progress)
     origin = recording.origin if origin is None else origin
-    poses = recording.T_world_camera[frame_ids]
-    poses[:, :3, 3] -= origin
+    T_world_camera = recording.T_world_camera[ids]
+    T_world_camera[:, :3, 3] -= origin
     return RgbdSequence(
-        recording.name, camera, colors, depths_mm, T_world_camera=poses, frame_ids=frame_ids,
-        times=recording.times[frame_ids], origin=origin,
+        recording.name, camera, colors, depths_mm, T_world_camera=T_world_camera, frame_ids=ids,
+        times=recording.times[ids], origin=origin,
         declared_unit=recording.declared.metres_per_unit or None,
     )  # fmt: skip
 
@@ -104,7 +102,7 @@ def select_frames(recording: Recording, frames: slice, needs_poses: bool = True)
 
 
 def without_outliers(sequence: RgbdSequence) -> RgbdSequence:
-    """Without depths farther than `far_limit`; a sequence that has none is returned as it is."""
+    """The sequence without depths farther than `far_limit`; as it is, where there are none."""
     sample = sequence.depths_mm[:, ::4, ::4]
     is_far = sequence.depths_mm > far_limit(sample[sample > 0])
     if not is_far.any():
@@ -124,36 +122,37 @@ def decode(
 
     Raises DataError if a file is damaged, of another kind or size, or holds depths over 65.535 m.
     """
-    files = [(recording.color_files[i], recording.depth_files[i]) for i in frame_ids]
-    color, depth = _read_image(files[0][0], is_color=True), _read_depth(files[0][1], recording)
-    resize = _resizes_color(color, depth, recording)
-    first = files[0][1 if resize else 0]  # the size is its
-    height, width = (depth if resize else color).shape[:2]
-    camera = recording.calibration.for_size(width, height, first)
+    color_files = [recording.color_files[i] for i in frame_ids]
+    depth_files = [recording.depth_files[i] for i in frame_ids]
+    color = _read_image(color_files[0], is_color=True)
+    depth = _read_depth(depth_files[0], recording)
+    resize = _decide_resizing(color, depth, recording)
+    model_file, model = (depth_files[0], depth) if resize else (color_files[0], color)
+    height, width = model.shape[:2]
+    camera = recording.calibration.for_size(width, height, model_file)
     maps = _undistortion(camera, recording.calibration.distortion)
-    colors = np.empty((len(files), height, width, 3), np.uint8)
-    depths = np.empty((len(files), height, width), np.uint16)
+    colors = np.empty((len(frame_ids), height, width, 3), np.uint8)
+    depths = np.empty((len(frame_ids), height, width), np.uint16)
 
     def read(index: int) -> None:
-        color_file, depth_file = files[index]
-        color = _read_image(color_file, is_color=True)
-        depth = _read_depth(depth_file, recording)
+        color = _read_image(color_files[index], is_color=True)
+        depth = _read_depth(depth_files[index], recording)
         if resize:
             color = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
-        _check(color_file, color, colors[index], first)
-        _check(depth_file, depth, depths[index], first)
+        _check(color_files[index], color, np.uint8, (height, width, 3), model_file)
+        _check(depth_files[index], depth, np.uint16, (height, width), model_file)
         if maps:
             color = cv2.remap(color, *maps, cv2.INTER_LINEAR)
             # Interpolation would invent points between a table and the wall behind.
             depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
-        depth[(depth == recording.declared.no_depth) | (depth == _SATURATED)] = 0
-        depths[index] = _in_millimetres(depth, recording.declared, camera, depth_file)
+        depth[(depth == recording.declared.no_depth) | (depth == _MAX_16_BITS)] = 0
+        depths[index] = _in_millimetres(depth, recording.declared, camera, depth_files[index])
         colors[index] = color
 
     # Decoding releases the interpreter lock, so a few threads suffice.
-    bar = ProgressBar("reading frames", len(files), progress)
+    bar = ProgressBar("reading frames", len(frame_ids), progress)
     with bar, ThreadPoolExecutor(max_workers=4) as pool:
-        for done, _ in enumerate(pool.map(read, range(len(files))), start=1):
+        for done, _ in enumerate(pool.map(read, range(len(frame_ids))), start=1):
             bar.move_to(done)
     return camera, colors, depths
 
@@ -168,7 +167,7 @@ def _read_image(path: Path, is_color: bool) -> Shaped[np.ndarray, "height width 
         with Image.open(path, formats=("PNG", "JPEG")) as image:
             image.verify()  # the checksums of a PNG; reading finds what a JPEG lacks
         with Image.open(path) as image:
-            is_8_bit = not image.mode.startswith("I")
+            is_8_bit = not image.mode.startswith("I")  # others are left for `_check` to refuse
             return np.array(image.convert("RGB") if is_color and is_8_bit else image)
 
 
@@ -179,16 +178,17 @@ def _read_depth(path: Path, recording: Recording) -> Shaped[np.ndarray, "height 
     return _read_image(path, is_color=False)
 
 
-def _resizes_color(color: np.ndarray, depth: np.ndarray, recording: Recording) -> bool:
-    """Whether colour is given the size of depth, since its format says so, or it is larger in the
+def _decide_resizing(color: np.ndarray, depth: np.ndarray, recording: Recording) -> bool:
+    """Decide whether colour is given the size of depth: its format says so, or it is larger in the
     same proportions, as phones with LiDAR give it.
 
-    The latter is noted in the recording; DataError where its calibration does not say which of both
-    it is for.
+    Adds the latter to the recording's notes. Raises DataError where its calibration does not say
+    which of both it is for.
     """
     if recording.format.resize_color:
         return True
-    (height, width), (depth_height, depth_width) = color.shape[:2], depth.shape[:2]
+    height, width = color.shape[:2]
+    depth_height, depth_width = depth.shape[:2]
     factor = width / depth_width
     if factor <= 1 or abs(factor * depth_height - height) > 1:
         return False
@@ -205,11 +205,12 @@ def _resizes_color(color: np.ndarray, depth: np.ndarray, recording: Recording) -
     return True
 
 
-def _check(path: Path, image: np.ndarray, wanted: np.ndarray, first: Path) -> None:
-    if (image.shape, image.dtype) != (wanted.shape, wanted.dtype):
+def _check(path: Path, image: np.ndarray, dtype: type, shape: tuple[int, ...], model: Path) -> None:
+    """Raises DataError for an image of another type or shape; `model` names whose size it is."""
+    if image.dtype != dtype or image.shape != shape:
         raise DataError(
-            f"{path} is {image.dtype} of shape {image.shape}: it must be {wanted.dtype} of shape "
-            f"{wanted.shape}, for the size of {first} (depth has 16 bits and one channel)"
+            f"{path} is {image.dtype} of shape {image.shape}: it must be {dtype.__name__} of shape "
+            f"{shape}, for the size of {model} (depth has 16 bits and one channel)"
         )
 
 
@@ -222,7 +223,7 @@ def _in_millimetres(
         y, x = np.indices(depth.shape) + 0.5
         squares = ((x - camera.cx) / camera.fx) ** 2 + ((y - camera.cy) / camera.fy) ** 2
         depth_mm /= np.sqrt(1 + squares)
-    if depth_mm.max() > _FARTHEST_MM:
+    if depth_mm.max() > _MAX_16_BITS:
         raise DataError(
             f"{file} holds {depth_mm.max() / 1000:.4g} m with {declared.depth_scale:g} depth "
             "values a metre: at most 65.535 m can be kept; set depth_scale or no_depth in "

@@ -50,17 +50,17 @@ class Recording:
 
     @cached_property
     def origin(self) -> Position:
-        """Where (m) sequences have their origin: 0, or, of a recording that is far from it, as in
-        map coordinates, whole kilometres near its cameras, since single precision would lose them.
-        Recordings of one place so have one origin, that of its map."""
+        """The point (m, world) that is 0 in sequences: 0, or whole kilometres near the cameras if
+        these are far from 0, as in map coordinates, where single precision would lose millimetres.
+        So recordings of one place have one origin, that of its map."""
         if not self.has_pose.any():
             return np.zeros(3)
         center = np.median(self.T_world_camera[self.has_pose, :3, 3], axis=0)
         return np.round(center, -3) if np.abs(center).max() > _FAR_FROM_ZERO else np.zeros(3)
 
     def contents(self) -> tuple[list[tuple[str, str, str]], str, Declaration]:
-        """What changes when a recording does: of every image its name and a digest, one of times,
-        poses and camera, and the declaration."""
+        """What changes when a recording does: the folder, name and digest of every image, a digest
+        of times, poses and camera, and the declaration."""
         images = [
             (file.parent.name, file.name, hashlib.sha256(file.read_bytes()).hexdigest())
             for file in self.color_files + self.depth_files
@@ -85,24 +85,24 @@ def open_recording(
     notes = []
     declared = declaration(folder, format)
     layout = FORMATS[declared.format]
-    depth = [f"{depth_folder}/{Path(p).name}" if depth_folder else p for p in layout.depth]
+    patterns = [f"{depth_folder}/{Path(p).name}" if depth_folder else p for p in layout.depth]
     colors = layout.files(folder, layout.color, "colour images (PNG or JPEG)")
-    depths = layout.files(folder, depth, "depth maps (PNG of 16 bits)")
-    if colors[0].suffix == ".txt":
+    depths = layout.files(folder, patterns, "depth maps (PNG of 16 bits)")
+    if colors[0].suffix == ".txt":  # lists of images
         colors, depths, own_times = pair_lists(colors[0], depths[0], notes)
     else:
         check_paired(colors, depths)
         own_times = _own_times(folder, colors)
     camera = _calibration(folder, layout, notes)
     if camera.depth_scale:
-        declared = declaration(folder, declared.format, depth_scale=camera.depth_scale)
+        declared = declaration(folder, declared.format, camera.depth_scale)
     moments = Moments(colors, own_times, declared.frame_rate, layout.counts_from_0)
     pattern = pose_file or _pose_pattern(folder, layout)
-    poses, times = np.full((len(colors), 4, 4), np.nan), moments.times
     if pattern:
         files = layout.files(folder, (pattern,), "poses")
         poses, times = _poses_and_times(files, folder / pattern, layout, declared, moments, notes)
     else:
+        poses, times = np.full((len(colors), 4, 4), np.nan), moments.times
         notes.append("no poses")
     return Recording(
         folder, folder.name, layout, declared, color_files=colors, depth_files=depths, times=times,
@@ -127,7 +127,10 @@ def _own_times(folder: Path, colors: list[Path]) -> Times | None:
 
 
 def _calibration(folder: Path, layout: Format, notes: list[str]) -> Calibration:
-    """The folder's own calibration, else one that is assumed by the folder's name."""
+    """The folder's own calibration, else one that is assumed by the folder's name.
+
+    What is assumed, and what a file says that is not used, is added to the notes.
+    """
     known = [c for c in layout.known_cameras if c.source.name in folder.name]
     if known and not any((folder / name).is_file() for name in layout.cameras):
         assumed = f"the camera assumed for {layout.label}"
@@ -152,18 +155,22 @@ def _poses_and_times(
     files: list[Path], path: Path, layout: Format, declared: Declaration, moments: Moments,
     notes: list[str],
 ) -> tuple[Poses, Times]:  # fmt: skip
-    """A pose a frame, and times; `path` names the files, with `*` where each frame has one."""
+    """A pose a frame, and times; `path` names the files, with `*` where each frame has one.
+
+    How poses were given to frames is added to the notes.
+    """
     tables = [layout.read_poses(file, declared.quaternion) for file in files]
-    poses, stamps = map(np.concatenate, zip(*tables, strict=True))
-    poses, times = checked_poses(poses, path), moments.times
-    # Frames without times of their own have those of the poses, if there is one for each.
+    poses = checked_poses(np.concatenate([poses for poses, _ in tables]), path)
+    stamps = np.concatenate([stamps for _, stamps in tables])
+    times = moments.times
+    # Frames without times of their own have those of the poses, if there are as many.
     if moments.own is None and len(stamps) == len(times) and (np.diff(stamps) > 0).all():
         times = stamps
     if "*" in path.name:
         check_paired(moments.images, files)
         return poses, times
     stamps = stamps if layout.stamps_tell else np.full(len(stamps), np.nan)
-    poses, note = moments.poses_of(path, poses, stamps, declared.turned_round)
+    poses, note = moments.poses_of(path, poses, stamps, declared.inverted_if_world_to_camera)
     if note:
         notes.append(f"{path.name}: {note}")
     return poses, times

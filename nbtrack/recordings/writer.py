@@ -57,7 +57,7 @@ def write_sequence(
                 write_atomic(unfinished / f"{prefix}{len(poses)}.png", content.tobytes())
             poses.append(T_world_camera)
             progress(len(poses))
-        for name, text in (_texts(camera, np.stack(poses)) | dict(notes or {})).items():
+        for name, text in {**_texts(camera, np.stack(poses)), **(notes or {})}.items():
             (unfinished / name).write_text(text, encoding="utf-8")
         unfinished.rename(folder)  # fails if another command has finished it meanwhile
 
@@ -77,6 +77,7 @@ def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
 
 
 def _text(rows: Float[np.ndarray, "n m"]) -> str:
+    """A line for each row, its numbers with all digits."""
     return "".join(" ".join(map(repr, row)) + "\n" for row in rows.astype(np.float64).tolist())
 
 
@@ -106,6 +107,7 @@ def convert_sequence(
 
 
 def _frames(recording: Recording, numbers: Frames) -> Iterator[WrittenFrame]:
+    """The frames of some numbers, of which only a part is in memory at a time."""
     for part in np.split(numbers, range(_FRAMES_AT_ONCE, len(numbers), _FRAMES_AT_ONCE)):
         _, colors, depths = decode(recording, part)
         for color, depth, T in zip(colors, depths, recording.T_world_camera[part], strict=True):
