@@ -1,7 +1,6 @@
 """One RGB-D image: the unit of tracking, from a recording or from a running camera."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +13,8 @@ from nbtrack.core.errors import DataError
 
 MILLIMETRE = 1e-3
 _MAX_MILLIMETRES = np.iinfo(np.uint16).max
-_MAX_METRES = 100.0  # beyond it in most of an image they are in another unit (our choice)
+_MAX_METRES = 100.0  # a median depth beyond it is in another unit (our choice)
+_DEPTH_UNITS = "uint16 in mm, or floating point in metres"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,21 +39,15 @@ class Frame:
                 floating point in metres, kept to the millimetre. 0, NaN, infinite and negative ones
                 are none, and so are masked ones.
         """
-        size = camera.height, camera.width
-        metres = "uint16 in mm, or floating point in metres"
-        _check("color", color, (*size, 3), UInt8, asked="uint8")
-        _check("depth", depth, size, UInt16, Float, asked=metres)
+        _check("color", color, (camera.height, camera.width, 3), [UInt8], "uint8")
+        _check("depth", depth, (camera.height, camera.width), [UInt16, Float], _DEPTH_UNITS)
         if np.ma.is_masked(color):
             raise DataError("color has masked pixels: fill them; only depth may lack some")
-        color, depth = np.ma.getdata(color), np.ma.filled(depth, 0)
-        if depth.dtype.type != np.uint16:  # of any byte order
-            depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float64)
-            if depth.any() and (median := np.median(depth[depth > 0])) > _MAX_METRES:
-                raise DataError(f"depth is {median:.4g} m in the median: give {metres}")
-            depth = (depth / MILLIMETRE).round()
-            depth = np.where(depth > _MAX_MILLIMETRES, 0, depth)
-        color = torch.from_numpy(np.array(color, order="C"))
-        return cls(camera, color, torch.from_numpy(depth.astype(np.int32)))
+        rgb = np.array(np.ma.getdata(color), order="C")
+        measured = np.ma.filled(depth, 0)
+        is_mm = measured.dtype.type == np.uint16  # of any byte order
+        depth_mm = (measured if is_mm else _in_millimetres(measured)).astype(np.int32)
+        return cls(camera, torch.from_numpy(rgb), torch.from_numpy(depth_mm))
 
     @property
     def has_depth(self) -> bool:
@@ -80,8 +74,21 @@ class Frame:
         return backproject(self.camera, columns, rows, depth), color
 
 
-def _check(what: str, image: np.ndarray, shape: tuple[int, ...], *kinds: Any, asked: str) -> None:
-    """Raises DataError for another shape or type."""
+def _in_millimetres(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Depth (m) in whole millimetres; 0 where it is no positive number, or more than 16 bits hold.
+
+    Raises DataError if the median is no depth in metres.
+    """
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float64)
+    median = np.median(depth[depth > 0]) if depth.any() else 0
+    if median > _MAX_METRES:
+        raise DataError(f"depth is {median:.4g} m in the median: give {_DEPTH_UNITS}")
+    depth_mm = (depth / MILLIMETRE).round()
+    return np.where(depth_mm > _MAX_MILLIMETRES, 0, depth_mm)
+
+
+def _check(what: str, image: np.ndarray, shape: tuple, kinds: list, asked: str) -> None:
+    """Raises DataError for another shape, or a type that is none of the kinds."""
     wanted = " ".join(map(str, shape))
     if not any(isinstance(image, kind[np.ndarray, wanted]) for kind in kinds):
         found = f"of type {type(image).__name__}"

@@ -54,11 +54,11 @@ class PixelSampler:
 
     def rays(self, frames: Indices, rows: Indices, columns: Indices) -> Rays:
         """Rays through given pixels, with their measurements."""
-        color, depth = self.measurements(frames, rows, columns)
+        color, depth = self.measured(frames, rows, columns)
         T_world_camera = self.T_world_camera[frames]
         directions_camera = pixel_directions(self.intrinsics, columns, rows)
-        directions = (T_world_camera[:, :3, :3] @ directions_camera[..., None]).squeeze(-1)
-        return Rays(T_world_camera[:, :3, 3], directions, color, depth)
+        directions_world = (T_world_camera[:, :3, :3] @ directions_camera[..., None]).squeeze(-1)
+        return Rays(T_world_camera[:, :3, 3], directions_world, color, depth)
 
     def normals_camera(self, frames: Indices, rows: Indices, columns: Indices) -> Points:
         """Unit normals (camera frame, towards it) of the surface at pixels.
@@ -68,23 +68,24 @@ class PixelSampler:
         """
         _, height, width = self.depths_mm.shape
         reach = max(1, round(width * PLANE_REACH))
-        depth = self.measurements(frames, rows, columns)[1]
-        points = []
+        _, depth = self.measured(frames, rows, columns)
+        points = {}  # m, camera frame
         is_whole = depth > 0
-        for down, right in ((0, -reach), (0, reach), (-reach, 0), (reach, 0)):
-            row, column = rows + down, columns + right
+        steps = {"left": (0, -reach), "right": (0, reach), "up": (-reach, 0), "down": (reach, 0)}
+        for side, (row_step, column_step) in steps.items():
+            row, column = rows + row_step, columns + column_step
             is_whole &= (row >= 0) & (row < height) & (column >= 0) & (column < width)
             row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
-            near = self.measurements(frames, row, column)[1]
+            _, near = self.measured(frames, row, column)
             is_whole &= (near > 0) & ((near - depth).abs() < PLANE_JUMP * depth)
-            points.append(backproject(self.intrinsics, column, row, near))
-        # To the right, then upwards: x times -y is -z, towards the camera.
-        normal = torch.linalg.cross(points[1] - points[0], points[2] - points[3])
+            points[side] = backproject(self.intrinsics, column, row, near)
+        # Rightwards cross upwards: x cross -y is -z, towards the camera.
+        normal = torch.linalg.cross(points["right"] - points["left"], points["up"] - points["down"])
         return torch.nn.functional.normalize(normal, dim=-1) * is_whole[:, None]
 
-    def measurements(self, *pixels: Indices) -> tuple[Colors, Values]:
-        """Colour in [0, 1] and z-depth (m, 0 = none) of pixels: frames, rows and columns."""
-        where = tuple(indices.to(self.colors.device) for indices in pixels)
+    def measured(self, frames: Indices, rows: Indices, columns: Indices) -> tuple[Colors, Values]:
+        """Colour in [0, 1] and z-depth (m, 0 = none) of pixels."""
+        where = tuple(indices.to(self.colors.device) for indices in (frames, rows, columns))
         color = self.colors[where].to(self.device).float() / 255
         depth_mm = self.depths_mm[where].to(self.device).int() & 0xFFFF
         return color, depth_mm.float() * MILLIMETRE
@@ -93,15 +94,16 @@ class PixelSampler:
         self, n_rays: int, generator: torch.Generator, frames: Indices, tangent_planes: bool = False
     ) -> Rays:
         """Rays through random pixels of the given frames; with planes, if asked for."""
+
+        def below(limit: int) -> Indices:
+            return torch.randint(limit, (n_rays,), generator=generator, device=generator.device)
+
         _, height, width = self.depths_mm.shape
-        chosen, rows, columns = (
-            torch.randint(limit, (n_rays,), generator=generator, device=generator.device)
-            for limit in (len(frames), height, width)
-        )
-        frames = frames[chosen]
-        rays = self.rays(frames, rows, columns)
+        drawn = frames[below(len(frames))]
+        rows, columns = below(height), below(width)
+        rays = self.rays(drawn, rows, columns)
         if not tangent_planes:
             return rays
-        normals_camera = self.normals_camera(frames, rows, columns)
-        normals = self.T_world_camera[frames, :3, :3] @ normals_camera[..., None]
-        return replace(rays, normals_world=normals.squeeze(-1))
+        normals_camera = self.normals_camera(drawn, rows, columns)
+        normals_world = self.T_world_camera[drawn, :3, :3] @ normals_camera[..., None]
+        return replace(rays, normals_world=normals_world.squeeze(-1))

@@ -51,8 +51,8 @@ class RgbdSequence:
         color = torch.from_numpy(self.colors[index].copy())
         depth_mm = torch.from_numpy(self.depths_mm[index].astype(np.int32))
         name = f"frame {self.frame_ids[index]} of {self.name}"
-        pose = self.T_world_camera[index].copy()
-        known = pose if np.isfinite(pose).all() else None
+        T_world_camera = self.T_world_camera[index].copy()
+        known = T_world_camera if np.isfinite(T_world_camera).all() else None
         return Frame(self.intrinsics, color, depth_mm, known, name)
 
     def color(self, index: int) -> Float[np.ndarray, "height width 3"]:

@@ -19,7 +19,7 @@ _TOLERANT = {"encoding": "utf-8-sig", "errors": "replace"}  # of a byte-order ma
 _DECIMAL_COMMA = re.compile(r"(?<!\S)[-+]?\d+,\d+(e[-+]?\d+)?(?!\S)")
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
 _FARTHEST = 1e7  # m from the origin: beyond map coordinates, within what floats can square
-_ALONE = 1000.0  # m from the middle, and so many times as far as nine in ten: no camera went there
+_ALONE = 1000.0  # times as far from the middle as nine in ten, or as 1 m: no camera went there
 _LATEST = 1e11  # s: no timestamp is larger; since 1970 even milliseconds are
 _RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 
@@ -29,6 +29,7 @@ def read_object(path: Path, kind: str = "") -> dict[str, Any]:
     kind = kind or ("JSON" if path.suffix.lower() == ".json" else "TOML")
     with naming_damaged(path, f"{kind} file of names and values", "correct it or write it anew"):
         text = path.read_text(**_TOLERANT)
+        # Braces, since they raise TypeError for a list or a number.
         return {**(tomllib.loads(text) if kind == "TOML" else json.loads(text))}
 
 
@@ -49,7 +50,7 @@ def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np
     if path.suffix == ".log":  # Open3D's, with a head of three numbers before each matrix
         lines = [line for line in lines if len(line.split()) != 3]
     with naming_damaged(path, "table", f"every line holds {meaning}"):
-        if any(map(_DECIMAL_COMMA.search, lines)):
+        if any(_DECIMAL_COMMA.search(line) for line in lines):
             raise ValueError("write decimal points, not commas")
         numbers = np.loadtxt([line.replace(",", " ") for line in lines], ndmin=2)
         if numbers.shape[1] not in columns:
@@ -60,7 +61,8 @@ def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np
 def in_seconds(times: Times) -> Times:
     """Times in seconds, also where a file has them in milli-, micro- or nanoseconds since 1970.
 
-    The median tells the unit. A time beyond `_LATEST` is none: NaN.
+    The unit is the largest in which the median is a time that can be. A single time that cannot
+    be is NaN.
 
     >>> in_seconds(np.array([1403636579763555584.0, 1403636579796888917.0])).round(2).tolist()
     [1403636579.76, 1403636579.8]
@@ -68,8 +70,8 @@ def in_seconds(times: Times) -> Times:
     [0.5, 0.6, nan]
     """
     usual = np.nanmedian(np.abs(times)) if np.isfinite(times).any() else 0.0
-    unit = next((unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if usual * unit < _LATEST), 1.0)
-    return np.where(np.abs(times * unit) < _LATEST, times * unit, np.nan)
+    unit_s = next((unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if usual * unit < _LATEST), 1.0)
+    return np.where(np.abs(times * unit_s) < _LATEST, times * unit_s, np.nan)
 
 
 def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times]:
@@ -100,9 +102,10 @@ def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> 
     # Clipped, so that absurd numbers are refused and overflow nothing here.
     q_xyzw = rows[:, [4 + order.index(axis) for axis in "xyzw"]].clip(-1e6, 1e6)
     is_known = np.isfinite(rows[:, 1:]).all(axis=1) & (q_xyzw != 0).any(axis=1)
-    q_xyzw[~is_known] = 0.5
+    q_xyzw[~is_known] = 0.5  # any unit quaternion; these poses become NaN
     norms = np.linalg.norm(q_xyzw, axis=1)
-    for i in np.flatnonzero((np.abs(norms - 1) > _RIGID) | (is_known & np.isnan(times))):
+    is_wrong = (np.abs(norms - 1) > _RIGID) | (is_known & np.isnan(times))
+    for i in np.flatnonzero(is_wrong):  # the first is told
         raise DataError(
             f"{path} pose {i} has the time {rows[i, 0]:.13g} and a quaternion of norm "
             f"{norms[i]:.3g}: columns must be finite timestamps (s), tx ty tz and a unit "
@@ -118,7 +121,8 @@ def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> 
 def checked_poses(poses: Poses, path: Path) -> Poses:
     """The poses, all NaN where a number is not finite or all are 0: those frames have no pose.
 
-    Raises DataError if a pose is no rigid transform, or absurdly far from the origin.
+    Raises DataError if a pose is no rigid transform, or absurdly far from the origin or from the
+    other poses.
     """
     is_known = np.isfinite(poses).all(axis=(1, 2)) & (poses[:, :3] != 0).any(axis=(1, 2))
     # Clipped, so that absurd numbers are refused and overflow nothing.
@@ -132,7 +136,7 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
         away = np.linalg.norm(T[:, :3, 3] - np.median(T[is_known, :3, 3], axis=0), axis=1)
         usual = np.quantile(away[is_known], 0.9, method="lower")
         is_wrong |= is_known & (away > _ALONE * max(1.0, usual))
-    for i in np.flatnonzero(is_wrong):
+    for i in np.flatnonzero(is_wrong):  # the first is told
         frame = f" frame {i}" if len(poses) > 1 else ""
         numbers = " ".join(f"{number:.4g}" for number in poses[i].flat)
         raise DataError(
