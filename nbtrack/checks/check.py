@@ -1,6 +1,5 @@
 """Validate a recording, and find from its own depth maps whether its numbers are read rightly."""
 
-import math
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -23,13 +22,13 @@ _FRAMES_AT_ONCE = 32  # 50 MB at 640x480
 _CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
 _N_PAIRS = 60  # of frames that are compared
-_QUICK_PAIRS = 6  # the same in a quick look
+_QUICK_PAIRS = 6  # of frames that are compared in a quick look
 _MIN_FRAMES = 30  # without which pairs share too much to tell a small misfit
-_GAPS = (5, 10, 20, 40)  # frames between the two: they moved, and still see the same,
-_TURNED_DEG = 60  # which they do where the camera has not turned by more in between
+_GAPS = (5, 10, 20, 40)  # frames between the two of a pair: they moved, and still see the same
+_TURNED_DEG = 60  # by which the camera may turn in between; more, and they see other things
 _CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
-# A pose so far (m) from the middle of its neighbours, and so many usual steps: real recordings, and
-# rooms thinned to every twentieth frame, have 1.1. Half as far is a pose before or after a jump.
+# A pose is odd if it is off the middle of its neighbours by more than both: metres, and medians of
+# a step. Real recordings, and rooms thinned to every twentieth frame, have up to 1.1 medians.
 _OFF = 0.05
 _OFF_STEPS = 2.5
 _MIN_REPEATED = 0.05  # share of frames whose depth is that of the frame before, though they moved
@@ -53,7 +52,8 @@ class DataReport:
     warnings: list[str]  # what is wrong, each in a sentence; how numbers are read comes first
 
     def __str__(self) -> str:
-        recording, cloud, (own, *others) = self.recording, self.cloud, self.conventions
+        recording, cloud = self.recording, self.cloud
+        own, *others = self.conventions
         rivals = sorted((r for r in others if r.overlap > 0), key=lambda r: -r.agreement)[:3]
         c = own.reading.camera
         wide = 2 * np.degrees(np.arctan(c.width / 2 / c.fx))
@@ -84,19 +84,18 @@ def check_recording(
 ) -> DataReport:
     """Read every frame of a recording and report what is there and whether it fits together.
 
-    Only images that are compared or shown are kept meanwhile. Unless the whole is asked for, only a
-    few pairs of frames are read, which takes about a second. Raises what `read_frames` does, and
-    DataError where the whole has no depth.
+    Unless the whole is asked for, only a few pairs of frames are read, in about a second. Raises
+    what `read_frames` does, and DataError where the whole has no depth.
     """
     ids = select_frames(recording, slice(None))
-    poses = recording.T_world_camera[ids]
-    poses[:, :3, 3] -= recording.origin
-    pairs = _pairs(poses, _N_PAIRS if is_whole else _QUICK_PAIRS)
+    T_world_camera = recording.T_world_camera[ids]
+    T_world_camera[:, :3, 3] -= recording.origin
+    pairs = _pairs(T_world_camera, _N_PAIRS if is_whole else _QUICK_PAIRS)
     shown, kept = _kept(pairs, ids, is_whole)
     # Depth values as they stand in the files, so that any unit can be tried.
-    in_files = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
-    in_files = replace(recording, declared=in_files)
-    sequence, frames = _read(in_files, ids if is_whole else kept, kept, progress)
+    as_stored = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
+    stored = replace(recording, declared=as_stored)
+    sequence, frames = _read(stored, ids if is_whole else kept, kept, progress)
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     own = Reading(recording.declared, sequence.intrinsics)
@@ -104,20 +103,21 @@ def check_recording(
     conventions, best = fit_all(seen, own)
     cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))
     is_right = best is conventions[0]
-    misfits, correlation = [], math.nan
+    misfits, correlation = [], np.nan
     if is_right and is_whole and len(ids) >= _MIN_FRAMES:
         misfits, correlation = find_misfits(seen, best.reading)
     is_far = cloud.depth > far_limit(cloud.depth)
-    warnings = [*_of_depth_images(frames, cloud, recording)]
+    warnings = list(_of_depth_images(frames, cloud, recording))
+    needs_proof = is_whole and not warnings
     main = main_misfit(misfits)
-    warnings.append(main or diagnosis(conventions, best, recording, is_whole and not warnings))
+    warnings.append(main if main else diagnosis(conventions, best, recording, needs_proof))
     if is_right:
         warnings += [*_of_poses(frames, recording), *_of_depths(cloud.depth, is_far)]
     if not main:
         warnings += _of_colors(frames.brightness, correlation)
     return DataReport(
-        recording, frames, poses, cloud[~is_far], conventions=conventions, best=best,
-        misfits=misfits, warnings=[*filter(None, warnings)],
+        recording, frames, T_world_camera, cloud[~is_far], conventions=conventions, best=best,
+        misfits=misfits, warnings=[text for text in warnings if text],
     )  # fmt: skip
 
 
@@ -131,7 +131,7 @@ def quick_warning(recording: Recording) -> str:
 def _of_depth_images(
     frames: pd.DataFrame, cloud: pd.DataFrame, recording: Recording
 ) -> Iterator[str]:
-    """What is wrong with them, whatever their numbers mean."""
+    """What is wrong with depth images, whatever their numbers mean."""
     if not frames.measured.any():
         yield (
             "no pixel that was looked at has a depth: all are 0, or saturated (65535); check "
@@ -143,7 +143,8 @@ def _of_depth_images(
             f"depths come in steps of {100 * step:.1f} cm: look for those that the camera gave, or "
             "expect no better poses"
         )
-    repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()  # below 1: the first is not
+    # Below 1, since the first frame repeats none.
+    repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
     if repeated > _MIN_REPEATED:
         yield (
             f"{repeated:.0%} of the depth images repeat the one before, though the poses move: "
@@ -152,10 +153,10 @@ def _of_depth_images(
 
 
 def _of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
-    """Which poses, read rightly, lie beside the path of their neighbours."""
+    """What is wrong with poses that are read rightly: some lie beside their neighbours' path."""
     off = frames.off_mm / 1e3
     is_odd = off > max(_OFF, _OFF_STEPS * frames.moved_mm.median() / 1e3)
-    # The neighbours of a pose that is off are off by half.
+    # Both neighbours of an odd pose are off by half as much: of three in a row the worst counts.
     odd = off[is_odd & (off == off.rolling(3, 1, center=True).max())]
     if len(odd):
         first = recording.color_files[odd.index[0]].name
@@ -167,7 +168,7 @@ def _of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
 
 
 def _of_depths(depth: pd.Series, is_far: pd.Series) -> Iterator[str]:
-    """Which depths, read rightly, no camera measures."""
+    """What is wrong with depths that are read rightly: no camera measures them."""
     if is_far.any():
         low, high = depth[is_far].min(), depth[is_far].max()
         yield (
@@ -184,6 +185,7 @@ def _of_depths(depth: pd.Series, is_far: pd.Series) -> Iterator[str]:
 
 
 def _of_colors(brightness: pd.Series, correlation: float) -> Iterator[str]:
+    """What is wrong with colours; a correlation that is not known is NaN, and nothing is said."""
     if brightness.median() < _BLACK:
         yield (
             "the colour images are black: check their folder, or track without colour: --set "
@@ -197,9 +199,9 @@ def _of_colors(brightness: pd.Series, correlation: float) -> Iterator[str]:
 
 
 def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:
-    """How far the camera turns from frame to frame."""
+    """How far the camera turns from frame to frame, by the trace of the rotation in between."""
     R = T_world_camera[:, :3, :3]
-    cosine = ((R[:-1] * R[1:]).sum(axis=(1, 2)) - 1) / 2  # from the trace of their product
+    cosine = ((R[:-1] * R[1:]).sum(axis=(1, 2)) - 1) / 2  # the sum is the trace of R_a^T R_b
     return np.degrees(np.arccos(cosine.clip(-1, 1)))
 
 
@@ -211,14 +213,19 @@ def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:
     n_frames = len(T_world_camera)
     if n_frames < 2:
         return np.empty((2, 0), int)
-    turn = max(1.0, np.median(_turned_deg(T_world_camera)))
-    gaps = np.minimum(np.resize(_GAPS, maximum), max(1, min(n_frames - 1, int(_TURNED_DEG / turn))))
+    step_deg = max(1.0, np.median(_turned_deg(T_world_camera)))
+    largest_gap = max(1, min(n_frames - 1, int(_TURNED_DEG / step_deg)))
+    gaps = np.minimum(np.resize(_GAPS, maximum), largest_gap)
     first = np.rint(np.linspace(0, 1, maximum) * (n_frames - 1 - gaps)).astype(int)
     return np.unique([first, first + gaps], axis=1)
 
 
 def _kept(pairs: Pairs, ids: Frames, is_whole: bool) -> tuple[Frames, Frames]:
-    """Positions in `ids` of frames whose points are shown, and ids of all whose images are kept."""
+    """Positions in `ids` of frames whose points are shown, and ids of all whose images are kept.
+
+    Of the whole, frames spread over the recording are shown, and neighbours of compared frames are
+    kept, which `find_misfits` needs; in a quick look the frames that are compared are both.
+    """
     compared = np.unique(pairs)
     if not is_whole:
         return compared, ids[compared]
@@ -233,9 +240,10 @@ def _read(
 ) -> tuple[RgbdSequence, pd.DataFrame]:
     """The frames to keep of those looked at, read in parts, and a row for each looked at.
 
-    The row holds the share that is measured, the brightness in [0, 1], the number that divides all
-    depths, whether these are those of the row before, by what the frame differs from the one before
-    it, and how far it is off the middle of its neighbours; NaN where one of these has no pose.
+    The row holds the share that is measured, the brightness in [0, 1], the greatest number that
+    divides all depth values, whether these are those of the row before, by what the camera moved
+    and turned since the frame before, and how far it is off the middle between the frames before
+    and after; NaN where one of these has no pose.
     """
     parts = []
     rows = []
@@ -243,8 +251,8 @@ def _read(
         for ids in np.split(looked_at, range(_FRAMES_AT_ONCE, len(looked_at), _FRAMES_AT_ONCE)):
             part = read_frames(recording, ids)
             for depth, color in zip(part.depths_mm, part.colors, strict=True):
-                step, checksum = np.gcd.reduce(depth, None), zlib.crc32(depth)
-                rows.append(((depth > 0).mean(), color.mean() / 255, step, checksum))
+                step = np.gcd.reduce(depth, axis=None)
+                rows.append(((depth > 0).mean(), color.mean() / 255, step, zlib.crc32(depth)))
             parts.append(part.select(np.isin(ids, kept)))
             bar.update(len(part))
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
@@ -252,7 +260,7 @@ def _read(
     frames["is_repeated"] = frames.pop("checksum").diff() == 0
     T_world_camera = recording.T_world_camera
     moves_mm = 1e3 * np.diff(T_world_camera[:, :3, 3], axis=0, prepend=np.nan)
-    off_mm = np.diff(moves_mm, axis=0, append=np.nan) / 2
+    off_mm = np.diff(moves_mm, axis=0, append=np.nan) / 2  # from the middle of both neighbours
     frames["moved_mm"] = np.linalg.norm(moves_mm, axis=1)[looked_at]
     frames["turned_deg"] = np.array([np.nan, *_turned_deg(T_world_camera)])[looked_at]
     frames["off_mm"] = np.linalg.norm(off_mm, axis=1)[looked_at]
@@ -262,10 +270,10 @@ def _read(
 def _cloud(own: Reading, sequence: RgbdSequence) -> pd.DataFrame:
     """Coloured points of frames as the recording is declared, whose depths are as in the files."""
     stride = max(1, round((sequence.depths_mm[0].size / _POINTS_PER_FRAME) ** 0.5))
-    points = own.points(*on_grid(sequence.depths_mm, stride)).numpy()
+    points_camera = own.points(*on_grid(sequence.depths_mm, stride)).numpy()
     T = sequence.T_world_camera
-    world = points @ T[:, :3, :3].mT + T[:, None, :3, 3]
-    colors = sequence.colors[:, ::stride, ::stride].reshape(*points.shape)
-    cloud = np.concatenate([world, colors, points[..., 2:]], axis=-1).reshape(-1, 7)
-    cloud = pd.DataFrame(cloud, columns=[*_XYZ, "red", "green", "blue", "depth"])
+    points_world = points_camera @ T[:, :3, :3].mT + T[:, None, :3, 3]
+    colors = sequence.colors[:, ::stride, ::stride].reshape(points_camera.shape)
+    table = np.concatenate([points_world, colors, points_camera[..., 2:]], axis=-1).reshape(-1, 7)
+    cloud = pd.DataFrame(table, columns=[*_XYZ, "red", "green", "blue", "depth"])
     return cloud[cloud.depth > 0]

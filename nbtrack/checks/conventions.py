@@ -55,32 +55,35 @@ class Convention:
 def fit_all(pairs: FramePairs, own: Reading) -> tuple[list[Convention], Convention]:
     """All conventions, the declared one first, with how well pairs of frames agree under each; and
     the best: the declared one, unless another is clearly better."""
-    conventions = []
-    short = {words: axes for axes, words in SPELLED_AXES.items()}
-    axes = short.get(own.declared.camera_axes, own.declared.camera_axes)
+    # Axes that have a name are called by it, so that one reading has one way to be written.
+    named_axes = {words: name for name, words in SPELLED_AXES.items()}
+    axes = named_axes.get(own.declared.camera_axes, own.declared.camera_axes)
     own = replace(own, declared=replace(own.declared, camera_axes=axes))
-    declared = "poses", axes_name(own.declared.camera_axes, own.declared.poses), own
-    for subject, name, reading in (declared, *_hypotheses(own)):
-        if conventions and reading == own:
-            continue
-        compared = pairs.compare(reading)
-        is_valid = compared.is_valid
-        n_points = (pairs.values > 0).sum().clamp(1)
-        convention = Convention(
-            subject, name, reading,
-            median_m=float(compared.residual[is_valid].abs().median()),
-            depth_m=float(compared.measured[is_valid].median()),
-            overlap=float(is_valid.sum() / n_points),
-            agreement=float(compared.agreement.sum() / n_points),
-        )  # fmt: skip
-        conventions.append(convention)
+    conventions = [_fit(pairs, "poses", axes_name(axes, own.declared.poses), own)]
+    for subject, name, reading in _hypotheses(own):
+        if reading != own:
+            conventions.append(_fit(pairs, subject, name, reading))
     return conventions, _best_of(conventions)
+
+
+def _fit(pairs: FramePairs, subject: str, name: str, reading: Reading) -> Convention:
+    """A convention with how well pairs of frames agree under it."""
+    compared = pairs.compare(reading)
+    is_valid = compared.is_valid
+    n_points = (pairs.values > 0).sum().clamp(1)
+    return Convention(
+        subject, name, reading,
+        median_m=float(compared.residual[is_valid].abs().median()),
+        depth_m=float(compared.measured[is_valid].median()),
+        overlap=float(is_valid.sum() / n_points),
+        agreement=float(compared.agreement.sum() / n_points),
+    )  # fmt: skip
 
 
 def axes_name(camera_axes: str, poses: str) -> str:
     """For people: `OpenGL axes (x right, y up, z backward), camera-to-world`."""
-    words = SPELLED_AXES.get(camera_axes, camera_axes).split()
-    return "{} (x {}, y {}, z {}), {}".format(AXES.get(camera_axes, "axes"), *words, poses)
+    x, y, z = SPELLED_AXES.get(camera_axes, camera_axes).split()
+    return f"{AXES.get(camera_axes, 'axes')} (x {x}, y {y}, z {z}), {poses}"
 
 
 _DECLARED = [
@@ -110,17 +113,18 @@ def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
 
 
 def _best_of(conventions: list[Convention]) -> Convention:
-    """The declared convention (the first), unless another fits clearly better.
+    """The declared convention (the first), unless another is clearly better.
 
-    The median depth must be that of a depth camera, since no other number tells a unit of depth
-    from one of positions.
+    The other is the first whose agreement is about the highest of those whose surfaces meet and
+    whose median depth is that of a depth camera, since no other number tells a unit of depth from
+    one of positions.
     """
     own = conventions[0]
     near, far = PLAUSIBLE_DEPTH
     meeting = [c for c in conventions if c.overlap >= _MIN_OVERLAP and c.median_m < _FAR_APART]
-    rivals = [c for c in meeting if near <= c.depth_m <= far]
-    most = max((c.agreement for c in rivals), default=0.0)
-    best = next((c for c in rivals if c.agreement >= _ALIKE * most), own)
+    plausible = [c for c in meeting if near <= c.depth_m <= far]
+    highest = max((c.agreement for c in plausible), default=0.0)
+    best = next((c for c in plausible if c.agreement >= _ALIKE * highest), own)
     return best if best.is_clearly_better(own) else own
 
 
@@ -169,7 +173,7 @@ def _remedy(reading: Reading, own: Reading) -> str:
     if (c := reading.camera) != own.camera:
         numbers = f"{c.fx:.6g} {c.fy:.6g} {c.cx - 0.5:.6g} {c.cy - 0.5:.6g}"
         return f"set fx fy cx cy in the calibration to {numbers} (the first pixel's centre at 0)"
-    changes = changed_settings(reading.declared, own.declared)
+    changes = changed_settings(reading.declared, own.declared)  # as `depth_scale=5000.0`
     said = " and ".join(text.replace("=", " = ", 1).removesuffix(".0") for text in changes)
     advice = f"set {said} in sequence.toml"
     if "quaternion" in said:

@@ -31,11 +31,11 @@ from nbtrack.tracking.trajectories import Trajectory
 _MISFIT_FACTOR = 3.0  # times what is usual in the map's own frames
 _MISFIT_ALLOWED = 0.05  # m
 _N_FRAMES = 40  # looked at
-_N_POINTS = 500  # the same, of each
+_N_POINTS = 500  # of each frame, looked at
 _MOSTLY = 0.5  # share of a frame's points outside of the map's bounds, where the frame lies outside
 _MAX_DISTANCE = 0.1  # m; points farther from any surface tell nothing
 _MIN_POINTS = 50  # of a frame, that an estimate needs
-_MIN_FRAMES = 8  # the same
+_MIN_FRAMES = 8  # that an estimate needs
 # What motions leave of longer depths, as a share of the points' distances from the camera: before
 # a flat wall 1 %, which is noise of the map's gradients; in rooms 10 % and more.
 _MIN_LEFT = 0.03
@@ -90,45 +90,50 @@ def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
     if is_known.sum() < 3:
         return None
     T_estimated, T_true = T_estimated[is_known], T_true[is_known]
-    # From orientations too, which tell it where the camera moves along a line.
+    # The rotation from orientations, which tell it also where the camera moves along a line; of the
+    # half of the frames that agree best, since lost frames say nothing of it.
     turns = Rotation.from_matrix(T_estimated[:, :3, :3] @ T_true[:, :3, :3].mT)
-    T_map_world = np.eye(4)
     off_mean = (turns.mean().inv() * turns).magnitude()
-    is_usual = off_mean <= np.median(off_mean)  # lost frames say nothing of it
-    T_map_world[:3, :3] = turns[is_usual].mean().as_matrix()
-    moved = T_true[:, :3, 3] @ T_map_world[:3, :3].T
-    T_map_world[:3, 3] = np.median(T_estimated[:, :3, 3] - moved, axis=0)
-    before, after = (pose_errors(T_estimated, T)[0] for T in (T_true, T_map_world @ T_true))
-    explained = np.median(after) < min(LOST_THRESHOLD_M, np.median(before) / 10)
-    return T_map_world if explained and np.median(before) > LOST_THRESHOLD_M else None
+    agrees = off_mean <= np.median(off_mean)
+    T_map_world = np.eye(4)
+    T_map_world[:3, :3] = turns[agrees].mean().as_matrix()
+    turned_positions = T_true[:, :3, 3] @ T_map_world[:3, :3].T
+    T_map_world[:3, 3] = np.median(T_estimated[:, :3, 3] - turned_positions, axis=0)
+    error_m = np.median(pose_errors(T_estimated, T_true)[0])
+    left_m = np.median(pose_errors(T_estimated, T_map_world @ T_true)[0])
+    is_explained = left_m < min(LOST_THRESHOLD_M, error_m / 10)
+    return T_map_world if error_m > LOST_THRESHOLD_M and is_explained else None
 
 
 def outside_map_share(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> float:
     """The share of some frames, spread evenly, that saw little of what was mapped: most of their
     points lie outside of the map, at their true poses where known, else at the estimated ones."""
     outside = []
-    for index, points in _some_points(sequence):
+    for index, points_camera in _some_points(sequence):
         T = sequence.T_world_camera[index]
-        world = _moved(points, T if np.isfinite(T).all() else T_estimated[index])
-        is_outside = (world < field.bounds.minimum) | (world > field.bounds.maximum)
+        points_world = _to_world(points_camera, T if np.isfinite(T).all() else T_estimated[index])
+        is_outside = (points_world < field.bounds.minimum) | (points_world > field.bounds.maximum)
         outside.append(is_outside.any(axis=1).mean() > _MOSTLY)
-    return float(np.mean(outside or [0.0]))
+    return float(np.mean(outside)) if outside else 0.0
 
 
 def map_misfit(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> str:
     """A sentence where depths of some frames misfit the distances of a map; else an empty one.
 
-    Frames tell nothing that see up to three walls: there a motion does the same.
+    Frames tell nothing that see up to three walls: there a motion does the same. The module's text
+    has the method and its symbols p, q, r and s.
     """
-    costs = []
-    for index, points_camera in _some_points(sequence) if field.is_distance else ():
+    if not field.is_distance:
+        return ""
+    costs = []  # of each frame at each share s
+    for index, points_camera in _some_points(sequence):
         T = T_estimated[index]
-        points_world = torch.from_numpy(_moved(points_camera, T)).float().to(field.device)
+        points_world = torch.from_numpy(_to_world(points_camera, T)).float().to(field.device)
         distance = field(points_world.requires_grad_())[1]
-        (gradient,) = torch.autograd.grad(distance.sum(), points_world)
-        near = np.abs(distance.numpy(force=True)) < _MAX_DISTANCE
-        p, r = points_camera[near], distance.numpy(force=True)[near]
-        q = (gradient.numpy(force=True) @ T[:3, :3])[near]
+        (gradient_world,) = torch.autograd.grad(distance.sum(), points_world)
+        is_near = np.abs(distance.numpy(force=True)) < _MAX_DISTANCE
+        p, r = points_camera[is_near], distance.numpy(force=True)[is_near]
+        q = (gradient_world.numpy(force=True) @ T[:3, :3])[is_near]
         motions, _ = np.linalg.qr(np.hstack([np.cross(p, q), q]))
         both = np.column_stack([r, (q * p).sum(axis=1)])
         residual, longer = (both - motions @ (motions.T @ both)).T  # what no motion explains
@@ -137,15 +142,17 @@ def map_misfit(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> str:
     return main_misfit([estimate(_LONGER, np.array(costs))]) if len(costs) >= _MIN_FRAMES else ""
 
 
-def _some_points(sequence: RgbdSequence) -> Iterator[tuple[int, WorldPoints]]:
-    """Places and points (m, camera frame) of some frames that have depth, spread evenly."""
+def _some_points(sequence: RgbdSequence) -> Iterator[tuple[int, np.ndarray]]:
+    """Places in the sequence, and points (n, 3; m, camera frame), of some frames that have depth,
+    spread evenly."""
     stride = math.ceil((sequence.depths_mm[0].size / _N_POINTS) ** 0.5)
     for index in range(0, len(sequence), math.ceil(len(sequence) / _N_FRAMES)):
         frame = sequence[index]
-        points, _ = frame.points(*frame.measured_pixels(stride))
-        if len(points):
-            yield index, points.double().numpy()
+        points_camera, _ = frame.points(*frame.measured_pixels(stride))
+        if len(points_camera):
+            yield index, points_camera.double().numpy()
 
 
-def _moved(points: WorldPoints, T_world_camera: Pose) -> WorldPoints:
-    return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+def _to_world(points_camera: np.ndarray, T_world_camera: Pose) -> WorldPoints:
+    """Points (m) of the camera frame in the world."""
+    return points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]

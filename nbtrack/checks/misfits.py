@@ -5,7 +5,6 @@ so far apart, and the intensities of their common points are so unlike. The valu
 best is the estimate; its interval comes from drawing the pairs anew (bootstrap).
 """
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -83,7 +82,7 @@ class Misfit:
         return (self.low > negligible or self.high < -negligible) and self.gain < _GAIN
 
     def __str__(self) -> str:
-        _, name, form, unit, *_ = self.parameter
+        name, form, unit = self.parameter.name, self.parameter.form, self.parameter.unit
         if not form:
             return f"{name}: {'yes' if self.is_significant else 'no'}"
         return f"{name} {self.estimate:{form}} ({self.low:{form}} to {self.high:{form}}){unit}"
@@ -97,11 +96,12 @@ def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
     looked for where depth is right. Those that even at their best leave colours less alike than
     MIN_CORRELATION are left out: such colours are of another place.
     """
-    found = [*_estimates(_DEPTH_PARAMETERS, own, pairs.depth_costs)]
+    found = list(_estimates(_DEPTH_PARAMETERS, own, pairs.depth_costs))
     color_costs = partial(pairs.color_costs, pairs.compare(own))
     unlikeness = color_costs(own)
-    correlation = float(1 - np.nanmedian(unlikeness)) if np.isfinite(unlikeness).any() else math.nan
+    correlation = float(1 - np.nanmedian(unlikeness)) if np.isfinite(unlikeness).any() else np.nan
     if not any(misfit.is_significant for misfit in found):
+        # At its best a misfit has `gain` of the unlikeness 1 - correlation.
         max_gain = (1 - MIN_CORRELATION) / max(1e-9, 1 - correlation)
         of_colors = _estimates(_COLOR_PARAMETERS, own, color_costs)
         found += [misfit for misfit in of_colors if misfit.gain < max_gain]
@@ -120,7 +120,8 @@ def main_misfit(misfits: list[Misfit]) -> str:
 def _estimates(
     parameters: list[Parameter], own: Reading, cost: Callable[[Reading], Costs]
 ) -> Iterator[Misfit]:
-    """Of parameters at all of whose values enough pairs see enough of the same."""
+    """An estimate of each parameter, by the pairs that have a cost at all of its values; none of
+    one for which these pairs are too few."""
     for parameter in parameters:
         readings = [replace(own, **{parameter.key: value}) for value in parameter.values]
         costs = np.stack([cost(reading) for reading in readings], axis=1)
@@ -135,14 +136,15 @@ def estimate(parameter: Parameter, costs: Float[np.ndarray, "n values"]) -> Misf
     values, mean = parameter.values, costs.mean(axis=0)
     drawn = np.random.default_rng(0).integers(len(costs), size=(_RESAMPLED, len(costs)))
     low, high = np.quantile(_lowest(values, costs[drawn].mean(axis=1)), _INTERVAL)
-    gain = float(mean.min() / mean[np.abs(values).argmin()])
+    gain = float(mean.min() / mean[np.abs(values).argmin()])  # by the mean at 0, as declared
     return Misfit(parameter, float(_lowest(values, mean)), low, high, gain)
 
 
 def _lowest(
     values: Float[np.ndarray, "values"], costs: Float[np.ndarray, "*n values"]
 ) -> Float[np.ndarray, "*n"]:
-    """The place of the lowest of costs at equal steps, by a parabola through three of them."""
+    """The value at which costs are lowest. Values have equal steps: between them a parabola goes
+    through the lowest cost and both beside it; at either end the value itself is taken."""
     at, last = costs.argmin(axis=-1), len(values) - 1
     around = np.clip(at[..., None] + [-1, 0, 1], 0, last)
     before, middle, after = np.moveaxis(np.take_along_axis(costs, around, axis=-1), -1, 0)

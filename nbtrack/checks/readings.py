@@ -68,11 +68,13 @@ class Reading:
         return directions * metres[..., None]
 
     def T_world_camera(self, file_poses: Poses, order: str) -> Poses:
-        """Camera-to-world poses with OpenCV axes, of a file read with this order of quaternions."""
+        """Camera-to-world poses with OpenCV's camera axes, of a file's as they were read with an
+        order of quaternions."""
         T = file_poses.copy()
-        if self.declared.quaternion != order:
-            numbers = Rotation.from_matrix(T[:, :3, :3]).as_quat(scalar_first=order == "wxyz")
-            T[:, :3, :3] = Rotation.from_quat(numbers, scalar_first=order == "xyzw").as_matrix()
+        if self.declared.quaternion != order:  # the file's four numbers, read the other way
+            w_first = order == "wxyz"
+            numbers = Rotation.from_matrix(T[:, :3, :3]).as_quat(scalar_first=w_first)
+            T[:, :3, :3] = Rotation.from_quat(numbers, scalar_first=not w_first).as_matrix()
         T[:, :3, 3] *= self.metres
         T = self.declared.poses_to_opencv(T)
         drift = [self.drift_x, self.drift_y, self.drift_z]
@@ -104,20 +106,23 @@ class FramePairs:
     """Pairs of frames that see much the same, to be read in one way or another."""
 
     def __init__(self, recording: Recording, ids: Frames, kept: RgbdSequence, pairs: Pairs) -> None:
-        """Pairs are positions in the numbers of a recording's frames that have a pose; of these,
-        those of the pairs are kept, with depth values as in the files."""
+        """Take the frames of pairs from a sequence whose depth values are as in the files.
+
+        `ids` are the numbers of the recording's frames that have a pose, and pairs are positions in
+        them. Points are looked at in the first frame of each pair.
+        """
         self.pairs = pairs
         self.file_poses = recording.file_poses[ids]
         self.order = recording.declared.quaternion
         self.colors = kept.colors
-        self.places = np.searchsorted(kept.frame_ids, ids[pairs])
+        self.places = np.searchsorted(kept.frame_ids, ids[pairs])  # of pairs in the sequence
         first, second = kept.depths_mm[self.places]
         stride = math.ceil((math.prod(first.shape[1:]) / _POINTS_PER_FRAME) ** 0.5)
         self.columns, self.rows, self.values = on_grid(first, stride)
-        self.inverse = 1 / torch.from_numpy(second[:, None].astype(np.float32))
+        self.inverse = 1 / torch.from_numpy(second[:, None].astype(np.float32))  # infinite: none
 
     def compare(self, reading: Reading) -> Comparison:
-        """Points of first frames, seen from the second ones.
+        """Points of the first frames a beside what was measured in the second ones b.
 
         Depth is interpolated between four pixels, in 1/z, which is exact for planes.
         """
@@ -131,18 +136,17 @@ class FramePairs:
         points_b = points_a @ T_b_a[:, :3, :3].mT + T_b_a[:, None, :3, 3]
         columns, rows, depth = project(reading.calibration, points_b)
         at = self._on_images(columns, rows)[:, None]
-        blended, nearest = (
-            1 / grid_sample(self.inverse, at, mode, align_corners=True)[:, 0, 0]
-            for mode in ("bilinear", "nearest")
-        )
+        blended = 1 / grid_sample(self.inverse, at, "bilinear", align_corners=True)[:, 0, 0]
+        nearest = 1 / grid_sample(self.inverse, at, "nearest", align_corners=True)[:, 0, 0]
         measured = reading.points(columns, rows, blended / longer_b)[..., 2]
         residual = depth - measured
-        valid = (self.values > 0) & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
-        valid &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
-        valid &= residual < _HIDDEN_BEHIND  # but in front is a contradiction, however far
-        # Geman-McClure's of the differences.
-        agreement = torch.where(valid, 1 / (1 + (residual / measured / _SCALE) ** 2), 0.0)
-        return Comparison(residual, measured, valid, agreement, at)
+        is_valid = (self.values > 0) & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
+        is_valid &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
+        # A point far in front of the surface stays: it contradicts, while one behind is hidden.
+        is_valid &= residual < _HIDDEN_BEHIND
+        # The weight of Geman and McClure of the difference, as a share of the depth.
+        agreement = torch.where(is_valid, 1 / (1 + (residual / measured / _SCALE) ** 2), 0.0)
+        return Comparison(residual, measured, is_valid, agreement, at)
 
     def _on_images(self, columns: Tensor, rows: Tensor) -> Tensor:
         """Pixels as `grid_sample` has them: -1 is the first, 1 the last."""
@@ -161,20 +165,22 @@ class FramePairs:
 
         NaN of pairs with few points, and without contrast.
         """
-        own = self._on_images(self.columns, self.rows).expand_as(compared.seen_at[:, 0])
-        at = torch.cat([own[:, None], compared.seen_at])
+        # Both frames' places of the points, first those of all first frames, then of all second.
+        in_first = self._on_images(self.columns, self.rows).expand_as(compared.seen_at[:, 0])
+        at = torch.cat([in_first[:, None], compared.seen_at])
         at[..., 0] += 2 * reading.color_right
         if reading.is_mirrored:
             at[..., 0] *= -1
         places = (self.places + reading.color_shift).clip(0, len(self.colors) - 1)
         gray = [cv2.cvtColor(self.colors[i], cv2.COLOR_RGB2GRAY) for i in places.ravel()]
-        gray = torch.from_numpy(np.stack(gray))[:, None].float() / 255
-        seen = grid_sample(gray, at, align_corners=True)[:, 0, 0].numpy()
+        images = torch.from_numpy(np.stack(gray))[:, None].float() / 255
+        in_firsts, in_seconds = grid_sample(images, at, align_corners=True)[:, 0, 0].chunk(2)
         is_inside = (at.abs() <= 1).all(dim=-1)[:, 0].view(2, *self.values.shape).all(dim=0)
-        mask = ((compared.agreement > _SAME) & is_inside).numpy()
-        costs = np.full(len(mask), np.nan)
-        for i, (row, a, b) in enumerate(zip(mask, *np.split(seen, 2), strict=True)):
-            a, b = a[row], b[row]
-            if row.mean() >= _MIN_OVERLAP and min(a.std(), b.std()) >= _MIN_CONTRAST:
-                costs[i] = 1 - np.corrcoef(a, b)[0, 1]
+        is_compared = ((compared.agreement > _SAME) & is_inside).numpy()
+        costs = np.full(len(is_compared), np.nan)
+        for pair in np.flatnonzero(is_compared.mean(axis=1) >= _MIN_OVERLAP):
+            first = in_firsts[pair].numpy()[is_compared[pair]]
+            second = in_seconds[pair].numpy()[is_compared[pair]]
+            if min(first.std(), second.std()) >= _MIN_CONTRAST:
+                costs[pair] = 1 - np.corrcoef(first, second)[0, 1]
         return costs
