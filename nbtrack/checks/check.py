@@ -56,14 +56,14 @@ class DataReport:
         own, *others = self.conventions
         rivals = sorted((r for r in others if r.overlap > 0), key=lambda r: -r.agreement)[:3]
         c = own.reading.camera
-        wide = 2 * np.degrees(np.arctan(c.width / 2 / c.fx))
+        wide_deg = 2 * np.degrees(np.arctan(c.width / 2 / c.fx))
         near, far = cloud.depth.quantile([0.01, 0.99])
         x, y, z = np.ptp(cloud[_XYZ].quantile(_CUT), axis=0)
         facts = self.frames[_PRINTED].agg(["mean", "min", "max"]).T
         lines = [
             f"{recording.name}: {recording.format.label}, {len(self.frames)} of {len(recording)} "
             f"frames have a pose, {c.width} x {c.height} px",
-            f"  camera: focal lengths {c.fx:.2f} and {c.fy:.2f} px ({wide:.1f} deg wide), "
+            f"  camera: focal lengths {c.fx:.2f} and {c.fy:.2f} px ({wide_deg:.1f} deg wide), "
             f"principal point ({c.cx:g}, {c.cy:g})",
             *(f"  note: {text}" for text in recording.notes),
             f"  depth: {near:.2f} to {far:.2f} m (1% and 99%)",
@@ -137,11 +137,12 @@ def _of_depth_images(
             "no pixel that was looked at has a depth: all are 0, or saturated (65535); check "
             "the depth folder, and no_depth in sequence.toml"
         )
-    step = np.gcd.reduce(frames.depth_step) / recording.declared.depth_scale
-    if _MAX_STEP * cloud.depth.median() < step < cloud.depth.max() / 8:
+    step_m = np.gcd.reduce(frames.depth_step) / recording.declared.depth_scale
+    # With fewer than eight steps up to the farthest point, they may be chance.
+    if _MAX_STEP * cloud.depth.median() < step_m < cloud.depth.max() / 8:
         yield (
-            f"depths come in steps of {100 * step:.1f} cm: look for those that the camera gave, or "
-            "expect no better poses"
+            f"depths come in steps of {100 * step_m:.1f} cm: look for those that the camera gave, "
+            "or expect no better poses"
         )
     # Below 1, since the first frame repeats none.
     repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
@@ -154,7 +155,7 @@ def _of_depth_images(
 
 def _of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
     """What is wrong with poses that are read rightly: some lie beside their neighbours' path."""
-    off = frames.off_mm / 1e3
+    off = frames.off_mm / 1e3  # m
     is_odd = off > max(_OFF, _OFF_STEPS * frames.moved_mm.median() / 1e3)
     # Both neighbours of an odd pose are off by half as much: of three in a row the worst counts.
     odd = off[is_odd & (off == off.rolling(3, 1, center=True).max())]

@@ -136,7 +136,8 @@ def map_misfit(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> str:
         q = (gradient_world.numpy(force=True) @ T[:3, :3])[is_near]
         motions, _ = np.linalg.qr(np.hstack([np.cross(p, q), q]))
         both = np.column_stack([r, (q * p).sum(axis=1)])
-        residual, longer = (both - motions @ (motions.T @ both)).T  # what no motion explains
+        # What no motion explains, of the distances and of what longer depths would add to them.
+        residual, longer = (both - motions @ (motions.T @ both)).T
         if len(p) >= _MIN_POINTS and (longer**2).sum() > _MIN_LEFT**2 * (p**2).sum():
             costs.append(((residual - SHARES[:, None] * longer) ** 2).sum(axis=1))
     return main_misfit([estimate(_LONGER, np.array(costs))]) if len(costs) >= _MIN_FRAMES else ""

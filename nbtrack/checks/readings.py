@@ -127,6 +127,7 @@ class FramePairs:
         Depth is interpolated between four pixels, in 1/z, which is exact for planes.
         """
         n_frames = len(self.file_poses)
+        # Of a frame at first half of the growth is missing, in the end half is too much.
         growth = reading.depth_growth * (self.pairs / n_frames - 0.5)
         longer_a, longer_b = torch.from_numpy(1 + growth[..., None]).float()
         points_a = reading.points(self.columns, self.rows, self.values / longer_a)
@@ -165,7 +166,7 @@ class FramePairs:
 
         NaN of pairs with few points, and without contrast.
         """
-        # Both frames' places of the points, first those of all first frames, then of all second.
+        # Places of the points in all first frames, then in all second ones.
         in_first = self._on_images(self.columns, self.rows).expand_as(compared.seen_at[:, 0])
         at = torch.cat([in_first[:, None], compared.seen_at])
         at[..., 0] += 2 * reading.color_right
