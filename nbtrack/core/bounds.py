@@ -39,7 +39,7 @@ class SceneBounds:
         """
         # An axis that a ray runs along is left at infinity, never at 0/0.
         safe = torch.where(directions_world.abs() < 1e-9, 1e-9, directions_world)
-        corners = self.minimum, self.maximum
-        low, high = (constant(c, origins_world.device, origins_world.dtype) for c in corners)
-        to_minimum, to_maximum = (low - origins_world) / safe, (high - origins_world) / safe
+        device, dtype = origins_world.device, origins_world.dtype
+        to_minimum = (constant(self.minimum, device, dtype) - origins_world) / safe
+        to_maximum = (constant(self.maximum, device, dtype) - origins_world) / safe
         return torch.maximum(to_minimum, to_maximum).amin(dim=-1)

@@ -24,15 +24,15 @@ def choose_device() -> torch.device:
 
     Raises ConfigError, saying what there is, if the named device is unknown, or not there.
     """
-    kind = torch.accelerator.current_accelerator(check_available=True)
+    accelerator = torch.accelerator.current_accelerator(check_available=True)
     name = os.environ.get("NBTRACK_DEVICE")
     if not name:
-        return kind or torch.device("cpu")
+        return accelerator or torch.device("cpu")
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()  # which a device without memory cannot say
     except (RuntimeError, AssertionError, NotImplementedError, ImportError):
-        there = ["cpu", *(f"{kind}:{i}" for i in range(torch.accelerator.device_count()))]
+        there = ["cpu", *(f"{accelerator}:{i}" for i in range(torch.accelerator.device_count()))]
         raise ConfigError(f"no device {name!r}: this machine has {', '.join(there)}") from None
     return device
 
@@ -51,8 +51,8 @@ def device_name(device: torch.device) -> str:
         return f"Apple GPU ({platform.machine()})"
     name = platform.processor() or platform.machine()
     with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
-        names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-        name = next(names, name)
+        models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+        name = next(models, name)  # the first core's
     return f"{name}, {usable_cores()} cores"
 
 
@@ -69,7 +69,7 @@ def usual_modes() -> Iterator[None]:
 
     Also in a program that has switched gradients off, or has another default type.
     """
-    usual_type = _restored(torch.set_default_dtype, torch.get_default_dtype(), torch.float32)
+    usual_type = _changed(torch.set_default_dtype, torch.get_default_dtype(), torch.float32)
     with usual_type, torch.inference_mode(False), torch.enable_grad():
         yield
 
@@ -80,22 +80,22 @@ def matrix_products(tf32: bool) -> contextlib.AbstractContextManager[None]:
     TF32 keeps 10 of the mantissa's 23 bits, and is several times as fast.
     """
     before = torch.get_float32_matmul_precision()
-    return _restored(torch.set_float32_matmul_precision, before, "high" if tf32 else "highest")
+    return _changed(torch.set_float32_matmul_precision, before, "high" if tf32 else "highest")
 
 
 def threads(number: int) -> contextlib.AbstractContextManager[None]:
     """Run a block with so many CPU threads."""
-    return _restored(torch.set_num_threads, torch.get_num_threads(), number)
+    return _changed(torch.set_num_threads, torch.get_num_threads(), number)
 
 
 @contextlib.contextmanager
-def _restored(change: Callable[[Any], object], before: Any, within: Any) -> Iterator[None]:
-    """Run a block with another value of a setting of PyTorch's."""
-    change(within)
+def _changed(setter: Callable[[Any], object], before: Any, within: Any) -> Iterator[None]:
+    """Run a block with another value of a setting of PyTorch's, and set the one before again."""
+    setter(within)
     try:
         yield
     finally:
-        change(before)
+        setter(before)
 
 
 def suitable_threads(width: int) -> contextlib.AbstractContextManager[None]:

@@ -52,9 +52,11 @@ def look_up_kind(what: str, name: str, known: Mapping[str, type], needed: Sequen
     """
     kind = look_up(what, name, known)
     lacks = [word for word in needed if not hasattr(kind, word)]
-    if lacks := [*lacks, *sorted(getattr(kind, "__abstractmethods__", ()))]:
+    lacks += sorted(getattr(kind, "__abstractmethods__", ()))
+    if lacks:
         raise ConfigError(f"{what} {name!r} lacks {', '.join(lacks)}: give them to {kind.__name__}")
-    if (own := getattr(kind, "name", None)) != name:
+    own = getattr(kind, "name", None)
+    if own != name:
         raise ConfigError(f"{what} {name!r} calls itself {own!r}: give the class this name")
     return kind
 

@@ -109,7 +109,7 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
     earlier ones as they were. Whoever is killed between two moves leaves a folder without the last.
     Missing folders are made. Raises OSError, which names the last file, where that is not possible.
     """
-    *_, last = contents
+    last = [*contents][-1]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # A new folder of a random name: nobody else writes there, or has put a link in its place.
@@ -165,11 +165,12 @@ def locked(path: Path) -> Iterator[None]:
     """
     lock = FileLock(path)
     try:
-        # It warns before it takes another kind, which would wait for files that locks have left.
-        with warnings.catch_warnings(action="error"):
+        # Where the file system knows no locks, FileLock warns, and would then take the presence of
+        # a file for one; but a killed process leaves that file behind.
+        with contextlib.suppress(UserWarning), warnings.catch_warnings(action="error"):
             lock.acquire()
-    except (OSError, UserWarning) as error:
-        if getattr(error, "errno", errno.ENOSYS) not in _NO_LOCKS:
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
             raise
     try:
         yield

@@ -32,11 +32,12 @@ def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
     >>> quaternion_to_matrix(torch.tensor([0.0, 0.0, 0.0, 2.0])).diagonal().tolist()
     [-1.0, -1.0, 1.0]
     """
-    like = q_wxyz.device, q_wxyz.dtype
+    device, dtype = q_wxyz.device, q_wxyz.dtype
     w, v = normalize_quaternion(q_wxyz).split([1, 3], dim=-1)
-    identity = constant(_IDENTITY, *like)
-    cross = (v[..., None] * constant(_CROSS, *like)).sum(-2).unflatten(-1, (3, 3))
-    return torch.add(identity, cross @ torch.addcmul(cross, w[..., None], identity), alpha=2)
+    identity = constant(_IDENTITY, device, dtype)
+    cross = (v[..., None] * constant(_CROSS, device, dtype)).sum(-2).unflatten(-1, (3, 3))  # [v]×
+    w_identity_plus_cross = torch.addcmul(cross, w[..., None], identity)
+    return torch.add(identity, cross @ w_identity_plus_cross, alpha=2)
 
 
 def matrix_to_quaternion(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
@@ -47,7 +48,7 @@ def matrix_to_quaternion(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor,
     """
     difference = rotation - rotation.mT
     total = rotation + rotation.mT
-    xx, yy, zz = (rotation[..., i, i] for i in range(3))
+    xx, yy, zz = rotation.diagonal(dim1=-2, dim2=-1).unbind(-1)
     wx, wy, wz = difference[..., 2, 1], difference[..., 0, 2], difference[..., 1, 0]
     xy, xz, yz = total[..., 0, 1], total[..., 0, 2], total[..., 1, 2]
     entries = [
@@ -66,9 +67,9 @@ def make_transform(
     rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
     """Homogeneous transform from a rotation matrix and a translation (m)."""
+    top = torch.cat([rotation, translation.unsqueeze(-1)], dim=-1)
     bottom = constant(((0, 0, 0, 1),), rotation.device, rotation.dtype)
-    bottom = bottom.expand(*rotation.shape[:-2], 1, 4)
-    return torch.cat([torch.cat([rotation, translation.unsqueeze(-1)], dim=-1), bottom], dim=-2)
+    return torch.cat([top, bottom.expand(*rotation.shape[:-2], 1, 4)], dim=-2)
 
 
 def transform_points(

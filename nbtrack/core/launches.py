@@ -47,6 +47,7 @@ class Recording:
         return self.result.clone()  # the next replay writes over it
 
     def _watch(self, work: Callable[[], Tensor]) -> Tensor:
+        """Call the work; if it waits for the device when it should no more, do not record it."""
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             torch.cuda.set_sync_debug_mode("warn")

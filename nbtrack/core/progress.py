@@ -20,6 +20,7 @@ def tell(news: str) -> None:
 
 
 def _is_notebook() -> bool:
+    """Whether this process is the kernel of a notebook."""
     ipython = sys.modules.get("IPython")
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
@@ -59,15 +60,16 @@ class ProgressBar(tqdm):
             options |= {"file": _Line(), "mininterval": 1.0}
         elif not sys.stderr.isatty():
             options |= {"file": _Line(), "mininterval": _LINE_SECONDS, "bar_format": _LINE_FORMAT}
-        how = {"disable": not is_shown, "delay": _DELAY_SECONDS, "miniters": 0, "ascii": False}
-        super().__init__(total=total, desc=title, **options, **how)
+        options |= {"disable": not is_shown, "delay": _DELAY_SECONDS, "miniters": 0, "ascii": False}
+        super().__init__(total=total, desc=title, **options)
 
     @property
     def format_dict(self) -> dict[str, Any]:
         """What is shown; the time that is left comes from the mean speed after the warm-up."""
         values = super().format_dict
-        worked, seconds = self.n - self.warm_up[0], values["elapsed"] - self.warm_up[1]
-        return values | {"rate": worked / max(seconds, 1e-3)}
+        warm_up_work, warm_up_seconds = self.warm_up
+        seconds = values["elapsed"] - warm_up_seconds
+        return values | {"rate": (self.n - warm_up_work) / max(seconds, 1e-3)}
 
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much is done, and a word on how it goes."""

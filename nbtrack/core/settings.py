@@ -82,8 +82,8 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
 
 def changed_settings(config: Config, original: Config) -> list[str]:
     """The `key=value` texts that turn the original into this config."""
-    before = flat(original).items()
-    return [f"{k}={json.dumps(v)}" for k, v in flat(config).items() if (k, v) not in before]
+    before = flat(original)
+    return [f"{k}={json.dumps(v)}" for k, v in flat(config).items() if before.get(k) != v]
 
 
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -109,12 +109,16 @@ def _replaced(node: Any, path: list[str], key: str, value: Any, allowed: Mapping
 
 
 def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
+    """A value in the type of the old one; ConfigError for another type, or one not allowed.
+
+    One value stands for a list of one, and a whole number for a float; nothing else is converted.
+    """
     wanted = type(old)
     if wanted is tuple and isinstance(value, list | tuple | str | int | float):
         values = value if isinstance(value, list | tuple) else [value]
         if not values:
             raise ConfigError(f"{key} = []: give at least one, for example {list(old)}")
-        return tuple(_converted(key, old[0], v, allowed) if old else v for v in values)
+        return tuple(_converted(key, old[0], part, allowed) if old else part for part in values)
     # Integers of TOML may be too large for a float, or to be printed.
     if type(value) is int and value.bit_length() > 10_000:
         value = math.inf
