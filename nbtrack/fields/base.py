@@ -131,8 +131,9 @@ class LearnedField(Field):
         NeuS evaluates the network there once more).
         """
         weights = self.weights(values, rays, depths)
-        if weights.shape != depths.shape:
-            colors, depths = ((ends[:, 1:] + ends[:, :-1]) / 2 for ends in (colors, depths))
+        if weights.shape != depths.shape:  # of sections
+            colors = (colors[:, 1:] + colors[:, :-1]) / 2
+            depths = (depths[:, 1:] + depths[:, :-1]) / 2
         return rendering.composite(weights, colors, depths)
 
     def query_along(self, rays: Rays, depths: RaySamples) -> tuple[RayColors, RaySamples]:
@@ -142,7 +143,8 @@ class LearnedField(Field):
 
     def render(self, rays: Rays, depths: RaySamples) -> Rendering:
         """Volume rendering with samples at ascending z-depths (m)."""
-        return self.composite(*self.query_along(rays, depths), rays, depths)
+        colors, values = self.query_along(rays, depths)
+        return self.composite(colors, values, rays, depths)
 
     @torch.no_grad()
     def hierarchical_depths(
@@ -160,12 +162,12 @@ class LearnedField(Field):
     ) -> Rendering:
         """What `render` gives at `hierarchical_depths`, with every sample asked for once."""
         coarse, colors, values, fine = self._two_passes(rays, n_stratified, n_importance, generator)
-        depths, order = torch.cat([coarse, fine], dim=-1).sort(dim=-1)
         fine_colors, fine_values = self.query_along(rays, fine)
-        colors = torch.cat([colors, fine_colors], dim=1)
-        colors = colors.gather(1, order[..., None].expand_as(colors))
-        values = torch.cat([values, fine_values], dim=1).gather(1, order)
-        return self.composite(colors, values, rays, depths)
+        depths, order = torch.cat([coarse, fine], dim=-1).sort(dim=-1)
+        all_colors = torch.cat([colors, fine_colors], dim=1)
+        all_colors = all_colors.gather(1, order[..., None].expand_as(all_colors))
+        all_values = torch.cat([values, fine_values], dim=1).gather(1, order)
+        return self.composite(all_colors, all_values, rays, depths)
 
     def render_view(self, camera: Intrinsics, T_world_camera: Pose) -> View:
         """Colour in [0, 1] and z-depth (m) from a camera pose. Nothing in it is random."""
@@ -180,9 +182,10 @@ class LearnedField(Field):
     def render_rays(self, origins_world: Points, directions_world: Points) -> tuple[Colors, Values]:
         """Colour and z-depth (m) of rays, by two passes with fixed samples."""
         parts = []
-        both = (x.split(_RAYS_AT_ONCE) for x in (origins_world, directions_world))
-        for origins, directions in zip(*both, strict=True):
-            unknown = torch.zeros_like(origins)
+        some_origins = origins_world.split(_RAYS_AT_ONCE)
+        some_directions = directions_world.split(_RAYS_AT_ONCE)
+        for origins, directions in zip(some_origins, some_directions, strict=True):
+            unknown = torch.zeros_like(origins)  # what was observed there
             rays = Rays(origins, directions, unknown, unknown[:, 0])
             parts.append(self.render_hierarchically(rays, _N_STRATIFIED, _N_IMPORTANCE))
         color = torch.cat([part.color.clamp(0, 1) for part in parts])

@@ -42,6 +42,6 @@ class IMapField(LearnedField):
         """iMAP's geometric and photometric losses."""
         rays = draw(settings.n_rays)
         # Not guided by measured depths: tracking has no such help, and would see a thinner map.
-        n_samples = settings.n_stratified, settings.n_surface
-        rendered = self.render(rays, self.hierarchical_depths(rays, *n_samples, generator))
+        n_first, n_second = settings.n_stratified, settings.n_surface
+        rendered = self.render(rays, self.hierarchical_depths(rays, n_first, n_second, generator))
         return rendered_losses(rendered, rays, settings.lambda_color, 1.0, over_std=True)

@@ -72,7 +72,7 @@ class FourierMlp(nn.Module):
         if not (self.head.weight.requires_grad or points_world.is_cuda):
             n_at_once = max(1, _LAYER_SIZE // self.head.in_features)
         parts = [self.head(self.features(part)) for part in points_world.split(n_at_once)]
-        raw = torch.cat(parts) if parts[1:] else parts[0]
+        raw = torch.cat(parts) if len(parts) > 1 else parts[0]
         color, value = raw.split([3, 1], dim=1)
         return color, value.squeeze(1)
 

@@ -73,10 +73,10 @@ class NeuSField(LearnedField):
 
     def _eikonal(self, points_world: Tensor, settings: NeusMapping, generator: Generator) -> Scalar:
         """Weighted mean (|grad f| - 1)^2 over a share of the ray samples, drawn anew every time."""
-        points = points_world.flatten(0, 1)
-        n_points = max(1, round(settings.eikonal_share * len(points)))
-        chosen = torch.randint(len(points), (n_points,), generator=generator, device=points.device)
-        points = points[chosen].detach().requires_grad_()
+        flat = points_world.flatten(0, 1)
+        n_points = max(1, round(settings.eikonal_share * len(flat)))
+        chosen = torch.randint(len(flat), (n_points,), generator=generator, device=flat.device)
+        points = flat[chosen].detach().requires_grad_()
         (gradient,) = torch.autograd.grad(self(points)[1].sum(), points, create_graph=True)
         return settings.lambda_eikonal * (gradient.norm(dim=-1) - 1).square().mean()
 
@@ -101,6 +101,7 @@ class NeuSField(LearnedField):
         normal.diagonal().add_(1e-3 * normal.diagonal().mean())
         moments = design.T @ (target / self.mlp.metres_per_unit).double()
         solution = torch.linalg.solve(normal, moments).float()
+        # Of the head's outputs the first three are the colour, the last is the distance.
         self.mlp.head.weight[3] = solution[:-1]
         self.mlp.head.bias[3] = solution[-1]
 
@@ -117,7 +118,7 @@ def guided_depths(
     measured = rays.depth > 0
     far = torch.where(measured, rays.depth + settings.surface_band, far_bound)
     coarse = rendering.stratified_depths(base.NEAR, far, settings.n_stratified, generator)
-    around = rendering.stratified_depths(-1.0, torch.ones_like(far), settings.n_surface, generator)
+    offsets = rendering.stratified_depths(-1.0, torch.ones_like(far), settings.n_surface, generator)
     center = torch.where(measured, rays.depth, far_bound)
-    around = (center[:, None] + settings.surface_band * around).clamp_min(base.NEAR)
+    around = (center[:, None] + settings.surface_band * offsets).clamp_min(base.NEAR)
     return torch.cat([coarse, around], dim=-1).sort(dim=-1).values

@@ -104,8 +104,10 @@ def _read_file(file: Path) -> Map:
     """The map of a file. Raises ValueError, KeyError and others if it is not sound."""
     content = file.read_bytes()  # safetensors itself opens no path whose letters are not UTF-8
     tensors = safetensors.torch.load(content)
+    # A safetensors file begins with the size of its JSON header, in 8 bytes, and that header.
     size = int.from_bytes(content[:8], "little")
-    header = dict(json.loads(json.loads(content[8:][:size])["__metadata__"][_FORMAT]))
+    metadata = json.loads(content[8:][:size])["__metadata__"]
+    header = dict(json.loads(metadata[_FORMAT]))
     if header.get("format_version") != _VERSION:
         raise ValueError(f"format {header.get('format_version')!r}; this nbtrack reads {_VERSION}")
     # A bit that flipped on a disk, or a number edited by hand, shows nowhere else.
@@ -114,7 +116,7 @@ def _read_file(file: Path) -> Map:
     name = header["field"]
     record = header["made"]
     _check_content(header, tensors)
-    corners = (tuple(map(float, corner)) for corner in header["bounds"])
+    corners = [tuple(map(float, corner)) for corner in header["bounds"]]
     bounds = SceneBounds(*corners, header.get("declared_unit"))
     if name not in FIELDS:
         advice = "import the file of its class first (--import FILE.py)"

@@ -85,9 +85,7 @@ def map_sequence(
     return Map(field, sequence.intrinsics, record, pd.DataFrame(history).rename_axis("iteration"))
 
 
-def recipe_of(
-    field_name: str, sequence: RgbdSequence, network: Any, settings: Any, seed: int
-) -> dict[str, Any]:
+def recipe_of(field_name: str, sequence: RgbdSequence, network, settings, seed: int) -> dict:
     """What a map is made of, as plain values: two maps of one recipe are the same map."""
     ids = sequence.frame_ids
     return {
@@ -107,9 +105,8 @@ def check_recipe(path: Path, recipe: dict[str, Any], wanted: dict[str, Any]) -> 
     """Raises DataError if a map or checkpoint at a path was made of something else."""
     changed = [name.replace("_", " ") for name in wanted if recipe.get(name) != wanted[name]]
     if changed:
-        raise DataError(
-            f"{path} was made with another {', '.join(changed)}: remove it, or name another"
-        )
+        advice = "remove it, or name another"
+        raise DataError(f"{path} was made with another {', '.join(changed)}: {advice}")
 
 
 class _Fit:
@@ -129,7 +126,7 @@ class _Fit:
         field.prepare(sequence, mapped)
         self.seconds = 0.0
         self.history = []
-        self.terms: list[str] = []
+        self.terms: list[str] = []  # names of the losses, told by the first batch
 
     def run(self, checkpoint: Path | None, on_iteration: OnIteration) -> None:
         """From the checkpoint, where there is one, to the last iteration."""
@@ -137,8 +134,8 @@ class _Fit:
             self._load(checkpoint)
         last_saved = time.perf_counter()
         end = self.settings.iterations
-        while (done := len(self.history)) < end:
-            self._advance(range(done, min(end, done + _PENDING)))
+        for first in range(len(self.history), end, _PENDING):
+            self._advance(range(first, min(end, first + _PENDING)))
             on_iteration(len(self.history) / end, self.history[-1])
             is_due = time.perf_counter() - last_saved > CHECKPOINT_SECONDS
             if checkpoint and (is_due or len(self.history) == end):
@@ -147,6 +144,7 @@ class _Fit:
         self.field.eval().requires_grad_(False)
 
     def _advance(self, iterations: range) -> None:
+        """Descend some iterations, whose losses are then looked at all at once."""
         start = time.perf_counter()
         pending = []
         for iteration in iterations:
@@ -156,24 +154,22 @@ class _Fit:
         for iteration, row in zip(iterations, torch.stack(pending).tolist(), strict=True):
             values = dict(zip(self.terms, row, strict=True))
             if not all(map(math.isfinite, row)):
-                raise NumericalError(
-                    f"losses {values} at mapping iteration {iteration}: lower the learning rate "
-                    f"({self.settings.learning_rate:g}) or check the depth and poses"
-                )
+                rate = f"the learning rate ({self.settings.learning_rate:g})"
+                found = f"losses {values} at mapping iteration {iteration}"
+                raise NumericalError(f"{found}: lower {rate} or check the depth and poses")
             self.history.append({**values, "total": sum(row), **diagnostics})
         self.seconds += time.perf_counter() - start
 
     def _descend(self) -> torch.Tensor:
+        """One step of Adam on a batch; its losses, in the order of `terms`, before the step."""
         draw = partial(self.sampler.draw, generator=self.generator, frames=self.frames)
         terms = self.field.mapping_losses(draw, self.settings, self.generator)
         found = f"mapping_losses of {self.field.name} gave"
         if not isinstance(terms, dict):
             raise ConfigError(f"{found} no dict: give terms by name")
-        if [*terms] != (self.terms or [*terms]):
-            raise ConfigError(
-                f"{found} {', '.join(terms)} after {', '.join(self.terms)}: give the same terms "
-                "every time, 0 where one is not used"
-            )
+        if self.terms and [*terms] != self.terms:
+            advice = "give the same terms every time, 0 where one is not used"
+            raise ConfigError(f"{found} {', '.join(terms)} after {', '.join(self.terms)}: {advice}")
         self.terms = [*terms]
         losses = torch.stack([*terms.values()])
         self.optimizer.zero_grad()
@@ -182,11 +178,13 @@ class _Fit:
         return losses.detach()
 
     def _save(self, checkpoint: Path) -> None:
-        state = {name: getattr(self, name) for name in ("recipe", "seconds", "history")}
+        """Write all that the next iteration depends on, and what tells of which map it is."""
+        state = {"recipe": self.recipe, "seconds": self.seconds, "history": self.history}
         state |= {"field": self.field.state_dict(), "optimizer": self.optimizer.state_dict()}
         save_checkpoint(checkpoint, {**state, "generator": self.generator.get_state()})
 
     def _load(self, checkpoint: Path) -> None:
+        """Take up what `_save` wrote; DataError if it is damaged or of another map."""
         with loaded_checkpoint(checkpoint) as state:
             check_recipe(checkpoint, state["recipe"], self.recipe)
             self.field.load_state_dict(state["field"])

@@ -46,13 +46,15 @@ def depth_residual_of(field: Field, frame: Frame) -> float:
     if not isinstance(field, LearnedField):
         points_world = transform_points(T_world_camera, frame.points(rows, columns)[0])
         return float(field(points_world)[1].abs().median())
-    directions = pixel_directions(frame.camera, columns, rows) @ T_world_camera[:3, :3].T
-    origins, measured = T_world_camera[:3, 3].expand_as(directions), frame.at(rows, columns)[1]
-    return float((field.render_rays(origins, directions)[1] - measured).abs().median())
+    directions_world = pixel_directions(frame.camera, columns, rows) @ T_world_camera[:3, :3].T
+    origins_world = T_world_camera[:3, 3].expand_as(directions_world)
+    rendered = field.render_rays(origins_world, directions_world)[1]
+    return float((rendered - frame.at(rows, columns)[1]).abs().median())
 
 
 def usual_depth_residual(field: Field, sequence: RgbdSequence, mapped: Frames) -> float:
     """The median misfit (m) of some of the mapped frames, evenly spread; 0 if none has a depth."""
     spread = np.linspace(0, len(mapped) - 1, min(_MISFIT_FRAMES, len(mapped))).round().astype(int)
     frames = [sequence[index] for index in mapped[spread].tolist()]
-    return float(np.median([depth_residual_of(field, f) for f in frames if f.has_depth] or [0.0]))
+    residuals = [depth_residual_of(field, frame) for frame in frames if frame.has_depth]
+    return float(np.median(residuals)) if residuals else 0.0
