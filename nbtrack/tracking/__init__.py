@@ -28,9 +28,8 @@ def check_pair(tracker_name: str, field: str | type) -> None:
     kind = field_class(field) if isinstance(field, str) else field
     if not tracker.works_in(kind):
         fits = ", ".join(name for name, other in FIELDS.items() if tracker.works_in(other))
-        raise ConfigError(
-            f"tracker {tracker_name!r} does not work on field {kind.name!r}: take one of {fits}"
-        )
+        mismatch = f"tracker {tracker_name!r} does not work on field {kind.name!r}"
+        raise ConfigError(f"{mismatch}: take one of {fits}")
     if tracker.package and importlib.util.find_spec(tracker.package) is None:
         extra = f"pip install 'nbtrack[{tracker_name}]'"
         raise MissingError(f"tracker {tracker_name} needs the package {tracker.package}: {extra}")

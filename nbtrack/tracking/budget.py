@@ -49,11 +49,14 @@ class ClockBudget:
         return self._steps(self._now(device), device)
 
     def _now(self, device: torch.device) -> float:
+        """The clock (s) when all that is queued on the device is done."""
         synchronize(device)
         return self._clock()
 
     def _steps(self, start: float, device: torch.device) -> Generator[int, None, None]:
-        prepared = now = self._now(device)
+        """The steps of a frame that began at `start` (s), asked for when it is prepared."""
+        prepared = self._now(device)
+        now = prepared
         mean = self.memory
         self.memory = None
         step = 0
@@ -63,7 +66,8 @@ class ClockBudget:
             finally:  # a search that has converged closes the frame at its last step
                 step += 1
                 now = self._now(device)
-                mean = self.memory = (now - prepared) / step
+                mean = (now - prepared) / step
+                self.memory = mean
 
 
 class StepBudget:
@@ -85,9 +89,10 @@ class StepBudget:
 
     def frame(self, device: torch.device = _HOST) -> Generator[int, None, None]:
         """Starts the next frame, on any device; yields 0, 1, ... while another step is allowed."""
-        done = floor(self.memory * self._exact)
+        steps_before = floor(self.memory * self._exact)
         self.memory += 1
-        yield from range(floor(self.memory * self._exact) - done)
+        steps_after = floor(self.memory * self._exact)
+        yield from range(steps_after - steps_before)
 
 
 Budget = ClockBudget | StepBudget
@@ -99,9 +104,8 @@ def make_budget(steps: Number | None, rate_hz: Number | None) -> Budget:
     Raises ConfigError if there are both or neither, or the number is far out.
     """
     if (steps is None) == (rate_hz is None):
-        raise ConfigError(
-            f"steps={steps} and rate_hz={rate_hz}: a frame has one budget; give --steps or --rate"
-        )
+        advice = "a frame has one budget; give --steps or --rate"
+        raise ConfigError(f"steps={steps} and rate_hz={rate_hz}: {advice}")
     return StepBudget(steps) if rate_hz is None else ClockBudget(rate_hz)
 
 
@@ -121,6 +125,7 @@ def paper_steps(tracker: str, rate_hz: Number) -> float:
 
 
 def _positive(name: str, value: Number) -> float:
+    """The value; ConfigError, by its name, if it is not 0.001 to 1e6."""
     if not 1e-3 <= value <= 1e6:  # beyond, a frame takes no step or never ends
         raise ConfigError(f"{name} is {value:g}; allowed: 0.001 to 1e+06; take for example 10")
     return float(value)

@@ -60,7 +60,8 @@ def find_methods(methods: Methods) -> list[Method]:
     """
     chosen = []
     check_lists(methods=methods)
-    for method in dict.fromkeys(methods):
-        chosen.append(look_up("method", method, METHODS) if isinstance(method, str) else method)
-        check_pair(chosen[-1].tracker, chosen[-1].field)
+    for named in dict.fromkeys(methods):  # each once
+        method = look_up("method", named, METHODS) if isinstance(named, str) else named
+        check_pair(method.tracker, method.field)
+        chosen.append(method)
     return chosen

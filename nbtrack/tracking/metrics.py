@@ -29,14 +29,14 @@ def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | i
     counts = {"frames": len(T_true), "frames_without_reference": int((~is_known).sum())}
     if not is_known.any():
         return counts
-    T_estimated, T_true = T_estimated[is_known], T_true[is_known]
-    errors, angles = pose_errors(T_estimated, T_true)
-    estimated, true = T_estimated[:, :3, 3], T_true[:, :3, 3]
-    aligned_errors = np.linalg.norm(align_rigidly(estimated, true) - true, axis=1)
+    errors, angles_deg = pose_errors(T_estimated[is_known], T_true[is_known])
+    positions, true_positions = T_estimated[is_known, :3, 3], T_true[is_known, :3, 3]
+    aligned = align_rigidly(positions, true_positions)
+    aligned_errors = np.linalg.norm(aligned - true_positions, axis=1)
     return {
         "ate_rmse_m": _root_mean_square(errors),  # unaligned: the paper's equation
         "ate_rmse_aligned_m": _root_mean_square(aligned_errors),  # after the best rigid motion
-        "rotation_rmse_deg": _root_mean_square(angles),
+        "rotation_rmse_deg": _root_mean_square(angles_deg),
         "median_error_m": float(np.median(errors)),
         "max_error_m": float(errors.max()),
         **counts,
@@ -65,12 +65,10 @@ def pose_errors(T_estimated: Poses, T_true: Poses) -> tuple[Errors, Errors]:
     numbers of poses, or none, and for one that is not finite.
     """
     n_frames = len(T_true)
-    is_paired = len(T_estimated) == n_frames > 0
+    is_paired = n_frames > 0 and len(T_estimated) == n_frames
     if not (is_paired and np.isfinite(T_estimated + T_true).all()):
-        raise DataError(
-            f"{len(T_estimated)} estimated and {n_frames} true poses: give equally many, at least "
-            "one, of frames whose poses are known and finite"
-        )
+        advice = "give equally many, at least one, of frames whose poses are known and finite"
+        raise DataError(f"{len(T_estimated)} estimated and {n_frames} true poses: {advice}")
     turn = T_true[:, :3, :3].mT @ T_estimated[:, :3, :3]
     distances = np.linalg.norm(T_estimated[:, :3, 3] - T_true[:, :3, 3], axis=1)
     return distances, np.degrees(Rotation.from_matrix(turn).magnitude())
@@ -90,4 +88,5 @@ def align_rigidly(points: Positions, targets: Positions) -> Positions:
 
 
 def _root_mean_square(values: Errors) -> float:
+    """The square root of the mean of the squares, in the unit of the values."""
     return float(np.sqrt(np.mean(values**2)))

@@ -69,19 +69,19 @@ class AdamTracker(Tracker):
         T_start = T_starts[0]
         with torch.no_grad():
             if len(T_starts) > 1:
-                self._draw()
-                drawn = self._drawn()
-                losses = torch.stack([self.loss(T, *drawn) for T in T_starts])
+                self._choose_pixels()
+                losses = torch.stack([self._loss_at(T) for T in T_starts])
                 T_start = T_starts[losses.argmin()]
             self.position.copy_(T_start[:3, 3])
             self.q_wxyz.copy_(geometry.matrix_to_quaternion(T_start[:3, :3]))
+            # A fresh Adam; its state is emptied in place, since recorded steps read it there.
             for moments in self.optimizer.state.values():
                 for value in moments.values():
                     value.zero_()
 
     def step(self) -> Scalar:
         """Draw pixels, lower their loss by one step of Adam, renormalise the quaternion."""
-        self._draw()
+        self._choose_pixels()
         return self.recording.run(self._descend)
 
     def _allocate(self, frame: Frame) -> None:
@@ -98,24 +98,27 @@ class AdamTracker(Tracker):
         self.recording = Recording(f"tracker {self.name}", self.generator)
 
     def _descend(self) -> Scalar:
+        """One step of Adam on the chosen pixels; returns the loss before it."""
         self.optimizer.zero_grad()
-        loss = self.loss(self.T_world_camera, *self._drawn())
+        loss = self._loss_at(self.T_world_camera)
         loss.backward()
         self.optimizer.step()
         with torch.no_grad():
             self.q_wxyz.div_(self.q_wxyz.norm(dim=-1, keepdim=True))
         return loss.detach()
 
-    def _draw(self) -> None:
+    def _choose_pixels(self) -> None:
         """Choose random measured pixels; how many there are changes, so it is not recorded."""
-        how = {"generator": self.generator, "device": self.device}
-        drawn = torch.randint(self.measured.shape[1], (self.settings.n_pixels,), **how)
-        torch.index_select(self.measured, 1, drawn, out=self.pixels)
+        n_measured, size = self.measured.shape[1], (self.settings.n_pixels,)
+        chosen = torch.randint(n_measured, size, generator=self.generator, device=self.device)
+        torch.index_select(self.measured, 1, chosen, out=self.pixels)
 
-    def _drawn(self) -> tuple[Points, Colors, Values]:
-        """Rays, colours and depths of the chosen pixels."""
+    def _loss_at(self, T_world_camera: Transform) -> Scalar:
+        """The loss of the chosen pixels at a pose."""
         rows, columns = self.pixels
-        return pixel_directions(self.frame.camera, columns, rows), *self.frame.at(rows, columns)
+        directions_camera = pixel_directions(self.frame.camera, columns, rows)
+        color, depth = self.frame.at(rows, columns)
+        return self.loss(T_world_camera, directions_camera, color, depth)
 
     @property
     def T_world_camera(self) -> Transform:
@@ -150,10 +153,10 @@ class VrTracker(AdamTracker):
         rotation, position = T_world_camera[:3].split([3, 1], dim=-1)
         directions_world = directions_camera @ rotation.T
         rays = Rays(position.T.expand_as(directions_world), directions_world, color, depth)
-        n_samples = self.settings.n_stratified, self.settings.n_importance
-        rendered = self.field.render_hierarchically(rays, *n_samples, self.generator)
-        lambdas = self.settings.lambda_color, self.settings.lambda_depth
-        terms = rendered_losses(rendered, rays, *lambdas, over_std=True)
+        n_first, n_second = self.settings.n_stratified, self.settings.n_importance
+        rendered = self.field.render_hierarchically(rays, n_first, n_second, self.generator)
+        lambda_color, lambda_depth = self.settings.lambda_color, self.settings.lambda_depth
+        terms = rendered_losses(rendered, rays, lambda_color, lambda_depth, over_std=True)
         return terms["depth"] + terms["color"]
 
 

@@ -42,24 +42,21 @@ def reach(steps: float, rate: float) -> float:
     return steps * rate
 
 
-def motion_of(
-    T_world_camera: Poses, motion_model: str = "previous_pose"
-) -> tuple[Motions, Motions]:
+def motion_of(T_world_camera: Poses, motion_model="previous_pose") -> tuple[Motions, Motions]:
     """Offsets and turns that a path leaves to the search of every frame but the first.
 
     Every frame before is taken to be found exactly.
     """
-    offsets, turns = np.zeros((2, len(T_world_camera) - 1, 3))
-    for k, T_true in enumerate(T_world_camera[1:]):
-        T_start = _nearest_start(motion_model, [*T_world_camera[max(0, k - 1) : k + 1]], T_true)
-        offsets[k] = T_true[:3, 3] - T_start[:3, 3]
-        turns[k] = Rotation.from_matrix(T_start[:3, :3].T @ T_true[:3, :3]).as_rotvec()
+    offsets = np.zeros((len(T_world_camera) - 1, 3))
+    turns = np.zeros_like(offsets)
+    for k, T_true in enumerate(T_world_camera[1:], start=1):
+        T_start = _nearest_start(motion_model, [*T_world_camera[max(0, k - 2) : k]], T_true)
+        offsets[k - 1] = T_true[:3, 3] - T_start[:3, 3]
+        turns[k - 1] = Rotation.from_matrix(T_start[:3, :3].T @ T_true[:3, :3]).as_rotvec()
     return offsets, turns
 
 
-def greedy_follower(
-    T_world_camera: Poses, reach_m: float, motion_model: str = "previous_pose"
-) -> Poses:
+def greedy_follower(T_world_camera: Poses, reach_m: float, motion_model="previous_pose") -> Poses:
     """The path of a greedy search with a reach (m): it ends each frame as near as it can.
 
     It knows the true pose, moves towards it by at most the reach along each axis, and turns at
@@ -80,9 +77,7 @@ def least_ate(T_world_camera: Poses, reach_m: float, motion_model: str = "previo
     return trajectory_metrics(followed[1:], T_world_camera[1:])["ate_rmse_m"]
 
 
-def reach_metrics(
-    reach: Reach | None, T_world_camera: Poses, motion_model: str
-) -> dict[str, float]:
+def reach_metrics(reach: Reach | None, T_world_camera: Poses, motion_model) -> dict[str, float]:
     """The reach of a run, the share of its frames that ask for more, and the greedy ATE (m).
 
     Nothing of a search without a bound; the reach alone where a pose (m) of the path, the given
@@ -93,7 +88,8 @@ def reach_metrics(
     metrics = {"reach_m": reach.position, "reach_deg": float(np.degrees(reach.orientation))}
     if not np.isfinite(T_world_camera).all() or len(T_world_camera) < 2:
         return metrics
-    exceeded = reach.is_exceeded(*motion_of(T_world_camera, motion_model))
+    offsets, turns = motion_of(T_world_camera, motion_model)
+    exceeded = reach.is_exceeded(offsets, turns)
     least_m = least_ate(T_world_camera, reach.position, motion_model)
     return {**metrics, "beyond_reach_share": float(exceeded.mean()), "least_ate_m": least_m}
 

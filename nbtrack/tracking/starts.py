@@ -14,12 +14,10 @@ def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
     T_k-1 (T_k-2^-1 T_k-1) (ORB-SLAM); or at both, for the tracker to choose: hands start and stop
     within a frame. Raises ConfigError, naming the nearest, for any other model.
     """
-    last = moved_on = estimates[-1]
-    if len(estimates) > 1:
+    last = estimates[-1]
+    starts = {"previous_pose": [last], "constant_velocity": [last], "better_of_both": [last]}
+    if len(estimates) > 1:  # else no velocity is known
         moved_on = last @ np.linalg.inv(estimates[-2]) @ last
-    starts = {
-        "previous_pose": [last],
-        "constant_velocity": [moved_on],
-        "better_of_both": [moved_on, last],
-    }
-    return look_up("motion model", motion_model, starts)[: len(estimates)]
+        starts["constant_velocity"] = [moved_on]
+        starts["better_of_both"] = [moved_on, last]
+    return look_up("motion model", motion_model, starts)

@@ -138,7 +138,7 @@ class Tracker(abc.ABC):
         What the frames before left is forgotten: velocities, and whatever a subclass remembers.
         Random numbers and the budget go on.
         """
-        pose = np.array(T_world_camera, dtype=np.float64)
+        pose = np.array(T_world_camera, dtype=np.float64)  # a copy: the other one is the user's
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise DataError("T_world_camera is no rigid transform: give 4 x 4 finite numbers")
         self.estimates = [*checked_poses(pose[None], Path("T_world_camera"))]
@@ -153,6 +153,7 @@ class Tracker(abc.ABC):
     @classmethod
     def check_finds(cls, in_corrected: bool) -> None:
         """Raises ConfigError if it cannot find a camera, in a corrected map or in another."""
+        # Those that can have a `restart_anywhere` of their own.
         if cls.restart_anywhere is Tracker.restart_anywhere or not in_corrected:
             raise ConfigError(
                 f"tracker {cls.name!r} cannot find a camera whose first pose is not known: take lm "
@@ -176,18 +177,22 @@ class Tracker(abc.ABC):
         for name in self.remembers:
             setattr(self, name, state[name])
 
+    def _warm_up(self, frame: Frame, T_starts: Poses) -> None:
+        """Take steps that count nowhere: first calls load, allocate and record for a second."""
+        state = self.state()
+        self._is_warm = True
+        self.begin(frame.to(self.device), torch.from_numpy(T_starts[:1]))
+        for _ in range(CALLS_BEFORE_RECORDING + 1):
+            if not self.is_converged:
+                self.step()
+        self.report()
+        self.restore(state)
+        synchronize(self.device)
+
     def _search(self, frame: Frame, T_starts: Poses, budget: Budget) -> Estimate:
+        """Search a frame's pose from some poses, as long as the budget lets it."""
         if not self._is_warm and frame.has_depth:
-            # Steps that count nowhere: first calls load, allocate and record for a second or more.
-            state = self.state()
-            self._is_warm = True
-            self.begin(frame.to(self.device), torch.from_numpy(T_starts[:1]))
-            for _ in range(CALLS_BEFORE_RECORDING + 1):
-                if not self.is_converged:
-                    self.step()
-            self.report()
-            self.restore(state)
-            synchronize(self.device)
+            self._warm_up(frame, T_starts)
         began = time.perf_counter()
         allowed = budget.frame(self.device)
         self.begin(frame.to(self.device), torch.from_numpy(T_starts))

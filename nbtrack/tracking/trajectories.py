@@ -53,8 +53,8 @@ def track_sequence(
     DataError if there are fewer than two frames, or none of them has a measured depth.
     """
     _check_trackable(sequence)
-    first = int(is_start_known)
     rows = []
+    first = 1 if is_start_known else 0  # the first frame to track
     if is_start_known:
         tracker.restart(sequence.T_world_camera[0])
     else:
@@ -78,6 +78,7 @@ def track_sequence(
 
 
 def _check_trackable(sequence: RgbdSequence) -> None:
+    """Raises DataError for fewer than two frames, or where no frame has a measured depth."""
     if len(sequence) < 2:
         raise DataError(f"{sequence!r} is too short to track: give at least two frames")
     if not sequence.depths_mm.any():
@@ -88,18 +89,19 @@ def _check_trackable(sequence: RgbdSequence) -> None:
 
 
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
-    distance, angle = [np.nan], [np.nan]
-    T_true, T_first = sequence.T_world_camera[[index, 0]]
+    """A frame of `Trajectory.frames`; errors are NaN where its true pose is not known."""
+    T_true, T_first = sequence.T_world_camera[index], sequence.T_world_camera[0]
+    errors_m, errors_deg = [np.nan], [np.nan]
     if np.isfinite(T_true).all():
-        distance, angle = pose_errors(estimate.T_world_camera[None], T_true[None])
+        errors_m, errors_deg = pose_errors(estimate.T_world_camera[None], T_true[None])
     return {
         "frame_id": int(sequence.frame_ids[index]),
         "time": float(sequence.times[index]),
         "steps": estimate.steps,
         "seconds": estimate.seconds,
         "loss": estimate.loss,
-        "translation_error_m": float(distance[0]),
-        "rotation_error_deg": float(angle[0]),
+        "translation_error_m": float(errors_m[0]),
+        "rotation_error_deg": float(errors_deg[0]),
         "still_error_m": float(np.linalg.norm((T_true - T_first)[:3, 3])),  # of no motion
         "without_depth": estimate.without_depth,
         **estimate.report,
