@@ -94,7 +94,9 @@ class Execution:
 
 def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[Any]:
     """The results of all jobs, in order; those that are missing, and what they need, are made.
-    Raises what the first failing job raised, unless it is to keep going."""
+
+    Raises what the first failing job raised, unless it is to keep going.
+    """
     execution = execution or Execution()
     missing = {part.folder: part for job in jobs for part in _missing(job)}
     results: dict[Path, Any] = {}
@@ -107,10 +109,9 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
         bar.set_description_str(job.doing, refresh=False)
         bar.move_to(worked, f"{len(results)} of {len(missing)} done, {job.name}: {status}")
 
-    with (
-        ProgressBar(Job.doing, sum(job.work for job in missing.values())) as bar,
-        contextlib.closing(_outcomes(missing, results, show, execution)) as outcomes,
-    ):
+    work = sum(job.work for job in missing.values())
+    outcomes = _outcomes(missing, show, execution)
+    with ProgressBar(Job.doing, work) as bar, contextlib.closing(outcomes):
         for folder, outcome in outcomes:
             if isinstance(outcome, NbtrackError) and not execution.keep_going:
                 raise outcome
@@ -124,16 +125,16 @@ def _missing(job: Job | None) -> list[Job]:
     return [] if job is None or job.is_done else [*_missing(job.needs), job]
 
 
-def _outcomes(
-    jobs: Mapping[Path, Job], results: Mapping[Path, Any], show: Callable, execution: Execution
-) -> Iterator[tuple[Path, Any]]:
-    """What becomes of each job, as they end; each begins when what it needs is in the results."""
+def _outcomes(jobs: Mapping[Path, Job], show: Callable, execution: Execution) -> Iterator[tuple]:
+    """What becomes of each job, as they end; each begins when the one that it needs has ended."""
     usual = usable_cores() if choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, len(jobs))
     needs = {folder: job.needs.folder if job.needs else None for folder, job in jobs.items()}
+    results: dict[Path, Any] = {}
     if workers <= 1 and execution.dask is None:
         for folder, job in jobs.items():
-            yield folder, job.outcome(results.get(needs[folder]), partial(show, job))
+            results[folder] = job.outcome(results.get(needs[folder]), partial(show, job))
+            yield folder, results[folder]
         return
     waiting = list(jobs)
     running: dict[Future, Path] = {}
@@ -143,11 +144,13 @@ def _outcomes(
                 if execution.dask or len(running) < workers:
                     running[submit(jobs[folder], results.get(needs[folder]))] = folder
                     waiting.remove(folder)
-            show(jobs[next(iter(running.values()))])
-            ended, _ = wait(running, _LOOK_SECONDS, FIRST_COMPLETED)
             names = " or ".join(folder.name for folder in running.values())
+            show(jobs[next(iter(running.values()))])  # that runs for the longest
+            ended, _ = wait(running, _LOOK_SECONDS, FIRST_COMPLETED)
             for future in ended:
-                yield running.pop(future), _result_of(future, names)
+                folder = running.pop(future)
+                results[folder] = _result_of(future, names)
+                yield folder, results[folder]
 
 
 def _result_of(future: Future, names: str) -> Any:
@@ -168,9 +171,11 @@ def _submitting(address: str | None, workers: int) -> Iterator[Callable[[Job, An
     notebook or script travel whole, those of files by the name of their module.
     """
     settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
-    settings |= {k: v for k, v in os.environ.items() if k == "NBTRACK_DEVICE"}
+    if "NBTRACK_DEVICE" in os.environ:
+        settings["NBTRACK_DEVICE"] = os.environ["NBTRACK_DEVICE"]
     n_threads = 1 if address else max(1, torch.get_num_threads() // workers)
-    with _cluster(address) if address else _pool(workers) as executor:
+    workplace = _cluster(address) if address else _pool(workers)
+    with workplace as executor:
 
         def submit(job: Job, needed: Any) -> Future:
             work = cloudpickle.dumps((FIELDS, TRACKERS, job, needed))
@@ -179,9 +184,7 @@ def _submitting(address: str | None, workers: int) -> Iterator[Callable[[Job, An
         yield submit
 
 
-def _outcome_there(
-    settings: Mapping[str, str], search_path: Sequence[str], n_threads: int, work: bytes
-) -> Any:
+def _outcome_there(settings: Mapping, search_path: Sequence[str], n_threads: int, work: bytes):
     """Runs in a worker, which may have been started elsewhere."""
     os.environ |= settings
     sys.path += [folder for folder in search_path if folder not in sys.path]
@@ -216,9 +219,11 @@ def _end_with(pipe: Connection) -> None:
 
 @contextlib.contextmanager
 def _spared() -> Iterator[None]:
-    """Spare the processes that are started in a block what is this one's business: Ctrl-C, of
-    which each would tell in a traceback, and the main script, which Python runs in them once more:
-    without a `__main__` guard it would start processes from within them."""
+    """Let processes that are started in a block ignore Ctrl-C, and not run the main script again.
+
+    At Ctrl-C each would print a traceback. A main script without a `__main__` guard would start
+    processes from within them: Python runs again what `sys.modules` holds as `__main__`.
+    """
     script = sys.modules["__main__"]
     is_main = threading.current_thread() is threading.main_thread()  # others have no handlers
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
