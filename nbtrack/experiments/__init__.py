@@ -36,20 +36,20 @@ def import_own(source: str) -> None:
     file's name.
     """
     file = resolved(source)
-    name = source
-    if file.suffix == ".py" and not file.is_file():
+    is_file = file.suffix == ".py"
+    name = file.stem if is_file else source
+    if is_file and not file.is_file():
         raise MissingError(f"no file {source} to import: give a Python file, or a module's name")
-    if file.suffix == ".py":
+    if is_file:
         sys.path.insert(0, str(file.parent))
-        name = file.stem
     try:
         module = importlib.import_module(name)
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
-        is_in_file = not place.filename.startswith("<frozen")
-        where = f" at {place.filename}, line {place.lineno}" * is_in_file
+        is_in_python = place.filename.startswith("<frozen")  # importing itself
+        where = "" if is_in_python else f" at {place.filename}, line {place.lineno}"
         reason = f"{type(error).__name__}: {error}"
         raise ConfigError(f"importing {source} failed{where} ({reason}): mend it") from error
-    if name != source and Path(module.__file__ or "") != file:
+    if is_file and Path(module.__file__ or "") != file:
         raise ConfigError(f"module {name} is {module}, not {source}: mend the path, or rename it")
-    IMPORTED.append(source if name == source else str(file))
+    IMPORTED.append(str(file) if is_file else source)

@@ -40,6 +40,7 @@ def tables_command(options: Namespace) -> None:
 
     Raises NbtrackError at the end where cells failed, and left gaps.
     """
+    # A setting is a text in TOML, which writes a list of words as Python does.
     names = [f"scenes.names={options.scenes.split(',')}"] if options.scenes else []
     preset = load_preset(options.preset, options.config, [*options.settings, *names])
     usual = TABLE_3 if options.beyond else TABLE_1
@@ -57,9 +58,7 @@ def tables_command(options: Namespace) -> None:
         raise NbtrackError(f"{cells}: {why}; mend the cause and run again, the rest is kept")
 
 
-def _fill_tables(
-    options: Namespace, preset: Preset, methods: Methods, execution: Execution, wording: Wording
-) -> pd.DataFrame:
+def _fill_tables(options, preset: Preset, methods: Methods, execution, wording) -> pd.DataFrame:
     """Track, print and write; the results, a row a run."""
     clock = options.budget == "clock"
     scenes = open_scenes(preset)
@@ -109,10 +108,8 @@ def bench_command(options: Namespace) -> None:
     print(tables.write_csv(folder / "table_2.csv", steps))
 
 
-def _table_2(
-    preset: Preset, scene: Scene, methods: Methods = TABLE_1
-) -> tuple[pd.DataFrame, dict[str, int]]:
-    """Measure and print it; the steps, and the n of Table I."""
+def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> tuple:
+    """Measure and print Table II; returns its steps, and the n of Table I by tracker."""
     steps, pixels = measure_steps(preset, scene, methods), default_pixels(preset, methods)
     machine = f"{device_name(choose_device())}, {torch.get_num_threads()} threads"
     print(f"Table II: steps, {preset.name} networks, on {machine}")
@@ -160,10 +157,11 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
 
 def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]:
     """The n that each tracker's first method uses for Table I, by its label in Table II."""
-    return {
-        m.tracker.upper(): preset.with_method(m.settings).tracking_of(m.tracker).n_pixels
-        for m in reversed(find_methods(methods))
-    }
+    pixels = {}
+    for method in find_methods(methods):
+        settings = preset.with_method(method.settings).tracking_of(method.tracker)
+        pixels.setdefault(method.tracker.upper(), settings.n_pixels)
+    return pixels
 
 
 def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
@@ -172,7 +170,8 @@ def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
     kind = f"{preset.scenes.motion} motion" if are_rooms else "recorded motion"
     if "path_m" not in results:
         return f"Camera: {kind}"
-    return f"Camera: {kind}, {1e3 * (results['path_m'] / results['frames']).mean():.1f} mm a frame"
+    frame_mm = 1e3 * (results["path_m"] / results["frames"]).mean()
+    return f"Camera: {kind}, {frame_mm:.1f} mm a frame"
 
 
 def _note(preset: Preset, clock: bool) -> str:

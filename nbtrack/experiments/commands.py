@@ -52,10 +52,10 @@ def map_command(options: Namespace) -> None:
     method = method_of(options.method, options.field, None)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     scene = _opened(options, preset)
-    scene.count(options.frames)
+    scene.count(options.frames)  # raises for a wrong slice, before anything is written
     job = MapJob.of(scene, method.field, preset, options.frames, options.seed)
     output.prepare(options.out)
-    _map(job)
+    _make_map(job)
     finished = job.map()
     _write_mesh(job, finished)
     folder = output.deliver(job.folder, output.FILES_OF_MAP, options.out)
@@ -83,19 +83,20 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
 def track_command(options: Namespace) -> None:
     """Track a sequence in its map, made first where none fits, or in a given one."""
     given = read_map(options.map_from) if options.map_from else None
-    own = given.field.name if given and not options.method else None
+    own = given.field.name if given and not options.method else None  # unless one is named
     method = method_of(options.method, options.field or own, options.tracker)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     if given:
         _check_fits(given, method.field, options)
-    steps = method.usual_steps if options.steps is options.rate is None else options.steps
+    has_budget = options.steps is not None or options.rate is not None
+    steps = options.steps if has_budget else method.usual_steps
     budget = make_budget(steps, options.rate)  # told before a room is made
     scene = _opened(options, preset)
     if given:
         job = GivenMap(given, options.map_from)
     else:
         job = MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
-        scene.count(job.frames)
+        scene.count(job.frames)  # raises for a wrong slice
     run = TrackJob(
         job, scene, method.tracker, preset.tracking_of(method.tracker),
         steps=steps, rate_hz=options.rate, frames=options.frames, seed=options.seed,
@@ -106,7 +107,7 @@ def track_command(options: Namespace) -> None:
         tell(f"nbtrack: warning: {warning}")
     output.prepare(options.out)
     if not given:
-        _map(job)
+        _make_map(job)
     # Made anew: recording and map may lie elsewhere now, and clocks differ.
     (run.folder / METRICS_FILE).unlink(missing_ok=True)
     (metrics,) = run_jobs([run])
@@ -123,16 +124,17 @@ def _print_run(metrics: dict[str, Any]) -> None:
         print("  no true pose is known of the tracked frames: errors cannot be computed")
     print(f"  on {metrics['device']}")
     outside = metrics.get("outside_map_share", 0.0)
-    is_outside = f"{outside:.0%} of the frames saw little of what was mapped" * (outside > 0)
-    for said in filter(None, (metrics["map_warning"], is_outside, metrics.get("map_misfit"))):
-        tell(f"nbtrack: warning: {said}")
+    unseen = f"{outside:.0%} of the frames saw little of what was mapped" if outside > 0 else None
+    for warning in filter(None, (metrics["map_warning"], unseen, metrics.get("map_misfit"))):
+        tell(f"nbtrack: warning: {warning}")
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:
     """The scene that is named, and a warning where it is likely read wrongly."""
     scene = open_scene(options.sequence, preset, options.format)
-    if not scene.made and (said := quick_warning(scene.recording)):
-        tell(f"nbtrack: warning: {said}; `data check` tells more")
+    warning = None if scene.made else quick_warning(scene.recording)
+    if warning:
+        tell(f"nbtrack: warning: {warning}; `data check` tells more")
     return scene
 
 
@@ -148,15 +150,16 @@ def _check_fits(given: Map, field: str, options: Namespace) -> None:
     correction = record.get("correction", 0.0)
     known = flat(setting_tree(made, record["network"], record["settings"], correction))
     for text in options.settings:
+        # Keys that no map has, as those of a tracker, are no contradiction.
         if any(known.get(key, value) != value for key, value in read_setting(text).items()):
             advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
             raise ConfigError(f"{path} was made with other settings than --set {text}: {advice}")
 
 
-def _map(job: MapJob) -> None:
+def _make_map(job: MapJob) -> None:
     """Map, unless the map is there, and say so."""
-    state = "map found in {}" if job.is_done else "no finished map in {}: mapping"
-    print(state.format(job.folder))
+    folder = job.folder
+    print(f"map found in {folder}" if job.is_done else f"no finished map in {folder}: mapping")
     has_pose = job.scene.recording.has_pose[reading.parse_frames(job.frames)]
     if not has_pose.all():
         tell(f"nbtrack: {(~has_pose).sum()} of {len(has_pose)} frames have no pose: not mapped")
@@ -164,7 +167,7 @@ def _map(job: MapJob) -> None:
 
 
 def _print_numbers(results: dict[str, Any]) -> None:
-    """The numbers among some results, by name; zeros of lost frames alone."""
+    """Print the numbers among some results by what they mean, and zeros only of lost frames."""
     for name, value in results.items():
         if isinstance(value, int | float) and (value or name in ("lost_frames", "flagged_frames")):
             print(f"  {MEANINGS.get(name, name)}: {value:.5g}")
@@ -199,7 +202,7 @@ def _seen(tracked: Trajectory, rows: np.ndarray, recording: Recording) -> RgbdSe
 
 
 def _surface(field: Any, seen: RgbdSequence, n_cells: int) -> Any:
-    """What was seen of a map, in so many cells across, of at least 6 m."""
+    """What was seen of a map, in so many cells across it; a map below 6 m counts as 6 m wide."""
     return extract_mesh(field, seen, voxel=max(6.0, 2 * field.bounds.metres_per_unit) / n_cells)
 
 
@@ -219,10 +222,11 @@ def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
     finished = read_map(source)
     seen = source / MESH_FILE
     is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
+    origin = np.array(finished.record["origin"])
     with naming_damaged(seen, "mesh", "remove it and map again"):
         mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)
-        origin = np.array(finished.record["origin"])
-        mesh.vertices -= origin * is_seen  # the file stands in the world of the recording
+        if is_seen:  # the file stands in the world of the recording
+            mesh.vertices -= origin
         content = mesh_bytes(mesh, format_name, origin)
     what = "what was seen" if is_seen else "all"
     return content, f"{len(mesh.vertices)} coloured vertices of {what}"
@@ -252,6 +256,7 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
 
 
 def _export_trajectory(source: Path, format_name: str) -> tuple[str, str]:
+    """The tracked poses of a run in KITTI's format."""
     n_poses = len(read_trajectory(source).frames)  # raises for what is no run
     T_world_camera = read_tum(source / "trajectory.txt")[1]
     what = "KITTI: three rows of the matrix (m), no time stamps"
@@ -276,7 +281,7 @@ def make_command(options: Namespace) -> None:
 def check_command(options: Namespace) -> None:
     """Validate a recording; print what it holds and what is wrong, and draw it if asked to."""
     output.prepare(options.out)
-    recording = _recording_of(options)
+    recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     report = check_recording(recording, progress=True)
     print(report)
     if options.out:
@@ -291,8 +296,5 @@ def convert_command(options: Namespace) -> None:
     """Write a recording in the Neural RGB-D layout; print what became of it."""
     frames = reading.parse_frames(options.frames)
     output.check_no_recording(options.out)
-    print(convert_sequence(_recording_of(options), options.out, frames, progress=True))
-
-
-def _recording_of(options: Namespace) -> Recording:
-    return open_recording(options.folder, options.format, options.depth_folder, options.poses)
+    recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
+    print(convert_sequence(recording, options.out, frames, progress=True))

@@ -36,11 +36,11 @@ def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -
     """
     check_lists(scenes=scenes, fields=fields)
     jobs = [MapJob.of(scene, field, preset) for field, scene in product(fields, scenes)]
-    return pd.DataFrame(
-        {"field": job.field, "scene": job.scene.name, "seed": job.seed}
-        | {"seconds": record["seconds"], **record["quality"]}
-        for job, record in zip(jobs, run_jobs(jobs), strict=True)
-    )
+    rows = []
+    for job, record in zip(jobs, run_jobs(jobs), strict=True):
+        row = {"field": job.field, "scene": job.scene.name, "seed": job.seed}
+        rows.append({**row, "seconds": record["seconds"], **record["quality"]})
+    return pd.DataFrame(rows)
 
 
 def track_scenes(
@@ -71,10 +71,12 @@ def track_scenes(
     check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
     rates = [None] if steps else rates_hz or preset.tables.rates_hz
     frames = str(frames or preset.scenes.track_frames)
-    jobs, rows, pairs = [], [], [*zip(scenes, tracked or scenes, strict=True)]
+    pairs = [*zip(scenes, tracked or scenes, strict=True)]  # the mapped scene and the tracked one
+    jobs, rows = [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
         settings = own.tracking_of(method.tracker)
+        # Those asked for, else none by the clock, else the paper's.
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
         made = MapJob.of(scene, method.field, own, seed=seed)
         by_clock = rate_hz if clock else None
@@ -94,7 +96,10 @@ def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[
 
 
 def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:
-    """Side by side; by the clock one after the other, here: a neighbour would slow a clock down."""
+    """The results of some jobs, run side by side, or by the clock one after the other.
+
+    With a clock nothing else may run beside it, so only the maps are made side by side.
+    """
     missing = [job for job in jobs if not job.is_done]
     for job in missing:
         job.scene.count(job.frames, needs_poses=False)  # raises before anything is mapped

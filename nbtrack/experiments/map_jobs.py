@@ -32,8 +32,9 @@ _FRAMES_LOOKED_AT = 20  # that tell a map's unit before there is a map
 def setting_tree(field: str, network: Any, settings: Any, correction: float) -> dict[str, Any]:
     """The settings of a map where a preset has them."""
     plain = PRESETS[PLAIN_PRESET].settings
+    of_network = field if field in plain["network"] else "neus"  # whose network the field has
     return {
-        "network": {field if field in plain["network"] else "neus": network} if network else {},
+        "network": {of_network: network} if network else {},
         "mapping": {field: settings},
         "correction": {field: correction} if field in plain["correction"] else {},
     }
@@ -67,10 +68,10 @@ class MapJob(Job):
     def key(self) -> str:
         """A digest of code, device, data, settings and seed."""
         code = provenance.code_fingerprint(field_class(self.field))
-        how = code, provenance.versions(), choose_device().type
-        settings = self.field, self.network, self.settings, self.correction
-        what = self.scene.fingerprint, self.frames, self.seed
-        return fingerprint(*how, *settings, *what)
+        parts = [code, provenance.versions(), choose_device().type]
+        parts += [self.field, self.network, self.settings, self.correction]
+        parts += [self.scene.fingerprint, self.frames, self.seed]
+        return fingerprint(*parts)
 
     @property
     def name(self) -> str:
@@ -107,6 +108,7 @@ class MapJob(Job):
         return _rough_unit(self.scene, self.frames)
 
     def _stored(self) -> Map:
+        """The finished map as it was read; read anew where its file has changed since."""
         return _read(self.folder, (self.folder / MAP_FILE).stat().st_mtime_ns)
 
     def compute(self, report: Report) -> dict[str, Any]:

@@ -62,9 +62,8 @@ def check_no_recording(path: Path) -> None:
     """Raises ConfigError if a path that is to be written is a recording, or lies within one."""
     for folder in (path, *resolved(path).parents):
         if folder.is_dir() and holds_recording(folder):
-            raise ConfigError(
-                f"{folder} holds a recording, where nothing is written: choose another"
-            )
+            where = f"{folder} holds a recording, where nothing is written"
+            raise ConfigError(f"{where}: choose another")
 
 
 def save_picture(figure: Figure, path: Path, dpi: float | str = "figure") -> None:

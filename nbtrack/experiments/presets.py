@@ -93,7 +93,7 @@ class Preset:
         What the preset does not name has the defaults of its class, with what the preset changes in
         NeuS or in SDF tracking. A user's values change only what they name.
         """
-        learned = {n: kind for n, kind in FIELDS.items() if issubclass(kind, LearnedField)}
+        learned = {name: kind for name, kind in FIELDS.items() if issubclass(kind, LearnedField)}
         networks = {n: k.Network() for n, k in learned.items() if k.Network is not NetworkSettings}
         tree = {
             "network": _NETWORKS | networks,
@@ -107,7 +107,10 @@ class Preset:
         return with_values(tree, self._usual(tree) | self.own | self.of_method | self.chosen)
 
     def _usual(self, tree: dict[str, Any]) -> dict[str, Any]:
-        """By dotted keys, what the preset changes in all that it does not name."""
+        """By dotted keys, what the preset changes in fields and trackers that it does not name.
+
+        That is what it changes in NeuS, or for trackers in SDF, where they have such a setting.
+        """
         named = {tuple(key.split(".")[:2]) for key in self.own}
         values = {}
         for key, value in self.own.items():
@@ -121,11 +124,12 @@ class Preset:
         return values
 
     def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values as their keys have them; ConfigError for unknown keys, wrong types and ranges."""
+        """Values in the types of their settings; ConfigError for a key or value not allowed."""
         tree = self.settings
         for key in values:
             part, *names = key.split(".")
-            if names and isinstance(known := tree.get(part), dict):
+            known = tree.get(part)
+            if names and isinstance(known, dict):
                 # The nearest whole key would be something else's.
                 look_up(f"config key, {part} of", names[0], known)
         checked = flat(with_values(tree, values))
@@ -203,7 +207,8 @@ def load_preset(
     exist, DataError if it is no TOML.
     """
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
-    if config_file := config_file or os.environ.get("NBTRACK_CONFIG"):
+    config_file = config_file or os.environ.get("NBTRACK_CONFIG")
+    if config_file:
         config_file = absolute(config_file)
         if not config_file.is_file():
             raise MissingError(f"no config file {config_file}: give a TOML file of settings")

@@ -49,9 +49,7 @@ def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -
     return scores
 
 
-def _score_images(
-    field: LearnedField, sequence: RgbdSequence, held_out: Frames, room: Room | None
-) -> Scores:
+def _score_images(field: LearnedField, sequence: RgbdSequence, held_out: Frames, room) -> Scores:
     """PSNR (dB) and depth L1 (m) over random measured pixels of held-out frames."""
     generator = torch.Generator(field.device).manual_seed(0)
     frames = torch.from_numpy(held_out).to(field.device)
@@ -68,8 +66,9 @@ def _score_images(
 
 def _exact_depths(rays: Rays, room: Room) -> Values:
     """The z-depth (m) at which each ray meets the room's surface."""
-    exact = (part.cpu().double().numpy() for part in (rays.origins_world, rays.directions_world))
-    return torch.from_numpy(room.first_hit(*exact)[0]).to(rays.depth)
+    origins_world = rays.origins_world.cpu().double().numpy()
+    directions_world = rays.directions_world.cpu().double().numpy()
+    return torch.from_numpy(room.first_hit(origins_world, directions_world)[0]).to(rays.depth)
 
 
 def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room) -> Scores:
@@ -81,9 +80,9 @@ def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room)
     is_in_front = torch.arange(len(rays.depth)) % 2 == 0
     around = rays.depth + NEAR * (2 * offsets - 1)
     depths = torch.where(is_in_front, rays.depth * offsets, around)
-    points = rays.points(depths[:, None])[:, 0][rays.depth > 0].double().numpy()
-    true_sdf = room.sdf(points)
-    error = np.abs(query_field(field, points)[1] - true_sdf)
+    points_world = rays.points(depths[:, None])[rays.depth > 0, 0].double().numpy()
+    true_sdf = room.sdf(points_world)
+    error = np.abs(query_field(field, points_world)[1] - true_sdf)
     is_near = np.abs(true_sdf) < NEAR
     is_free = ~is_near & (true_sdf > 0)
     return {"sdf_near_m": float(error[is_near].mean()), "sdf_free_m": float(error[is_free].mean())}
@@ -103,10 +102,11 @@ def _score_surface(field: Field, sequence, mapped: Frames, rays: Rays, room: Roo
         points = np.random.default_rng(0).permutation(mesh.vertices)[:POINTS_SCORED]
     else:
         points = mesh.sample(POINTS_SCORED, seed=0)
-    true_points = rays.points(_exact_depths(rays, room)[:, None])[rays.depth > 0, 0].numpy()
-    cells = np.floor(true_points / NEAR).astype(int)
-    true_points = true_points[np.unique(cells, axis=0, return_index=True)[1]]
-    to_truth, to_map = np.abs(room.sdf(points)), cKDTree(points).query(true_points)[0]
+    hits_world = rays.points(_exact_depths(rays, room)[:, None])[rays.depth > 0, 0].numpy()
+    cells = np.floor(hits_world / NEAR).astype(int)
+    _, one_a_cell = np.unique(cells, axis=0, return_index=True)
+    to_truth = np.abs(room.sdf(points))
+    to_map, _ = cKDTree(points).query(hits_world[one_a_cell])
     precision, recall = float((to_truth < NEAR).mean()), float((to_map < NEAR).mean())
     return {
         "mesh_accuracy_m": float(to_truth.mean()),

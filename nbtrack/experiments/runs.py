@@ -52,8 +52,8 @@ def read_trajectory(folder: Path) -> Trajectory:
     T_true = np.full_like(T_estimated, np.nan)
     truth = folder / "groundtruth.txt"
     if truth.is_file():
-        known, poses = read_tum(truth)
-        T_true[np.searchsorted(times, known)] = poses
+        times_known, T_known = read_tum(truth)
+        T_true[np.searchsorted(times, times_known)] = T_known  # in the rows of the same times
     metrics = files.read_json(folder / METRICS_FILE)
     with files.naming_damaged(folder / "frames.csv", "table of frames", "track again"):
         frames = pd.read_csv(folder / "frames.csv")
@@ -89,9 +89,10 @@ def over_rooms(results: pd.DataFrame, by: list[str], value: str = "ate_m") -> pd
     A room counts once, with the mean of its seeds' logarithms: rooms differ more than seeds do.
     The interval is Student's of the rooms' logarithms, NaN for a single room (our choice).
     """
-    of_rooms = np.log(results.set_index([*by, "scene"])[value])
-    rooms = of_rooms.groupby([*by, "scene"], sort=False).mean().groupby(by, sort=False)
-    mean, half = rooms.mean(), rooms.sem() * stdtrit(rooms.size() - 1, 0.975)
+    logarithms = np.log(results.set_index([*by, "scene"])[value])
+    of_rooms = logarithms.groupby([*by, "scene"], sort=False).mean()
+    groups = of_rooms.groupby(by, sort=False)
+    mean, half = groups.mean(), groups.sem() * stdtrit(groups.size() - 1, 0.975)
     return np.exp(pd.DataFrame({value: mean, "from": mean - half, "to": mean + half})).reset_index()
 
 

@@ -66,17 +66,18 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     """
     text = str(sequence)
     folder = absolute(sequence)
-    if text in _KNOWN and folder.is_dir() and not is_own_output(folder):
-        tell(f"{text}: the folder {folder} is read, not the room or scene of that name")
-    elif text in ROOMS:
-        return _room(text, preset.scenes)
-    elif text in DATASET_SCENES:
-        if (folder := data_folder() / text).is_dir():
-            return Scene(text, folder, format)
-        advice = f"see data/README.md, or use a room, which needs no download: {', '.join(ROOMS)}"
-        raise MissingError(f"no folder {folder} of the Neural RGB-D dataset: {advice}")
-    if folder.is_dir():
+    if folder.is_dir() and not (text in _KNOWN and is_own_output(folder)):
+        if text in _KNOWN:
+            tell(f"{text}: the folder {folder} is read, not the room or scene of that name")
         return Scene(folder.name, folder, format)
+    if text in ROOMS:
+        return _room(text, preset.scenes)
+    if text in DATASET_SCENES:
+        downloaded = data_folder() / text
+        if downloaded.is_dir():
+            return Scene(text, downloaded, format)
+        advice = f"see data/README.md, or use a room, which needs no download: {', '.join(ROOMS)}"
+        raise MissingError(f"no folder {downloaded} of the Neural RGB-D dataset: {advice}")
     advice = nearest_name(text, _KNOWN)
     raise ConfigError(f"no sequence {text!r}: it is neither a folder nor a known scene; {advice}")
 
@@ -111,15 +112,15 @@ def open_scenes(preset: Preset) -> list[Scene]:
 def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
     """A room as a sequence folder, under a bar."""
     with ProgressBar(f"room {name}", config.n_frames) as bar:
-        size = config.width, config.width * 3 // 4
-        make_room(name, folder, config.n_frames, *size, config.seed, config.motion, bar.move_to)
+        width, height = config.width, config.width * 3 // 4
+        seed, motion = config.seed, config.motion
+        make_room(name, folder, config.n_frames, width, height, seed, motion, bar.move_to)
 
 
 def _room(name: str, config: ScenesConfig) -> Scene:
     """A room of this size, length and seed in the cache, made if it is not there."""
     recipe = f"{config.motion}-{config.n_frames}x{config.width}-seed{config.seed}"
-    recipe += f"-{room_version(name)}"
-    folder = runs_folder() / "rooms" / f"{name}-{recipe}" / name
+    folder = runs_folder() / "rooms" / f"{name}-{recipe}-{room_version(name)}" / name
     if not folder.is_dir():  # it appears when it is complete
         check_no_recording(runs_folder())
         # Another command that needs the same room waits, and then reads it.

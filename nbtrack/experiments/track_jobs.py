@@ -72,13 +72,13 @@ class TrackJob(Job):
     @cached_property
     def key(self) -> str:
         """A digest of code, map, tracker, budget, frames, seed; by the clock, machine, threads."""
-        kinds = tracker_class(self.tracker), field_class(self.needs.field)
-        code = provenance.code_fingerprint(*kinds)
+        tracker, field = tracker_class(self.tracker), field_class(self.needs.field)
         clock = self.rate_hz, device_name(choose_device()), torch.get_num_threads()
         budget = self.steps if self.rate_hz is None else clock
-        how = self.tracker, self.settings, budget, self.start
-        what = self.frames, self.seed, self.scene.fingerprint
-        return files.fingerprint(code, provenance.versions(), self.needs.key, *how, *what)
+        parts = [provenance.code_fingerprint(tracker, field), provenance.versions(), self.needs.key]
+        parts += [self.tracker, self.settings, budget, self.start]
+        parts += [self.frames, self.seed, self.scene.fingerprint]
+        return files.fingerprint(*parts)
 
     @property
     def name(self) -> str:
@@ -100,7 +100,7 @@ class TrackJob(Job):
         return (self.folder / METRICS_FILE).is_file()
 
     def _true_path(self) -> Poses:
-        """Of the frames (m), NaN where it is not known. Raises as `select_frames` does."""
+        """True poses of the frames (m), NaN where not known. Raises as `select_frames` does."""
         recording = self.scene.recording
         frame_ids = select_frames(recording, parse_frames(self.frames), needs_poses=False)
         return recording.T_world_camera[frame_ids]
@@ -108,7 +108,7 @@ class TrackJob(Job):
     def check(self) -> None:
         """Raises ConfigError or DataError, before anything is made, where a run cannot begin."""
         is_known = self.start == "given" and np.isfinite(self._true_path()[0]).all()
-        expected_poses(self.settings.motion_model, [np.eye(4)])
+        expected_poses(self.settings.motion_model, [np.eye(4)])  # raises for an unknown model
         if not is_known:
             tracker_class(self.tracker).check_finds(in_corrected=self.needs.correction > 0)
 
@@ -120,6 +120,7 @@ class TrackJob(Job):
         return {}
 
     def _reach(self, steps: float, metres_per_unit: float, T_true: Poses) -> dict[str, float]:
+        """`reach_metrics` of so many steps a frame along a path (m)."""
         reach = self.settings.reach(steps, metres_per_unit)
         return reach_metrics(reach, T_true, self.settings.motion_model)
 
@@ -166,9 +167,7 @@ class TrackJob(Job):
                 raise
             return replace(start, is_in_other_world=True)
 
-    def _track(
-        self, finished: Map, sequence: RgbdSequence, start: _Start, report: Report
-    ) -> tuple[Trajectory, str]:
+    def _track(self, finished: Map, sequence, start: _Start, report) -> tuple[Trajectory, str]:
         """The trajectory, and the name of the device that it was tracked on."""
 
         def tell(done: int, error_m: float) -> None:
@@ -183,16 +182,15 @@ class TrackJob(Job):
         tracked = track_sequence(tracker, sequence, checkpoint, tell, start.is_known)
         return tracked, device_name(tracker.device)  # LM and ICP run on the host
 
-    def _notes(
-        self, finished: Map, sequence: RgbdSequence, start: _Start, tracked: Trajectory
-    ) -> dict[str, Any]:
+    def _notes(self, finished: Map, sequence, start: _Start, tracked: Trajectory) -> dict[str, Any]:
         """What is to be said of a run beside its errors."""
         T_true = sequence.T_world_camera
         metres_per_unit = finished.field.bounds.metres_per_unit
         notes = {"metres_per_unit": metres_per_unit, "map_warning": start.warning}
         notes["start"] = "given" if start.is_known else "unknown"
         if isinstance(self.needs, GivenMap):
-            followed = sequence.select(slice(len(sequence) - len(tracked.frames), None))
+            n_given = len(sequence) - len(tracked.frames)  # a first frame is not tracked
+            followed = sequence.select(slice(n_given, None))
             if start.is_in_other_world:
                 followed = replace(followed, T_world_camera=tracked.T_estimated)
             field, T_estimated = finished.field, tracked.T_estimated
@@ -253,13 +251,13 @@ def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
 
     It tells of the scene where a greedy follower is off by most.
     """
-    short: dict[tuple, dict[str, dict[str, float]]] = {}
+    behind: dict[tuple, dict[str, dict[str, float]]] = {}  # by kind of run, reaches by scene
     for run in runs:
         reach = run.expected_reach()
         is_behind = reach.get("least_ate_m", 0.0) > _GREEDY_ATE
         if is_behind or reach.get("beyond_reach_share", 0.0) > _SHARE:
-            short.setdefault((run.tracker, run.settings, run.steps), {})[run.scene.name] = reach
-    for (tracker, settings, steps), reaches in short.items():
+            behind.setdefault((run.tracker, run.settings, run.steps), {})[run.scene.name] = reach
+    for (tracker, settings, steps), reaches in behind.items():
         scene, worst = max(reaches.items(), key=lambda pair: pair[1]["least_ate_m"])
         others = f" (of {len(reaches)} scenes)" if len(reaches) > 1 else ""
         advice = "take more steps, a lower rate, "
