@@ -26,10 +26,9 @@ def a_path(text: str) -> Path:
 
 
 def a_count(text: str, minimum: int = 1, maximum: int = _MAX_COUNT) -> int:
-    """A number of things, of which there is at least one, or of a seed."""
+    """A whole number within limits: a number of things, or of a seed."""
     if not (text.lstrip("-").isdecimal() and minimum <= int(text) <= maximum):
-        limits = f"from {minimum} to {maximum}"
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number {limits}")
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from {minimum} to {maximum}")
     return int(text)
 
 
@@ -137,11 +136,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         module = "bench" if options.command in ("tables", "bench") else "commands"
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)
-        print(end="", flush=True)
+        print(end="", flush=True)  # a closed pipe is found here, not after the return
         return 0
     except BrokenPipeError:  # whoever read the output, as `head` does, has enough
-        for stream in (1, 2):  # what Python flushes at its end goes nowhere
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+        for descriptor in (1, 2):  # what Python flushes at its end goes nowhere
+            os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
         return 1
     except (NbtrackError, OSError, MemoryError, KeyboardInterrupt) as error:
         if os.environ.get("NBTRACK_DEBUG"):
@@ -163,22 +162,23 @@ def _message_of(error: BaseException) -> str:
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The options of a command line; ConfigError, with the nearest names, for a wrong one."""
     parser = Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
     parser.add_argument("--version", action="version", version=f"nbtrack {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     data = commands.add_parser("data", help="make rooms; check or convert a recording")
     actions = data.add_subparsers(required=True, metavar="ACTION")
-    for name, (about, options) in COMMANDS.items():
+    for name, (about, words) in COMMANDS.items():
         group = actions if name.startswith("data ") else commands
         last = name.split()[-1]
         command = group.add_parser(last, help=about, description=about)
-        for word in [*options.split(), "--import"]:
+        for word in [*words.split(), "--import"]:
             command.add_argument(word, **OPTIONS[word])
         command.set_defaults(command=last, parser=command, device=None)
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
-        name = unknown[0].partition("=")[0]
-        known = [*options.parser._option_string_actions]
-        advice = nearest_name(name, [option for option in known if option[:2] == "--"])
+        given = unknown[0].partition("=")[0]
+        known = [name for name in options.parser._option_string_actions if name.startswith("--")]
+        advice = nearest_name(given, known)
         options.parser.error(f"unknown argument {unknown[0]!r}: {advice}")
     return options

@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import dataclass, field
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,9 @@ def latex_file(styler: Any, path: Path, note: str, own: Wording = OUR_WORDING) -
     of Table I or III; Table II then has the usual one without the note.
     """
     cells = styler.data
-    groups = groupby(zip(cells.index, cells.to_numpy(), strict=True), lambda row: row[0][0])
+    groups = {}  # the rows of a rate by method, or of a tracker by n
+    for (first, second), row in zip(cells.index, cells.to_numpy(), strict=True):
+        groups.setdefault(first, []).append((second, row))
     return _LATEX.get_template("table.tex.jinja").render(
         styler=styler,
         own=own,
@@ -49,7 +50,7 @@ def latex_file(styler: Any, path: Path, note: str, own: Wording = OUR_WORDING) -
         has_steps="n_pixels" in cells.index.names,
         has_std=any(cell.std for cell in cells.to_numpy().flat),
         columns=[own.scenes.get(scene, scene) for scene in cells],
-        groups=[(first, [(key[1], row) for key, row in rows]) for first, rows in groups],
+        groups=groups.items(),
     )
 
 

@@ -23,7 +23,8 @@ _PACKAGES = ("numpy", "scipy", "numba", "small_gicp")  # that compute results be
 _LIBRARIES = ("nbtrack", "torch", "abc", "typing", "builtins")  # what own classes are built on
 _INSTALLED = (
     *map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")),
-    *(*site.getsitepackages(), site.getusersitepackages()),
+    *site.getsitepackages(),
+    site.getusersitepackages(),
 )
 
 
@@ -40,13 +41,13 @@ def code_fingerprint(*kinds: type) -> str:
     That is this package's, and where a class or a base class was written elsewhere, all the code
     that this process has loaded from there; see `own_code`.
     """
-    bases = {base.__module__.partition(".")[0] for kind in kinds for base in kind.__mro__}
-    own = bases.difference(_LIBRARIES)
+    packages = {base.__module__.partition(".")[0] for kind in kinds for base in kind.__mro__}
+    own = packages.difference(_LIBRARIES)
     return fingerprint(package_code(*_COMPUTING), own_code(own) if own else {})
 
 
 def own_code(packages: set[str]) -> dict[str, str]:
-    """The text of each module that is no installed one, or belongs to one of some packages.
+    """The text of each loaded module that is not installed, or belongs to one of some packages.
 
     Helpers that a user's file imports count as the file does. Of a notebook, which has no file,
     those statements of the executed cells count that define a class, a function or a constant.
@@ -55,8 +56,8 @@ def own_code(packages: set[str]) -> dict[str, str]:
     for name, module in [*sys.modules.items()]:
         file = getattr(module, "__file__", None) or ""
         top = name.partition(".")[0]
-        is_own = top in packages or not (top == "nbtrack" or file.startswith(_INSTALLED))
-        if is_own and file.endswith(".py") and Path(file).is_file():
+        is_installed = top == "nbtrack" or file.startswith(_INSTALLED)
+        if (top in packages or not is_installed) and file.endswith(".py") and Path(file).is_file():
             texts[name] = Path(file).read_text("utf-8")
     for cell in getattr(sys.modules["__main__"], "In", []):
         with contextlib.suppress(SyntaxError):  # of a cell that ended with an error
@@ -66,7 +67,10 @@ def own_code(packages: set[str]) -> dict[str, str]:
 
 
 def _definition(statement: ast.stmt) -> dict[str, str]:
-    """The class, the function or the constant that a statement defines, by its name."""
+    """The text of a statement that defines a class, a function or a constant, by the name.
+
+    A constant is what is assigned a value in which no other name occurs.
+    """
     if isinstance(statement, ast.ClassDef | ast.FunctionDef):
         return {statement.name: ast.unparse(statement)}
     is_constant = isinstance(statement, ast.Assign) and not any(

@@ -43,7 +43,10 @@ def published_table_2() -> pd.DataFrame:
 
 
 def naming_points(results: pd.DataFrame) -> pd.DataFrame:
-    """The results of methods that use different numbers of points or pixels, n, named with it."""
+    """The results with n, the number of points or pixels, in the names of their methods.
+
+    A name that ends with the bare number, as "LM, 4096", becomes "LM, n = 4096".
+    """
     both = zip(results["method"], results["n_pixels"], strict=True)
     return results.assign(method=[f"{m.removesuffix(f', {n}')}, n = {n}" for m, n in both])
 
@@ -66,7 +69,7 @@ def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
     groups = results.groupby(_CELL_1, sort=False)["ate_m"]
     averaged = groups.mean(skipna=False).reset_index()
     if groups.size().max() > 1:
-        spread = groups.std(skipna=False).to_numpy()  # who stands still does so with every seed
+        spread = groups.std(skipna=False).to_numpy()  # of standing still it would say nothing
         averaged["ate_std_m"] = np.where(averaged["method"] == STANDING_STILL, np.nan, spread)
     return averaged.sort_values("rate_hz", ascending=False, kind="stable", ignore_index=True)
 
@@ -101,7 +104,8 @@ def beside_published(results: pd.DataFrame) -> pd.DataFrame:
     the median ATE (m), and the share of scenes where it is above 0.2 m, or there is no result.
     """
     ours, paper = table_1(results), table_1(published_table_1())
-    if common := [scene for scene in ours if scene in paper]:
+    common = [scene for scene in ours if scene in paper]
+    if common:
         return beside(ours[common], paper)
     sides = {"ours": ours, "paper": paper}
     summary = {("median ATE (m)", side): table.median(axis=1) for side, table in sides.items()}
@@ -115,6 +119,7 @@ def beside(ours: pd.DataFrame, paper: pd.DataFrame) -> pd.DataFrame:
     same = paper.reindex(index=ours.index, columns=ours.columns)
     sources = {"ours": ours, "paper": same, "difference": ours - same}
     both = pd.concat(sources, names=["source"]).reorder_levels([1, 2, 0])
+    # Ours alone where the paper has no such row.
     rows = [(*row, s) for row in ours.index for s in sources if s == "ours" or row in paper.index]
     return both.loc[rows]
 
@@ -126,6 +131,7 @@ def _wide(cells: pd.DataFrame, keys: list[str], value: str) -> pd.DataFrame:
 
 
 def _refuse_doubles(cells: pd.DataFrame, keys: list[str]) -> None:
+    """Raises DataError where two rows have the same values of these columns."""
     twice = cells[cells.duplicated(keys)]
     if len(twice):
         cell = ", ".join(str(key) for key in twice[keys].iloc[0])
@@ -149,7 +155,8 @@ class Cell:
 
     def css(self) -> str:
         """Its style."""
-        return "color: red;" * self.is_lost + _BOLD * self.is_best
+        color = "color: red;" if self.is_lost else ""
+        return color + (_BOLD if self.is_best else "")
 
     def html(self) -> str:
         """Its text."""
@@ -167,9 +174,7 @@ class TableStyler(Styler):
         return self.data.map(str).to_string()
 
 
-def style_table_1(
-    results: pd.DataFrame, caption: str | None = None, unit: str = "m"
-) -> TableStyler:
+def style_table_1(results: pd.DataFrame, caption: str | None = None, unit="m") -> TableStyler:
     """Table I, mean ± std over seeds: best bold, above 0.2 m red with a dagger, missing "–".
 
     Both marks follow the digits printed, three in m and one in mm: values equal to the last digit
@@ -179,10 +184,10 @@ def style_table_1(
     scale, form = look_up("unit", unit, _UNITS)
     shown = (scale * table_1(results)).map(lambda value: float(form.format(value)))
     rivals = shown.groupby(level="rate_hz")
-    best = (shown == rivals.transform("min")) & (rivals.transform("count") > 1)
+    is_best = (shown == rivals.transform("min")) & (rivals.transform("count") > 1)
     stds = _texts(scale * table_1(results, "ate_std_m"), form)
     texts = _texts(shown, form, _MISSING)
-    styler = _styled(texts, stds, best, shown > scale * LOST_THRESHOLD_M)
+    styler = _styled(texts, stds, is_best, shown > scale * LOST_THRESHOLD_M)
     styler.unit = unit
     styler.format_index("{:g} Hz", level="rate_hz")
     styler.format_index(escape="html", level="method").format_index(escape="html", axis="columns")
@@ -213,12 +218,13 @@ def style_table_2(
 
 
 def _texts(wide: pd.DataFrame, form: str, missing: str = "") -> pd.DataFrame:
+    """Numbers as texts by a format such as `{:.3f}`; NaN as another text."""
     return wide.map(lambda value: missing if pd.isna(value) else form.format(value))
 
 
-def _styled(texts: pd.DataFrame, *parts: pd.DataFrame) -> TableStyler:
-    """A table of cells, of whose parts each is a table of the same shape."""
-    cells = np.vectorize(Cell, otypes=[object])(texts, *parts)
+def _styled(texts: pd.DataFrame, stds: pd.DataFrame, is_best=False, is_lost=False) -> TableStyler:
+    """A table of cells of these parts, each a table of one shape, or one value for all."""
+    cells = np.vectorize(Cell, otypes=[object])(texts, stds, is_best, is_lost)
     styler = TableStyler(pd.DataFrame(cells, texts.index, texts.columns))
     return styler.format(Cell.html).map(Cell.css)
 
@@ -272,6 +278,7 @@ def write_table_3(folder: Path, results: pd.DataFrame, note: str, own=OUR_WORDIN
 
 
 def _write_table(stem: Path, cells, styler: TableStyler, note: str, own: Wording) -> list[Path]:
+    """Write a table in long form as CSV and its styled form as LaTeX; returns both paths."""
     path = stem.with_suffix(".tex")
     write_atomic(path, latex_file(styler, path, note, own))
     return [write_csv(stem.with_suffix(".csv"), cells), path]
