@@ -82,9 +82,9 @@ def table_1(results: pd.DataFrame, value: str = "ate_m") -> pd.DataFrame:
     gets a row at every rate; what has no result is NaN.
     """
     cells = average_over_seeds(results)
-    rates, methods, scenes = (cells[key].unique() for key in _CELL_1)
+    rates, methods = cells["rate_hz"].unique(), cells["method"].unique()
     index = pd.MultiIndex.from_product([rates, methods], names=_CELL_1[:2])
-    return _wide(cells, _CELL_1, value).reindex(index=index, columns=scenes)
+    return _wide(cells, _CELL_1, value).reindex(index=index, columns=cells["scene"].unique())
 
 
 def table_2(steps: pd.DataFrame, value: str = "steps") -> pd.DataFrame:

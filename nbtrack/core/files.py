@@ -85,8 +85,10 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def loaded_checkpoint(path: Path) -> Iterator[dict[str, Any]]:
-    """What `save_checkpoint` wrote, on the CPU. Raises DataError, also for what is made of it
-    within the block, if the file is damaged or of another kind."""
+    """What `save_checkpoint` wrote, on the CPU, within a block that takes it up.
+
+    Raises DataError if the file is damaged, or its content is not what the block takes.
+    """
     with naming_damaged(path):
         with zipfile.ZipFile(path) as archive:  # torch checks no checksums
             if damaged := archive.testzip():

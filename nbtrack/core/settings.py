@@ -55,7 +55,7 @@ def read_setting(setting: str) -> dict[str, Any]:
 
     Raises ConfigError for a text that is none.
     """
-    key, equals, text = (part.strip() for part in setting.partition("="))
+    key, equals, text = [part.strip() for part in setting.partition("=")]
     if not equals:
         raise ConfigError(f"setting {setting!r} has no value: write key=value")
     try:
@@ -97,7 +97,10 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def _replaced(node: Any, path: list[str], key: str, value: Any, allowed: Mapping) -> Any:
-    """The tree with one key set. Nested parts are rebuilt, never changed in place."""
+    """A part of a tree with the value of one key, which lies at a path of names below that part.
+
+    Nested parts are rebuilt, never changed in place. What a field allows is in its metadata.
+    """
     if not path:
         return _converted(key, node, value, allowed)
     name, *rest = path

@@ -67,7 +67,6 @@ def track_scenes(
     Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), the metrics,
     ate_m (NaN where not known), failure (why). Raises ConfigError for no list; what a job raised.
     """
-    execution = execution or Execution()
     check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
     rates = [None] if steps else rates_hz or preset.tables.rates_hz
     frames = str(frames or preset.scenes.track_frames)
@@ -76,7 +75,6 @@ def track_scenes(
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
         settings = own.tracking_of(method.tracker)
-        # Those asked for, else none by the clock, else the paper's.
         n_steps = steps or (None if clock else method.paper_steps(rate_hz))
         made = MapJob.of(scene, method.field, own, seed=seed)
         by_clock = rate_hz if clock else None
@@ -84,7 +82,7 @@ def track_scenes(
         jobs.append(job)
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
         rows.append(row | {"seed": seed, "run": job.folder.name, "n_pixels": settings.n_pixels})
-    return pd.DataFrame(map(_row_of, rows, _run(jobs, clock, execution)))
+    return pd.DataFrame(map(_row_of, rows, _run(jobs, clock, execution or Execution())))
 
 
 def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[str, Any]:

@@ -140,6 +140,7 @@ def _outcomes(jobs: Mapping[Path, Job], show: Callable, execution: Execution) ->
     running: dict[Future, Path] = {}
     with _submitting(execution.dask, workers) as submit:
         while waiting or running:
+            # Those that need nothing, what is cached already, or what has ended.
             for folder in [f for f in waiting if needs[f] in results or needs[f] not in jobs]:
                 if execution.dask or len(running) < workers:
                     running[submit(jobs[folder], results.get(needs[folder]))] = folder

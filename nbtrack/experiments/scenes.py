@@ -45,8 +45,10 @@ class Scene:
         return fingerprint(*self.recording.contents(), package_code("data", "recordings"))
 
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
-        """The frames of a slice such as `10:50:2`, without outliers; more options and errors: see
-        `read_frames`."""
+        """The frames of a slice such as `10:50:2`, without outliers.
+
+        More options, and what is raised, are those of `read_frames`.
+        """
         frame_ids = reading.parse_frames(frames)
         return reading.without_outliers(reading.read_frames(self.recording, frame_ids, **options))
 

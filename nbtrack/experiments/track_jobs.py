@@ -152,8 +152,11 @@ class TrackJob(Job):
         return metrics
 
     def _begin(self, finished: Map, sequence: RgbdSequence) -> _Start:
-        """Where to begin. A given map that does not fit the pose to start from is a DataError; one
-        that does not fit a pose which is not used tells of a recording in another world."""
+        """Where to begin, and whether a given map fits the first frame at the recording's pose.
+
+        If it does not, and the run would start there, it is a DataError. Where the run does not use
+        that pose, the recording is in another world than the map.
+        """
         T_first = sequence.T_world_camera[0]
         is_known = self.start == "given" and bool(np.isfinite(T_first).all())
         start = _Start(T_first if is_known else np.eye(4), is_known)

@@ -148,12 +148,14 @@ class Tracker(abc.ABC):
 
     def restart_anywhere(self) -> None:
         """Track from an unknown pose. ConfigError if this tracker cannot find the camera."""
-        self.check_finds(in_corrected=False)
+        self.check_finds(in_corrected=False)  # raises, as no class can that does not override this
 
     @classmethod
     def check_finds(cls, in_corrected: bool) -> None:
-        """Raises ConfigError if it cannot find a camera, in a corrected map or in another."""
-        # Those that can have a `restart_anywhere` of their own.
+        """Raises ConfigError if it cannot find a camera, in a corrected map or in another.
+
+        Only a class that has a `restart_anywhere` of its own can, and in a corrected map only.
+        """
         if cls.restart_anywhere is Tracker.restart_anywhere or not in_corrected:
             raise ConfigError(
                 f"tracker {cls.name!r} cannot find a camera whose first pose is not known: take lm "
