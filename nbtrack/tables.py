@@ -174,7 +174,9 @@ class TableStyler(Styler):
         return self.data.map(str).to_string()
 
 
-def style_table_1(results: pd.DataFrame, caption: str | None = None, unit="m") -> TableStyler:
+def style_table_1(
+    results: pd.DataFrame, caption: str | None = None, unit: str = "m"
+) -> TableStyler:
     """Table I, mean ± std over seeds: best bold, above 0.2 m red with a dagger, missing "–".
 
     Both marks follow the digits printed, three in m and one in mm: values equal to the last digit

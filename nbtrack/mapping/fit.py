@@ -85,7 +85,9 @@ def map_sequence(
     return Map(field, sequence.intrinsics, record, pd.DataFrame(history).rename_axis("iteration"))
 
 
-def recipe_of(field_name: str, sequence: RgbdSequence, network, settings, seed: int) -> dict:
+def recipe_of(
+    field_name: str, sequence: RgbdSequence, network: Any, settings: Any, seed: int
+) -> dict[str, Any]:
     """What a map is made of, as plain values: two maps of one recipe are the same map."""
     ids = sequence.frame_ids
     return {

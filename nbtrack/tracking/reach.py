@@ -42,7 +42,9 @@ def reach(steps: float, rate: float) -> float:
     return steps * rate
 
 
-def motion_of(T_world_camera: Poses, motion_model="previous_pose") -> tuple[Motions, Motions]:
+def motion_of(
+    T_world_camera: Poses, motion_model: str = "previous_pose"
+) -> tuple[Motions, Motions]:
     """Offsets and turns that a path leaves to the search of every frame but the first.
 
     Every frame before is taken to be found exactly.
@@ -56,7 +58,9 @@ def motion_of(T_world_camera: Poses, motion_model="previous_pose") -> tuple[Moti
     return offsets, turns
 
 
-def greedy_follower(T_world_camera: Poses, reach_m: float, motion_model="previous_pose") -> Poses:
+def greedy_follower(
+    T_world_camera: Poses, reach_m: float, motion_model: str = "previous_pose"
+) -> Poses:
     """The path of a greedy search with a reach (m): it ends each frame as near as it can.
 
     It knows the true pose, moves towards it by at most the reach along each axis, and turns at
@@ -77,7 +81,9 @@ def least_ate(T_world_camera: Poses, reach_m: float, motion_model: str = "previo
     return trajectory_metrics(followed[1:], T_world_camera[1:])["ate_rmse_m"]
 
 
-def reach_metrics(reach: Reach | None, T_world_camera: Poses, motion_model) -> dict[str, float]:
+def reach_metrics(
+    reach: Reach | None, T_world_camera: Poses, motion_model: str
+) -> dict[str, float]:
     """The reach of a run, the share of its frames that ask for more, and the greedy ATE (m).
 
     Nothing of a search without a bound; the reach alone where a pose (m) of the path, the given
