@@ -8,11 +8,10 @@ eight vertices. What the network says away from surfaces stays.
 import copy
 import time
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from nbtrack.beyond.grid import Accuracy, BakedField
 from nbtrack.beyond.least_squares import corrected_vertices, interpolation, regularisation_of, solve
@@ -30,21 +29,23 @@ from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 
 # All our choice, tried in the two rooms for tuning.
 _N_POINTS = 300_000  # measured points
-# Where along their normals (m) the distance is that offset: within a voxel, as planes end.
+# Signed distances (m) of the places along a point's normal that ask for one: the surface first, and
+# the others within a voxel of it, as planes end.
 _OFFSETS = (0.0, -0.03, -0.015, 0.015, 0.03)
 # A larger place takes more points, so that a frame sees no cells in which none lies. Rooms have so
 # many a cell anyway; an office of 10 by 11 m had 3 (docs/tried.md).
 _POINTS_A_CELL = 10
-_MAX_TIMES = 4  # as many points at most
+_MAX_TIMES = 4  # times `_N_POINTS` are drawn at most
 _HUBER = 0.01  # m; a larger residual counts less
-_ROUNDS = 4  # how often that is judged anew
-_COLOR_REGULARISATION = 0.1  # of that regularisation, since colours change faster than distances
+_ROUNDS = 4  # how often the weights of residuals are computed anew
+_COLOR_REGULARISATION = 0.1  # times that of distances, since colours change faster
 _COLOR_HUBER = 0.05
 _COLOR_ROUNDS = 3
-# The least scales of a tracker's residuals (distance, luma): so many medians of what the measured
-# points leave, and no less. Chosen in the rooms for tuning and on a real recording, whose medians
-# are 1.8 mm and 0.002, and 4 mm and 0.02.
-_MEDIANS = np.array([5.5, 2.3])
+# The least scales of a tracker's residuals (distance, luma): so many times the median residual that
+# the corrected map leaves at measured points, and never below `_MIN_SCALES` (m, luma). Chosen in
+# the rooms for tuning and on a real recording, whose medians are 1.8 mm and 0.002, and 4 mm and
+# 0.02.
+_SCALES_PER_MEDIAN = np.array([5.5, 2.3])
 _MIN_SCALES = np.array([0.01, 0.05])
 _INLIER_DISTANCE = 0.025  # m
 _UNMEASURED = 0.1  # confidence where nothing was measured, and the network interpolates
@@ -71,13 +72,13 @@ class CorrectedField(BakedField):
         self.label = f"{source.label} corrected"
         self.source = source
 
-    def add(self, *correction: Tensor) -> None:
-        """Add to what the field gives at vertices; the correction's tensors are `CORRECTIONS`."""
-        for name, tensor in zip(CORRECTIONS, correction, strict=True):
-            self.register_buffer(name, tensor)
+    def add(self, correction: State) -> None:
+        """Add a correction, tensors by the names in `CORRECTIONS`, to the values at vertices."""
+        for name in CORRECTIONS:
+            self.register_buffer(name, correction[name])
         medians = self.residual_medians.double().numpy()
-        sigma = tuple(np.maximum(_MEDIANS * medians, _MIN_SCALES).tolist())
-        self.accuracy = Accuracy(sigma, _INLIER_DISTANCE, float(medians[1]))
+        scales = np.maximum(_SCALES_PER_MEDIAN * medians, _MIN_SCALES)
+        self.accuracy = Accuracy(tuple(scales.tolist()), _INLIER_DISTANCE, float(medians[1]))
         self.volume[4] = _UNMEASURED
         self.volume[:, self.numbers.long()] += self.corrections.float().T
 
@@ -88,18 +89,17 @@ class CorrectedField(BakedField):
 
     def state(self) -> State:
         """That of the field as mapped, and the corrections."""
-        corrections = {name: getattr(self, name) for name in CORRECTIONS}
-        return corrections | {f"{_SOURCE}{name}": x for name, x in self.source.state().items()}
+        correction = {name: getattr(self, name) for name in CORRECTIONS}
+        source = {f"{_SOURCE}{name}": tensor for name, tensor in self.source.state().items()}
+        return correction | source
 
     @classmethod
-    def from_state(
-        cls, state: State, made: dict[str, Any], bounds: SceneBounds
-    ) -> "CorrectedField":
+    def from_state(cls, state: State, made: dict[str, Any], bounds: SceneBounds) -> Self:
         """The field as mapped, sampled and corrected anew."""
         source = {n.removeprefix(_SOURCE): x for n, x in state.items() if n.startswith(_SOURCE)}
         mapped = field_class(made["field"]).from_state(source, made, bounds)
         field = cls(mapped, float(made["correction"]))
-        field.add(*(state[name] for name in CORRECTIONS))
+        field.add(state)
         return field
 
 
@@ -119,9 +119,7 @@ def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
     return replace(finished, field=field, record=record)
 
 
-def corrected(
-    source: Field, sequence: RgbdSequence, frames: Frames, voxel: float
-) -> CorrectedField:
+def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float) -> CorrectedField:
     """A map with a signed distance, corrected in cells of `voxel` (m) by its mapped frames.
 
     At a measured point p with normal n the interpolated distance at p + s n shall be s, at five
@@ -129,64 +127,64 @@ def corrected(
     none. These equations, weighted by 1 / depth^2, are linear in the corrections of the vertices
     around; see `solve`. Raises DataError where no frame shows a plane.
     """
-    field = CorrectedField(copy.deepcopy(source).cpu(), voxel)
-    points, normals, depth, color = _measured_planes(sequence, frames, field)
-    asked = np.concatenate([points + offset * normals for offset in _OFFSETS])
-    vertices, weights = interpolation(asked, field)
-    numbers, matrix = corrected_vertices(vertices, weights, field.n_vertices)
-    regularisation = regularisation_of(numbers, field.n_vertices)
-    values = field.volume[:4].T.double().numpy()[numbers]
+    grid = CorrectedField(copy.deepcopy(field).cpu(), voxel)
+    points_world, normals_world, depth, seen_color = _measured_planes(sequence, frames, grid)
+    n_points = len(points_world)
+    asked_world = np.concatenate([points_world + s * normals_world for s in _OFFSETS])
+    vertices, weights = interpolation(asked_world, grid)
+    numbers, matrix = corrected_vertices(vertices, weights, grid.n_vertices)
+    regularisation = regularisation_of(numbers, grid.n_vertices)
+    values = grid.volume[:4].T.double().numpy()[numbers]  # colour and distance, uncorrected
     reliability = (depth.mean() / depth) ** 2
 
-    missing = np.repeat(_OFFSETS, len(points))[:, None] - matrix @ values[:, 3:]
-    everywhere = np.tile(reliability, len(_OFFSETS))
-    distance, diagonal = solve(matrix, missing, everywhere, regularisation, _HUBER, _ROUNDS)
+    wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ values[:, 3:]
+    reliabilities = np.tile(reliability, len(_OFFSETS))
+    distance, diagonal = solve(matrix, wanted, reliabilities, regularisation, _HUBER, _ROUNDS)
     # The share of measurements, not regularisation, in a vertex's diagonal.
     confidence = (1 - _UNMEASURED) * (1 - regularisation.diagonal() / diagonal)
 
-    matrix, missing = matrix[: len(points)], missing[: len(points)]  # offset 0: at the surface
-    missing_color = color - matrix @ values[:, :3]
-    regularisation *= _COLOR_REGULARISATION
-    colors, _ = solve(
-        matrix, missing_color, reliability, regularisation, _COLOR_HUBER, _COLOR_ROUNDS
-    )
+    at_surface = matrix[:n_points]  # the rows of the first offset, which is 0
+    wanted_color = seen_color - at_surface @ values[:, :3]
+    springs = regularisation * _COLOR_REGULARISATION
+    color, _ = solve(at_surface, wanted_color, reliability, springs, _COLOR_HUBER, _COLOR_ROUNDS)
 
-    left = missing - matrix @ distance
-    left_luma = (missing_color - matrix @ colors) @ LUMA
-    medians = [float(np.median(np.abs(residual))) for residual in (left, left_luma)]
-    corrections = torch.from_numpy(np.column_stack([colors, distance, confidence])).float().half()
-    cameras, views = _views(sequence, frames)
-    field.add(torch.from_numpy(numbers).int(), corrections, cameras, views, torch.tensor(medians))
-    return field
+    distance_residuals = wanted[:n_points] - at_surface @ distance
+    luma_residuals = (wanted_color - at_surface @ color) @ LUMA
+    medians = [float(np.median(np.abs(each))) for each in (distance_residuals, luma_residuals)]
+    corrections = torch.from_numpy(np.column_stack([color, distance, confidence])).float().half()
+    correction = {"numbers": torch.from_numpy(numbers).int(), "corrections": corrections}
+    correction["residual_medians"] = torch.tensor(medians)
+    grid.add(correction | _views(sequence, frames))
+    return grid
 
 
-def _views(sequence: RgbdSequence, frames: Frames) -> tuple[Tensor, Tensor]:
-    """Some of the frames' poses, T_world_camera (n x 4 x 4), and what the camera saw from them."""
+def _views(sequence: RgbdSequence, frames: Frames) -> State:
+    """Poses of some frames, `cameras` (n x 4 x 4), and what the camera saw from them, `views`."""
     kept = frames[spread_out(sequence.T_world_camera[frames])]
     views = torch.stack([view_of(sequence[index]) for index in kept.tolist()])
-    return torch.from_numpy(sequence.T_world_camera[kept]).float(), views
+    return {"cameras": torch.from_numpy(sequence.T_world_camera[kept]).float(), "views": views}
 
 
 def _measured_planes(sequence: RgbdSequence, frames: Frames, grid: BakedField) -> list[np.ndarray]:
     """Random measured points (n x 3, m, world frame), their normals, z-depths (n, m) and colours.
 
-    They are `_N_POINTS`. Where the grid's cells would hold too few of them, as many more are drawn
-    anew as the cells lack, up to `_MAX_TIMES` as many.
+    They are `_N_POINTS`. If fewer than `_POINTS_A_CELL` of them lie in a cell on average, as in a
+    large place, so many times more are drawn anew as are lacking, up to `_MAX_TIMES`.
     """
-    cells, *planes = _draw_planes(sequence, frames, grid, _N_POINTS)
-    times = min(_POINTS_A_CELL * len(np.unique(cells)) / len(cells), _MAX_TIMES)
+    n_cells, planes = _draw_planes(sequence, frames, grid, _N_POINTS)
+    times = min(_POINTS_A_CELL * n_cells / len(planes[0]), _MAX_TIMES)
     if times > 1:
-        _, *planes = _draw_planes(sequence, frames, grid, round(times * _N_POINTS))
+        _, planes = _draw_planes(sequence, frames, grid, round(times * _N_POINTS))
     return planes
 
 
 def _draw_planes(
     sequence: RgbdSequence, frames: Frames, grid: BakedField, n_points: int
-) -> list[np.ndarray]:
-    """Numbers of the cells in which so many random measured points lie, and what is known of these.
+) -> tuple[int, list[np.ndarray]]:
+    """How many of the grid's cells so many random measured points lie in; and `_measured_planes`.
 
     Points without a plane are left out. Neighbours come one after another: their vertices are then
-    still in the processor's cache.
+    still in the processor's cache. Raises DataError if no point has a plane.
     """
     sampler = PixelSampler(sequence, torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
@@ -195,9 +193,9 @@ def _draw_planes(
     if not has_plane.any():
         raise DataError(f"{sequence.name} shows no surface to correct a map by: check its depth")
     points_world = rays.points(rays.depth[:, None])[:, 0]
-    measured = points_world, rays.normals_world, rays.depth, rays.color
+    measured = (points_world, rays.normals_world, rays.depth, rays.color)
     planes = [part[has_plane].double().numpy() for part in measured]
     vertices, _ = interpolation(planes[0], grid)
     cells = vertices[:, 0]  # a cell has the number of its first vertex
     order = np.argsort(cells, kind="stable")
-    return [part[order] for part in (cells, *planes)]
+    return len(np.unique(cells)), [part[order] for part in planes]

@@ -6,8 +6,8 @@ sparse matrix.
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import sparse
 from scipy.ndimage import binary_dilation
+from scipy.sparse import coo_array, csr_array, dia_array, eye_array
 from scipy.sparse.linalg import LinearOperator, cg
 
 from nbtrack.beyond.grid import BakedField
@@ -21,7 +21,7 @@ _FADE = 1  # vertices beyond those that points touch, over which corrections fad
 Columns = Float[np.ndarray, "rows columns"]
 Vertices = Int[np.ndarray, "points 8"]
 Corners = Float[np.ndarray, "points 8"]
-_CORNERS = np.stack(np.meshgrid(*3 * [[0, 1]], indexing="ij"), -1).reshape(8, 3)
+_CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T  # of a cell, 8 x 3: z is fastest
 
 
 def interpolation(points_world: WorldPoints, grid: BakedField) -> tuple[Vertices, Corners]:
@@ -29,60 +29,64 @@ def interpolation(points_world: WorldPoints, grid: BakedField) -> tuple[Vertices
     shape = np.array(grid.n_vertices)
     scaled = (points_world - grid.low.double().numpy()) / grid.voxel
     cells = np.clip(np.floor(scaled).astype(np.int64), 0, shape - 2)
-    x, y, z = np.moveaxis(np.stack([1 - (scaled - cells), scaled - cells], axis=-1), 1, 0)
-    weights = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
+    # Of the two vertices along each axis: n x 3 x 2. A corner's weight is the product of three.
+    along = np.stack([1 - (scaled - cells), scaled - cells], axis=-1)
+    xy = along[:, 0, :, None, None] * along[:, 1, None, :, None]
+    weights = xy * along[:, 2, None, None, :]
     strides = np.array([shape[1] * shape[2], shape[2], 1])
     return (cells @ strides)[:, None] + _CORNERS @ strides, weights.reshape(-1, 8)
 
 
 def corrected_vertices(
-    vertices: Vertices, weights: Corners, shape: tuple[int, int, int]
-) -> tuple[Int[np.ndarray, "n"], sparse.csr_array]:
-    """The vertices to correct, which are those near points, and the interpolation between them.
+    vertices: Vertices, weights: Corners, shape: tuple[int, ...]
+) -> tuple[Int[np.ndarray, "n"], csr_array]:
+    """Numbers of the vertices to correct, those near points; and the interpolation from them.
 
-    The latter is a matrix: a row a point, a column for each of these vertices.
+    The latter is a matrix A (points x n): A x is at the points what x is at these vertices.
     """
     is_touched = np.zeros(shape, dtype=bool)
     is_touched.flat[vertices] = True
     numbers = np.flatnonzero(binary_dilation(is_touched, iterations=_FADE))
-    column = np.empty(is_touched.size, dtype=np.int32)
-    column[numbers] = np.arange(len(numbers), dtype=np.int32)
-    entries = weights.ravel(), column[vertices].ravel(), np.arange(0, weights.size + 1, 8)
-    return numbers, sparse.csr_array(entries, shape=(len(weights), len(numbers)))
+    column_of = np.empty(is_touched.size, dtype=np.int32)
+    column_of[numbers] = np.arange(len(numbers), dtype=np.int32)
+    # Every row has eight entries: weights, columns, and where rows begin.
+    entries = (weights.ravel(), column_of[vertices].ravel(), np.arange(0, weights.size + 1, 8))
+    return numbers, csr_array(entries, shape=(len(weights), len(numbers)))
 
 
-def regularisation_of(
-    numbers: Int[np.ndarray, "n"], shape: tuple[int, int, int]
-) -> sparse.csr_array:
+def regularisation_of(numbers: Int[np.ndarray, "n"], shape: tuple[int, ...]) -> csr_array:
     """The regularisation of corrections as a matrix: springs between neighbours, and to zero.
 
     Neighbours that are not corrected stand at zero, so that corrections fade out.
     """
-    column = np.full(shape, -1)
-    column.flat[numbers] = np.arange(len(numbers))
-    springs = sparse.csr_array((len(numbers), len(numbers)))
+    column_of = np.full(shape, -1)
+    column_of.flat[numbers] = np.arange(len(numbers))
+    springs = csr_array((len(numbers), len(numbers)))  # 1 from each vertex to the next one
     for axis in range(3):
-        pairs = np.stack([np.delete(column, -1, axis), np.delete(column, 0, axis)]).reshape(2, -1)
-        pairs = pairs[:, (pairs >= 0).all(axis=0)]
-        ones = np.ones(pairs.shape[1])
-        springs += sparse.coo_array((ones, tuple(pairs)), shape=springs.shape)
-    own = sparse.eye_array(len(numbers)) * (_PULL + 6 * _SMOOTHNESS)
+        first = np.delete(column_of, -1, axis).ravel()
+        second = np.delete(column_of, 0, axis).ravel()
+        joins = (first >= 0) & (second >= 0)
+        entries = (np.ones(joins.sum()), (first[joins], second[joins]))
+        springs += coo_array(entries, shape=springs.shape)
+    own = eye_array(len(numbers)) * (_PULL + 6 * _SMOOTHNESS)
     return (own - _SMOOTHNESS * (springs + springs.T)).tocsr()
 
 
 def solve(
-    matrix: sparse.csr_array,
+    matrix: csr_array,
     wanted: Columns,
     reliability: Float[np.ndarray, "rows"],
-    regularisation: sparse.csr_array,
+    regularisation: csr_array,
     huber: float,
     rounds: int,
 ) -> tuple[Columns, Float[np.ndarray, "n"]]:
-    """Minimise |W^(1/2) (A x - wanted)|^2 + x' regularisation x; and the diagonal of its Hessian.
+    """The x that minimises |W^(1/2) (A x - wanted)|^2 + x' R x, and the Hessian's diagonal.
 
-    W holds the reliability, times huber / |residual| where the largest residual of a row's columns
-    is above that; it is judged anew in every round. A'WA is applied, and never formed: its entries
-    would take several times as long to sum up.
+    A is the matrix, R the regularisation, W the reliability times Huber's weight: 1 up to a
+    residual of `huber`, else huber / |residual|, of the largest one of a row's columns. Each round
+    solves by conjugate gradients with the weights of the solution before. The diagonal is the last
+    round's, A'WA + R. That is applied to vectors, and never formed: its entries would take several
+    times as long to sum up.
     """
     solution = np.zeros((matrix.shape[1], wanted.shape[1]))
     squares = matrix.power(2)
@@ -90,13 +94,14 @@ def solve(
         largest = np.abs(wanted - matrix @ solution).max(axis=1)
         weights = reliability * huber / np.maximum(largest, huber)
 
-        def curvature(x, weights=weights):
+        def hessian_times(x, weights=weights):  # weights of this round
             return matrix.T @ (weights * (matrix @ x)) + regularisation @ x
 
-        hessian = LinearOperator(regularisation.shape, matvec=curvature, dtype=float)
+        hessian = LinearOperator(regularisation.shape, matvec=hessian_times, dtype=float)
         diagonal = squares.T @ weights + regularisation.diagonal()
-        scaling = sparse.dia_array((1 / diagonal[None], 0), shape=regularisation.shape)
-        for column, vector in enumerate((matrix.T @ (weights[:, None] * wanted)).T):
-            start = solution[:, column].copy()
-            solution[:, column], _ = cg(hessian, vector, start, rtol=1e-3, M=scaling)
+        preconditioner = dia_array((1 / diagonal[None], 0), shape=regularisation.shape)
+        right_sides = matrix.T @ (weights[:, None] * wanted)
+        for k in range(wanted.shape[1]):
+            start = solution[:, k].copy()
+            solution[:, k], _ = cg(hessian, right_sides[:, k], start, rtol=1e-3, M=preconditioner)
     return solution, diagonal
