@@ -1,6 +1,6 @@
 """LM: second-order steps on signed distance and colour at observed points, and restarts."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +15,7 @@ from nbtrack.beyond.lm_residuals import grid_of
 from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.observed import Observed, draw_points, with_normals
 from nbtrack.beyond.verdict import p_lost
-from nbtrack.beyond.views import retrieve, view_of
+from nbtrack.beyond.views import Viewpoints, retrieve, view_of
 from nbtrack.core.arrays import Pose, Poses, Transform, Transforms
 from nbtrack.core.settings import limited
 from nbtrack.data.frame import Frame
@@ -31,17 +31,17 @@ _MIN_COARSE = 128  # points
 # Starts are compared at wide robust scales (m, luma): at narrow ones all that are off cost alike.
 _WIDE_SCALES = np.array([0.1, 0.2])
 _CLEARLY = 0.97  # a pose that costs less than this share of the best one's cost takes over
-# Starts that differ by more (m, rad), as of a fast camera that may have stopped, are compared after
-# their coarse stages, since the costs of the starts do not tell which leads to the true pose.
+# Starts that differ by more (m, rad), as those of a fast camera that may have stopped, are compared
+# after their coarse stages: the costs at the starts do not tell which leads to the true pose.
 _FAR_APART = 0.06
 _MAX_COARSE_STEPS = 30
-_LOST = 0.5  # a pose is lost from this probability on that it is wrong
-_DOUBTFUL = 0.1  # from this one on another is looked for
-# What a descent needs beyond so many steps counts as one step, and so does a descent elsewhere.
+_LOST = 0.5  # a pose is lost if it is wrong with at least this probability
+_DOUBTFUL = 0.1  # and in doubt from this one on: other descents follow
+# The first descent's steps from this one on count as one step, and so does a descent elsewhere.
 _MAX_FOLLOWING = 20
 _SAME = 0.01  # rad, m; another descent that ends so near a pose confirms it
-_LARGEST_INNOVATION = 1.0  # rad, m; of a pose where the frame before led to none
-_ROUNDING = 0.25 / 255  # median that 256 grey levels leave; no intensity is more accurate
+_LARGEST_INNOVATION = 1.0  # rad, m; also where no pose is trusted
+_ROUNDING = 0.25 / 255  # median error of 256 grey levels; no intensity is more accurate
 _MIN_CONTRAST = 0.01  # standard deviation of a picture that is not dark, covered or overexposed
 _RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
 # Where a map has views, a lost camera is looked for where the views most like the frame were taken,
@@ -95,8 +95,8 @@ class LmTracker(Tracker):
         self.grid = grid_of(grid)
         # Loads what numba has compiled, the inner functions before those that call them: sums would
         # else be rounded otherwise in the process that compiles than in later ones.
-        point = Observed(np.zeros((1, 3)), np.zeros(1), np.empty((0, 3)))
-        LmOptimizer(self.grid, point, point, 1.0, np.eye(4)).certainty()
+        any_point = Observed(np.zeros((1, 3)), np.zeros(1), np.empty((0, 3)))
+        LmOptimizer(self.grid, any_point, any_point, 1.0, np.eye(4)).certainty()
         return grid
 
     def restart_anywhere(self) -> None:
@@ -121,34 +121,37 @@ class LmTracker(Tracker):
             starts = np.concatenate([starts, self.last_good.numpy()[None]])
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
         R = starts[:, :3, :3]
-        R[:] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
+        starts[:, :3, :3] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
         # Poses that a right one is near: after a lost frame the last good one, if there was any.
         self.trusted = starts[len(T_starts) :] if self.was_lost else starts
-        self.T_start, self.best, self.search = starts[0], None, iter(())
+        self.T_start = starts[0]
+        self.best = None
+        self.remaining_steps = iter(())  # none, if the frame has too few points
         observed = draw_points(frame, self.settings.n_pixels, self.generator)
         n_points = len(observed.points)
         self.is_converged = n_points < _MIN_POINTS
         if self.is_converged:
             return
-        some = with_normals(frame, observed, max(_MIN_COARSE, n_points // _COARSE_SHARE))
+        coarse = with_normals(frame, observed, max(_MIN_COARSE, n_points // _COARSE_SHARE))
         has_contrast = observed.intensity.std() > _MIN_CONTRAST  # else the picture says nothing
         self.weight = self.settings.lambda_intensity if has_contrast else 0.0
-        self.descent_from = partial(LmOptimizer, self.grid, some, observed, self.weight)
+        # Makes this frame's descent from a start.
+        self.descent_from = partial(LmOptimizer, self.grid, coarse, observed, self.weight)
         descents = [self.descent_from(T) for T in starts]
         if np.abs(starts - starts[0]).max() > _FAR_APART:
             for descent in descents:
                 descent.run_stage(_MAX_COARSE_STEPS)
         self.best = _by_cost(descents)[0]
-        self.search = self._steps(frame, starts[-1])
+        self.remaining_steps = self._steps(frame, starts[-1])
 
     def step(self) -> float:
         """One step of Levenberg-Marquardt, or one descent elsewhere; returns the cost before it."""
-        return next(self.search, float("nan"))
+        return next(self.remaining_steps, float("nan"))
 
     @property
     def T_world_camera(self) -> Transform:
         """The estimate so far; without points, the first start."""
-        return torch.from_numpy(self.best.T_world_camera if self.best else self.T_start)
+        return torch.from_numpy(self.T_start if self.best is None else self.best.T_world_camera)
 
     def report(self) -> dict[str, float | bool]:
         """What a descent says of its pose, and how likely that makes it a wrong one: the verdict.
@@ -159,37 +162,37 @@ class LmTracker(Tracker):
             return {"inlier_ratio": 0.0, "p_lost": 1.0, "lost": True}
         said = self.best.certainty()
         usual_mad = max(self.field.accuracy.intensity_mad, _ROUNDING)
-        innovation = _apart(self.trusted, self.best.T_world_camera)
-        said |= {
-            "intensity_ratio": said["intensity_mad"] / usual_mad if self.weight else 1.0,
-            "last_step": 0.0 if self.best.is_finished else float(self.best.last_step),
-            "innovation": float(innovation.min(initial=_LARGEST_INNOVATION)),
-        }
+        innovations = _apart(self.trusted, self.best.T_world_camera)
+        said["intensity_ratio"] = said["intensity_mad"] / usual_mad if self.weight else 1.0
+        said["last_step"] = 0.0 if self.best.is_finished else float(self.best.last_step)
+        said["innovation"] = float(innovations.min(initial=_LARGEST_INNOVATION))
         probability = p_lost(said)
         return {**said, "p_lost": probability, "lost": probability >= _LOST}
 
     def _steps(self, frame: Frame, T_expected: Pose) -> Iterator[float]:
         """Steps of the best descent, then other descents while its pose is in doubt.
 
-        Gives the cost before each of them.
+        Yields the cost before each of them; at the last one the search has converged.
         """
-        for number in range(1, _MAX_FOLLOWING + 1):
-            cost = self.best.step()
-            if number == _MAX_FOLLOWING or self.best.is_finished:
-                self.best.run()  # its rest, if any
+        cost = self.best.step()
+        for _ in range(_MAX_FOLLOWING - 1):
+            if self.best.is_finished:
                 break
             if self.best.is_ended:
                 self.best.refine()
             yield cost
-        max_p_lost = _DOUBTFUL
-        others = None if self.settings.n_restarts else []  # None: not looked for yet
-        while others != [] and self.report()["p_lost"] >= max_p_lost:
+            cost = self.best.step()
+        self.best.run()  # the rest, if any
+        if self.settings.n_restarts and self.report()["p_lost"] >= _DOUBTFUL:
             yield cost
-            cost = self.best.cost(NEAR_SCALES)
-            if others is None:
-                others = self._other_starts(frame, T_expected)
-            is_confirmed = self._descend_from(others.pop(0))
-            max_p_lost = _LOST if is_confirmed else _DOUBTFUL
+            others = self._other_starts(frame, T_expected)
+            while True:
+                cost = self.best.cost(NEAR_SCALES)
+                is_confirmed = self._descend_from(others.pop(0))
+                max_p_lost = _LOST if is_confirmed else _DOUBTFUL
+                if not (others and self.report()["p_lost"] >= max_p_lost):
+                    break
+                yield cost
         self.is_converged = True
         yield cost
 
@@ -205,26 +208,34 @@ class LmTracker(Tracker):
         return bool(_apart(other.T_world_camera, best_so_far.T_world_camera) < _SAME)
 
     def _other_starts(self, frame: Frame, T_expected: Pose) -> list[Pose]:
-        """Where else the camera may be, the likeliest first; all that can be thought of where no
-        pose is trusted."""
+        """Where else the camera may be, the likeliest first.
+
+        These are `n_restarts` poses at most, or all if no pose is trusted.
+        """
         anchor = T_expected if self.last_good is None else self.last_good.numpy()
-        n_restarts, viewpoints = self.settings.n_restarts, self.field.viewpoints
-        if viewpoints is None:
-            # The last good pose itself, then turned about x, y and z both ways, and wider.
-            turns = _RESTART_ANGLE * np.kron(np.eye(6)[:3], [[1], [-1]])
-            twists = (factor * turn for factor in range(1, n_restarts) for turn in turns)
-            starts = [anchor, *(retract(anchor, twist) for twist in twists)]
+        if self.field.viewpoints is None:
+            # The anchor, then turned about x, y and z both ways, by ever wider angles.
+            angles = [factor * _RESTART_ANGLE for factor in range(1, self.settings.n_restarts)]
+            axes = [sign * axis for axis in np.eye(6)[:3] for sign in (1, -1)]
+            starts = [anchor] + [retract(anchor, a * axis) for a in angles for axis in axes]
         else:
-            alike = retrieve(view_of(frame), viewpoints, _ALIKE)
-            random = map(self.descent_from, self._random_poses(viewpoints.T_world_camera))
-            tried = [*map(self.descent_from, [anchor, *alike]), *_by_cost(random)[:_TRIED]]
-            for descent in tried:
-                descent.run_stage(_TRIED_STEPS)
-            starts = [descent.T_world_camera for descent in _by_cost(tried)]
-        return starts[:n_restarts] if len(self.trusted) else starts
+            starts = self._starts_by_views(frame, anchor, self.field.viewpoints)
+        return starts[: self.settings.n_restarts] if len(self.trusted) else starts
+
+    def _starts_by_views(self, frame: Frame, anchor: Pose, viewpoints: Viewpoints) -> list[Pose]:
+        """Poses after a few steps from the anchor, views like the frame, and random poses.
+
+        Of the random ones only the cheapest are tried.
+        """
+        alike = retrieve(view_of(frame), viewpoints, _ALIKE)
+        random = [self.descent_from(T) for T in self._random_poses(viewpoints.T_world_camera)]
+        tried = [self.descent_from(T) for T in (anchor, *alike)] + _by_cost(random)[:_TRIED]
+        for descent in tried:
+            descent.run_stage(_TRIED_STEPS)
+        return [descent.T_world_camera for descent in _by_cost(tried)]
 
     def _random_poses(self, T_world_camera: Poses) -> Poses:
-        """Where else a camera may be: near the known ones, turned about the vertical they share."""
+        """Random poses near known ones, turned about the vertical: the known ones' mean y axis."""
         seed = torch.randint(2**62, (), generator=self.generator)
         random = np.random.default_rng(int(seed))
         poses = T_world_camera[random.integers(len(T_world_camera), size=_RANDOM)]
@@ -235,11 +246,11 @@ class LmTracker(Tracker):
         return poses
 
 
-def _by_cost(descents: Iterable[LmOptimizer]) -> list[LmOptimizer]:
+def _by_cost(descents: list[LmOptimizer]) -> list[LmOptimizer]:
     """Descents in the order of their robust costs, all at equal scales."""
     return sorted(descents, key=lambda descent: descent.cost(_WIDE_SCALES))
 
 
 def _apart(T_first: Pose | Poses, T_second: Pose) -> np.ndarray:
-    """How far poses are from another one (rad or m, whichever is more)."""
+    """How far poses are from another one: about the larger of angle (rad) and offset (m)."""
     return np.abs(np.linalg.inv(T_first) @ T_second - np.eye(4)).max(axis=(-2, -1))

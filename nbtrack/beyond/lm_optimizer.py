@@ -20,14 +20,13 @@ _MAX_STEPS = 60  # of a stage
 # Points that count as independent where it is asked whether a pose is held: with 384 some wrong
 # poses before a flat wall pass (docs/tried.md).
 _INDEPENDENT = 256
-# The coarse stage may lead away from a good start: the better of both goes on, at these scales.
+# Robust scales (m, luma) at which the ends of descents are compared, also that of a coarse stage
+# with its start, which it may have left for a worse pose.
 NEAR_SCALES = np.array([0.02, 0.05])
-
-
 # From afar distances say where the camera is; intensities mislead: their basin is as wide as the
 # texture.
-COARSE = Stage(False, 10.0, 1e-2)
-FINE = Stage(True, MAD_FACTOR, 3e-4)
+COARSE = Stage(is_fine=False, mad_factor=10.0, min_step=1e-2)
+FINE = Stage(is_fine=True, mad_factor=MAD_FACTOR, min_step=3e-4)
 
 
 class LmOptimizer:
@@ -40,13 +39,13 @@ class LmOptimizer:
     """
 
     def __init__(
-        self, grid: Grid, some: Observed, all: Observed, lambda_intensity: float, T_start: Pose
+        self, grid: Grid, coarse: Observed, fine: Observed, lambda_intensity: float, T_start: Pose
     ) -> None:
-        """Begin with some points, for the coarse stage, and all, for the fine one."""
+        """Begin the coarse stage, on its points; `fine` are those of the fine stage: all."""
         self.T_world_camera = T_start
         self.last_step = np.inf  # rad or m, whichever is more
-        self.fine_problem = Problem(all, grid, FINE, lambda_intensity, T_start)
-        self._begin(Problem(some, grid, COARSE, 0.0, T_start))
+        self.fine_problem = Problem(fine, grid, FINE, lambda_intensity, T_start)
+        self._begin_stage(Problem(coarse, grid, COARSE, 0.0, T_start))
         self._start_cost = self.cost(NEAR_SCALES)
 
     def step(self) -> float:
@@ -54,10 +53,12 @@ class LmOptimizer:
         step = lm_solver.try_step(
             self.problem, self.T_world_camera, self.terms, self.scales, self.damping, self.twist
         )
-        self.T_world_camera, self.terms, self.twist = step.T_world_camera, step.terms, step.twist
+        self.T_world_camera = step.T_world_camera
+        self.terms = step.terms
+        self.twist = step.twist
         self.last_step = step.length
         if step.is_better:
-            self._narrow()
+            self._narrow_scales()
             self.damping = max(self.damping * _DAMPING_DOWN, _MIN_DAMPING)
         else:
             self.damping *= _DAMPING_UP
@@ -65,7 +66,7 @@ class LmOptimizer:
         return step.cost_before
 
     def run_stage(self, max_steps: int = _MAX_STEPS) -> None:
-        """Steps of the stage that it is in, until that ends."""
+        """Steps of the stage that it is in, until that ends or so many are taken."""
         for _ in range(max_steps):
             if self.is_ended:
                 return
@@ -75,10 +76,10 @@ class LmOptimizer:
         """Go on with all points from where the coarse stage ended, or from the start if better."""
         if self.cost(NEAR_SCALES) > self._start_cost:
             self.T_world_camera = self.problem.T_start
-        self._begin(self.fine_problem)
+        self._begin_stage(self.fine_problem)
 
     def run(self) -> None:
-        """The rest of the search."""
+        """Take the search to its end: the rest of its stage, and the fine one if that is left."""
         self.run_stage()
         if not self.problem.stage.is_fine:
             self.refine()
@@ -111,47 +112,56 @@ class LmOptimizer:
         distance, intensity = self.terms.residuals
         reliability = self.terms.reliability
         # A picture that is darker as a whole says nothing against a pose.
-        off = np.abs(intensity - _median(intensity)) * (self.fine_problem.lambda_intensity > 0)
+        has_weight = self.fine_problem.lambda_intensity > 0
+        off = np.abs(intensity - _median(intensity)) if has_weight else np.zeros_like(intensity)
         is_near = np.abs(distance) < self.problem.grid.accuracy.inlier_distance
         is_inlier = is_near & (reliability > 0) & (off < _INLIER_INTENSITY)
         known_ratio = float(reliability.mean())
-        fitting = float((reliability * is_inlier).mean())
-        H, _ = lm_solver.normal_equations(self.terms, self.scales, self.problem.lambda_intensity)
-        values = np.linalg.eigvalsh(H)
-        covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2  # rad, m
-        blocks = np.stack([covariance[:3, :3], covariance[3:, 3:]])
-        rotation, position = np.linalg.eigvalsh(blocks)[:, -1] ** 0.5
-        moved_std_m = std_when_moved(
-            self._costs_at, self.T_world_camera, covariance,
-            n_directions=1, n_independent=_INDEPENDENT,
-        )  # fmt: skip
         return {
             "inlier_ratio": float(is_inlier.mean()),
             "known_ratio": known_ratio,
-            "fitting_ratio": fitting / max(known_ratio, 1e-6),
+            "fitting_ratio": float((reliability * is_inlier).mean()) / max(known_ratio, 1e-6),
             "intensity_mad": float(_median(off)),
-            "position_std_m": float(max(position, moved_std_m)),
-            "rotation_std_deg": float(np.rad2deg(rotation)),
-            "condition_number": float(values[-1] / max(values[0], 1e-9)),
+            **self._spread(),
+        }
+
+    def _spread(self) -> dict[str, float]:
+        """What `certainty` says of how well the cost holds the pose: stds and condition number."""
+        H, _ = lm_solver.normal_equations(self.terms, self.scales, self.problem.lambda_intensity)
+        curvatures = np.linalg.eigvalsh(H)
+        covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2  # rad, m
+        rotation_std = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+        position_std_m = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
+        moved_std_m = std_when_moved(
+            self._costs_at, self.T_world_camera, covariance, 1, n_independent=_INDEPENDENT
+        )
+        return {
+            "position_std_m": float(max(position_std_m, moved_std_m)),
+            "rotation_std_deg": float(np.rad2deg(rotation_std)),
+            "condition_number": float(curvatures[-1] / max(curvatures[0], 1e-9)),
         }
 
     def _costs_at(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
+        """The points' costs at another pose, at the scales of this one."""
         terms = residual_terms(self.problem, T_world_camera)
         return lm_solver.point_costs(terms, self.scales, self.problem.lambda_intensity)
 
-    def _begin(self, problem: Problem) -> None:
+    def _begin_stage(self, problem: Problem) -> None:
+        """Begin a stage at the pose so far, with scales and damping anew."""
         self.problem = problem
         self.damping = _FIRST_DAMPING
         self.is_ended = False
         self.twist = np.zeros(6)  # of the step before
         self.terms = residual_terms(problem, self.T_world_camera)
         self.scales = np.full(2, np.inf)
-        self._narrow()
+        self._narrow_scales()
 
-    def _narrow(self) -> None:
+    def _narrow_scales(self) -> None:
+        """Let the robust scales follow the residuals down; they never grow in a stage."""
         sigma, factor = self.problem.grid.accuracy.residual_sigma, self.problem.stage.mad_factor
         self.scales = lm_solver.robust_scales(self.terms.residuals, self.scales, sigma, factor)
 
 
 def _median(values: Float[np.ndarray, "n"]) -> float:
+    """One of the values: of an even number the upper one of the two in the middle."""
     return np.partition(values, len(values) // 2)[len(values) // 2]

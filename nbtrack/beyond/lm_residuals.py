@@ -37,8 +37,8 @@ G_MIN = 0.3
 G_MAX = 2.0
 G_SCALE = 0.5
 MARGIN = 0.3  # m beyond a field's bounds, where walls lie if the pose is off
-_ONE = np.float32(1)
-_ZERO = np.float32(0)
+ONE = np.float32(1)
+ZERO = np.float32(0)
 
 
 class Grid(NamedTuple):
@@ -107,26 +107,30 @@ def residual_terms(problem, T):
     residuals = np.empty((2, n_points), np.float32)
     gradients = np.empty((2, 3, n_points), np.float32)
     lever_arms, reliability, cells, in_cell, per_metre = _locate(points, T, grid)
-    vertices, one = grid.vertices, np.uintp(1)
+    # Unsigned numbers of vertices: numba need not ask whether they count from the end.
+    vertices, step_z = grid.vertices, np.uintp(1)
     step_x, step_y = np.uintp(grid.n_vertices[1] * grid.n_vertices[2]), np.uintp(grid.n_vertices[2])
     for i in range(n_points):
         v, x, y, z = np.uintp(cells[i]), in_cell[0, i], in_cell[1, i], in_cell[2, i]
         for k in range(3 if problem.stage.is_fine else 2):
-            # Eight corners of the cell: a, b are neighbours along z, ab and cd along y, the rest
-            # along x.
-            a, b = vertices[v, k], vertices[v + one, k]
-            c, d = vertices[v + step_y, k], vertices[v + step_y + one, k]
-            e, f = vertices[v + step_x, k], vertices[v + step_x + one, k]
-            g, h = vertices[v + step_x + step_y, k], vertices[v + step_x + step_y + one, k]
-            ab, cd, ef, gh = a + z * (b - a), c + z * (d - c), e + z * (f - e), g + z * (h - g)
-            low, high = ab + y * (cd - ab), ef + y * (gh - ef)
+            # Trilinear interpolation: c011 is the value at the cell's corner that is low in x, high
+            # in y and z; c01 is interpolated along z, c0 along y as well.
+            c000, c001 = vertices[v, k], vertices[v + step_z, k]
+            c010, c011 = vertices[v + step_y, k], vertices[v + step_y + step_z, k]
+            c100, c101 = vertices[v + step_x, k], vertices[v + step_x + step_z, k]
+            c110, c111 = vertices[v + step_x + step_y, k], vertices[v + step_x + step_y + step_z, k]
+            c00, c01 = c000 + z * (c001 - c000), c010 + z * (c011 - c010)
+            c10, c11 = c100 + z * (c101 - c100), c110 + z * (c111 - c110)
+            c0, c1 = c00 + y * (c01 - c00), c10 + y * (c11 - c10)
             if k == 2:
-                reliability[i] *= low + x * (high - low)
+                reliability[i] *= c0 + x * (c1 - c0)
                 break
-            low_z, high_z = b - a + y * (d - c - b + a), f - e + y * (h - g - f + e)
-            residuals[k, i] = low + x * (high - low)
-            gradients[k, 0, i] = (high - low) * per_metre[0, i]
-            gradients[k, 1, i] = (cd - ab + x * (gh - ef - cd + ab)) * per_metre[1, i]
+            # The derivative along z, at low and at high x.
+            low_z = c001 - c000 + y * (c011 - c010 - c001 + c000)
+            high_z = c101 - c100 + y * (c111 - c110 - c101 + c100)
+            residuals[k, i] = c0 + x * (c1 - c0)
+            gradients[k, 0, i] = (c1 - c0) * per_metre[0, i]
+            gradients[k, 1, i] = (c01 - c00 + x * (c11 - c10 - c01 + c00)) * per_metre[1, i]
             gradients[k, 2, i] = (low_z + x * (high_z - low_z)) * per_metre[2, i]
         residuals[1, i] -= problem.observed.intensity[i]
     terms = Terms(residuals, reliability, lever_arms, gradients)
@@ -137,8 +141,12 @@ def residual_terms(problem, T):
 @no_type_check
 @compiled
 def _locate(points, T, grid):
-    """Lever arms; whether points are usable (1 or 0); their cells, where in these they lie, and by
-    what derivatives along these are multiplied (1/m)."""
+    """Where points (m, camera frame) lie in the grid at a pose.
+
+    Returns lever arms (3 x n, m); reliabilities (n), 1 or, out of the usable box, 0; cells (n), as
+    numbers of their first vertices; positions in them (3 x n, from 0 to 1); and 1 / voxel (3 x n,
+    1/m), by which derivatives along a cell are multiplied, or 0 outside of the grid.
+    """
     n_points, inverse = len(points), 1 / grid.voxel
     reliability, cells = np.ones(n_points, np.float32), np.zeros(n_points, np.int64)
     lever_arms = np.empty((3, n_points), np.float32)
@@ -149,9 +157,10 @@ def _locate(points, T, grid):
             lever_arm = T[k, 0] * points[i, 0] + T[k, 1] * points[i, 1] + T[k, 2] * points[i, 2]
             world = lever_arm + T[k, 3]
             lever_arms[k, i] = lever_arm
-            reliability[i] *= (grid.usable_low[k] <= world) & (world <= grid.usable_high[k])
+            if not grid.usable_low[k] <= world <= grid.usable_high[k]:
+                reliability[i] = 0
             scaled = (world - grid.low[k]) * inverse
-            # Points outside are moved to the border, where the gradient is 0; so are NaNs.
+            # Points outside of the grid, and NaN, are moved to its border; the gradient is 0 there.
             per_metre[k, i] = inverse if (scaled >= 0) & (scaled <= last) else 0.0
             scaled = min(scaled, last) if scaled > 0 else 0.0
             cell = min(int(scaled), grid.n_vertices[k] - 2)
@@ -163,12 +172,12 @@ def _locate(points, T, grid):
 @no_type_check
 @compiled
 def _weigh(terms, normals, T):
-    """Reliability by the gradient norm and the angle to normals, and division by the norm."""
+    """Complete the terms in place: weigh by gradient norm and normals, and divide by the norm."""
     gradient = terms.gradients[0]
     for i in range(len(terms.reliability)):
         g = np.sqrt(gradient[0, i] ** 2 + gradient[1, i] ** 2 + gradient[2, i] ** 2)
-        weight = _ONE / (_ONE + ((g - _ONE) / np.float32(G_SCALE)) ** 2)
-        terms.reliability[i] *= weight * weight if G_MIN < g < G_MAX else _ZERO
+        weight = ONE / (ONE + ((g - ONE) / np.float32(G_SCALE)) ** 2)
+        terms.reliability[i] *= weight * weight if G_MIN < g < G_MAX else ZERO
         divisor = max(g, np.float32(G_MIN))
         if len(normals):
             cosine = 0.0

@@ -21,17 +21,15 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from nbtrack.beyond.lm_residuals import Terms, residual_terms
+from nbtrack.beyond.lm_residuals import ONE, ZERO, Terms, residual_terms
 from nbtrack.beyond.observed import compiled
 from nbtrack.core.arrays import Pose
 
 # So weak that it decides only where the frame says nothing, as along a corridor: one point's worth
 # at a twist of 0.5 rad or 0.5 m (our choice).
 PRIOR_WEIGHT = 1 / 0.5**2
-_MIN_RATIO = 0.5  # of two steps' lengths, from which on they creep
-_MAX_RATIO = 0.9  # of theirs, up to which the limit of the series is tried
-_ONE = np.float32(1)
-_ZERO = np.float32(0)
+_MIN_RATIO = 0.5  # steps creep if each is longer than this share of the last one
+_MAX_RATIO = 0.9  # larger ratios are taken for this one, so that no limit is too far
 
 
 class Step(NamedTuple):
@@ -46,8 +44,12 @@ class Step(NamedTuple):
 
 
 def robust_scales(residuals, before, residual_sigma, mad_factor):
-    """Robust scales of both residuals; numpy's own median, whose compilation would take seconds."""
-    if (before <= residual_sigma).all():  # as in most steps: a median takes as long as many sums
+    """Robust scales of both residuals (2), given those before: as the module states them.
+
+    Not compiled, since that would take seconds for numpy's `partition`.
+    """
+    # Scales that cannot fall any more, as in most steps: a median takes as long as many sums.
+    if (before <= residual_sigma).all():
         return before
     middle = (residuals.shape[1] - 1) // 2
     median = np.partition(np.abs(residuals), middle, axis=1)[:, middle]
@@ -57,13 +59,14 @@ def robust_scales(residuals, before, residual_sigma, mad_factor):
 @no_type_check
 @compiled
 def robust_cost(residuals, reliability, scales, lambda_intensity):
-    """The mean cost of the points."""
+    """The mean cost of the points, as the module states it."""
     total, weight = 0.0, np.float32(lambda_intensity)
-    first, second = np.float32(1 / scales[0]), np.float32(1 / scales[1])
+    per_scale_d, per_scale_i = np.float32(1 / scales[0]), np.float32(1 / scales[1])
     for i in range(len(reliability)):
-        u, v = (residuals[0, i] * first) ** 2, (residuals[1, i] * second) ** 2
-        cost = u / (_ONE + u) + weight * v / (_ONE + v)
-        total += reliability[i] * cost + (_ONE - reliability[i]) * (_ONE + weight)
+        square_d = (residuals[0, i] * per_scale_d) ** 2
+        square_i = (residuals[1, i] * per_scale_i) ** 2
+        cost = square_d / (ONE + square_d) + weight * square_i / (ONE + square_i)
+        total += reliability[i] * cost + (ONE - reliability[i]) * (ONE + weight)
     return total / len(reliability)
 
 
@@ -78,12 +81,12 @@ def point_costs(terms, scales, lambda_intensity):
 @no_type_check
 @compiled
 def normal_equations(terms, scales, lambda_intensity):
-    """H (6 x 6) and b (6), in double precision."""
+    """H (6 x 6) and b (6), in double precision, as the module states them."""
     n_points = len(terms.reliability)
     jacobian, weights = np.empty((6, n_points), np.float32), np.empty(n_points, np.float32)
     matrix, vector = np.zeros((6, 6)), np.zeros(6)
     for k in range(2):
-        scale, share = np.float32(scales[k]), np.float32(lambda_intensity if k else 1.0)
+        scale, factor = np.float32(scales[k]), np.float32(lambda_intensity if k == 1 else 1.0)
         residuals, gradients = terms.residuals[k], terms.gradients[k]
         for i in range(n_points):
             gx, gy, gz = gradients[0, i], gradients[1, i], gradients[2, i]
@@ -91,8 +94,8 @@ def normal_equations(terms, scales, lambda_intensity):
             jacobian[0, i], jacobian[1, i] = ay * gz - az * gy, az * gx - ax * gz
             jacobian[2, i], jacobian[3, i] = ax * gy - ay * gx, gx
             jacobian[4, i], jacobian[5, i] = gy, gz
-            flat = (_ONE + (residuals[i] / scale) ** 2) * scale
-            weights[i] = share * terms.reliability[i] / (flat * flat)
+            divisor = (ONE + (residuals[i] / scale) ** 2) * scale
+            weights[i] = factor * terms.reliability[i] / (divisor * divisor)
         for a in range(6):
             for i in range(n_points):
                 vector[a] += weights[i] * jacobian[a, i] * residuals[i]
@@ -129,17 +132,19 @@ def retract(T, twist):
 def damped_step(problem, T, terms, scales, damping):
     """The twist (6,) that solves the damped normal equations of data and prior."""
     matrix, vector = normal_equations(terms, scales, problem.lambda_intensity)
-    T_start = problem.T_start
     for k in range(3):
+        # sin(angle) axis is half of the differences Q_ij - Q_ji of the rotation Q = R R_start'.
         i, j = (k + 2) % 3, (k + 1) % 3
-        turned = 0.0
+        difference = 0.0
         for m in range(3):
-            turned += T[i, m] * T_start[j, m] - T[j, m] * T_start[i, m]
-        vector[k] += PRIOR_WEIGHT * turned / 2
-        vector[3 + k] += PRIOR_WEIGHT * (T[k, 3] - T_start[k, 3])
+            difference += T[i, m] * problem.T_start[j, m] - T[j, m] * problem.T_start[i, m]
+        vector[k] += PRIOR_WEIGHT * difference / 2
+        vector[3 + k] += PRIOR_WEIGHT * (T[k, 3] - problem.T_start[k, 3])
     for k in range(6):
         matrix[k, k] += PRIOR_WEIGHT + damping * matrix[k, k]
-    for k in range(6):  # elimination without pivots, which positive definite matrices do not need
+    # Gaussian elimination without pivots, which positive definite matrices do not need; then back
+    # substitution, with the sign of the twist.
+    for k in range(6):
         for i in range(k + 1, 6):
             share = matrix[i, k] / matrix[k, k]
             vector[i] -= share * vector[k]
@@ -157,26 +162,28 @@ def damped_step(problem, T, terms, scales, damping):
 def try_step(problem, T, terms, scales, damping, last_twist):
     """A step from a pose with its terms, after a step of `last_twist` (0 at first).
 
-    Steps that creep, each hardly shorter than the last one, are a geometric series: first its
-    limit is tried (Aitken 1926), so far as `_MAX_RATIO` allows.
+    Steps that creep, each hardly shorter than the last one and in nearly its direction, are a
+    geometric series: first its limit is tried (Aitken 1926), so far as `_MAX_RATIO` allows, and
+    the step alone if that is no better.
 
-    From cell to cell of a grid gradients jump, and reliabilities: in the fine stage a pose is no
-    worse for that. But at first, from afar, the gradient tells that a surface is near.
+    In the fine stage usable points keep the reliabilities of the pose before: from cell to cell of
+    a grid gradients jump, and reliabilities with them, and a pose is no worse for that. In the
+    coarse one, from afar, reliable gradients tell that a surface is near.
     """
     twist = damped_step(problem, T, terms, scales, damping)
     before = robust_cost(terms.residuals, terms.reliability, scales, problem.lambda_intensity)
-    along, length = (twist * last_twist).sum(), (last_twist * last_twist).sum()
-    does_creep = along > _MIN_RATIO * length and along**2 > 0.5 * length * (twist * twist).sum()
-    stride = 1 / (1 - min(along / length, _MAX_RATIO)) if does_creep else 1.0
+    along, square = (twist * last_twist).sum(), (last_twist * last_twist).sum()
+    does_creep = along > _MIN_RATIO * square and along**2 > 0.5 * square * (twist * twist).sum()
+    stride = 1 / (1 - min(along / square, _MAX_RATIO)) if does_creep else 1.0
     for factor in (stride, 1.0):
         T_after = retract(T, factor * twist)
         after = residual_terms(problem, T_after)
         reliability = after.reliability
         if problem.stage.is_fine:
-            reliability = np.where(reliability > 0, terms.reliability, _ZERO)
+            reliability = np.where(reliability > 0, terms.reliability, ZERO)
         cost = robust_cost(after.residuals, reliability, scales, problem.lambda_intensity)
         if cost < before:
             return Step(True, T_after, after, twist, factor * np.abs(twist).max(), before)
-        if factor == 1:
+        if not does_creep:
             break
     return Step(False, T, terms, last_twist, np.abs(twist).max(), before)

@@ -19,7 +19,7 @@ from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 WRONG_M = 0.05
 WRONG_DEG = 3.0
-_LEAST_SHARE = 0.01  # of points; shares of none and of all would be infinitely telling
+_LEAST_SHARE = 0.01  # of points; shares of 0 and 1 would have infinite log odds
 _INTERCEPT = 2.01
 _COEFFICIENTS = np.array([-2.06, -0.28, 2.8, 1.39])
 # Scales of robust costs are 3 medians of |r|: two standard deviations, were residuals normal.
@@ -90,7 +90,9 @@ def std_when_moved(
 def score_detection(
     called_lost: Bool[np.ndarray, "n"], errors_m: Float[np.ndarray, "n"]
 ) -> dict[str, float | None]:
-    """Precision and recall of verdicts against `LOST_THRESHOLD_M`; None is a share of nothing.
+    """Precision and recall of verdicts: lost are frames with errors above `LOST_THRESHOLD_M`.
+
+    The precision is None where none was called lost, the recall None where none was.
 
     >>> score_detection(np.array([True, True, False]), np.array([0.3, 0.1, 0.5]))
     {'lost_precision': 0.5, 'lost_recall': 0.5}
@@ -98,4 +100,4 @@ def score_detection(
     is_lost = errors_m > LOST_THRESHOLD_M
     both = int((called_lost & is_lost).sum())
     counts = {"lost_precision": int(called_lost.sum()), "lost_recall": int(is_lost.sum())}
-    return {name: both / count if count else None for name, count in counts.items()}
+    return {name: both / count if count > 0 else None for name, count in counts.items()}
