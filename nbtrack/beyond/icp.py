@@ -31,9 +31,8 @@ _MIN_INLIERS = 0.5  # share of the points; below, a frame is lost
 _MIN_SCALE = 0.005  # m, of robust costs: what a voxel's points scatter by
 _INDEPENDENT = 128  # points: with 256 half of the wrong poses before a flat wall pass
 _LOST = 0.5  # a pose is lost if the probability that it is right is less
-# A move of less than the epsilons (rad, m) ends a search.
-_OPTIONS = {"registration_type": "GICP", "num_threads": 1, "max_iterations": 30}
-_OPTIONS |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}
+_SEARCH = {"registration_type": "GICP", "num_threads": 1, "max_iterations": 30}
+_END = {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}  # rad, m; smaller moves end it
 
 
 @dataclass(frozen=True)
@@ -72,8 +71,8 @@ class IcpTracker(Tracker):
             )
         self.small_gicp = importlib.import_module(self.package)
         field = deepcopy(field).cpu()
-        cloud = self.small_gicp.PointCloud(field.points.double().numpy())
-        self.target, self.target_tree = self._with_planes(cloud)
+        self.target = self.small_gicp.PointCloud(field.points.double().numpy())
+        self.target_tree = self._find_planes(self.target)
         self.map_normals = self.target.normals()[:, :3]
         return field
 
@@ -89,10 +88,10 @@ class IcpTracker(Tracker):
         self.source = None
         self.is_converged = False
         self.found = None
-        points = draw_points(frame, self.settings.n_pixels, self.generator, _EDGE_JUMP)[0]
-        if len(points):
-            thinned = self.small_gicp.voxelgrid_sampling(points, _SOURCE_VOXEL)
-            self.source, _ = self._with_planes(thinned)
+        observed = draw_points(frame, self.settings.n_pixels, self.generator, _EDGE_JUMP)
+        if len(observed.points):
+            self.source = self.small_gicp.voxelgrid_sampling(observed.points, _SOURCE_VOXEL)
+            self._find_planes(self.source)
 
     def step(self) -> float:
         """Align the frame; returns half the mean squared Mahalanobis distance of the inliers.
@@ -102,13 +101,15 @@ class IcpTracker(Tracker):
         self.is_converged = True
         if self.source is None or self.source.size() < _MIN_POINTS:
             return float("nan")
+        # From afar the tree would look for partners for seconds, and find none.
         starts = [T for T in self.T_starts if self._is_near(T)]
         if not starts:
-            return float("nan")  # of points so far away the tree finds no partner, in seconds
+            return float("nan")
         if np.abs(self.T_starts - self.T_starts[0]).max() < _FAR_APART:
             starts = starts[:1]
-        found = max((self._align(T, _WIDE) for T in starts), key=lambda result: result.num_inliers)
-        found = self._align(found.T_target_source, _NARROW) if found.num_inliers else found
+        found = max([self._align(T, _WIDE) for T in starts], key=lambda result: result.num_inliers)
+        if found.num_inliers:
+            found = self._align(found.T_target_source, _NARROW)
         if not found.num_inliers or not np.isfinite(found.T_target_source).all():
             return float("nan")
         self.T_world_camera = torch.from_numpy(found.T_target_source.copy())
@@ -116,22 +117,22 @@ class IcpTracker(Tracker):
         return found.error / found.num_inliers
 
     def _is_near(self, T_world_camera: Pose) -> bool:
-        """Whether any point lies near the map's box at a pose."""
+        """Whether any point of the frame lies within `_WIDE` of the map's box at a pose."""
         points_world = (self.source.points() @ T_world_camera.T)[:, :3]
         low, high = self.field.tree.mins - _WIDE, self.field.tree.maxes + _WIDE
         return bool(((points_world > low) & (points_world < high)).all(axis=1).any())
 
-    def _align(self, T_start: Pose, distance: float) -> Any:
-        """The frame aligned with the map, where partners are so near (m)."""
-        options = {**_OPTIONS, "max_correspondence_distance": distance}
+    def _align(self, T_start: Pose, max_distance: float) -> Any:
+        """small_gicp's result of the frame aligned with the map, with partners so near (m)."""
+        options = {**_SEARCH, **_END, "max_correspondence_distance": max_distance}
         return self.small_gicp.align(self.target, self.source, self.target_tree, T_start, **options)
 
     def _distances(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
         """How far (m) the points lie from their partners' planes; infinite where none is near."""
         points_world = (self.source.points() @ T_world_camera.T)[:, :3]
         tree = self.field.tree
-        apart, partners = tree.query(points_world, distance_upper_bound=_NARROW)
-        is_near = np.isfinite(apart)
+        to_partners, partners = tree.query(points_world, distance_upper_bound=_NARROW)
+        is_near = np.isfinite(to_partners)
         offsets = points_world[is_near] - tree.data[partners[is_near]]
         normals = self.map_normals[partners[is_near]]
         distances = np.full(len(points_world), np.inf)
@@ -141,30 +142,33 @@ class IcpTracker(Tracker):
     def report(self) -> dict[str, float | bool]:
         """The share of points near the map, the position's std, and whether the frame is lost.
 
-        It is where most points lie elsewhere, or where they fit as well at a wrong position. This
-        is no part of ICP, so that the time of a frame is without it.
+        It is lost if most points lie elsewhere, or if they fit as well at a wrong position. The
+        verdict is no part of ICP, and no part of a frame's measured time.
         """
         if self.found is None:
             return {"inlier_ratio": 0.0, "lost": True}
         T_found = self.found.T_target_source
         distances = self._distances(T_found)
-        usual = np.median(distances[np.isfinite(distances)])
-        scale = max(MAD_FACTOR * usual, _MIN_SCALE)
-        turn = np.kron(np.eye(2), T_found[:3, :3])  # small_gicp's twists are in the camera's frame
-        H_world = turn @ self.found.H @ turn.T
+        scale = max(MAD_FACTOR * np.median(distances[np.isfinite(distances)]), _MIN_SCALE)
+
+        def costs_at(T_world_camera: Pose) -> Float[np.ndarray, "n"]:
+            return 1 - 1 / (1 + (self._distances(T_world_camera) / scale) ** 2)
+
+        # small_gicp's twists are in the camera's frame: both turn and offset are to be rotated.
+        R_twist = np.kron(np.eye(2), T_found[:3, :3])
+        H_world = R_twist @ self.found.H @ R_twist.T
         covariance = np.linalg.inv(H_world + PRIOR_WEIGHT * np.eye(6))
-        # Two directions, those of a wall, since nothing but planes counts.
+        # Two directions, those along a wall, since nothing but planes counts.
         position_std_m = std_when_moved(
-            lambda T: 1 - 1 / (1 + (self._distances(T) / scale) ** 2), T_found, covariance,
-            n_directions=2, n_independent=_INDEPENDENT,
-        )  # fmt: skip
+            costs_at, T_found, covariance, n_directions=2, n_independent=_INDEPENDENT
+        )
         inlier_ratio = self.found.num_inliers / self.source.size()
         is_held = p_within(CORRELATED * position_std_m) > _LOST
         lost = inlier_ratio < _MIN_INLIERS or not is_held
         return {"inlier_ratio": inlier_ratio, "position_std_m": position_std_m, "lost": lost}
 
-    def _with_planes(self, cloud: Any) -> tuple[Any, Any]:
-        """A cloud of small_gicp with normals and covariances, and its tree."""
+    def _find_planes(self, cloud: Any) -> Any:
+        """Give a cloud of small_gicp its normals and covariances; returns its search tree."""
         tree = self.small_gicp.KdTree(cloud)
         self.small_gicp.estimate_normals_covariances(cloud, tree, _NEIGHBOURS)
-        return cloud, tree
+        return tree

@@ -12,8 +12,9 @@ from nbtrack.data.pixels import PLANE_JUMP, PLANE_REACH
 
 _EDGE_JUMP = 0.05  # a neighbouring depth that differs by a larger share marks an edge
 _DRAWN_PER_POINT = 4  # pixels that are looked at for every point that is wanted
-# Pixels are spread evenly: of the sequence R2 (Roberts 2018), the fractions of n g and n g^2 with
-# g^3 + g^2 = 1, every beginning is. In units of 1 / _MODULUS; down and across.
+# Pixels follow the sequence R2 (Roberts 2018): the n-th lies at the fractional parts of n g and
+# n g^2, with g^3 + g^2 = 1, down and across, in units of 1 / _MODULUS. However many are taken, they
+# are spread evenly.
 _EVEN_STEPS = (0xC13FA9A9, 0x91E10DA5)
 _MODULUS = 2**32
 LUMA = (0.299, 0.587, 0.114)
@@ -62,15 +63,17 @@ def with_normals(frame: Frame, observed: Observed, n_points: int) -> Observed:
 
 
 def _pinhole(frame: Frame) -> tuple[float, float, float, float]:
-    c = frame.camera
-    return c.fx, c.fy, c.cx, c.cy
+    """fx, fy, cx and cy (pixels): a tuple, as compiled functions take it."""
+    return frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy
 
 
 @no_type_check
 @compiled
 def _drawn_points(depth_mm, color, pinhole, n_points, starts, edge_jump):
-    (height, width), (fx, fy, cx, cy), n_drawn = depth_mm.shape, pinhole, 0
-    points, luma = np.empty((n_points, 3)), np.empty(n_points)
+    """Points (m, camera frame) and luma of `draw_points`; `starts` is where R2 begins."""
+    height, width = depth_mm.shape
+    fx, fy, cx, cy = pinhole
+    points, luma, n_drawn = np.empty((n_points, 3)), np.empty(n_points), 0
     n_looked_at = _DRAWN_PER_POINT * n_points if min(height, width) > 2 else 0
     for order in range(n_looked_at):
         if n_drawn == n_points:
@@ -81,10 +84,11 @@ def _drawn_points(depth_mm, color, pinhole, n_points, starts, edge_jump):
         jump = edge_jump * z
         is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
         is_smooth &= abs(depth_mm[v, u + 1] - z) < jump and abs(depth_mm[v, u - 1] - z) < jump
-        if is_smooth:  # never without a depth: nothing is below a jump of zero
-            point, metres = points[n_drawn], z * MILLIMETRE
-            point[0], point[1] = (u + 0.5 - cx) / fx * metres, (v + 0.5 - cy) / fy * metres
-            point[2] = metres
+        if is_smooth:  # never without a depth: no difference is below a jump of zero
+            depth = z * MILLIMETRE
+            points[n_drawn, 0] = (u + 0.5 - cx) / fx * depth
+            points[n_drawn, 1] = (v + 0.5 - cy) / fy * depth
+            points[n_drawn, 2] = depth
             red, green, blue = color[v, u, 0], color[v, u, 1], color[v, u, 2]
             luma[n_drawn] = (_RED * red + _GREEN * green + _BLUE * blue) / 255
             n_drawn += 1
@@ -94,8 +98,9 @@ def _drawn_points(depth_mm, color, pinhole, n_points, starts, edge_jump):
 @no_type_check
 @compiled
 def _normals(depth_mm, pinhole, points):
-    """`PixelSampler.normals_camera` at observed points (m, camera frame)."""
-    (height, width), (fx, fy, cx, cy) = depth_mm.shape, pinhole
+    """`PixelSampler.normals_camera` at observed points (m, camera frame); 0 where not known."""
+    height, width = depth_mm.shape
+    fx, fy, cx, cy = pinhole
     reach, normals = max(1, round(width * PLANE_REACH)), np.zeros((len(points), 3))
     for i in range(len(points)):
         x, y = points[i, 0] / points[i, 2], points[i, 1] / points[i, 2]
@@ -105,7 +110,8 @@ def _normals(depth_mm, pinhole, points):
             above, below = depth_mm[v - reach, u], depth_mm[v + reach, u]
             jump = max(abs(left - z), abs(right - z), abs(above - z), abs(below - z))
             if jump < PLANE_JUMP * z:
-                # How fast the logarithm of the depth grows along x / z and y / z.
+                # How fast the logarithm of the depth grows along x / z and y / z: a normal of the
+                # plane is (a, b, c).
                 a = fx / reach * (right - left) / (right + left)
                 b = fy / reach * (below - above) / (below + above)
                 c = -1 - x * a - y * b
