@@ -51,8 +51,8 @@ class FeatureGrid(nn.Module):
         self.register_buffer("low", torch.tensor(bounds.minimum), persistent=False)
         extent = torch.tensor(bounds.maximum) - self.low
         self.voxels = [settings.finest * 2**level for level in range(settings.levels)]
-        sizes = [((extent / voxel).ceil().long() + 1).tolist() for voxel in self.voxels]
-        volumes = (torch.randn(settings.features, *s, generator=generator) for s in sizes)
+        shapes = [((extent / voxel).ceil().long() + 1).tolist() for voxel in self.voxels]
+        volumes = [torch.randn(settings.features, *shape, generator=generator) for shape in shapes]
         self.volumes = nn.ParameterList(_SMALL * volume for volume in volumes)
         self.layer = nn.Linear(settings.levels * settings.features + 3, settings.hidden)
         self.head = nn.Linear(settings.hidden, 4)
@@ -63,9 +63,9 @@ class FeatureGrid(nn.Module):
     def features(self, points_world: Points) -> Float[Tensor, "n hidden"]:
         """Activations of the hidden layer at points (m, world frame)."""
         levels = zip(self.volumes, self.voxels, strict=True)
-        found = [trilinear(volume, self.low, voxel, points_world).T for volume, voxel in levels]
-        normalized = (points_world - self.low) / self.metres_per_unit - 1
-        return nn.functional.silu(self.layer(torch.cat([*found, normalized], dim=-1)))
+        inputs = [trilinear(volume, self.low, voxel, points_world).T for volume, voxel in levels]
+        inputs.append((points_world - self.low) / self.metres_per_unit - 1)
+        return nn.functional.silu(self.layer(torch.cat(inputs, dim=-1)))
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Raw colour and the raw fourth output, before a field gives them a meaning."""

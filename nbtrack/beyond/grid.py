@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from nbtrack.beyond.views import Viewpoints
 from nbtrack.core.arrays import Colors, Points, Values
@@ -60,12 +61,13 @@ class BakedField(Field):
         self.surface_level = float(source.surface_level)
         self.voxel = float(voxel)
         self.n_vertices = checked_size(source.bounds, voxel)
-        # The first vertex lies one cell below the bounds; they are listed with z fastest.
+        # The first vertex lies one cell below the bounds; z is fastest.
         low = torch.tensor([x - voxel for x in self.bounds.minimum]).to(source.device)
-        axes = (torch.arange(n, dtype=torch.int32, device=low.device) for n in self.n_vertices)
-        numbers = torch.cartesian_prod(*axes).split(_POINTS_AT_ONCE)
-        answers = [source(low + voxel * number) for number in numbers]
-        color, value = map(torch.cat, zip(*answers, strict=True))
+        axes = [torch.arange(n, dtype=torch.int32, device=low.device) for n in self.n_vertices]
+        batches = torch.cartesian_prod(*axes).split(_POINTS_AT_ONCE)
+        answers = [source(low + voxel * vertices) for vertices in batches]
+        color = torch.cat([color for color, _ in answers])
+        value = torch.cat([value for _, value in answers])
         volume = torch.cat([color.T, value[None], torch.ones_like(value)[None]])
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("volume", volume, persistent=False)
@@ -83,7 +85,7 @@ class BakedField(Field):
         """All channels at points (m)."""
         volume = self.volume.view(5, *self.n_vertices)
         values = trilinear(volume, self.low, self.voxel, points_world)
-        # A point that is not a number is taken for one at the border.
+        # `trilinear` moves NaN to the border, too.
         return torch.where(points_world.isnan().any(dim=-1), torch.nan, values)
 
 
@@ -95,18 +97,20 @@ def trilinear(
     Differentiable; points outside are moved to the border.
     """
     extent = voxel * (constant(tuple(volume.shape[1:]), low.device, low.dtype) - 1)
-    # grid_sample takes x, y, z of a volume indexed z, y, x, from -1 to 1.
+    # grid_sample takes positions from -1 to 1, along the volume's axes in reverse order.
     normalized = (2 * (points - low) / extent - 1).flip(-1)[None, None, None]
-    options = {"padding_mode": "border", "align_corners": True}
-    return nn.functional.grid_sample(volume[None], normalized, **options)[0, :, 0, 0]
+    values = grid_sample(volume[None], normalized, padding_mode="border", align_corners=True)
+    return values[0, :, 0, 0]
 
 
-def checked_size(
-    bounds: SceneBounds, voxel: float | int, setting: str = "voxel"
-) -> tuple[int, int, int]:
-    """Vertices along x, y and z, if the grid is allowed. Raises ConfigError, naming the setting."""
+def checked_size(bounds: SceneBounds, voxel: float | int, key: str = "voxel") -> tuple[int, ...]:
+    """The number of vertices along x, y and z of a grid with cells of `voxel` (m).
+
+    Raises ConfigError, which names the setting's key, unless the voxel is positive and the grid
+    fits in 0.5 GB.
+    """
     extent = np.subtract(bounds.maximum, bounds.minimum)
-    # Stays floating-point until it is known to be small: 1e-300 m is a positive length.
+    # In floating point, where the number of vertices may overflow: 1e-300 m is positive, too.
     with np.errstate(all="ignore"):
         n_vertices = np.ceil(extent / voxel) + 3
         n_bytes = float(np.prod(n_vertices)) * _BYTES_PER_VERTEX
@@ -114,8 +118,8 @@ def checked_size(
         # The smallest that fits, with 5 % for the cells to spare and for rounding.
         enough = 1.05 * (float(np.prod(extent)) * _BYTES_PER_VERTEX / _MAX_BYTES) ** (1 / 3)
         raise ConfigError(
-            f"{setting} is {voxel} m, of a scene of {' x '.join(f'{x:.3g}' for x in extent)} m: a "
-            f"grid may take {_MAX_BYTES / 1e9:g} GB; set {setting}={enough:.2g} or more; "
+            f"{key} is {voxel} m, of a scene of {' x '.join(f'{x:.3g}' for x in extent)} m: a "
+            f"grid may take {_MAX_BYTES / 1e9:g} GB; set {key}={enough:.2g} or more; "
             "is the scene smaller than that, `data check` may tell which depths or poses are wrong"
         )
     return tuple(n_vertices.astype(int).tolist())

@@ -6,8 +6,10 @@ _COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
 _NEUS_CORRECTED = ("correction.neus=0.04",)
 # As good as from 1400 iterations, in half the time (benchmarks/README.md; rooms for tuning).
 _CORRECTED = ("correction.neus_plus=0.04", "mapping.neus_plus.iterations=600")
-_SPARSE, _MIDDLE, _DENSE = ((*_CORRECTED, f"tracking.lm.n_pixels={n}") for n in (512, 2048, 4096))
-_GEOMETRY = (*_MIDDLE, "tracking.lm.lambda_intensity=0")
+_SPARSE = (*_CORRECTED, "tracking.lm.n_pixels=512")
+_MIDDLE = (*_CORRECTED, "tracking.lm.n_pixels=2048")
+_DENSE = (*_CORRECTED, "tracking.lm.n_pixels=4096")
+_SHAPE = (*_MIDDLE, "tracking.lm.lambda_intensity=0")
 _GRID_CORRECTED = ("correction.grid_plus=0.04", "tracking.lm.n_pixels=2048")
 
 METHODS |= {
@@ -25,9 +27,7 @@ METHODS |= {
     "corrected": Method("NeuS+ corrected (LM)", "neus_plus", "lm", _MIDDLE),
     "corrected_sparse": Method("NeuS+ corrected (LM), sparse", "neus_plus", "lm", _SPARSE),
     "corrected_dense": Method("NeuS+ corrected (LM), dense", "neus_plus", "lm", _DENSE),
-    "corrected_geometry": Method(
-        "NeuS+ corrected (LM), without colour", "neus_plus", "lm", _GEOMETRY
-    ),
+    "corrected_geometry": Method("NeuS+ corrected (LM), without colour", "neus_plus", "lm", _SHAPE),
     "grid_corrected": Method("NeuS+ grid corrected (LM)", "grid_plus", "lm", _GRID_CORRECTED),
     "neus_corrected": Method("NeuS corrected (LM)", "neus", "lm", _NEUS_CORRECTED),
     "sdf_corrected": Method("NeuS corrected with SDF (Adam)", "neus", "sdf", _NEUS_CORRECTED),

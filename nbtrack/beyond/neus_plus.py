@@ -22,8 +22,8 @@ _MIN_VOXEL = 0.05  # m between the corners at which distances are kept
 _MAX_CELLS_A_SIDE = 128  # larger scenes have larger voxels
 _MIN_POINTS = 3  # of a cell whose mean counts as a point of the surface: single ones are noise
 _POINTS_PER_FRAME = 10_000  # about, on a regular grid of its pixels
-# How much the distances to a tangent plane and to the nearest point may differ for the plane to be
-# believed (m): by half a point voxel, and the cells' rounding of distances near the surface.
+# The tangent plane gives a sample's distance if that differs by less (m) from the distance to the
+# nearest point: half a voxel of the points, and the rounding of distances near the surface.
 _PLANE_TOLERANCE = 0.015
 _FREE_IN_FRONT = 0.05  # m in front of a measured depth
 Flags = Bool[Tensor, "rays samples"]
@@ -119,27 +119,31 @@ class ObservedDistance:
     ) -> None:
         low, high = np.array(bounds.minimum), np.array(bounds.maximum)
         self.voxel = max(_MIN_VOXEL, (high - low).max() / _MAX_CELLS_A_SIDE)
+        # Points are kept in cells half as large: the centre of every second one is a corner.
         fine = self.voxel / 2
         shape = np.ceil((high - low) / fine).astype(int) + 1
         n_pixels = sequence.intrinsics.width * sequence.intrinsics.height
         stride = max(1, round((n_pixels / _POINTS_PER_FRAME) ** 0.5))
         cloud = fuse_points(sequence, frames, bounds, fine, stride, _MIN_POINTS)
         points = cloud.points.double().numpy()
-        number = np.full(shape, -1)  # of each cell's point
+        point_in = np.full(shape, -1)  # each cell's point, by number; -1 where there is none
         cells, inside = cells_of(points, low, shape, fine)
-        number.flat[cells] = np.flatnonzero(inside)
-        place = distance_transform_edt(number < 0, return_distances=False, return_indices=True)
-        nearest = points[number[tuple(place[:, ::2, ::2, ::2])]]
+        point_in.flat[cells] = np.flatnonzero(inside)
+        # Of each cell the nearest one that has a point: 3 indices.
+        place = distance_transform_edt(point_in < 0, return_distances=False, return_indices=True)
+        nearest = points[point_in[tuple(place[:, ::2, ::2, ::2])]]
         corners = np.stack(np.indices(shape)[:, ::2, ::2, ::2], -1) * fine + low + fine / 2
-        distance = np.linalg.norm(corners - nearest, axis=-1)
-        corners = torch.from_numpy(corners.reshape(-1, 3)).float()
-        is_free = min_depth_behind(corners, sequence, frames) < -_FREE_IN_FRONT
-        values = torch.from_numpy(distance).float(), is_free.view(distance.shape).float()
-        self.values = torch.stack(values).to(device)
-        self.low = corners[0].to(device)
+        distance = torch.from_numpy(np.linalg.norm(corners - nearest, axis=-1)).float()
+        corners_world = torch.from_numpy(corners.reshape(-1, 3)).float()
+        is_free = min_depth_behind(corners_world, sequence, frames) < -_FREE_IN_FRONT
+        self.values = torch.stack([distance, is_free.view(distance.shape).float()]).to(device)
+        self.low = corners_world[0].to(device)
 
     def __call__(self, points_world: Float[Tensor, "rays samples 3"]) -> tuple[RaySamples, Flags]:
-        """Distance (m) and whether it is free at points (m); outside those of the border."""
-        found = trilinear(self.values, self.low, self.voxel, points_world.flatten(0, 1))
-        distance, free = found.view(2, *points_world.shape[:2])
+        """Distance (m), and whether a camera saw through, at points (m).
+
+        Points outside of the grid get the values at its border.
+        """
+        values = trilinear(self.values, self.low, self.voxel, points_world.flatten(0, 1))
+        distance, free = values.view(2, *points_world.shape[:2])
         return distance, free > 0.5

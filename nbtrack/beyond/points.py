@@ -21,7 +21,7 @@ from nbtrack.fields.base import Field, State
 
 _MAX_CELLS_A_SIDE = 2**20  # so that a cell's number fits into 64 bits
 _ASKED_EVERY = 5  # frames
-_FRAMES_AT_ONCE = 8  # frames whose voxels wait to be merged: what the memory is bounded by
+_FRAMES_AT_ONCE = 8  # frames whose voxels wait to be merged: it bounds the memory
 
 
 @dataclass(frozen=True)
@@ -98,30 +98,33 @@ def fuse_points(
             f"{extent.max() / _MAX_CELLS_A_SIDE:.2g} to {extent.max():.2g} m; set for instance 0.02"
         )
     shape = np.floor(extent / voxel).astype(np.int64) + 1
-    # For each voxel's number the sums of x, y, z (m), red, green, blue, and one a pixel.
-    parts = []
+    # Rows of x, y, z (m), red, green, blue and 1, by the voxel's number; merged, their sums.
+    tables = []
     for count, index in enumerate(frames.tolist(), start=1):
         frame = sequence[index]
         T_world_camera = sequence.T_world_camera[index]
         rows, columns = frame.measured_pixels(stride)
         points_camera = frame.points(rows, columns)[0].double().numpy()
-        points = points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+        points_world = points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
         colors = frame.color[rows, columns].numpy() / 255.0
-        voxels, inside = cells_of(points, np.array(bounds.minimum), shape, voxel)
-        values = np.concatenate([points, colors, np.ones((len(points), 1))], axis=1)[inside]
-        parts.append(pd.DataFrame(values, voxels))
+        voxels, inside = cells_of(points_world, np.array(bounds.minimum), shape, voxel)
+        values = np.column_stack([points_world, colors, np.ones(len(colors))])[inside]
+        tables.append(pd.DataFrame(values, voxels))
         if count % _FRAMES_AT_ONCE == 0 or count == len(frames):
-            parts = [pd.concat(parts).groupby(level=0).sum()]
-    sums = parts[0].to_numpy()
-    sums = sums[sums[:, 6] >= min(min_count, sums[:, 6].max(initial=0))]
-    means = torch.from_numpy((sums[:, :6] / sums[:, 6:]).astype(np.float32))
+            tables = [pd.concat(tables).groupby(level=0).sum()]
+    sums = tables[0].to_numpy()
+    kept = sums[sums[:, 6] >= min(min_count, sums[:, 6].max(initial=0))]
+    means = torch.from_numpy((kept[:, :6] / kept[:, 6:]).astype(np.float32))
     return PointCloud(means[:, :3].contiguous(), means[:, 3:].contiguous(), voxel, bounds)
 
 
 def cells_of(
     points: WorldPoints, low: Float[np.ndarray, "3"], shape: Int[np.ndarray, "3"], voxel: float
 ) -> tuple[Int[np.ndarray, "_"], np.ndarray]:
-    """Numbers of the grid's cells that hold points, z fastest; and which points lie inside."""
+    """The number of the grid's cell that holds each point inside, z fastest; and which these are.
+
+    The grid begins at `low` (m) and has cells of `voxel` (m). The latter is a mask of the points.
+    """
     cells = np.floor((points - low) / voxel).astype(np.int64)
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
     return np.ravel_multi_index(tuple(cells[inside].T), tuple(shape)), inside
@@ -138,6 +141,7 @@ def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frame
 
 
 def _depth_behind(frame: Frame, points_world: Points) -> Values:
+    """`min_depth_behind` of one frame."""
     T_world_camera = torch.from_numpy(frame.T_world_camera).to(points_world)
     points_camera = (points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     columns, rows, depth = project(frame.camera, points_camera)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, grid_sample
 
-from nbtrack.core.arrays import Poses
+from nbtrack.core.arrays import Poses, Values
 from nbtrack.data.frame import MILLIMETRE, Frame
 
 _COLUMNS = 20
@@ -41,23 +41,27 @@ class Viewpoints(NamedTuple):
 
 
 def view_of(frame: Frame) -> View:
-    """Luma (0 to 255; 0 out of the picture) and depth (in 5 cm) of a frame, in one byte each."""
+    """Luma (1 to 255; 0 out of the picture) and depth (in `_DEPTH_UNIT`), in one byte each.
+
+    Luma is here the mean of red, green and blue. The frame is averaged in cells as large as those
+    of a view, then interpolated along a view's directions.
+    """
     camera = frame.camera
-    luma, depth = frame.color.float().mean(dim=-1), frame.depth_mm.float()
-    parts = torch.stack([luma, depth * (MILLIMETRE / _DEPTH_UNIT), (depth > 0).float()])
-    cells = [  # as large as those of a view
-        max(1, round(pixels / (focal * _STEP)))
-        for pixels, focal in ((camera.height, camera.fy), (camera.width, camera.fx))
-    ]
-    x, y = (_STEP * (torch.arange(n) - (n - 1) / 2) for n in (_COLUMNS, _ROWS))
+    grey, depth_mm = frame.color.float().mean(dim=-1), frame.depth_mm.float()
+    parts = torch.stack([grey, depth_mm * (MILLIMETRE / _DEPTH_UNIT), (depth_mm > 0).float()])
+    n_rows = max(1, round(camera.height / (camera.fy * _STEP)))
+    n_columns = max(1, round(camera.width / (camera.fx * _STEP)))
+    blurred = adaptive_avg_pool2d(parts.to("cpu"), (n_rows, n_columns))
+    x = _STEP * (torch.arange(_COLUMNS) - (_COLUMNS - 1) / 2)
+    y = _STEP * (torch.arange(_ROWS) - (_ROWS - 1) / 2)
+    # The directions' pixels, as `grid_sample` takes them: the picture spans -1 to 1.
     u = 2 * (camera.fx * x + camera.cx) / camera.width - 1
     v = 2 * (camera.fy * y + camera.cy) / camera.height - 1
     at = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
-    blurred = adaptive_avg_pool2d(parts.to("cpu"), cells)[None]
-    luma, depth, share = grid_sample(blurred, at[None], align_corners=False)[0]
-    luma = luma.clamp(1, 255) * (at.abs() < 1).all(dim=-1)
-    depth = torch.where(share > 0.5, depth / share, 0).clamp(0, 255)
-    return torch.stack([luma, depth]).round().byte()
+    luma, depth, share = grid_sample(blurred[None], at[None], align_corners=False)[0]
+    luma_inside = luma.clamp(1, 255) * (at.abs() < 1).all(dim=-1)
+    mean_depth = torch.where(share > 0.5, depth / share, 0).clamp(0, 255)
+    return torch.stack([luma_inside, mean_depth]).round().byte()
 
 
 def spread_out(T_world_camera: Poses) -> Int[np.ndarray, "_"]:
@@ -78,7 +82,8 @@ def spread_out(T_world_camera: Poses) -> Int[np.ndarray, "_"]:
 def retrieve(view: View, viewpoints: Viewpoints, n: int) -> Poses:
     """Where a camera may be that saw a view: the poses of the `n` views most like it, in order.
 
-    Each is turned about the camera's x and y as it fits best.
+    Each is turned about the camera's x and y as it fits best: shifts of a view's cells stand for
+    turns.
     """
     turns = [(down, across) for across in _TURNS_ACROSS for down in _TURNS_DOWN]
     here, there = view.float(), viewpoints.views.float()
@@ -92,16 +97,21 @@ def retrieve(view: View, viewpoints: Viewpoints, n: int) -> Poses:
 
 
 def _moved(view: Tensor, down: int, across: int) -> Tensor:
-    """What of a view remains where it is shifted; of the other one `_moved` the other way."""
+    """The part of a view that overlaps with another one, which is shifted by so many cells.
+
+    Of the other view it is `_moved(other, -down, -across)`.
+    """
     rows = slice(max(0, down), _ROWS + min(0, down))
     columns = slice(max(0, across), _COLUMNS + min(0, across))
     return view[..., rows, columns]
 
 
-def _unlikeness(
-    here: Float[Tensor, "2 _ _"], there: Float[Tensor, "n 2 _ _"]
-) -> Float[Tensor, "n"]:
-    """One less the correlation of luma, and how far depths are apart, 0 to 1; 0 for the same."""
+def _unlikeness(here: Float[Tensor, "2 _ _"], there: Float[Tensor, "n 2 _ _"]) -> Values:
+    """1 - correlation of luma + `_DEPTH_WEIGHT` times how far depths are apart; 0 for the same.
+
+    Depths are apart by their log ratio, as a share of `_MAX_LOG_RATIO` and at most 1, in the mean
+    over cells where both are measured; by 1 if too few are.
+    """
     is_seen = ((here[0] > 0) & (there[:, 0] > 0)).float()
     first, second = _centred(here[0], is_seen), _centred(there[:, 0], is_seen)
     norms = first.norm(dim=(1, 2)) * second.norm(dim=(1, 2))
