@@ -80,10 +80,12 @@ def std_when_moved(
     here = costs_at(T_world_camera)
     growths = []
     for k in range(1, n_directions + 1):
+        # Of all twists that move the position so far along the direction, the likeliest.
         twist = _MOVED_M * covariance[:, 3:] @ directions[:, -k] / variances[-k]
         for way in (1, -1):
             growths.append((costs_at(retract(T_world_camera, way * twist)) - here).mean())
     growth = max(min(growths), 0.0) * min(len(here), n_independent)
+    # Of a cost that grows with the square of the offset, and of the pose prior.
     return 1 / (SIGMAS * (growth / _MOVED_M**2 + PRIOR_WEIGHT) ** 0.5)
 
 

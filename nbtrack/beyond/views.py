@@ -90,6 +90,7 @@ def retrieve(view: View, viewpoints: Viewpoints, n: int) -> Poses:
     unlikeness = [_unlikeness(_moved(here, y, x), _moved(there, -y, -x)) for y, x in turns]
     minimum, best = torch.stack(unlikeness).min(dim=0)
     order = minimum.argsort()[:n].numpy()
+    # A turn down is about x, one across about y the other way.
     rotations = _STEP * np.array([[down, -across, 0.0] for down, across in turns])
     poses = viewpoints.T_world_camera[order]
     poses[:, :3, :3] @= Rotation.from_rotvec(rotations[best[order].numpy()]).as_matrix()
