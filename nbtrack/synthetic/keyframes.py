@@ -43,8 +43,8 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     A shorter path is the beginning of one of these, a longer one turns back at both ends (our
     choice). Raises `NumericalError` as `attempts` does.
     """
-    keys = np.array(room.walk.keys[n_frames > _SHORT])
-    length = round(keys[-1, 6]) + 1
+    short_keys, long_keys = room.walk.keys
+    keys = np.array(short_keys if n_frames <= _SHORT else long_keys)
     base = _calibrated_path(room, keys)
     least = min(_MIN_STILL, _STILL_SHARE * still_metrics(base)["still_ate_m"])
 
@@ -55,29 +55,31 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
         poses = _calibrated_path(room, moved)
         is_far = still_metrics(poses)["still_ate_m"] > least
         if is_far and is_clear(room, poses) and _is_like_the_dataset(room, poses):
-            return poses[np.pad(np.arange(length), (0, n_frames), mode="reflect")[:n_frames]]
+            back_and_forth = np.pad(np.arange(len(poses)), (0, n_frames), mode="reflect")
+            return poses[back_and_forth[:n_frames]]
 
 
 def _is_like_the_dataset(room: Room, poses: Poses) -> bool:
     """Whether a path in free space has the right speed, and looks at things far enough."""
     unit, near = _view(room, poses)
-    mean, largest = np.stack([MEAN_STEP, _FASTEST]) * [1e3 * unit, 1.0]
-    return near > _NEAR and has_speed(poses, mean, largest, 0.03)
+    to_mm = np.array([1e3 * unit, 1.0])  # degrees stay degrees
+    return near > _NEAR and has_speed(poses, MEAN_STEP * to_mm, _FASTEST * to_mm, 0.03)
 
 
 def _calibrated_path(room: Room, keys: Keys) -> Poses:
-    """The path through key poses, which are moved together and turned until speeds are right."""
+    """The path through key poses, after their x, z and yaw were spread around their means, or drawn
+    together, until the mean speeds are right."""
     keys = keys.copy()
-    columns = [0, 1, 2, 4]  # x, y, z, yaw
+    spread = [0, 2, 4]  # columns: x, z, yaw
     unit = np.max(room.parts[0].solid.size) / 2
     for _ in range(4):
         poses = _path(keys)
-        unit = _view(room, poses)[0] if room.sdf(poses[:, :3, 3]).min() > 0 else unit
+        if room.sdf(poses[:, :3, 3]).min() > 0:  # only a camera in free space sees something
+            unit = _view(room, poses)[0]
         wanted = MEAN_STEP * [1e3 * unit, 1.0]
-        farther, faster = np.clip(wanted / steps_between(poses).mean(axis=1), 0.5, 2.0)
-        middle = keys[:, columns].mean(axis=0)
-        away = keys[:, columns] - middle
-        keys[:, columns] = middle + away * [farther, 1, farther, faster]
+        move, turn = np.clip(wanted / steps_between(poses).mean(axis=1), 0.5, 2.0)
+        middle = keys[:, spread].mean(axis=0)
+        keys[:, spread] = middle + (keys[:, spread] - middle) * [move, move, turn]
     return _path(keys)
 
 
@@ -87,30 +89,34 @@ def _path(keys: Keys) -> Poses:
     At a join the camera keeps its direction, and is the slower the more the direction bends.
     """
     places = keys[:, :3]
-    times = keys[:, 6]
+    times = keys[:, 6]  # frames
     legs = np.diff(places, axis=0)
-    towards = legs / np.linalg.norm(legs, axis=1, keepdims=True)
-    along = np.concatenate([towards[:1], (towards[1:] + towards[:-1]) / 2, towards[-1:]])
-    speed = np.linalg.norm(legs, axis=1) / np.diff(times)
-    pieces = []
-    for k in range(len(legs)):
+    directions = legs / np.linalg.norm(legs, axis=1, keepdims=True)
+    at_joins = (directions[1:] + directions[:-1]) / 2  # shorter than 1 where the path bends
+    tangents = np.concatenate([directions[:1], at_joins, directions[-1:]])
+    speeds = np.linalg.norm(legs, axis=1) / np.diff(times)
+    coefficients = []  # piece by piece, since the speed jumps at the joins
+    for k, speed in enumerate(speeds):
         ends = slice(k, k + 2)
-        pieces.append(CubicHermiteSpline(times[ends], places[ends], along[ends] * speed[k]).c)
-    at = np.arange(round(times[-1]) + 1)
-    turning = Slerp(times, Rotation.from_matrix(camera_poses(keys[:, :6])[:, :3, :3]))
-    poses = np.tile(np.eye(4), (len(at), 1, 1))
-    poses[:, :3, :3] = turning(at.clip(max=times[-1])).as_matrix()
-    poses[:, :3, 3] = PPoly(np.concatenate(pieces, axis=1), times)(at)
+        piece = CubicHermiteSpline(times[ends], places[ends], tangents[ends] * speed)
+        coefficients.append(piece.c)
+    frames = np.arange(round(times[-1]) + 1)
+    rotation = Slerp(times, Rotation.from_matrix(camera_poses(keys[:, :6])[:, :3, :3]))
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    # The last time may be a rounding error below its frame, and Slerp does not extrapolate.
+    poses[:, :3, :3] = rotation(frames.clip(max=times[-1])).as_matrix()
+    poses[:, :3, 3] = PPoly(np.concatenate(coefficients, axis=1), times)(frames)
     return poses
 
 
 def _view(room: Room, poses: Poses) -> tuple[float, float]:
     """What some frames see: the unit (m) of a map of it, as `SceneBounds` has it, and the least
     z-depth (m) that a quarter of an image does not exceed."""
-    rays = np.stack(np.meshgrid(_ACROSS, _DOWN, [1.0]), axis=-1).reshape(-1, 3)
-    directions = (rays @ poses[::12, :3, :3].mT).reshape(-1, 3)
-    origins = poses[::12, :3, 3].repeat(len(rays), axis=0)
+    rays_camera = np.stack(np.meshgrid(_ACROSS, _DOWN, [1.0]), axis=-1).reshape(-1, 3)
+    directions = (rays_camera @ poses[::12, :3, :3].mT).reshape(-1, 3)
+    origins = poses[::12, :3, 3].repeat(len(rays_camera), axis=0)
     depths, _ = room.first_hit(origins, directions)
-    points = np.concatenate([origins + depths[:, None] * directions, poses[:, :3, 3]])
-    near = np.quantile(depths.reshape(-1, len(rays)), 0.25, axis=1).min()
-    return float(np.ptp(points, axis=0).max() / 2 + _MARGIN), float(near)
+    points_world = np.concatenate([origins + depths[:, None] * directions, poses[:, :3, 3]])
+    unit = np.ptp(points_world, axis=0).max() / 2 + _MARGIN
+    near = np.quantile(depths.reshape(-1, len(rays_camera)), 0.25, axis=1).min()
+    return float(unit), float(near)

@@ -55,7 +55,8 @@ def room_frames(
     # NumPy releases the interpreter lock, so threads suffice.
     with ThreadPoolExecutor(usable_cores()) as pool:
         for start in range(0, n_frames, _FRAMES_AT_ONCE):
-            yield from pool.map(make_frame, range(n_frames)[start : start + _FRAMES_AT_ONCE])
+            end = min(start + _FRAMES_AT_ONCE, n_frames)
+            yield from pool.map(make_frame, range(start, end))
 
 
 def make_room(
@@ -74,11 +75,11 @@ def make_room(
     poses are exact in both pose files. `room.json` records how the scene was made. The same
     arguments give the same bytes. Raises as `build_room`, `room_frames` and `write_sequence` do.
     """
-    record = {"room": name, "version": ROOM_VERSION, "motion": motion, "seed": seed}
-    record |= {"frames": n_frames, "width": width, "height": height}
-    notes = {ROOM_FILE: json_text(record)}
+    made_with = {"room": name, "version": ROOM_VERSION, "motion": motion, "seed": seed}
+    size = {"frames": n_frames, "width": width, "height": height}
+    notes = {ROOM_FILE: json_text(made_with | size)}
     frames = room_frames(build_room(name), n_frames, width, height, seed, motion)
-    with closing(frames):  # its threads end with it, whatever keeps it from being written
+    with closing(frames):  # ends the threads that render, also where writing fails
         write_sequence(folder, room_intrinsics(width, height), frames, notes, progress)
     return folder
 

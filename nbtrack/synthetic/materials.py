@@ -59,8 +59,8 @@ def checker(
     points: Points, first: Color, second: Color, period: float, axes: tuple[int, int] = (0, 2)
 ) -> Points:
     """Two colors in rounded squares over two world axes; a period is two squares."""
-    across, along = (2 * np.pi / period * points[:, axis] for axis in axes)
-    product = np.sin(across + 0.7) * np.sin(along + 0.4)
+    phases = 2 * np.pi / period * points[:, axes]
+    product = np.sin(phases[:, 0] + 0.7) * np.sin(phases[:, 1] + 0.4)
     return _mix(first, second, _squared(product, 0.02))
 
 
@@ -127,10 +127,10 @@ def lining(
 ) -> Points:
     """Colours of a room's shell; `sides` are the walls perpendicular to x, `ends` those to z."""
     colors = np.empty_like(points)
-    side, up, end = shell.normals(points).T
-    walls = (np.abs(side) > 0.5, sides), (np.abs(end) > 0.5, ends)
-    for chosen, material in ((up > 0.5, floor), (up < -0.5, ceiling), *walls):
-        colors[chosen] = material(points[chosen])
+    x, y, z = shell.normals(points).T  # into the room: up from the floor
+    linings = [(y > 0.5, floor), (y < -0.5, ceiling), (abs(x) > 0.5, sides), (abs(z) > 0.5, ends)]
+    for is_there, material in linings:
+        colors[is_there] = material(points[is_there])
     return colors
 
 

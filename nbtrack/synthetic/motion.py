@@ -80,33 +80,41 @@ def is_clear(room: Room, poses: Poses) -> bool:
 
 def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
     """Draw a path and its speed; adjust radius and turning rate until mean speeds are as wanted."""
-    knots = np.arange(-2.0, 1.6 * length * np.radians(MEAN_STEP[1]) / _KNOT_SPACING + 4.0)
-    # Radius (relative), side (rad), yaw (rad), pitch (rad), roll (rad), height (m).
-    spread = np.array([0.04, 0.05, 0.07, 0.09, 0.025, 0.05])
-    values = spread * np.clip(rng.normal(size=(len(knots), 6)), -2.0, 2.0)
-    values[:, 3] += walk.pitch
-    values[:, 5] = np.clip(values[:, 5] + rng.uniform(1.3, 1.5), 1.15, 1.65)
-    wandering = CubicSpline(knots * _KNOT_SPACING, values)  # over the angle turned
-    covered = _before(_relative_speed(length, rng))
-    trembling = _tremor(length, rng)
+    wandering = _wandering(walk.pitch, length, rng)
+    n_turns = _before(_relative_speed(length, rng))  # until a frame, each by the rate
+    tremor = _tremor(length, rng)
     center = np.asarray(walk.center) + rng.uniform(-_CENTER_REACH, _CENTER_REACH, 2)
     heading = walk.start_yaw + rng.uniform(-_HEADING_REACH, _HEADING_REACH)
-    axes = -np.array([[np.sin(heading), np.cos(heading)], [np.cos(heading), -np.sin(heading)]])
-    radius = 0.7
-    rate = np.radians(0.5)
+    forward = [-np.sin(heading), -np.cos(heading)]  # x, z
+    left = [-np.cos(heading), np.sin(heading)]
+    radius = 0.7  # m
+    rate = np.radians(0.5)  # a frame, in the mean
     for _ in range(12):
-        angle = rate * covered
+        angle = rate * n_turns
         stretch, side, glance, pitch, roll, height = wandering(angle).T
         turned = walk.turn * angle
         # Opposite to the direction of view, so that the room lies before the camera.
         ellipse = np.stack([-np.cos(turned + side), -_FLATTENING * np.sin(turned + side)], axis=1)
-        x, z = (center + radius * (1.0 + stretch[:, None]) * (ellipse @ axes)).T
+        offset = ellipse @ np.array([forward, left])
+        x, z = (center + radius * (1.0 + stretch[:, None]) * offset).T
         yaw = heading + turned + glance
-        poses = camera_poses(np.stack([x, height, z, pitch, yaw, roll], axis=1) + trembling)
-        slower = np.clip(MEAN_STEP / steps_between(poses).mean(axis=1), 0.7, 1.4)
-        radius *= slower[0]
-        rate *= slower[1]
+        poses = camera_poses(np.stack([x, height, z, pitch, yaw, roll], axis=1) + tremor)
+        faster = np.clip(MEAN_STEP / steps_between(poses).mean(axis=1), 0.7, 1.4)
+        radius *= faster[0]
+        rate *= faster[1]
     return poses
+
+
+def _wandering(pitch: float, length: int, rng: np.random.Generator) -> CubicSpline:
+    """Over the angle turned: changes of radius (relative), side and yaw (rad); pitch and roll (rad)
+    and height (m) themselves."""
+    # From before the start to behind the end, since the turning rate is not known yet.
+    knots = np.arange(-2.0, 1.6 * length * np.radians(MEAN_STEP[1]) / _KNOT_SPACING + 4.0)
+    spread = np.array([0.04, 0.05, 0.07, 0.09, 0.025, 0.05])
+    values = spread * np.clip(rng.normal(size=(len(knots), 6)), -2.0, 2.0)
+    values[:, 3] += pitch
+    values[:, 5] = np.clip(values[:, 5] + rng.uniform(1.3, 1.5), 1.15, 1.65)
+    return CubicSpline(knots * _KNOT_SPACING, values)
 
 
 def steps_between(T_world_camera: Poses) -> Float[np.ndarray, "2 n"]:
@@ -138,15 +146,16 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     rng = np.random.default_rng([seed, room.number])
     first = rng.integers(len(room.walk.stops))
     around = _closed_walk(room, np.roll(room.walk.stops, -first, axis=0))
-    length = np.linalg.norm(np.diff(around, axis=0, append=around[:1]), axis=1)
+    steps = np.linalg.norm(np.diff(around, axis=0, append=around[:1]), axis=1)
+    round_m = steps.sum()
     # Three rounds, so that smoothing and interpolation meet no end in the middle one.
-    curve = CubicSpline(_before(np.tile(length, 3)), np.tile(around, (3, 1)))
+    curve = CubicSpline(_before(np.tile(steps, 3)), np.tile(around, (3, 1)))  # over metres walked
     speed = _relative_speed(n_frames, rng)
-    at = length.sum() * (1 + _before(speed) / speed.sum())
-    x, z = curve(at).T
-    forward = curve(np.concatenate([at - length.sum(), at, at + length.sum()]), 1)
-    yaw = np.unwrap(np.arctan2(-forward[:, 0], -forward[:, 1]))
-    yaw = gaussian_filter1d(yaw, _AHEAD)[n_frames : 2 * n_frames]
+    walked = round_m * (1 + _before(speed) / speed.sum())
+    x, z = curve(walked).T
+    forward = curve(np.concatenate([walked - round_m, walked, walked + round_m]), nu=1)
+    ahead = np.unwrap(np.arctan2(-forward[:, 0], -forward[:, 1]))
+    yaw = gaussian_filter1d(ahead, _AHEAD)[n_frames : 2 * n_frames]
     height = rng.uniform(1.3, 1.5) + _wander(n_frames, rng, 0.05)
     pitch = room.walk.pitch + _wander(n_frames, rng, 0.09)
     roll = _wander(n_frames, rng, 0.025)
@@ -156,16 +165,20 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
 
 def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """Places (x and z, m) of a smooth closed walk by stops, in the middle of what is free."""
-    x, z = (np.arange(_CELL - side / 2, side / 2, _CELL) for side in room.parts[0].solid.size[::2])
+    width, _, depth = room.parts[0].solid.size
+    x = np.arange(_CELL - width / 2, width / 2, _CELL)
+    z = np.arange(_CELL - depth / 2, depth / 2, _CELL)
     points = np.stack(np.meshgrid(x, np.linspace(*HEIGHTS, 5), z, indexing="ij"), axis=-1)
     clearance = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:3]).min(axis=1)
     is_free = clearance >= CLEARANCE + _MARGIN
+    # A negative cost is a cell that no route enters.
     costs = np.where(is_free, 1.0 / np.maximum(clearance - CLEARANCE, 0.01), -1.0)
     cells = [(np.abs(x - stop[0]).argmin(), np.abs(z - stop[1]).argmin()) for stop in stops]
-    route = []
+    walk = []
     for start, end in zip(cells, cells[1:] + cells[:1], strict=True):
-        route += route_through_array(costs, start, end, geometric=True)[0][:-1]
-    rows, columns = np.array(route).T
+        route, _ = route_through_array(costs, start, end, geometric=True)
+        walk += route[:-1]  # the next route begins at this one's end
+    rows, columns = np.array(walk).T
     places = np.stack([x[rows], z[columns]], axis=1)
     return gaussian_filter1d(places, _SMOOTHED / _CELL, axis=0, mode="wrap")
 
@@ -194,7 +207,7 @@ def _tremor(n_frames: int, rng: np.random.Generator) -> Placed:
     """A hand's tremor: four sines of 1.5 to 5 Hz for each number."""
     cycles_per_frame = rng.uniform(1.5, 5.0, (4, 6)) / 30
     phases = rng.uniform(0, 2 * np.pi, (4, 6))
-    amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / 2.0
+    amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / 2.0  # m, rad
     waves = np.sin(2 * np.pi * cycles_per_frame * np.arange(n_frames)[:, None, None] + phases)
     return amplitude * waves.sum(axis=1)
 
@@ -208,7 +221,8 @@ def camera_poses(placed: Placed) -> Poses:
     forward = np.hstack([-np.sin(yaw) * np.cos(pitch), np.sin(pitch), -np.cos(yaw) * np.cos(pitch)])
     right = np.hstack([np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)])
     down = np.cross(forward, right)
-    rolled = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right
+    rolled_right = np.cos(roll) * right + np.sin(roll) * down
+    rolled_down = np.cos(roll) * down - np.sin(roll) * right
     poses = np.tile(np.eye(4), (len(placed), 1, 1))
-    poses[:, :3] = np.stack([*rolled, forward, placed[:, :3]], axis=-1)
+    poses[:, :3] = np.stack([rolled_right, rolled_down, forward, placed[:, :3]], axis=-1)
     return poses

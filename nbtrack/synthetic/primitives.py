@@ -32,8 +32,10 @@ def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Inte
     """Where a ray is inside the box |local| <= half."""
     # A direction parallel to a slab: a tiny slope sends both crossings far away, without 0/0.
     direction = np.where(directions == 0.0, 1e-30, directions)
-    first, second = (-half - origins) / direction, (half - origins) / direction
-    return _row_max(np.minimum(first, second)), -_row_max(-np.maximum(first, second))
+    first = (-half - origins) / direction
+    second = (half - origins) / direction
+    far = reduce(np.minimum, np.maximum(first, second).T)
+    return _row_max(np.minimum(first, second)), far
 
 
 def _round_interval(offsets: Origins, directions: Points, radius: float) -> Interval:
@@ -41,13 +43,14 @@ def _round_interval(offsets: Origins, directions: Points, radius: float) -> Inte
     a = row_dot(directions, directions)
     b = row_dot(offsets, directions)
     c = row_dot(offsets, offsets) - radius**2
-    moving = a > 1e-24
-    a = np.where(moving, a, 1.0)
-    discriminant = b * b - a * c
     # A ray along the axis of a cylinder never crosses its side: it is inside for ever or never.
-    met = np.where(moving, discriminant > 0.0, c < 0.0)
-    half_width = np.where(moving, np.sqrt(np.maximum(discriminant, 0.0)) / a, np.inf)
-    return np.where(met, -b / a - half_width, np.inf), np.where(met, -b / a + half_width, -np.inf)
+    crosses = a > 1e-24
+    a = np.where(crosses, a, 1.0)
+    discriminant = b * b - a * c
+    is_met = np.where(crosses, discriminant > 0.0, c < 0.0)
+    half_width = np.where(crosses, np.sqrt(np.maximum(discriminant, 0.0)) / a, np.inf)
+    near = np.where(is_met, -b / a - half_width, np.inf)
+    return near, np.where(is_met, -b / a + half_width, -np.inf)
 
 
 class Solid:
@@ -100,7 +103,8 @@ class Box(Solid):
         """Unit normals of the face that lies nearest."""
         local = (points - self.center) @ self._axes
         axis = (np.abs(local) - self.half).argmax(axis=1)
-        return np.eye(3)[axis] * np.where(local < 0, -1.0, 1.0) @ self._axes.T
+        normals_local = np.eye(3)[axis] * np.where(local < 0, -1.0, 1.0)
+        return normals_local @ self._axes.T
 
 
 class RoomShell(Box):
@@ -169,14 +173,14 @@ class Cylinder(Solid):
     def _crossing(self, origins: Origins, directions: Points) -> Interval:
         offset_along, offset_across = self._split(origins - self.center)
         direction_along, direction_across = self._split(directions)
-        side = _round_interval(offset_across, direction_across, self.radius)
+        near, far = _round_interval(offset_across, direction_across, self.radius)
         caps = _slab_interval(offset_along[..., None], direction_along[:, None], self.half[1:])
-        return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
+        return np.maximum(near, caps[0]), np.minimum(far, caps[1])
 
     def normals(self, points: Points) -> Points:
         """Unit normals of the side or the cap, whichever lies nearer."""
         along, across = self._split(points - self.center)
-        from_side, from_cap = (self._coordinates(points) - self.half).T[:, :, None]
+        beyond_side, beyond_cap = (self._coordinates(points) - self.half).T
         lengths = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-        cap = np.where(along < 0, -1.0, 1.0)[:, None] * self._axis
-        return np.where(from_cap > from_side, cap, across / lengths)
+        of_cap = np.where(along < 0, -1.0, 1.0)[:, None] * self._axis
+        return np.where((beyond_cap > beyond_side)[:, None], of_cap, across / lengths)

@@ -34,12 +34,12 @@ def render_frame(
     axes; the camera stands in free space.
     """
     height, width = intrinsics.height, intrinsics.width
-    rows, columns = (grid.ravel() for grid in np.indices((height, width)))
+    rows, columns = np.indices((height, width)).reshape(2, -1)
 
-    def cast(columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+    def cast(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
         # `camera.pixel_directions` is single precision, too coarse for an exact depth.
-        x = (columns + 0.5 - intrinsics.cx) / intrinsics.fx
-        y = (rows + 0.5 - intrinsics.cy) / intrinsics.fy
+        x = (u + 0.5 - intrinsics.cx) / intrinsics.fx
+        y = (v + 0.5 - intrinsics.cy) / intrinsics.fy
         directions_camera = np.stack([x, y, np.ones_like(x)], axis=1)
         return room.cast(T_world_camera[:3, 3], directions_camera @ T_world_camera[:3, :3].T)
 
@@ -47,7 +47,7 @@ def render_frame(
     surfaces = index.reshape(height, width)
     rough = np.flatnonzero(_rough(colors.reshape(height, width, 3), surfaces))
     # One call for all samples: culling and shading cost per call, not only per ray.
-    dx, dy = np.array(_SUBPIXELS).T[:, :, None]
+    dx, dy = np.array(_SUBPIXELS).T[:, :, None]  # (4, 1): four samples of each rough pixel
     _, samples, _ = cast((columns[rough] + dx).ravel(), (rows[rough] + dy).ravel())
     colors[rough] = samples.reshape(4, -1, 3).mean(axis=0)
     pixels = np.round(255.0 * colors).astype(np.uint8)
@@ -58,8 +58,9 @@ def _rough(image: Float[np.ndarray, "h w 3"], surfaces: Surfaces) -> Bool[np.nda
     """Pixels that differ from a neighbor in surface or color."""
     looks = np.dstack([image, surfaces])  # another surface differs by one or more
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))  # a pixel and its neighbors
-    above, below = cv2.dilate(looks, cross) - looks, looks - cv2.erode(looks, cross)
-    return np.maximum(above, below).max(axis=2) > _CONTRAST
+    to_largest = cv2.dilate(looks, cross) - looks
+    to_smallest = looks - cv2.erode(looks, cross)
+    return np.maximum(to_largest, to_smallest).max(axis=2) > _CONTRAST
 
 
 def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> Depth:
@@ -88,14 +89,13 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     lost |= is_edge & (rng.uniform(size=depth.shape) < EDGE_DROPOUT)
     shift = rng.normal(scale=LATERAL_NOISE / per_pixel, size=(2, height, width))
     places = np.indices(depth.shape) + shift
-    # Between pixels: at a width of 96 the jitter is below a tenth of one.
-    looked_up, was_seen = (
-        map_coordinates(values, places, order=1, mode="nearest") for values in (exact, 1.0 * seen)
-    )
+    # Interpolated: at a width of 96 the jitter is below a tenth of a pixel.
+    looked_up = map_coordinates(exact, places, order=1, mode="nearest")
+    share_seen = map_coordinates(seen.astype(float), places, order=1, mode="nearest")
     noisy = looked_up + rng.normal(scale=DISPARITY_NOISE, size=depth.shape)
     disparity = np.rint(noisy / DISPARITY_STEP) * DISPARITY_STEP
     measured = scale / np.maximum(disparity, DISPARITY_STEP)
-    lost |= (measured < RANGE[0]) | (measured > RANGE[1]) | (was_seen < 0.999)
+    lost |= (measured < RANGE[0]) | (measured > RANGE[1]) | (share_seen < 0.999)
     return np.where(lost, 0.0, measured)
 
 

@@ -14,11 +14,10 @@ from nbtrack.synthetic import materials, primitives
 from nbtrack.synthetic.materials import Light, Material, Pair, Part
 from nbtrack.synthetic.primitives import Array3, Indices, Origins, Points, Values, row_dot
 
-_TABLES, _PATHS = (
-    tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
-    for name in ("rooms.toml", "paths.toml")
-)
-_PALETTE = _TABLES.pop("palette")
+_FOLDER = Path(__file__).parent
+_TABLES = tomllib.loads((_FOLDER / "rooms.toml").read_text(encoding="utf-8"))
+_PATHS = tomllib.loads((_FOLDER / "paths.toml").read_text(encoding="utf-8"))
+_PALETTE = _TABLES.pop("palette")  # all other tables are rooms
 _OPENNESS_RADIUS = 0.2  # m; how far contact shadows reach (our choice)
 
 ROOMS: tuple[str, ...] = tuple(_TABLES)
@@ -32,7 +31,8 @@ class Walk:
     """Where cameras go: across the room near a point, turning; and by the paths of `paths.toml`."""
 
     center: Pair  # m; x and z
-    keys: tuple[tuple[tuple[float, ...], ...], ...]  # of an animated camera's two paths
+    # Key poses of an animated camera, on its short and on its long path; see `paths.toml`.
+    keys: tuple[tuple[tuple[float, ...], ...], tuple[tuple[float, ...], ...]]
     stops: tuple[Pair, ...]  # m; x and z; of a tour
     start_yaw: float = 0.0  # rad; 0 walks and looks along -z, positive turns left
     turn: int = 1  # +1 turns left, -1 right
@@ -115,7 +115,7 @@ def description(name: str) -> dict[str, Any]:
 def build_room(name: str) -> Room:
     """The synthetic room of that name. Raises ConfigError as `description` does."""
     table = description(name)
-    named: dict[str, Material] = {}
+    named: dict[str, Material] = {}  # a material may name one before it
     for label, material in table["materials"].items():
         named[label] = _resolved(material, named)
     width, height, depth = table["size"]
@@ -131,9 +131,11 @@ def build_room(name: str) -> Room:
 
 def _resolved(value: Any, named: dict[str, Material]) -> Any:
     """A value of the file with its materials made or looked up and its lists as tuples."""
-    if isinstance(value, dict):
-        options = {key: _resolved(item, named) for key, item in value.items() if key != "kind"}
-        return partial(getattr(materials, value["kind"]), **options) if "kind" in value else options
+    if isinstance(value, str):
+        return named[value]
     if isinstance(value, list):
         return tuple(_resolved(item, named) for item in value)
-    return named[value] if isinstance(value, str) else value
+    if not isinstance(value, dict):
+        return value
+    options = {key: _resolved(item, named) for key, item in value.items() if key != "kind"}
+    return partial(getattr(materials, value["kind"]), **options) if "kind" in value else options
