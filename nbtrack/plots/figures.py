@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from itertools import chain
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -19,7 +20,15 @@ from nbtrack.tables import STANDING_STILL
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 DEPTH, DEPTH_ERROR = "depth (m)", "depth error (cm)"
-Panel = tuple[str, np.ndarray, str]  # a title, an image (colours or numbers), the numbers' unit
+_MARKS = "os^Dv"  # matplotlib's markers of up to five methods
+
+
+class Panel(NamedTuple):
+    """An image of a grid: colours, or numbers with the label of their bar."""
+
+    title: str
+    image: np.ndarray
+    label: str = ""  # none for colours
 
 
 @style.styled
@@ -29,11 +38,11 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     With a slider, where `fixed` is that of ipywidgets: `interact(plot_frame,
     sequence=fixed(sequence), index=(0, len(sequence) - 1), title=fixed("A room"))`.
     """
-    some = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
+    some_mm = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
+    far = MILLIMETRE * _most(np.ma.masked_equal(some_mm, 0))
     depth = np.ma.masked_equal(sequence.depth(index), 0)
-    name = f"frame {sequence.frame_ids[index]}: colour"
-    row = [(name, sequence.color(index), ""), ("depth", depth, DEPTH)]
-    return _image_grid(title, [row], MILLIMETRE * _most(np.ma.masked_equal(some, 0)))
+    color = Panel(f"frame {sequence.frame_ids[index]}: colour", sequence.color(index))
+    return _image_grid(title, [[color, Panel("depth", depth, DEPTH)]], far)
 
 
 @style.styled
@@ -48,12 +57,10 @@ def plot_views(
     rows = []
     for index, (color, rendered) in zip(indices, views, strict=True):
         depth = np.ma.masked_equal(sequence.depth(index), 0)
-        observed = sequence.color(index)
-        rows.append([
-            (f"frame {sequence.frame_ids[index]}", observed, ""), ("rendered colour", color, ""),
-            ("observed depth", depth, DEPTH), ("rendered depth", rendered, DEPTH),
-            ("|error|", 100 * np.abs(rendered - depth), DEPTH_ERROR),
-        ])  # fmt: skip
+        observed = Panel(f"frame {sequence.frame_ids[index]}", sequence.color(index))
+        depths = [Panel("observed depth", depth, DEPTH), Panel("rendered depth", rendered, DEPTH)]
+        error = Panel("|error|", 100 * np.abs(rendered - depth), DEPTH_ERROR)
+        rows.append([observed, Panel("rendered colour", color), *depths, error])
     return _image_grid(title, rows)
 
 
@@ -64,32 +71,35 @@ def plot_distances(frame: Frame, distances: Mapping[str, Values], title: str = "
     The distances (m) are those of `frame.measured_pixels()`, in this order.
     """
     rows, columns = frame.measured_pixels().cpu().numpy()
-    panels = [("observed colour", frame.color.cpu().numpy(), "")]
+    panels = [Panel("observed colour", frame.color.cpu().numpy())]
     for label, sdf in distances.items():
-        image = np.ma.masked_all(frame.depth_mm.shape)
-        image[rows, columns] = 100 * sdf.abs().cpu().numpy()
-        panels.append((f"{label}: mean {image.mean():.1f} cm", image, "|signed distance| (cm)"))
+        image_cm = np.ma.masked_all(frame.depth_mm.shape)
+        image_cm[rows, columns] = 100 * sdf.abs().cpu().numpy()
+        name = f"{label}: mean {image_cm.mean():.1f} cm"
+        panels.append(Panel(name, image_cm, "|signed distance| (cm)"))
     return _image_grid(title, [panels])
 
 
 def _image_grid(title: str, rows: list[list[Panel]], far: float | None = None) -> Figure:
-    """Images in rows; those of a unit share a bar, and a scale that ends at `far` or `_most`."""
-    height, width = rows[0][0][1].shape[:2]
+    """Images in rows; those of a label share a bar, and a scale that ends at `far` or `_most`."""
+    height, width = rows[0][0].image.shape[:2]
     inches = 0.9 + len(rows) * (0.2 + style.WIDTH / len(rows[0]) * height / width)
     grid = style.new_axes(title, inches, len(rows), len(rows[0]))
-    shown: dict[str, list[AxesImage]] = {}
-    for axes, (name, image, unit) in zip(grid.flat, chain(*rows), strict=True):
-        drawn = show_image(axes, image, name, "viridis" if unit == DEPTH else "magma")
-        if unit:  # colours have none
-            shown.setdefault(unit, []).append(drawn)
+    with_bar: dict[str, list[AxesImage]] = {}
+    for axes, panel in zip(grid.flat, chain(*rows), strict=True):
+        colors = "viridis" if panel.label == DEPTH else "magma"
+        drawn = show_image(axes, panel.image, panel.title, colors)
+        if panel.label:
+            with_bar.setdefault(panel.label, []).append(drawn)
     figure = grid[0, 0].figure
-    for unit, images in shown.items():
-        limit = far or _most(np.ma.stack([image.get_array() for image in images]))
+    for label, images in with_bar.items():
+        limit = _most(np.ma.stack([image.get_array() for image in images])) if far is None else far
         for image in images:
             image.set_clim(0, limit)
-        bar = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max", "label": unit}
-        bar["panchor"] = False  # else panels with a bar are lower than those without
-        figure.colorbar(images[0], ax=[image.axes for image in images], **bar)
+        look = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max"}
+        # With an anchor, panels with a bar would be lower than those without.
+        beside = [image.axes for image in images]
+        figure.colorbar(images[0], ax=beside, label=label, panchor=False, **look)
     return figure
 
 
@@ -114,9 +124,9 @@ def plot_along_ray(
 
     The last samples may be left out, as by the weights of sections between samples.
     """
-    at = depths.cpu().numpy()
-    shown = {label: pd.Series(c.detach().cpu(), at[: len(c)]) for label, c in curves.items()}
-    figure = plot_columns([pd.DataFrame(shown).rename_axis("depth (m)")], title)
+    index = depths.cpu().numpy()
+    columns = {k: pd.Series(c.detach().cpu(), index[: len(c)]) for k, c in curves.items()}
+    figure = plot_columns([pd.DataFrame(columns).rename_axis("depth (m)")], title)
     for axes in figure.axes:
         axes.axvline(measured_depth, label="measured depth", **style.DASHED)
     figure.axes[0].legend()
@@ -136,7 +146,7 @@ def plot_columns(tables: Sequence[pd.DataFrame], title: str = "") -> Figure:
             axes.plot(table[name].dropna(), ".-", markersize=4, color=color)
             axes.set(xlabel=table.index.name, ylabel=name)
             axes.label_outer()
-    return axes.figure
+    return grid[0, 0].figure
 
 
 @style.styled
@@ -149,10 +159,11 @@ def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figur
     # Loss terms are the columns before their total; what is behind it are diagnostics.
     terms = {label: history.loc[:, :"total"].iloc[:, :-1] for label, history in histories.items()}
     # A term of weight zero has no place on a logarithmic axis.
-    names = dict.fromkeys(n for losses in terms.values() for n in losses if losses[n].any())
+    names = pd.unique(np.concatenate([t.columns[t.any()] for t in terms.values()]))
     panels = style.new_axes(title, 3.0, 1, len(names), sharex=True)[0]
     for axes, name in zip(panels, names, strict=True):
         for label, color in style.method_colors(terms).items():
+            # A map without this term has an empty line, for the legend.
             values = terms[label].get(name, pd.Series(dtype=float))
             # A twentieth of the series, centred, cut short at the ends.
             window = values.rolling(max(5, len(values) // 20), center=True, min_periods=1)
@@ -173,8 +184,9 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """
     above, below = style.new_axes(title, 4.9, 2, sharex=True)[:, 0]
     draw_errors(above, frames)
-    for tracked, line in zip(frames.values(), above.lines, strict=False):
-        below.plot(line.get_xdata(), tracked["rotation_error_deg"], color=line.get_color())
+    for label, color in style.method_colors(frames).items():
+        tracked = frames[label]
+        below.plot(_seconds(tracked), tracked["rotation_error_deg"], color=color)
     above.axhline(100 * LOST_THRESHOLD_M, **style.DASHED)
     above.text(0, 100 * LOST_THRESHOLD_M, "lost above 0.2 m", va="bottom")
     below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
@@ -184,12 +196,18 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
 def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
     """Errors of the position (cm) over time (s), by label, and those of a camera standing still."""
     for label, color in style.method_colors(frames).items():
-        tracked = frames[label]
-        seconds = tracked["time"] - tracked["time"].iloc[0]
-        axes.plot(seconds, 100 * tracked["translation_error_m"], color=color, label=label)
-    axes.plot(seconds, 100 * tracked["still_error_m"], label=STANDING_STILL, **style.DOTTED)
+        error_cm = 100 * frames[label]["translation_error_m"]
+        axes.plot(_seconds(frames[label]), error_cm, color=color, label=label)
+    still = list(frames.values())[-1]  # the same in every run of these frames
+    still_cm = 100 * still["still_error_m"]
+    axes.plot(_seconds(still), still_cm, label=STANDING_STILL, **style.DOTTED)
     axes.set_ylabel("translation error (cm)")
     style.log_axes(axes, "y")
+
+
+def _seconds(frames: pd.DataFrame) -> pd.Series:
+    """Times of a run's frames (s) since its first."""
+    return frames["time"] - frames["time"].iloc[0]
 
 
 @style.styled
@@ -200,13 +218,14 @@ def plot_panels(panels: Mapping[str, pd.DataFrame], x: str, title: str = "") -> 
     """
     grid = style.new_axes(title, 3.4, 1, len(panels), sharey=True)[0]
     for axes, (name, values) in zip(grid, panels.items(), strict=True):
-        for (label, color), mark in zip(style.method_colors(values).items(), "os^Dv", strict=False):
-            own = {"color": color, "marker": mark, "linestyle": ""}
+        colors = style.method_colors(values)
+        for label, mark in zip(colors, _MARKS, strict=False):
+            own = {"color": colors[label], "marker": mark, "linestyle": ""}
             look = style.DOTTED if label == STANDING_STILL else own
             axes.plot(values[label], values.index, label=label, **look)
         axes.set(title=name, xlabel=x, ylim=(len(values) - 0.5, -0.5))
         style.log_axes(axes, "x")
-    return axes.figure.legend_below()
+    return grid[0].figure.legend_below()
 
 
 @style.styled
@@ -222,22 +241,18 @@ def plot_curves(
     `standing still` as a dotted line. Axes of `log` are logarithmic; line "none" leaves points.
     """
     axes = style.new_axes(title, 3.6)[0, 0]
-    names = table[[group] if isinstance(group, str) else group]
-    labels = names.agg(", ".join, axis=1)
-    first, last = names.iloc[:, 0], names.iloc[:, -1]
-    colors = dict(zip(labels, first.map(style.method_colors(first)), strict=True))
-    marks = dict(zip(labels, pd.factorize(last)[0], strict=True))
+    groups = table[[group] if isinstance(group, str) else group]
+    labels = groups.agg(", ".join, axis=1)
     is_text = not pd.api.types.is_numeric_dtype(table[x])
     if is_text:
         table = table.assign(**{x: _side_by_side(axes, table[x], labels)})
         line, log = "none", log.replace("x", "")
+    looks = _looks(groups.set_axis(labels), line)
     for label, rows in table.groupby(labels, sort=False):
-        look = {"color": colors[label], "marker": "os^Dv"[marks[label] % 5], "label": label}
-        n_alike = sum(drawn.get_color() == colors[label] for drawn in axes.lines)
-        look["linestyle"] = line or ("-", "--", ":")[n_alike % 3]
-        axes.plot(rows[x], rows[y], **look)
+        look = looks.loc[label]
+        axes.plot(rows[x], rows[y], label=label, **look)
         if "from" in table:
-            axes.vlines(rows[x], rows["from"], rows["to"], colors[label], linewidth=0.8)
+            axes.vlines(rows[x], rows["from"], rows["to"], look["color"], linewidth=0.8)
     if STANDING_STILL in table:
         axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **style.DOTTED)
     axes.set(xlabel=x, ylabel=y)
@@ -245,17 +260,30 @@ def plot_curves(
     if is_text or not labels.is_unique or len(labels) == 1:
         axes.figure.legend(loc="outside right center")
         return axes.figure
-    style.label_points(axes, table[x], table[y], colors)
+    style.label_points(axes, table[x], table[y], looks["color"].to_dict())
     if STANDING_STILL in table:
         axes.legend(handles=axes.lines[-1:])
     return axes.figure
 
 
+def _looks(groups: pd.DataFrame, line: str) -> pd.DataFrame:
+    """How `plot_curves` draws the group of each label, the index: colour by the first column, mark
+    by the last; without a given line, dashes by the number of earlier groups of this colour."""
+    groups = groups[~groups.index.duplicated()]
+    first, last = groups.iloc[:, 0], groups.iloc[:, -1]
+    looks = first.map(style.method_colors(first)).to_frame("color")
+    looks["marker"] = [_MARKS[number % len(_MARKS)] for number in pd.factorize(last)[0]]
+    n_earlier = looks.groupby("color").cumcount()
+    looks["linestyle"] = line or [("-", "--", ":")[number % 3] for number in n_earlier]
+    return looks
+
+
 def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray:
-    """Where points of labelled groups lie on x, whose ticks are texts; long ones turn."""
+    """Make texts the ticks of x, turned if they are long; where points lie, shifted by group."""
     codes, ticks = pd.factorize(texts)
     letters = sum(max(map(len, tick.split("\n"))) for tick in ticks)
     turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}
     axes.set_xticks(range(len(ticks)), ticks, **turned)
     groups, names = pd.factorize(labels)
-    return codes + (groups - (len(names) - 1) / 2) * 0.5 / max(len(names), 4)
+    from_middle = groups - (len(names) - 1) / 2
+    return codes + from_middle * 0.5 / max(len(names), 4)

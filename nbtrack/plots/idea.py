@@ -17,18 +17,14 @@ from nbtrack.plots.style import method_colors, new_axes, styled
 
 _STEP = 0.01  # m, between the grid points of a slice
 _BEFORE, _BEHIND, _ASIDE = 1.25, 0.45, 0.3  # m, what is drawn around the measured point
+_N_STRATIFIED, _N_IMPORTANCE = 32, 12  # iMAP's samples along a ray
 _DOT = {"edgecolors": "black", "linewidths": 0.5, "zorder": 4}
 _COLORS = method_colors(["VR", "SDF", "true"])
 
 
 @styled
 def plot_idea(
-    field: LearnedField,
-    frame: Frame,
-    T_world_camera: Pose,
-    row: int,
-    column: int,
-    title: str = "",
+    field: LearnedField, frame: Frame, T_world_camera: Pose, row: int, column: int, title: str = ""
 ) -> Figure:
     """What a tracker asks a map around the measured point of one pixel (row, column) of a frame.
 
@@ -41,58 +37,59 @@ def plot_idea(
     axes = new_axes(title, 3.8)[0, 0]
     rows, columns = frame.measured_pixels()
     columns = columns[rows == row]
-    points, _ = frame.points(torch.full_like(columns, row), columns)
-    (point,) = points[columns == column]
-    end = point.norm().item()
-    along = point / end
-    left = along * along[0] - torch.tensor([1.0, 0, 0])  # the row's plane has the camera's x
-    to_page = torch.stack([along, left / left.norm()])
-    across = np.arange(-_ASIDE, _ASIDE + _STEP, _STEP)
-    places = np.stack(np.meshgrid(np.arange(end - _BEFORE, end + _BEHIND, _STEP), across), axis=-1)
-    grid_world = places @ to_page.numpy() @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    points_camera, _ = frame.points(torch.full_like(columns, row), columns)
+    point_camera = points_camera[columns == column][0]
+    distance = point_camera.norm().item()
+    along = point_camera / distance
+    left = along * along[0] - torch.tensor([1.0, 0, 0])  # minus x, but for its share along the ray
+    page_camera = torch.stack([along, left / left.norm()])  # the page's axes, (2, 3)
+    x = np.arange(distance - _BEFORE, distance + _BEHIND, _STEP)
+    places = np.stack(np.meshgrid(x, np.arange(-_ASIDE, _ASIDE + _STEP, _STEP)), axis=-1)
+    grid_camera = places @ page_camera.numpy()
+    grid_world = grid_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     draw_slice(axes, field, grid_world, places, aspect=25, pad=0.015)
     pose = torch.from_numpy(T_world_camera).float()
     axes.axhline(0, color="0.2", linewidth=0.8)
     if field.is_distance:
-        _draw_queries(axes, field, pose, points, to_page)
+        _draw_queries(axes, field, pose, points_camera, page_camera)
     else:
-        _draw_samples(axes, field, pose, point)
+        _draw_samples(axes, field, pose, point_camera)
     axes.plot([], [], "k-", label=f"surface of {field.label}")
-    limits = {"xlim": (end - _BEFORE, end + _BEHIND), "ylim": (-_ASIDE, _ASIDE)}
-    axes.set(**limits, xlabel="along the ray (m)", ylabel="to its left (m)", aspect="equal")
+    axes.set(xlim=(distance - _BEFORE, distance + _BEHIND), ylim=(-_ASIDE, _ASIDE), aspect="equal")
+    axes.set(xlabel="along the ray (m)", ylabel="to its left (m)")
     return axes.figure.legend_below()
 
 
-def _draw_samples(axes: Axes, field: LearnedField, pose: Tensor, point: Tensor) -> None:
-    """iMAP's samples on the ray to a measured point (m, camera frame), and what they render."""
-    ray = point[None] / point[2]
-    unknown = torch.zeros(1, 3)
-    rays = Rays(pose[None, :3, 3], ray @ pose[:3, :3].T, unknown, unknown[:, 0])
+def _draw_samples(axes: Axes, field: LearnedField, pose: Tensor, point_camera: Tensor) -> None:
+    """iMAP's samples on the ray to a measured point (m), and the distance that they render."""
+    direction = point_camera[None] / point_camera[2]  # of z = 1 in the camera, so that depth is z
+    not_used = torch.zeros(1, 3)  # observed colour and depth
+    rays = Rays(pose[None, :3, 3], direction @ pose[:3, :3].T, not_used, not_used[:, 0])
     with torch.no_grad():
-        depths = field.hierarchical_depths(rays, 32, 12)
+        depths = field.hierarchical_depths(rays, _N_STRATIFIED, _N_IMPORTANCE)
         rendered = field.render(rays, depths)
-    to_length = ray.norm().item()
-    x = depths[0] * to_length
+    distances = depths[0] * direction.norm().item()
     sizes = 12 + 400 * rendered.weights[0]
-    label = f"{len(x)} samples, by weight"
-    axes.scatter(x, 0 * x, s=sizes, label=label, color=_COLORS["VR"], **_DOT)
-    start, end = point.norm().item(), rendered.depth.item() * to_length
-    axes.axvline(end, linestyle="--", color=_COLORS["VR"], label="rendered distance")
-    axes.scatter(start, 0, s=60, label="measured point", color=_COLORS["true"], **_DOT)
-    axes.annotate("", (end, 0.1), (start, 0.1), arrowprops={"arrowstyle": "<->"})
-    error = f"error {100 * abs(end - start):.0f} cm"
-    axes.annotate(error, ((start + end) / 2, 0.11), ha="center", va="bottom")
+    label = f"{len(distances)} samples, by weight"
+    axes.scatter(distances, 0 * distances, s=sizes, label=label, color=_COLORS["VR"], **_DOT)
+    measured, found = point_camera.norm().item(), rendered.depth.item() * direction.norm().item()
+    axes.axvline(found, linestyle="--", color=_COLORS["VR"], label="rendered distance")
+    axes.scatter(measured, 0, s=60, label="measured point", color=_COLORS["true"], **_DOT)
+    axes.annotate("", (found, 0.1), (measured, 0.1), arrowprops={"arrowstyle": "<->"})
+    error = f"error {100 * abs(found - measured):.0f} cm"
+    axes.annotate(error, ((measured + found) / 2, 0.11), ha="center", va="bottom")
 
 
 def _draw_queries(
-    axes: Axes, field: LearnedField, pose: Tensor, points: Tensor, to_page: Tensor
+    axes: Axes, field: LearnedField, pose: Tensor, points_camera: Tensor, page_camera: Tensor
 ) -> None:
-    """Measured points (m, camera frame), and steps of length |d| against the gradient."""
-    points_world = transform_points(pose, points).requires_grad_()
+    """Measured points (m) on the page, and from each a step of length |d| against the gradient."""
+    points_world = transform_points(pose, points_camera).requires_grad_()
     sdf = field(points_world)[1]
     (gradient,) = torch.autograd.grad(sdf.sum(), points_world)
-    feet = points - sdf.detach()[:, None] * normalize(gradient) @ pose[:3, :3]
-    start, end = (points @ to_page.T).numpy(), (feet @ to_page.T).numpy()
+    ends_camera = points_camera - sdf.detach()[:, None] * normalize(gradient) @ pose[:3, :3]
+    start = (points_camera @ page_camera.T).numpy()
+    end = (ends_camera @ page_camera.T).numpy()
     axes.scatter(*start.T, s=40, label="measured points", color=_COLORS["true"], **_DOT)
     axes.plot([], [], color=_COLORS["SDF"], label="|d| against the gradient")
     look = {"color": _COLORS["SDF"], "angles": "xy", "scale_units": "xy", "scale": 1, "zorder": 5}

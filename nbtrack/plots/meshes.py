@@ -35,10 +35,12 @@ def extract_mesh(
         colors = (255 * field.colors).round().byte()
         return trimesh.PointCloud(field.points.cpu().numpy(), colors.cpu().numpy())
     low, high = np.array([field.bounds.minimum, field.bounds.maximum])
-    first, *others = (np.arange(a, b + voxel, voxel) for a, b in zip(low, high, strict=True))
-    # One layer at a time: all points of a large place are gigabytes.
-    layers = (np.stack(np.meshgrid(x, *others, indexing="ij"), axis=-1)[0] for x in first)
-    values = np.stack([query_field(field, layer)[1] for layer in layers])
+    x, y, z = [np.arange(a, b + voxel, voxel) for a, b in zip(low, high, strict=True)]
+    layers = []  # one at a time: all points of a large place are gigabytes
+    for place in x:
+        (layer,) = np.stack(np.meshgrid(place, y, z, indexing="ij"), axis=-1)
+        layers.append(query_field(field, layer)[1])
+    values = np.stack(layers)
     if not values.min() < field.surface_level < values.max():
         raise DataError(
             f"the {field.label} map has no surface: its values lie in [{values.min():.3g}, "
@@ -68,8 +70,10 @@ def mesh_bytes(mesh: Mesh, kind: str, origin: Position) -> bytes:
     content = mesh.export(file_type=kind, vertex_normal=False)
     if not origin.any():
         return content
+    # Its vertices, the first of the body, are replaced.
     head, end, body = content.partition(b"end_header\n")
-    single, double = (np.dtype([("xyz", f, 3), ("rgba", "u1", 4)]) for f in ("<f4", "<f8"))
+    single = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)])
+    double = np.dtype([("xyz", "<f8", 3), ("rgba", "u1", 4)])
     vertices = np.frombuffer(body, single, len(mesh.vertices)).astype(double)
     vertices["xyz"] = mesh.vertices + origin
     head = head.replace(b"property float", b"property double")
@@ -83,7 +87,8 @@ def query_field(
     """Colours and values at any number of points (m), some at a time to bound the memory."""
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32)).view(-1, 3)
     answers = [field(part.to(field.device)) for part in points.split(_POINTS_AT_ONCE)]
-    colors, values = (torch.cat(parts).cpu().numpy() for parts in zip(*answers, strict=True))
+    colors = torch.cat([color for color, _ in answers]).cpu().numpy()
+    values = torch.cat([value for _, value in answers]).cpu().numpy()
     return colors.reshape(points_world.shape), values.reshape(points_world.shape[:-1])
 
 

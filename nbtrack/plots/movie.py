@@ -43,7 +43,7 @@ def movie_pictures(
     """
     left, middle, right = new_axes(title, 2.8, 1, 3, width_ratios=[1, 1, 0.9])[0]
     page = draw_cloud(right, cloud_of(surface), {"tracked": T_estimated})
-    path, here = right.lines
+    path, here = right.lines  # here: the dot at the start, which now moves along the path
     here.set_color(path.get_color())
     words = right.text(0, 1.03, "", transform=right.transAxes)
     canvas = FigureCanvasAgg(left.figure)
@@ -61,7 +61,7 @@ def movie_pictures(
         error = "" if np.isnan(error_cm) else f", off by {error_cm:.1f} cm"
         words.set_text(f"frame {row.frame_id}{error}")
         canvas.draw()
-        left.figure.set_layout_engine("none")  # nothing moves from picture to picture
+        left.figure.set_layout_engine("none")  # from now on nothing moves in the layout
         progress(index + 1)
         picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
         yield picture.quantize(_GIF_COLORS)
@@ -69,7 +69,7 @@ def movie_pictures(
 
 @styled
 def movie_bytes(pictures: Iterator[Image.Image]) -> bytes:
-    """A GIF that repeats; its pictures are drawn while it is written."""
+    """A GIF that repeats; its pictures are drawn, in the house style, while it is written."""
     content = io.BytesIO()
     options = {"duration": 1000 // _RATE_HZ, "loop": 0, "optimize": True}
     next(pictures).save(content, "GIF", save_all=True, append_images=pictures, **options)
@@ -84,20 +84,22 @@ def view_of(surface: Mesh, camera: Intrinsics, T_world_camera: Pose) -> np.ndarr
     they call the front.
     """
     scale = _WIDTH / camera.width
-    points = (np.asarray(surface.vertices) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-    parts = getattr(surface, "faces", np.arange(len(points))[:, None])
-    corners = points[parts]  # m, camera frame
+    height = round(scale * camera.height)
+    points_camera = (np.asarray(surface.vertices) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     if isinstance(surface, trimesh.PointCloud):
-        corners = corners + _POINT_SIZE * _SQUARE
+        parts = np.arange(len(points_camera))[:, None]  # each point is one
+        corners = points_camera[parts] + _POINT_SIZE * _SQUARE
+    else:
+        parts = surface.faces
+        corners = points_camera[parts]
     depth = np.maximum(corners[..., 2:], _NEAR)
     pixels = scale * (corners[..., :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
-    size = round(scale * camera.width), round(scale * camera.height)
-    is_seen = ((pixels.max(axis=1) > 0) & (pixels.min(axis=1) < size)).all(axis=1)
-    seen = np.flatnonzero(is_seen & (corners[..., 2] > _NEAR).all(axis=1))
-    seen = seen[np.argsort(-corners[seen, :, 2].mean(axis=1))]
-    colors = surface.visual.vertex_colors[parts[seen], :3].mean(axis=1)
-    image = np.full((*size[::-1], 3), 255, np.uint8)
-    for polygon, color in zip(pixels[seen].round().astype(np.int32), colors.tolist(), strict=True):
+    in_view = ((pixels.max(axis=1) > 0) & (pixels.min(axis=1) < [_WIDTH, height])).all(axis=1)
+    seen = np.flatnonzero(in_view & (corners[..., 2] > _NEAR).all(axis=1))
+    order = seen[np.argsort(-corners[seen, :, 2].mean(axis=1))]
+    colors = surface.visual.vertex_colors[parts[order], :3].mean(axis=1)
+    image = np.full((height, _WIDTH, 3), 255, np.uint8)
+    for polygon, color in zip(pixels[order].round().astype(np.int32), colors.tolist(), strict=True):
         cv2.fillConvexPoly(image, polygon, color)
     return image
 

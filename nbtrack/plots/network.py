@@ -17,24 +17,23 @@ def plot_network(network: FourierMlp, value: str, title: str = "") -> Figure:
 
     `value` names the fourth output, "density (1/m)".
     """
-    layers = network.layer_1, network.layer_2, network.layer_3, network.layer_4
-    shapes = [network.frequencies.shape, *(layer.weight.T.shape for layer in layers)]
-    names = ["sin(x B)", *[f"{network.activation.__name__}(W h + b)"] * 4, "W h + b"]
-    texts = [
-        f"{name}\n{rows} × {columns}"
-        for name, (rows, columns) in zip(names, [*shapes, network.head.weight.T.shape], strict=True)
-    ]
+    hidden = f"{network.activation.__name__}(W h + b)"
+    layers = [("sin(x B)", network.frequencies)]
+    for layer in (network.layer_1, network.layer_2, network.layer_3, network.layer_4):
+        layers.append((hidden, layer.weight.T))
+    layers.append(("W h + b", network.head.weight.T))
+    texts = [f"{name}\n{matrix.shape[0]} × {matrix.shape[1]}" for name, matrix in layers]
     axes = new_axes(title, 1.6)[0, 0]
     boxes = []
     for place, text in enumerate(["point\n3 (m, world)", *texts, f"colour (3)\n{value}"]):
-        edge = PALETTE[0] if 0 < place <= len(texts) else "none"
+        edge = PALETTE[0] if 0 < place <= len(texts) else "none"  # of layers only
         box = {"boxstyle": "square,pad=0.6", "facecolor": "white", "edgecolor": edge}
         boxes.append(axes.text(place, 0, text, bbox=box, **_CENTRED).get_bbox_patch())
     for place, (start, end) in enumerate(pairwise(boxes)):
         arrow = _ARROW | {"patchA": start, "patchB": end}
         axes.annotate("", (place + 1, 0), (place, 0), arrowprops=arrow)
-    arrow = _ARROW | {"connectionstyle": "bar,fraction=-0.12", "patchA": boxes[1]}
-    axes.annotate("", (4, 0), (1, 0), arrowprops=arrow | {"patchB": boxes[4]})
+    skip = {"connectionstyle": "bar,fraction=-0.12", "patchA": boxes[1], "patchB": boxes[4]}
+    axes.annotate("", (4, 0), (1, 0), arrowprops=_ARROW | skip)
     axes.text(2.5, 0.8, "sin(x B) once more, beside the output of the second layer", **_CENTRED)
     axes.set(xlim=(-0.5, len(boxes) - 0.5), ylim=(-0.6, 1))
     axes.set_axis_off()

@@ -11,13 +11,12 @@ import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 from matplotlib.ticker import LogLocator
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-PALETTE = (
-    "#3b6fb6", "#e08214", "#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d4d4d", "#a6911a",
-)  # fmt: skip
+PALETTE = "#3b6fb6", "#e08214", "#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d4d4d", "#a6911a"
 _FIXED = {
     **dict.fromkeys(["iMAP with VR", "iMAP", "VR"], PALETTE[0]),
     **dict.fromkeys(["NeuS with SDF", "NeuS", "SDF", "NeuS+ with SDF (Adam)"], PALETTE[1]),
@@ -78,23 +77,24 @@ class NotebookFigure(Figure):
         return picture.getvalue()
 
     def legend_below(self) -> "NotebookFigure":
-        """The figure, with the first panel's legend for all."""
+        """The figure, with the first panel's legend for all below, in one row if it fits."""
         handles, labels = self.axes[0].get_legend_handles_labels()
-        ncols = 3 if sum(map(len, labels)) > 100 else len(labels)
+        ncols = 3 if len("".join(labels)) > 100 else len(labels)
         self.legend(handles, labels, loc="outside lower center", ncols=ncols)
         return self
 
 
-def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **share) -> np.ndarray:
+def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **options) -> np.ndarray:
     """A grid of axes in a new figure of a height (inches), with its finding as title.
 
-    A dollar sign of the title, as in the name of a recording, begins no formula.
+    A dollar sign of the title, as in the name of a recording, begins no formula. Options are those
+    of `Figure.subplots`.
     """
     figure = NotebookFigure(figsize=(WIDTH, height), layout="compressed")
     if title:
         title = title.encode(errors="replace").decode()  # letters that the system's encoding lacks
         figure.suptitle(textwrap.fill(title, 100).replace("$", r"\$"), x=0.01, ha="left")
-    return figure.subplots(rows, columns, squeeze=False, **share)
+    return figure.subplots(rows, columns, squeeze=False, **options)
 
 
 def method_colors(labels: Iterable[str]) -> dict[str, str]:
@@ -104,8 +104,8 @@ def method_colors(labels: Iterable[str]) -> dict[str, str]:
     the paper's methods are never free.
     """
     known = {label: _FIXED.get(label.split(",")[0]) for label in labels}
-    free = cycle(color for color in PALETTE[2:] if color not in known.values())
-    return {label: color or next(free) for label, color in known.items()}
+    free = cycle([color for color in PALETTE[2:] if color not in known.values()])
+    return {label: next(free) if color is None else color for label, color in known.items()}
 
 
 def label_points(
@@ -113,24 +113,34 @@ def label_points(
 ) -> None:
     """Beside every point its label in its colour, on the right or on the left.
 
-    A label that would cover another or leave the axes is moved up or down.
+    Colours are by label, in the order of the points. A label that would cover another or leave the
+    axes is moved up or down.
     """
     axes.margins(x=0.4, y=0.1)
-    axes.figure.draw_without_rendering()
-    rows = sorted(zip(x, y, colors, strict=True), key=lambda row: row[1])
-    pixels = axes.transData.transform([row[:2] for row in rows])
+    axes.figure.draw_without_rendering()  # else the axes have no place in the figure yet
+    points = sorted(zip(x, y, colors, strict=True), key=lambda point: point[1])
+    pixels = axes.transData.transform([point[:2] for point in points])
     taken = [Bbox.from_bounds(left - 5, bottom - 5, 10, 10) for left, bottom in pixels]
-    for x_point, y_point, label in rows:
+    for x_point, y_point, label in points:
         text = axes.annotate(label, (x_point, y_point), (0, 0), textcoords="offset points")
         text.set(color=colors[label])
-        shifts = sorted(range(-60, 61, 3), key=abs)
-        for shift, (right, align) in product(shifts, {6: "left", -6: "right"}.items()):
-            text.set(position=(right, shift - 3), horizontalalignment=align)
-            box = text.get_window_extent()
-            inside = (box.min > axes.bbox.min).all() and (box.max < axes.bbox.max).all()
-            if inside and not any(box.overlaps(other) for other in taken):
-                break
-        taken.append(box)
+        _move_to_free_place(text, taken)
+        taken.append(text.get_window_extent())
+
+
+def _move_to_free_place(text: Annotation, taken: list[Bbox]) -> None:
+    """Move a text to the nearest place beside its point, within the axes, that none has taken.
+
+    It stays at the farthest if all are taken.
+    """
+    within = text.axes.bbox
+    shifts = sorted(range(-60, 61, 3), key=abs)  # points, up
+    for shift, (aside, align) in product(shifts, [(6, "left"), (-6, "right")]):
+        text.set(position=(aside, shift - 3), horizontalalignment=align)
+        box = text.get_window_extent()
+        is_inside = (box.min > within.min).all() and (box.max < within.max).all()
+        if is_inside and not any(box.overlaps(other) for other in taken):
+            return
 
 
 def log_axes(axes: Axes, names: str) -> None:

@@ -98,8 +98,7 @@ def _path(keys: Keys) -> Poses:
     coefficients = []  # piece by piece, since the speed jumps at the joins
     for k, speed in enumerate(speeds):
         ends = slice(k, k + 2)
-        piece = CubicHermiteSpline(times[ends], places[ends], tangents[ends] * speed)
-        coefficients.append(piece.c)
+        coefficients.append(CubicHermiteSpline(times[ends], places[ends], speed * tangents[ends]).c)
     frames = np.arange(round(times[-1]) + 1)
     rotation = Slerp(times, Rotation.from_matrix(camera_poses(keys[:, :6])[:, :3, :3]))
     poses = np.tile(np.eye(4), (len(frames), 1, 1))

@@ -55,8 +55,7 @@ def room_frames(
     # NumPy releases the interpreter lock, so threads suffice.
     with ThreadPoolExecutor(usable_cores()) as pool:
         for start in range(0, n_frames, _FRAMES_AT_ONCE):
-            end = min(start + _FRAMES_AT_ONCE, n_frames)
-            yield from pool.map(make_frame, range(start, end))
+            yield from pool.map(make_frame, range(start, min(start + _FRAMES_AT_ONCE, n_frames)))
 
 
 def make_room(

@@ -32,8 +32,7 @@ def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Inte
     """Where a ray is inside the box |local| <= half."""
     # A direction parallel to a slab: a tiny slope sends both crossings far away, without 0/0.
     direction = np.where(directions == 0.0, 1e-30, directions)
-    first = (-half - origins) / direction
-    second = (half - origins) / direction
+    first, second = (-half - origins) / direction, (half - origins) / direction
     far = reduce(np.minimum, np.maximum(first, second).T)
     return _row_max(np.minimum(first, second)), far
 
