@@ -20,6 +20,8 @@ from nbtrack.tables import STANDING_STILL
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 DEPTH, DEPTH_ERROR = "depth (m)", "depth error (cm)"
+# Without an anchor: else panels with a bar are lower than those without.
+_BAR = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max", "panchor": False}
 _MARKS = "os^Dv"  # matplotlib's markers of up to five methods
 
 
@@ -96,10 +98,7 @@ def _image_grid(title: str, rows: list[list[Panel]], far: float | None = None) -
         limit = _most(np.ma.stack([image.get_array() for image in images])) if far is None else far
         for image in images:
             image.set_clim(0, limit)
-        look = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max"}
-        # With an anchor, panels with a bar would be lower than those without.
-        beside = [image.axes for image in images]
-        figure.colorbar(images[0], ax=beside, label=label, panchor=False, **look)
+        figure.colorbar(images[0], ax=[image.axes for image in images], label=label, **_BAR)
     return figure
 
 
@@ -185,8 +184,7 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     above, below = style.new_axes(title, 4.9, 2, sharex=True)[:, 0]
     draw_errors(above, frames)
     for label, color in style.method_colors(frames).items():
-        tracked = frames[label]
-        below.plot(_seconds(tracked), tracked["rotation_error_deg"], color=color)
+        below.plot(_seconds(frames[label]), frames[label]["rotation_error_deg"], color=color)
     above.axhline(100 * LOST_THRESHOLD_M, **style.DASHED)
     above.text(0, 100 * LOST_THRESHOLD_M, "lost above 0.2 m", va="bottom")
     below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
@@ -199,8 +197,7 @@ def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
         error_cm = 100 * frames[label]["translation_error_m"]
         axes.plot(_seconds(frames[label]), error_cm, color=color, label=label)
     still = list(frames.values())[-1]  # the same in every run of these frames
-    still_cm = 100 * still["still_error_m"]
-    axes.plot(_seconds(still), still_cm, label=STANDING_STILL, **style.DOTTED)
+    axes.plot(_seconds(still), 100 * still["still_error_m"], label=STANDING_STILL, **style.DOTTED)
     axes.set_ylabel("translation error (cm)")
     style.log_axes(axes, "y")
 
@@ -285,5 +282,4 @@ def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray
     turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}
     axes.set_xticks(range(len(ticks)), ticks, **turned)
     groups, names = pd.factorize(labels)
-    from_middle = groups - (len(names) - 1) / 2
-    return codes + from_middle * 0.5 / max(len(names), 4)
+    return codes + (groups - (len(names) - 1) / 2) * 0.5 / max(len(names), 4)

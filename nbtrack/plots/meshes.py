@@ -8,13 +8,14 @@ from skimage.measure import marching_cubes
 
 from nbtrack.beyond import PointCloud
 from nbtrack.beyond.points import min_depth_behind
-from nbtrack.core.arrays import Frames, Position, WorldPoints
+from nbtrack.core.arrays import Frames, Position
 from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 
 _POINTS_AT_ONCE = 65_536
 _SEEN_BEHIND = 0.1  # m behind the measured depth that still count as seen
+GridPoints = Float[np.ndarray, "*shape 3"]  # m
 Mesh = trimesh.Trimesh | trimesh.PointCloud
 
 
@@ -81,10 +82,8 @@ def mesh_bytes(mesh: Mesh, kind: str, origin: Position) -> bytes:
 
 
 @torch.no_grad()
-def query_field(
-    field: Field, points_world: Float[np.ndarray, "*shape 3"]
-) -> tuple[Float[np.ndarray, "*shape 3"], Float[np.ndarray, "*shape"]]:
-    """Colours and values at any number of points (m), some at a time to bound the memory."""
+def query_field(field: Field, points_world: GridPoints) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (*shape, 3) and values (*shape,) at points, some at a time to bound the memory."""
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32)).view(-1, 3)
     answers = [field(part.to(field.device)) for part in points.split(_POINTS_AT_ONCE)]
     colors = torch.cat([color for color, _ in answers]).cpu().numpy()
@@ -93,12 +92,13 @@ def query_field(
 
 
 def seen_by(
-    points_world: WorldPoints, sequence: RgbdSequence, frames: Frames | None = None
-) -> Bool[np.ndarray, "n"]:
+    points_world: GridPoints, sequence: RgbdSequence, frames: Frames | None = None
+) -> Bool[np.ndarray, "*shape"]:
     """Whether points (m) lie in view of given frames, by default all, before what was measured.
 
     See `min_depth_behind`.
     """
-    points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32))
+    points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32)).view(-1, 3)
     frames = np.arange(len(sequence)) if frames is None else frames
-    return (min_depth_behind(points, sequence, frames) < _SEEN_BEHIND).numpy()
+    behind = min_depth_behind(points, sequence, frames).numpy()
+    return behind.reshape(points_world.shape[:-1]) < _SEEN_BEHIND

@@ -86,12 +86,9 @@ def view_of(surface: Mesh, camera: Intrinsics, T_world_camera: Pose) -> np.ndarr
     scale = _WIDTH / camera.width
     height = round(scale * camera.height)
     points_camera = (np.asarray(surface.vertices) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-    if isinstance(surface, trimesh.PointCloud):
-        parts = np.arange(len(points_camera))[:, None]  # each point is one
-        corners = points_camera[parts] + _POINT_SIZE * _SQUARE
-    else:
-        parts = surface.faces
-        corners = points_camera[parts]
+    is_cloud = isinstance(surface, trimesh.PointCloud)
+    parts = np.arange(len(points_camera))[:, None] if is_cloud else surface.faces
+    corners = points_camera[parts] + (_POINT_SIZE * _SQUARE if is_cloud else 0)
     depth = np.maximum(corners[..., 2:], _NEAR)
     pixels = scale * (corners[..., :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
     in_view = ((pixels.max(axis=1) > 0) & (pixels.min(axis=1) < [_WIDTH, height])).all(axis=1)

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import torch
 import trimesh
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from nbtrack.core.arrays import Pose, Transform
@@ -20,7 +21,9 @@ from nbtrack.plots.style import DASHED, method_colors, new_axes, styled
 from nbtrack.tracking.paper import SdfSettings, VrSettings, sdf_loss
 from nbtrack.tracking.tracker import Tracker
 
+_SDF_LOSS, _VR_LOSS, _DENSITY = "SDF's loss (no unit)", "VR's loss (no unit)", "mean density (1/m)"
 _OFFSETS_CM = np.arange(-20, 21, 2)
+_COLORS = dict(zip((_SDF_LOSS, _VR_LOSS), method_colors(["SDF", "VR"]).values(), strict=True))
 _N_PIXELS = 128  # enough for smooth curves, and fast enough for a slider
 
 
@@ -41,24 +44,23 @@ def pose_losses(
     settings and nothing random. The third column is the mean density at the observed points.
     """
     measured = frame.measured_pixels()
-    rows, columns = measured[:, :: 1 + measured.shape[1] // _N_PIXELS]
+    rows, columns = measured[:, :: 1 + measured.shape[1] // _N_PIXELS]  # the same for all poses
     directions_camera = pixel_directions(frame.camera, columns, rows)
     color, depth = frame.at(rows, columns)
     vr, eq_2 = VrSettings(), SdfSettings()
     losses = []
     for x_cm in _OFFSETS_CM:
         T_world_camera = move_sideways(frame, x_cm, y_deg)
-        points = transform_points(T_world_camera, directions_camera * depth[:, None])
-        field_color, sdf = distance(points)
+        points_world = transform_points(T_world_camera, directions_camera * depth[:, None])
+        field_color, sdf = distance(points_world)
         directions = directions_camera @ T_world_camera[:3, :3].T
         rays = Rays(T_world_camera[:3, 3].expand_as(directions), directions, color, depth)
         rendered = density.render_hierarchically(rays, vr.n_stratified, vr.n_importance)
         terms = rendered_losses(rendered, rays, vr.lambda_color, vr.lambda_depth, over_std=True)
         of_sdf = sdf_loss(sdf, field_color, color, eq_2.lambda_sdf, eq_2.lambda_color)
-        of_pose = of_sdf, sum(terms.values()), density(points)[1].mean()
-        losses.append([value.item() for value in of_pose])
-    names = ["SDF's loss (no unit)", "VR's loss (no unit)", "mean density (1/m)"]
-    return pd.DataFrame(losses, pd.Index(_OFFSETS_CM, name="x_cm"), names)
+        mean_density = density(points_world)[1].mean()
+        losses.append([of_sdf.item(), sum(terms.values()).item(), mean_density.item()])
+    return pd.DataFrame(losses, pd.Index(_OFFSETS_CM, name="x_cm"), [_SDF_LOSS, _VR_LOSS, _DENSITY])
 
 
 @styled
@@ -72,25 +74,25 @@ def plot_pose_losses(
     """
     straight = pose_losses(density, distance, frame)
     turned = pose_losses(density, distance, frame, y_deg)
-    title = "Turned by {:g}°: SDF's loss is lowest at {} cm along x, VR's at {} cm"
-    *panels, view = new_axes(title.format(y_deg, *turned.idxmin()), 2.9, 1, 3)[0]
+    best_cm = turned.idxmin()
+    title = f"Turned by {y_deg:g}°: SDF's loss is lowest at {best_cm[_SDF_LOSS]} cm along x, "
+    *panels, view = new_axes(f"{title}VR's at {best_cm[_VR_LOSS]} cm", 2.9, 1, 3)[0]
     T_world_camera = move_sideways(frame, x_cm, y_deg).double().numpy()
     view.imshow(density.render_view(frame.camera, T_world_camera)[0])
     view.set_title("the view from this pose")
     view.axis("off")
     along = np.array([-5, 0, 5])  # cm, of the tangent
-    colors = method_colors(["SDF", "VR"]).values()
-    for axes, name, color in zip(panels, turned, colors, strict=False):  # not the density
+    for axes, (name, color) in zip(panels, _COLORS.items(), strict=True):
         axes.plot(straight[name], color=color, alpha=0.4, label="not turned")
         axes.plot(turned[name], color=color, label=f"turned by {y_deg:g}°")
-        slopes = np.gradient(turned[name], turned.index)
-        loss, slope = (np.interp(x_cm, turned.index, curve) for curve in (turned[name], slopes))
+        loss = np.interp(x_cm, turned.index, turned[name])
+        slope = np.interp(x_cm, turned.index, np.gradient(turned[name], turned.index))
         look = {"marker": "o", "markevery": [1], "label": "this pose and the gradient"}
         axes.plot(x_cm + along, loss + slope * along, color="0.3", **look)
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
-    figure = axes.figure.legend_below()
-    for line in figure.legends[0].get_lines():  # of any method
+    figure = view.figure.legend_below()
+    for line in figure.legends[0].get_lines():  # they hold for the curves of both methods
         line.set_color("0.3")
     return figure
 
@@ -98,17 +100,20 @@ def plot_pose_losses(
 @styled
 def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
     """SDF's loss and the mean density of `pose_losses`, and where each would pull the camera."""
-    panels = new_axes(title, 2.9, 1, 2)[0]
-    best = {curves.columns[0]: ("lowest", np.argmin), curves.columns[2]: ("highest", np.argmax)}
-    for axes, name, color in zip(panels, best, method_colors(["SDF", "VR"]).values(), strict=True):
-        told, find = best[name]
-        place = curves.index[find(curves[name])]
-        axes.plot(curves[name], color=color)
-        axes.plot(place, curves[name][place], "o", color="0.3", label=f"{told}, at {place} cm")
-        axes.axvline(0, label="the true pose", **DASHED)
-        axes.set(xlabel="camera off along x (cm)", ylabel=name)
-        axes.legend()
-    return axes.figure
+    left, right = new_axes(title, 2.9, 1, 2)[0]
+    loss, density = curves[_SDF_LOSS], curves[_DENSITY]
+    _draw_with_best(left, loss, _COLORS[_SDF_LOSS], loss.idxmin(), "lowest")
+    _draw_with_best(right, density, _COLORS[_VR_LOSS], density.idxmax(), "highest")
+    return left.figure
+
+
+def _draw_with_best(axes: Axes, curve: pd.Series, color: str, best_cm: int, told: str) -> None:
+    """A curve of `pose_losses` with a dot where it is best, which the legend tells."""
+    axes.plot(curve, color=color)
+    axes.plot(best_cm, curve[best_cm], "o", color="0.3", label=f"{told}, at {best_cm} cm")
+    axes.axvline(0, label="the true pose", **DASHED)
+    axes.set(xlabel="camera off along x (cm)", ylabel=curve.name)
+    axes.legend()
 
 
 @styled
@@ -119,32 +124,38 @@ def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, nea
     2000 measured points, on the plane of the true camera's x and z, with the true orientation;
     trackers also turn.
     """
-    T_true = frame.T_world_camera
-    paths = {label: _path_cm(tracker, frame, T_start) for label, tracker in trackers.items()}
-    errors_mm = {label: 10 * np.linalg.norm(path, axis=1) for label, path in paths.items()}
-    found = {label: np.flatnonzero(e < 1000 * near) for label, e in errors_mm.items()}
-    told = [f"{k} {f'after {n[0]} steps' if len(n) else 'never'}" for k, n in found.items()]
+    paths_cm = {label: _path_cm(tracker, frame, T_start) for label, tracker in trackers.items()}
+    errors_mm = {label: 10 * np.linalg.norm(path, axis=1) for label, path in paths_cm.items()}
+    within = {label: np.flatnonzero(e < 1000 * near) for label, e in errors_mm.items()}
+    found = [f"{k} after {n[0]} steps" if len(n) else f"{k} never" for k, n in within.items()]
     ends = " and ".join(f"{errors[-1]:.0f}" for errors in errors_mm.values())
-    title = f"Within {1000 * near:.0f} mm: {', '.join(told)}; at their ends {ends} mm"
+    title = f"Within {1000 * near:.0f} mm: {', '.join(found)}; at their ends {ends} mm"
     plane, by_step = new_axes(title, 3.6, 1, 2, width_ratios=[1.2, 1])[0]
-    spread = np.concatenate([*paths.values(), [[0, 0, 0]]])
-    x, z = (np.linspace(spread[:, k].min() - 1, spread[:, k].max() + 1, 21) for k in (0, 2))
-    pixels = frame.measured_pixels()
-    points = frame.points(*pixels[:, :: 1 + pixels.shape[1] // 2000])[0].numpy()
-    moved = points + np.stack(np.meshgrid(x, 0, z), axis=-1)[0][:, :, None] / 100
     field = next(iter(trackers.values())).field
-    values = query_field(field, moved @ T_true[:3, :3].T + T_true[:3, 3])[1]
-    mean_cm = 100 * np.abs(values).mean(axis=-1)
-    filled = plane.contourf(x, z, mean_cm.T, np.arange(0, mean_cm.max() + 0.25, 0.25), cmap="Greys")
-    plane.figure.colorbar(filled, ax=plane, label="mean |d| (cm)")
-    for label, color in method_colors(paths).items():
+    _draw_mean_distance(plane, field, frame, np.concatenate([*paths_cm.values(), [[0, 0, 0]]]))
+    for label, color in method_colors(paths_cm).items():
         look = {"color": color, "marker": ".", "label": label}
-        plane.plot(paths[label][:, 0], paths[label][:, 2], **look)
+        plane.plot(paths_cm[label][:, 0], paths_cm[label][:, 2], **look)
         by_step.plot(errors_mm[label], **look)
     plane.plot(0, 0, "*", color="black", markersize=10, linestyle="", label="true pose")
     plane.set(xlabel="camera off along x (cm)", ylabel="off along z (cm)", aspect="equal")
     by_step.set(xlabel="step", ylabel="position error (mm)")
     return plane.figure.legend_below()
+
+
+def _draw_mean_distance(axes: Axes, field: Field, frame: Frame, places_cm: np.ndarray) -> None:
+    """The mean |d| (cm) of a frame's points, over offsets of the true camera along its x and z (cm)
+    that reach 1 cm beyond the places (n, 3)."""
+    x, _, z = np.linspace(places_cm.min(axis=0) - 1, places_cm.max(axis=0) + 1, 21).T
+    pixels = frame.measured_pixels()
+    points_camera = frame.points(*pixels[:, :: 1 + pixels.shape[1] // 2000])[0].numpy()
+    offsets = np.stack(np.meshgrid(x, 0, z), axis=-1)[0] / 100
+    moved_camera = points_camera + offsets[:, :, None]
+    T_true = frame.T_world_camera
+    _, sdf = query_field(field, moved_camera @ T_true[:3, :3].T + T_true[:3, 3])
+    mean_cm = 100 * np.abs(sdf).mean(axis=-1)
+    filled = axes.contourf(x, z, mean_cm.T, np.arange(0, mean_cm.max() + 0.25, 0.25), cmap="Greys")
+    axes.figure.colorbar(filled, ax=axes, label="mean |d| (cm)")
 
 
 def _path_cm(tracker: Tracker, frame: Frame, T_start: Pose) -> np.ndarray:

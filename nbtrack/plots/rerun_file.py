@@ -34,11 +34,12 @@ def rerun_bytes(surface: Mesh, seen: RgbdSequence, run: Trajectory, title: str) 
     for row in run.frames.itertuples():
         recording.set_time("frame", sequence=row.frame_id)
         recording.set_time("seconds", duration=row.time)
-        for i in np.flatnonzero(seen.frame_ids == row.frame_id):
+        for i in np.flatnonzero(seen.frame_ids == row.frame_id):  # one or none
             T = seen.T_world_camera[i]
             recording.log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
             recording.log("world/camera/color", rr.Image(seen.colors[i]).compress())
             recording.log("world/camera/depth", rr.DepthImage(seen.depths_mm[i], meter=1000))
         recording.log("error_m", rr.Scalars(row.translation_error_m))
+        # Not all trackers judge themselves.
         recording.log("lost", rr.Scalars(float(getattr(row, "lost", row.without_depth))))
     return stream.read()

@@ -1,6 +1,6 @@
 """Figures of rooms: a slice, a mesh, the paper's Figure 1, and an overview of a run."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -9,12 +9,13 @@ import trimesh
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from nbtrack.core.arrays import Colors, Points, Poses, Values
+from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.plots import scene
 from nbtrack.plots.figures import draw_errors
-from nbtrack.plots.meshes import extract_mesh
+from nbtrack.plots.meshes import extract_mesh, seen_by
+from nbtrack.plots.scene import Paths
 from nbtrack.plots.style import method_colors, new_axes, styled
 from nbtrack.synthetic import Room
 
@@ -38,7 +39,7 @@ def plot_slice(
     around the path and what the frames have seen, in the room if that is known.
     """
     fields = [fields] if isinstance(fields, Field) else fields
-    norm, where = None, f"height {height:.2f} m; pale: never seen"
+    where = f"height {height:.2f} m; pale: never seen"
     names = [field.label for field in fields]
     if len(fields) > 1:  # once for all, since panels side by side are narrow
         title = f"{title}, {where}"
@@ -47,25 +48,25 @@ def plot_slice(
     if room is not None and len(fields) == 1 and fields[0].is_distance:
         fields = [fields[0], _ExactDistance(room, fields[0])]
     panels = new_axes(title, 5.4 - 0.9 * (len(fields) - 1), 1, len(fields), sharey=True)[0]
+    norm = None  # the first field's, for all
     for axes, field, name in zip(panels, fields, names, strict=False):
         up, page = scene.draw_from_above(axes, {"camera path": sequence.T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / _POINTS_ALONG
         points, places = _level_grid(page, low, high + step, step, height * up)
         label = field.value_label.replace("(m)", "(m; thin lines: every 0.25 m)")
-        look = {"ax": panels, "aspect": 25, "pad": 0.015, "label": label}
-        norm = scene.draw_slice(axes, field, points, places, sequence, norm, **look)
-        shown = axes.collections[-1].get_array()[..., 3] == 0  # the veil over the unseen
+        bar = {"ax": panels, "aspect": 25, "pad": 0.015, "label": label}
+        shown = seen_by(points, sequence)
+        norm = scene.draw_slice(axes, field, points, places, shown, norm, **bar)
         axes.plot([], [], "k-", label="surface")
         if room is not None:
             true = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:2])
-            shown &= true > 0
+            shown = shown & (true > 0)
             scene.draw_levels(axes, places, true, [0.0], zorder=3, **_TRUE_LINE)
             axes.plot([], [], "--", color=_TRUE_LINE["colors"], label="true surface")
         axes.set_title(name)
         _end_around(axes, places[shown], sequence.T_world_camera[:, :3, 3] @ page.T)
-    axes.figure.legend_below()
-    return axes.figure
+    return panels[0].figure.legend_below()
 
 
 def _end_around(axes: Axes, *places: np.ndarray) -> None:
@@ -101,7 +102,7 @@ def _level_grid(
 
 
 @styled
-def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = "") -> Figure:
+def plot_mesh(mesh: trimesh.Trimesh, T_paths: Paths, title: str = "") -> Figure:
     """A vertex-coloured mesh of a room from outside, without the near walls and the ceiling.
 
     Every face that shows its back is left out, and one looks from where most surface shows. The
@@ -110,21 +111,21 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Mapping[str, Poses], title: str = 
     """
     room, enlarged = new_axes(title, 5.0, 1, 2, width_ratios=[2, 1])[0]
     to_screen = scene.draw_mesh(room, mesh, scene.up_of(*T_paths.values()))
-    for axes in (room, enlarged):
-        scene.draw_paths(axes, T_paths, to_screen[:2])
-    scene.look_through(enlarged)
-    enlarged.set_title("The path, larger")
-    room.figure.legend_below()
-    return room.figure
+    scene.draw_paths(room, T_paths, to_screen[:2])
+    _draw_enlarged(enlarged, T_paths, to_screen[:2])
+    return room.figure.legend_below()
+
+
+def _draw_enlarged(axes: Axes, T_paths: Paths, to_page: np.ndarray) -> None:
+    """The paths of a room alone, in its projection."""
+    scene.draw_paths(axes, T_paths, to_page)
+    scene.look_through(axes)
+    axes.set_title("The path, larger")
 
 
 @styled
 def plot_map_and_slice(
-    field: Field,
-    sequence: RgbdSequence,
-    T_paths: Mapping[str, Poses],
-    title: str = "",
-    voxel: float = 0.04,
+    field: Field, sequence: RgbdSequence, T_paths: Paths, title: str = "", voxel: float = 0.04
 ) -> Figure:
     """A map as in the paper's Figure 1: its surface, a slice through its signed distance, paths.
 
@@ -145,24 +146,23 @@ def plot_map_and_slice(
     points, _ = _level_grid(page, *mesh.bounds @ page.T, voxel, height * up)
     places = (points + aside) @ to_screen[:2].T
     bar = {"location": "bottom", "shrink": 0.4, "aspect": 30, "pad": 0.0}
-    scene.draw_slice(axes, field, points, places, sequence, **bar)
-    names = "Mesh: the zero level", "Slice at the cameras' height; pale: never seen"
-    for name, drawn in zip(names, (mesh.vertices @ to_screen[:2].T, places), strict=True):
-        x, y = drawn.reshape(-1, 2).T
+    scene.draw_slice(axes, field, points, places, seen_by(points, sequence), **bar)
+    parts = {"Mesh: the zero level": mesh.vertices @ to_screen[:2].T}
+    parts["Slice at the cameras' height; pale: never seen"] = places.reshape(-1, 2)
+    for name, on_page in parts.items():
+        x, y = on_page.T
         axes.text((x.min() + x.max()) / 2, y.max() + 2 * voxel, name, ha="center")
     scene.draw_paths(axes, T_paths, to_screen[:2], 0.7)
-    axes.figure.legend_below()
+    axes.figure.legend_below()  # before the paths are drawn once more, in the slice
     scene.draw_paths(axes, T_paths, to_screen[:2], 0.7, aside)
     axes.set_axis_off()
-    scene.draw_paths(enlarged, T_paths, to_screen[:2])
-    scene.look_through(enlarged)
-    enlarged.set_title("The path, larger")
+    _draw_enlarged(enlarged, T_paths, to_screen[:2])
     return axes.figure
 
 
 @styled
 def plot_overview(
-    cloud: pd.DataFrame, T_paths: Mapping[str, Poses], frames: pd.DataFrame | None, title: str
+    cloud: pd.DataFrame, T_paths: Paths, frames: pd.DataFrame | None, title: str
 ) -> Figure:
     """Coloured points (m) and paths from above, and the errors of a tracked run over time.
 
@@ -172,11 +172,10 @@ def plot_overview(
     without them, or without a known true pose, there are no errors.
     """
     has_errors = frames is not None and frames["translation_error_m"].notna().any()
-    left, *right = new_axes(title, 4.2 if has_errors else 6.0, 1, 1 + has_errors)[0]
-    scene.draw_cloud(left, cloud, T_paths)
-    left.figure.legend_below()
-    for axes in right:
-        draw_errors(axes, {"tracked": frames})
-        axes.set_xlabel("time (s)")
-        axes.legend(loc="best")
-    return left.figure
+    panels = new_axes(title, 4.2 if has_errors else 6.0, 1, 2 if has_errors else 1)[0]
+    scene.draw_cloud(panels[0], cloud, T_paths)
+    if has_errors:
+        draw_errors(panels[1], {"tracked": frames})
+        panels[1].set_xlabel("time (s)")
+        panels[1].legend(loc="best")
+    return panels[0].figure.legend_below()

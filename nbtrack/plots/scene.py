@@ -10,17 +10,17 @@ from itertools import cycle
 import numpy as np
 import pandas as pd
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm, Normalize
 
 from nbtrack.core.arrays import Poses
-from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
-from nbtrack.plots.meshes import query_field, seen_by
+from nbtrack.plots.meshes import query_field
 from nbtrack.plots.style import method_colors
 
+Paths = Mapping[str, Poses]  # camera-to-world poses (m) by label
 _ELEVATION = np.radians(45)  # of the viewer of a mesh
 _AMBIENT = 0.55  # share of the light on a mesh that comes from everywhere
 _DIMMED = 0.72  # how white the unseen becomes
@@ -65,10 +65,10 @@ def draw_mesh(axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
     side = inward_side(mesh)
     # None of the azimuths looks along the walls of a room aligned to the axes.
     screens = np.stack([screen_axes(up, azimuth) for azimuth in np.arange(15.0, 360.0, 30.0)])
-    fronts = side * mesh.face_normals @ screens[:, 2].T
-    best = (mesh.area_faces @ fronts.clip(0)).argmax()
+    cosines = side * mesh.face_normals @ screens[:, 2].T  # of faces to viewers, (faces, azimuths)
+    best = (mesh.area_faces @ cosines.clip(0)).argmax()
     to_screen = screens[best]
-    faces = mesh.faces[fronts[:, best] > 0]
+    faces = mesh.faces[cosines[:, best] > 0]
     corners = (mesh.vertices @ to_screen.T)[faces]
     # Smoothed normals: those of single marching-cubes faces flicker.
     normals = side * mesh.vertex_normals[faces].mean(axis=1)
@@ -89,7 +89,7 @@ def look_through(axes: Axes) -> None:
     axes.grid(False)
 
 
-def draw_from_above(axes: Axes, T_paths: Mapping[str, Poses]) -> tuple[np.ndarray, np.ndarray]:
+def draw_from_above(axes: Axes, T_paths: Paths) -> tuple[np.ndarray, np.ndarray]:
     """Paths, and axes in metres, equal, and turned so that nothing is mirrored.
 
     Returns up, and the world's axes to the right and ahead on the page, (2, 3).
@@ -97,34 +97,30 @@ def draw_from_above(axes: Axes, T_paths: Mapping[str, Poses]) -> tuple[np.ndarra
     up = up_of(*T_paths.values())
     page = np.eye(3)[up == 0]
     draw_paths(axes, T_paths, page)
-    right, ahead = ("xyz"[axis.argmax()] for axis in page)
+    right, ahead = np.array(list("xyz"))[up == 0]
     axes.set(xlabel=f"{right} (m)", ylabel=f"{ahead} (m)", aspect="equal")
     axes.yaxis.set_inverted(np.cross(*page) @ up < 0)  # right, page-up and up are right-handed
     return up, page
 
 
 def draw_paths(
-    axes: Axes,
-    T_paths: Mapping[str, Poses],
-    to_page: np.ndarray,
-    width: float = 1.0,
-    aside: np.ndarray | float = 0.0,
+    axes: Axes, T_paths: Paths, to_page: np.ndarray, width: float = 1, aside: np.ndarray | float = 0
 ) -> None:
     """Trajectories by label on a page, (2, 3), with a dot at the first one's start; aside (m)."""
-    styles = cycle(("--", "-.", ":"))
+    dashes = cycle(("--", "-.", ":"))
     for label, color in method_colors(T_paths).items():
-        path = (T_paths[label][:, :3, 3] + aside) @ to_page.T
+        x, y = to_page @ (T_paths[label][:, :3, 3] + aside).T
+        line = "-" if label == "true" else next(dashes)
         # The true path is wide, so that the others do not hide it.
-        dashes, own = ("-", 4.0) if label == "true" else (next(styles), 1.6)
-        look = {"linewidth": own * width, "color": color, "label": label, "zorder": 3}
-        axes.plot(*path.T, dashes, **look)
-    first = next(iter(T_paths.values()))[0, :3, 3] + aside
+        look = {"linewidth": width * (4.0 if label == "true" else 1.6), "color": color, "zorder": 3}
+        axes.plot(x, y, line, label=label, **look)
+    x, y = to_page @ (next(iter(T_paths.values()))[0, :3, 3] + aside)
     look = {"color": "black", "markersize": 5 * width, "zorder": 4}
     # A legend has four keys at most.
-    axes.plot(*to_page @ first, "o", label="start" if len(T_paths) < 4 else "", **look)
+    axes.plot(x, y, "o", label="start" if len(T_paths) < 4 else "", **look)
 
 
-def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) -> np.ndarray:
+def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Paths) -> np.ndarray:
     """Coloured points from above, but for those higher than all cameras; and paths.
 
     Returns the world's axes to the right and ahead, (2, 3).
@@ -136,7 +132,8 @@ def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Mapping[str, Poses]) ->
     highest = max((path[:, :3, 3] @ up).max() for path in T_paths.values())
     shown = cloud.loc[heights.index[heights <= highest + 0.1]]
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
-    axes.scatter(*page @ places.loc[shown.index].to_numpy().T, c=colors, s=4, linewidths=0)
+    right, ahead = page @ shown[["x", "y", "z"]].to_numpy().T
+    axes.scatter(right, ahead, c=colors, s=4, linewidths=0)
     return page
 
 
@@ -145,7 +142,7 @@ def draw_slice(
     field: Field,
     points: Float[np.ndarray, "rows columns 3"],
     places: Float[np.ndarray, "rows columns 2"],
-    sequence: RgbdSequence | None = None,
+    seen: Bool[np.ndarray, "rows columns"] | None = None,
     norm: Normalize | None = None,
     **bar: object,
 ) -> Normalize:
@@ -153,10 +150,10 @@ def draw_slice(
 
     A signed distance is blue in free space and red in matter, with thin lines 0.25 m apart; a
     density or an occupancy has a logarithmic scale. Black is the surface (the field's
-    `surface_level`). What no frame of a sequence has seen is pale: there the field invents. The
-    scale is returned; with that of another slice as `norm` no bar is drawn.
+    `surface_level`). What no frame has seen is pale: there the field invents. The scale is
+    returned; with that of another slice as `norm` no bar is drawn.
     """
-    values = query_field(field, points)[1]
+    _, values = query_field(field, points)
     level = field.surface_level
     if field.is_distance:
         limit = np.clip(np.quantile(np.abs(values), 0.98), 0.2, 1.5)
@@ -172,10 +169,10 @@ def draw_slice(
     if field.is_distance:
         draw_levels(axes, places, values, _LINES_M, colors="0.35", linewidths=0.4, linestyles="-")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
-    if sequence is not None:
+    if seen is not None:
         pale = image.to_rgba(values)
         pale += _DIMMED * (1 - pale)
-        pale[..., 3] = ~seen_by(points.reshape(-1, 3), sequence).reshape(values.shape)
+        pale[..., 3] = ~seen  # transparent over what was seen
         axes.pcolormesh(*page, pale, gid="unseen", zorder=2.5, **grid)  # above the map's lines
     return image.norm
 

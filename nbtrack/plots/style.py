@@ -108,9 +108,7 @@ def method_colors(labels: Iterable[str]) -> dict[str, str]:
     return {label: next(free) if color is None else color for label, color in known.items()}
 
 
-def label_points(
-    axes: Axes, x: Iterable[float], y: Iterable[float], colors: dict[str, str]
-) -> None:
+def label_points(axes: Axes, x: Iterable, y: Iterable, colors: dict[str, str]) -> None:
     """Beside every point its label in its colour, on the right or on the left.
 
     Colours are by label, in the order of the points. A label that would cover another or leave the

@@ -43,8 +43,7 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     A shorter path is the beginning of one of these, a longer one turns back at both ends (our
     choice). Raises `NumericalError` as `attempts` does.
     """
-    short_keys, long_keys = room.walk.keys
-    keys = np.array(short_keys if n_frames <= _SHORT else long_keys)
+    keys = np.array(room.walk.keys[0 if n_frames <= _SHORT else 1])
     base = _calibrated_path(room, keys)
     least = min(_MIN_STILL, _STILL_SHARE * still_metrics(base)["still_ate_m"])
 
@@ -92,8 +91,9 @@ def _path(keys: Keys) -> Poses:
     times = keys[:, 6]  # frames
     legs = np.diff(places, axis=0)
     directions = legs / np.linalg.norm(legs, axis=1, keepdims=True)
-    at_joins = (directions[1:] + directions[:-1]) / 2  # shorter than 1 where the path bends
-    tangents = np.concatenate([directions[:1], at_joins, directions[-1:]])
+    # At a join the mean of two directions, which is shorter the more the path bends.
+    joins = (directions[1:] + directions[:-1]) / 2
+    tangents = np.concatenate([directions[:1], joins, directions[-1:]])
     speeds = np.linalg.norm(legs, axis=1) / np.diff(times)
     coefficients = []  # piece by piece, since the speed jumps at the joins
     for k, speed in enumerate(speeds):
@@ -116,6 +116,5 @@ def _view(room: Room, poses: Poses) -> tuple[float, float]:
     origins = poses[::12, :3, 3].repeat(len(rays_camera), axis=0)
     depths, _ = room.first_hit(origins, directions)
     points_world = np.concatenate([origins + depths[:, None] * directions, poses[:, :3, 3]])
-    unit = np.ptp(points_world, axis=0).max() / 2 + _MARGIN
     near = np.quantile(depths.reshape(-1, len(rays_camera)), 0.25, axis=1).min()
-    return float(unit), float(near)
+    return float(np.ptp(points_world, axis=0).max() / 2 + _MARGIN), float(near)

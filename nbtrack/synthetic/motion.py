@@ -85,8 +85,8 @@ def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
     tremor = _tremor(length, rng)
     center = np.asarray(walk.center) + rng.uniform(-_CENTER_REACH, _CENTER_REACH, 2)
     heading = walk.start_yaw + rng.uniform(-_HEADING_REACH, _HEADING_REACH)
-    forward = [-np.sin(heading), -np.cos(heading)]  # x, z
-    left = [-np.cos(heading), np.sin(heading)]
+    # Forward and left, (x, z).
+    axes = np.array([[-np.sin(heading), -np.cos(heading)], [-np.cos(heading), np.sin(heading)]])
     radius = 0.7  # m
     rate = np.radians(0.5)  # a frame, in the mean
     for _ in range(12):
@@ -95,8 +95,7 @@ def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
         turned = walk.turn * angle
         # Opposite to the direction of view, so that the room lies before the camera.
         ellipse = np.stack([-np.cos(turned + side), -_FLATTENING * np.sin(turned + side)], axis=1)
-        offset = ellipse @ np.array([forward, left])
-        x, z = (center + radius * (1.0 + stretch[:, None]) * offset).T
+        x, z = (center + radius * (1.0 + stretch[:, None]) * (ellipse @ axes)).T
         yaw = heading + turned + glance
         poses = camera_poses(np.stack([x, height, z, pitch, yaw, roll], axis=1) + tremor)
         faster = np.clip(MEAN_STEP / steps_between(poses).mean(axis=1), 0.7, 1.4)

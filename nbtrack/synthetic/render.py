@@ -77,8 +77,7 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     (growth with incidence); Handa et al., ICRA 2014 (jitter, rounding). Dropout probability and
     thresholds are our choice.
     """
-    height, width = depth.shape
-    per_pixel = 640.0 / width
+    per_pixel = 640.0 / depth.shape[1]
     scale = focal * per_pixel * BASELINE  # disparity (px at width 640) times depth (m)
     seen = np.isfinite(depth) & (depth > 0)
     exact = np.where(seen, scale / np.where(seen, depth, 1.0), 0.0)
@@ -87,7 +86,7 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     bends = [np.abs(np.diff(exact, 2, axis=axis)) > EDGE_JUMP for axis in (0, 1)]
     is_edge = np.pad(bends[0], ((1, 1), (0, 0))) | np.pad(bends[1], ((0, 0), (1, 1)))
     lost |= is_edge & (rng.uniform(size=depth.shape) < EDGE_DROPOUT)
-    shift = rng.normal(scale=LATERAL_NOISE / per_pixel, size=(2, height, width))
+    shift = rng.normal(scale=LATERAL_NOISE / per_pixel, size=(2, *depth.shape))
     places = np.indices(depth.shape) + shift
     # Interpolated: at a width of 96 the jitter is below a tenth of a pixel.
     looked_up = map_coordinates(exact, places, order=1, mode="nearest")

@@ -131,11 +131,9 @@ def build_room(name: str) -> Room:
 
 def _resolved(value: Any, named: dict[str, Material]) -> Any:
     """A value of the file with its materials made or looked up and its lists as tuples."""
-    if isinstance(value, str):
-        return named[value]
     if isinstance(value, list):
         return tuple(_resolved(item, named) for item in value)
     if not isinstance(value, dict):
-        return value
+        return named[value] if isinstance(value, str) else value
     options = {key: _resolved(item, named) for key, item in value.items() if key != "kind"}
     return partial(getattr(materials, value["kind"]), **options) if "kind" in value else options
