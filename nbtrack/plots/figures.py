@@ -1,8 +1,6 @@
 """What a camera saw beside what a field renders; numbers as curves and bars."""
 
 from collections.abc import Mapping, Sequence
-from itertools import chain
-from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -19,18 +17,12 @@ from nbtrack.plots import style
 from nbtrack.tables import STANDING_STILL
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
-DEPTH, DEPTH_ERROR = "depth (m)", "depth error (cm)"
+DEPTH, DISTANCE = "depth (m)", "|signed distance| (cm)"
 # Without an anchor: else panels with a bar are lower than those without.
 _BAR = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max", "panchor": False}
 _MARKS = "os^Dv"  # matplotlib's markers of up to five methods
-
-
-class Panel(NamedTuple):
-    """An image of a grid: colours, or numbers with the label of their bar."""
-
-    title: str
-    image: np.ndarray
-    label: str = ""  # none for colours
+# A title, an image (colours or numbers), and the label of the numbers' bar; colours have none.
+Panel = tuple[str, np.ndarray, str]
 
 
 @style.styled
@@ -43,8 +35,8 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     some_mm = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
     far = MILLIMETRE * _most(np.ma.masked_equal(some_mm, 0))
     depth = np.ma.masked_equal(sequence.depth(index), 0)
-    color = Panel(f"frame {sequence.frame_ids[index]}: colour", sequence.color(index))
-    return _image_grid(title, [[color, Panel("depth", depth, DEPTH)]], far)
+    color = (f"frame {sequence.frame_ids[index]}: colour", sequence.color(index), "")
+    return _image_grid(title, [[color, ("depth", depth, DEPTH)]], far)
 
 
 @style.styled
@@ -59,10 +51,11 @@ def plot_views(
     rows = []
     for index, (color, rendered) in zip(indices, views, strict=True):
         depth = np.ma.masked_equal(sequence.depth(index), 0)
-        observed = Panel(f"frame {sequence.frame_ids[index]}", sequence.color(index))
-        depths = [Panel("observed depth", depth, DEPTH), Panel("rendered depth", rendered, DEPTH)]
-        error = Panel("|error|", 100 * np.abs(rendered - depth), DEPTH_ERROR)
-        rows.append([observed, Panel("rendered colour", color), *depths, error])
+        name = f"frame {sequence.frame_ids[index]}"
+        colors = [(name, sequence.color(index), ""), ("rendered colour", color, "")]
+        depths = [("observed depth", depth, DEPTH), ("rendered depth", rendered, DEPTH)]
+        error = ("|error|", 100 * np.abs(rendered - depth), "depth error (cm)")
+        rows.append([*colors, *depths, error])
     return _image_grid(title, rows)
 
 
@@ -73,26 +66,25 @@ def plot_distances(frame: Frame, distances: Mapping[str, Values], title: str = "
     The distances (m) are those of `frame.measured_pixels()`, in this order.
     """
     rows, columns = frame.measured_pixels().cpu().numpy()
-    panels = [Panel("observed colour", frame.color.cpu().numpy())]
+    panels = [("observed colour", frame.color.cpu().numpy(), "")]
     for label, sdf in distances.items():
         image_cm = np.ma.masked_all(frame.depth_mm.shape)
         image_cm[rows, columns] = 100 * sdf.abs().cpu().numpy()
-        name = f"{label}: mean {image_cm.mean():.1f} cm"
-        panels.append(Panel(name, image_cm, "|signed distance| (cm)"))
+        panels.append((f"{label}: mean {image_cm.mean():.1f} cm", image_cm, DISTANCE))
     return _image_grid(title, [panels])
 
 
 def _image_grid(title: str, rows: list[list[Panel]], far: float | None = None) -> Figure:
     """Images in rows; those of a label share a bar, and a scale that ends at `far` or `_most`."""
-    height, width = rows[0][0].image.shape[:2]
+    _, first, _ = rows[0][0]
+    height, width = first.shape[:2]
     inches = 0.9 + len(rows) * (0.2 + style.WIDTH / len(rows[0]) * height / width)
     grid = style.new_axes(title, inches, len(rows), len(rows[0]))
     with_bar: dict[str, list[AxesImage]] = {}
-    for axes, panel in zip(grid.flat, chain(*rows), strict=True):
-        colors = "viridis" if panel.label == DEPTH else "magma"
-        drawn = show_image(axes, panel.image, panel.title, colors)
-        if panel.label:
-            with_bar.setdefault(panel.label, []).append(drawn)
+    for axes, (name, image, label) in zip(grid.flat, sum(rows, []), strict=True):
+        drawn = show_image(axes, image, name, "viridis" if label == DEPTH else "magma")
+        if label:
+            with_bar.setdefault(label, []).append(drawn)
     figure = grid[0, 0].figure
     for label, images in with_bar.items():
         limit = _most(np.ma.stack([image.get_array() for image in images])) if far is None else far
@@ -215,9 +207,8 @@ def plot_panels(panels: Mapping[str, pd.DataFrame], x: str, title: str = "") -> 
     """
     grid = style.new_axes(title, 3.4, 1, len(panels), sharey=True)[0]
     for axes, (name, values) in zip(grid, panels.items(), strict=True):
-        colors = style.method_colors(values)
-        for label, mark in zip(colors, _MARKS, strict=False):
-            own = {"color": colors[label], "marker": mark, "linestyle": ""}
+        for (label, color), mark in zip(style.method_colors(values).items(), _MARKS, strict=False):
+            own = {"color": color, "marker": mark, "linestyle": ""}
             look = style.DOTTED if label == STANDING_STILL else own
             axes.plot(values[label], values.index, label=label, **look)
         axes.set(title=name, xlabel=x, ylim=(len(values) - 0.5, -0.5))

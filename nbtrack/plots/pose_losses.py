@@ -149,8 +149,7 @@ def _draw_mean_distance(axes: Axes, field: Field, frame: Frame, places_cm: np.nd
     x, _, z = np.linspace(places_cm.min(axis=0) - 1, places_cm.max(axis=0) + 1, 21).T
     pixels = frame.measured_pixels()
     points_camera = frame.points(*pixels[:, :: 1 + pixels.shape[1] // 2000])[0].numpy()
-    offsets = np.stack(np.meshgrid(x, 0, z), axis=-1)[0] / 100
-    moved_camera = points_camera + offsets[:, :, None]
+    moved_camera = points_camera + np.stack(np.meshgrid(x, 0, z), axis=-1)[0][:, :, None] / 100
     T_true = frame.T_world_camera
     _, sdf = query_field(field, moved_camera @ T_true[:3, :3].T + T_true[:3, 3])
     mean_cm = 100 * np.abs(sdf).mean(axis=-1)

@@ -146,13 +146,12 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     first = rng.integers(len(room.walk.stops))
     around = _closed_walk(room, np.roll(room.walk.stops, -first, axis=0))
     steps = np.linalg.norm(np.diff(around, axis=0, append=around[:1]), axis=1)
-    round_m = steps.sum()
     # Three rounds, so that smoothing and interpolation meet no end in the middle one.
     curve = CubicSpline(_before(np.tile(steps, 3)), np.tile(around, (3, 1)))  # over metres walked
     speed = _relative_speed(n_frames, rng)
-    walked = round_m * (1 + _before(speed) / speed.sum())
+    walked = steps.sum() * (1 + _before(speed) / speed.sum())
     x, z = curve(walked).T
-    forward = curve(np.concatenate([walked - round_m, walked, walked + round_m]), nu=1)
+    forward = curve(np.concatenate([walked - steps.sum(), walked, walked + steps.sum()]), nu=1)
     ahead = np.unwrap(np.arctan2(-forward[:, 0], -forward[:, 1]))
     yaw = gaussian_filter1d(ahead, _AHEAD)[n_frames : 2 * n_frames]
     height = rng.uniform(1.3, 1.5) + _wander(n_frames, rng, 0.05)
@@ -164,9 +163,7 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
 
 def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """Places (x and z, m) of a smooth closed walk by stops, in the middle of what is free."""
-    width, _, depth = room.parts[0].solid.size
-    x = np.arange(_CELL - width / 2, width / 2, _CELL)
-    z = np.arange(_CELL - depth / 2, depth / 2, _CELL)
+    x, z = [np.arange(_CELL - half, half, _CELL) for half in room.parts[0].solid.half[[0, 2]]]
     points = np.stack(np.meshgrid(x, np.linspace(*HEIGHTS, 5), z, indexing="ij"), axis=-1)
     clearance = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:3]).min(axis=1)
     is_free = clearance >= CLEARANCE + _MARGIN
@@ -175,8 +172,8 @@ def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
     cells = [(np.abs(x - stop[0]).argmin(), np.abs(z - stop[1]).argmin()) for stop in stops]
     walk = []
     for start, end in zip(cells, cells[1:] + cells[:1], strict=True):
-        route, _ = route_through_array(costs, start, end, geometric=True)
-        walk += route[:-1]  # the next route begins at this one's end
+        # The next route begins where this one ends.
+        walk += route_through_array(costs, start, end, geometric=True)[0][:-1]
     rows, columns = np.array(walk).T
     places = np.stack([x[rows], z[columns]], axis=1)
     return gaussian_filter1d(places, _SMOOTHED / _CELL, axis=0, mode="wrap")

@@ -46,10 +46,9 @@ def _round_interval(offsets: Origins, directions: Points, radius: float) -> Inte
     crosses = a > 1e-24
     a = np.where(crosses, a, 1.0)
     discriminant = b * b - a * c
-    is_met = np.where(crosses, discriminant > 0.0, c < 0.0)
+    met = np.where(crosses, discriminant > 0.0, c < 0.0)
     half_width = np.where(crosses, np.sqrt(np.maximum(discriminant, 0.0)) / a, np.inf)
-    near = np.where(is_met, -b / a - half_width, np.inf)
-    return near, np.where(is_met, -b / a + half_width, -np.inf)
+    return np.where(met, -b / a - half_width, np.inf), np.where(met, -b / a + half_width, -np.inf)
 
 
 class Solid:
