@@ -1,6 +1,7 @@
 """What a camera saw beside what a field renders; numbers as curves and bars."""
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 
 import matplotlib
 import numpy as np
@@ -81,7 +82,7 @@ def _image_grid(title: str, rows: list[list[Panel]], far: float | None = None) -
     inches = 0.9 + len(rows) * (0.2 + style.WIDTH / len(rows[0]) * height / width)
     grid = style.new_axes(title, inches, len(rows), len(rows[0]))
     with_bar: dict[str, list[AxesImage]] = {}
-    for axes, (name, image, label) in zip(grid.flat, sum(rows, []), strict=True):
+    for axes, (name, image, label) in zip(grid.flat, chain(*rows), strict=True):
         drawn = show_image(axes, image, name, "viridis" if label == DEPTH else "magma")
         if label:
             with_bar.setdefault(label, []).append(drawn)

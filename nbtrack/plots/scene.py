@@ -132,8 +132,7 @@ def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Paths) -> np.ndarray:
     highest = max((path[:, :3, 3] @ up).max() for path in T_paths.values())
     shown = cloud.loc[heights.index[heights <= highest + 0.1]]
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
-    right, ahead = page @ shown[["x", "y", "z"]].to_numpy().T
-    axes.scatter(right, ahead, c=colors, s=4, linewidths=0)
+    axes.scatter(*page @ shown[["x", "y", "z"]].to_numpy().T, c=colors, s=4, linewidths=0)
     return page
 
 
