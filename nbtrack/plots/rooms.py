@@ -40,16 +40,14 @@ def plot_slice(
     """
     fields = [fields] if isinstance(fields, Field) else fields
     where = f"height {height:.2f} m; pale: never seen"
-    names = [field.label for field in fields]
-    if len(fields) > 1:  # once for all, since panels side by side are narrow
+    single = len(fields) == 1
+    if not single:  # once for all, since panels side by side are narrow
         title = f"{title}, {where}"
-    else:
-        names = [f"{names[0]} at {where}", _ExactDistance.label]
-    if room is not None and len(fields) == 1 and fields[0].is_distance:
+    elif room is not None and fields[0].is_distance:
         fields = [fields[0], _ExactDistance(room, fields[0])]
     panels = new_axes(title, 5.4 - 0.9 * (len(fields) - 1), 1, len(fields), sharey=True)[0]
     norm = None  # the first field's, for all
-    for axes, field, name in zip(panels, fields, names, strict=False):
+    for axes, field in zip(panels, fields, strict=True):
         up, page = scene.draw_from_above(axes, {"camera path": sequence.T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / _POINTS_ALONG
@@ -60,13 +58,18 @@ def plot_slice(
         norm = scene.draw_slice(axes, field, points, places, shown, norm, **bar)
         axes.plot([], [], "k-", label="surface")
         if room is not None:
-            true = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:2])
-            shown = shown & (true > 0)
-            scene.draw_levels(axes, places, true, [0.0], zorder=3, **_TRUE_LINE)
-            axes.plot([], [], "--", color=_TRUE_LINE["colors"], label="true surface")
-        axes.set_title(name)
+            shown = shown & _draw_true_level(axes, room, points, places)
+        axes.set_title(f"{field.label} at {where}" if single and axes is panels[0] else field.label)
         _end_around(axes, places[shown], sequence.T_world_camera[:, :3, 3] @ page.T)
     return panels[0].figure.legend_below()
+
+
+def _draw_true_level(axes: Axes, room: Room, points: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """A room's true surface, dashed, on a slice; returns which of its points lie in the room."""
+    sdf = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:2])
+    scene.draw_levels(axes, places, sdf, [0.0], zorder=3, **_TRUE_LINE)
+    axes.plot([], [], "--", color=_TRUE_LINE["colors"], label="true surface")
+    return sdf > 0
 
 
 def _end_around(axes: Axes, *places: np.ndarray) -> None:
