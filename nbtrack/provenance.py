@@ -56,8 +56,8 @@ def own_code(packages: set[str]) -> dict[str, str]:
     for name, module in [*sys.modules.items()]:
         file = getattr(module, "__file__", None) or ""
         top = name.partition(".")[0]
-        is_installed = top == "nbtrack" or file.startswith(_INSTALLED)
-        if (top in packages or not is_installed) and file.endswith(".py") and Path(file).is_file():
+        is_library = top == "nbtrack" or file.startswith(_INSTALLED)
+        if (top in packages or not is_library) and file.endswith(".py") and Path(file).is_file():
             texts[name] = Path(file).read_text("utf-8")
     for cell in getattr(sys.modules["__main__"], "In", []):
         with contextlib.suppress(SyntaxError):  # of a cell that ended with an error

@@ -116,14 +116,15 @@ class LmTracker(Tracker):
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Draw the frame's points; take up the descent from the start that fits them best."""
         starts = T_starts.double().numpy()
-        # A lost frame says little of where the next one starts.
+        n_expected = len(starts)
         if self.was_lost and self.last_good is not None:
             starts = np.concatenate([starts, self.last_good.numpy()[None]])
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
         R = starts[:, :3, :3]
         starts[:, :3, :3] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
-        # Poses that a right one is near: after a lost frame the last good one, if there was any.
-        self.trusted = starts[len(T_starts) :] if self.was_lost else starts
+        # Poses that a right one is near. A lost frame says little of where the next one starts:
+        # after it that is the last good one, if there was any.
+        self.trusted = starts[n_expected:] if self.was_lost else starts
         self.T_start = starts[0]
         self.best = None
         self.remaining_steps = iter(())  # none, if the frame has too few points
@@ -134,9 +135,9 @@ class LmTracker(Tracker):
             return
         coarse = with_normals(frame, observed, max(_MIN_COARSE, n_points // _COARSE_SHARE))
         has_contrast = observed.intensity.std() > _MIN_CONTRAST  # else the picture says nothing
-        self.weight = self.settings.lambda_intensity if has_contrast else 0.0
+        self.intensity_weight = self.settings.lambda_intensity if has_contrast else 0.0
         # Makes this frame's descent from a start.
-        self.descent_from = partial(LmOptimizer, self.grid, coarse, observed, self.weight)
+        self.descent_from = partial(LmOptimizer, self.grid, coarse, observed, self.intensity_weight)
         descents = [self.descent_from(T) for T in starts]
         if np.abs(starts - starts[0]).max() > _FAR_APART:
             for descent in descents:
@@ -163,13 +164,14 @@ class LmTracker(Tracker):
         said = self.best.certainty()
         usual_mad = max(self.field.accuracy.intensity_mad, _ROUNDING)
         innovations = _apart(self.trusted, self.best.T_world_camera)
-        said["intensity_ratio"] = said["intensity_mad"] / usual_mad if self.weight else 1.0
+        ratio = said["intensity_mad"] / usual_mad
+        said["intensity_ratio"] = ratio if self.intensity_weight else 1.0
         said["last_step"] = 0.0 if self.best.is_finished else float(self.best.last_step)
         said["innovation"] = float(innovations.min(initial=_LARGEST_INNOVATION))
         probability = p_lost(said)
         return {**said, "p_lost": probability, "lost": probability >= _LOST}
 
-    def _steps(self, frame: Frame, T_expected: Pose) -> Iterator[float]:
+    def _steps(self, frame: Frame, T_last_start: Pose) -> Iterator[float]:
         """Steps of the best descent, then other descents while its pose is in doubt.
 
         Yields the cost before each of them; at the last one the search has converged.
@@ -185,7 +187,7 @@ class LmTracker(Tracker):
         self.best.run()  # the rest, if any
         if self.settings.n_restarts and self.report()["p_lost"] >= _DOUBTFUL:
             yield cost
-            others = self._other_starts(frame, T_expected)
+            others = self._other_starts(frame, T_last_start)
             while True:
                 cost = self.best.cost(NEAR_SCALES)
                 is_confirmed = self._descend_from(others.pop(0))
@@ -207,12 +209,12 @@ class LmTracker(Tracker):
             self.best = other
         return bool(_apart(other.T_world_camera, best_so_far.T_world_camera) < _SAME)
 
-    def _other_starts(self, frame: Frame, T_expected: Pose) -> list[Pose]:
+    def _other_starts(self, frame: Frame, T_last_start: Pose) -> list[Pose]:
         """Where else the camera may be, the likeliest first.
 
         These are `n_restarts` poses at most, or all if no pose is trusted.
         """
-        anchor = T_expected if self.last_good is None else self.last_good.numpy()
+        anchor = T_last_start if self.last_good is None else self.last_good.numpy()
         if self.field.viewpoints is None:
             # The anchor, then turned about x, y and z both ways, by ever wider angles.
             angles = [factor * _RESTART_ANGLE for factor in range(1, self.settings.n_restarts)]

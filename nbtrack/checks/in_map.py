@@ -83,8 +83,8 @@ def in_world_of_map(tracked: Trajectory) -> tuple[Trajectory, bool]:
 def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
     """The one rigid motion (m) from true to estimated poses that explains the errors of a run.
 
-    After it those of most frames are below `LOST_THRESHOLD_M` and a tenth of what they were (our
-    choice); None where no motion does that, or too little is known to tell.
+    After it those of most frames are below `LOST_THRESHOLD_M`, which they exceeded before, and a
+    tenth of what they were (our choice); None where no motion does that, or too little is known.
     """
     is_known = np.isfinite(T_true).all(axis=(1, 2))
     if is_known.sum() < 3:

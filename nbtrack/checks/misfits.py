@@ -101,10 +101,9 @@ def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
     unlikeness = color_costs(own)
     correlation = float(1 - np.nanmedian(unlikeness)) if np.isfinite(unlikeness).any() else np.nan
     if not any(misfit.is_significant for misfit in found):
-        # At its best a misfit has `gain` of the unlikeness 1 - correlation.
-        max_gain = (1 - MIN_CORRELATION) / max(1e-9, 1 - correlation)
+        unlike = 1 - correlation  # as declared; at its best a misfit leaves the share `gain` of it
         of_colors = _estimates(_COLOR_PARAMETERS, own, color_costs)
-        found += [misfit for misfit in of_colors if misfit.gain < max_gain]
+        found += [m for m in of_colors if m.gain * unlike < 1 - MIN_CORRELATION]
     return found, correlation
 
 

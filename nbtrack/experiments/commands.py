@@ -83,14 +83,16 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
 def track_command(options: Namespace) -> None:
     """Track a sequence in its map, made first where none fits, or in a given one."""
     given = read_map(options.map_from) if options.map_from else None
-    own = given.field.name if given and not options.method else None  # unless one is named
-    method = method_of(options.method, options.field or own, options.tracker)
+    field = options.field
+    if given and not (field or options.method):
+        field = given.field.name
+    method = method_of(options.method, field, options.tracker)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     if given:
         _check_fits(given, method.field, options)
     has_budget = options.steps is not None or options.rate is not None
     steps = options.steps if has_budget else method.usual_steps
-    budget = make_budget(steps, options.rate)  # told before a room is made
+    budget = make_budget(steps, options.rate)  # raises for a wrong one, before a room is made
     scene = _opened(options, preset)
     if given:
         job = GivenMap(given, options.map_from)

@@ -158,10 +158,11 @@ class TrackJob(Job):
         that pose, the recording is in another world than the map.
         """
         T_first = sequence.T_world_camera[0]
-        is_known = self.start == "given" and bool(np.isfinite(T_first).all())
+        has_pose = bool(np.isfinite(T_first).all())
+        is_known = has_pose and self.start == "given"
         start = _Start(T_first if is_known else np.eye(4), is_known)
-        # Another path of a mapped room may begin where no map reaches.
-        if not isinstance(self.needs, GivenMap) or sequence[0].T_world_camera is None:
+        # Another path of a room that is mapped here may begin where the map does not reach.
+        if not (has_pose and isinstance(self.needs, GivenMap)):
             return start
         try:
             return replace(start, warning=check_belongs(finished, sequence[0]))
@@ -257,8 +258,8 @@ def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
     behind: dict[tuple, dict[str, dict[str, float]]] = {}  # by kind of run, reaches by scene
     for run in runs:
         reach = run.expected_reach()
-        is_behind = reach.get("least_ate_m", 0.0) > _GREEDY_ATE
-        if is_behind or reach.get("beyond_reach_share", 0.0) > _SHARE:
+        is_far_off = reach.get("least_ate_m", 0.0) > _GREEDY_ATE
+        if is_far_off or reach.get("beyond_reach_share", 0.0) > _SHARE:
             behind.setdefault((run.tracker, run.settings, run.steps), {})[run.scene.name] = reach
     for (tracker, settings, steps), reaches in behind.items():
         scene, worst = max(reaches.items(), key=lambda pair: pair[1]["least_ate_m"])

@@ -88,7 +88,7 @@ def read_map(path: Path | str) -> Map:
     """
     path = Path(path).expanduser()
     file = path / MAP_FILE if path.is_dir() else path
-    history = path / HISTORY_FILE
+    history = path / HISTORY_FILE  # a single file has none
     if not file.is_file():
         hint = "give a folder or file that it wrote, or run the `map` command of that folder again"
         raise MissingError(f"{path} holds no finished map of this nbtrack: {hint}")

@@ -51,7 +51,7 @@ def _camera(path: Path, numbers: Sequence[float]) -> Calibration:
 
 
 def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times]:
-    """The poses, and the times (s) of their frames; the `order` of quaternions is the app's."""
+    """The poses and their frames' times (s); `order` is not used: the app always writes xyzw."""
     with _content(path) as content:
         rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
         times = np.array(content.get("frameTimestamps", ()), dtype=np.float64)

@@ -62,6 +62,7 @@ class AdamTracker(Tracker):
         """Take up a frame; of several starts, that with the lowest loss on the same pixels."""
         if self.frame is None or self.frame.camera != frame.camera:
             self._allocate(frame)
+        # All that steps read is written in place: on CUDA recorded steps read these very tensors.
         self.frame.color.copy_(frame.color)
         self.frame.depth_mm.copy_(frame.depth_mm)
         self.measured = frame.measured_pixels()
@@ -74,8 +75,7 @@ class AdamTracker(Tracker):
                 T_start = T_starts[losses.argmin()]
             self.position.copy_(T_start[:3, 3])
             self.q_wxyz.copy_(geometry.matrix_to_quaternion(T_start[:3, :3]))
-            # A fresh Adam; its state is emptied in place, since recorded steps read it there.
-            for moments in self.optimizer.state.values():
+            for moments in self.optimizer.state.values():  # a fresh Adam
                 for value in moments.values():
                     value.zero_()
 

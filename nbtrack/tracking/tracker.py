@@ -85,7 +85,8 @@ class Tracker(abc.ABC):
         is not rigid.
         """
         self.settings = settings or self.Settings()
-        with_values(self.settings, {"n_pixels": int(self.settings.n_pixels)})  # within its limits
+        n_pixels = int(self.settings.n_pixels)
+        with_values(self.settings, {"n_pixels": n_pixels})  # raises where it is out of its range
         self.field = self.prepare(field).eval().requires_grad_(False)
         self.device = self.field.device
         self.budget = budget
