@@ -264,7 +264,9 @@ def test_one_looks_into_the_doll_house(inverted, sequence) -> None:
     mesh = room_mesh()
     if inverted:
         mesh.invert()
-    room, enlarged = plots.plot_mesh(mesh, {"true": sequence.T_world_camera}).axes
+    paths = {"true": sequence.T_world_camera}
+    assert len(plots.plot_mesh(mesh, paths).axes) == 1  # nothing is compared
+    room, enlarged = plots.plot_mesh(mesh, paths | {"SDF": sequence.T_world_camera}).axes
     assert np.ptp(enlarged.get_xlim()) < 0.2 < np.ptp(room.get_xlim())  # the path is 5 cm long
     assert len(room.collections[0].get_paths()) == 6  # triangles of the floor and two far walls
     screen = screen_axes(np.array([0, 0, -1]), 35.0)

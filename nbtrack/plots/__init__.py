@@ -11,6 +11,7 @@ from nbtrack.plots.figures import (
     plot_distances,
     plot_errors,
     plot_frame,
+    plot_images,
     plot_losses,
     plot_panels,
     plot_views,

@@ -37,7 +37,7 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     far = MILLIMETRE * _most(np.ma.masked_equal(some_mm, 0))
     depth = np.ma.masked_equal(sequence.depth(index), 0)
     color = (f"frame {sequence.frame_ids[index]}: colour", sequence.color(index), "")
-    return _image_grid(title, [[color, ("depth", depth, DEPTH)]], far)
+    return plot_images([[color, ("depth", depth, DEPTH)]], title, far)
 
 
 @style.styled
@@ -57,7 +57,7 @@ def plot_views(
         depths = [("observed depth", depth, DEPTH), ("rendered depth", rendered, DEPTH)]
         error = ("|error|", 100 * np.abs(rendered - depth), "depth error (cm)")
         rows.append([*colors, *depths, error])
-    return _image_grid(title, rows)
+    return plot_images(rows, title)
 
 
 @style.styled
@@ -72,11 +72,15 @@ def plot_distances(frame: Frame, distances: Mapping[str, Values], title: str = "
         image_cm = np.ma.masked_all(frame.depth_mm.shape)
         image_cm[rows, columns] = 100 * sdf.abs().cpu().numpy()
         panels.append((f"{label}: mean {image_cm.mean():.1f} cm", image_cm, DISTANCE))
-    return _image_grid(title, [panels])
+    return plot_images([panels], title)
 
 
-def _image_grid(title: str, rows: list[list[Panel]], far: float | None = None) -> Figure:
-    """Images in rows; those of a label share a bar, and a scale that ends at `far` or `_most`."""
+@style.styled
+def plot_images(rows: list[list[Panel]], title: str = "", far: float | None = None) -> Figure:
+    """Images in rows, each with a title and its bar's label, "" for colours.
+
+    Those of a label share a bar, and a scale that ends at `far` or where 98 % of the values end.
+    """
     _, first, _ = rows[0][0]
     height, width = first.shape[:2]
     inches = 0.9 + len(rows) * (0.2 + style.WIDTH / len(rows[0]) * height / width)

@@ -110,12 +110,14 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Paths, title: str = "") -> Figure:
 
     Every face that shows its back is left out, and one looks from where most surface shows. The
     projection is parallel; lengths across the picture are true (m). The camera-to-world poses by
-    label are drawn on top, and larger beside it; "true" is green, "tracked" red.
+    label are drawn on top; "true" is green, "tracked" red. Several paths are larger beside it.
     """
-    room, enlarged = new_axes(title, 5.0, 1, 2, width_ratios=[2, 1])[0]
+    widths = [2, 1] if len(T_paths) > 1 else [1]
+    room, *enlarged = new_axes(title, 5.0, 1, len(widths), width_ratios=widths)[0]
     to_screen = scene.draw_mesh(room, mesh, scene.up_of(*T_paths.values()))
     scene.draw_paths(room, T_paths, to_screen[:2])
-    _draw_enlarged(enlarged, T_paths, to_screen[:2])
+    for axes in enlarged:
+        _draw_enlarged(axes, T_paths, to_screen[:2])
     return room.figure.legend_below()
 
 
