@@ -5,9 +5,9 @@
 Reads `poses.txt` of the dataset's scenes in the data folder (`NBTRACK_DATA`; no images are needed)
 and adds rows to `paper_tables/protocol/bounds.csv`, those of a scene anew. A row is a scene, a cell
 of Table I and a reading of what the paper leaves open: the bound of a tracker that ends each frame
-as near as its reach allows (`least_ate_m`), and of one that knows the whole path and may move ahead
-of the camera, which is the least of all (`least_any_m`; not from constant velocity, where the reach
-of a frame grows with the speed).
+as near as its reach allows (`greedy_ate_m`), and of one that knows the whole path and may move
+ahead of the camera, which is the least of all (`least_any_m`; not from constant velocity, where the
+reach of a frame grows with the speed).
 """
 
 from itertools import product
@@ -22,7 +22,7 @@ from nbtrack.recordings.formats import Declaration
 from nbtrack.tables import published_table_1, write_csv
 from nbtrack.tracking import SdfSettings, paper_steps
 from nbtrack.tracking.metrics import still_metrics
-from nbtrack.tracking.reach import least_ate, reach
+from nbtrack.tracking.reach import greedy_ate, reach
 
 RATE = SdfSettings().position_rate
 METHODS = {"vr": "iMAP with VR", "sdf": "NeuS with SDF"}
@@ -53,7 +53,7 @@ def bounds_of(scene: str) -> pd.DataFrame:
         row = {"tracker": tracker, "rate_hz": rate_hz, "steps": steps, "reading": reading}
         row |= {"published_ate_m": published[rate_hz, method, DATASET_SCENES[scene]]}
         row |= {"metres_per_unit": unit, "reach_m": reach_m}
-        row |= {"least_ate_m": least_ate(path, reach_m, motion_model)}
+        row |= {"greedy_ate_m": greedy_ate(path, reach_m, motion_model)}
         row |= {"least_any_m": least_of_all(path, reach_m) if is_any else np.nan}
         rows.append({**known, **row})
     return pd.DataFrame(rows)

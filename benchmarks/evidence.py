@@ -42,7 +42,7 @@ IN_GRIDS = "vr_grid", "sdf_grid"
 KEPT = [
     "rate_hz", "method", "scene", "frames", "steps_per_frame", "path_m", "still_ate_m", "ate_m",
     "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "lost_frames", "metres_per_unit",
-    "reach_m", "reach_deg", "beyond_reach_share", "least_ate_m",
+    "reach_m", "reach_deg", "beyond_reach_share", "greedy_ate_m",
 ]  # fmt: skip
 
 

@@ -258,11 +258,11 @@ def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
     behind: dict[tuple, dict[str, dict[str, float]]] = {}  # by kind of run, reaches by scene
     for run in runs:
         reach = run.expected_reach()
-        is_far_off = reach.get("least_ate_m", 0.0) > _GREEDY_ATE
+        is_far_off = reach.get("greedy_ate_m", 0.0) > _GREEDY_ATE
         if is_far_off or reach.get("beyond_reach_share", 0.0) > _SHARE:
             behind.setdefault((run.tracker, run.settings, run.steps), {})[run.scene.name] = reach
     for (tracker, settings, steps), reaches in behind.items():
-        scene, worst = max(reaches.items(), key=lambda pair: pair[1]["least_ate_m"])
+        scene, worst = max(reaches.items(), key=lambda pair: pair[1]["greedy_ate_m"])
         others = f" (of {len(reaches)} scenes)" if len(reaches) > 1 else ""
         advice = "take more steps, a lower rate, "
         if settings.motion_model == "previous_pose":
@@ -271,5 +271,5 @@ def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
             f"{steps:g} steps of {tracker} move the camera by at most {1e3 * worst['reach_m']:.1f} "
             f"mm along an axis and {worst['reach_deg']:.2f} deg about it; it moves farther in "
             f"{worst['beyond_reach_share']:.0%} of the frames of {scene}{others}, where a greedy "
-            f"follower has an ATE of {worst['least_ate_m']:.3f} m: {advice}or --method corrected"
+            f"follower has an ATE of {worst['greedy_ate_m']:.3f} m: {advice}or --method corrected"
         )

@@ -75,7 +75,7 @@ def greedy_follower(
     return np.stack(followed)
 
 
-def least_ate(T_world_camera: Poses, reach_m: float, motion_model: str = "previous_pose") -> float:
+def greedy_ate(T_world_camera: Poses, reach_m: float, motion_model: str = "previous_pose") -> float:
     """The ATE (m) of the greedy follower on a path of known poses, given the first."""
     followed = greedy_follower(T_world_camera, reach_m, motion_model)
     return trajectory_metrics(followed[1:], T_world_camera[1:])["ate_rmse_m"]
@@ -96,8 +96,8 @@ def reach_metrics(
         return metrics
     offsets, turns = motion_of(T_world_camera, motion_model)
     exceeded = reach.is_exceeded(offsets, turns)
-    least_m = least_ate(T_world_camera, reach.position, motion_model)
-    return {**metrics, "beyond_reach_share": float(exceeded.mean()), "least_ate_m": least_m}
+    greedy_m = greedy_ate(T_world_camera, reach.position, motion_model)
+    return {**metrics, "beyond_reach_share": float(exceeded.mean()), "greedy_ate_m": greedy_m}
 
 
 def _nearest_start(motion_model: str, found: list[np.ndarray], T_true: np.ndarray) -> np.ndarray:
