@@ -114,9 +114,9 @@ def pair_lists(
     color_of_depth = nearest(depth_times, color_times, _TOLERANCE)
     is_mutual = color_of_depth[depth_of_color] == np.arange(len(colors))
     kept = np.flatnonzero((depth_of_color >= 0) & is_mutual)
-    left_out = f"{len(colors) - len(kept)} of the {len(colors)} images in {color_list.name} are "
-    left_out += f"left out: no depth map of {depth_list.name} is within {_TOLERANCE} s, or none "
-    left_out += "that is nearest to them"
+    of_all = f"{len(colors) - len(kept)} of the {len(colors)} images in {color_list.name}"
+    why = f"no depth map of {depth_list.name} has them nearest within {_TOLERANCE} s"
+    left_out = f"{of_all} are left out: {why}"
     if not len(kept):
         raise DataError(f"{color_list.parent}: {left_out}; both lists need the same clock")
     if len(kept) < len(colors):
