@@ -39,11 +39,7 @@ def plot_slice(
     around the path and what the frames have seen, in the room if that is known.
     """
     fields = [fields] if isinstance(fields, Field) else fields
-    where = f"height {height:.2f} m; pale: never seen"
-    single = len(fields) == 1
-    if not single:  # once for all, since panels side by side are narrow
-        title = f"{title}, {where}"
-    elif room is not None and fields[0].is_distance:
+    if len(fields) == 1 and room is not None and fields[0].is_distance:
         fields = [fields[0], _ExactDistance(room, fields[0])]
     panels = new_axes(title, 5.4 - 0.9 * (len(fields) - 1), 1, len(fields), sharey=True)[0]
     norm = None  # the first field's, for all
@@ -59,7 +55,8 @@ def plot_slice(
         axes.plot([], [], "k-", label="surface")
         if room is not None:
             shown = shown & _draw_true_level(axes, room, points, places)
-        axes.set_title(f"{field.label} at {where}" if single and axes is panels[0] else field.label)
+        axes.set_title(field.label)
+        axes.set_xlabel(f"height {height:.2f} m; pale: never seen; {axes.get_xlabel()}")
         _end_around(axes, places[shown], sequence.T_world_camera[:, :3, 3] @ page.T)
     return panels[0].figure.legend_below()
 
