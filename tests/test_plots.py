@@ -88,6 +88,7 @@ FIGURES = {
     "frame": lambda s: plots.plot_frame(s, 3, "one"),
     "views": lambda s: plots.plot_views(s, [0, 3], [(s.color(0), s.depth(0) + 0.02)] * 2, "x"),
     "ray": lambda s: plots.plot_along_ray(AT, {"a (1/m)": RAY, "b (m)": RAY[:-1]}, 1.2, "end"),
+    "one": lambda s: plots.plot_along_ray(AT, {"true": RAY, "b": RAY[:-1]}, 1.2, "end", "d (m)"),
     "columns": lambda s: plots.plot_columns([COLUMNS, 2 * COLUMNS], "rise"),
     "losses": lambda s: plots.plot_losses(HISTORIES, "fall"),
     "slice": lambda s: plots.plot_slice(SPHERE, s, 0.0, title="round"),

@@ -114,15 +114,22 @@ def show_image(axes: Axes, image: np.ndarray, title: str, colors: str = "viridis
 
 @style.styled
 def plot_along_ray(
-    depths: Values, curves: Mapping[str, Values], measured_depth: float, title: str = ""
+    depths: Values, curves: Mapping[str, Values], measured_depth: float, title="", together=""
 ) -> Figure:
     """Quantities by label with its unit, below each other over the same z-depths (m) of a ray.
 
+    With the name of what all of them are, "weight", they are drawn `together`, every second dashed.
     The last samples may be left out, as by the weights of sections between samples.
     """
     index = depths.cpu().numpy()
     columns = {k: pd.Series(c.detach().cpu(), index[: len(c)]) for k, c in curves.items()}
-    figure = plot_columns([pd.DataFrame(columns).rename_axis("depth (m)")], title)
+    table = pd.DataFrame(columns).rename_axis("depth (m)")
+    if together:
+        figure = style.new_axes(title, 2.7)[0, 0].figure
+        table.plot(ax=figure.axes[0], style=["-", "--"] * len(curves), ylabel=together,
+                   color=style.method_colors(table))  # fmt: skip
+    else:
+        figure = plot_columns([table], title)
     for axes in figure.axes:
         axes.axvline(measured_depth, label="measured depth", **style.DASHED)
     figure.axes[0].legend()
