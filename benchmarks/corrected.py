@@ -3,8 +3,8 @@
     python benchmarks/corrected.py [RECORDING ...]
     python benchmarks/corrected.py fast
 
-Writes tracking.csv, times.csv and agreement.csv, or fast.csv and reliability.csv to
-paper_tables/corrected.
+Writes tracking.csv, times.csv, agreement.csv and odd_frames.csv, or fast.csv and reliability.csv
+to paper_tables/corrected.
 RECORDING is a folder in the dataset's layout; the paper's methods and `agreement` are asked for the
 first alone. Times count: run nothing else.
 """
@@ -46,6 +46,10 @@ COLUMNS = [
     "lost_frames", "seconds_per_frame", "steps_per_frame", "map_seconds", "median_error_m",
     "wrong_frames", "longest_wrong", "called_lost", "missed_frames", "frames_lost_in_vain",
 ]  # fmt: skip
+SAID = [
+    "frame_id", "translation_error_m", "rotation_error_deg", "fitting_ratio", "known_ratio",
+    "intensity_ratio", "innovation", "position_std_m", "last_step", "p_lost",
+]  # fmt: skip
 P_EDGES = [0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 1]
 WRONG_M, WRONG_DEG = 0.05, 3.0  # in a room, whose truth is known
 WRONG_IN_RECORDING_M = 0.2  # there the reference is off, too
@@ -80,6 +84,7 @@ def main() -> None:
         write_rows("tracking.csv", pd.concat(runs))
     if recordings:
         write_rows("agreement.csv", agreement(recordings[0], preset))
+        write_rows("odd_frames.csv", odd_frames(pd.concat(runs)))
 
 
 def _track(scenes, methods, preset, frames, path, tracked=None, steps=30) -> pd.DataFrame:
@@ -175,6 +180,15 @@ def reliability(runs: pd.DataFrame) -> pd.DataFrame:
     return table.reset_index(drop=True)
 
 
+def odd_frames(runs: pd.DataFrame) -> pd.DataFrame:
+    """A row a frame of LM that its map leaves out: errors, and what LM says of its pose."""
+    runs = runs[(runs["frames"] == "1::2") & (runs["method"] == METHODS["corrected"].label)]
+    of_run = [
+        read_run(r.run).frames[SAID].assign(scene=r.scene, seed=r.seed) for r in runs.itertuples()
+    ]
+    return pd.concat(of_run)
+
+
 def agreement(scene, preset) -> pd.DataFrame:
     """How far (RMS, m) paths are from one another: both trackers, two seeds, and the reference."""
     methods, seeds = [METHODS["corrected_dense"], METHODS["icp_dense"]], [0, 1]
@@ -202,8 +216,9 @@ def _held_out(scene, preset, seed: int) -> pd.DataFrame:
         row = {name: found[name] for name in COLUMNS if name in found}
         row |= {"ate_m": found["ate_rmse_m"], "method": method.label}
         row |= {"n_pixels": settings.n_pixels, **_judged(job.folder.name, WRONG_IN_RECORDING_M)}
-        rows.append({**row, "scene": scene.name, "frames": "1::2", "path": "odd, mapped even"})
-    return pd.DataFrame(rows)[COLUMNS]
+        row |= {"scene": scene.name, "frames": "1::2", "path": "odd, mapped even"}
+        rows.append({**row, "run": job.folder.name})
+    return pd.DataFrame(rows)[[*COLUMNS, "run"]]
 
 
 def write_rows(name: str, rows: pd.DataFrame) -> None:

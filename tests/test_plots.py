@@ -145,12 +145,13 @@ def test_curves_along_a_ray_share_their_depths() -> None:
 
 def test_panels_share_their_rows() -> None:
     """Catches rows from the bottom, another panel's numbers, and a method in another's colour."""
-    rows = pd.DataFrame({"ICP": [1.0, 2.0], "standing still": [9.0, 8.0]}, index=["b", "a"])
+    rows = pd.DataFrame({"ICP": [1.0, 2.0], "SDF": [9.0, 8.0]}, index=["b", "a"])
     panels = plots.plot_panels({"one": rows, "two": 2 * rows}, "ATE (cm)").axes
     for axes, factor in zip(panels, (1, 2), strict=True):
-        icp, still = axes.lines
-        assert [icp.get_color(), still.get_linestyle()] == [PALETTE[4], ":"]
-        assert [*still.get_xdata()] == [9.0 * factor, 8.0 * factor]
+        icp, sdf = axes.lines
+        assert [icp.get_color(), sdf.get_color()] == [PALETTE[4], PALETTE[1]]
+        assert [*sdf.get_xdata()] == [9.0 * factor, 8.0 * factor]
+        assert axes.collections[0].get_segments()[0][:, 0].tolist() == [factor, 9.0 * factor]
         assert axes.yaxis_inverted()
 
 
