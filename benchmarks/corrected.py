@@ -126,9 +126,8 @@ def frame_times(rooms, preset) -> pd.DataFrame:
             drawn = f"tracking.{method.tracker}.n_pixels={n_pixels}"
             changed = with_settings(preset, *method.settings, drawn)
             field = map_scene(room, method.field, changed).field
-            T_first = sequence.T_world_camera[0]
             settings = changed.tracking_of(method.tracker)
-            how = field, T_first, StepBudget(30), settings
+            how = field, sequence.T_world_camera[0], StepBudget(30), settings
             trackers[method.label] = make_tracker(method.tracker, *how), sequence
         rows.append(in_turns(trackers).assign(scene=room.name, n_pixels=n_pixels))
     kept = ["scene", "method", "n_pixels"], ["milliseconds", "error_m"]
@@ -160,9 +159,7 @@ def fast() -> pd.DataFrame:
     )
     rooms, elsewhere = open_scenes(preset), open_scenes(second)
     methods = [method for method in ON_RECORDINGS if method != METHODS["baked"]]
-    runs = [
-        _track(rooms, methods, preset, frames, "second", elsewhere) for frames in ("::4", "::8")
-    ]
+    runs = [_track(rooms, methods, preset, f"::{n}", "second", elsewhere) for n in (4, 8)]
     return pd.concat(runs)
 
 
@@ -171,10 +168,8 @@ def reliability(runs: pd.DataFrame) -> pd.DataFrame:
     said to be."""
     runs = runs[runs["method"].str.startswith("NeuS+ corrected")]
     frames = pd.concat([read_run(run).frames for run in runs["run"]])
-    is_wrong = (frames["translation_error_m"] > WRONG_M) | (
-        frames["rotation_error_deg"] > WRONG_DEG
-    )
-    said = pd.DataFrame({"p_lost": frames["p_lost"], "wrong": is_wrong})
+    limits = "translation_error_m > @WRONG_M or rotation_error_deg > @WRONG_DEG"
+    said = pd.DataFrame({"p_lost": frames["p_lost"], "wrong": frames.eval(limits)})
     groups = said.groupby(pd.cut(frames["p_lost"], P_EDGES, include_lowest=True), observed=True)
     table = groups.agg(frames=("wrong", "size"), wrong=("wrong", "sum"), p_lost=("p_lost", "mean"))
     return table.reset_index(drop=True)
@@ -183,10 +178,10 @@ def reliability(runs: pd.DataFrame) -> pd.DataFrame:
 def odd_frames(runs: pd.DataFrame) -> pd.DataFrame:
     """A row a frame of LM that its map leaves out: errors, and what LM says of its pose."""
     runs = runs[(runs["frames"] == "1::2") & (runs["method"] == METHODS["corrected"].label)]
-    of_run = [
-        read_run(r.run).frames[SAID].assign(scene=r.scene, seed=r.seed) for r in runs.itertuples()
-    ]
-    return pd.concat(of_run)
+    tables = []
+    for run in runs.itertuples():
+        tables.append(read_run(run.run).frames[SAID].assign(scene=run.scene, seed=run.seed))
+    return pd.concat(tables)
 
 
 def agreement(scene, preset) -> pd.DataFrame:

@@ -211,11 +211,13 @@ def _over_rooms(ratios: pd.Series) -> pd.Series:
 def breakfast(cells: pd.DataFrame) -> pd.DataFrame:
     """The column Breakfast of Table I (m), as published and as ours, means of the seeds."""
     scene = DATASET_SCENES["breakfast_room"]
+    large = pd.read_csv(PROJECT / "paper_tables" / "paper_rooms_gpu" / "table_1_cells.csv")
     sides = {"published": published_table_1(), "here": cells}
+    sides["here, the paper's sizes"] = large.drop(columns="still_ate_m")
     columns = {side: table_1(rows)[scene].unstack("rate_hz") for side, rows in sides.items()}
     table = pd.concat(columns).reorder_levels([1, 0]).sort_index()[[10.0, 5.0, 2.0]]
     table = table.set_axis(table.index.map(", ".join)).rename(columns="{:g} Hz".format)
-    return table.map("{:.3f}".format)
+    return table.map("{:.3f}".format, na_action="ignore").fillna("–")
 
 
 TABLES = {

@@ -1,23 +1,19 @@
-"""VR, VR by colour alone, and SDF in five fields; how opaque their maps are to VR; and from how far
-off colour alone finds a pose.
+"""VR, VR by colour alone, and SDF in five fields; and how opaque their maps are to VR.
 
     python benchmarks/other_fields.py [SEEDS]
 
 Rows are added to paper_tables/other_fields/table_1_cells.csv as they are finished; those that are
 there are not made again, whatever has changed since: remove the file to begin anew. The first seed
-takes 90 minutes on one core, a further one, of NeuS and VolSDF alone, 15. Then opacity.csv is made
-and, where it is missing, starts.csv.
+takes 90 minutes on one core, a further one, of NeuS and VolSDF alone, 15. Then opacity.csv is made.
 """
 
 import sys
 from collections.abc import Iterator
 from functools import partial
 from itertools import product
-from pathlib import Path
 
 import pandas as pd
 import torch
-from basin import OFFSETS, find_from_afar
 from evidence import Chunk, add_rows, track
 from motions import HAND_HELD
 
@@ -33,14 +29,6 @@ ROWS = (
 )  # fmt: skip
 FURTHER = ("vr_neus", "sdf", "vr_volsdf", "sdf_volsdf")  # rows of the seeds after the first
 RATES_HZ = (10.0, 2.0)
-
-
-def starts(path: Path) -> None:
-    """VR with and without depth, from starts that are off by up to 4 cm and 4 degrees."""
-    preset = load_preset("smoke", settings=HAND_HELD)
-    methods = dict.fromkeys(["vr", "color", "vr_neus", "color_neus"], 100)
-    found = find_from_afar(open_scenes(preset)[0], methods, preset, OFFSETS[:3], 8)
-    write_csv(path, found)
 
 
 @torch.no_grad()
@@ -79,8 +67,6 @@ def main(seeds: int) -> None:
     folder = tables_folder() / "other_fields"
     add_rows(folder / "table_1_cells.csv", track_rows(seeds))
     write_csv(folder / "opacity.csv", opacity(seeds), float_format="%.4g")
-    if not (folder / "starts.csv").exists():
-        starts(folder / "starts.csv")
 
 
 if __name__ == "__main__":
