@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from nbtrack import __version__
 from nbtrack.core.errors import ConfigError, NbtrackError, nearest_name
@@ -120,12 +120,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     With `NBTRACK_DEBUG` set, the traceback of whatever ended it is printed too.
     """
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # as a daemon's, which are closed
-            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
-        stream = getattr(sys, name)
-        if hasattr(stream, "reconfigure"):  # its encoding may lack letters of a path
-            stream.reconfigure(errors="backslashreplace")
+    sys.stdout = _writable(sys.stdout)
+    sys.stderr = _writable(sys.stderr)
     try:
         options = _parsed(arguments)
         if options.device:
@@ -147,6 +143,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exception(error)
         print(f"nbtrack: {_message_of(error)}", file=sys.stderr)
         return _INTERRUPTED if isinstance(error, KeyboardInterrupt) else 2
+
+
+def _writable(stream: TextIO | None) -> TextIO:
+    """A stream that takes every text: one that is closed, as a daemon's, leads nowhere from now on.
+
+    Letters that its encoding lacks, as of a path, are escaped.
+    """
+    if stream is None:
+        stream = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+    if hasattr(stream, "reconfigure"):
+        stream.reconfigure(errors="backslashreplace")
+    return stream
 
 
 def _message_of(error: BaseException) -> str:

@@ -16,16 +16,12 @@ import torch
 import nbtrack
 from nbtrack.core.files import PACKAGE, fingerprint
 
-_COMPUTING = (
-    "beyond", "core", "data", "experiments", "fields", "mapping", "recordings", "tracking",
-)  # fmt: skip
+# Folders whose code computes results.
+_FOLDERS = ("beyond", "core", "data", "experiments", "fields", "mapping", "recordings", "tracking")
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp")  # that compute results beside torch
 _LIBRARIES = ("nbtrack", "torch", "abc", "typing", "builtins")  # what own classes are built on
-_INSTALLED = (
-    *map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")),
-    *site.getsitepackages(),
-    site.getusersitepackages(),
-)
+_LIBRARY_FOLDERS = map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib"))
+_INSTALLED = (*_LIBRARY_FOLDERS, *site.getsitepackages(), site.getusersitepackages())
 
 
 @cache
@@ -43,7 +39,7 @@ def code_fingerprint(*kinds: type) -> str:
     """
     packages = {base.__module__.partition(".")[0] for kind in kinds for base in kind.__mro__}
     own = packages.difference(_LIBRARIES)
-    return fingerprint(package_code(*_COMPUTING), own_code(own) if own else {})
+    return fingerprint(package_code(*_FOLDERS), own_code(own) if own else {})
 
 
 def own_code(packages: set[str]) -> dict[str, str]:

@@ -29,6 +29,7 @@ _CELL_2 = ["tracker", "n_pixels", "budget_ms"]
 _MISSING = "–"
 _BOLD = "font-weight: bold;"
 _LEGEND = f"bold: best at this rate; † and red: above {LOST_THRESHOLD_M:g} m"
+Marks = pd.DataFrame | bool  # a table of flags, or one for all cells
 _UNITS = {"m": (1, "{:.3f}"), "mm": (1000, "{:.1f}")}  # of an ATE, and how it is printed
 
 
@@ -120,7 +121,9 @@ def beside(ours: pd.DataFrame, paper: pd.DataFrame) -> pd.DataFrame:
     sources = {"ours": ours, "paper": same, "difference": ours - same}
     both = pd.concat(sources, names=["source"]).reorder_levels([1, 2, 0])
     # Ours alone where the paper has no such row.
-    rows = [(*row, s) for row in ours.index for s in sources if s == "ours" or row in paper.index]
+    rows = []
+    for row in ours.index:
+        rows += [(*row, source) for source in (sources if row in paper.index else ["ours"])]
     return both.loc[rows]
 
 
@@ -207,7 +210,7 @@ def style_table_2(
     is_whole = (wide.isna() | (wide % 1 == 0)).all(axis=1) & stds.isna().all(axis=1)
     texts = _texts(wide, "{:.1f}", _MISSING)
     texts[is_whole] = _texts(wide[is_whole], "{:.0f}", _MISSING)
-    styler = _styled(texts, _texts(stds, "{:.1f}"))
+    styler = _styled(texts, _texts(stds, "{:.1f}"), is_best=False, is_lost=False)
     styler.default_pixels = default_pixels
     is_default = [default_pixels.get(tracker) == n for tracker, n in wide.index]
     styler.format_index("{:g} ms", axis="columns")
@@ -224,7 +227,7 @@ def _texts(wide: pd.DataFrame, form: str, missing: str = "") -> pd.DataFrame:
     return wide.map(lambda value: missing if pd.isna(value) else form.format(value))
 
 
-def _styled(texts: pd.DataFrame, stds: pd.DataFrame, is_best=False, is_lost=False) -> TableStyler:
+def _styled(texts: pd.DataFrame, stds: pd.DataFrame, is_best: Marks, is_lost: Marks) -> TableStyler:
     """A table of cells of these parts, each a table of one shape, or one value for all."""
     cells = np.vectorize(Cell, otypes=[object])(texts, stds, is_best, is_lost)
     styler = TableStyler(pd.DataFrame(cells, texts.index, texts.columns))
@@ -261,7 +264,9 @@ def write_tables(
     return [*paths, write_csv(folder / "table_2_vs_paper.csv", compared, index=True)]
 
 
-def write_table_1(folder: Path, results: pd.DataFrame, note: str, own=OUR_WORDING) -> list[Path]:
+def write_table_1(
+    folder: Path, results: pd.DataFrame, note: str, own: Wording = OUR_WORDING
+) -> list[Path]:
     """Writes Table I alone as CSV, LaTeX, and beside the paper's; see `write_tables`."""
     cells, styled = average_over_seeds(results), style_table_1(results)
     paths = _write_table(folder / "table_1", cells, styled, note, own)
@@ -269,7 +274,9 @@ def write_table_1(folder: Path, results: pd.DataFrame, note: str, own=OUR_WORDIN
     return [*paths, write_csv(folder / "table_1_vs_paper.csv", compared, index=True)]
 
 
-def write_table_3(folder: Path, results: pd.DataFrame, note: str, own=OUR_WORDING) -> list[Path]:
+def write_table_3(
+    folder: Path, results: pd.DataFrame, note: str, own: Wording = OUR_WORDING
+) -> list[Path]:
     """Writes Table III, Table I with other rows and in mm, as CSV and LaTeX; see `write_tables`.
 
     Labels of rows contain n, since a method with more points a frame is another method.
@@ -279,7 +286,9 @@ def write_table_3(folder: Path, results: pd.DataFrame, note: str, own=OUR_WORDIN
     return _write_table(folder / "table_3", cells, styled, note, own)
 
 
-def _write_table(stem: Path, cells, styler: TableStyler, note: str, own: Wording) -> list[Path]:
+def _write_table(
+    stem: Path, cells: pd.DataFrame, styler: TableStyler, note: str, own: Wording
+) -> list[Path]:
     """Write a table in long form as CSV and its styled form as LaTeX; returns both paths."""
     path = stem.with_suffix(".tex")
     write_atomic(path, latex_file(styler, path, note, own))

@@ -36,7 +36,7 @@ def test_a_warm_up_is_left_out(clock: Clock, capsys) -> None:
     """Catches hours that are left for half an hour, because the first frame was compiled."""
     with ProgressBar("tracking", 60) as bar:
         clock.now = 600
-        bar.warm_up = 1, bar.format_dict["elapsed"]
+        bar.end_warm_up(1)
         bar.move_to(1)
         clock.now = 631
         bar.move_to(2)

@@ -8,7 +8,7 @@ eight vertices. What the network says away from surfaces stays.
 import copy
 import time
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -128,14 +128,14 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     around; see `solve`. Raises DataError where no frame shows a plane.
     """
     grid = CorrectedField(copy.deepcopy(field).cpu(), voxel)
-    points_world, normals_world, depth, seen_color = _measured_planes(sequence, frames, grid)
-    n_points = len(points_world)
-    asked_world = np.concatenate([points_world + s * normals_world for s in _OFFSETS])
+    seen = _measured_planes(sequence, frames, grid)
+    n_points = len(seen.points_world)
+    asked_world = np.concatenate([seen.points_world + s * seen.normals_world for s in _OFFSETS])
     vertices, weights = interpolation(asked_world, grid)
     numbers, matrix = corrected_vertices(vertices, weights, grid.n_vertices)
     regularisation = regularisation_of(numbers, grid.n_vertices)
     values = grid.volume[:4].T.double().numpy()[numbers]  # colour and distance, uncorrected
-    reliability = (depth.mean() / depth) ** 2
+    reliability = (seen.depth.mean() / seen.depth) ** 2
 
     wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ values[:, 3:]
     reliabilities = np.tile(reliability, len(_OFFSETS))
@@ -144,7 +144,7 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     confidence = (1 - _UNMEASURED) * (1 - regularisation.diagonal() / diagonal)
 
     at_surface = matrix[:n_points]  # the rows of the first offset, which is 0
-    wanted_color = seen_color - at_surface @ values[:, :3]
+    wanted_color = seen.color - at_surface @ values[:, :3]
     springs = regularisation * _COLOR_REGULARISATION
     color, _ = solve(at_surface, wanted_color, reliability, springs, _COLOR_HUBER, _COLOR_ROUNDS)
 
@@ -165,37 +165,45 @@ def _views(sequence: RgbdSequence, frames: Frames) -> State:
     return {"cameras": torch.from_numpy(sequence.T_world_camera[kept]).float(), "views": views}
 
 
-def _measured_planes(sequence: RgbdSequence, frames: Frames, grid: BakedField) -> list[np.ndarray]:
-    """Random measured points (n x 3, m, world frame), their normals, z-depths (n, m) and colours.
+class _Planes(NamedTuple):
+    """Measured points with the planes that they lie on."""
+
+    points_world: np.ndarray  # n x 3, m
+    normals_world: np.ndarray  # n x 3
+    depth: np.ndarray  # n, z-depth in m
+    color: np.ndarray  # n x 3, in [0, 1]
+    n_cells: int  # of a grid, in which the points lie
+
+
+def _measured_planes(sequence: RgbdSequence, frames: Frames, grid: BakedField) -> _Planes:
+    """Random measured points with a plane.
 
     They are `_N_POINTS`. If fewer than `_POINTS_A_CELL` of them lie in a cell on average, as in a
     large place, so many times more are drawn anew as are lacking, up to `_MAX_TIMES`.
     """
-    n_cells, planes = _draw_planes(sequence, frames, grid, _N_POINTS)
-    times = min(_POINTS_A_CELL * n_cells / len(planes[0]), _MAX_TIMES)
+    planes = _draw_planes(sequence, frames, grid, _N_POINTS)
+    times = min(_POINTS_A_CELL * planes.n_cells / len(planes.depth), _MAX_TIMES)
     if times > 1:
-        _, planes = _draw_planes(sequence, frames, grid, round(times * _N_POINTS))
+        planes = _draw_planes(sequence, frames, grid, round(times * _N_POINTS))
     return planes
 
 
-def _draw_planes(
-    sequence: RgbdSequence, frames: Frames, grid: BakedField, n_points: int
-) -> tuple[int, list[np.ndarray]]:
-    """How many of the grid's cells so many random measured points lie in; and `_measured_planes`.
+def _draw_planes(sequence: RgbdSequence, frames: Frames, grid: BakedField, n: int) -> _Planes:
+    """Those of `n` random measured points that have a plane. Raises DataError if none has.
 
-    Points without a plane are left out. Neighbours come one after another: their vertices are then
-    still in the processor's cache. Raises DataError if no point has a plane.
+    Neighbours come one after another: their vertices are then still in the processor's cache.
     """
     sampler = PixelSampler(sequence, torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
-    rays = sampler.draw(n_points, generator, torch.from_numpy(frames), tangent_planes=True)
+    rays = sampler.draw(n, generator, torch.from_numpy(frames), tangent_planes=True)
     has_plane = rays.normals_world.any(dim=-1)
     if not has_plane.any():
         raise DataError(f"{sequence.name} shows no surface to correct a map by: check its depth")
-    points_world = rays.points(rays.depth[:, None])[:, 0]
-    measured = (points_world, rays.normals_world, rays.depth, rays.color)
-    planes = [part[has_plane].double().numpy() for part in measured]
-    vertices, _ = interpolation(planes[0], grid)
+    points_world = rays.points(rays.depth[:, None])[has_plane, 0].double().numpy()
+    vertices, _ = interpolation(points_world, grid)
     cells = vertices[:, 0]  # a cell has the number of its first vertex
     order = np.argsort(cells, kind="stable")
-    return len(np.unique(cells)), [part[order] for part in planes]
+    normals_world = rays.normals_world[has_plane].double().numpy()[order]
+    depth = rays.depth[has_plane].double().numpy()[order]
+    color = rays.color[has_plane].double().numpy()[order]
+    return _Planes(points_world[order], normals_world, depth, color, len(np.unique(cells)))

@@ -32,7 +32,7 @@ _MIN_SCALE = 0.005  # m, of robust costs: what a voxel's points scatter by
 _INDEPENDENT = 128  # points: with 256 half of the wrong poses before a flat wall pass
 _LOST = 0.5  # a pose is lost if the probability that it is right is less
 _SEARCH = {"registration_type": "GICP", "num_threads": 1, "max_iterations": 30}
-_END = {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}  # rad, m; smaller moves end it
+_SEARCH |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}  # rad, m; smaller moves end it
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,9 @@ class IcpTracker(Tracker):
         Raises ConfigError where it has too few points for a plane.
         """
         if len(field.points) < _NEIGHBOURS:
-            raise ConfigError(
-                f"the map has {len(field.points)} points of {field.voxel:g} m cells; ICP needs "
-                f"{_NEIGHBOURS} or more: set a smaller mapping.points.voxel, or map more frames"
-            )
+            found = f"the map has {len(field.points)} points of {field.voxel:g} m cells"
+            advice = "set a smaller mapping.points.voxel, or map more frames"
+            raise ConfigError(f"{found}; ICP needs {_NEIGHBOURS} or more: {advice}")
         self.small_gicp = importlib.import_module(self.package)
         field = deepcopy(field).cpu()
         self.target = self.small_gicp.PointCloud(field.points.double().numpy())
@@ -124,7 +123,7 @@ class IcpTracker(Tracker):
 
     def _align(self, T_start: Pose, max_distance: float) -> Any:
         """small_gicp's result of the frame aligned with the map, with partners so near (m)."""
-        options = {**_SEARCH, **_END, "max_correspondence_distance": max_distance}
+        options = {**_SEARCH, "max_correspondence_distance": max_distance}
         return self.small_gicp.align(self.target, self.source, self.target_tree, T_start, **options)
 
     def _distances(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
@@ -159,9 +158,7 @@ class IcpTracker(Tracker):
         H_world = R_twist @ self.found.H @ R_twist.T
         covariance = np.linalg.inv(H_world + PRIOR_WEIGHT * np.eye(6))
         # Two directions, those along a wall, since nothing but planes counts.
-        position_std_m = std_when_moved(
-            costs_at, T_found, covariance, n_directions=2, n_independent=_INDEPENDENT
-        )
+        position_std_m = std_when_moved(costs_at, T_found, covariance, 2, _INDEPENDENT)
         inlier_ratio = self.found.num_inliers / self.source.size()
         is_held = p_within(CORRELATED * position_std_m) > _LOST
         lost = inlier_ratio < _MIN_INLIERS or not is_held

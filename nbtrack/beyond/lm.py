@@ -115,7 +115,7 @@ class LmTracker(Tracker):
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Draw the frame's points; take up the descent from the start that fits them best."""
-        starts = T_starts.double().numpy()
+        starts = T_starts.double().numpy().copy()
         n_expected = len(starts)
         if self.was_lost and self.last_good is not None:
             starts = np.concatenate([starts, self.last_good.numpy()[None]])

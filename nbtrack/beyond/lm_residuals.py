@@ -30,7 +30,7 @@ import numpy as np
 import torch
 
 from nbtrack.beyond.grid import Accuracy, BakedField
-from nbtrack.beyond.observed import LUMA, Observed, compiled
+from nbtrack.beyond.observed import LUMA, Array, Observed, compiled
 from nbtrack.core.arrays import Pose
 
 G_MIN = 0.3
@@ -97,7 +97,7 @@ def grid_of(field: BakedField) -> Grid:
 
 @no_type_check
 @compiled
-def residual_terms(problem, T):
+def residual_terms(problem: Problem, T: Pose) -> Terms:
     """The terms of all points at a pose.
 
     Loops are plain, which numba compiles soonest; no result depends on the number of threads.
@@ -140,7 +140,7 @@ def residual_terms(problem, T):
 
 @no_type_check
 @compiled
-def _locate(points, T, grid):
+def _locate(points: Array, T: Pose, grid: Grid) -> tuple[Array, ...]:
     """Where points (m, camera frame) lie in the grid at a pose.
 
     Returns lever arms (3 x n, m); reliabilities (n), 1 or, out of the usable box, 0; cells (n), as
@@ -171,7 +171,7 @@ def _locate(points, T, grid):
 
 @no_type_check
 @compiled
-def _weigh(terms, normals, T):
+def _weigh(terms: Terms, normals: Array, T: Pose) -> None:
     """Complete the terms in place: weigh by gradient norm and normals, and divide by the norm."""
     gradient = terms.gradients[0]
     for i in range(len(terms.reliability)):

@@ -21,8 +21,8 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from nbtrack.beyond.lm_residuals import ONE, ZERO, Terms, residual_terms
-from nbtrack.beyond.observed import compiled
+from nbtrack.beyond.lm_residuals import ONE, ZERO, Problem, Terms, residual_terms
+from nbtrack.beyond.observed import Array, compiled
 from nbtrack.core.arrays import Pose
 
 # So weak that it decides only where the frame says nothing, as along a corridor: one point's worth
@@ -43,22 +43,24 @@ class Step(NamedTuple):
     cost_before: float
 
 
-def robust_scales(residuals, before, residual_sigma, mad_factor):
+def robust_scales(residuals: Array, before: Array, sigma: Array | tuple, factor: float) -> Array:
     """Robust scales of both residuals (2), given those before: as the module states them.
 
     Not compiled, since that would take seconds for numpy's `partition`.
     """
     # Scales that cannot fall any more, as in most steps: a median takes as long as many sums.
-    if (before <= residual_sigma).all():
+    if (before <= sigma).all():
         return before
     middle = (residuals.shape[1] - 1) // 2
     median = np.partition(np.abs(residuals), middle, axis=1)[:, middle]
-    return np.minimum(np.maximum(mad_factor * median, residual_sigma), before)
+    return np.minimum(np.maximum(factor * median, sigma), before)
 
 
 @no_type_check
 @compiled
-def robust_cost(residuals, reliability, scales, lambda_intensity):
+def robust_cost(
+    residuals: Array, reliability: Array, scales: Array, lambda_intensity: float
+) -> float:
     """The mean cost of the points, as the module states it."""
     total, weight = 0.0, np.float32(lambda_intensity)
     per_scale_d, per_scale_i = np.float32(1 / scales[0]), np.float32(1 / scales[1])
@@ -70,7 +72,7 @@ def robust_cost(residuals, reliability, scales, lambda_intensity):
     return total / len(reliability)
 
 
-def point_costs(terms, scales, lambda_intensity):
+def point_costs(terms: Terms, scales: Array, lambda_intensity: float) -> Array:
     """The cost of each point (n,), of which `robust_cost` is the mean."""
     squares = (terms.residuals / scales[:, None]) ** 2
     distance, intensity = squares / (1 + squares)
@@ -80,7 +82,7 @@ def point_costs(terms, scales, lambda_intensity):
 
 @no_type_check
 @compiled
-def normal_equations(terms, scales, lambda_intensity):
+def normal_equations(terms: Terms, scales: Array, lambda_intensity: float) -> tuple[Array, Array]:
     """H (6 x 6) and b (6), in double precision, as the module states them."""
     n_points = len(terms.reliability)
     jacobian, weights = np.empty((6, n_points), np.float32), np.empty(n_points, np.float32)
@@ -110,7 +112,7 @@ def normal_equations(terms, scales, lambda_intensity):
 
 @no_type_check
 @compiled
-def retract(T, twist):
+def retract(T: Pose, twist: Array) -> Pose:
     """The pose after a twist (omega in rad, v in m), by Rodrigues' formula; finite at zero."""
     x, y, z = twist[0], twist[1], twist[2]
     angle = np.sqrt(x * x + y * y + z * z)
@@ -129,7 +131,7 @@ def retract(T, twist):
 
 @no_type_check
 @compiled
-def damped_step(problem, T, terms, scales, damping):
+def damped_step(problem: Problem, T: Pose, terms: Terms, scales: Array, damping: float) -> Array:
     """The twist (6,) that solves the damped normal equations of data and prior."""
     matrix, vector = normal_equations(terms, scales, problem.lambda_intensity)
     for k in range(3):
@@ -159,7 +161,9 @@ def damped_step(problem, T, terms, scales, damping):
 
 @no_type_check
 @compiled
-def try_step(problem, T, terms, scales, damping, last_twist):
+def try_step(
+    problem: Problem, T: Pose, terms: Terms, scales: Array, damping: float, last_twist: Array
+) -> Step:
     """A step from a pose with its terms, after a step of `last_twist` (0 at first).
 
     Steps that creep, each hardly shorter than the last one and in nearly its direction, are a

@@ -24,6 +24,10 @@ _RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
 _JIT = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 
 
+Array = np.ndarray
+"""As compiled functions take it, whose docstrings tell its shape."""
+
+
 class Observed(NamedTuple):
     """Points that a frame observed."""
 
@@ -69,7 +73,9 @@ def _pinhole(frame: Frame) -> tuple[float, float, float, float]:
 
 @no_type_check
 @compiled
-def _drawn_points(depth_mm, color, pinhole, n_points, starts, edge_jump):
+def _drawn_points(
+    depth_mm: Array, color: Array, pinhole: tuple, n_points: int, starts: Array, edge_jump: float
+) -> tuple[Array, Array]:
     """Points (m, camera frame) and luma of `draw_points`; `starts` is where R2 begins."""
     height, width = depth_mm.shape
     fx, fy, cx, cy = pinhole
@@ -97,7 +103,7 @@ def _drawn_points(depth_mm, color, pinhole, n_points, starts, edge_jump):
 
 @no_type_check
 @compiled
-def _normals(depth_mm, pinhole, points):
+def _normals(depth_mm: Array, pinhole: tuple, points: Array) -> Array:
     """`PixelSampler.normals_camera` at observed points (m, camera frame); 0 where not known."""
     height, width = depth_mm.shape
     fx, fy, cx, cy = pinhole

@@ -133,24 +133,19 @@ def _of_depth_images(
 ) -> Iterator[str]:
     """What is wrong with depth images, whatever their numbers mean."""
     if not frames.measured.any():
-        yield (
-            "no pixel that was looked at has a depth: all are 0, or saturated (65535); check "
-            "the depth folder, and no_depth in sequence.toml"
-        )
+        advice = "check the depth folder, and no_depth in sequence.toml"
+        yield f"no pixel that was looked at has a depth: all are 0, or saturated (65535); {advice}"
     step_m = np.gcd.reduce(frames.depth_step) / recording.declared.depth_scale
     # With fewer than eight steps up to the farthest point, they may be chance.
     if _MAX_STEP * cloud.depth.median() < step_m < cloud.depth.max() / 8:
-        yield (
-            f"depths come in steps of {100 * step_m:.1f} cm: look for those that the camera gave, "
-            "or expect no better poses"
-        )
+        advice = "look for those that the camera gave, or expect no better poses"
+        yield f"depths come in steps of {100 * step_m:.1f} cm: {advice}"
     # Below 1, since the first frame repeats none.
     repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
     if repeated > _MIN_REPEATED:
-        yield (
-            f"{repeated:.0%} of the depth images repeat the one before, though the poses move: "
-            f"leave them out, as with --frames ::{round(1 / (1 - repeated))} of map and track"
-        )
+        found = f"{repeated:.0%} of the depth images repeat the one before, though the poses move"
+        every = round(1 / (1 - repeated))
+        yield f"{found}: leave them out, as with --frames ::{every} of map and track"
 
 
 def _of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
@@ -179,24 +174,18 @@ def _of_depths(depth: pd.Series, is_far: pd.Series) -> Iterator[str]:
         )
     median, (near, far) = depth[~is_far].median(), PLAUSIBLE_DEPTH
     if median < near or median > far:
-        yield (
-            f"the median depth is {median:.3g} m, outside {near:g} to {far:g} m: set depth_scale, "
-            "the depth values a metre, in sequence.toml"
-        )
+        advice = "set depth_scale, the depth values a metre, in sequence.toml"
+        yield f"the median depth is {median:.3g} m, outside {near:g} to {far:g} m: {advice}"
 
 
 def _of_colors(brightness: pd.Series, correlation: float) -> Iterator[str]:
     """What is wrong with colours; a correlation that is not known is NaN, and nothing is said."""
     if brightness.median() < _BLACK:
-        yield (
-            "the colour images are black: check their folder, or track without colour: --set "
-            "tracking.lm.lambda_intensity=0, or tracking.sdf.lambda_color=0 for sdf"
-        )
+        options = "--set tracking.lm.lambda_intensity=0, or tracking.sdf.lambda_color=0 for sdf"
+        yield f"the colour images are black: check their folder, or track without colour: {options}"
     if correlation < MIN_CORRELATION:
-        yield (
-            "colours do not belong to the depth images: of points that two frames see they "
-            f"correlate by {correlation:.2f}; check their folder and order"
-        )
+        found = f"of points that two frames see they correlate by {correlation:.2f}"
+        yield f"colours do not belong to the depth images: {found}; check their folder and order"
 
 
 def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:

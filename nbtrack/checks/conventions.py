@@ -149,10 +149,9 @@ def diagnosis(
             f"declared they {apart}){turned}"
         )
     if own.overlap < _MIN_OVERLAP:
-        return (
-            f"{file} is not proved: two frames see too little of the same ({own.overlap:.0%} of "
-            f"the points, whose surfaces {apart}): check it, and a piece with smaller steps"
-        )
+        seen = f"{own.overlap:.0%} of the points, whose surfaces {apart}"
+        found = f"{file} is not proved: two frames see too little of the same ({seen})"
+        return f"{found}: check it, and a piece with smaller steps"
     if own.median_m > _FAR_APART:
         return (
             f"surfaces that two frames see {apart} (median, {own.overlap:.0%} of the points "

@@ -131,10 +131,9 @@ def advise_on_memory(setting: str) -> Iterator[None]:
         words = ("can't allocate memory", "not enough memory", "out of memory")
         if not (isinstance(error, MemoryError) or any(word in str(error) for word in words)):
             raise
-        raise OutOfMemory(
-            f"out of memory with {setting}: lower it with --set, or take fewer frames, as with "
-            "--frames ::2; what was finished is kept"
-        ) from None
+        advice = "lower it with --set, or take fewer frames, as with --frames ::2"
+        kept = "what was finished is kept"
+        raise OutOfMemory(f"out of memory with {setting}: {advice}; {kept}") from None
 
 
 def synchronize(device: torch.device) -> None:

@@ -51,7 +51,9 @@ class _Line:
 class ProgressBar(tqdm):
     """Progress with an ETA over a known amount of work, to be used in a `with` block."""
 
-    warm_up = 0, 0.0  # work, and its seconds, that say nothing of the time that is left
+    # What says nothing of the time that is left: work, and its seconds.
+    warm_up_work: float | int = 0
+    warm_up_seconds = 0.0
 
     def __init__(self, title: str, total: float | int, is_shown: bool = True) -> None:
         """Begin; nothing is shown before a second has gone."""
@@ -67,9 +69,13 @@ class ProgressBar(tqdm):
     def format_dict(self) -> dict[str, Any]:
         """What is shown; the time that is left comes from the mean speed after the warm-up."""
         values = super().format_dict
-        warm_up_work, warm_up_seconds = self.warm_up
-        seconds = values["elapsed"] - warm_up_seconds
-        return values | {"rate": (self.n - warm_up_work) / max(seconds, 1e-3)}
+        seconds = values["elapsed"] - self.warm_up_seconds
+        return values | {"rate": (self.n - self.warm_up_work) / max(seconds, 1e-3)}
+
+    def end_warm_up(self, done: float | int) -> None:
+        """Leave the work that is done by now, and the time so far, out of the mean speed."""
+        self.warm_up_work = done
+        self.warm_up_seconds = self.format_dict["elapsed"]
 
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much is done, and a word on how it goes."""

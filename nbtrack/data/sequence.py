@@ -91,9 +91,8 @@ def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
         clouds.append(points_camera.numpy() @ T[:3, :3].T + T[:3, 3])
     points_world = np.concatenate(clouds)
     if len(points_world) == 0:
-        raise DataError(
-            f"no pixel of {sequence.name} has a depth, of one in {stride**2}: check its files"
-        )
+        found = f"no pixel of {sequence.name} has a depth, of one in {stride**2}"
+        raise DataError(f"{found}: check its files")
     positions = sequence.T_world_camera[:, :3, 3]
     low, high = np.quantile(points_world, [_CUT_OFF, 1 - _CUT_OFF], axis=0)
     low = np.minimum(low, positions.min(axis=0)) - margin

@@ -105,7 +105,8 @@ def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> 
     q_xyzw[~is_known] = 0.5  # any unit quaternion; these poses become NaN
     norms = np.linalg.norm(q_xyzw, axis=1)
     is_wrong = (np.abs(norms - 1) > _RIGID) | (is_known & np.isnan(times))
-    for i in np.flatnonzero(is_wrong):  # the first is told
+    if is_wrong.any():
+        i = is_wrong.argmax()  # the first is told
         raise DataError(
             f"{path} pose {i} has the time {rows[i, 0]:.13g} and a quaternion of norm "
             f"{norms[i]:.3g}: columns must be finite timestamps (s), tx ty tz and a unit "
@@ -136,7 +137,8 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
         away = np.linalg.norm(T[:, :3, 3] - np.median(T[is_known, :3, 3], axis=0), axis=1)
         usual = np.quantile(away[is_known], 0.9, method="lower")
         is_wrong |= is_known & (away > _ALONE * max(1.0, usual))
-    for i in np.flatnonzero(is_wrong):  # the first is told
+    if is_wrong.any():
+        i = is_wrong.argmax()  # the first is told
         frame = f" frame {i}" if len(poses) > 1 else ""
         numbers = " ".join(f"{number:.4g}" for number in poses[i].flat)
         raise DataError(

@@ -15,6 +15,7 @@ from nbtrack.core.files import runs_folder
 from nbtrack.core.progress import ProgressBar
 from nbtrack.core.settings import changed_settings
 from nbtrack.data.dataset import DATASET_SCENES
+from nbtrack.data.frame import Frame
 from nbtrack.experiments.grid import Execution, map_scene, track_scenes
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
 from nbtrack.experiments.output import prepare
@@ -23,7 +24,7 @@ from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.latex import Wording
 from nbtrack.recordings.reading import read_frames
 from nbtrack.synthetic import ROOMS
-from nbtrack.tracking import ClockBudget, StepBudget, make_tracker
+from nbtrack.tracking import ClockBudget, StepBudget, Tracker, make_tracker
 from nbtrack.tracking.methods import Methods, find_methods
 
 _FRAMES_A_CELL = 3  # that a mean of steps in Table II is taken over
@@ -58,7 +59,9 @@ def tables_command(options: Namespace) -> None:
         raise NbtrackError(f"{cells}: {why}; mend the cause and run again, the rest is kept")
 
 
-def _fill_tables(options, preset: Preset, methods: Methods, execution, wording) -> pd.DataFrame:
+def _fill_tables(
+    options: Namespace, preset: Preset, methods: Methods, execution: Execution, wording: Wording
+) -> pd.DataFrame:
     """Track, print and write; the results, a row a run."""
     clock = options.budget == "clock"
     scenes = open_scenes(preset)
@@ -78,8 +81,8 @@ def _fill_tables(options, preset: Preset, methods: Methods, execution, wording) 
         print(tables.style_table_1(shown))
         print("Table I beside the paper's")
         print(tables.beside_published(shown).to_string(float_format="%.3f", na_rep="–"))
-        steps, pixels = _table_2(preset, scenes[0], methods)
-        by_clock = _note(preset, clock=True)
+        steps = _table_2(preset, scenes[0], methods)
+        pixels, by_clock = default_pixels(preset, methods), _note(preset, clock=True)
         paths = tables.write_tables(folder, shown, steps, note, pixels, by_clock, wording)
     cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
     paths.append(tables.write_csv(cells, results.filter(_CELL_COLUMNS), float_format=None))
@@ -103,18 +106,18 @@ def bench_command(options: Namespace) -> None:
     quick = ("scenes.n_frames=2", "mapping.imap.iterations=1", "mapping.neus.iterations=1")
     preset = load_preset(name, options.config, [*options.settings, *quick])
     prepare(options.out)
-    steps, _ = _table_2(preset, open_scene(preset.scenes.names[0], preset))
+    steps = _table_2(preset, open_scene(preset.scenes.names[0], preset))
     folder = options.out or runs_folder() / "bench" / preset.name
     print(tables.write_csv(folder / "table_2.csv", steps))
 
 
-def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> tuple:
-    """Measure and print Table II; returns its steps, and the n of Table I by tracker."""
-    steps, pixels = measure_steps(preset, scene, methods), default_pixels(preset, methods)
+def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
+    """Measure and print Table II; returns its steps."""
+    steps = measure_steps(preset, scene, methods)
     machine = f"{device_name(choose_device())}, {torch.get_num_threads()} threads"
     print(f"Table II: steps, {preset.name} networks, on {machine}")
-    print(tables.style_table_2(steps, default_pixels=pixels))
-    return steps, pixels
+    print(tables.style_table_2(steps, default_pixels=default_pixels(preset, methods)))
+    return steps
 
 
 def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
@@ -132,27 +135,33 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     pixels = preset.tables.pixels
     plan = [(m, n) for m in firsts.values() for n in pixels.get(m.tracker, pixels["sdf"])]
     has_pose = np.flatnonzero(scene.recording.has_pose)
-    sequence = read_frames(scene.recording, has_pose[:1])
-    T_first = sequence.T_world_camera[0]
+    frame = read_frames(scene.recording, has_pose[:1])[0]
     rows = []
     with ProgressBar("Table II", len(plan)) as bar:
         for done, (method, n_pixels) in enumerate(plan):
-            name, own = method.tracker, preset.with_method(method.settings)
+            name = method.tracker
+            own = preset.with_method(method.settings)
             bar.move_to(done, f"{name}={n_pixels}")
             settings = replace(own.tracking_of(name), n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
                 field = map_scene(scene, method.field, own).field
-                tracker = make_tracker(name, field, T_first, StepBudget(1), settings)
+                tracker = make_tracker(name, field, frame.T_world_camera, StepBudget(1), settings)
                 for budget_ms in preset.tables.budgets_ms:
-                    tracker.budget = ClockBudget(1000 / budget_ms)
-                    counts = []
-                    for _ in range(1 + _FRAMES_A_CELL):
-                        tracker.restart(T_first)
-                        counts.append(tracker.track(sequence[0]).steps)
-                    mean, std = float(np.mean(counts[1:])), float(np.std(counts[1:]))
+                    counts = _steps_within(tracker, frame, budget_ms)
+                    mean, std = float(np.mean(counts)), float(np.std(counts))
                     rows.append((name.upper(), n_pixels, budget_ms, mean, std))
         bar.move_to(len(plan))
     return pd.DataFrame(rows, columns=["tracker", "n_pixels", "budget_ms", "steps", "steps_std"])
+
+
+def _steps_within(tracker: Tracker, frame: Frame, budget_ms: float) -> list[int]:
+    """The steps that a tracker takes within a budget, frame by frame, after one not counted."""
+    tracker.budget = ClockBudget(1000 / budget_ms)
+    counts = []
+    for _ in range(1 + _FRAMES_A_CELL):
+        tracker.restart(frame.T_world_camera)
+        counts.append(tracker.track(frame).steps)
+    return counts[1:]
 
 
 def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]:

@@ -134,28 +134,29 @@ def _print_run(metrics: dict[str, Any]) -> None:
 def _opened(options: Namespace, preset: Preset) -> Scene:
     """The scene that is named, and a warning where it is likely read wrongly."""
     scene = open_scene(options.sequence, preset, options.format)
-    warning = None if scene.made else quick_warning(scene.recording)
-    if warning:
+    if not scene.made and (warning := quick_warning(scene.recording)):
         tell(f"nbtrack: warning: {warning}; `data check` tells more")
     return scene
 
 
 def _check_fits(given: Map, field: str, options: Namespace) -> None:
     """Raises ConfigError where a given map is of another field or other settings than asked for."""
-    path, made = options.map_from, given.field.name
+    made = given.field.name
     if options.map_frames:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
     if field != made:
         advice = "leave --method and --field out"
-        raise ConfigError(f"{path} is a map of field {made!r}, not {field!r}: {advice}")
+        raise ConfigError(f"{options.map_from} is a map of field {made!r}, not {field!r}: {advice}")
     record = given.record
     correction = record.get("correction", 0.0)
     known = flat(setting_tree(made, record["network"], record["settings"], correction))
     for text in options.settings:
+        asked = read_setting(text)
         # Keys that no map has, as those of a tracker, are no contradiction.
-        if any(known.get(key, value) != value for key, value in read_setting(text).items()):
+        if any(known[key] != asked[key] for key in asked if key in known):
             advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
-            raise ConfigError(f"{path} was made with other settings than --set {text}: {advice}")
+            what = f"{options.map_from} was made with other settings than --set {text}"
+            raise ConfigError(f"{what}: {advice}")
 
 
 def _make_map(job: MapJob) -> None:

@@ -100,18 +100,18 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
     execution = execution or Execution()
     missing = {part.folder: part for job in jobs for part in _missing(job)}
     results: dict[Path, Any] = {}
+    bar = ProgressBar(Job.doing, sum(job.work for job in missing.values()))
 
     def show(job: Job, share: float = 0.0, status: str = "running") -> None:
         """Where the work is: `share` of a job that runs in this process, and all that ended."""
         worked = sum(missing[folder].work for folder in results) + share * job.work
-        if 0 < share < 1 and not bar.warm_up[0]:  # a first frame waits for what is compiled
-            bar.warm_up = worked, bar.format_dict["elapsed"]
+        if 0 < share < 1 and not bar.warm_up_work:  # a first frame waits for what is compiled
+            bar.end_warm_up(worked)
         bar.set_description_str(job.doing, refresh=False)
         bar.move_to(worked, f"{len(results)} of {len(missing)} done, {job.name}: {status}")
 
-    work = sum(job.work for job in missing.values())
     outcomes = _outcomes(missing, show, execution)
-    with ProgressBar(Job.doing, work) as bar, contextlib.closing(outcomes):
+    with bar, contextlib.closing(outcomes):
         for folder, outcome in outcomes:
             if isinstance(outcome, NbtrackError) and not execution.keep_going:
                 raise outcome
@@ -185,8 +185,8 @@ def _submitting(address: str | None, workers: int) -> Iterator[Callable[[Job, An
         yield submit
 
 
-def _outcome_there(settings: Mapping, search_path: Sequence[str], n_threads: int, work: bytes):
-    """Runs in a worker, which may have been started elsewhere."""
+def _outcome_there(settings: Mapping, search_path: list[str], n_threads: int, work: bytes) -> Any:
+    """What becomes of a job: runs in a worker, which may have been started elsewhere."""
     os.environ |= settings
     sys.path += [folder for folder in search_path if folder not in sys.path]
     fields, trackers, job, needed = pickle.loads(work)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -58,7 +58,7 @@ class MapJob(Job):
     work = 4.0  # by the queries of a field with `smoke`
 
     @classmethod
-    def of(cls, scene: Scene, field: str, preset: Preset, frames=":", seed=0) -> "MapJob":
+    def of(cls, scene: Scene, field: str, preset: Preset, frames: str = ":", seed: int = 0) -> Self:
         """The map of a scene with the settings of a preset."""
         network, settings = preset.network_of(field), preset.mapping_of(field)
         correction = preset.correction.get(field, 0.0)
@@ -149,7 +149,6 @@ class GivenMap:
     finished: Map
     folder: Path  # or its file
 
-    needs = None
     is_done = True
 
     @cached_property

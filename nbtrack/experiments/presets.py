@@ -14,15 +14,7 @@ from typing import Any
 
 from nbtrack.core.errors import ConfigError, MissingError, look_up
 from nbtrack.core.files import absolute
-from nbtrack.core.settings import (
-    changed_settings,
-    flat,
-    limited,
-    one_of,
-    read_setting,
-    with_settings,
-    with_values,
-)  # fmt: skip
+from nbtrack.core.settings import flat, limited, one_of, read_setting, with_settings, with_values
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
@@ -229,7 +221,7 @@ def claim(preset: Preset, holds: bool, text: str, usual: Sequence[str] = ()) -> 
     """
     if holds:
         print(text)
-    elif changed_settings(preset.settings, with_settings(PRESETS["smoke"], *usual).settings):
+    elif flat(preset.settings) != flat(with_settings(PRESETS["smoke"], *usual).settings):
         warnings.warn(f"with these settings it does not hold that {text}", stacklevel=2)
     else:
         raise AssertionError(f"it does not hold that {text}")

@@ -38,22 +38,25 @@ def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -
     scores = dict.fromkeys(SCORES)
     mapped, held_out = split_holdout(len(sequence), finished.record["settings"]["holdout_every"])
     if len(held_out) and isinstance(field, LearnedField):
-        scores |= _score_images(field, sequence, held_out, room)
+        generator = torch.Generator(field.device).manual_seed(0)
+        scores |= _score_images(field, _random_rays(sequence, held_out, generator), room)
     if room is not None:
         generator = torch.Generator().manual_seed(0)
-        sampler = PixelSampler(sequence, torch.device("cpu"))
-        rays = sampler.draw(POINTS_SCORED, generator, torch.from_numpy(mapped))
+        rays = _random_rays(sequence, mapped, generator)
         if field.is_distance:
             scores |= _score_sdf(field, rays, generator, room)
         scores |= _score_surface(field, sequence, mapped, rays, room)
     return scores
 
 
-def _score_images(field: LearnedField, sequence: RgbdSequence, held_out: Frames, room) -> Scores:
-    """PSNR (dB) and depth L1 (m) over random measured pixels of held-out frames."""
-    generator = torch.Generator(field.device).manual_seed(0)
-    frames = torch.from_numpy(held_out).to(field.device)
-    rays = PixelSampler(sequence, field.device).draw(POINTS_SCORED, generator, frames)
+def _random_rays(sequence: RgbdSequence, frames: Frames, generator: torch.Generator) -> Rays:
+    """Rays through random pixels of some frames, on the device of the generator."""
+    numbers = torch.from_numpy(frames).to(generator.device)
+    return PixelSampler(sequence, generator.device).draw(POINTS_SCORED, generator, numbers)
+
+
+def _score_images(field: LearnedField, rays: Rays, room: Room | None) -> Scores:
+    """PSNR (dB) and depth L1 (m) over those of some held-out pixels that are measured."""
     hit = rays.depth > 0
     if not hit.any():
         return {}
@@ -88,7 +91,9 @@ def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room)
     return {"sdf_near_m": float(error[is_near].mean()), "sdf_free_m": float(error[is_free].mean())}
 
 
-def _score_surface(field: Field, sequence, mapped: Frames, rays: Rays, room: Room) -> Scores:
+def _score_surface(
+    field: Field, sequence: RgbdSequence, mapped: Frames, rays: Rays, room: Room
+) -> Scores:
     """Accuracy, completion (m) and F-score of the seen part of a map's surface, if it has one.
 
     The true surface is where rays of mapped frames meet the room, one point a cell of 5 cm: what is

@@ -91,8 +91,7 @@ class TrackJob(Job):
     @property
     def is_elsewhere(self) -> bool:
         """Whether the map was made from another recording."""
-        made = self.needs
-        return isinstance(made, GivenMap) or self.scene.folder != made.scene.folder
+        return isinstance(self.needs, GivenMap) or self.needs.scene.folder != self.scene.folder
 
     @property
     def is_done(self) -> bool:
@@ -171,7 +170,9 @@ class TrackJob(Job):
                 raise
             return replace(start, is_in_other_world=True)
 
-    def _track(self, finished: Map, sequence, start: _Start, report) -> tuple[Trajectory, str]:
+    def _track(
+        self, finished: Map, sequence: RgbdSequence, start: _Start, report: Report
+    ) -> tuple[Trajectory, str]:
         """The trajectory, and the name of the device that it was tracked on."""
 
         def tell(done: int, error_m: float) -> None:
@@ -186,7 +187,9 @@ class TrackJob(Job):
         tracked = track_sequence(tracker, sequence, checkpoint, tell, start.is_known)
         return tracked, device_name(tracker.device)  # LM and ICP run on the host
 
-    def _notes(self, finished: Map, sequence, start: _Start, tracked: Trajectory) -> dict[str, Any]:
+    def _notes(
+        self, finished: Map, sequence: RgbdSequence, start: _Start, tracked: Trajectory
+    ) -> dict[str, Any]:
         """What is to be said of a run beside its errors."""
         T_true = sequence.T_world_camera
         metres_per_unit = finished.field.bounds.metres_per_unit
@@ -226,22 +229,25 @@ class TrackJob(Job):
         }
 
     def _command(self) -> str:
-        """What makes this run anew, and its map where that is not cached."""
+        """What makes this run anew, and its map where that is not cached.
+
+        A room of the cache is named by its name, and made again; another recording by its folder.
+        """
         options = {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
         options |= {"start": self.start, "frames": self.frames, "seed": self.seed}
         options |= {"format": self.scene.format, "device": choose_device().type}
         options["preset"] = PLAIN_PRESET
         settings: dict[str, Any] = {"tracking": {self.tracker: self.settings}}
-        if self.is_elsewhere:
-            options["map-from"] = self.needs.folder
-        else:
-            options |= {"field": self.needs.field, "map-frames": self.needs.frames}
-            made = self.needs
-            settings |= setting_tree(made.field, made.network, made.settings, made.correction)
         sequence = str(self.scene.folder)
-        if self.scene.made and not self.is_elsewhere:
-            sequence = self.scene.name
-            settings["scenes"] = {name: getattr(self.scene.made, name) for name in SIZES}
+        made = self.needs
+        if self.is_elsewhere:
+            options["map-from"] = made.folder
+        else:
+            options |= {"field": made.field, "map-frames": made.frames}
+            settings |= setting_tree(made.field, made.network, made.settings, made.correction)
+            if self.scene.made:
+                sequence = self.scene.name
+                settings["scenes"] = {name: getattr(self.scene.made, name) for name in SIZES}
         words = ["python", "-m", "nbtrack", "track", sequence]
         changed = changed_settings(settings, PRESETS[PLAIN_PRESET].settings)
         words += [f"--set={text}" for text in changed]

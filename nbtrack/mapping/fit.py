@@ -11,6 +11,7 @@ from typing import Any
 import pandas as pd
 import torch
 
+from nbtrack.core.arrays import Frames
 from nbtrack.core.device import (
     advise_on_memory,
     device_name,
@@ -114,7 +115,9 @@ def check_recipe(path: Path, recipe: dict[str, Any], wanted: dict[str, Any]) -> 
 class _Fit:
     """All that changes while a field is fitted, and what its batches are drawn from."""
 
-    def __init__(self, recipe: dict, settings, field: LearnedField, sequence, mapped) -> None:
+    def __init__(
+        self, recipe: dict, settings: Any, field: LearnedField, seen: RgbdSequence, mapped: Frames
+    ) -> None:
         self.recipe = {**recipe, "device": field.device.type}  # each draws other numbers
         self.settings = settings
         self.field = field
@@ -122,10 +125,10 @@ class _Fit:
         self.optimizer = make_adam([parameters], field.device)
         self.rate = self.optimizer.param_groups[0]["lr"]
         self.generator = torch.Generator(field.device).manual_seed(recipe["seed"])
-        self.sampler = PixelSampler(sequence, field.device)
+        self.sampler = PixelSampler(seen, field.device)
         self.frames = torch.from_numpy(mapped).to(field.device)
         self.recording = Recording(f"mapping {field.name}", self.generator)
-        field.prepare(sequence, mapped)
+        field.prepare(seen, mapped)
         self.seconds = 0.0
         self.history = []
         self.terms: list[str] = []  # names of the losses, told by the first batch

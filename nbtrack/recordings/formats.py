@@ -107,10 +107,9 @@ class Format:
         for pattern in patterns:
             if files := files_of(folder, pattern):
                 return files
-        raise MissingError(
-            f"no {what} in {folder}: {self.label} needs {' or '.join(patterns)}; add it, or name "
-            "another format with --format"
-        )
+        needed = f"{self.label} needs {' or '.join(patterns)}"
+        advice = "add it, or name another format with --format"
+        raise MissingError(f"no {what} in {folder}: {needed}; {advice}")
 
 
 def files_of(folder: Path, pattern: str) -> list[Path]:
@@ -205,20 +204,17 @@ def declaration(folder: Path, format: str | None = None, depth_scale: float = 0.
 
 def _told_by_files(folder: Path) -> str:
     """The format with the largest share of what it needs."""
-    shares = {
-        name: np.mean([_is_there(folder, patterns) for patterns in layout.needs])
-        for name, layout in FORMATS.items()
-    }
+    shares = {}
+    for name, layout in FORMATS.items():
+        shares[name] = np.mean([_is_there(folder, patterns) for patterns in layout.needs])
     maximum = max(shares.values())
     best = [name for name, share in shares.items() if share == maximum]
     if maximum == 0:
         files = (f"{name} ({', '.join(p[0] for p in FORMATS[name].needs)})" for name in best)
         raise MissingError(f"{folder} is no recording: it needs the files of {'; '.join(files)}")
     if len(best) > 1 and maximum == 1:
-        raise DataError(
-            f"{folder} can be read as {' or '.join(best)}: choose with --format, or by "
-            f'format = "{best[0]}" in {DECLARATION_FILE}'
-        )
+        advice = f'choose with --format, or by format = "{best[0]}" in {DECLARATION_FILE}'
+        raise DataError(f"{folder} can be read as {' or '.join(best)}: {advice}")
     return best[0]
 
 

@@ -22,9 +22,7 @@ from nbtrack.core.files import naming_damaged
 from nbtrack.data.text_files import Times, in_seconds, read_lines
 
 # Seconds since 1970 with decimals, or as many milli-, micro- or nanoseconds, in 13 to 19 digits.
-_STAMP = re.compile(
-    r"(?<!\d)(?<!\d\.)([1-9]\d{8,9}\.\d+|1\d{12}(?:\d{3}){0,2})(?!\.?\d)", flags=re.ASCII
-)
+_STAMP = re.compile(r"(?a)(?<!\d)(?<!\d\.)([1-9]\d{8,9}\.\d+|1\d{12}(?:\d{3}){0,2})(?!\.?\d)")
 TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
 _TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
 _SAME_TIME = 1e-6  # s: the last digit of lists
@@ -103,11 +101,9 @@ def nearest(times: Times, others: Times, tolerance: float) -> Frames:
     return np.where(apart <= tolerance, closest, -1)
 
 
-def pair_lists(
-    color_list: Path, depth_list: Path, notes: list[str]
-) -> tuple[list[Path], list[Path], Times]:
-    """Images and depth maps of two lists that are each other's nearest in time, and the images'
-    times (s). A sentence is added to the notes if images are left out; DataError if all are."""
+def pair_lists(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Path], Times, str]:
+    """Images and depth maps of two lists that are each other's nearest in time, the images' times
+    (s), and a note, empty unless images are left out. Raises DataError if all are."""
     color_times, colors = _read_list(color_list)
     depth_times, depths = _read_list(depth_list)
     depth_of_color = nearest(color_times, depth_times, _TOLERANCE)
@@ -119,9 +115,9 @@ def pair_lists(
     left_out = f"{of_all} are left out: {why}"
     if not len(kept):
         raise DataError(f"{color_list.parent}: {left_out}; both lists need the same clock")
-    if len(kept) < len(colors):
-        notes.append(left_out)
-    return [colors[i] for i in kept], [depths[i] for i in depth_of_color[kept]], color_times[kept]
+    note = left_out if len(kept) < len(colors) else ""
+    paired_depths = [depths[i] for i in depth_of_color[kept]]
+    return [colors[i] for i in kept], paired_depths, color_times[kept], note
 
 
 def _read_list(path: Path) -> tuple[Times, list[Path]]:

@@ -195,10 +195,9 @@ def _decide_resizing(color: np.ndarray, depth: np.ndarray, recording: Recording)
     sizes = f"{width}x{height} and {depth_width}x{depth_height}"
     camera = recording.calibration
     if not camera.size:
-        raise DataError(
-            f"colour and depth are {sizes}, and {camera.source} does not say which of both it is "
-            "for: write a JSON file with fx, fy, cx, cy and their width and height"
-        )
+        doubt = f"{camera.source} does not say which of both it is for"
+        advice = "write a JSON file with fx, fy, cx, cy and their width and height"
+        raise DataError(f"colour and depth are {sizes}, and {doubt}: {advice}")
     note = f"colour is made as small as depth: {sizes}"
     if note not in recording.notes:
         recording.notes.append(note)
@@ -208,10 +207,9 @@ def _decide_resizing(color: np.ndarray, depth: np.ndarray, recording: Recording)
 def _check(path: Path, image: np.ndarray, dtype: type, shape: tuple[int, ...], model: Path) -> None:
     """Raises DataError for an image of another type or shape; `model` names whose size it is."""
     if image.dtype != dtype or image.shape != shape:
-        raise DataError(
-            f"{path} is {image.dtype} of shape {image.shape}: it must be {dtype.__name__} of shape "
-            f"{shape}, for the size of {model} (depth has 16 bits and one channel)"
-        )
+        wanted = f"{dtype.__name__} of shape {shape}, for the size of {model}"
+        found = f"{path} is {image.dtype} of shape {image.shape}"
+        raise DataError(f"{found}: it must be {wanted} (depth has 16 bits and one channel)")
 
 
 def _in_millimetres(

@@ -61,10 +61,10 @@ class Recording:
     def contents(self) -> tuple[list[tuple[str, str, str]], str, Declaration]:
         """What changes when a recording does: the folder, name and digest of every image, a digest
         of times, poses and camera, and the declaration."""
-        images = [
-            (file.parent.name, file.name, hashlib.sha256(file.read_bytes()).hexdigest())
-            for file in self.color_files + self.depth_files
-        ]
+        images = []
+        for file in self.color_files + self.depth_files:
+            of_file = hashlib.sha256(file.read_bytes()).hexdigest()
+            images.append((file.parent.name, file.name, of_file))
         digest = hashlib.sha256(repr(replace(self.calibration, source=Path())).encode())
         digest.update(self.times.tobytes() + self.file_poses.tobytes())
         return images, digest.hexdigest(), self.declared
@@ -82,32 +82,33 @@ def open_recording(
     Raises MissingError, DataError or ConfigError if something is not there, wrong or unknown.
     """
     folder = absolute(folder)
-    notes = []
     declared = declaration(folder, format)
     layout = FORMATS[declared.format]
     patterns = [f"{depth_folder}/{Path(p).name}" if depth_folder else p for p in layout.depth]
     colors = layout.files(folder, layout.color, "colour images (PNG or JPEG)")
     depths = layout.files(folder, patterns, "depth maps (PNG of 16 bits)")
+    list_note = ""
     if colors[0].suffix == ".txt":  # lists of images
-        colors, depths, own_times = pair_lists(colors[0], depths[0], notes)
+        colors, depths, own_times, list_note = pair_lists(colors[0], depths[0])
     else:
         check_paired(colors, depths)
         own_times = _own_times(folder, colors)
-    camera = _calibration(folder, layout, notes)
+    camera, camera_note = _calibration(folder, layout)
     if camera.depth_scale:
         declared = declaration(folder, declared.format, camera.depth_scale)
     moments = Moments(colors, own_times, declared.frame_rate, layout.counts_from_0)
     pattern = pose_file or _pose_pattern(folder, layout)
-    if pattern:
+    pose_path = folder / pattern if pattern else None
+    if pose_path:
         files = layout.files(folder, (pattern,), "poses")
-        poses, times = _poses_and_times(files, folder / pattern, layout, declared, moments, notes)
+        poses, times, pose_note = _poses_and_times(files, pose_path, layout, declared, moments)
     else:
         poses, times = np.full((len(colors), 4, 4), np.nan), moments.times
-        notes.append("no poses")
+        pose_note = "no poses"
+    notes = [note for note in (list_note, camera_note, pose_note) if note]
     return Recording(
         folder, folder.name, layout, declared, color_files=colors, depth_files=depths, times=times,
-        calibration=camera, notes=notes, file_poses=poses,
-        pose_file=folder / pattern if pattern else None,
+        calibration=camera, notes=notes, file_poses=poses, pose_file=pose_path,
     )  # fmt: skip
 
 
@@ -119,27 +120,25 @@ def _own_times(folder: Path, colors: list[Path]) -> Times | None:
         return None if None in stamps or (np.diff(stamps) <= 0).any() else np.array(stamps)
     times = in_seconds(read_numbers(path, (1,), "the time (s) of a frame").ravel())
     if len(times) != len(colors) or not (np.diff(times) > 0).all():
-        raise DataError(
-            f"{path} has {len(times)} times for {len(colors)} images: write one each, rising, in "
-            "seconds, or since 1970 in milli-, micro- or nanoseconds"
-        )
+        found = f"{path} has {len(times)} times for {len(colors)} images"
+        advice = "in seconds, or since 1970 in milli-, micro- or nanoseconds"
+        raise DataError(f"{found}: write one each, rising, {advice}")
     return times
 
 
-def _calibration(folder: Path, layout: Format, notes: list[str]) -> Calibration:
-    """The folder's own calibration, else one that is assumed by the folder's name.
+def _calibration(folder: Path, layout: Format) -> tuple[Calibration, str]:
+    """The folder's own calibration, else one that is assumed by the folder's name; and a note.
 
-    What is assumed, and what a file says that is not used, is added to the notes.
+    It tells what is assumed, or what the file says that is not used; else it is empty.
     """
     known = [c for c in layout.known_cameras if c.source.name in folder.name]
     if known and not any((folder / name).is_file() for name in layout.cameras):
         assumed = f"the camera assumed for {layout.label}"
-        notes.append(f"{assumed}, {known[0].fx:g} px at 640x480: no {layout.cameras[0]}")
-        return replace(known[0], source=folder / assumed)
+        note = f"{assumed}, {known[0].fx:g} px at 640x480: no {layout.cameras[0]}"
+        return replace(known[0], source=folder / assumed), note
     camera = layout.read_camera(layout.files(folder, layout.cameras, "calibration")[0])
-    if camera.unused:
-        notes.append(f"not used of {camera.source.name}: {', '.join(camera.unused)}")
-    return camera
+    unused = ", ".join(camera.unused)
+    return camera, f"not used of {camera.source.name}: {unused}" if camera.unused else ""
 
 
 def _pose_pattern(folder: Path, layout: Format) -> str | None:
@@ -152,12 +151,11 @@ def _pose_pattern(folder: Path, layout: Format) -> str | None:
 
 
 def _poses_and_times(
-    files: list[Path], path: Path, layout: Format, declared: Declaration, moments: Moments,
-    notes: list[str],
-) -> tuple[Poses, Times]:  # fmt: skip
-    """A pose a frame, and times; `path` names the files, with `*` where each frame has one.
+    files: list[Path], path: Path, layout: Format, declared: Declaration, moments: Moments
+) -> tuple[Poses, Times, str]:
+    """A pose a frame, times, and a note: how poses were given to frames, or nothing.
 
-    How poses were given to frames is added to the notes.
+    `path` names the files, with `*` where each frame has one.
     """
     tables = [layout.read_poses(file, declared.quaternion) for file in files]
     poses = checked_poses(np.concatenate([poses for poses, _ in tables]), path)
@@ -168,9 +166,7 @@ def _poses_and_times(
         times = stamps
     if "*" in path.name:
         check_paired(moments.images, files)
-        return poses, times
+        return poses, times, ""
     stamps = stamps if layout.stamps_tell else np.full(len(stamps), np.nan)
     poses, note = moments.poses_of(path, poses, stamps, declared.inverted_if_world_to_camera)
-    if note:
-        notes.append(f"{path.name}: {note}")
-    return poses, times
+    return poses, times, f"{path.name}: {note}" if note else ""

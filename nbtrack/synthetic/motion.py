@@ -68,9 +68,8 @@ def attempts(room: Room, seed: int) -> Iterator[np.random.Generator]:
     """
     for attempt in range(_ATTEMPTS):
         yield np.random.default_rng([seed, attempt, room.number])
-    raise NumericalError(
-        f"room '{room.name}': no path keeps {CLEARANCE} m from surfaces; move its walk or furniture"
-    )
+    found = f"room '{room.name}': no path keeps {CLEARANCE} m from surfaces"
+    raise NumericalError(f"{found}; move its walk or furniture")
 
 
 def is_clear(room: Room, poses: Poses) -> bool:
@@ -163,17 +162,21 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
 
 def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """Places (x and z, m) of a smooth closed walk by stops, in the middle of what is free."""
-    x, z = [np.arange(_CELL - half, half, _CELL) for half in room.parts[0].solid.half[[0, 2]]]
-    points = np.stack(np.meshgrid(x, np.linspace(*HEIGHTS, 5), z, indexing="ij"), axis=-1)
+    half_x, _, half_z = room.parts[0].solid.half
+    x = np.arange(_CELL - half_x, half_x, _CELL)
+    z = np.arange(_CELL - half_z, half_z, _CELL)
+    heights = np.linspace(HEIGHTS[0], HEIGHTS[1], 5)
+    points = np.stack(np.meshgrid(x, heights, z, indexing="ij"), axis=-1)
     clearance = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:3]).min(axis=1)
     is_free = clearance >= CLEARANCE + _MARGIN
     # A negative cost is a cell that no route enters.
     costs = np.where(is_free, 1.0 / np.maximum(clearance - CLEARANCE, 0.01), -1.0)
     cells = [(np.abs(x - stop[0]).argmin(), np.abs(z - stop[1]).argmin()) for stop in stops]
+    ends = [*cells[1:], cells[0]]
     walk = []
-    for start, end in zip(cells, cells[1:] + cells[:1], strict=True):
-        # The next route begins where this one ends.
-        walk += route_through_array(costs, start, end, geometric=True)[0][:-1]
+    for start, end in zip(cells, ends, strict=True):
+        route, _ = route_through_array(costs, start, end, geometric=True)
+        walk += route[:-1]  # the next one begins where it ends
     rows, columns = np.array(walk).T
     places = np.stack([x[rows], z[columns]], axis=1)
     return gaussian_filter1d(places, _SMOOTHED / _CELL, axis=0, mode="wrap")

@@ -10,7 +10,7 @@ Kingma & Ba 2015, Sec. 2.1 (the bound of a step).
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Poses
@@ -26,11 +26,6 @@ class Reach:
 
     position: float  # m, along an axis of the world
     orientation: float  # rad
-
-    def is_exceeded(self, offsets: Motions, turns: Motions) -> Bool[np.ndarray, "frames"]:
-        """Whether the camera moves or turns farther than that, a flag a frame."""
-        too_far = np.abs(offsets).max(axis=1) > self.position
-        return too_far | (np.abs(turns).max(axis=1) > self.orientation)
 
 
 def reach(steps: float, rate: float) -> float:
@@ -95,9 +90,11 @@ def reach_metrics(
     if not np.isfinite(T_world_camera).all() or len(T_world_camera) < 2:
         return metrics
     offsets, turns = motion_of(T_world_camera, motion_model)
-    exceeded = reach.is_exceeded(offsets, turns)
+    moves_beyond = np.abs(offsets).max(axis=1) > reach.position
+    turns_beyond = np.abs(turns).max(axis=1) > reach.orientation
+    beyond_share = float((moves_beyond | turns_beyond).mean())
     greedy_m = greedy_ate(T_world_camera, reach.position, motion_model)
-    return {**metrics, "beyond_reach_share": float(exceeded.mean()), "greedy_ate_m": greedy_m}
+    return {**metrics, "beyond_reach_share": beyond_share, "greedy_ate_m": greedy_m}
 
 
 def _nearest_start(motion_model: str, found: list[np.ndarray], T_true: np.ndarray) -> np.ndarray:

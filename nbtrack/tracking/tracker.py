@@ -158,10 +158,9 @@ class Tracker(abc.ABC):
         Only a class that has a `restart_anywhere` of its own can, and in a corrected map only.
         """
         if cls.restart_anywhere is Tracker.restart_anywhere or not in_corrected:
-            raise ConfigError(
-                f"tracker {cls.name!r} cannot find a camera whose first pose is not known: take lm "
-                "in a corrected map (--method corrected), or begin with a frame that has a pose"
-            )
+            lacks = f"tracker {cls.name!r} cannot find a camera whose first pose is not known"
+            advice = "take lm in a corrected map (--method corrected)"
+            raise ConfigError(f"{lacks}: {advice}, or begin with a frame that has a pose")
 
     def state(self) -> dict[str, Any]:
         """What the tracker remembers from past frames: tensors and plain values."""
