@@ -123,7 +123,8 @@ def beside(ours: pd.DataFrame, paper: pd.DataFrame) -> pd.DataFrame:
     # Ours alone where the paper has no such row.
     rows = []
     for row in ours.index:
-        rows += [(*row, source) for source in (sources if row in paper.index else ["ours"])]
+        there = sources if row in paper.index else ["ours"]
+        rows += [(*row, source) for source in there]
     return both.loc[rows]
 
 

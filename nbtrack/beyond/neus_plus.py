@@ -129,9 +129,10 @@ class ObservedDistance:
         point_in = np.full(shape, -1)  # each cell's point, by number; -1 where there is none
         cells, inside = cells_of(points, low, shape, fine)
         point_in.flat[cells] = np.flatnonzero(inside)
-        # Of each cell the nearest one that has a point: 3 indices.
+        # Of each cell the nearest one that has a point, as three indices.
         place = distance_transform_edt(point_in < 0, return_distances=False, return_indices=True)
         nearest = points[point_in[tuple(place[:, ::2, ::2, ::2])]]
+        # The corners of the grid, m: the centres of every second cell.
         corners = np.stack(np.indices(shape)[:, ::2, ::2, ::2], -1) * fine + low + fine / 2
         distance = torch.from_numpy(np.linalg.norm(corners - nearest, axis=-1)).float()
         corners_world = torch.from_numpy(corners.reshape(-1, 3)).float()

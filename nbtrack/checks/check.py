@@ -107,6 +107,7 @@ def check_recording(
     if is_right and is_whole and len(ids) >= _MIN_FRAMES:
         misfits, correlation = find_misfits(seen, best.reading)
     is_far = cloud.depth > far_limit(cloud.depth)
+    # Poses and depths are only judged where they are read rightly, colours where nothing misfits.
     warnings = list(_of_depth_images(frames, cloud, recording))
     needs_proof = is_whole and not warnings
     main = main_misfit(misfits)
@@ -156,23 +157,21 @@ def _of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
     odd = off[is_odd & (off == off.rolling(3, 1, center=True).max())]
     if len(odd):
         first = recording.color_files[odd.index[0]].name
-        yield (
-            f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path of "
-            f"their neighbours, first {first}: check the poses there, or leave frames out with "
-            "--frames of map and track"
-        )
+        found = f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path"
+        advice = "check the poses there, or leave frames out with --frames of map and track"
+        yield f"{found} of their neighbours, first {first}: {advice}"
 
 
 def _of_depths(depth: pd.Series, is_far: pd.Series) -> Iterator[str]:
     """What is wrong with depths that are read rightly: no camera measures them."""
     if is_far.any():
         low, high = depth[is_far].min(), depth[is_far].max()
-        yield (
-            f"{is_far.mean():.2%} of the depths are outliers, {low:.3g} to {high:.3g} m away, more "
-            f"than {FAR:g} times as far as nine in ten: maps and tracking leave them out; check "
-            "the camera, or set no_depth in sequence.toml to what it gives for none"
-        )
-    median, (near, far) = depth[~is_far].median(), PLAUSIBLE_DEPTH
+        found = f"{is_far.mean():.2%} of the depths are outliers, {low:.3g} to {high:.3g} m away"
+        rule = f"more than {FAR:g} times as far as nine in ten: maps and tracking leave them out"
+        advice = "check the camera, or set no_depth in sequence.toml to what it gives for none"
+        yield f"{found}, {rule}; {advice}"
+    near, far = PLAUSIBLE_DEPTH
+    median = depth[~is_far].median()
     if median < near or median > far:
         advice = "set depth_scale, the depth values a metre, in sequence.toml"
         yield f"the median depth is {median:.3g} m, outside {near:g} to {far:g} m: {advice}"

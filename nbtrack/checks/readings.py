@@ -127,7 +127,8 @@ class FramePairs:
         Depth is interpolated between four pixels, in 1/z, which is exact for planes.
         """
         n_frames = len(self.file_poses)
-        # Of a frame at first half of the growth is missing, in the end half is too much.
+        # Depths grow from frame to frame: the first are too short by half of the growth, the last
+        # too long by as much. So many times too long they are in a and b:
         growth = reading.depth_growth * (self.pairs / n_frames - 0.5)
         longer_a, longer_b = torch.from_numpy(1 + growth[..., None]).float()
         points_a = reading.points(self.columns, self.rows, self.values / longer_a)
@@ -136,7 +137,7 @@ class FramePairs:
         T_b_a = torch.from_numpy(np.linalg.solve(T_world_b, T_world_a)).float()
         points_b = points_a @ T_b_a[:, :3, :3].mT + T_b_a[:, None, :3, 3]
         columns, rows, depth = project(reading.calibration, points_b)
-        at = self._on_images(columns, rows)[:, None]
+        at = self._on_images(columns, rows)[:, None]  # (pairs, 1, points, 2)
         blended = 1 / grid_sample(self.inverse, at, "bilinear", align_corners=True)[:, 0, 0]
         nearest = 1 / grid_sample(self.inverse, at, "nearest", align_corners=True)[:, 0, 0]
         measured = reading.points(columns, rows, blended / longer_b)[..., 2]

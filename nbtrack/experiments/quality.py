@@ -56,7 +56,7 @@ def _random_rays(sequence: RgbdSequence, frames: Frames, generator: torch.Genera
 
 
 def _score_images(field: LearnedField, rays: Rays, room: Room | None) -> Scores:
-    """PSNR (dB) and depth L1 (m) over those of some held-out pixels that are measured."""
+    """PSNR (dB) and depth L1 (m) over rays of held-out frames whose pixels are measured."""
     hit = rays.depth > 0
     if not hit.any():
         return {}

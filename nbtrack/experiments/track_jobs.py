@@ -183,8 +183,7 @@ class TrackJob(Job):
         tracker = make_tracker(
             self.tracker, finished.field, start.T_world_camera, budget, self.settings, self.seed
         )
-        checkpoint = self.folder / RUN_FILE
-        tracked = track_sequence(tracker, sequence, checkpoint, tell, start.is_known)
+        tracked = track_sequence(tracker, sequence, self.folder / RUN_FILE, tell, start.is_known)
         return tracked, device_name(tracker.device)  # LM and ICP run on the host
 
     def _notes(

@@ -226,8 +226,10 @@ class Moments:
             return []
         first = self.numbers[0]
         is_1_to_n = first == 1 and np.ptp(self.numbers) == len(self.numbers) - 1
-        starts = [0] if self.counts_from_0 and not is_1_to_n else [0, min(first, 1), first]
-        return [self.numbers - start for start in starts]
+        if self.counts_from_0 and not is_1_to_n:
+            return [self.numbers]
+        from_1 = min(first, 1)  # not where there is a frame 0
+        return [self.numbers, self.numbers - from_1, self.numbers - first]
 
 
 def _interpolated(

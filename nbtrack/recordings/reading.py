@@ -93,11 +93,10 @@ def select_frames(recording: Recording, frames: slice, needs_poses: bool = True)
         frame_ids = frame_ids[recording.has_pose[frame_ids]]
         found += f", and {len(frame_ids)} of these have a pose"
     if not len(frame_ids):
-        raise DataError(
-            f"{found}: choose others (--frames of map and track, scenes.track_frames of tables), "
-            f"add poses ({recording.pose_file or ' or '.join(recording.format.poses)}), or track "
-            "in a map of the same place with --map-from, which needs none"
-        )
+        choose = "choose others (--frames of map and track, scenes.track_frames of tables)"
+        add = f"add poses ({recording.pose_file or ' or '.join(recording.format.poses)})"
+        track = "or track in a map of the same place with --map-from, which needs none"
+        raise DataError(f"{found}: {choose}, {add}, {track}")
     return frame_ids
 
 
@@ -222,11 +221,10 @@ def _in_millimetres(
         squares = ((x - camera.cx) / camera.fx) ** 2 + ((y - camera.cy) / camera.fy) ** 2
         depth_mm /= np.sqrt(1 + squares)
     if depth_mm.max() > _MAX_16_BITS:
-        raise DataError(
-            f"{file} holds {depth_mm.max() / 1000:.4g} m with {declared.depth_scale:g} depth "
-            "values a metre: at most 65.535 m can be kept; set depth_scale or no_depth in "
-            "sequence.toml"
-        )
+        found = f"{file} holds {depth_mm.max() / 1000:.4g} m"
+        scale = f"{declared.depth_scale:g} depth values a metre"
+        advice = "set depth_scale or no_depth in sequence.toml"
+        raise DataError(f"{found} with {scale}: at most 65.535 m can be kept; {advice}")
     return np.rint(depth_mm).astype(np.uint16)
 
 
