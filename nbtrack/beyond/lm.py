@@ -115,7 +115,7 @@ class LmTracker(Tracker):
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Draw the frame's points; take up the descent from the start that fits them best."""
-        starts = T_starts.double().numpy().copy()
+        starts = T_starts.double().numpy().copy()  # the other ones are the caller's
         n_expected = len(starts)
         if self.was_lost and self.last_good is not None:
             starts = np.concatenate([starts, self.last_good.numpy()[None]])
@@ -191,6 +191,7 @@ class LmTracker(Tracker):
             while True:
                 cost = self.best.cost(NEAR_SCALES)
                 is_confirmed = self._descend_from(others.pop(0))
+                # A pose that another descent confirms may be doubtful, but not lost.
                 max_p_lost = _LOST if is_confirmed else _DOUBTFUL
                 if not (others and self.report()["p_lost"] >= max_p_lost):
                     break

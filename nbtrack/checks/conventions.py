@@ -133,7 +133,9 @@ def diagnosis(
 ) -> str:
     """What is wrong with how the numbers are read, in a sentence; empty where nothing is.
 
-    Where proof is needed, a camera that moves too little to tell conventions apart is wrong too.
+    The first of these that holds is told: another convention is better; two frames see too little
+    of the same; their surfaces lie apart in every convention; and, where proof is needed, the
+    camera moves too little to tell conventions apart.
     """
     own, *others = conventions
     file = recording.pose_file.name

@@ -147,9 +147,8 @@ def _check_fits(given: Map, field: str, options: Namespace) -> None:
     if field != made:
         advice = "leave --method and --field out"
         raise ConfigError(f"{options.map_from} is a map of field {made!r}, not {field!r}: {advice}")
-    record = given.record
-    correction = record.get("correction", 0.0)
-    known = flat(setting_tree(made, record["network"], record["settings"], correction))
+    correction = given.record.get("correction", 0.0)
+    known = flat(setting_tree(made, given.record["network"], given.record["settings"], correction))
     for text in options.settings:
         asked = read_setting(text)
         # Keys that no map has, as those of a tracker, are no contradiction.

@@ -187,5 +187,8 @@ def _rough_unit(scene: Scene, frames: str) -> float:
 
 @lru_cache(maxsize=4)
 def _read(folder: Path, modified_ns: int) -> Map:
-    """Read once for all runs in a map: a corrected one samples its network, which takes seconds."""
+    """The map of a folder, read once for all runs in it, and anew where its file has another time.
+
+    A corrected one samples its network, which takes seconds.
+    """
     return read_map(folder)
