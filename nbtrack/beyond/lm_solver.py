@@ -93,6 +93,7 @@ def normal_equations(terms: Terms, scales: Array, lambda_intensity: float) -> tu
         for i in range(n_points):
             gx, gy, gz = gradients[0, i], gradients[1, i], gradients[2, i]
             ax, ay, az = terms.lever_arms[0, i], terms.lever_arms[1, i], terms.lever_arms[2, i]
+            # A column of the Jacobian: the lever arm a cross the gradient g, then g itself.
             jacobian[0, i], jacobian[1, i] = ay * gz - az * gy, az * gx - ax * gz
             jacobian[2, i], jacobian[3, i] = ax * gy - ay * gx, gx
             jacobian[4, i], jacobian[5, i] = gy, gz
