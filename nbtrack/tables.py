@@ -278,11 +278,8 @@ def write_table_1(
 def write_table_3(
     folder: Path, results: pd.DataFrame, note: str, own: Wording = OUR_WORDING
 ) -> list[Path]:
-    """Writes Table III, Table I with other rows and in mm, as CSV and LaTeX; see `write_tables`.
-
-    Labels of rows contain n, since a method with more points a frame is another method.
-    """
-    results = naming_points(results)
+    """Writes Table III, Table I with other rows and in mm, as CSV and LaTeX; see `write_tables`."""
+    results = naming_points(results)  # with more points a frame it is another method
     cells, styled = average_over_seeds(results), style_table_1(results, unit="mm")
     return _write_table(folder / "table_3", cells, styled, note, own)
 

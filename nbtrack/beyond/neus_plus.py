@@ -131,7 +131,8 @@ class ObservedDistance:
         point_in.flat[cells] = np.flatnonzero(inside)
         # Of each cell the nearest one that has a point, as three indices.
         place = distance_transform_edt(point_in < 0, return_distances=False, return_indices=True)
-        nearest = points[point_in[tuple(place[:, ::2, ::2, ::2])]]
+        x, y, z = place[:, ::2, ::2, ::2]
+        nearest = points[point_in[x, y, z]]
         # The corners of the grid, m: the centres of every second cell.
         corners = np.stack(np.indices(shape)[:, ::2, ::2, ::2], -1) * fine + low + fine / 2
         distance = torch.from_numpy(np.linalg.norm(corners - nearest, axis=-1)).float()

@@ -107,12 +107,11 @@ def check_recording(
     if is_right and is_whole and len(ids) >= _MIN_FRAMES:
         misfits, correlation = find_misfits(seen, best.reading)
     is_far = cloud.depth > far_limit(cloud.depth)
-    # Poses and depths are only judged where they are read rightly, colours where nothing misfits.
     warnings = list(_of_depth_images(frames, cloud, recording))
     needs_proof = is_whole and not warnings
     main = main_misfit(misfits)
     warnings.append(main if main else diagnosis(conventions, best, recording, needs_proof))
-    if is_right:
+    if is_right:  # else their numbers mean something else
         warnings += [*_of_poses(frames, recording), *_of_depths(cloud.depth, is_far)]
     if not main:
         warnings += _of_colors(frames.brightness, correlation)

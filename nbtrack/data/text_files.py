@@ -36,9 +36,10 @@ def read_object(path: Path, kind: str = "") -> dict[str, Any]:
 def read_lines(path: Path) -> list[str]:
     """The lines of a text file that are neither blank nor comments. DataError if there is none."""
     lines = path.read_text(**_TOLERANT).splitlines()
-    if lines := [line for line in lines if line.partition("#")[0].strip()]:
-        return lines
-    raise DataError(f"{path} is empty: write it anew")
+    full = [line for line in lines if line.partition("#")[0].strip()]
+    if not full:
+        raise DataError(f"{path} is empty: write it anew")
+    return full
 
 
 def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np.ndarray, "n m"]:

@@ -75,9 +75,7 @@ def track_scenes(
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
         settings = own.tracking_of(method.tracker)
-        n_steps = steps
-        if not steps:
-            n_steps = None if clock else method.paper_steps(rate_hz)
+        n_steps = steps if steps or clock else method.paper_steps(rate_hz)  # None by the clock
         made = MapJob.of(scene, method.field, own, seed=seed)
         by_clock = rate_hz if clock else None
         job = TrackJob(made, seen, method.tracker, settings, n_steps, by_clock, frames, seed)
