@@ -212,18 +212,21 @@ def _seconds(frames: pd.DataFrame) -> pd.Series:
 
 
 @style.styled
-def plot_panels(panels: Mapping[str, pd.DataFrame], x: str, title: str = "") -> Figure:
+def plot_panels(
+    panels: Mapping[str, pd.DataFrame], x: str, title: str = "", same_x: bool = False
+) -> Figure:
     """Numbers of methods (columns) at the texts of the index, by title, which has a panel.
 
-    Panels share these texts, from the top; x is logarithmic. A pale line joins those of a text.
+    Panels share these texts, from the top; x is logarithmic, if wanted of one range in all panels.
+    A pale line joins those of a row; a text may have several rows.
     """
-    grid = style.new_axes(title, 3.4, 1, len(panels), sharey=True)[0]
+    grid = style.new_axes(title, 3.4, 1, len(panels), sharex=same_x, sharey=True)[0]
     for axes, (name, values) in zip(grid, panels.items(), strict=True):
         spans = values.index, values.min(axis=1), values.max(axis=1)
         axes.hlines(*spans, color="0.85", linewidth=2, zorder=1)
         for (label, color), mark in zip(style.method_colors(values).items(), _MARKS, strict=False):
             axes.plot(values[label], values.index, mark, color=color, label=label)
-        axes.set(title=name, xlabel=x, ylim=(len(values) - 0.5, -0.5))
+        axes.set(title=name, xlabel=x, ylim=(values.index.nunique() - 0.5, -0.5))
         style.log_axes(axes, "x")
     return grid[0].figure.legend_below()
 

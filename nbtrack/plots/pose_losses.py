@@ -129,16 +129,21 @@ def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, nea
     within = {label: np.flatnonzero(e < 1000 * near) for label, e in errors_mm.items()}
     found = [f"{k} after {n[0]} steps" if len(n) else f"{k} never" for k, n in within.items()]
     ends = " and ".join(f"{errors[-1]:.0f}" for errors in errors_mm.values())
-    title = f"Within {1000 * near:.0f} mm: {', '.join(found)}; at their ends {ends} mm"
+    title = f"Within {1000 * near:.0f} mm: {', '.join(found)}; they end {ends} mm off"
     plane, by_step = new_axes(title, 3.6, 1, 2, width_ratios=[1.2, 1])[0]
     field = next(iter(trackers.values())).field
     _draw_mean_distance(plane, field, frame, np.concatenate([*paths_cm.values(), [[0, 0, 0]]]))
     for label, color in method_colors(paths_cm).items():
-        look = {"color": color, "marker": ".", "label": label}
+        look = {"color": color, "marker": ".", "markersize": 4, "label": label}
         plane.plot(paths_cm[label][:, 0], paths_cm[label][:, 2], **look)
         by_step.plot(errors_mm[label], **look)
-    plane.plot(0, 0, "*", color="black", markersize=10, linestyle="", label="true pose")
+    start, marks = paths_cm[label][0], {"color": "black", "linestyle": ""}
+    plane.plot(start[0], start[2], "s", label="start", **marks)
+    plane.plot(0, 0, "*", markersize=10, label="true pose", **marks)
     plane.set(xlabel="camera off along x (cm)", ylabel="off along z (cm)", aspect="equal")
+    by_step.axhline(1000 * near, **DASHED)
+    look = {"ha": "right", "va": "bottom"}
+    by_step.text(by_step.get_xlim()[1], 1000 * near, f"{1000 * near:.0f} mm", **look)
     by_step.set(xlabel="step", ylabel="position error (mm)")
     return plane.figure.legend_below()
 
