@@ -92,7 +92,8 @@ def check_recording(
     T_world_camera[:, :3, 3] -= recording.origin
     pairs = _pairs(T_world_camera, _N_PAIRS if is_whole else _QUICK_PAIRS)
     shown, kept = _kept(pairs, ids, is_whole)
-    # Depth values as they stand in the files, so that any unit can be tried.
+    # Declared as millimetres along the axis, depth values are read as they stand in the files: the
+    # `depths_mm` below hold these, whatever their unit and direction, so that any can be tried.
     as_stored = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
     stored = replace(recording, declared=as_stored)
     sequence, frames = _read(stored, ids if is_whole else kept, kept, progress)
@@ -255,13 +256,13 @@ def _read(
     return replace(parts[0], **arrays), frames
 
 
-def _cloud(own: Reading, sequence: RgbdSequence) -> pd.DataFrame:
-    """Coloured points of frames as the recording is declared, whose depths are as in the files."""
-    stride = max(1, round((sequence.depths_mm[0].size / _POINTS_PER_FRAME) ** 0.5))
-    points_camera = own.points(*on_grid(sequence.depths_mm, stride)).numpy()
-    T = sequence.T_world_camera
+def _cloud(own: Reading, stored: RgbdSequence) -> pd.DataFrame:
+    """Coloured points (m) by the recording's declaration; `depths_mm` are the files' own values."""
+    stride = max(1, round((stored.depths_mm[0].size / _POINTS_PER_FRAME) ** 0.5))
+    points_camera = own.points(*on_grid(stored.depths_mm, stride)).numpy()
+    T = stored.T_world_camera
     points_world = points_camera @ T[:, :3, :3].mT + T[:, None, :3, 3]
-    colors = sequence.colors[:, ::stride, ::stride].reshape(points_camera.shape)
+    colors = stored.colors[:, ::stride, ::stride].reshape(points_camera.shape)
     table = np.concatenate([points_world, colors, points_camera[..., 2:]], axis=-1).reshape(-1, 7)
     cloud = pd.DataFrame(table, columns=[*_XYZ, "red", "green", "blue", "depth"])
     return cloud[cloud.depth > 0]

@@ -27,11 +27,8 @@ AXES = {
 # Those that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1 mm, SUN3D's
 # millimetres and tenths times 8; and metres and micrometres, which 16 bits hold badly.
 _SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 8000.0, 80_000.0, 256.0, 100.0, 1.0, 1e6)
-_CALIBRATIONS = {  # factors of focal lengths
-    "one with its principal point in the middle of the image": 1.0,
-    "one for images twice as large": 0.5,
-    "one for images half as large": 2.0,
-}
+# Factors of focal lengths and principal point.
+_CALIBRATIONS = {"one for images twice as large": 0.5, "one for images half as large": 2.0}
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
 
 
@@ -102,12 +99,13 @@ def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
     for subject, name, keys in _DECLARED:
         yield subject, name, replace(own, declared=replace(own.declared, **keys))
     camera = own.camera
-    # The principal point scales with the rest, or is in the middle of any image.
-    middle = camera.width / 2, camera.height / 2
+    middle = {"cx": camera.width / 2, "cy": camera.height / 2}
+    centred = "one with its principal point in the middle of the image"
+    yield "calibration", centred, replace(own, camera=replace(camera, **middle))
     for label, factor in _CALIBRATIONS.items():
-        scaled = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
-        for cx, cy in ((factor * camera.cx, factor * camera.cy), middle):
-            yield "calibration", label, replace(own, camera=replace(scaled, cx=cx, cy=cy))
+        scaled = {key: factor * getattr(camera, key) for key in ("fx", "fy", "cx", "cy")}
+        for changed in (scaled, scaled | middle):  # the middle of an image of any size
+            yield "calibration", label, replace(own, camera=replace(camera, **changed))
     for unit, metres in _UNITS.items():
         yield "poses", f"ones in {unit}", replace(own, metres=metres)
 

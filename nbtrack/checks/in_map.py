@@ -99,10 +99,11 @@ def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
     T_map_world[:3, :3] = turns[agrees].mean().as_matrix()
     turned_positions = T_true[:, :3, 3] @ T_map_world[:3, :3].T
     T_map_world[:3, 3] = np.median(T_estimated[:, :3, 3] - turned_positions, axis=0)
-    error_m = np.median(pose_errors(T_estimated, T_true)[0])
-    left_m = np.median(pose_errors(T_estimated, T_map_world @ T_true)[0])
-    is_explained = left_m < min(LOST_THRESHOLD_M, error_m / 10)
-    return T_map_world if error_m > LOST_THRESHOLD_M and is_explained else None
+    errors_m, _ = pose_errors(T_estimated, T_true)
+    left_m, _ = pose_errors(T_estimated, T_map_world @ T_true)
+    usual_m = np.median(errors_m)
+    is_explained = np.median(left_m) < min(LOST_THRESHOLD_M, usual_m / 10)
+    return T_map_world if usual_m > LOST_THRESHOLD_M and is_explained else None
 
 
 def outside_map_share(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> float:
@@ -129,7 +130,7 @@ def map_misfit(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> str:
     for index, points_camera in _some_points(sequence):
         T = T_estimated[index]
         points_world = torch.from_numpy(_to_world(points_camera, T)).float().to(field.device)
-        distance = field(points_world.requires_grad_())[1]
+        _, distance = field(points_world.requires_grad_())
         (gradient_world,) = torch.autograd.grad(distance.sum(), points_world)
         is_near = np.abs(distance.numpy(force=True)) < _MAX_DISTANCE
         p, r = points_camera[is_near], distance.numpy(force=True)[is_near]

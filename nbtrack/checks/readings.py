@@ -64,25 +64,26 @@ class Reading:
         directions = pixel_directions(self.calibration, columns, rows)
         if self.declared.depth_along == "ray":
             directions = directions / directions.norm(dim=-1, keepdim=True)
-        metres = values * ((1 + self.depth_share) / self.declared.depth_scale)
-        return directions * metres[..., None]
+        lengths = values * ((1 + self.depth_share) / self.declared.depth_scale)  # m
+        return directions * lengths[..., None]
 
     def T_world_camera(self, file_poses: Poses, order: str) -> Poses:
         """Camera-to-world poses with OpenCV's camera axes, of a file's as they were read with an
         order of quaternions."""
-        T = file_poses.copy()
+        T_file = file_poses.copy()
         if self.declared.quaternion != order:  # the file's four numbers, read the other way
             w_first = order == "wxyz"
-            numbers = Rotation.from_matrix(T[:, :3, :3]).as_quat(scalar_first=w_first)
-            T[:, :3, :3] = Rotation.from_quat(numbers, scalar_first=not w_first).as_matrix()
-        T[:, :3, 3] *= self.metres
-        T = self.declared.poses_to_opencv(T)
-        drift = [self.drift_x, self.drift_y, self.drift_z]
-        T[:, :3, 3] -= np.outer(np.linspace(0, 1, len(T)), drift)
+            numbers = Rotation.from_matrix(T_file[:, :3, :3]).as_quat(scalar_first=w_first)
+            T_file[:, :3, :3] = Rotation.from_quat(numbers, scalar_first=not w_first).as_matrix()
+        T_file[:, :3, 3] *= self.metres
+        T_world_camera = self.declared.poses_to_opencv(T_file)
+        drift = [self.drift_x, self.drift_y, self.drift_z]  # m, in the end
+        positions = T_world_camera[:, :3, 3] - np.outer(np.linspace(0, 1, len(T_file)), drift)
         # Scattered positions move towards the averages over their neighbours.
-        off = T[:, :3, 3] - uniform_filter1d(T[:, :3, 3], _SMOOTHED, axis=0, mode="nearest")
-        T[:, :3, 3] -= self.scatter * off / max(1e-9, np.sqrt((off**2).sum(axis=1).mean()))
-        return T
+        off = positions - uniform_filter1d(positions, _SMOOTHED, axis=0, mode="nearest")
+        mean_off = np.sqrt((off**2).sum(axis=1).mean())
+        T_world_camera[:, :3, 3] = positions - self.scatter * off / max(1e-9, mean_off)
+        return T_world_camera
 
 
 def on_grid(values: UInt16[np.ndarray, "frames h w"], stride: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -116,30 +117,25 @@ class FramePairs:
         self.order = recording.declared.quaternion
         self.colors = kept.colors
         self.places = np.searchsorted(kept.frame_ids, ids[pairs])  # of pairs in the sequence
-        first, second = kept.depths_mm[self.places]
+        first, second = kept.depths_mm[self.places]  # the files' values, in their unit
         stride = math.ceil((math.prod(first.shape[1:]) / _POINTS_PER_FRAME) ** 0.5)
-        self.columns, self.rows, self.values = on_grid(first, stride)
-        self.inverse = 1 / torch.from_numpy(second[:, None].astype(np.float32))  # infinite: none
+        self.columns, self.rows, self.values = on_grid(first, stride)  # of the points
+        # Of the second frames; infinite without a depth.
+        self.inverse_values = 1 / torch.from_numpy(second[:, None].astype(np.float32))
 
     def compare(self, reading: Reading) -> Comparison:
         """Points of the first frames a beside what was measured in the second ones b.
 
         Depth is interpolated between four pixels, in 1/z, which is exact for planes.
         """
-        n_frames = len(self.file_poses)
-        # Depths grow from frame to frame: the first are too short by half of the growth, the last
-        # too long by as much. So many times too long they are in a and b:
-        growth = reading.depth_growth * (self.pairs / n_frames - 0.5)
-        longer_a, longer_b = torch.from_numpy(1 + growth[..., None]).float()
+        longer_a, longer_b = self._longer(reading)
         points_a = reading.points(self.columns, self.rows, self.values / longer_a)
-        poses = reading.T_world_camera(self.file_poses, self.order)
-        T_world_a, T_world_b = poses[(self.pairs - reading.depth_shift).clip(0, n_frames - 1)]
-        T_b_a = torch.from_numpy(np.linalg.solve(T_world_b, T_world_a)).float()
+        T_b_a = self._T_second_first(reading)
         points_b = points_a @ T_b_a[:, :3, :3].mT + T_b_a[:, None, :3, 3]
         columns, rows, depth = project(reading.calibration, points_b)
         at = self._on_images(columns, rows)[:, None]  # (pairs, 1, points, 2)
-        blended = 1 / grid_sample(self.inverse, at, "bilinear", align_corners=True)[:, 0, 0]
-        nearest = 1 / grid_sample(self.inverse, at, "nearest", align_corners=True)[:, 0, 0]
+        blended = 1 / grid_sample(self.inverse_values, at, "bilinear", align_corners=True)[:, 0, 0]
+        nearest = 1 / grid_sample(self.inverse_values, at, "nearest", align_corners=True)[:, 0, 0]
         measured = reading.points(columns, rows, blended / longer_b)[..., 2]
         residual = depth - measured
         is_valid = (self.values > 0) & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
@@ -150,9 +146,25 @@ class FramePairs:
         agreement = torch.where(is_valid, 1 / (1 + (residual / measured / _SCALE) ** 2), 0.0)
         return Comparison(residual, measured, is_valid, agreement, at)
 
+    def _longer(self, reading: Reading) -> Tensor:
+        """How many times too long depths are in first and in second frames, (2, pairs, 1).
+
+        They grow from frame to frame: the recording's first are too short by half of the growth,
+        its last too long by as much.
+        """
+        growth = reading.depth_growth * (self.pairs / len(self.file_poses) - 0.5)
+        return torch.from_numpy(1 + growth[..., None]).float()
+
+    def _T_second_first(self, reading: Reading) -> Tensor:
+        """Poses of the first cameras in the second ones' frames, (pairs, 4, 4; m)."""
+        T_world_camera = reading.T_world_camera(self.file_poses, self.order)
+        numbers = (self.pairs - reading.depth_shift).clip(0, len(self.file_poses) - 1)
+        T_world_first, T_world_second = T_world_camera[numbers]
+        return torch.from_numpy(np.linalg.solve(T_world_second, T_world_first)).float()
+
     def _on_images(self, columns: Tensor, rows: Tensor) -> Tensor:
         """Pixels as `grid_sample` has them: -1 is the first, 1 the last."""
-        height, width = self.inverse.shape[2:]
+        height, width = self.inverse_values.shape[2:]
         return 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1) - 1
 
     def depth_costs(self, reading: Reading) -> Costs:

@@ -121,8 +121,8 @@ def read_calibration(path: Path) -> Calibration:
 def _from_json(path: Path) -> Calibration:
     """As `read_calibration`; a missing number of the matrix is NaN, which `calibration` refuses."""
     content = read_object(path)
-    entries = content["camera"] if isinstance(content.get("camera"), dict) else content
-    entries = {_OTHER_NAMES.get(key, key): value for key, value in entries.items()}
+    camera = content["camera"] if isinstance(content.get("camera"), dict) else content
+    entries = {_OTHER_NAMES.get(key, key): value for key, value in camera.items()}
     unused = tuple(sorted(entries.keys() - _COUNTS.keys()))
     with naming_damaged(path, "description of a camera", _ADVICE):
         for key in unused:
@@ -130,9 +130,8 @@ def _from_json(path: Path) -> Calibration:
         found = {key: _numbers(key, entries[key]) for key in entries.keys() & _COUNTS.keys()}
         single = {key: numbers[0] for key, numbers in found.items() if len(numbers) == 1}
         lens = tuple(found.get("distortion", [single.get(key, 0.0) for key in _LENS]))
-        scale = single.get("depth_scale")
-        if scale and scale < 1:  # metres a value
-            scale = 1 / scale
+        stored = single.get("depth_scale")
+        scale = 1 / stored if stored and stored < 1 else stored  # below 1 it is metres a value
         has_size = "width" in single or "height" in single
         size = (int(single["width"]), int(single["height"])) if has_size else None
         K = camera_matrix(*[single.get(key, np.nan) for key in ("fx", "fy", "cx", "cy")])

@@ -122,10 +122,10 @@ def pair_lists(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Pat
 
 def _read_list(path: Path) -> tuple[Times, list[Path]]:
     """Times and files of a list with `timestamp file` a line, in the order of time."""
-    rows = [line.strip().split(maxsplit=1) for line in read_lines(path)]
+    words = [line.strip().split(maxsplit=1) for line in read_lines(path)]
     advice = "every line holds 'timestamp file', such as '1305031102.175 rgb/1305031102.175.png'"
     with naming_damaged(path, "list", advice):
-        rows = sorted((float(time), name) for time, name in rows)
+        rows = sorted((float(time), name) for time, name in words)
         times = in_seconds(np.array([time for time, _ in rows]))
         if not np.isfinite(times).all():
             raise ValueError("a time is not finite")

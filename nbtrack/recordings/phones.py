@@ -31,10 +31,8 @@ from nbtrack.recordings.calibration import Calibration, calibration, camera_matr
 from nbtrack.recordings.formats import FORMATS, Declaration, Format
 
 _ADVICE = "export the recording again, as .r3d which is to be unpacked, or as raw data"
-_ADVICE_ON_DEPTH = (
-    "run `pip install pyliblzfse`, or put 16-bit PNG files in millimetres into depth/ in place of "
-    "the .depth files"
-)
+_INSTEAD = "16-bit PNG files in millimetres into depth/ in place of the .depth files"
+_ADVICE_ON_DEPTH = f"run `pip install pyliblzfse`, or put {_INSTEAD}"
 
 
 @contextmanager
@@ -47,13 +45,14 @@ def _content(path: Path) -> Iterator[dict[str, Any]]:
 def _camera(path: Path, numbers: Sequence[float]) -> Calibration:
     """The camera of fx, fy, cx, cy, width and height as the apps write them."""
     fx, fy, cx, cy, width, height = numbers
+    # The apps count from the first pixel's corner, a camera matrix of OpenCV's from its centre.
     return calibration(path, camera_matrix(fx, fy, cx - 0.5, cy - 0.5), (int(width), int(height)))
 
 
 def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times]:
     """The poses and their frames' times (s); `order` is not used: the app always writes xyzw."""
     with _content(path) as content:
-        rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
+        rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)  # qx qy qz qw tx ty tz
         times = np.array(content.get("frameTimestamps", ()), dtype=np.float64)
         if times.shape != (len(rows),) or not np.isfinite(times).all():
             times = np.arange(len(rows)) / float(content["fps"])
@@ -63,8 +62,9 @@ def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times]:
 def _record3d_camera(path: Path) -> Calibration:
     """The first frame's, as the app writes it; later ones move by a pixel or two."""
     with _content(path) as content:
-        K = np.array(content["K"], dtype=np.float64)  # column by column
-        return _camera(path, [K[0], K[4], K[6], K[7], content["w"], content["h"]])
+        # The matrix, column by column.
+        fx, _, _, _, fy, _, cx, cy, _ = np.array(content["K"], dtype=np.float64)
+        return _camera(path, [fx, fy, cx, cy, content["w"], content["h"]])
 
 
 def _record3d_depth(path: Path, camera: Calibration) -> DepthImage:

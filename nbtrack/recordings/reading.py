@@ -125,7 +125,9 @@ def decode(
     depth_files = [recording.depth_files[i] for i in frame_ids]
     color = _read_image(color_files[0], is_color=True)
     depth = _read_depth(depth_files[0], recording)
-    resize = _decide_resizing(color, depth, recording)
+    resize, note = _resizing(color, depth, recording)
+    if note and note not in recording.notes:
+        recording.notes.append(note)  # for reports of what was read
     model_file, model = (depth_files[0], depth) if resize else (color_files[0], color)
     height, width = model.shape[:2]
     camera = recording.calibration.for_size(width, height, model_file)
@@ -177,30 +179,26 @@ def _read_depth(path: Path, recording: Recording) -> Shaped[np.ndarray, "height 
     return _read_image(path, is_color=False)
 
 
-def _decide_resizing(color: np.ndarray, depth: np.ndarray, recording: Recording) -> bool:
-    """Decide whether colour is given the size of depth: its format says so, or it is larger in the
-    same proportions, as phones with LiDAR give it.
+def _resizing(color: np.ndarray, depth: np.ndarray, recording: Recording) -> tuple[bool, str]:
+    """Whether colour is given the size of depth: its format says so, or it is larger in the same
+    proportions, as phones with LiDAR give it. The latter is told by a note, else empty.
 
-    Adds the latter to the recording's notes. Raises DataError where its calibration does not say
-    which of both it is for.
+    Raises DataError where the calibration does not say which of both it is for.
     """
     if recording.format.resize_color:
-        return True
+        return True, ""
     height, width = color.shape[:2]
     depth_height, depth_width = depth.shape[:2]
     factor = width / depth_width
     if factor <= 1 or abs(factor * depth_height - height) > 1:
-        return False
+        return False, ""
     sizes = f"{width}x{height} and {depth_width}x{depth_height}"
     camera = recording.calibration
     if not camera.size:
         doubt = f"{camera.source} does not say which of both it is for"
         advice = "write a JSON file with fx, fy, cx, cy and their width and height"
         raise DataError(f"colour and depth are {sizes}, and {doubt}: {advice}")
-    note = f"colour is made as small as depth: {sizes}"
-    if note not in recording.notes:
-        recording.notes.append(note)
-    return True
+    return True, f"colour is made as small as depth: {sizes}"
 
 
 def _check(path: Path, image: np.ndarray, dtype: type, shape: tuple[int, ...], model: Path) -> None:

@@ -158,15 +158,15 @@ def _poses_and_times(
     `path` names the files, with `*` where each frame has one.
     """
     tables = [layout.read_poses(file, declared.quaternion) for file in files]
-    poses = checked_poses(np.concatenate([poses for poses, _ in tables]), path)
-    stamps = np.concatenate([stamps for _, stamps in tables])
-    times = moments.times
+    listed = checked_poses(np.concatenate([poses for poses, _ in tables]), path)
+    stamps = np.concatenate([times for _, times in tables])
     # Frames without times of their own have those of the poses, if there are as many.
-    if moments.own is None and len(stamps) == len(times) and (np.diff(stamps) > 0).all():
-        times = stamps
+    is_one_each = len(stamps) == len(moments.times) and (np.diff(stamps) > 0).all()
+    times = stamps if moments.own is None and is_one_each else moments.times
     if "*" in path.name:
         check_paired(moments.images, files)
-        return poses, times, ""
-    stamps = stamps if layout.stamps_tell else np.full(len(stamps), np.nan)
-    poses, note = moments.poses_of(path, poses, stamps, declared.inverted_if_world_to_camera)
+        return listed, times, ""
+    # Stamps that do not tell whose a pose is may still be the times of as many frames, above.
+    telling = stamps if layout.stamps_tell else np.full(len(stamps), np.nan)
+    poses, note = moments.poses_of(path, listed, telling, declared.inverted_if_world_to_camera)
     return poses, times, f"{path.name}: {note}" if note else ""

@@ -66,12 +66,12 @@ def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
     """The camera and the poses, by file."""
     # The layout's y and z point the other way: the same turn leads to OpenCV's axes and back.
     T_file = FORMATS["neural_rgbd"].declared.poses_to_opencv(T_world_camera)
-    poses = _text(T_file.reshape(-1, 4))
-    texts = {"poses.txt": poses, "trainval_poses.txt": poses}
-    stored = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
-    if np.allclose(astuple(camera), astuple(stored), rtol=0, atol=_SAME_CAMERA):
+    texts = dict.fromkeys(["poses.txt", "trainval_poses.txt"], _text(T_file.reshape(-1, 4)))
+    told_by_focal = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
+    if np.allclose(astuple(camera), astuple(told_by_focal), rtol=0, atol=_SAME_CAMERA):
         return texts | {"focal.txt": f"{float(camera.fx)!r}\n"}
-    # Programs that know only `focal.txt` then stop, instead of reading another camera.
+    # Programs that know only `focal.txt` then stop, instead of reading another camera. In the file
+    # pixel centres are whole numbers, as OpenCV counts.
     K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
     return texts | {"intrinsics.txt": _text(K)}
 
