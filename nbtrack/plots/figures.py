@@ -24,6 +24,8 @@ _BAR = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max", "panch
 _MARKS = "os^Dv"  # matplotlib's markers of up to five methods
 # A title, an image (colours or numbers), and the label of the numbers' bar; colours have none.
 Panel = tuple[str, np.ndarray, str]
+Curves = Mapping[str, Values]  # numbers by label
+Keys = str | list[str]  # columns whose values make groups of rows
 
 
 @style.styled
@@ -61,7 +63,7 @@ def plot_views(
 
 
 @style.styled
-def plot_distances(frame: Frame, distances: Mapping[str, Values], title: str = "") -> Figure:
+def plot_distances(frame: Frame, distances: Curves, title: str = "") -> Figure:
     """A frame's colour, and by label |d| (cm) of its points in a map; unmeasured pixels are grey.
 
     The distances (m) are those of `frame.measured_pixels()`, in this order.
@@ -114,7 +116,7 @@ def show_image(axes: Axes, image: np.ndarray, title: str, colors: str = "viridis
 
 @style.styled
 def plot_along_ray(
-    depths: Values, curves: Mapping[str, Values], measured_depth: float, title="", together=""
+    depths: Values, curves: Curves, measured_depth: float, title: str = "", together: str = ""
 ) -> Figure:
     """Quantities by label with its unit, below each other over the same z-depths (m) of a ray.
 
@@ -233,7 +235,7 @@ def plot_panels(
 
 @style.styled
 def plot_curves(
-    table: pd.DataFrame, x: str, y: str, group: str | list[str], title="", log="xy", line=""
+    table: pd.DataFrame, x: str, y: str, by: Keys, title: str = "", log: str = "xy", line: str = ""
 ) -> Figure:
     """One column over another, a line a group; groups of one row are points with their labels.
 
@@ -244,14 +246,12 @@ def plot_curves(
     `standing still` as a dotted line. Axes of `log` are logarithmic; line "none" leaves points.
     """
     axes = style.new_axes(title, 3.6)[0, 0]
-    groups = table[[group] if isinstance(group, str) else group]
+    groups = table[[by] if isinstance(by, str) else by]
     labels = groups.agg(", ".join, axis=1)
     is_text = not pd.api.types.is_numeric_dtype(table[x])
-    if is_text:
-        table = table.assign(**{x: _side_by_side(axes, table[x], labels)})
-        line, log = "none", log.replace("x", "")
-    looks = _looks(groups.set_axis(labels), line)
-    for label, rows in table.groupby(labels, sort=False):
+    looks = _looks(groups.set_axis(labels), "none" if is_text else line)
+    places = _side_by_side(axes, table[x], labels) if is_text else table[x]
+    for label, rows in table.assign(**{x: places}).groupby(labels, sort=False):
         look = looks.loc[label]
         axes.plot(rows[x], rows[y], label=label, **look)
         if "from" in table:
@@ -259,13 +259,14 @@ def plot_curves(
     if STANDING_STILL in table:
         axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **style.DOTTED)
     axes.set(xlabel=x, ylabel=y)
-    style.log_axes(axes, log)
-    if is_text or not labels.is_unique or len(labels) == 1:
+    style.log_axes(axes, log.replace("x", "") if is_text else log)
+    are_labelled_points = labels.is_unique and len(labels) > 1 and not is_text
+    if not are_labelled_points:
         axes.figure.legend(loc="outside right center")
-        return axes.figure
-    style.label_points(axes, table[x], table[y], looks["color"].to_dict())
-    if STANDING_STILL in table:
-        axes.legend(handles=axes.lines[-1:])
+    else:
+        style.label_points(axes, table[x], table[y], looks["color"].to_dict())
+        if STANDING_STILL in table:
+            axes.legend(handles=axes.lines[-1:])
     return axes.figure
 
 

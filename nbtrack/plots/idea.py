@@ -35,8 +35,8 @@ def plot_idea(
     from each a step of length |d| against the gradient.
     """
     axes = new_axes(title, 3.8)[0, 0]
-    rows, columns = frame.measured_pixels()
-    columns = columns[rows == row]
+    rows, all_columns = frame.measured_pixels()
+    columns = all_columns[rows == row]
     points_camera, _ = frame.points(torch.full_like(columns, row), columns)
     point_camera = points_camera[columns == column][0]
     distance = point_camera.norm().item()
@@ -85,7 +85,7 @@ def _draw_queries(
 ) -> None:
     """Measured points (m) on the page, and from each a step of length |d| against the gradient."""
     points_world = transform_points(pose, points_camera).requires_grad_()
-    sdf = field(points_world)[1]
+    _, sdf = field(points_world)
     (gradient,) = torch.autograd.grad(sdf.sum(), points_world)
     ends_camera = points_camera - sdf.detach()[:, None] * normalize(gradient) @ pose[:3, :3]
     start = (points_camera @ page_camera.T).numpy()

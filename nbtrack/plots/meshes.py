@@ -40,16 +40,17 @@ def extract_mesh(
     layers = []  # one at a time: all points of a large place are gigabytes
     for place in x:
         (layer,) = np.stack(np.meshgrid(place, y, z, indexing="ij"), axis=-1)
-        layers.append(query_field(field, layer)[1])
+        _, layer_values = query_field(field, layer)
+        layers.append(layer_values)
     values = np.stack(layers)
     if not values.min() < field.surface_level < values.max():
-        raise DataError(
-            f"the {field.label} map has no surface: its values lie in [{values.min():.3g}, "
-            f"{values.max():.3g}], all on one side of {field.surface_level:g}; map for longer"
-        )
+        span = f"[{values.min():.3g}, {values.max():.3g}]"
+        found = f"the {field.label} map has no surface: its values lie in {span}"
+        raise DataError(f"{found}, all on one side of {field.surface_level:g}; map for longer")
     vertices, faces, _, _ = marching_cubes(values, field.surface_level, spacing=(voxel,) * 3)
-    colors = (255 * query_field(field, vertices + low)[0]).round().astype(np.uint8)
-    mesh = trimesh.Trimesh(vertices + low, faces, vertex_colors=colors, process=False)
+    colors, _ = query_field(field, vertices + low)
+    rgb = (255 * colors).round().astype(np.uint8)
+    mesh = trimesh.Trimesh(vertices + low, faces, vertex_colors=rgb, process=False)
     if sequence is not None:
         mesh.update_faces(seen_by(mesh.vertices, sequence, frames)[faces].all(axis=1))
         mesh.remove_unreferenced_vertices()

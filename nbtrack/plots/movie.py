@@ -63,8 +63,7 @@ def movie_pictures(
         canvas.draw()
         left.figure.set_layout_engine("none")  # from now on nothing moves in the layout
         progress(index + 1)
-        picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
-        yield picture.quantize(_GIF_COLORS)
+        yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(_GIF_COLORS)
 
 
 @styled

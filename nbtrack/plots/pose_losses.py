@@ -58,8 +58,8 @@ def pose_losses(
         rendered = density.render_hierarchically(rays, vr.n_stratified, vr.n_importance)
         terms = rendered_losses(rendered, rays, vr.lambda_color, vr.lambda_depth, over_std=True)
         of_sdf = sdf_loss(sdf, field_color, color, eq_2.lambda_sdf, eq_2.lambda_color)
-        mean_density = density(points_world)[1].mean()
-        losses.append([of_sdf.item(), sum(terms.values()).item(), mean_density.item()])
+        _, densities = density(points_world)
+        losses.append([of_sdf.item(), sum(terms.values()).item(), densities.mean().item()])
     return pd.DataFrame(losses, pd.Index(_OFFSETS_CM, name="x_cm"), [_SDF_LOSS, _VR_LOSS, _DENSITY])
 
 
@@ -78,7 +78,8 @@ def plot_pose_losses(
     title = f"Turned by {y_deg:g}°: SDF's loss is lowest at {best_cm[_SDF_LOSS]} cm along x, "
     *panels, view = new_axes(f"{title}VR's at {best_cm[_VR_LOSS]} cm", 2.9, 1, 3)[0]
     T_world_camera = move_sideways(frame, x_cm, y_deg).double().numpy()
-    view.imshow(density.render_view(frame.camera, T_world_camera)[0])
+    rendered_color, _ = density.render_view(frame.camera, T_world_camera)
+    view.imshow(rendered_color)
     view.set_title("the view from this pose")
     view.axis("off")
     along = np.array([-5, 0, 5])  # cm, of the tangent
@@ -153,8 +154,9 @@ def _draw_mean_distance(axes: Axes, field: Field, frame: Frame, places_cm: np.nd
     that reach 1 cm beyond the places (n, 3)."""
     x, _, z = np.linspace(places_cm.min(axis=0) - 1, places_cm.max(axis=0) + 1, 21).T
     pixels = frame.measured_pixels()
-    points_camera = frame.points(*pixels[:, :: 1 + pixels.shape[1] // 2000])[0].numpy()
-    moved_camera = points_camera + np.stack(np.meshgrid(x, 0, z), axis=-1)[0][:, :, None] / 100
+    points_camera, _ = frame.points(*pixels[:, :: 1 + pixels.shape[1] // 2000])
+    (offsets_cm,) = np.stack(np.meshgrid(x, 0, z), axis=-1)  # (x, z, 3): there is one y alone
+    moved_camera = points_camera.numpy() + offsets_cm[:, :, None] / 100
     T_true = frame.T_world_camera
     _, sdf = query_field(field, moved_camera @ T_true[:3, :3].T + T_true[:3, 3])
     mean_cm = 100 * np.abs(sdf).mean(axis=-1)

@@ -38,12 +38,12 @@ def plot_slice(
     if it is a synthetic one: its distance stands beside that of a single field. The axes end
     around the path and what the frames have seen, in the room if that is known.
     """
-    fields = [fields] if isinstance(fields, Field) else fields
-    if len(fields) == 1 and room is not None and fields[0].is_distance:
-        fields = [fields[0], _ExactDistance(room, fields[0])]
-    panels = new_axes(title, 5.4 - 0.9 * (len(fields) - 1), 1, len(fields), sharey=True)[0]
+    drawn = [fields] if isinstance(fields, Field) else [*fields]
+    if len(drawn) == 1 and room is not None and drawn[0].is_distance:
+        drawn.append(_ExactDistance(room, drawn[0]))
+    panels = new_axes(title, 5.4 - 0.9 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
     norm = None  # the first field's, for all
-    for axes, field in zip(panels, fields, strict=True):
+    for axes, field in zip(panels, drawn, strict=True):
         up, page = scene.draw_from_above(axes, {"camera path": sequence.T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / _POINTS_ALONG

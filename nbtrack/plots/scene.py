@@ -4,7 +4,7 @@ A room is seen from above, or from outside in a parallel projection. Up is the a
 that the cameras' own up is nearest to: they are mostly held upright.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import cycle
 
 import numpy as np
@@ -25,7 +25,7 @@ _ELEVATION = np.radians(45)  # of the viewer of a mesh
 _AMBIENT = 0.55  # share of the light on a mesh that comes from everywhere
 _DIMMED = 0.72  # how white the unseen becomes
 _CUT = 0.01  # share of a recording's points cut off at either end: wild depths hide the room
-_LINES_M = np.arange(-1.0, 1.01, 0.25)  # distances with a thin line
+_LINES_M = np.arange(-1.0, 1.01, 0.25).tolist()  # distances with a thin line
 
 
 def up_of(*T_paths: Poses) -> np.ndarray:
@@ -114,10 +114,10 @@ def draw_paths(
         # The true path is wide, so that the others do not hide it.
         look = {"linewidth": width * (4.0 if label == "true" else 1.6), "color": color, "zorder": 3}
         axes.plot(x, y, line, label=label, **look)
-    x, y = to_page @ (next(iter(T_paths.values()))[0, :3, 3] + aside)
+    start_x, start_y = to_page @ (next(iter(T_paths.values()))[0, :3, 3] + aside)
     look = {"color": "black", "markersize": 5 * width, "zorder": 4}
     # A legend has four keys at most.
-    axes.plot(x, y, "o", label="start" if len(T_paths) < 4 else "", **look)
+    axes.plot(start_x, start_y, "o", label="start" if len(T_paths) < 4 else "", **look)
 
 
 def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Paths) -> np.ndarray:
@@ -130,7 +130,8 @@ def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Paths) -> np.ndarray:
     inside = (places >= places.quantile(_CUT)) & (places <= places.quantile(1 - _CUT))
     heights = (places @ up)[inside.all(axis=1)].sort_values()  # drawn from the floor up
     highest = max((path[:, :3, 3] @ up).max() for path in T_paths.values())
-    shown = cloud.loc[heights.index[heights <= highest + 0.1]]
+    heights_shown = heights[heights <= highest + 0.1]
+    shown = cloud.loc[heights_shown.index]
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
     axes.scatter(*page @ shown[["x", "y", "z"]].to_numpy().T, c=colors, s=4, linewidths=0)
     return page
@@ -159,9 +160,9 @@ def draw_slice(
         own_norm, colors = Normalize(-limit, limit), "RdBu"
     else:
         own_norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
-    grid = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
+    look = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
     page = np.moveaxis(places, -1, 0)
-    image = axes.pcolormesh(*page, values, cmap=colors, norm=norm or own_norm, **grid)
+    image = axes.pcolormesh(*page, values, cmap=colors, norm=norm or own_norm, **look)
     if norm is None:
         usual = {"ax": axes, "label": field.value_label, "extend": "both"}
         axes.figure.colorbar(image, **(usual | bar))
@@ -172,11 +173,13 @@ def draw_slice(
         pale = image.to_rgba(values)
         pale += _DIMMED * (1 - pale)
         pale[..., 3] = ~seen  # transparent over what was seen
-        axes.pcolormesh(*page, pale, gid="unseen", zorder=2.5, **grid)  # above the map's lines
+        axes.pcolormesh(*page, pale, gid="unseen", zorder=2.5, **look)  # above the map's lines
     return image.norm
 
 
-def draw_levels(axes: Axes, places: np.ndarray, values: np.ndarray, levels, **look: object) -> None:
+def draw_levels(
+    axes: Axes, places: np.ndarray, values: np.ndarray, levels: Sequence[float], **look: object
+) -> None:
     """Lines where values reach levels, if they do: else matplotlib warns."""
     if values.min() < max(levels) and min(levels) < values.max():
         axes.contour(*np.moveaxis(places, -1, 0), values, levels, **look)

@@ -6,6 +6,7 @@ import textwrap
 import warnings
 from collections.abc import Iterable, Iterator
 from itertools import cycle, product
+from typing import Any
 
 import matplotlib.style
 import numpy as np
@@ -84,17 +85,17 @@ class NotebookFigure(Figure):
         return self
 
 
-def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **options) -> np.ndarray:
+def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **more: Any) -> np.ndarray:
     """A grid of axes in a new figure of a height (inches), with its finding as title.
 
-    A dollar sign of the title, as in the name of a recording, begins no formula. Options are those
-    of `Figure.subplots`.
+    A dollar sign of the title, as in the name of a recording, begins no formula. More options are
+    those of `Figure.subplots`.
     """
     figure = NotebookFigure(figsize=(WIDTH, height), layout="compressed")
     if title:
         title = title.encode(errors="replace").decode()  # letters that the system's encoding lacks
         figure.suptitle(textwrap.fill(title, 100).replace("$", r"\$"), x=0.01, ha="left")
-    return figure.subplots(rows, columns, squeeze=False, **options)
+    return figure.subplots(rows, columns, squeeze=False, **more)
 
 
 def method_colors(labels: Iterable[str]) -> dict[str, str]:
