@@ -76,10 +76,10 @@ class CorrectedField(BakedField):
         """Add a correction, tensors by the names in `CORRECTIONS`, to the values at vertices."""
         for name in CORRECTIONS:
             self.register_buffer(name, correction[name])
-        medians = self.residual_medians.double().numpy()
+        medians = self.residual_medians.double().numpy()  # of distance (m) and luma
         scales = np.maximum(_SCALES_PER_MEDIAN * medians, _MIN_SCALES)
         self.accuracy = Accuracy(tuple(scales.tolist()), _INLIER_DISTANCE, float(medians[1]))
-        self.volume[4] = _UNMEASURED
+        self.volume[4] = _UNMEASURED  # the channel of confidence
         self.volume[:, self.numbers.long()] += self.corrections.float().T
 
     @property
@@ -98,7 +98,7 @@ class CorrectedField(BakedField):
         """The field as mapped, sampled and corrected anew."""
         source = {n.removeprefix(_SOURCE): x for n, x in state.items() if n.startswith(_SOURCE)}
         mapped = field_class(made["field"]).from_state(source, made, bounds)
-        field = cls(mapped, float(made["correction"]))
+        field = cls(mapped, voxel=float(made["correction"]))  # m: its cells, as `correct_map` says
         field.add(state)
         return field
 
@@ -134,17 +134,18 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     vertices, weights = interpolation(asked_world, grid)
     numbers, matrix = corrected_vertices(vertices, weights, grid.n_vertices)
     regularisation = regularisation_of(numbers, grid.n_vertices)
-    values = grid.volume[:4].T.double().numpy()[numbers]  # colour and distance, uncorrected
+    uncorrected = grid.volume[:4].T.double().numpy()[numbers]
+    color_before, distance_before = uncorrected[:, :3], uncorrected[:, 3:]
     reliability = (seen.depth.mean() / seen.depth) ** 2
 
-    wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ values[:, 3:]
+    wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ distance_before
     reliabilities = np.tile(reliability, len(_OFFSETS))
     distance, diagonal = solve(matrix, wanted, reliabilities, regularisation, _HUBER, _ROUNDS)
     # The share of measurements, not regularisation, in a vertex's diagonal.
     confidence = (1 - _UNMEASURED) * (1 - regularisation.diagonal() / diagonal)
 
     at_surface = matrix[:n_points]  # the rows of the first offset, which is 0
-    wanted_color = seen.color - at_surface @ values[:, :3]
+    wanted_color = seen.color - at_surface @ color_before
     springs = regularisation * _COLOR_REGULARISATION
     color, _ = solve(at_surface, wanted_color, reliability, springs, _COLOR_HUBER, _COLOR_ROUNDS)
 

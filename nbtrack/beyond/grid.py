@@ -82,7 +82,7 @@ class BakedField(Field):
         return self._at(points_world)[4]
 
     def _at(self, points_world: Points) -> Float[Tensor, "5 points"]:
-        """All channels at points (m)."""
+        """Red, green, blue, value and confidence at points (m)."""
         volume = self.volume.view(5, *self.n_vertices)
         values = trilinear(volume, self.low, self.voxel, points_world)
         # `trilinear` moves NaN to the border, too.

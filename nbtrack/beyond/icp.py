@@ -106,9 +106,8 @@ class IcpTracker(Tracker):
             return float("nan")
         if np.abs(self.T_starts - self.T_starts[0]).max() < _FAR_APART:
             starts = starts[:1]
-        found = max([self._align(T, _WIDE) for T in starts], key=lambda result: result.num_inliers)
-        if found.num_inliers:
-            found = self._align(found.T_target_source, _NARROW)
+        coarse = max([self._align(T, _WIDE) for T in starts], key=lambda result: result.num_inliers)
+        found = self._align(coarse.T_target_source, _NARROW) if coarse.num_inliers else coarse
         if not found.num_inliers or not np.isfinite(found.T_target_source).all():
             return float("nan")
         self.T_world_camera = torch.from_numpy(found.T_target_source.copy())

@@ -90,14 +90,14 @@ class LmTracker(Tracker):
 
     def prepare(self, field: Field) -> BakedField:
         """The map as a grid on the host; ConfigError where it would be too large."""
-        grid = field if isinstance(field, BakedField) else BakedField(field, self.settings.voxel)
-        grid = grid if grid.device.type == "cpu" else deepcopy(grid).cpu()
-        self.grid = grid_of(grid)
+        baked = field if isinstance(field, BakedField) else BakedField(field, self.settings.voxel)
+        on_host = baked if baked.device.type == "cpu" else deepcopy(baked).cpu()
+        self.grid = grid_of(on_host)
         # Loads what numba has compiled, the inner functions before those that call them: sums would
         # else be rounded otherwise in the process that compiles than in later ones.
         any_point = Observed(np.zeros((1, 3)), np.zeros(1), np.empty((0, 3)))
         LmOptimizer(self.grid, any_point, any_point, 1.0, np.eye(4)).certainty()
-        return grid
+        return on_host
 
     def restart_anywhere(self) -> None:
         """Look for the camera near all poses that the map was made from; see `_other_starts`."""
@@ -116,16 +116,16 @@ class LmTracker(Tracker):
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Draw the frame's points; take up the descent from the start that fits them best."""
         starts = T_starts.double().numpy().copy()  # the other ones are the caller's
-        n_expected = len(starts)
         if self.was_lost and self.last_good is not None:
             starts = np.concatenate([starts, self.last_good.numpy()[None]])
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
         R = starts[:, :3, :3]
         starts[:, :3, :3] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
+        expected, last_good = np.split(starts, [len(T_starts)])  # the latter is one pose or none
         # Poses that a right one is near. A lost frame says little of where the next one starts:
         # after it that is the last good one, if there was any.
-        self.trusted = starts[n_expected:] if self.was_lost else starts
-        self.T_start = starts[0]
+        self.trusted = last_good if self.was_lost else expected
+        self.T_start = expected[0]
         self.best = None
         self.remaining_steps = iter(())  # none, if the frame has too few points
         observed = draw_points(frame, self.settings.n_pixels, self.generator)
@@ -142,8 +142,8 @@ class LmTracker(Tracker):
         if np.abs(starts - starts[0]).max() > _FAR_APART:
             for descent in descents:
                 descent.run_stage(_MAX_COARSE_STEPS)
-        self.best = _by_cost(descents)[0]
-        self.remaining_steps = self._steps(frame, starts[-1])
+        self.best, *_ = _by_cost(descents)
+        self.remaining_steps = self._steps(frame, expected[-1])
 
     def step(self) -> float:
         """One step of Levenberg-Marquardt, or one descent elsewhere; returns the cost before it."""
@@ -171,10 +171,11 @@ class LmTracker(Tracker):
         probability = p_lost(said)
         return {**said, "p_lost": probability, "lost": probability >= _LOST}
 
-    def _steps(self, frame: Frame, T_last_start: Pose) -> Iterator[float]:
+    def _steps(self, frame: Frame, T_expected: Pose) -> Iterator[float]:
         """Steps of the best descent, then other descents while its pose is in doubt.
 
-        Yields the cost before each of them; at the last one the search has converged.
+        Yields the cost before each of them, when it is known whether that is the last one: then
+        the search has converged.
         """
         cost = self.best.step()
         for _ in range(_MAX_FOLLOWING - 1):
@@ -184,11 +185,11 @@ class LmTracker(Tracker):
                 self.best.refine()
             yield cost
             cost = self.best.step()
-        self.best.run()  # the rest, if any
+        self.best.run()  # the rest of it, if any, within the last of these steps
         if self.settings.n_restarts and self.report()["p_lost"] >= _DOUBTFUL:
             yield cost
-            others = self._other_starts(frame, T_last_start)
-            while True:
+            others = self._other_starts(frame, T_expected)
+            while True:  # a step is a descent from the next of these
                 cost = self.best.cost(NEAR_SCALES)
                 is_confirmed = self._descend_from(others.pop(0))
                 # A pose that another descent confirms may be doubtful, but not lost.
@@ -210,12 +211,11 @@ class LmTracker(Tracker):
             self.best = other
         return bool(_apart(other.T_world_camera, best_so_far.T_world_camera) < _SAME)
 
-    def _other_starts(self, frame: Frame, T_last_start: Pose) -> list[Pose]:
-        """Where else the camera may be, the likeliest first.
-
-        These are `n_restarts` poses at most, or all if no pose is trusted.
+    def _other_starts(self, frame: Frame, T_expected: Pose) -> list[Pose]:
+        """Where else the camera may be, the likeliest first: around the last good pose or, before
+        there is one, an expected pose. These are `n_restarts` at most, or all if none is trusted.
         """
-        anchor = T_last_start if self.last_good is None else self.last_good.numpy()
+        anchor = T_expected if self.last_good is None else self.last_good.numpy()
         if self.field.viewpoints is None:
             # The anchor, then turned about x, y and z both ways, by ever wider angles.
             angles = [factor * _RESTART_ANGLE for factor in range(1, self.settings.n_restarts)]
@@ -239,8 +239,7 @@ class LmTracker(Tracker):
 
     def _random_poses(self, T_world_camera: Poses) -> Poses:
         """Random poses near known ones, turned about the vertical: the known ones' mean y axis."""
-        seed = torch.randint(2**62, (), generator=self.generator)
-        random = np.random.default_rng(int(seed))
+        random = np.random.default_rng(int(torch.randint(2**62, (), generator=self.generator)))
         poses = T_world_camera[random.integers(len(T_world_camera), size=_RANDOM)]
         down = T_world_camera[:, :3, 1].mean(axis=0)
         turns = random.uniform(0, 2 * np.pi, (_RANDOM, 1)) * down / np.linalg.norm(down)

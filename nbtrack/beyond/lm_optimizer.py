@@ -130,15 +130,15 @@ class LmOptimizer:
         H, _ = lm_solver.normal_equations(self.terms, self.scales, self.problem.lambda_intensity)
         curvatures = np.linalg.eigvalsh(H)
         covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2  # rad, m
-        rotation_std = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-        position_std_m = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
+        rotation_std = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3]).max())
+        position_std_m = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:]).max())
         moved_std_m = std_when_moved(
             self._costs_at, self.T_world_camera, covariance, 1, n_independent=_INDEPENDENT
         )
         return {
             "position_std_m": float(max(position_std_m, moved_std_m)),
             "rotation_std_deg": float(np.rad2deg(rotation_std)),
-            "condition_number": float(curvatures[-1] / max(curvatures[0], 1e-9)),
+            "condition_number": float(curvatures.max() / max(curvatures.min(), 1e-9)),
         }
 
     def _costs_at(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:

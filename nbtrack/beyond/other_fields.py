@@ -45,8 +45,7 @@ class VolSdfField(NeuSField):
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
         """Weights of samples, from the density that belongs to the signed distance."""
         density = density_from_sdf(values, self.inverse_std)
-        lengths = rays.directions_world.norm(dim=-1)
-        return weights_from_density(density, depths, lengths)
+        return weights_from_density(density, depths, rays.directions_world.norm(dim=-1))
 
 
 def density_from_sdf(sdf: RaySamples, inverse_scale: Scalar) -> RaySamples:

@@ -76,7 +76,7 @@ def std_when_moved(
     points, so many points tell no more than `n_independent`. Costs are Geman-McClure's, at scales
     of `MAD_FACTOR` medians.
     """
-    variances, directions = np.linalg.eigh(covariance[3:, 3:])
+    variances, directions = np.linalg.eigh(covariance[3:, 3:])  # the least certain come last
     here = costs_at(T_world_camera)
     growths = []
     for k in range(1, n_directions + 1):

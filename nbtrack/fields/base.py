@@ -92,8 +92,7 @@ class Field(nn.Module, abc.ABC):
     @property
     def device(self) -> torch.device:
         """Where its tensors lie."""
-        tensors = itertools.chain(self.parameters(), self.buffers())
-        return next(tensors, torch.empty(0)).device
+        return next(itertools.chain(self.parameters(), self.buffers()), torch.empty(0)).device
 
 
 class LearnedField(Field):
@@ -209,8 +208,7 @@ class LearnedField(Field):
 
 def rays_end(rays: Rays, bounds: SceneBounds) -> Values:
     """Z-depth (m) at which rays leave the scene, at least a little in front of the camera."""
-    far_bound = bounds.far_bound(rays.origins_world, rays.directions_world)
-    return far_bound.clamp_min(2 * NEAR)
+    return bounds.far_bound(rays.origins_world, rays.directions_world).clamp_min(2 * NEAR)
 
 
 def measured_mean(error: Float[Tensor, "*some"], measured: Float[Tensor, "*some"]) -> Scalar:

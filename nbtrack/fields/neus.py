@@ -77,7 +77,8 @@ class NeuSField(LearnedField):
         n_points = max(1, round(settings.eikonal_share * len(flat)))
         chosen = torch.randint(len(flat), (n_points,), generator=generator, device=flat.device)
         points = flat[chosen].detach().requires_grad_()
-        (gradient,) = torch.autograd.grad(self(points)[1].sum(), points, create_graph=True)
+        _, sdf = self(points)
+        (gradient,) = torch.autograd.grad(sdf.sum(), points, create_graph=True)
         return settings.lambda_eikonal * (gradient.norm(dim=-1) - 1).square().mean()
 
     def diagnostics(self) -> dict[str, float]:

@@ -122,8 +122,7 @@ def _read_file(file: Path) -> Map:
         advice = "import the file of its class first (--import FILE.py)"
         raise ConfigError(f"{file} is a map of field {name!r}, which is not registered: {advice}")
     kind = FORMS[header["form"]] if header["form"] else FIELDS[name]
-    mapped = kind.from_state(tensors, record, bounds)
-    return Map(mapped, Intrinsics(**header["camera"]), record)
+    return Map(kind.from_state(tensors, record, bounds), Intrinsics(**header["camera"]), record)
 
 
 def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
@@ -153,8 +152,7 @@ def _form_of(mapped: Field) -> str:
 
 def _tensors(mapped: Field) -> dict[str, Tensor]:
     """All that was learnt, by name, on the CPU."""
-    state = mapped.state()
-    return {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
+    return {name: part.detach().cpu().contiguous() for name, part in mapped.state().items()}
 
 
 def _digest(plain: Any, tensors: dict[str, Tensor]) -> str:

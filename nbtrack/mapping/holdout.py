@@ -44,12 +44,14 @@ def depth_residual_of(field: Field, frame: Frame) -> float:
     rows, columns = pixels[:, order[:_MISFIT_PIXELS].to(pixels.device)]
     T_world_camera = torch.from_numpy(frame.T_world_camera).float().to(rows.device)
     if not isinstance(field, LearnedField):
-        points_world = transform_points(T_world_camera, frame.points(rows, columns)[0])
-        return float(field(points_world)[1].abs().median())
+        points_camera, _ = frame.points(rows, columns)
+        _, distance = field(transform_points(T_world_camera, points_camera))
+        return float(distance.abs().median())
     directions_world = pixel_directions(frame.camera, columns, rows) @ T_world_camera[:3, :3].T
     origins_world = T_world_camera[:3, 3].expand_as(directions_world)
-    rendered = field.render_rays(origins_world, directions_world)[1]
-    return float((rendered - frame.at(rows, columns)[1]).abs().median())
+    _, rendered_depth = field.render_rays(origins_world, directions_world)
+    _, measured_depth = frame.at(rows, columns)
+    return float((rendered_depth - measured_depth).abs().median())
 
 
 def usual_depth_residual(field: Field, sequence: RgbdSequence, mapped: Frames) -> float:

@@ -43,14 +43,15 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     A shorter path is the beginning of one of these, a longer one turns back at both ends (our
     choice). Raises `NumericalError` as `attempts` does.
     """
-    keys = np.array(room.walk.keys[0 if n_frames <= _SHORT else 1])
+    of_short, of_long = room.walk.keys
+    keys = np.array(of_short if n_frames <= _SHORT else of_long)
     base = _calibrated_path(room, keys)
     least = min(_MIN_STILL, _STILL_SHARE * still_metrics(base)["still_ate_m"])
 
     for rng in attempts(room, seed):
         moved = keys.copy()
         moved[:, :3] += rng.uniform(-1, 1, (len(keys), 3)) * _SHIFTED
-        moved[:, 4] += rng.uniform(-_TURNED, _TURNED, len(keys))
+        moved[:, 4] += rng.uniform(-_TURNED, _TURNED, len(keys))  # yaw
         poses = _calibrated_path(room, moved)
         is_far = still_metrics(poses)["still_ate_m"] > least
         if is_far and is_clear(room, poses) and _is_like_the_dataset(room, poses):
@@ -70,11 +71,11 @@ def _calibrated_path(room: Room, keys: Keys) -> Poses:
     together, until the mean speeds are right."""
     keys = keys.copy()
     spread = [0, 2, 4]  # columns: x, z, yaw
-    unit = np.max(room.parts[0].solid.size) / 2
+    unit = np.max(room.parts[0].solid.size) / 2  # m; of the shell
     for _ in range(4):
         poses = _path(keys)
         if room.sdf(poses[:, :3, 3]).min() > 0:  # only a camera in free space sees something
-            unit = _view(room, poses)[0]
+            unit, _ = _view(room, poses)
         wanted = MEAN_STEP * [1e3 * unit, 1.0]
         move, turn = np.clip(wanted / steps_between(poses).mean(axis=1), 0.5, 2.0)
         middle = keys[:, spread].mean(axis=0)

@@ -87,9 +87,9 @@ def colorful(
     """Many colors, `spread` from a base, side by side along an axis: book spines, tins."""
     phase = 2 * np.pi / period * points[:, axis]
     turns = np.random.default_rng(seed).uniform(0, 2 * np.pi, 3)
-    waves = np.sin(phase[:, None] * np.array([1.0, 0.83, 0.64]) + turns)
+    of_channels = np.sin(phase[:, None] * np.array([1.0, 0.83, 0.64]) + turns)
     # Half of the change is common to all channels: spines differ in brightness, not hue alone.
-    waves = 0.7 * waves + 0.5 * np.sin(1.13 * phase + turns[0])[:, None]
+    waves = 0.7 * of_channels + 0.5 * np.sin(1.13 * phase + turns[0])[:, None]
     return np.clip(np.asarray(base) + spread * waves, 0.05, 1.0)
 
 
@@ -147,8 +147,9 @@ class Light:
     def shade(self, albedo: Points, points: Points, normals: Points, openness: Values) -> Points:
         """RGB in [0, 1] of a matt surface: Lambert's law, wrapped so that its terminator is soft.
 
-        `openness` is 0 in a corner and 1 in the open: it darkens the light from all sides, which
-        stands in for contact shadows. Source: our choice; it only gives shapes a look.
+        `openness` is 0 in a corner and 1 in the open: corners have about half of the light from all
+        sides and a little less of the lamps', which stands in for contact shadows. Source: our
+        choice; it only gives shapes a look.
         """
         energy = (self.ambient + self.sky * (0.5 + 0.5 * normals[:, 1])) * (0.55 + 0.45 * openness)
         for position in self.lamps:

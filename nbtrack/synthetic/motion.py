@@ -97,9 +97,9 @@ def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
         x, z = (center + radius * (1.0 + stretch[:, None]) * (ellipse @ axes)).T
         yaw = heading + turned + glance
         poses = camera_poses(np.stack([x, height, z, pitch, yaw, roll], axis=1) + tremor)
-        faster = np.clip(MEAN_STEP / steps_between(poses).mean(axis=1), 0.7, 1.4)
-        radius *= faster[0]
-        rate *= faster[1]
+        move, turn = np.clip(MEAN_STEP / steps_between(poses).mean(axis=1), 0.7, 1.4)
+        radius *= move
+        rate *= turn
     return poses
 
 
@@ -110,6 +110,7 @@ def _wandering(pitch: float, length: int, rng: np.random.Generator) -> CubicSpli
     knots = np.arange(-2.0, 1.6 * length * np.radians(MEAN_STEP[1]) / _KNOT_SPACING + 4.0)
     spread = np.array([0.04, 0.05, 0.07, 0.09, 0.025, 0.05])
     values = spread * np.clip(rng.normal(size=(len(knots), 6)), -2.0, 2.0)
+    # Columns 3 and 5 are pitch and height.
     values[:, 3] += pitch
     values[:, 5] = np.clip(values[:, 5] + rng.uniform(1.3, 1.5), 1.15, 1.65)
     return CubicSpline(knots * _KNOT_SPACING, values)
@@ -162,7 +163,7 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
 
 def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """Places (x and z, m) of a smooth closed walk by stops, in the middle of what is free."""
-    half_x, _, half_z = room.parts[0].solid.half
+    half_x, _, half_z = room.parts[0].solid.half  # of the shell, in whose middle x and z are 0
     x = np.arange(_CELL - half_x, half_x, _CELL)
     z = np.arange(_CELL - half_z, half_z, _CELL)
     heights = np.linspace(HEIGHTS[0], HEIGHTS[1], 5)

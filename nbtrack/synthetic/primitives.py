@@ -39,12 +39,12 @@ def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Inte
 
 def _round_interval(offsets: Origins, directions: Points, radius: float) -> Interval:
     """Where |offset + t direction| <= radius (none: near = inf, far = -inf)."""
-    a = row_dot(directions, directions)
+    squared = row_dot(directions, directions)
     b = row_dot(offsets, directions)
     c = row_dot(offsets, offsets) - radius**2
     # A ray along the axis of a cylinder never crosses its side: it is inside for ever or never.
-    crosses = a > 1e-24
-    a = np.where(crosses, a, 1.0)
+    crosses = squared > 1e-24
+    a = np.where(crosses, squared, 1.0)
     discriminant = b * b - a * c
     met = np.where(crosses, discriminant > 0.0, c < 0.0)
     half_width = np.where(crosses, np.sqrt(np.maximum(discriminant, 0.0)) / a, np.inf)

@@ -87,8 +87,7 @@ class AdamTracker(Tracker):
     def _allocate(self, frame: Frame) -> None:
         """Make room for all that a step reads and changes, for frames of one size."""
         self.frame = replace(frame, color=frame.color.clone(), depth_mm=frame.depth_mm.clone())
-        n_pixels = self.settings.n_pixels
-        self.pixels = torch.empty(2, n_pixels, dtype=torch.int64, device=self.device)
+        self.pixels = torch.empty(2, self.settings.n_pixels, dtype=torch.int64, device=self.device)
         self.position = torch.zeros(3, device=self.device, requires_grad=True)
         self.q_wxyz = torch.zeros(4, device=self.device, requires_grad=True)
         position_rate = self.settings.position_rate_m(self.field.bounds.metres_per_unit)
@@ -123,8 +122,7 @@ class AdamTracker(Tracker):
     @property
     def T_world_camera(self) -> Transform:
         """The present estimate; gradients flow to position and quaternion."""
-        rotation = geometry.quaternion_to_matrix(self.q_wxyz)
-        return geometry.make_transform(rotation, self.position)
+        return geometry.make_transform(geometry.quaternion_to_matrix(self.q_wxyz), self.position)
 
 
 @dataclass(frozen=True)

@@ -196,7 +196,7 @@ class Tracker(abc.ABC):
         if not self._is_warm and frame.has_depth:
             self._warm_up(frame, T_starts)
         began = time.perf_counter()
-        allowed = budget.frame(self.device)
+        allowed = budget.frame(self.device)  # a clock runs from here
         self.begin(frame.to(self.device), torch.from_numpy(T_starts))
         steps = 0
         loss = float("nan")
@@ -206,7 +206,7 @@ class Tracker(abc.ABC):
             if self.is_converged:
                 break
         synchronize(self.device)
-        allowed.close()
+        allowed.close()  # which counts the last step, also where the search ended by itself
         seconds = time.perf_counter() - began
         pose = self.T_world_camera.detach().cpu().double().numpy().copy()
         if not np.isfinite(pose).all():

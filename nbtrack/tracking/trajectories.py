@@ -82,10 +82,9 @@ def _check_trackable(sequence: RgbdSequence) -> None:
     if len(sequence) < 2:
         raise DataError(f"{sequence!r} is too short to track: give at least two frames")
     if not sequence.depths_mm.any():
-        advice = (
-            "check the depth folder and its unit (uint16 millimetres), or choose other --frames"
-        )
-        raise DataError(f"no frame of {sequence.name} has a measured depth: {advice}")
+        found = f"no frame of {sequence.name} has a measured depth"
+        advice = "check the depth folder and its unit (uint16 millimetres), or choose other"
+        raise DataError(f"{found}: {advice} --frames")
 
 
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
