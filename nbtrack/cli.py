@@ -187,6 +187,5 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     if unknown:
         given = unknown[0].partition("=")[0]
         known = [name for name in options.parser._option_string_actions if name.startswith("--")]
-        advice = nearest_name(given, known)
-        options.parser.error(f"unknown argument {unknown[0]!r}: {advice}")
+        options.parser.error(f"unknown argument {unknown[0]!r}: {nearest_name(given, known)}")
     return options

@@ -159,8 +159,7 @@ class Cell:
 
     def css(self) -> str:
         """Its style."""
-        color = "color: red;" if self.is_lost else ""
-        return color + (_BOLD if self.is_best else "")
+        return ("color: red;" if self.is_lost else "") + (_BOLD if self.is_best else "")
 
     def html(self) -> str:
         """Its text."""
@@ -192,8 +191,7 @@ def style_table_1(
     rivals = shown.groupby(level="rate_hz")
     is_best = (shown == rivals.transform("min")) & (rivals.transform("count") > 1)
     stds = _texts(scale * table_1(results, "ate_std_m"), form)
-    texts = _texts(shown, form, _MISSING)
-    styler = _styled(texts, stds, is_best, shown > scale * LOST_THRESHOLD_M)
+    styler = _styled(_texts(shown, form, _MISSING), stds, is_best, shown > scale * LOST_THRESHOLD_M)
     styler.unit = unit
     styler.format_index("{:g} Hz", level="rate_hz")
     styler.format_index(escape="html", level="method").format_index(escape="html", axis="columns")

@@ -48,8 +48,7 @@ def tables_command(options: Namespace) -> None:
     methods = find_methods(options.method.split(",") if options.method else usual)
     # What is wrong is told before a room is made.
     execution = Execution(options.workers, options.dask, keep_going=True)
-    labels = dict(map(_label_of, preset.scenes.labels))
-    wording = Wording(options.caption, options.label, labels)
+    wording = Wording(options.caption, options.label, dict(map(_label_of, preset.scenes.labels)))
     prepare(options.out)
     results = _fill_tables(options, preset, methods, execution, wording)
     failed = results[results["failure"] != ""]

@@ -83,9 +83,8 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
 def track_command(options: Namespace) -> None:
     """Track a sequence in its map, made first where none fits, or in a given one."""
     given = read_map(options.map_from) if options.map_from else None
-    field = options.field
-    if given and not (field or options.method):
-        field = given.field.name
+    is_named = options.field or options.method
+    field = given.field.name if given and not is_named else options.field
     method = method_of(options.method, field, options.tracker)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     if given:
@@ -141,14 +140,14 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
 
 def _check_fits(given: Map, field: str, options: Namespace) -> None:
     """Raises ConfigError where a given map is of another field or other settings than asked for."""
-    made = given.field.name
+    made, record = given.field.name, given.record
     if options.map_frames:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
     if field != made:
         advice = "leave --method and --field out"
         raise ConfigError(f"{options.map_from} is a map of field {made!r}, not {field!r}: {advice}")
-    correction = given.record.get("correction", 0.0)
-    known = flat(setting_tree(made, given.record["network"], given.record["settings"], correction))
+    voxel = record.get("correction", 0.0)  # m
+    known = flat(setting_tree(made, record["network"], record["settings"], voxel))
     for text in options.settings:
         asked = read_setting(text)
         # Keys that no map has, as those of a tracker, are no contradiction.
@@ -252,15 +251,14 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
     else:
         with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
             frames, poses = tracked.frames.iloc[shown], seen.T_world_camera
-            pictures = movie_pictures(surface, seen, frames, poses, title, bar.move_to)
-            content = movie_bytes(pictures)
+            content = movie_bytes(movie_pictures(surface, seen, frames, poses, title, bar.move_to))
     return content, f"{len(shown)} of {n_frames} frames, {len(content) / 1e6:.1f} MB"
 
 
 def _export_trajectory(source: Path, format_name: str) -> tuple[str, str]:
     """The tracked poses of a run in KITTI's format."""
     n_poses = len(read_trajectory(source).frames)  # raises for what is no run
-    T_world_camera = read_tum(source / "trajectory.txt")[1]
+    _, T_world_camera = read_tum(source / "trajectory.txt")  # m, in the recording's world
     what = "KITTI: three rows of the matrix (m), no time stamps"
     given = "the first frame's, which was given, is not among them"
     return number_lines(T_world_camera[:, :3].reshape(-1, 12)), f"{n_poses} poses, {what}; {given}"

@@ -129,29 +129,37 @@ def _outcomes(jobs: Mapping[Path, Job], show: Callable, execution: Execution) ->
     """What becomes of each job, as they end; each begins when the one that it needs has ended."""
     usual = usable_cores() if choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, len(jobs))
+    if execution.dask is not None or workers > 1:
+        limit = len(jobs) if execution.dask else workers
+        with _submitting(execution.dask, workers) as submit:
+            yield from _elsewhere(jobs, submit, limit, show)
+        return
+    results: dict[Path, Any] = {}
+    for folder, job in jobs.items():
+        needed = results.get(job.needs.folder) if job.needs else None
+        results[folder] = job.outcome(needed, partial(show, job))
+        yield folder, results[folder]
+
+
+def _elsewhere(jobs: Mapping[Path, Job], submit: Callable, limit: int, show: Callable) -> Iterator:
+    """As `_outcomes`, of jobs that `submit` begins elsewhere; so many run at a time at most."""
     needs = {folder: job.needs.folder if job.needs else None for folder, job in jobs.items()}
     results: dict[Path, Any] = {}
-    if workers <= 1 and execution.dask is None:
-        for folder, job in jobs.items():
-            results[folder] = job.outcome(results.get(needs[folder]), partial(show, job))
-            yield folder, results[folder]
-        return
     waiting = list(jobs)
     running: dict[Future, Path] = {}
-    with _submitting(execution.dask, workers) as submit:
-        while waiting or running:
-            # Those that need nothing, what is cached already, or what has ended.
-            for folder in [f for f in waiting if needs[f] in results or needs[f] not in jobs]:
-                if execution.dask or len(running) < workers:
-                    running[submit(jobs[folder], results.get(needs[folder]))] = folder
-                    waiting.remove(folder)
-            names = " or ".join(folder.name for folder in running.values())
-            show(jobs[next(iter(running.values()))])  # that runs for the longest
-            ended, _ = wait(running, _LOOK_SECONDS, FIRST_COMPLETED)
-            for future in ended:
-                folder = running.pop(future)
-                results[folder] = _result_of(future, names)
-                yield folder, results[folder]
+    while waiting or running:
+        # Those that need nothing, what is cached already, or what has ended.
+        ready = [f for f in waiting if needs[f] in results or needs[f] not in jobs]
+        for folder in ready[: limit - len(running)]:
+            running[submit(jobs[folder], results.get(needs[folder]))] = folder
+            waiting.remove(folder)
+        names = " or ".join(folder.name for folder in running.values())
+        show(jobs[next(iter(running.values()))])  # that runs for the longest
+        ended, _ = wait(running, _LOOK_SECONDS, FIRST_COMPLETED)
+        for future in ended:
+            folder = running.pop(future)
+            results[folder] = _result_of(future, names)
+            yield folder, results[folder]
 
 
 def _result_of(future: Future, names: str) -> Any:

@@ -29,14 +29,14 @@ PLAIN_PRESET = "synthetic"
 _FRAMES_LOOKED_AT = 20  # that tell a map's unit before there is a map
 
 
-def setting_tree(field: str, network: Any, settings: Any, correction: float) -> dict[str, Any]:
-    """The settings of a map where a preset has them."""
+def setting_tree(field: str, network: Any, settings: Any, voxel: float) -> dict[str, Any]:
+    """The settings of a map, corrected in cells of `voxel` (m; 0: not), where a preset has them."""
     plain = PRESETS[PLAIN_PRESET].settings
     of_network = field if field in plain["network"] else "neus"  # whose network the field has
     return {
         "network": {of_network: network} if network else {},
         "mapping": {field: settings},
-        "correction": {field: correction} if field in plain["correction"] else {},
+        "correction": {field: voxel} if field in plain["correction"] else {},
     }
 
 
@@ -50,9 +50,9 @@ class MapJob(Job):
     settings: Any  # of the mapping
     frames: str = ":"
     seed: int = 0
-    correction: float = 0.0  # cells (m) in which the fitted map is corrected; 0: it is not
-    # Cells (m) in which the job that needs this map will correct it.
-    is_corrected_in: float = field(default=0.0, compare=False)
+    correction_voxel: float = 0.0  # m, of the cells in which the map is corrected; 0: it is not
+    # m, of the cells in which the job that needs this map will correct it.
+    later_voxel: float = field(default=0.0, compare=False)
 
     kind, doing = "maps", "mapping"
     work = 4.0  # by the queries of a field with `smoke`
@@ -61,30 +61,29 @@ class MapJob(Job):
     def of(cls, scene: Scene, field: str, preset: Preset, frames: str = ":", seed: int = 0) -> Self:
         """The map of a scene with the settings of a preset."""
         network, settings = preset.network_of(field), preset.mapping_of(field)
-        correction = preset.correction.get(field, 0.0)
-        return cls(scene, field, network, settings, frames, seed, correction)
+        return cls(scene, field, network, settings, frames, seed, preset.correction.get(field, 0.0))
 
     @cached_property
     def key(self) -> str:
         """A digest of code, device, data, settings and seed."""
         code = provenance.code_fingerprint(field_class(self.field))
         parts = [code, provenance.versions(), choose_device().type]
-        parts += [self.field, self.network, self.settings, self.correction]
+        parts += [self.field, self.network, self.settings, self.correction_voxel]
         parts += [self.scene.fingerprint, self.frames, self.seed]
         return fingerprint(*parts)
 
     @property
     def name(self) -> str:
         """Scene and field, and the seed if it is not the first."""
-        name = f"{self.scene.name}-{self.field}{'-corrected' if self.correction else ''}"
+        name = f"{self.scene.name}-{self.field}{'-corrected' if self.correction_voxel else ''}"
         return f"{name}-seed{self.seed}" if self.seed else name
 
     @cached_property
     def needs(self) -> "MapJob | None":
         """The map that this one corrects, if it is a corrected one."""
-        if not self.correction:
+        if not self.correction_voxel:
             return None
-        return replace(self, correction=0.0, is_corrected_in=self.correction)
+        return replace(self, correction_voxel=0.0, later_voxel=self.correction_voxel)
 
     @property
     def is_done(self) -> bool:
@@ -119,11 +118,11 @@ class MapJob(Job):
             report(share, " ".join(f"{name} {loss:.3f}" for name, loss in losses.items()))
 
         sequence = self.scene.read(self.frames)
-        if self.is_corrected_in:  # what would fail after minutes of mapping is told now
+        if self.later_voxel:  # what would fail after minutes of mapping is told now
             setting = f"correction.{self.field}"
-            checked_size(observed_bounds(sequence), self.is_corrected_in, setting)
+            checked_size(observed_bounds(sequence), self.later_voxel, setting)
         if self.needs:
-            finished = correct_map(self.needs.map(), sequence, self.correction)
+            finished = correct_map(self.needs.map(), sequence, self.correction_voxel)
         else:
             finished = map_sequence(
                 self.field, sequence, self.network, self.settings, self.seed, choose_device(),
@@ -133,7 +132,7 @@ class MapJob(Job):
             "quality": score_map(finished, sequence, self.scene.room),
             "frames": self.frames,
             "key": self.key,
-            "correction": self.correction,
+            "correction": self.correction_voxel,
             "versions": provenance.versions(),
         }
         finished = replace(finished, record=finished.record | record)
@@ -163,8 +162,8 @@ class GivenMap:
         return self.finished.field.name
 
     @property
-    def correction(self) -> float:
-        """Cells (m) in which it was corrected; 0: it was not."""
+    def correction_voxel(self) -> float:
+        """Edge (m) of the cells in which it was corrected; 0: it was not."""
         return self.finished.record.get("correction", 0.0)
 
     @property

@@ -71,7 +71,8 @@ def _exact_depths(rays: Rays, room: Room) -> Values:
     """The z-depth (m) at which each ray meets the room's surface."""
     origins_world = rays.origins_world.cpu().double().numpy()
     directions_world = rays.directions_world.cpu().double().numpy()
-    return torch.from_numpy(room.first_hit(origins_world, directions_world)[0]).to(rays.depth)
+    depth, _ = room.first_hit(origins_world, directions_world)
+    return torch.from_numpy(depth).to(rays.depth)
 
 
 def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room) -> Scores:
@@ -85,7 +86,8 @@ def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room)
     depths = torch.where(is_in_front, rays.depth * offsets, around)
     points_world = rays.points(depths[:, None])[rays.depth > 0, 0].double().numpy()
     true_sdf = room.sdf(points_world)
-    error = np.abs(query_field(field, points_world)[1] - true_sdf)
+    _, sdf = query_field(field, points_world)
+    error = np.abs(sdf - true_sdf)
     is_near = np.abs(true_sdf) < NEAR
     is_free = ~is_near & (true_sdf > 0)
     return {"sdf_near_m": float(error[is_near].mean()), "sdf_free_m": float(error[is_free].mean())}

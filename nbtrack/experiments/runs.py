@@ -106,5 +106,4 @@ def shares(results: pd.DataFrame, by: list[str], value: str) -> pd.DataFrame:
     middle = (true + z**2 / 2) / (size + z**2)
     half = z / (size + z**2) * np.sqrt(true * (size - true) / size + z**2 / 4)
     columns = {value: true / size, "from": middle - half, "to": middle + half}
-    table = 100 * pd.DataFrame(columns).clip(0, 1)
-    return table.assign(true=true, size=size).reset_index()
+    return (100 * pd.DataFrame(columns).clip(0, 1)).assign(true=true, size=size).reset_index()

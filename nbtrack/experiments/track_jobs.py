@@ -109,7 +109,7 @@ class TrackJob(Job):
         is_known = self.start == "given" and np.isfinite(self._true_path()[0]).all()
         expected_poses(self.settings.motion_model, [np.eye(4)])  # raises for an unknown model
         if not is_known:
-            tracker_class(self.tracker).check_finds(in_corrected=self.needs.correction > 0)
+            tracker_class(self.tracker).check_finds(in_corrected=self.needs.correction_voxel > 0)
 
     def expected_reach(self) -> dict[str, float]:
         """What `reach_metrics` will say of it; nothing where its steps are not known before."""
@@ -243,7 +243,8 @@ class TrackJob(Job):
             options["map-from"] = made.folder
         else:
             options |= {"field": made.field, "map-frames": made.frames}
-            settings |= setting_tree(made.field, made.network, made.settings, made.correction)
+            voxel = made.correction_voxel
+            settings |= setting_tree(made.field, made.network, made.settings, voxel)
             if self.scene.made:
                 sequence = self.scene.name
                 settings["scenes"] = {name: getattr(self.scene.made, name) for name in SIZES}
