@@ -19,10 +19,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from motions import HAND_HELD, SPEEDS
-from scipy.stats import binomtest, bootstrap
+from nine_rooms import SDF, VR, verdicts
 
 from nbtrack import METHODS, Method, load_preset, map_scene, open_scenes, track_scenes
 from nbtrack.core.device import choose_device, device_name
@@ -35,10 +34,9 @@ from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.tables import write_csv, write_table_1
-from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
-VR, SDF = METHODS["vr"], METHODS["sdf"]
 IN_GRIDS = "vr_grid", "sdf_grid"
+_BY_CLOCK = {"rates_hz": [10], "clock": True}
 KEPT = [
     "rate_hz", "method", "scene", "frames", "steps_per_frame", "path_m", "still_ate_m", "ate_m",
     "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "lost_frames", "metres_per_unit",
@@ -68,6 +66,11 @@ class Case:
     methods: Sequence[str | Method] | None = None  # by default the experiment's
     tracked: tuple[str, ...] = ()  # settings of the scenes that are tracked, and not mapped
     exact_depth: tuple[str, ...] = ()  # "mapped" and "tracked" scenes that have it
+
+    def in_role(self, role: str, scenes: list[Scene]) -> list[Scene]:
+        """Scenes that are "mapped" or "tracked", with exact depth where they have it."""
+        is_exact = role in self.exact_depth
+        return [OtherDepth(scene.name, scene.folder) if is_exact else scene for scene in scenes]
 
 
 @dataclass(frozen=True)
@@ -174,9 +177,7 @@ GRIDS = {
     "more_steps": Grid(THREE, [Case({"steps": n}, how={"steps": n}) for n in (128, 32, 8)]),
     # In grids of features, with the paper's steps; and in 1/10 s a frame.
     "cheap_queries": Grid(THREE, methods=IN_GRIDS),
-    "by_the_clock": Grid(
-        THREE, methods=(*TABLE_1, *IN_GRIDS), how={"rates_hz": [10], "clock": True}
-    ),
+    "by_the_clock": Grid(THREE, methods=(*TABLE_1, *IN_GRIDS), how=_BY_CLOCK),
     # Equal steps on the whole path, hand-held; every frame and every fourth.
     "steps": Grid(
         HELD,
@@ -201,10 +202,8 @@ GRIDS = {
 def main(experiment: str, seeds: int) -> None:
     """Make the rows that are missing, and what is made of all."""
     grid = GRIDS[experiment]
-    file = (
-        f"{experiment}/table_1_cells.csv" if grid.has_table else f"{grid.folder}/{experiment}.csv"
-    )
-    path = tables_folder() / file
+    name = f"{experiment}/table_1_cells" if grid.has_table else f"{grid.folder}/{experiment}"
+    path = tables_folder() / f"{name}.csv"
     add_rows(path, (chunk for seed in range(seeds) for chunk in chunks_of(grid, seed)))
     rows = pd.read_csv(path)  # as anybody has them, rounded
     if experiment == "nine_rooms":
@@ -245,11 +244,8 @@ def chunks_of(grid: Grid, seed: int) -> Iterator[Chunk]:
         how = {"seeds": [seed], **grid.how, **case.how}
         if grid.workers:  # all at once; below they are read
             track(scenes, methods, preset, grid.workers, **how)
-        for mapped, seen in zip(scenes, tracked, strict=True):
-            mapped, seen = (
-                OtherDepth(scene.name, scene.folder) if role in case.exact_depth else scene
-                for role, scene in (("mapped", mapped), ("tracked", seen))
-            )
+        pairs = zip(case.in_role("mapped", scenes), case.in_role("tracked", tracked), strict=True)
+        for mapped, seen in pairs:
 
             def make(mapped=mapped, seen=seen, methods=methods, preset=preset, how=how):
                 rows = track([mapped], methods, preset, tracked=[seen], **how)
@@ -277,33 +273,6 @@ def with_maps(rows: pd.DataFrame, scene: Scene, preset: Preset, seed: int) -> pd
         for score, value in made["quality"].items():
             rows.loc[own, score] = value
     return rows
-
-
-def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
-    """Reach, accuracy and sequences lost: a row a path and rate, intervals of 95 %.
-
-    VR's error over SDF's is paired by room and seed; a room counts once, with the mean of its
-    seeds' logarithms, and rooms are drawn anew (bootstrap). Shares of sequences lost (ATE above
-    0.2 m) have Wilson's interval, as if the seeds of a room were independent.
-    """
-    judged = []
-    for (path, rate_hz), cells in rows.groupby(["path", "rate_hz"]):
-        ate_m = cells.pivot(index=["scene", "seed"], columns="method", values="ate_m")
-        ratio = np.log(ate_m[VR.label] / ate_m[SDF.label]).groupby("scene").mean()
-        span = bootstrap((ratio,), np.mean, rng=0).confidence_interval
-        mean, low, high = np.exp([ratio.mean(), *span])
-        row = {"path": path, "rate_hz": rate_hz, "rooms": len(ratio), "sequences": len(ate_m)}
-        row |= {"vr_over_sdf": mean, "from": low, "to": high, "vr_ahead": (ratio < 0).sum()}
-        for method in (VR, SDF):
-            own = cells[cells["method"] == method.label]
-            motion_m = own["path_m"] / own["frames"]
-            row[f"{method.tracker}_reach_over_motion"] = (own["reach_m"] / motion_m).mean()
-            lost = binomtest(int((ate_m[method.label] > LOST_THRESHOLD_M).sum()), len(ate_m))
-            low, high = lost.proportion_ci(method="wilson")
-            name = f"{method.tracker}_lost"
-            row |= {name: lost.k, f"{name}_from": low, f"{name}_to": high}
-        judged.append(row)
-    return pd.DataFrame(judged)
 
 
 if __name__ == "__main__":
