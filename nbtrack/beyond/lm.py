@@ -102,7 +102,7 @@ class LmTracker(Tracker):
     def restart_anywhere(self) -> None:
         """Look for the camera near all poses that the map was made from; see `_other_starts`."""
         self.check_finds(in_corrected=self.field.viewpoints is not None)
-        self.restart(self.field.viewpoints.T_world_camera[0])
+        self.restart(self.field.viewpoints.T_world_camera[0])  # as good as any: it is not trusted
         self.was_lost = True
 
     def track(self, frame: Frame, budget: Budget | None = None) -> Estimate:

@@ -45,7 +45,7 @@ class LmOptimizer:
         self.T_world_camera = T_start
         self.last_step = np.inf  # rad or m, whichever is more
         self.fine_problem = Problem(fine, grid, FINE, lambda_intensity, T_start)
-        self._begin_stage(Problem(coarse, grid, COARSE, 0.0, T_start))
+        self._begin_stage(Problem(coarse, grid, COARSE, lambda_intensity=0.0, T_start=T_start))
         self._start_cost = self.cost(NEAR_SCALES)
 
     def step(self) -> float:

@@ -136,7 +136,7 @@ class FramePairs:
         at = self._on_images(columns, rows)[:, None]  # (pairs, 1, points, 2)
         blended = 1 / grid_sample(self.inverse_values, at, "bilinear", align_corners=True)[:, 0, 0]
         nearest = 1 / grid_sample(self.inverse_values, at, "nearest", align_corners=True)[:, 0, 0]
-        measured = reading.points(columns, rows, blended / longer_b)[..., 2]
+        _, _, measured = reading.points(columns, rows, blended / longer_b).unbind(-1)  # z-depth
         residual = depth - measured
         is_valid = (self.values > 0) & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
         is_valid &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
@@ -182,7 +182,7 @@ class FramePairs:
         # Places of the points in all first frames, then in all second ones.
         in_first = self._on_images(self.columns, self.rows).expand_as(compared.seen_at[:, 0])
         at = torch.cat([in_first[:, None], compared.seen_at])
-        at[..., 0] += 2 * reading.color_right
+        at[..., 0] += 2 * reading.color_right  # an image is 2 wide, from -1 to 1
         if reading.is_mirrored:
             at[..., 0] *= -1
         places = (self.places + reading.color_shift).clip(0, len(self.colors) - 1)

@@ -71,8 +71,8 @@ def fingerprint(*parts: Any) -> str:
 
     Numbers count by their value: 30 is 30.0.
     """
-    plain = json.dumps([as_dict(p) if dataclasses.is_dataclass(p) else p for p in parts])
-    plain = json.dumps(json.loads(plain, parse_int=float), sort_keys=True)
+    as_given = json.dumps([as_dict(p) if dataclasses.is_dataclass(p) else p for p in parts])
+    plain = json.dumps(json.loads(as_given, parse_int=float), sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()[:12]
 
 

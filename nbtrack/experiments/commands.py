@@ -49,7 +49,7 @@ def methods_command(options: Namespace) -> None:
 
 def map_command(options: Namespace) -> None:
     """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
-    method = method_of(options.method, options.field, None)
+    method = method_of(options.method, options.field, tracker=None)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     scene = _opened(options, preset)
     scene.count(options.frames)  # raises for a wrong slice, before anything is written

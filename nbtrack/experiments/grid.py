@@ -77,8 +77,8 @@ def track_scenes(
         settings = own.tracking_of(method.tracker)
         n_steps = steps if steps or clock else method.paper_steps(rate_hz)  # None by the clock
         made = MapJob.of(scene, method.field, own, seed=seed)
-        by_clock = rate_hz if clock else None
-        job = TrackJob(made, seen, method.tracker, settings, n_steps, by_clock, frames, seed)
+        clock_rate_hz = rate_hz if clock else None
+        job = TrackJob(made, seen, method.tracker, settings, n_steps, clock_rate_hz, frames, seed)
         jobs.append(job)
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
         rows.append(row | {"seed": seed, "run": job.folder.name, "n_pixels": settings.n_pixels})

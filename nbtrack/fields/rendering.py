@@ -36,8 +36,8 @@ def weights_from_density(
     Source: Sucar et al. 2021 (iMAP), Sec. 3.2. The last sample has no successor; it gets the
     section length of the one before it (our choice: a wall stays opaque, and free space free).
     """
-    sections = depths.diff(dim=-1)
-    sections = torch.cat([sections, sections[:, -1:]], dim=-1) * ray_lengths[:, None]
+    z_steps = depths.diff(dim=-1)
+    sections = torch.cat([z_steps, z_steps[:, -1:]], dim=-1) * ray_lengths[:, None]
     optical_depth = density * sections
     opacity = -torch.expm1(-optical_depth)
     # Transmittance in front of a sample: everything that lies before it, itself left out.

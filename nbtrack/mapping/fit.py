@@ -71,7 +71,7 @@ def map_sequence(
     kind = field_class(field_name)
     if issubclass(kind, LearnedField):
         with advise_on_memory(f"mapping.{field_name}.n_rays={settings.n_rays}"):
-            with suitable_threads(0):
+            with suitable_threads(width=0):
                 field = make_field(field_name, network, bounds, seed).to(device)
             with suitable_threads(field.width), matrix_products(settings.tf32):
                 fit = _Fit(recipe | {"code": code}, settings, field, sequence, mapped)

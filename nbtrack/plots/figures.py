@@ -95,8 +95,8 @@ def plot_images(rows: list[list[Panel]], title: str = "", far: float | None = No
     figure = grid[0, 0].figure
     for label, images in with_bar.items():
         limit = _most(np.ma.stack([image.get_array() for image in images])) if far is None else far
-        for image in images:
-            image.set_clim(0, limit)
+        for drawn in images:
+            drawn.set_clim(0, limit)
         figure.colorbar(images[0], ax=[image.axes for image in images], label=label, **_BAR)
     return figure
 

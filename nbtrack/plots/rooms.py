@@ -141,7 +141,8 @@ def plot_map_and_slice(
     axes, enlarged = new_axes(title, 4.6, 1, 2, width_ratios=[5, 1])[0]
     to_screen = scene.draw_mesh(axes, mesh, up)
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
-    # From the room to where the slice is drawn; it is above the middle of the room's height.
+    # From the room to where the slice is drawn: to the picture's right, the first row, and down
+    # from the cameras' height to the middle of the room's.
     aside = (1.04 * np.ptp(mesh.vertices @ to_screen[0]) + voxel) * to_screen[0]
     aside -= (height - (mesh.vertices @ up).mean()) * up
     page = np.eye(3)[up == 0]

@@ -72,7 +72,8 @@ def draw_mesh(axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
     corners = (mesh.vertices @ to_screen.T)[faces]
     # Smoothed normals: those of single marching-cubes faces flicker.
     normals = side * mesh.vertex_normals[faces].mean(axis=1)
-    light = to_screen[2] + 0.5 * to_screen[0] + 0.6 * up
+    right, _, viewer = to_screen
+    light = viewer + 0.5 * right + 0.6 * up
     shade = _AMBIENT + (1 - _AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)
     colors = mesh.visual.vertex_colors[faces, :3].mean(axis=1) / 255 * shade[:, None]
     order = corners[..., 2].mean(axis=1).argsort()  # from the farthest to the nearest
@@ -130,7 +131,7 @@ def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Paths) -> np.ndarray:
     inside = (places >= places.quantile(_CUT)) & (places <= places.quantile(1 - _CUT))
     heights = (places @ up)[inside.all(axis=1)].sort_values()  # drawn from the floor up
     highest = max((path[:, :3, 3] @ up).max() for path in T_paths.values())
-    heights_shown = heights[heights <= highest + 0.1]
+    heights_shown = heights[heights <= highest + 0.1]  # m
     shown = cloud.loc[heights_shown.index]
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
     axes.scatter(*page @ shown[["x", "y", "z"]].to_numpy().T, c=colors, s=4, linewidths=0)

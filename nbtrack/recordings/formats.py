@@ -125,8 +125,9 @@ def files_of(folder: Path, pattern: str) -> list[Path]:
 
 
 _VGA = (640, 480)
-# The benchmark's own calibrations of its three cameras. Their lenses are not corrected: its page on
-# the Kinect's calibration says that the driver has done so, and laid depth on colour by the pixel.
+# The benchmark's own calibrations of its three cameras, their principal points moved by half a
+# pixel, since pixel centres lie at integer + 0.5. Their lenses are not corrected: its page on the
+# Kinect's calibration says that the driver has done so, and laid depth on colour by the pixel.
 _TUM_CAMERAS = (
     Calibration(Path("freiburg1"), 517.3, 516.5, (319.1, 255.8), _VGA),
     Calibration(Path("freiburg2"), 520.9, 521.0, (325.6, 250.2), _VGA),

@@ -177,7 +177,7 @@ class Moments:
         """
         has_both = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(stamps)
         known_poses, known_stamps = poses[has_both], stamps[has_both]
-        same_time = nearest(self.times, known_stamps, 0.0)
+        same_time = nearest(self.times, known_stamps, tolerance=0.0)
         if len(known_stamps) > 0 and (same_time >= 0).sum() == len(known_stamps):
             return _at(known_poses, same_time), ""
         if self.own is not None and (nearest(self.times, known_stamps, _TOLERANCE) >= 0).any():

@@ -215,7 +215,7 @@ def _in_millimetres(
     """Millimetres along the optical axis."""
     depth_mm = depth * (1000 / declared.depth_scale)
     if declared.depth_along == "ray":
-        y, x = np.indices(depth.shape) + 0.5
+        y, x = np.indices(depth.shape) + 0.5  # pixel centres
         squares = ((x - camera.cx) / camera.fx) ** 2 + ((y - camera.cy) / camera.fy) ** 2
         depth_mm /= np.sqrt(1 + squares)
     if depth_mm.max() > _MAX_16_BITS:

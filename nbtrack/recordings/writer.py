@@ -53,7 +53,7 @@ def write_sequence(
             images["images/img"] = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
             for prefix, image in images.items():
                 # The fastest compression: rooms are made often and read from a local disk.
-                content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+                _, content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
                 write_atomic(unfinished / f"{prefix}{len(poses)}.png", content.tobytes())
             poses.append(T_world_camera)
             progress(len(poses))

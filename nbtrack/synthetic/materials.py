@@ -51,8 +51,8 @@ def plain(
     points: Points, color: Color, variation: float = 0.08, wavelength: float = 0.45, seed: int = 0
 ) -> Points:
     """One color with a faint, relative, cloudy variation, as of paint, cloth or plaster."""
-    noise = _smooth_noise(points, wavelength, seed)
-    return np.asarray(color) * (1.0 + variation * noise)[:, None]
+    brightness = 1.0 + variation * _smooth_noise(points, wavelength, seed)
+    return np.asarray(color) * brightness[:, None]
 
 
 def checker(
@@ -117,6 +117,7 @@ def framed(
     frame, first, second = colors
     offset = np.abs(points - np.asarray(center))
     sideways = 2 - axis  # z of a picture across x, x of one across z
+    # From the border inwards: `size` is width and height.
     inset = np.minimum(size[0] / 2 - offset[:, sideways], size[1] / 2 - offset[:, 1])
     shapes = _mix(first, second, _squared(np.sin(2.5 * _smooth_noise(points, 0.25, seed))))
     return np.where((inset < 0.05)[:, None], np.asarray(frame), shapes)

@@ -54,10 +54,9 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     length = max(n_frames, _CALIBRATION_FRAMES)
     for rng in attempts(room, seed):
         poses = _glance_around(room.walk, length, rng)
-        height = poses[:, 1, 3]
-        is_upright = height.min() >= HEIGHTS[0] and height.max() <= HEIGHTS[1]
-        is_steady = has_speed(poses, MEAN_STEP, 3 * MEAN_STEP, 0.05)
-        if is_steady and is_upright and is_clear(room, poses):
+        is_at_height = poses[:, 1, 3].min() >= HEIGHTS[0] and poses[:, 1, 3].max() <= HEIGHTS[1]
+        is_steady = has_speed(poses, MEAN_STEP, 3 * MEAN_STEP, tolerance=0.05)
+        if is_at_height and is_steady and is_clear(room, poses):
             return poses[:n_frames]
 
 
@@ -106,7 +105,8 @@ def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
 def _wandering(pitch: float, length: int, rng: np.random.Generator) -> CubicSpline:
     """Over the angle turned: changes of radius (relative), side and yaw (rad); pitch and roll (rad)
     and height (m) themselves."""
-    # From before the start to behind the end, since the turning rate is not known yet.
+    # From before the start to behind the end, since the turning rate is not known yet: about that
+    # of `MEAN_STEP`.
     knots = np.arange(-2.0, 1.6 * length * np.radians(MEAN_STEP[1]) / _KNOT_SPACING + 4.0)
     spread = np.array([0.04, 0.05, 0.07, 0.09, 0.025, 0.05])
     values = spread * np.clip(rng.normal(size=(len(knots), 6)), -2.0, 2.0)
@@ -151,8 +151,9 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     speed = _relative_speed(n_frames, rng)
     walked = steps.sum() * (1 + _before(speed) / speed.sum())
     x, z = curve(walked).T
-    forward = curve(np.concatenate([walked - steps.sum(), walked, walked + steps.sum()]), nu=1)
-    ahead = np.unwrap(np.arctan2(-forward[:, 0], -forward[:, 1]))
+    three_rounds = np.concatenate([walked - steps.sum(), walked, walked + steps.sum()])
+    forward_x, forward_z = curve(three_rounds, nu=1).T
+    ahead = np.unwrap(np.arctan2(-forward_x, -forward_z))  # yaw
     yaw = gaussian_filter1d(ahead, _AHEAD)[n_frames : 2 * n_frames]
     height = rng.uniform(1.3, 1.5) + _wander(n_frames, rng, 0.05)
     pitch = room.walk.pitch + _wander(n_frames, rng, 0.09)
@@ -172,7 +173,7 @@ def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
     is_free = clearance >= CLEARANCE + _MARGIN
     # A negative cost is a cell that no route enters.
     costs = np.where(is_free, 1.0 / np.maximum(clearance - CLEARANCE, 0.01), -1.0)
-    cells = [(np.abs(x - stop[0]).argmin(), np.abs(z - stop[1]).argmin()) for stop in stops]
+    cells = [(np.abs(x - at_x).argmin(), np.abs(z - at_z).argmin()) for at_x, at_z in stops]
     ends = [*cells[1:], cells[0]]
     walk = []
     for start, end in zip(cells, ends, strict=True):
