@@ -132,6 +132,7 @@ class LmOptimizer:
         covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2  # rad, m
         rotation_std = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3]).max())
         position_std_m = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:]).max())
+        # Moved along one direction, the least certain.
         moved_std_m = std_when_moved(
             self._costs_at, self.T_world_camera, covariance, 1, n_independent=_INDEPENDENT
         )

@@ -102,6 +102,7 @@ def check_recording(
     own = Reading(recording.declared, sequence.intrinsics)
     seen = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(seen, own)
+    # The sequence has the frames of `kept`, in this order.
     cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))
     is_right = best is conventions[0]
     misfits, correlation = [], np.nan

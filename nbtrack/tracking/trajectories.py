@@ -89,17 +89,17 @@ def _check_trackable(sequence: RgbdSequence) -> None:
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
     """A frame of `Trajectory.frames`; errors are NaN where its true pose is not known."""
     T_true, T_first = sequence.T_world_camera[index], sequence.T_world_camera[0]
-    errors_m, errors_deg = [np.nan], [np.nan]
+    error_m, error_deg = np.nan, np.nan
     if np.isfinite(T_true).all():
-        errors_m, errors_deg = pose_errors(estimate.T_world_camera[None], T_true[None])
+        (error_m,), (error_deg,) = pose_errors(estimate.T_world_camera[None], T_true[None])
     return {
         "frame_id": int(sequence.frame_ids[index]),
         "time": float(sequence.times[index]),
         "steps": estimate.steps,
         "seconds": estimate.seconds,
         "loss": estimate.loss,
-        "translation_error_m": float(errors_m[0]),
-        "rotation_error_deg": float(errors_deg[0]),
+        "translation_error_m": float(error_m),
+        "rotation_error_deg": float(error_deg),
         "still_error_m": float(np.linalg.norm((T_true - T_first)[:3, 3])),  # of no motion
         "without_depth": estimate.without_depth,
         **estimate.report,
