@@ -55,7 +55,7 @@ class FeatureGrid(nn.Module):
         volumes = [torch.randn(settings.features, *shape, generator=generator) for shape in shapes]
         self.volumes = nn.ParameterList(_SMALL * volume for volume in volumes)
         self.layer = nn.Linear(settings.levels * settings.features + 3, settings.hidden)
-        self.head = nn.Linear(settings.hidden, 4)
+        self.head = nn.Linear(settings.hidden, 4)  # colour and value
         for part in (self.layer, self.head):
             nn.init.normal_(part.weight, std=part.in_features**-0.5, generator=generator)
             nn.init.normal_(part.bias, std=0.5, generator=generator)
@@ -64,7 +64,7 @@ class FeatureGrid(nn.Module):
         """Activations of the hidden layer at points (m, world frame)."""
         levels = zip(self.volumes, self.voxels, strict=True)
         inputs = [trilinear(volume, self.low, voxel, points_world).T for volume, voxel in levels]
-        inputs.append((points_world - self.low) / self.metres_per_unit - 1)
+        inputs.append((points_world - self.low) / self.metres_per_unit - 1)  # about [-1, 1]
         return nn.functional.silu(self.layer(torch.cat(inputs, dim=-1)))
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:

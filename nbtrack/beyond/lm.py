@@ -189,12 +189,12 @@ class LmTracker(Tracker):
         if self.settings.n_restarts and self.report()["p_lost"] >= _DOUBTFUL:
             yield cost
             others = self._other_starts(frame, T_expected)
-            while True:  # a step is a descent from the next of these
+            for n_tried, T_start in enumerate(others, start=1):
                 cost = self.best.cost(NEAR_SCALES)
-                is_confirmed = self._descend_from(others.pop(0))
+                is_confirmed = self._descend_from(T_start)
                 # A pose that another descent confirms may be doubtful, but not lost.
                 max_p_lost = _LOST if is_confirmed else _DOUBTFUL
-                if not (others and self.report()["p_lost"] >= max_p_lost):
+                if n_tried == len(others) or not self.report()["p_lost"] >= max_p_lost:
                     break
                 yield cost
         self.is_converged = True

@@ -179,7 +179,7 @@ class FramePairs:
 
         NaN of pairs with few points, and without contrast.
         """
-        # Places of the points in all first frames, then in all second ones.
+        # The points' places in all first frames, then in all second ones: (2 pairs, 1, points, 2).
         in_first = self._on_images(self.columns, self.rows).expand_as(compared.seen_at[:, 0])
         at = torch.cat([in_first[:, None], compared.seen_at])
         at[..., 0] += 2 * reading.color_right  # an image is 2 wide, from -1 to 1

@@ -53,7 +53,7 @@ class FourierMlp(nn.Module):
         self.layer_2 = _linear(width, width, generator)
         self.layer_3 = _linear(width + n_frequencies, width, generator)
         self.layer_4 = _linear(width, width, generator)
-        self.head = _linear(width, 4, generator)
+        self.head = _linear(width, 4, generator)  # colour and value
 
     def features(self, points_world: Points) -> Float[Tensor, "n width"]:
         """Activations of the last hidden layer at points (m, world frame)."""

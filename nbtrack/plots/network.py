@@ -32,6 +32,7 @@ def plot_network(network: FourierMlp, value: str, title: str = "") -> Figure:
     for place, (start, end) in enumerate(pairwise(boxes)):
         arrow = _ARROW | {"patchA": start, "patchB": end}
         axes.annotate("", (place + 1, 0), (place, 0), arrowprops=arrow)
+    # From the sines to the third layer.
     skip = {"connectionstyle": "bar,fraction=-0.12", "patchA": boxes[1], "patchB": boxes[4]}
     axes.annotate("", (4, 0), (1, 0), arrowprops=_ARROW | skip)
     axes.text(2.5, 0.8, "sin(x B) once more, beside the output of the second layer", **_CENTRED)
