@@ -86,7 +86,7 @@ def _drawn_points(
             break
         v = 1 + (starts[0] + _EVEN_STEPS[0] * order) % _MODULUS * (height - 2) // _MODULUS
         u = 1 + (starts[1] + _EVEN_STEPS[1] * order) % _MODULUS * (width - 2) // _MODULUS
-        z = depth_mm[v, u]
+        z = depth_mm[v, u]  # mm
         jump = edge_jump * z
         is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
         is_smooth &= abs(depth_mm[v, u + 1] - z) < jump and abs(depth_mm[v, u - 1] - z) < jump

@@ -98,8 +98,7 @@ def fuse_points(
             f"{extent.max() / _MAX_CELLS_A_SIDE:.2g} to {extent.max():.2g} m; set for instance 0.02"
         )
     shape = np.floor(extent / voxel).astype(np.int64) + 1
-    # Rows of x, y, z (m), red, green, blue and 1, by the voxel's number; merged, their sums, of
-    # which the last one counts the pixels.
+    # Rows of x, y, z (m), red, green, blue and 1, by the voxel's number; merged, sums and a count.
     tables = []
     for count, index in enumerate(frames.tolist(), start=1):
         frame = sequence[index]

@@ -92,8 +92,7 @@ def check_recording(
     T_world_camera[:, :3, 3] -= recording.origin
     pairs = _pairs(T_world_camera, _N_PAIRS if is_whole else _QUICK_PAIRS)
     shown, kept = _kept(pairs, ids, is_whole)
-    # Declared as millimetres along the axis, depth values are read as they stand in the files: the
-    # `depths_mm` below hold these, whatever their unit and direction, so that any can be tried.
+    # So `depths_mm` hold the files' values, whatever their unit and direction: any can be tried.
     as_stored = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
     stored = replace(recording, declared=as_stored)
     sequence, frames = _read(stored, ids if is_whole else kept, kept, progress)
@@ -102,8 +101,7 @@ def check_recording(
     own = Reading(recording.declared, sequence.intrinsics)
     seen = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(seen, own)
-    # The sequence has the frames of `kept`, in this order.
-    cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))
+    cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))  # it holds `kept`
     is_right = best is conventions[0]
     misfits, correlation = [], np.nan
     if is_right and is_whole and len(ids) >= _MIN_FRAMES:
@@ -230,7 +228,8 @@ def _read(
 ) -> tuple[RgbdSequence, pd.DataFrame]:
     """The frames to keep of those looked at, read in parts, and a row for each looked at.
 
-    The row holds the share that is measured, the brightness in [0, 1], the greatest number that
+    `depths_mm` are the files' values, as the recording is declared here (see `check_recording`).
+    A row holds the share that is measured, the brightness in [0, 1], the greatest number that
     divides all depth values, whether these are those of the row before, by what the camera moved
     and turned since the frame before, and how far it is off the middle between the frames before
     and after; NaN where one of these has no pose.
@@ -240,9 +239,9 @@ def _read(
     with ProgressBar("reading frames", len(looked_at), progress) as bar:
         for ids in np.split(looked_at, range(_FRAMES_AT_ONCE, len(looked_at), _FRAMES_AT_ONCE)):
             part = read_frames(recording, ids)
-            for depth, color in zip(part.depths_mm, part.colors, strict=True):
-                step = np.gcd.reduce(depth, axis=None)
-                rows.append(((depth > 0).mean(), color.mean() / 255, step, zlib.crc32(depth)))
+            for values, color in zip(part.depths_mm, part.colors, strict=True):
+                step = np.gcd.reduce(values, axis=None)
+                rows.append(((values > 0).mean(), color.mean() / 255, step, zlib.crc32(values)))
             parts.append(part.select(np.isin(ids, kept)))
             bar.update(len(part))
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}

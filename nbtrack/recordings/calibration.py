@@ -86,6 +86,7 @@ def calibration(path: Path, K: Float[np.ndarray, "3 3"], size: tuple | None = No
     has_form = np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6)
     is_in_range = min(fx, fy) >= _MIN_FOCAL and np.abs(K).max() < _LARGEST
     if has_form and is_in_range and (size is None or min(size) >= 1):
+        # In the matrix pixel centres are whole numbers.
         return Calibration(path, fx, fy, principal_point=(cx + 0.5, cy + 0.5), size=size)
     raise DataError(
         f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "

@@ -144,15 +144,13 @@ def decode(
         _check(depth_files[index], depth, np.uint16, (height, width), model_file)
         if maps:
             color = cv2.remap(color, *maps, cv2.INTER_LINEAR)
-            # Interpolation would invent points between a table and the wall behind.
-            depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
+            depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)  # no points between two surfaces
         depth[(depth == recording.declared.no_depth) | (depth == _MAX_16_BITS)] = 0
         depths[index] = _in_millimetres(depth, recording.declared, camera, depth_files[index])
         colors[index] = color
 
-    # Decoding releases the interpreter lock, so a few threads suffice.
     bar = ProgressBar("reading frames", len(frame_ids), progress)
-    with bar, ThreadPoolExecutor(max_workers=4) as pool:
+    with bar, ThreadPoolExecutor(max_workers=4) as pool:  # decoding frees the interpreter lock
         for done, _ in enumerate(pool.map(read, range(len(frame_ids))), start=1):
             bar.move_to(done)
     return camera, colors, depths
