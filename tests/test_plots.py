@@ -43,10 +43,6 @@ FOG = Formula(lambda p: 20 * torch.exp(5 * (p.norm(dim=-1) - 1.5)), CUBE)
 FOG.surface_level = 20.0
 SWEEP = pd.DataFrame({"time (ms)": [1.0, 9.0], "ATE (cm)": [2.0, 0.5], "method": ["VR", "SDF"]})
 AT, RAY = torch.linspace(0, 2, 20), torch.linspace(1, -1, 20).requires_grad_()
-FALLING = 1 / (1 + np.arange(40.0))
-IMAP = pd.DataFrame({"depth": FALLING, "color": FALLING, "total": FALLING, "std_m": FALLING})
-HISTORIES = {"iMAP": IMAP, "NeuS": IMAP.copy()}
-HISTORIES["NeuS"].insert(2, "eikonal", FALLING)
 FRAMES = pd.DataFrame({
     "frame_id": [33, 36], "time": [1.1, 1.2], "translation_error_m": [0.01, 0.3],
     "rotation_error_deg": [0.1, 0.2], "still_error_m": [0.02, 0.04],
@@ -90,7 +86,6 @@ FIGURES = {
     "ray": lambda s: plots.plot_along_ray(AT, {"a (1/m)": RAY, "b (m)": RAY[:-1]}, 1.2, "end"),
     "one": lambda s: plots.plot_along_ray(AT, {"true": RAY, "b": RAY[:-1]}, 1.2, "end", "d (m)"),
     "columns": lambda s: plots.plot_columns([COLUMNS, 2 * COLUMNS], "rise"),
-    "losses": lambda s: plots.plot_losses(HISTORIES, "fall"),
     "slice": lambda s: plots.plot_slice(SPHERE, s, 0.0, title="round"),
     "density": lambda s: plots.plot_slice(FOG, s, 0.0, title="round"),
     "distances": lambda s: plots.plot_distances(s[0], {"start": FAR, "end": FAR / 2}, "closer"),
@@ -309,16 +304,6 @@ def test_a_method_keeps_its_color() -> None:
     assert colors["NeuS with SDF"] == colors["SDF"] == colors["NeuS"]
     assert colors["new"] == method_colors(["SDF", "new"])["new"]
     assert len(set(colors.values())) == 4
-
-
-def test_losses_show_the_terms_and_no_diagnostics() -> None:
-    """Catches sums or lengths drawn as losses, and a median that is shifted."""
-    spike = pd.Series([1.0, 2.0, 90.0, 4.0, 5.0, 6.0])
-    spikes = {"spike": pd.DataFrame({"depth": spike, "total": spike})}
-    depth, color, eikonal = plots.plot_losses(HISTORIES | spikes).axes
-    for axes, n in (depth, 6), (color, 4), (eikonal, 2):  # raw and median each
-        assert sum(len(line.get_xdata()) > 0 for line in axes.lines) == n
-    assert depth.lines[5].get_ydata()[2] == 4.0
 
 
 def test_errors_run_in_seconds() -> None:

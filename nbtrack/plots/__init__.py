@@ -12,7 +12,6 @@ from nbtrack.plots.figures import (
     plot_errors,
     plot_frame,
     plot_images,
-    plot_losses,
     plot_panels,
     plot_views,
 )

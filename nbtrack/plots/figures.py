@@ -155,32 +155,6 @@ def plot_columns(tables: Sequence[pd.DataFrame], title: str = "") -> Figure:
 
 
 @style.styled
-def plot_losses(histories: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
-    """Every loss term over mapping: each iteration pale, the running median on top.
-
-    `histories` are those of maps by label. A term that several maps share is one panel, though its
-    unit may differ: iMAP divides depth errors by their std.
-    """
-    # Loss terms are the columns before their total; what is behind it are diagnostics.
-    terms = {label: history.loc[:, :"total"].iloc[:, :-1] for label, history in histories.items()}
-    # A term of weight zero has no place on a logarithmic axis.
-    names = pd.unique(np.concatenate([t.columns[t.any()] for t in terms.values()]))
-    panels = style.new_axes(title, 3.0, 1, len(names), sharex=True)[0]
-    for axes, name in zip(panels, names, strict=True):
-        for label, color in style.method_colors(terms).items():
-            # A map without this term has an empty line, for the legend.
-            values = terms[label].get(name, pd.Series(dtype=float))
-            # A twentieth of the series, centred, cut short at the ends.
-            window = values.rolling(max(5, len(values) // 20), center=True, min_periods=1)
-            axes.plot(values, color=color, alpha=0.22, linewidth=0.6)
-            axes.plot(window.median(), color=color, label=label)
-        term = name.replace("color", "colour")
-        axes.set(yscale="log", xlabel="mapping iteration", ylabel=f"weighted {term} loss (no unit)")
-    panels[0].legend()
-    return panels[0].figure
-
-
-@style.styled
 def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """Errors of every frame over time: position (cm, logarithmic) and orientation (degrees).
 
