@@ -101,16 +101,17 @@ def check_recording(
     own = Reading(recording.declared, sequence.intrinsics)
     seen = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(seen, own)
-    cloud = _cloud(own, sequence.select(np.searchsorted(kept, ids[shown])))  # it holds `kept`
+    are_shown = np.isin(kept, ids[shown])  # of the frames of `sequence`
+    cloud = _cloud(own, sequence.select(np.flatnonzero(are_shown)))
     is_right = best is conventions[0]
     misfits, correlation = [], np.nan
     if is_right and is_whole and len(ids) >= _MIN_FRAMES:
         misfits, correlation = find_misfits(seen, best.reading)
     is_far = cloud.depth > far_limit(cloud.depth)
     warnings = list(_of_depth_images(frames, cloud, recording))
-    needs_proof = is_whole and not warnings
-    main = main_misfit(misfits)
-    warnings.append(main if main else diagnosis(conventions, best, recording, needs_proof))
+    needs_proof = is_whole and not warnings  # of poses, by a camera that moves enough
+    main = main_misfit(misfits)  # why surfaces lie apart, of which `diagnosis` says only that
+    warnings.append(main or diagnosis(conventions, best, recording, needs_proof))
     if is_right:  # else their numbers mean something else
         warnings += [*_of_poses(frames, recording), *_of_depths(cloud.depth, is_far)]
     if not main:

@@ -99,15 +99,15 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
 def _replaced(node: Any, path: list[str], key: str, value: Any, allowed: Mapping) -> Any:
     """A part of a tree with the value of one key, which lies at a path of names below that part.
 
-    Nested parts are rebuilt, never changed in place. What a field allows is in its metadata.
+    Nested parts are rebuilt, never changed in place. `allowed` is the metadata of the part's field.
     """
     if not path:
         return _converted(key, node, value, allowed)
     name, *rest = path
     if isinstance(node, dict):
         return {**node, name: _replaced(node[name], rest, key, value, {})}
-    allowed = next(f.metadata for f in dataclasses.fields(node) if f.name == name)
-    new = _replaced(getattr(node, name), rest, key, value, allowed)
+    of_field = next(f.metadata for f in dataclasses.fields(node) if f.name == name)
+    new = _replaced(getattr(node, name), rest, key, value, of_field)
     return dataclasses.replace(node, **{name: new})
 
 

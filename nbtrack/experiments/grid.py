@@ -86,7 +86,7 @@ def track_scenes(
 
 
 def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[str, Any]:
-    """A whole row: its place, whose scene is the mapped one, and the metrics or the failure."""
+    """A row with its run's metrics, all but their scene, the tracked one; or with its failure."""
     if isinstance(result, NbtrackError):
         return {**row, "failure": str(result), "ate_m": float("nan")}
     metrics = {k: v for k, v in result.items() if k not in ("config", "map_record", "versions")}

@@ -32,7 +32,7 @@ POINTS_SCORED = 20_000  # on surfaces and along rays; as many pixels
 def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -> Scores:
     """`SCORES` of a map of a sequence; None where its field has no such answer, or without truth.
 
-    Only what the mapped frames have seen counts. The truth is known of synthetic rooms only.
+    Distances and surfaces count where mapped frames saw them. Only synthetic rooms tell the truth.
     """
     field = finished.field
     scores = dict.fromkeys(SCORES)
@@ -41,7 +41,7 @@ def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -
         generator = torch.Generator(field.device).manual_seed(0)
         scores |= _score_images(field, _random_rays(sequence, held_out, generator), room)
     if room is not None:
-        generator = torch.Generator().manual_seed(0)
+        generator = torch.Generator().manual_seed(0)  # on the CPU, as the room
         rays = _random_rays(sequence, mapped, generator)
         if field.is_distance:
             scores |= _score_sdf(field, rays, generator, room)

@@ -41,7 +41,7 @@ class IMapField(LearnedField):
     def mapping_losses(self, draw: Draw, settings: MappingSettings, generator: Generator) -> Losses:
         """iMAP's geometric and photometric losses."""
         rays = draw(settings.n_rays)
-        # Not guided by measured depths: tracking has no such help, and would see a thinner map.
+        # Not guided by measured depths, since VR cannot be (docs/choices.md).
         n_first, n_second = settings.n_stratified, settings.n_surface
         rendered = self.render(rays, self.hierarchical_depths(rays, n_first, n_second, generator))
         return rendered_losses(rendered, rays, settings.lambda_color, 1.0, over_std=True)

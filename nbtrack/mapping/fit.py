@@ -58,10 +58,10 @@ def map_sequence(
     """Fit a field to a sequence with known poses; one that learns nothing is made from its frames.
 
     Settings are those of the field's `Network`, None where it has none, and of its `Settings`. A
-    `checkpoint` is written every few seconds, and resumed from, if it is of the same `code`, with
-    the batches of an uninterrupted run; who has written the finished map removes it. Raises
-    DataError where no pixel has a depth, or the checkpoint is of another map; ConfigError where a
-    field's losses are no dictionary; NumericalError; OutOfMemory.
+    `checkpoint` is written every few seconds, and resumed with the batches of an uninterrupted run;
+    the caller removes it once the map is written. Raises DataError where no pixel has a depth, or
+    the checkpoint is of another map or `code`; ConfigError where a field's losses are no
+    dictionary; NumericalError; OutOfMemory.
     """
     recipe = recipe_of(field_name, sequence, network, settings, seed)
     start = time.perf_counter()
@@ -71,7 +71,7 @@ def map_sequence(
     kind = field_class(field_name)
     if issubclass(kind, LearnedField):
         with advise_on_memory(f"mapping.{field_name}.n_rays={settings.n_rays}"):
-            with suitable_threads(width=0):
+            with suitable_threads(width=0):  # one, so that its start does not depend on them
                 field = make_field(field_name, network, bounds, seed).to(device)
             with suitable_threads(field.width), matrix_products(settings.tf32):
                 fit = _Fit(recipe | {"code": code}, settings, field, sequence, mapped)

@@ -55,14 +55,13 @@ class NotebookFigure(Figure):
     """A figure that is shown once where a cell ends with it; it is not registered with pyplot."""
 
     def _repr_mimebundle_(self, **chosen: object) -> tuple[dict, dict]:
-        """The picture's title describes it where it cannot be seen, whichever way it is drawn.
-
-        It is shown at the figure's own size (pixels), at half that of the picture.
+        """What is said of the picture that `_repr_png_` draws: its title, for who cannot see it,
+        and the size at which it is shown, the figure's own (pixels), half of the picture's.
         """
         from IPython import get_ipython  # it asks for this, and others may lack it
 
         if shell := get_ipython():
-            # Sliders load pyplot's inline backend, which draws all figures anew, cropped and small.
+            # Sliders load pyplot's inline backend, which would draw it instead, cropped and small.
             pictures = shell.display_formatter.formatters["image/png"]
             pictures.for_type(NotebookFigure, NotebookFigure._repr_png_)
         width, height = (round(pixels) for pixels in self.bbox.size)

@@ -235,16 +235,16 @@ class Moments:
 def _interpolated(
     times: Times, poses: Poses, stamps: Times, flip: Callable[[Poses], Poses]
 ) -> tuple[Poses, str]:
-    """The nearest poses, or those between two that are close to each other, and a note.
+    """The nearest poses, or those between two that are close in time, and a note.
 
-    The camera goes straight there, and turns about one axis. A pose of a frame's very time stays.
+    The camera goes straight in the world, to whose poses `flip` leads and back, turning evenly.
     """
     found = _at(poses, nearest(times, stamps, _TOLERANCE))
     knots, places = np.unique(stamps, return_index=True)
     later = np.searchsorted(knots, times).clip(1, len(knots) - 1)
     before, after = times - knots[later - 1], knots[later] - times
     to_nearest = np.minimum(before, after)  # negative outside of the list
-    is_between = (before + after <= _GAP) & (to_nearest > _SAME_TIME)
+    is_between = (before + after <= _GAP) & (to_nearest > _SAME_TIME)  # else the nearest stays
     if not is_between.any():
         return found, ""
     T_knots, at = flip(poses[places]), times[is_between]

@@ -101,8 +101,8 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
 def _is_grazing(disparity: Depth, focal: float) -> Bool[np.ndarray, "h w"]:
     """Pixels whose surface is seen at more than `MAX_INCIDENCE` from its normal.
 
-    On a plane, inverse depth is a x + b y + c over normalised coordinates (x, y), and (a, b, c)
-    is parallel to the normal: the slopes of disparity give the normal without back-projection.
+    On a plane disparity, like inverse depth, is a x + b y + c over normalised coordinates (x, y),
+    and (a, b, c) is parallel to the normal; so its product with the ray (x, y, 1) is disparity.
     """
     height, width = disparity.shape
     gradient_y = focal * _smaller_difference(disparity)
@@ -110,8 +110,8 @@ def _is_grazing(disparity: Depth, focal: float) -> Bool[np.ndarray, "h w"]:
     y = ((np.arange(height) + 0.5 - height / 2) / focal)[:, None]
     x = ((np.arange(width) + 0.5 - width / 2) / focal)[None, :]
     constant = disparity - gradient_x * x - gradient_y * y
-    normal = np.sqrt(gradient_x**2 + gradient_y**2 + constant**2)
-    cosine = disparity / np.maximum(normal * np.sqrt(1 + x * x + y * y), 1e-12)
+    length = np.sqrt(gradient_x**2 + gradient_y**2 + constant**2)  # of (a, b, c)
+    cosine = disparity / np.maximum(length * np.sqrt(1 + x * x + y * y), 1e-12)
     return cosine < np.cos(MAX_INCIDENCE)
 
 
