@@ -194,15 +194,22 @@ def plot_panels(
     """Numbers of methods (columns) at the texts of the index, by title, which has a panel.
 
     Panels share these texts, from the top; x is logarithmic, if wanted of one range in all panels.
-    A pale line joins those of a row; a text may have several rows.
+    A pale line joins those of a row. A text may have several rows; methods then lie one below
+    another.
     """
+    texts = pd.Index(np.concatenate([table.index for table in panels.values()])).unique()
     grid = style.new_axes(title, 3.4, 1, len(panels), sharex=same_x, sharey=True)[0]
     for axes, (name, values) in zip(grid, panels.items(), strict=True):
-        spans = values.index, values.min(axis=1), values.max(axis=1)
-        axes.hlines(*spans, color="0.85", linewidth=2, zorder=1)
-        for (label, color), mark in zip(style.method_colors(values).items(), _MARKS, strict=False):
-            axes.plot(values[label], values.index, mark, color=color, label=label)
-        axes.set(title=name, xlabel=x, ylim=(values.index.nunique() - 0.5, -0.5))
+        y = texts.get_indexer(values.index)
+        axes.hlines(y, values.min(axis=1), values.max(axis=1), color="0.85", linewidth=2, zorder=1)
+        # Below each other where a text has several rows, whose marks would hide one another.
+        below = 0.2 if values.index.has_duplicates else 0.0
+        looks = zip(style.method_colors(values).items(), _MARKS, strict=False)
+        for place, ((label, color), mark) in enumerate(looks):
+            shift = below * (place - (values.shape[1] - 1) / 2)
+            axes.plot(values[label], y + shift, mark, color=color, label=label)
+        axes.set_yticks(range(len(texts)), texts)
+        axes.set(title=name, xlabel=x, ylim=(len(texts) - 0.5, -0.5))
         style.log_axes(axes, "x")
     return grid[0].figure.legend_below()
 
