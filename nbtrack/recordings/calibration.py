@@ -61,6 +61,7 @@ class Calibration:
         factor = width / own_width
         own_cx, own_cy = self.principal_point or (width / factor / 2, height / factor / 2)
         cx, cy = factor * own_cx, factor * own_cy
+        # Resizing rounds sides to whole pixels, so that heights may differ by one.
         if not (abs(factor * own_height - height) <= 1 and 0 <= cx <= width and 0 <= cy <= height):
             size = f"{own_width}x{own_height}" if self.size else "any size"
             raise DataError(
@@ -107,12 +108,14 @@ def read_calibration(path: Path) -> Calibration:
     """
     if path.suffix.lower() == ".json":
         return _from_json(path)
-    numbers = read_numbers(path, (1, 3, 4, 9, 16), _CAMERA_LINE)
+    numbers = read_numbers(path, (1, 3, 4, 9, 16), _CAMERA_LINE)  # so many may stand in a line
     if numbers.size == 1:
         f = numbers.item()
+        # The 0 are placeholders: without a principal point it is the middle of the image.
         return replace(calibration(path, camera_matrix(f, f, 0.0, 0.0)), principal_point=None)
     if numbers.size == 4:
         return calibration(path, camera_matrix(*numbers.flat))
+    # By how many numbers there are: 3x3, 4x4 without its last row, 4x4.
     n_columns = {9: 3, 12: 4, 16: 4}.get(numbers.size)
     if not n_columns:
         raise DataError(f"{path} holds {numbers.size} numbers: every line holds {_CAMERA_LINE}")
@@ -134,15 +137,20 @@ def _from_json(path: Path) -> Calibration:
         stored = single.get("depth_scale")
         scale = 1 / stored if stored and stored < 1 else stored  # below 1 it is metres a value
         has_size = "width" in single or "height" in single
+        # One without the other is a KeyError, which `naming_damaged` makes a DataError.
         size = (int(single["width"]), int(single["height"])) if has_size else None
         K = camera_matrix(*[single.get(key, np.nan) for key in ("fx", "fy", "cx", "cy")])
         if "intrinsic_matrix" in found:
-            K = np.reshape(found["intrinsic_matrix"], (3, 3)).T
+            K = np.reshape(found["intrinsic_matrix"], (3, 3)).T  # the file has it by columns
     return replace(calibration(path, K, size), distortion=lens, depth_scale=scale, unused=unused)
 
 
 def _numbers(key: str, value: Any) -> list[float]:
-    """The numbers of an entry. Raises ValueError where they are others than it may have."""
+    """The numbers of the entry `key`, whose value is one number or a list of them.
+
+    Raises ValueError if it is anything else, has a count of numbers that is not in `_COUNTS`, or a
+    number that no camera has.
+    """
     values = value if isinstance(value, list) else [value]
     # NaN is not below anything, and True is no number here.
     is_valid = all(type(v) in (int, float) and abs(v) < _LARGEST for v in values)
@@ -155,9 +163,10 @@ def _numbers(key: str, value: Any) -> list[float]:
 
 
 def _check_unused(key: str, value: Any) -> None:
-    """Raises ValueError where an entry that is not used tells of another lens or unit.
+    """Raises ValueError if an entry that is not used says that the lens or the unit is another.
 
-    A usual word tells of none, and neither do zeros, false, null and an empty list.
+    Entries with other names than `_TELLING` may hold anything. Those with such a name may hold a
+    word of `_USUAL`, zeros, false, null or an empty list, which say that nothing is unusual.
     """
     is_usual = value.lower() in _USUAL if isinstance(value, str) else not np.any(value)
     if _TELLING.match(key) and not is_usual:

@@ -57,7 +57,10 @@ class Declaration:
         return np.array([_DIRECTIONS.get(word, np.zeros(3)) for word in words])
 
     def inverted_if_world_to_camera(self, poses: Poses) -> Poses:
-        """Camera-to-world poses of a file's, and a file's of camera-to-world; NaN stays NaN."""
+        """The inverse poses if the file's are declared world-to-camera, else a copy; NaN stays NaN.
+
+        So it makes camera-to-world poses of the file's, and the file's of camera-to-world ones.
+        """
         inverse = poses.copy()
         if self.poses == WORLD_TO_CAMERA:
             # A transpose, unlike a solver, takes NaN and never fails.
@@ -66,11 +69,12 @@ class Declaration:
         return inverse
 
     def poses_to_opencv(self, file_poses: Poses) -> Poses:
-        """Camera-to-world poses with OpenCV's camera axes, of a file's; NaN poses stay NaN."""
-        axes = self._axes
+        """The file's poses as camera-to-world, with OpenCV's camera axes; NaN poses stay NaN."""
+        axes = self._axes  # as a matrix, from OpenCV's camera frame to the file's
         T_world_camera = self.inverted_if_world_to_camera(file_poses)
         T_world_camera[:, :3, :3] = T_world_camera[:, :3, :3] @ axes
-        # The determinant of left-handed axes is -1. They come with a left-handed world: z turns.
+        # Left-handed camera axes, whose determinant is -1, come with a left-handed world. With the
+        # sign of the world's z changed the rotations are proper ones again.
         T_world_camera[:, 2] *= np.linalg.det(axes)
         return T_world_camera
 
@@ -85,15 +89,16 @@ class Format:
     depth: tuple[str, ...]  # the same
     poses: tuple[str, ...]  # a file of all poses, or with `*` one a frame
     cameras: tuple[str, ...]  # calibration files; the first that is there
-    known_cameras: tuple[Calibration, ...] = ()  # without a file, if a folder's name holds `source`
+    # Without such a file, the first whose `source` has a name that occurs in the folder's name.
+    known_cameras: tuple[Calibration, ...] = ()
     declared: Declaration = Declaration()  # what its numbers mean
     counts_from_0: bool = False  # a number is the place of the frame's pose in a list
     stamps_tell: bool = True  # times in a list tell whose a pose is; else only its place does
     resize_color: bool = False  # colour has another size than depth and shows the same view
-    # Own readers: of a file of poses, their quaternions' order given, with times (s), NaN for none;
-    # of a calibration; of a depth map in `depth_scale`, where that is no PNG or JPEG file.
+    # Poses and their times (s; NaN: none) of a file, given the order of its quaternions.
     read_poses: Callable[[Path, str], tuple[Poses, Times]] = read_poses
     read_camera: Callable[[Path], Calibration] = read_calibration
+    # Depth values, `depth_scale` a metre, of a depth map that is no PNG or JPEG file.
     read_depth: Callable[[Path, Calibration], DepthImage] | None = None
 
     @property
@@ -103,7 +108,10 @@ class Format:
         return self.color, self.depth, self.poses, *cameras
 
     def files(self, folder: Path, patterns: Sequence[str], what: str) -> list[Path]:
-        """Files of the first pattern that has any, or raises MissingError."""
+        """Files of the first pattern that has any, or raises MissingError.
+
+        `what` says in the message which files are missing.
+        """
         for pattern in patterns:
             if files := files_of(folder, pattern):
                 return files
@@ -113,7 +121,10 @@ class Format:
 
 
 def files_of(folder: Path, pattern: str) -> list[Path]:
-    """Files of the suffix that a pattern names, else images; `img2` before `img10`."""
+    """The file that is called as the pattern, or those that match it; `img2` before `img10`.
+
+    A pattern without a suffix, or with `.*`, matches images only (`IMAGE_SUFFIXES`).
+    """
     if (folder / pattern).is_file():
         return [folder / pattern]
     suffix = Path(pattern).suffix
@@ -157,7 +168,7 @@ FORMATS: dict[str, Format] = {
     ),
     # Shotton et al. 2013. Colour and depth come from two cameras 25 mm apart that the dataset does
     # not register. Its page states the focal length and the principal point (320, 240), taken here
-    # as the middle of the image.
+    # as the middle of the image. `Path()` has an empty name, which occurs in every folder's name.
     "7scenes": Format(
         "7-Scenes", color=("*.color.*",), depth=("*.depth.*",), poses=("*.pose.txt",),
         cameras=("intrinsics.txt", "camera-intrinsics.txt", "../camera-intrinsics.txt"),
@@ -184,8 +195,8 @@ def declaration(folder: Path, format: str | None = None, depth_scale: float = 0.
 
     The folder's `sequence.toml` comes first, then the depth scale given here (of a calibration
     file; 0: none) and the unit of a scene of the dataset, then the format's. If files are missing,
-    it is the format that the most are left of; reading says what is missing. Raises MissingError,
-    ConfigError or DataError for what it cannot tell.
+    the format is the one with the largest share of what it needs; reading says what is missing.
+    Raises MissingError, ConfigError or DataError for what it cannot tell.
     """
     if not folder.is_dir():
         raise MissingError(f"no folder {folder}: give a recording's, or a synthetic room's name")
@@ -204,7 +215,10 @@ def declaration(folder: Path, format: str | None = None, depth_scale: float = 0.
 
 
 def _told_by_files(folder: Path) -> str:
-    """The format with the largest share of what it needs."""
+    """The format with the largest share of what it needs, the first of equals.
+
+    Raises MissingError if no format has any of its files, and DataError if several have all.
+    """
     shares = {}
     for name, layout in FORMATS.items():
         shares[name] = np.mean([_is_there(folder, patterns) for patterns in layout.needs])

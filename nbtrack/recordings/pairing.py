@@ -97,6 +97,7 @@ def nearest(times: Times, others: Times, tolerance: float) -> Frames:
     """For every time the index of the nearest other one; -1 if none is within the tolerance (s)."""
     if not len(others):
         return np.full(len(times), -1)
+    # In one dimension p=1 is the plain difference, which no square and root round.
     apart, closest = cKDTree(others[:, None]).query(times[:, None], p=1)
     return np.where(apart <= tolerance, closest, -1)
 
@@ -108,6 +109,7 @@ def pair_lists(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Pat
     depth_times, depths = _read_list(depth_list)
     depth_of_color = nearest(color_times, depth_times, _TOLERANCE)
     color_of_depth = nearest(depth_times, color_times, _TOLERANCE)
+    # An image without a depth map has -1, which indexes the last one: the next line leaves it out.
     is_mutual = color_of_depth[depth_of_color] == np.arange(len(colors))
     kept = np.flatnonzero((depth_of_color >= 0) & is_mutual)
     of_all = f"{len(colors) - len(kept)} of the {len(colors)} images in {color_list.name}"
@@ -169,11 +171,12 @@ class Moments:
         1. Each stamp (s; NaN: none) is the very time of a frame, as where nbtrack wrote the list.
         2. Frames have times of their own, and some stamp is near one: it is the same clock, and
            poses are interpolated.
-        3. Frames' numbers, see `_by_number`. If times and stamps are of two clocks, equal counts
-           prove nothing: then this holds only for even stamps, which just count the lines.
+        3. The frames' numbers tell, see `_by_number`. Frames with times of their own, no stamp near
+           one, are on another clock. Then equal counts prove nothing, and the rule applies only if
+           the stamps are even, as where they just count the lines.
 
-        `flip` makes camera-to-world poses of the list's, and the other way round. Raises DataError
-        if no rule applies.
+        `flip` makes camera-to-world poses of the list's, and the other way round: rule 2 needs
+        both. `path` names the list in messages. Raises DataError if no rule applies.
         """
         has_both = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(stamps)
         known_poses, known_stamps = poses[has_both], stamps[has_both]
@@ -195,14 +198,17 @@ class Moments:
     def _by_number(self, poses: Poses, stamps: Times | None) -> tuple[Poses, str] | None:
         """A pose a frame by the frames' numbers, and a note; None where these tell nothing.
 
-        A pose has the number of its stamp (s) times the rate or, without stamps, of its place in a
-        list longer than the frames. As many as can must then find each other, in just one way to
-        count. Else poses follow one another, if there are as many as frames, unless stamps show
-        that some were left out: uneven ones, by which most frames find their pose.
+        The number of a pose is its stamp (s) times the rate or, without stamps, its place in the
+        list. Two rules are tried:
+        1. Frames take the poses of their numbers if, over the ways to count of `_counted`, just
+           one pairing is complete: all frames find a pose, or all poses a frame. Without stamps
+           this needs more poses than frames; for equally many there is rule 2.
+        2. Equally many poses and frames are paired in their order. Not so if stamps are uneven and
+           most frames find a pose by them: then the list lacks some frames and has others.
         """
         n_frames, n_poses = len(self.images), len(poses)
         pose_numbers = np.arange(n_poses) if stamps is None else stamps * self.rate_hz
-        tolerance = min(_ON_TIME * self.rate_hz, 0.25)
+        tolerance = min(_ON_TIME * self.rate_hz, 0.25)  # in numbers, which are 1 apart
         # A row for each way to count: the place of every frame's pose, -1 without one.
         ways = [nearest(numbers, pose_numbers, tolerance) for numbers in self._counted()]
         places = np.unique(np.reshape(ways, (-1, n_frames)), axis=0)
@@ -219,45 +225,49 @@ class Moments:
         return poses, "" if counts_up else "images have the poses one after another"
 
     def _counted(self) -> list[Frames]:
-        """The frames' numbers, counted from 0 in each way that may be meant: as they stand, from 1,
-        or from the first frame's. In a format that counts from 0 only as they stand, unless they
-        are just 1 to n."""
+        """Places in the list that the frames' numbers may mean, an array for each way to count.
+
+        The list may begin with number 0 (the numbers as they stand), with 1, or with the first
+        frame's. In a format that counts from 0 it begins with 0, unless the numbers are 1 to n.
+        """
         if self.numbers is None:
             return []
         first = self.numbers[0]
         is_1_to_n = first == 1 and np.ptp(self.numbers) == len(self.numbers) - 1
         if self.counts_from_0 and not is_1_to_n:
             return [self.numbers]
-        from_1 = min(first, 1)  # not where there is a frame 0
-        return [self.numbers, self.numbers - from_1, self.numbers - first]
+        number_of_place_0 = min(first, 1)  # 1, but 0 where there is a frame 0
+        return [self.numbers, self.numbers - number_of_place_0, self.numbers - first]
 
 
 def _interpolated(
     times: Times, poses: Poses, stamps: Times, flip: Callable[[Poses], Poses]
 ) -> tuple[Poses, str]:
-    """The nearest poses, or those between two that are close in time, and a note.
+    """Poses at some times, and a note: between two close in time interpolated, else the nearest.
 
-    The camera goes straight in the world, to whose poses `flip` leads and back, turning evenly.
+    In between the camera moves along a straight line in the world and turns at an even rate. That
+    is said of camera-to-world poses: `flip` makes these of the list's, and afterwards the reverse.
     """
     found = _at(poses, nearest(times, stamps, _TOLERANCE))
     knots, places = np.unique(stamps, return_index=True)
     later = np.searchsorted(knots, times).clip(1, len(knots) - 1)
-    before, after = times - knots[later - 1], knots[later] - times
-    to_nearest = np.minimum(before, after)  # negative outside of the list
+    before, after = times - knots[later - 1], knots[later] - times  # s, to both stamps beside
+    to_nearest = np.minimum(before, after)  # s; negative outside of the list
     is_between = (before + after <= _GAP) & (to_nearest > _SAME_TIME)  # else the nearest stays
     if not is_between.any():
         return found, ""
-    T_knots, at = flip(poses[places]), times[is_between]
-    T_at = np.tile(np.eye(4), (len(at), 1, 1))
-    T_at[:, :3, 3] = interp1d(knots, T_knots[:, :3, 3], axis=0)(at)
-    T_at[:, :3, :3] = Slerp(knots, Rotation.from_matrix(T_knots[:, :3, :3]))(at).as_matrix()
-    found[is_between] = flip(T_at)
-    note = f"{len(at)} of {len(found)} poses are interpolated, the nearest up to"
+    T_knots, wanted = flip(poses[places]), times[is_between]
+    T_wanted = np.tile(np.eye(4), (len(wanted), 1, 1))
+    T_wanted[:, :3, 3] = interp1d(knots, T_knots[:, :3, 3], axis=0)(wanted)
+    turning = Slerp(knots, Rotation.from_matrix(T_knots[:, :3, :3]))
+    T_wanted[:, :3, :3] = turning(wanted).as_matrix()
+    found[is_between] = flip(T_wanted)
+    note = f"{len(wanted)} of {len(found)} poses are interpolated, the nearest up to"
     return found, f"{note} {1e3 * to_nearest[is_between].max():.1f} ms away"
 
 
 def _are_even(stamps: Times) -> bool:
-    """Whether all steps between stamps are the same, but for a tenth of the median step."""
+    """Whether steps between stamps differ by no more than a tenth of the median step."""
     steps = np.diff(stamps)
     return len(steps) == 0 or np.ptp(steps) <= _UNEVEN * np.median(np.abs(steps))
 

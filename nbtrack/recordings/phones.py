@@ -37,7 +37,11 @@ _ADVICE_ON_DEPTH = f"run `pip install pyliblzfse`, or put {_INSTEAD}"
 
 @contextmanager
 def _content(path: Path) -> Iterator[dict[str, Any]]:
-    """What an app's JSON file holds; DataError, also for what is made of it within the block."""
+    """What an app's JSON file holds, for a `with` block.
+
+    An error in the block, such as a key that is missing, also becomes a DataError that names the
+    file.
+    """
     with naming_damaged(path, "file of the app", _ADVICE):
         yield read_object(path, "JSON")
 
@@ -60,7 +64,7 @@ def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times]:
 
 
 def _record3d_camera(path: Path) -> Calibration:
-    """The first frame's, as the app writes it; later ones move by a pixel or two."""
+    """The camera of the first frame, which the app writes; later ones move by a pixel or two."""
     with _content(path) as content:
         # The matrix, column by column.
         fx, _, _, _, fy, _, cx, cy, _ = np.array(content["K"], dtype=np.float64)
@@ -68,7 +72,10 @@ def _record3d_camera(path: Path) -> Calibration:
 
 
 def _record3d_depth(path: Path, camera: Calibration) -> DepthImage:
-    """Millimetres. LZFSE is no part of Python: `liblzfse` reads it, where that is installed."""
+    """Depth in millimetres; 0 where there is none, 65535 where it is farther than 16 bits can say.
+
+    LZFSE is no part of Python: `liblzfse` reads it, where that is installed.
+    """
     content = path.read_bytes()
     kind = "file of float32 depth, plain or by LZFSE, in the proportions of colour"
     with naming_damaged(path, kind, _ADVICE_ON_DEPTH):
@@ -78,18 +85,22 @@ def _record3d_depth(path: Path, camera: Calibration) -> DepthImage:
             content = liblzfse.decompress(content)
         metres = np.frombuffer(content, "<f4")
         width, height = camera.size
+        # The file does not say its size: its rows follow from the proportions of colour.
         depth_mm = 1000 * metres.reshape(round(np.sqrt(metres.size * height / width)), -1)
         return np.rint(np.nan_to_num(depth_mm).clip(0, 65535)).astype(np.uint16)
 
 
 def _corrected(path: Path) -> Path:
-    """Polycam's optimised camera of a frame, where the app has made one."""
+    """Polycam's optimised camera file of a frame; `path` itself where the app has made none."""
     corrected = path.parent.parent / "corrected_cameras" / path.name
     return corrected if corrected.is_file() else path
 
 
 def _polycam_pose(path: Path, order: str) -> tuple[Poses, Times]:
-    """A frame's pose and its time (s); there are no quaternions whose `order` would count."""
+    """A frame's pose and its time (s), which names the file in microseconds.
+
+    `order` is not used: the poses are matrices.
+    """
     with _content(_corrected(path)) as content:
         pose = np.eye(4)
         pose[:3] = [[float(content[f"t_{i}{j}"]) for j in range(4)] for i in range(3)]
@@ -97,7 +108,7 @@ def _polycam_pose(path: Path, order: str) -> tuple[Poses, Times]:
 
 
 def _polycam_camera(path: Path) -> Calibration:
-    """The median of all frames' cameras, which differ by a pixel or two."""
+    """The median of all frames' cameras, which differ by a pixel or two; `path` is any of them."""
     rows = []
     for file in sorted(path.parent.glob("*.json")):
         with _content(_corrected(file)) as content:
@@ -117,6 +128,7 @@ _RECORD3D_FILES = ("metadata", "metadata.json")
 FORMATS["record3d"] = Format(
     "Record3D", color=("rgbd/*", "rgb/*"), depth=("rgbd/*.depth", "depth/*"),
     poses=_RECORD3D_FILES, cameras=_RECORD3D_FILES,
+    # Pose N of the list is that of image N, whatever its time.
     declared=Declaration(camera_axes="opengl"), counts_from_0=True, stamps_tell=False,
     read_poses=_record3d_poses, read_camera=_record3d_camera, read_depth=_record3d_depth,
 )  # fmt: skip

@@ -65,10 +65,11 @@ def read_frames(
     needs_poses: bool = True,
     origin: Position | None = None,
 ) -> RgbdSequence:
-    """The frames of an opened recording of some numbers, or that a slice selects and, where needed,
-    that have a pose. Poses are relative to an origin (m), by default the recording's.
+    """Frames of an opened recording: those of given numbers, or those of a slice.
 
-    Raises DataError if an image cannot be read, or no frame is left.
+    Of a slice frames without a pose are left out if `needs_poses`. Positions are relative to
+    `origin` (m, the recording's world), by default the recording's own. Raises DataError if an
+    image cannot be read, or no frame is left.
     """
     ids = select_frames(recording, frames, needs_poses) if isinstance(frames, slice) else frames
     camera, colors, depths_mm = decode(recording, ids, progress)
@@ -83,7 +84,7 @@ def read_frames(
 
 
 def select_frames(recording: Recording, frames: slice, needs_poses: bool = True) -> Frames:
-    """Numbers of the selected frames, where needed of those that have a pose.
+    """Numbers of the frames of a slice; if `needs_poses`, only of those that have a pose.
 
     Raises DataError if there is none.
     """
@@ -102,7 +103,7 @@ def select_frames(recording: Recording, frames: slice, needs_poses: bool = True)
 
 def without_outliers(sequence: RgbdSequence) -> RgbdSequence:
     """The sequence without depths farther than `far_limit`; as it is, where there are none."""
-    sample = sequence.depths_mm[:, ::4, ::4]
+    sample = sequence.depths_mm[:, ::4, ::4]  # every sixteenth pixel suffices for a quantile
     is_far = sequence.depths_mm > far_limit(sample[sample > 0])
     if not is_far.any():
         return sequence
@@ -110,7 +111,7 @@ def without_outliers(sequence: RgbdSequence) -> RgbdSequence:
 
 
 def far_limit(depths: np.ndarray) -> float:
-    """The distance, in the unit of some measured depths, beyond which they are outliers."""
+    """The distance beyond which measured depths are outliers, in their unit."""
     return FAR * float(np.quantile(depths, 0.9)) if len(depths) else np.inf
 
 
@@ -127,10 +128,10 @@ def decode(
     depth = _read_depth(depth_files[0], recording)
     resize, note = _resizing(color, depth, recording)
     if note and note not in recording.notes:
-        recording.notes.append(note)  # for reports of what was read
-    model_file, model = (depth_files[0], depth) if resize else (color_files[0], color)
-    height, width = model.shape[:2]
-    camera = recording.calibration.for_size(width, height, model_file)
+        recording.notes.append(note)  # of the caller's recording, for reports of what was read
+    sized_file = (depth_files if resize else color_files)[0]  # its size is wanted of all others
+    height, width = (depth if resize else color).shape[:2]
+    camera = recording.calibration.for_size(width, height, sized_file)
     maps = _undistortion(camera, recording.calibration.distortion)
     colors = np.empty((len(frame_ids), height, width, 3), np.uint8)
     depths = np.empty((len(frame_ids), height, width), np.uint16)
@@ -140,8 +141,8 @@ def decode(
         depth = _read_depth(depth_files[index], recording)
         if resize:
             color = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
-        _check(color_files[index], color, np.uint8, (height, width, 3), model_file)
-        _check(depth_files[index], depth, np.uint16, (height, width), model_file)
+        _check(color_files[index], color, np.uint8, (height, width, 3), sized_file)
+        _check(depth_files[index], depth, np.uint16, (height, width), sized_file)
         if maps:
             color = cv2.remap(color, *maps, cv2.INTER_LINEAR)
             depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)  # no points between two surfaces
@@ -150,7 +151,7 @@ def decode(
         colors[index] = color
 
     bar = ProgressBar("reading frames", len(frame_ids), progress)
-    with bar, ThreadPoolExecutor(max_workers=4) as pool:  # decoding frees the interpreter lock
+    with bar, ThreadPoolExecutor(max_workers=4) as pool:  # decoding frees the GIL: a few suffice
         for done, _ in enumerate(pool.map(read, range(len(frame_ids))), start=1):
             bar.move_to(done)
     return camera, colors, depths
@@ -171,24 +172,25 @@ def _read_image(path: Path, is_color: bool) -> Shaped[np.ndarray, "height width 
 
 
 def _read_depth(path: Path, recording: Recording) -> Shaped[np.ndarray, "height width *channels"]:
-    """A depth map's values as they are stored, or as its format has them."""
+    """A depth map's values as they are stored, or as the format's own reader gives them."""
     if recording.format.read_depth and path.suffix.lower() not in IMAGE_SUFFIXES:
         return recording.format.read_depth(path, recording.calibration)
     return _read_image(path, is_color=False)
 
 
 def _resizing(color: np.ndarray, depth: np.ndarray, recording: Recording) -> tuple[bool, str]:
-    """Whether colour is given the size of depth: its format says so, or it is larger in the same
-    proportions, as phones with LiDAR give it. The latter is told by a note, else empty.
+    """Whether colour is to be given the size of depth, and a note.
 
-    Raises DataError where the calibration does not say which of both it is for.
+    It is if its format says so, or if it is larger in the same proportions, as phones with LiDAR
+    give it. The note tells of the second case and is empty otherwise. Raises DataError if the
+    calibration then does not say which of both sizes it is for.
     """
     if recording.format.resize_color:
         return True, ""
     height, width = color.shape[:2]
     depth_height, depth_width = depth.shape[:2]
     factor = width / depth_width
-    if factor <= 1 or abs(factor * depth_height - height) > 1:
+    if factor <= 1 or abs(factor * depth_height - height) > 1:  # a pixel is rounding
         return False, ""
     sizes = f"{width}x{height} and {depth_width}x{depth_height}"
     camera = recording.calibration
@@ -199,10 +201,10 @@ def _resizing(color: np.ndarray, depth: np.ndarray, recording: Recording) -> tup
     return True, f"colour is made as small as depth: {sizes}"
 
 
-def _check(path: Path, image: np.ndarray, dtype: type, shape: tuple[int, ...], model: Path) -> None:
-    """Raises DataError for an image of another type or shape; `model` names whose size it is."""
+def _check(path: Path, image: np.ndarray, dtype: type, shape: tuple[int, ...], sized: Path) -> None:
+    """Raises DataError unless an image has this type and shape; `sized` is a file of that size."""
     if image.dtype != dtype or image.shape != shape:
-        wanted = f"{dtype.__name__} of shape {shape}, for the size of {model}"
+        wanted = f"{dtype.__name__} of shape {shape}, for the size of {sized}"
         found = f"{path} is {image.dtype} of shape {image.shape}"
         raise DataError(f"{found}: it must be {wanted} (depth has 16 bits and one channel)")
 
@@ -210,7 +212,10 @@ def _check(path: Path, image: np.ndarray, dtype: type, shape: tuple[int, ...], m
 def _in_millimetres(
     depth: np.ndarray, declared: Declaration, camera: Intrinsics, file: Path
 ) -> DepthImage:
-    """Millimetres along the optical axis."""
+    """Depth along the optical axis (mm) of a depth map's values, which mean what is declared.
+
+    Raises DataError, which names `file`, for more than 65.535 m.
+    """
     depth_mm = depth * (1000 / declared.depth_scale)
     if declared.depth_along == "ray":
         y, x = np.indices(depth.shape) + 0.5  # pixel centres
@@ -225,10 +230,14 @@ def _in_millimetres(
 
 
 def _undistortion(camera: Intrinsics, distortion: tuple[float, ...]) -> tuple[np.ndarray, ...]:
-    """For cv2.remap: where a pinhole camera's pixels lie in the image; empty for a pinhole's."""
+    """For cv2.remap: where pixels of the camera without its lens lie in the image.
+
+    Empty if the lens distorts nothing.
+    """
     if not any(distortion):
         return ()
     # OpenCV counts pixel centres as whole numbers.
     K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
     size = (camera.width, camera.height)
+    # None: no rotation. The second K: the undistorted image keeps the camera matrix.
     return cv2.initUndistortRectifyMap(K, np.array(distortion), None, K, size, cv2.CV_32FC1)

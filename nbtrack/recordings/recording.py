@@ -50,9 +50,12 @@ class Recording:
 
     @cached_property
     def origin(self) -> Position:
-        """The point (m, world) that is 0 in sequences: 0, or whole kilometres near the cameras if
-        these are far from 0, as in map coordinates, where single precision would lose millimetres.
-        So recordings of one place have one origin, that of its map."""
+        """The point (m, world) that is subtracted from positions in sequences.
+
+        It is 0 unless the cameras are far from 0, as in map coordinates, where single precision
+        would lose millimetres. Then it is near them, in whole kilometres, so that recordings of one
+        place have one origin, which is that of its map.
+        """
         if not self.has_pose.any():
             return np.zeros(3)
         center = np.median(self.T_world_camera[self.has_pose, :3, 3], axis=0)
@@ -60,7 +63,7 @@ class Recording:
 
     def contents(self) -> tuple[list[tuple[str, str, str]], str, Declaration]:
         """What changes when a recording does: the folder, name and digest of every image, a digest
-        of times, poses and camera, and the declaration."""
+        of times, poses and camera, and the declaration. Where the recording lies does not count."""
         images = []
         for file in self.color_files + self.depth_files:
             of_file = hashlib.sha256(file.read_bytes()).hexdigest()
@@ -78,7 +81,7 @@ def open_recording(
 ) -> Recording:
     """Find the files of a recording and read its poses and calibration; pixels come later.
 
-    The format is told by the files, unless named; a depth folder or a pose file replaces its own.
+    Without `format` the files tell it; `depth_folder` and `pose_file` replace the format's own.
     Raises MissingError, DataError or ConfigError if something is not there, wrong or unknown.
     """
     folder = absolute(folder)
@@ -113,7 +116,10 @@ def open_recording(
 
 
 def _own_times(folder: Path, colors: list[Path]) -> Times | None:
-    """Times of frames that no list names, from a file or their names, if these say them."""
+    """Times (s) of images that stand in a folder, not in a list with times; None if nothing tells.
+
+    They come from `timestamps.txt`, else from the images' names if all hold a time, and it rises.
+    """
     path = folder / TIMES_FILE
     if not path.is_file():
         stamps = [stamp_in(file) for file in colors]
@@ -129,7 +135,7 @@ def _own_times(folder: Path, colors: list[Path]) -> Times | None:
 def _calibration(folder: Path, layout: Format) -> tuple[Calibration, str]:
     """The folder's own calibration, else one that is assumed by the folder's name; and a note.
 
-    It tells what is assumed, or what the file says that is not used; else it is empty.
+    The note tells what is assumed, or what the file says that is not used; else it is empty.
     """
     known = [c for c in layout.known_cameras if c.source.name in folder.name]
     if known and not any((folder / name).is_file() for name in layout.cameras):
@@ -142,7 +148,10 @@ def _calibration(folder: Path, layout: Format) -> tuple[Calibration, str]:
 
 
 def _pose_pattern(folder: Path, layout: Format) -> str | None:
-    """Which of a format's files of poses is there, with `*` where every frame has one."""
+    """The format's pattern whose files of poses are there, with `*` where every frame has a file.
+
+    None if the folder has no poses. Raises DataError if it has those of two patterns.
+    """
     there = [pattern for pattern in layout.poses if files_of(folder, pattern)]
     if len(there) > 1:
         both = " and ".join(there)
@@ -153,9 +162,10 @@ def _pose_pattern(folder: Path, layout: Format) -> str | None:
 def _poses_and_times(
     files: list[Path], path: Path, layout: Format, declared: Declaration, moments: Moments
 ) -> tuple[Poses, Times, str]:
-    """A pose a frame, times, and a note: how poses were given to frames, or nothing.
+    """A pose and a time (s) for each frame, and a note of how poses were given to frames.
 
-    `path` names the files, with `*` where each frame has one.
+    The note is empty where it goes without saying. `path` is the one file of poses, or the pattern
+    with `*` where each frame has one.
     """
     tables = [layout.read_poses(file, declared.quaternion) for file in files]
     listed = checked_poses(np.concatenate([poses for poses, _ in tables]), path)
@@ -166,7 +176,7 @@ def _poses_and_times(
     if "*" in path.name:
         check_paired(moments.images, files)
         return listed, times, ""
-    # Stamps that do not tell whose a pose is may still be the times of as many frames, above.
+    # In some formats stamps are times only, as used above, and do not tell whose a pose is.
     telling = stamps if layout.stamps_tell else np.full(len(stamps), np.nan)
     poses, note = moments.poses_of(path, listed, telling, declared.inverted_if_world_to_camera)
     return poses, times, f"{path.name}: {note}" if note else ""

@@ -37,8 +37,8 @@ def write_sequence(
 
     It is put in place when it is complete, so that a run that is killed leaves no half-written
     scene; only if the system ends it at once, a hidden folder `.NAME....unfinished` stays beside.
-    `progress` is called after each frame with how many are written; one is needed. Raises DataError
-    if the folder exists.
+    `progress` is called after each frame with how many are written. At least one frame is needed.
+    Raises DataError if the folder exists.
     """
     if folder.exists():
         raise DataError(f"{folder} exists: choose another folder or remove it first")
@@ -63,15 +63,16 @@ def write_sequence(
 
 
 def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
-    """The camera and the poses, by file."""
-    # The layout's y and z point the other way: the same turn leads to OpenCV's axes and back.
+    """Texts of the files of poses and of the camera, by file name."""
+    # The layout's y and z axes point the other way than OpenCV's. Turning them is its own inverse,
+    # so that the function that reads the layout's poses also writes them.
     T_file = FORMATS["neural_rgbd"].declared.poses_to_opencv(T_world_camera)
     texts = dict.fromkeys(["poses.txt", "trainval_poses.txt"], _text(T_file.reshape(-1, 4)))
     told_by_focal = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
     if np.allclose(astuple(camera), astuple(told_by_focal), rtol=0, atol=_SAME_CAMERA):
         return texts | {"focal.txt": f"{float(camera.fx)!r}\n"}
-    # Programs that know only `focal.txt` then stop, instead of reading another camera. In the file
-    # pixel centres are whole numbers, as OpenCV counts.
+    # There is no `focal.txt` then, so that programs that know only this file stop, instead of
+    # reading another camera. In `intrinsics.txt` pixel centres are whole numbers, as in OpenCV.
     K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
     return texts | {"intrinsics.txt": _text(K)}
 
@@ -92,7 +93,7 @@ def convert_sequence(
     """
     select_frames(recording, frames)  # raises where none has a pose
     numbers = select_frames(recording, frames, needs_poses=False)
-    camera, _, _ = decode(recording, numbers[:1])
+    camera, _, _ = decode(recording, numbers[:1])  # one frame tells the size of all
     with ProgressBar("converting", len(numbers), progress) as bar:
         times = {TIMES_FILE: _text(recording.times[numbers, None])}
         write_sequence(out, camera, _frames(recording, numbers), times, bar.move_to)
@@ -107,7 +108,7 @@ def convert_sequence(
 
 
 def _frames(recording: Recording, numbers: Frames) -> Iterator[WrittenFrame]:
-    """The frames of some numbers, of which only a part is in memory at a time."""
+    """The frames of some numbers one by one; only `_FRAMES_AT_ONCE` are in memory at a time."""
     for part in np.split(numbers, range(_FRAMES_AT_ONCE, len(numbers), _FRAMES_AT_ONCE)):
         _, colors, depths = decode(recording, part)
         for color, depth, T in zip(colors, depths, recording.T_world_camera[part], strict=True):
