@@ -84,15 +84,15 @@ def check_recording(
 ) -> DataReport:
     """Read every frame of a recording and report what is there and whether it fits together.
 
-    Unless the whole is asked for, only a few pairs of frames are read, in about a second. Raises
-    what `read_frames` does, and DataError where the whole has no depth.
+    Unless `is_whole`, only a few pairs of frames are read, in about a second. Raises what
+    `read_frames` does, and DataError where the whole has no depth.
     """
     ids = select_frames(recording, slice(None))
     T_world_camera = recording.T_world_camera[ids]
     T_world_camera[:, :3, 3] -= recording.origin
     pairs = _pairs(T_world_camera, _N_PAIRS if is_whole else _QUICK_PAIRS)
     shown, kept = _kept(pairs, ids, is_whole)
-    # So `depths_mm` hold the files' values, whatever their unit and direction: any can be tried.
+    # Read as if in mm and z-depth, so that `depths_mm` hold the files' values for any reading.
     as_stored = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
     stored = replace(recording, declared=as_stored)
     sequence, frames = _read(stored, ids if is_whole else kept, kept, progress)
@@ -101,18 +101,17 @@ def check_recording(
     own = Reading(recording.declared, sequence.intrinsics)
     seen = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(seen, own)
-    are_shown = np.isin(kept, ids[shown])  # of the frames of `sequence`
-    cloud = _cloud(own, sequence.select(np.flatnonzero(are_shown)))
+    cloud = _cloud(own, sequence.select(np.flatnonzero(np.isin(kept, ids[shown]))))
     is_right = best is conventions[0]
     misfits, correlation = [], np.nan
     if is_right and is_whole and len(ids) >= _MIN_FRAMES:
         misfits, correlation = find_misfits(seen, best.reading)
     is_far = cloud.depth > far_limit(cloud.depth)
     warnings = list(_of_depth_images(frames, cloud, recording))
-    needs_proof = is_whole and not warnings  # of poses, by a camera that moves enough
-    main = main_misfit(misfits)  # why surfaces lie apart, of which `diagnosis` says only that
+    main = main_misfit(misfits)  # replaces a diagnosis, which would not say why surfaces lie apart
+    needs_proof = is_whole and not warnings  # that the camera moves enough to prove poses
     warnings.append(main or diagnosis(conventions, best, recording, needs_proof))
-    if is_right:  # else their numbers mean something else
+    if is_right:  # else poses and depths mean something else than is judged here
         warnings += [*_of_poses(frames, recording), *_of_depths(cloud.depth, is_far)]
     if not main:
         warnings += _of_colors(frames.brightness, correlation)
@@ -132,7 +131,10 @@ def quick_warning(recording: Recording) -> str:
 def _of_depth_images(
     frames: pd.DataFrame, cloud: pd.DataFrame, recording: Recording
 ) -> Iterator[str]:
-    """What is wrong with depth images, whatever their numbers mean."""
+    """What is wrong with depth images, whatever their numbers mean.
+
+    Depths and their steps are both as declared: only the ratio of the two decides.
+    """
     if not frames.measured.any():
         advice = "check the depth folder, and no_depth in sequence.toml"
         yield f"no pixel that was looked at has a depth: all are 0, or saturated (65535); {advice}"
@@ -141,7 +143,7 @@ def _of_depth_images(
     if _MAX_STEP * cloud.depth.median() < step_m < cloud.depth.max() / 8:
         advice = "look for those that the camera gave, or expect no better poses"
         yield f"depths come in steps of {100 * step_m:.1f} cm: {advice}"
-    # Below 1, since the first frame repeats none.
+    # The first frame repeats none, so that the share is below 1 and 1 / (1 - repeated) is finite.
     repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
     if repeated > _MIN_REPEATED:
         found = f"{repeated:.0%} of the depth images repeat the one before, though the poses move"
@@ -195,13 +197,15 @@ def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:
 
 
 def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:
-    """Positions of frames that see much the same, spread over a sequence, with all gaps alike.
+    """At most `maximum` pairs of frames that see much the same, as indices of their poses.
 
-    How far the camera turns is the same in all conventions.
+    They are spread over the sequence, and every gap of `_GAPS` occurs about equally often. How far
+    the camera turns, which limits the gaps, is the same in all conventions.
     """
     n_frames = len(T_world_camera)
     if n_frames < 2:
         return np.empty((2, 0), int)
+    # At least 1, so that nothing is divided by 0; up to there no gap of `_GAPS` is limited.
     step_deg = max(1.0, np.median(_turned_deg(T_world_camera)))
     largest_gap = max(1, min(n_frames - 1, int(_TURNED_DEG / step_deg)))
     gaps = np.minimum(np.resize(_GAPS, maximum), largest_gap)
@@ -210,10 +214,11 @@ def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:
 
 
 def _kept(pairs: Pairs, ids: Frames, is_whole: bool) -> tuple[Frames, Frames]:
-    """Positions in `ids` of frames whose points are shown, and ids of all whose images are kept.
+    """Which frames' points are shown, as indices in `ids`, and ids of those whose images are kept.
 
-    Of the whole, frames spread over the recording are shown, and neighbours of compared frames are
-    kept, which `find_misfits` needs; in a quick look the frames that are compared are both.
+    If `is_whole`, frames spread over the recording are shown, and kept are these, the compared
+    frames and the neighbours of these, which `find_misfits` needs. In a quick look the frames that
+    are compared are both shown and kept.
     """
     compared = np.unique(pairs)
     if not is_whole:
@@ -227,9 +232,10 @@ def _kept(pairs: Pairs, ids: Frames, is_whole: bool) -> tuple[Frames, Frames]:
 def _read(
     recording: Recording, looked_at: Frames, kept: Frames, progress: bool
 ) -> tuple[RgbdSequence, pd.DataFrame]:
-    """The frames to keep of those looked at, read in parts, and a row for each looked at.
+    """The frames to be kept, as a sequence, and a table with a row for each frame looked at.
 
-    `depths_mm` are the files' values, as the recording is declared here (see `check_recording`).
+    Images are read in parts, so that memory holds few besides those kept. `depths_mm` are the
+    files' values, as `check_recording` declares the recording for this.
     A row holds the share that is measured, the brightness in [0, 1], the greatest number that
     divides all depth values, whether these are those of the row before, by what the camera moved
     and turned since the frame before, and how far it is off the middle between the frames before
@@ -258,7 +264,10 @@ def _read(
 
 
 def _cloud(own: Reading, stored: RgbdSequence) -> pd.DataFrame:
-    """Coloured points (m) by the recording's declaration; `depths_mm` are the files' own values."""
+    """Coloured points (m, world) of some frames, as `own` reads them, with the columns of `cloud`.
+
+    `stored` has the files' own values as `depths_mm`.
+    """
     stride = max(1, round((stored.depths_mm[0].size / _POINTS_PER_FRAME) ** 0.5))
     points_camera = own.points(*on_grid(stored.depths_mm, stride)).numpy()
     T = stored.T_world_camera

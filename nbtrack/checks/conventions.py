@@ -50,8 +50,11 @@ class Convention:
 
 
 def fit_all(pairs: FramePairs, own: Reading) -> tuple[list[Convention], Convention]:
-    """All conventions, the declared one first, with how well pairs of frames agree under each; and
-    the best: the declared one, unless another is clearly better."""
+    """All conventions, with how well pairs of frames agree under each, and the best of them.
+
+    `own` is the declared reading, which comes first and is the best unless another is clearly
+    better.
+    """
     # Axes that have a name are called by it, so that one reading has one way to be written.
     named_axes = {words: name for name, words in SPELLED_AXES.items()}
     axes = named_axes.get(own.declared.camera_axes, own.declared.camera_axes)
@@ -83,6 +86,7 @@ def axes_name(camera_axes: str, poses: str) -> str:
     return f"{AXES.get(camera_axes, 'axes')} (x {x}, y {y}, z {z}), {poses}"
 
 
+# Subject, name and what is declared otherwise of the mistakes that a `Declaration` can tell.
 _DECLARED = [
     *(("poses", axes_name(axes, poses), {"camera_axes": axes, "poses": poses})
       for poses, axes in product((CAMERA_TO_WORLD, WORLD_TO_CAMERA), AXES)),
@@ -95,7 +99,7 @@ _DECLARED = [
 
 
 def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
-    """Subject, name and reading of the usual mistakes, common ones first."""
+    """Subject, name and reading of the usual mistakes beside the declared reading, common first."""
     for subject, name, keys in _DECLARED:
         yield subject, name, replace(own, declared=replace(own.declared, **keys))
     camera = own.camera
@@ -104,7 +108,8 @@ def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
     yield "calibration", centred, replace(own, camera=replace(camera, **middle))
     for label, factor in _CALIBRATIONS.items():
         scaled = {key: factor * getattr(camera, key) for key in ("fx", "fy", "cx", "cy")}
-        for changed in (scaled, scaled | middle):  # the middle of an image of any size
+        # A principal point scales too, unless it is the middle of the image at either size.
+        for changed in (scaled, scaled | middle):
             yield "calibration", label, replace(own, camera=replace(camera, **changed))
     for unit, metres in _UNITS.items():
         yield "poses", f"ones in {unit}", replace(own, metres=metres)
@@ -113,9 +118,10 @@ def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
 def _best_of(conventions: list[Convention]) -> Convention:
     """The declared convention (the first), unless another is clearly better.
 
-    The other is the first whose agreement is about the highest of those whose surfaces meet and
-    whose median depth is that of a depth camera, since no other number tells a unit of depth from
-    one of positions.
+    Of the others those count whose surfaces meet and whose median depth is plausible for a depth
+    camera: surfaces also meet if depths and positions are wrong by the same factor, and only the
+    depth then tells which unit is right. Of these the first is taken whose agreement is about the
+    highest.
     """
     own = conventions[0]
     near, far = PLAUSIBLE_DEPTH
@@ -166,7 +172,7 @@ def diagnosis(
 
 
 def _remedy(reading: Reading, own: Reading) -> str:
-    """What to change, so that a reading is the declared one."""
+    """What a user is to change, so that `reading` becomes the declared one, which is now `own`."""
     if reading.metres != 1:
         return f"multiply the positions in the pose file by {reading.metres:g}"
     if (c := reading.camera) != own.camera:

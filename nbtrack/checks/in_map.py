@@ -39,17 +39,17 @@ _MIN_FRAMES = 8  # that an estimate needs
 # What motions leave of longer depths, as a share of the points' distances from the camera: before
 # a flat wall 1 %, which is noise of the map's gradients; in rooms 10 % and more.
 _MIN_LEFT = 0.03
-_LONGER = Parameter(
+_LONGER = Parameter(  # without a key, since it is no field of a `Reading`
     "", "residuals in the map grow with depth, as if depths were off by", "+.1%", "", SHARES, 0.01,
     "the share may be larger, or focal lengths are off; compare both recordings by `data check`",
 )  # fmt: skip
 
 
 def check_belongs(finished: Map, frame: Frame) -> str | None:
-    """A warning where it cannot be told whether a map belongs to a frame; None where it does.
+    """A warning if the frame has no depth to tell by; None if the map belongs to the frame.
 
-    The rule: its misfit is at most 5 cm, or three times what is usual in the map's own frames.
-    Raises DataError if it is more.
+    It does if the frame's misfit is at most 5 cm, or at most three times what is usual in the map's
+    own frames. Raises DataError if the misfit is larger.
     """
     name = f"the map of {finished.record['scene']}"
     usual = finished.record["misfit_m"]
@@ -67,7 +67,8 @@ def check_belongs(finished: Map, frame: Frame) -> str | None:
 
 
 def in_world_of_map(tracked: Trajectory) -> tuple[Trajectory, bool]:
-    """The trajectory with true poses in the map's world, and whether they were in another one."""
+    """The trajectory with true poses in the map's world and the errors against these, and whether
+    they were in another world; where they were not, it is returned as it is."""
     T_map_world = other_world(tracked.T_estimated, tracked.T_true)
     if T_map_world is None:
         return tracked, False
@@ -83,8 +84,9 @@ def in_world_of_map(tracked: Trajectory) -> tuple[Trajectory, bool]:
 def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
     """The one rigid motion (m) from true to estimated poses that explains the errors of a run.
 
-    After it those of most frames are below `LOST_THRESHOLD_M`, which they exceeded before, and a
-    tenth of what they were (our choice); None where no motion does that, or too little is known.
+    It explains them if their median was above `LOST_THRESHOLD_M` and after the motion is below it
+    and below a tenth of what it was (our choice). None where no motion does that, or fewer than
+    three frames have a true pose.
     """
     is_known = np.isfinite(T_true).all(axis=(1, 2))
     if is_known.sum() < 3:
@@ -107,8 +109,11 @@ def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
 
 
 def outside_map_share(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> float:
-    """The share of some frames, spread evenly, that saw little of what was mapped: most of their
-    points lie outside of the map, at their true poses where known, else at the estimated ones."""
+    """The share of frames, of some spread evenly, that saw little of what was mapped.
+
+    Most of such a frame's points lie outside of the map's bounds, at its true pose if that is
+    known, else at the estimated one.
+    """
     outside = []
     for index, points_camera in _some_points(sequence):
         T = sequence.T_world_camera[index]
@@ -121,12 +126,12 @@ def outside_map_share(field: Field, sequence: RgbdSequence, T_estimated: Poses) 
 def map_misfit(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> str:
     """A sentence where depths of some frames misfit the distances of a map; else an empty one.
 
-    Frames tell nothing that see up to three walls: there a motion does the same. The module's text
-    has the method and its symbols p, q, r and s.
+    A frame that sees no more than three walls tells nothing: moving the camera there has the same
+    effect as longer depths. The module's text has the method and its symbols p, q, r and s.
     """
     if not field.is_distance:
         return ""
-    costs = []  # of each frame at each share s
+    costs = []  # of each frame at each share s: squared distances (m²) that no motion explains
     for index, points_camera in _some_points(sequence):
         T = T_estimated[index]
         points_world = torch.from_numpy(_to_world(points_camera, T)).float().to(field.device)
@@ -137,7 +142,7 @@ def map_misfit(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> str:
         q = (gradient_world.numpy(force=True) @ T[:3, :3])[is_near]
         motions, _ = np.linalg.qr(np.hstack([np.cross(p, q), q]))
         both = np.column_stack([r, (q * p).sum(axis=1)])
-        # What no motion explains, of the distances and of what longer depths would add to them.
+        # What no motion explains: of r, and of q . p, which times s is what longer depths add to r.
         residual, longer = (both - motions @ (motions.T @ both)).T
         if len(p) >= _MIN_POINTS and (longer**2).sum() > _MIN_LEFT**2 * (p**2).sum():
             costs.append(((residual - SHARES[:, None] * longer) ** 2).sum(axis=1))

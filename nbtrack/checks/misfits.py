@@ -21,7 +21,9 @@ _METRES = np.linspace(-0.6, 0.6, 13)  # by which poses may drift along an axis, 
 _PIXELS = np.linspace(-0.06, 0.06, 13)  # by which colours may be off, as a share of the width
 _FRAMES = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
 _NO_YES = np.array([0, 1])
-_SCATTER = np.linspace(-0.02, 0.04, 13)  # m, by which positions may scatter; below 0 for symmetry
+# m, by which positions may scatter. Values below 0 have no meaning: they are there so that 0 lies
+# between others, as in the other ranges.
+_SCATTER = np.linspace(-0.02, 0.04, 13)
 _GAIN = 0.98  # share of the cost as declared, above which an estimate tells nothing (our choice)
 _MIN_PAIRS = 8  # that an estimate needs
 MIN_CORRELATION = 0.75  # of intensities that pairs of a right recording have (our choice)
@@ -34,10 +36,10 @@ class Parameter(NamedTuple):
 
     key: str  # of `Reading`
     name: str
-    form: str  # how its estimate is written; empty for yes or no
+    form: str  # format specification of its estimate; empty for yes or no
     unit: str
     values: Float[np.ndarray, "values"]
-    negligible: float  # our choice: more than right recordings show
+    negligible: float  # as the values; our choice: more than right recordings show
     advice: str  # with {factor}, 1 + estimate
 
 
@@ -89,14 +91,16 @@ class Misfit:
 
 
 def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
-    """Misfits that pairs of frames can tell, whether there or not, and how alike their colours are:
-    the correlation of intensities of points that both see, NaN without contrast.
+    """Estimates of all misfits that pairs of frames can tell, also of those that are not
+    significant, and the correlation of intensities of points that both frames of a pair see.
 
-    The frames up to MAX_SHIFT around those of the pairs must be kept too. Misfits of colours are
-    looked for where depth is right. Those that even at their best leave colours less alike than
-    MIN_CORRELATION are left out: such colours are of another place.
+    The correlation is as declared, NaN without contrast. `pairs` must also hold the frames up to
+    MAX_SHIFT around those of the pairs. Misfits of colours are looked for if none of depth is
+    significant. Those are left out with which colours correlate by less than MIN_CORRELATION even
+    at the best value: such colours are of another place.
     """
     found = list(_estimates(_DEPTH_PARAMETERS, own, pairs.depth_costs))
+    # Colours are compared at the points whose depths agree as declared.
     color_costs = partial(pairs.color_costs, pairs.compare(own))
     unlikeness = color_costs(own)
     correlation = float(1 - np.nanmedian(unlikeness)) if np.isfinite(unlikeness).any() else np.nan
@@ -108,7 +112,7 @@ def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
 
 
 def main_misfit(misfits: list[Misfit]) -> str:
-    """A sentence on the significant one that explains the most; empty where none is."""
+    """A sentence on the significant misfit that explains the most; empty if none is significant."""
     main = min((m for m in misfits if m.is_significant), key=lambda m: m.gain, default=None)
     if not main:
         return ""
@@ -119,8 +123,10 @@ def main_misfit(misfits: list[Misfit]) -> str:
 def _estimates(
     parameters: list[Parameter], own: Reading, cost: Callable[[Reading], Costs]
 ) -> Iterator[Misfit]:
-    """An estimate of each parameter, by the pairs that have a cost at all of its values; none of
-    one for which these pairs are too few."""
+    """An estimate of each parameter, by the pairs that have a cost at all of its values.
+
+    A parameter for which these are fewer than `_MIN_PAIRS` is passed over.
+    """
     for parameter in parameters:
         readings = [replace(own, **{parameter.key: value}) for value in parameter.values]
         costs = np.stack([cost(reading) for reading in readings], axis=1)
@@ -133,6 +139,7 @@ def estimate(parameter: Parameter, costs: Float[np.ndarray, "n values"]) -> Misf
     """The value of a parameter at which `n` observations agree best; its interval is a bootstrap's,
     which draws the observations anew."""
     values, mean = parameter.values, costs.mean(axis=0)
+    # A fixed seed, so that a recording always has the same interval.
     drawn = np.random.default_rng(0).integers(len(costs), size=(_RESAMPLED, len(costs)))
     low, high = np.quantile(_lowest(values, costs[drawn].mean(axis=1)), _INTERVAL)
     gain = float(mean.min() / mean[np.abs(values).argmin()])  # by the mean at 0, as declared
@@ -142,12 +149,15 @@ def estimate(parameter: Parameter, costs: Float[np.ndarray, "n values"]) -> Misf
 def _lowest(
     values: Float[np.ndarray, "values"], costs: Float[np.ndarray, "*n values"]
 ) -> Float[np.ndarray, "*n"]:
-    """The value at which costs are lowest. Values have equal steps: between them a parabola goes
-    through the lowest cost and both beside it; at either end the value itself is taken."""
+    """The value at which costs are lowest, for each row of costs; values have equal steps.
+
+    It is the minimum of the parabola through the lowest cost and those on both sides of it. If the
+    lowest cost is the first or the last, it is the value itself.
+    """
     at, last = costs.argmin(axis=-1), len(values) - 1
     around = np.clip(at[..., None] + [-1, 0, 1], 0, last)
     before, middle, after = np.moveaxis(np.take_along_axis(costs, around, axis=-1), -1, 0)
-    bend = before - 2 * middle + after
+    bend = before - 2 * middle + after  # 0 where all three are equal: no parabola
     is_inside = (at > 0) & (at < last) & (bend > 0)
     offset = np.where(is_inside, (before - after) / 2 / np.where(is_inside, bend, 1), 0)
     return values[at] + offset * (values[1] - values[0])

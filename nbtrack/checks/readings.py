@@ -25,7 +25,7 @@ from nbtrack.recordings.recording import Recording
 _HIDDEN_BEHIND = 0.25  # m behind a surface points are hidden: several times a camera's noise
 _SAME_SURFACE = 0.025  # of the depth: where neighbours blend to more, they lie on two surfaces
 _SCALE = 0.01  # of the depth: surfaces so far apart agree by half, several times a camera's noise
-_SAME = 0.2  # agreement of points whose colours are compared: twice as far apart
+_SAME = 0.2  # least agreement of points whose colours are compared: surfaces 2 * _SCALE apart
 _MIN_OVERLAP = 0.1  # share of a pair's points without which its cost is none
 _MIN_CONTRAST = 0.02  # standard deviation of intensities in [0, 1], below which nothing is seen
 _POINTS_PER_FRAME = 1000  # 20 pairs of frames have enough for a median
@@ -68,8 +68,10 @@ class Reading:
         return directions * lengths[..., None]
 
     def T_world_camera(self, file_poses: Poses, order: str) -> Poses:
-        """Camera-to-world poses with OpenCV's camera axes, of a file's as they were read with an
-        order of quaternions."""
+        """Camera-to-world poses with OpenCV's camera axes.
+
+        `file_poses` are as the file has them, their quaternions read in the order `order`.
+        """
         T_file = file_poses.copy()
         if self.declared.quaternion != order:  # the file's four numbers, read the other way
             w_first = order == "wxyz"
@@ -79,7 +81,7 @@ class Reading:
         T_world_camera = self.declared.poses_to_opencv(T_file)
         drift = [self.drift_x, self.drift_y, self.drift_z]  # m, in the end
         positions = T_world_camera[:, :3, 3] - np.outer(np.linspace(0, 1, len(T_file)), drift)
-        # Scattered positions move towards the averages over their neighbours.
+        # Positions move towards averages over their neighbours, by `scatter` in root mean square.
         off = positions - uniform_filter1d(positions, _SMOOTHED, axis=0, mode="nearest")
         mean_off = np.sqrt((off**2).sum(axis=1).mean())
         T_world_camera[:, :3, 3] = positions - self.scatter * off / max(1e-9, mean_off)
@@ -87,7 +89,7 @@ class Reading:
 
 
 def on_grid(values: UInt16[np.ndarray, "frames h w"], stride: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Columns and rows (n,) of every `stride`-th pixel of each axis, and values (frames, n)."""
+    """Columns and rows (n,) of every `stride`-th pixel along each axis, and values (frames, n)."""
     some = torch.from_numpy(values[:, ::stride, ::stride].astype(np.float32))
     rows, columns = (stride * torch.from_numpy(np.indices(some.shape[1:]))).flatten(1)
     return columns, rows, some.flatten(1)
@@ -109,14 +111,15 @@ class FramePairs:
     def __init__(self, recording: Recording, ids: Frames, kept: RgbdSequence, pairs: Pairs) -> None:
         """Take the frames of pairs from a sequence whose depth values are as in the files.
 
-        `ids` are the numbers of the recording's frames that have a pose, and pairs are positions in
-        them. Points are looked at in the first frame of each pair.
+        `ids` are the numbers of the recording's frames that have a pose, and `pairs` are indices in
+        `ids`. Points are those of the first frame of each pair. `kept` also holds frames around
+        those of the pairs where `color_costs` is to shift colours against depth.
         """
         self.pairs = pairs
         self.file_poses = recording.file_poses[ids]
         self.order = recording.declared.quaternion
         self.colors = kept.colors
-        self.places = np.searchsorted(kept.frame_ids, ids[pairs])  # of pairs in the sequence
+        self.places = np.searchsorted(kept.frame_ids, ids[pairs])  # of pairs in `kept`
         first, second = kept.depths_mm[self.places]  # the files' values, in their unit
         stride = math.ceil((math.prod(first.shape[1:]) / _POINTS_PER_FRAME) ** 0.5)
         self.columns, self.rows, self.values = on_grid(first, stride)  # of the points
@@ -147,10 +150,10 @@ class FramePairs:
         return Comparison(residual, measured, is_valid, agreement, at)
 
     def _longer(self, reading: Reading) -> Tensor:
-        """How many times too long depths are in first and in second frames, (2, pairs, 1).
+        """Factors by which depths are too long in first and in second frames, (2, pairs, 1).
 
-        They grow from frame to frame: the recording's first are too short by half of the growth,
-        its last too long by as much.
+        They grow evenly over the recording: its first depths are too short by half of
+        `depth_growth`, its last ones too long by as much.
         """
         growth = reading.depth_growth * (self.pairs / len(self.file_poses) - 0.5)
         return torch.from_numpy(1 + growth[..., None]).float()
@@ -158,17 +161,18 @@ class FramePairs:
     def _T_second_first(self, reading: Reading) -> Tensor:
         """Poses of the first cameras in the second ones' frames, (pairs, 4, 4; m)."""
         T_world_camera = reading.T_world_camera(self.file_poses, self.order)
+        # Depth that is late by some frames was taken at the pose that is so many frames before.
         numbers = (self.pairs - reading.depth_shift).clip(0, len(self.file_poses) - 1)
         T_world_first, T_world_second = T_world_camera[numbers]
         return torch.from_numpy(np.linalg.solve(T_world_second, T_world_first)).float()
 
     def _on_images(self, columns: Tensor, rows: Tensor) -> Tensor:
-        """Pixels as `grid_sample` has them: -1 is the first, 1 the last."""
+        """Pixel indices as `grid_sample` has them, (..., 2): -1 is the first pixel, 1 the last."""
         height, width = self.inverse_values.shape[2:]
         return 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1) - 1
 
     def depth_costs(self, reading: Reading) -> Costs:
-        """How little the depths of pairs agree; NaN of pairs that see little of the same."""
+        """1 - the mean agreement of the points of a pair that are valid; NaN if these are few."""
         compared = self.compare(reading)
         overlap = compared.is_valid.float().mean(dim=1)
         costs = 1 - compared.agreement.mean(dim=1) / overlap
@@ -177,7 +181,8 @@ class FramePairs:
     def color_costs(self, compared: Comparison, reading: Reading) -> Costs:
         """1 - the correlation of intensities of points whose depths agree; exposures may differ.
 
-        NaN of pairs with few points, and without contrast.
+        `compared` tells where points lie and agree, and `reading` how colours are shifted. NaN of
+        pairs with few points, and without contrast.
         """
         # The points' places in all first frames, then in all second ones: (2 pairs, 1, points, 2).
         in_first = self._on_images(self.columns, self.rows).expand_as(compared.seen_at[:, 0])
@@ -185,6 +190,7 @@ class FramePairs:
         at[..., 0] += 2 * reading.color_right  # an image is 2 wide, from -1 to 1
         if reading.is_mirrored:
             at[..., 0] *= -1
+        # `kept` holds the neighbours in order, so that so many frames later is so many places on.
         places = (self.places + reading.color_shift).clip(0, len(self.colors) - 1)
         gray = [cv2.cvtColor(self.colors[i], cv2.COLOR_RGB2GRAY) for i in places.ravel()]
         images = torch.from_numpy(np.stack(gray))[:, None].float() / 255
