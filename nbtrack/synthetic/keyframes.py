@@ -18,8 +18,9 @@ from nbtrack.tracking.metrics import still_metrics
 
 Keys = Float[np.ndarray, "n 7"]  # as `camera_poses` takes them, and the frame that is there
 
-MEAN_STEP = np.array([5.7e-3, 0.45])  # translation (units of the scene), rotation (degrees)
-_FASTEST = np.array([8.5e-3, 0.95])  # the dataset's path: 7.8e-3 and 0.92
+# Translation (units of the scene) and rotation (degrees) a frame.
+MEAN_STEP = np.array([5.7e-3, 0.45])
+_FASTEST = np.array([8.5e-3, 0.95])  # at most; the dataset's path: 7.8e-3 and 0.92
 # A camera that stands still should be off by so much (m), or by this share of what it is without a
 # seed's changes.
 _MIN_STILL = 1.0
@@ -29,10 +30,11 @@ _SHORT = 240  # frames of the shorter of a room's two paths
 # pass the same things.
 _SHIFTED = (0.2, 0.1, 0.2)
 _TURNED = 0.12
-_ACROSS = np.linspace(-0.55, 0.55, 7)  # rays through an image
+# x and y of a grid of rays with z = 1, which covers most of an image.
+_ACROSS = np.linspace(-0.55, 0.55, 7)
 _DOWN = np.linspace(-0.4, 0.4, 5)
-_NEAR = 0.8  # m; a quarter of an image at most is so near
-_MARGIN = 0.1  # m; of a scene's bounds
+_NEAR = 0.8  # m; at most a quarter of an image is nearer
+_MARGIN = 0.1  # m; around what is seen, in a scene's bounds
 
 
 def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
@@ -46,6 +48,7 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     of_short, of_long = room.walk.keys
     keys = np.array(of_short if n_frames <= _SHORT else of_long)
     base = _calibrated_path(room, keys)
+    # How far (m) a camera that stands still has to be off at least.
     least = min(_MIN_STILL, _STILL_SHARE * still_metrics(base)["still_ate_m"])
 
     for rng in attempts(room, seed):
@@ -55,6 +58,7 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
         poses = _calibrated_path(room, moved)
         is_far = still_metrics(poses)["still_ate_m"] > least
         if is_far and is_clear(room, poses) and _is_like_the_dataset(room, poses):
+            # Frame numbers 0, 1, ..., last, last - 1, ..., 0, 1, ...: at least `n_frames` of them.
             back_and_forth = np.pad(np.arange(len(poses)), (0, n_frames), mode="reflect")
             return poses[back_and_forth[:n_frames]]
 
@@ -63,20 +67,20 @@ def _is_like_the_dataset(room: Room, poses: Poses) -> bool:
     """Whether a path in free space has the right speed, and looks at things far enough."""
     unit, near = _view(room, poses)
     to_mm = np.array([1e3 * unit, 1.0])  # degrees stay degrees
-    return near > _NEAR and has_speed(poses, MEAN_STEP * to_mm, _FASTEST * to_mm, 0.03)
+    return near > _NEAR and has_speed(poses, MEAN_STEP * to_mm, _FASTEST * to_mm, tolerance=0.03)
 
 
 def _calibrated_path(room: Room, keys: Keys) -> Poses:
-    """The path through key poses, after their x, z and yaw were spread around their means, or drawn
-    together, until the mean speeds are right."""
+    """The path through key poses, whose x, z and yaw are scaled about their means, in four rounds,
+    to give it the mean speeds `MEAN_STEP`; the frames of the keys stay."""
     keys = keys.copy()
     spread = [0, 2, 4]  # columns: x, z, yaw
-    unit = np.max(room.parts[0].solid.size) / 2  # m; of the shell
+    unit = np.max(room.parts[0].solid.size) / 2  # m; at first of the whole room, by its shell
     for _ in range(4):
         poses = _path(keys)
         if room.sdf(poses[:, :3, 3]).min() > 0:  # only a camera in free space sees something
             unit, _ = _view(room, poses)
-        wanted = MEAN_STEP * [1e3 * unit, 1.0]
+        wanted = MEAN_STEP * [1e3 * unit, 1.0]  # mm, degrees
         move, turn = np.clip(wanted / steps_between(poses).mean(axis=1), 0.5, 2.0)
         middle = keys[:, spread].mean(axis=0)
         keys[:, spread] = middle + (keys[:, spread] - middle) * [move, move, turn]
@@ -84,7 +88,7 @@ def _calibrated_path(room: Room, keys: Keys) -> Poses:
 
 
 def _path(keys: Keys) -> Poses:
-    """One cubic of the position and one turning rate between two key poses.
+    """Camera-to-world poses, with one cubic of the position and one turning rate between two keys.
 
     At a join the camera keeps its direction, and is the slower the more the direction bends.
     """
@@ -110,8 +114,11 @@ def _path(keys: Keys) -> Poses:
 
 
 def _view(room: Room, poses: Poses) -> tuple[float, float]:
-    """What some frames see: the unit (m) of a map of it, as `SceneBounds` has it, and the least
-    z-depth (m) that a quarter of an image does not exceed."""
+    """What every twelfth frame of a path sees: the unit of a map of it, and how near it is (m).
+
+    The unit is that of `SceneBounds`. How near says the lower quartile of the z-depths of a frame,
+    of the frame where it is least.
+    """
     rays_camera = np.stack(np.meshgrid(_ACROSS, _DOWN, [1.0]), axis=-1).reshape(-1, 3)
     directions = (rays_camera @ poses[::12, :3, :3].mT).reshape(-1, 3)
     origins = poses[::12, :3, 3].repeat(len(rays_camera), axis=0)

@@ -39,11 +39,15 @@ def _smooth_noise(points: Points, wavelength: float, seed: int) -> Values:
 
 
 def _squared(wave: Values, softness: float = 0.04) -> Values:
-    """A wave in [0, 1], square with rounded edges: a hard edge would ring in any smooth field."""
+    """A wave about 0 made square, in [0, 1], with rounded edges: hard ones ring in a smooth field.
+
+    The larger `softness` (in squares of the wave), the rounder they are.
+    """
     return 0.5 + 0.5 * wave / np.sqrt(wave * wave + softness)
 
 
 def _mix(first: Color, second: Color, amount: Values) -> Points:
+    """Colors between two: the first where the amount is 0, the second where it is 1."""
     return np.asarray(first) + amount[:, None] * (np.asarray(second) - np.asarray(first))
 
 
@@ -60,14 +64,14 @@ def checker(
 ) -> Points:
     """Two colors in rounded squares over two world axes; a period is two squares."""
     phases = 2 * np.pi / period * points[:, axes]
-    product = np.sin(phases[:, 0] + 0.7) * np.sin(phases[:, 1] + 0.4)
-    return _mix(first, second, _squared(product, 0.02))
+    product = np.sin(phases[:, 0] + 0.7) * np.sin(phases[:, 1] + 0.4)  # phases: our choice
+    return _mix(first, second, _squared(product, softness=0.02))
 
 
 def stripes(
     points: Points, first: Color, second: Color, period: float, direction: Vector3 = (1.0, 0.0, 0.0)
 ) -> Points:
-    """Two colors in rounded stripes."""
+    """Two colors in rounded stripes; a period is two stripes."""
     phase = 2 * np.pi / period * (points @ np.asarray(direction))
     return _mix(first, second, _squared(np.sin(phase)))
 
@@ -84,29 +88,31 @@ def wood(
 def colorful(
     points: Points, base: Color, seed: int, spread: float, period: float, axis: int
 ) -> Points:
-    """Many colors, `spread` from a base, side by side along an axis: book spines, tins."""
+    """Many colors side by side along an axis, up to about `spread` from a base: books, tins."""
     phase = 2 * np.pi / period * points[:, axis]
-    turns = np.random.default_rng(seed).uniform(0, 2 * np.pi, 3)
-    of_channels = np.sin(phase[:, None] * np.array([1.0, 0.83, 0.64]) + turns)
+    shifts = np.random.default_rng(seed).uniform(0, 2 * np.pi, 3)  # rad
+    # Red, green and blue have different periods.
+    of_channels = np.sin(phase[:, None] * np.array([1.0, 0.83, 0.64]) + shifts)
     # Half of the change is common to all channels: spines differ in brightness, not hue alone.
-    waves = 0.7 * of_channels + 0.5 * np.sin(1.13 * phase + turns[0])[:, None]
+    waves = 0.7 * of_channels + 0.5 * np.sin(1.13 * phase + shifts[0])[:, None]
     return np.clip(np.asarray(base) + spread * waves, 0.05, 1.0)
 
 
 def patchwork(points: Points, base: Color, period: float, seed: int, spread: float = 0.2) -> Points:
     """Rounded patches in many colors around a base, on any face: a quilt, a woven carpet."""
     rng = np.random.default_rng(seed)
-    # Another period for each axis and channel: no two patches near each other look alike.
+    # Another period for each axis and channel: no two patches near each other look alike. The
+    # channels are three colors and a brightness.
     angular = 2 * np.pi / (period * rng.uniform(0.8, 1.4, (3, 4)))
     total = np.sin(points[:, :, None] * angular + rng.uniform(0, 2 * np.pi, (3, 4))).sum(axis=1)
     waves = total / np.sqrt(total * total + 0.2)
-    # Patches differ in brightness, which the last wave gives, more than in hue.
+    # Patches differ in brightness more than in hue.
     mixed = 0.6 * waves[:, :3] + 0.9 * waves[:, 3:]
     return np.clip(np.asarray(base) + spread * mixed, 0.05, 1.0)
 
 
 def split(points: Points, below: Material, above: Material, axis: int) -> Points:
-    """Two materials on either side of the middle of a world axis: paint that ends at a wall."""
+    """A material below 0 of a world axis and one above: paint that ends at a wall."""
     return np.where(points[:, axis, None] > 0.0, above(points), below(points))
 
 
@@ -117,7 +123,7 @@ def framed(
     frame, first, second = colors
     offset = np.abs(points - np.asarray(center))
     sideways = 2 - axis  # z of a picture across x, x of one across z
-    # From the border inwards: `size` is width and height.
+    # How far (m) a point lies inside of the picture's border; `size` is width and height.
     inset = np.minimum(size[0] / 2 - offset[:, sideways], size[1] / 2 - offset[:, 1])
     shapes = _mix(first, second, _squared(np.sin(2.5 * _smooth_noise(points, 0.25, seed))))
     return np.where((inset < 0.05)[:, None], np.asarray(frame), shapes)
@@ -126,7 +132,7 @@ def framed(
 def lining(
     points: Points, shell: Box, floor: Material, ceiling: Material, sides: Material, ends: Material
 ) -> Points:
-    """Colours of a room's shell; `sides` are the walls perpendicular to x, `ends` those to z."""
+    """Colors of a room's shell; walls perpendicular to x are `sides`, those to z are `ends`."""
     colors = np.empty_like(points)
     x, y, z = shell.normals(points).T  # into the room: up from the floor
     linings = [(y > 0.5, floor), (y < -0.5, ceiling), (abs(x) > 0.5, sides), (abs(z) > 0.5, ends)]

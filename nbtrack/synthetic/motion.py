@@ -61,7 +61,7 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
 
 
 def attempts(room: Room, seed: int) -> Iterator[np.random.Generator]:
-    """Random numbers for one path after another, until one is taken.
+    """Random numbers for one path after another, until the caller takes a path and stops.
 
     Raises `NumericalError` after the last: the room is too full for any to keep `CLEARANCE`.
     """
@@ -77,21 +77,23 @@ def is_clear(room: Room, poses: Poses) -> bool:
 
 
 def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
-    """Draw a path and its speed; adjust radius and turning rate until mean speeds are as wanted."""
+    """A random path of `length` frames, its radius and turning rate adjusted to `MEAN_STEP`."""
     wandering = _wandering(walk.pitch, length, rng)
-    n_turns = _before(_relative_speed(length, rng))  # until a frame, each by the rate
+    covered = _before(_relative_speed(length, rng))  # at each frame, in frames at the mean speed
     tremor = _tremor(length, rng)
     center = np.asarray(walk.center) + rng.uniform(-_CENTER_REACH, _CENTER_REACH, 2)
     heading = walk.start_yaw + rng.uniform(-_HEADING_REACH, _HEADING_REACH)
-    # Forward and left, (x, z).
+    # Rows: x and z of the directions forward and left.
     axes = np.array([[-np.sin(heading), -np.cos(heading)], [-np.cos(heading), np.sin(heading)]])
+    # Where the adjustment begins, of which each round comes nearer to the wanted mean speeds.
     radius = 0.7  # m
     rate = np.radians(0.5)  # a frame, in the mean
     for _ in range(12):
-        angle = rate * n_turns
+        angle = rate * covered
         stretch, side, glance, pitch, roll, height = wandering(angle).T
         turned = walk.turn * angle
-        # Opposite to the direction of view, so that the room lies before the camera.
+        # (forward, left) in radii: on the side of the center opposite to the direction of view, so
+        # that the room lies before the camera.
         ellipse = np.stack([-np.cos(turned + side), -_FLATTENING * np.sin(turned + side)], axis=1)
         x, z = (center + radius * (1.0 + stretch[:, None]) * (ellipse @ axes)).T
         yaw = heading + turned + glance
@@ -103,10 +105,13 @@ def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
 
 
 def _wandering(pitch: float, length: int, rng: np.random.Generator) -> CubicSpline:
-    """Over the angle turned: changes of radius (relative), side and yaw (rad); pitch and roll (rad)
-    and height (m) themselves."""
-    # From before the start to behind the end, since the turning rate is not known yet: about that
-    # of `MEAN_STEP`.
+    """What wanders over the angle turned (rad) in `length` frames, a spline with six columns.
+
+    The first three are changes: of the radius (relative), of the place on the ellipse and of the
+    yaw (rad). The others are values: the pitch, about a mean of `pitch`, and the roll (rad), and
+    the height (m).
+    """
+    # More knots on both sides than the mean turning rate needs: the path's own is not known yet.
     knots = np.arange(-2.0, 1.6 * length * np.radians(MEAN_STEP[1]) / _KNOT_SPACING + 4.0)
     spread = np.array([0.04, 0.05, 0.07, 0.09, 0.025, 0.05])
     values = spread * np.clip(rng.normal(size=(len(knots), 6)), -2.0, 2.0)
@@ -126,10 +131,8 @@ def steps_between(T_world_camera: Poses) -> Float[np.ndarray, "2 n"]:
 
 
 def has_speed(poses: Poses, mean: Values, largest: Values, tolerance: float) -> bool:
-    """Whether no step (mm, degrees) is larger than allowed, and the mean is off by little.
-
-    The tolerance is a share of the mean.
-    """
+    """Whether no step exceeds `largest`, and the mean step is off `mean` by a share `tolerance` at
+    most; both are pairs of mm and degrees a frame."""
     steps = steps_between(poses)
     is_mean_right = np.abs(steps.mean(axis=1) / mean - 1) < tolerance
     return bool((is_mean_right & (steps.max(axis=1) <= largest)).all())
@@ -149,10 +152,10 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     # Three rounds, so that smoothing and interpolation meet no end in the middle one.
     curve = CubicSpline(_before(np.tile(steps, 3)), np.tile(around, (3, 1)))  # over metres walked
     speed = _relative_speed(n_frames, rng)
-    walked = steps.sum() * (1 + _before(speed) / speed.sum())
+    walked = steps.sum() * (1 + _before(speed) / speed.sum())  # m at each frame, in round two
     x, z = curve(walked).T
     three_rounds = np.concatenate([walked - steps.sum(), walked, walked + steps.sum()])
-    forward_x, forward_z = curve(three_rounds, nu=1).T
+    forward_x, forward_z = curve(three_rounds, nu=1).T  # the derivative: where the walk leads
     ahead = np.unwrap(np.arctan2(-forward_x, -forward_z))  # yaw
     yaw = gaussian_filter1d(ahead, _AHEAD)[n_frames : 2 * n_frames]
     height = rng.uniform(1.3, 1.5) + _wander(n_frames, rng, 0.05)
@@ -171,7 +174,8 @@ def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
     points = np.stack(np.meshgrid(x, heights, z, indexing="ij"), axis=-1)
     clearance = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:3]).min(axis=1)
     is_free = clearance >= CLEARANCE + _MARGIN
-    # A negative cost is a cell that no route enters.
+    # Costs fall with the distance from surfaces, which draws routes to the middle. A negative cost
+    # is a cell that no route enters.
     costs = np.where(is_free, 1.0 / np.maximum(clearance - CLEARANCE, 0.01), -1.0)
     cells = [(np.abs(x - at_x).argmin(), np.abs(z - at_z).argmin()) for at_x, at_z in stops]
     ends = [*cells[1:], cells[0]]
@@ -187,7 +191,10 @@ def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
 def _wander(
     n_frames: int, rng: np.random.Generator, std: float, spacing: int = 40, limit: float = 2.0
 ) -> Values:
-    """A smooth random curve with knots every `spacing` frames, up to `limit` times the std."""
+    """A smooth random curve about 0, a value a frame, with knots every `spacing` frames.
+
+    The values at knots are normal, of standard deviation `std`, and cut at `limit` times that.
+    """
     knots = np.arange(-1.0, n_frames / spacing + 3.0)
     values = std * np.clip(rng.normal(size=len(knots)), -limit, limit)
     return CubicSpline(knots, values)(np.arange(n_frames) / spacing)
@@ -200,13 +207,13 @@ def _relative_speed(n_frames: int, rng: np.random.Generator) -> Values:
 
 
 def _before(steps: Values) -> Values:
-    """What was covered before each step."""
+    """The sum of the steps before each step; 0 for the first."""
     return np.concatenate([[0.0], np.cumsum(steps)[:-1]])
 
 
 def _tremor(n_frames: int, rng: np.random.Generator) -> Placed:
-    """A hand's tremor: four sines of 1.5 to 5 Hz for each number."""
-    cycles_per_frame = rng.uniform(1.5, 5.0, (4, 6)) / 30
+    """A hand's tremor, to be added to places: four sines of 1.5 to 5 Hz for each number."""
+    cycles_per_frame = rng.uniform(1.5, 5.0, (4, 6)) / 30  # frames a second
     phases = rng.uniform(0, 2 * np.pi, (4, 6))
     amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / 2.0  # m, rad
     waves = np.sin(2 * np.pi * cycles_per_frame * np.arange(n_frames)[:, None, None] + phases)

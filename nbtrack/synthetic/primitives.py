@@ -29,8 +29,8 @@ def _row_max(rows: Vectors) -> Values:
 
 
 def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Interval:
-    """Where a ray is inside the box |local| <= half."""
-    # A direction parallel to a slab: a tiny slope sends both crossings far away, without 0/0.
+    """Where a ray, in the box's own coordinates, is inside |coordinates| <= half."""
+    # In a direction parallel to a slab a tiny slope sends both crossings far away, without 0/0.
     direction = np.where(directions == 0.0, 1e-30, directions)
     first, second = (-half - origins) / direction, (half - origins) / direction
     far = reduce(np.minimum, np.maximum(first, second).T)
@@ -38,11 +38,12 @@ def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Inte
 
 
 def _round_interval(offsets: Origins, directions: Points, radius: float) -> Interval:
-    """Where |offset + t direction| <= radius (none: near = inf, far = -inf)."""
+    """The t between which |offset + t direction| <= radius (none: near = inf, far = -inf)."""
     squared = row_dot(directions, directions)
     b = row_dot(offsets, directions)
     c = row_dot(offsets, offsets) - radius**2
-    # A ray along the axis of a cylinder never crosses its side: it is inside for ever or never.
+    # A ray along the axis of a cylinder has no direction across it: it never crosses the side and
+    # is inside for ever or never. There 1 only avoids a division by 0.
     crosses = squared > 1e-24
     a = np.where(crosses, squared, 1.0)
     discriminant = b * b - a * c
@@ -54,9 +55,10 @@ def _round_interval(offsets: Origins, directions: Points, radius: float) -> Inte
 class Solid:
     """A closed convex body that is a box in its own coordinates.
 
-    A subclass has a `center` (world frame, m). `_coordinates` maps points to coordinates (m, not
-    negative), which are inside up to `half`. `_crossing` gives the interval in which a line is
-    inside. `normals` gives unit outward normals at points on the surface.
+    A subclass has a `center` (world frame, m). `_coordinates` maps points (m, world) to distances
+    (m) from the center or an axis, in directions perpendicular to each other: a point is inside if
+    none exceeds its entry in `half`. `_crossing` gives the interval of ray parameters in which a
+    line is inside. `normals` gives unit outward normals (world frame) at points on the surface.
     """
 
     def __init__(self, center: Array3, half: Vectors) -> None:
@@ -111,7 +113,7 @@ class RoomShell(Box):
     def __init__(self, center: Vector3, size: Vector3) -> None:
         """Of full edge lengths (m)."""
         super().__init__(center, size)
-        self.reach = np.inf
+        self.reach = np.inf  # all of space but the room: no bounding sphere holds it
 
     def sdf(self, points: Points) -> Values:
         """Exact signed distance (m), positive inside the room."""
@@ -159,7 +161,7 @@ class Cylinder(Solid):
         self._axis = along / length
 
     def _split(self, vectors: Origins) -> tuple[Float[np.ndarray, "..."], Origins]:
-        """Lengths along the axis, and what of the vectors is across it."""
+        """Signed lengths of vectors along the axis, and their parts perpendicular to it."""
         along = np.asarray(vectors @ self._axis)
         return along, vectors - along[..., None] * self._axis
 

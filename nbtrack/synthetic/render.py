@@ -37,6 +37,7 @@ def render_frame(
     rows, columns = np.indices((height, width)).reshape(2, -1)
 
     def cast(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
+        """z-depth, color and surface at pixel columns u and rows v, which need not be whole."""
         # `camera.pixel_directions` is single precision, too coarse for an exact depth.
         x = (u + 0.5 - intrinsics.cx) / intrinsics.fx
         y = (v + 0.5 - intrinsics.cy) / intrinsics.fy
@@ -88,7 +89,8 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     lost |= is_edge & (rng.uniform(size=depth.shape) < EDGE_DROPOUT)
     shift = rng.normal(scale=LATERAL_NOISE / per_pixel, size=(2, *depth.shape))
     places = np.indices(depth.shape) + shift
-    # Interpolated: at a width of 96 the jitter is below a tenth of a pixel.
+    # Interpolated: at a width of 96 the jitter is below a tenth of a pixel, and the nearest pixel
+    # would nearly always be the same one.
     looked_up = map_coordinates(exact, places, order=1, mode="nearest")
     share_seen = map_coordinates(seen.astype(float), places, order=1, mode="nearest")
     noisy = looked_up + rng.normal(scale=DISPARITY_NOISE, size=depth.shape)
@@ -103,6 +105,7 @@ def _is_grazing(disparity: Depth, focal: float) -> Bool[np.ndarray, "h w"]:
 
     On a plane disparity, like inverse depth, is a x + b y + c over normalised coordinates (x, y),
     and (a, b, c) is parallel to the normal; so its product with the ray (x, y, 1) is disparity.
+    `focal` is in pixels of this image; the principal point is the image's middle.
     """
     height, width = disparity.shape
     gradient_y = focal * _smaller_difference(disparity)
@@ -116,7 +119,7 @@ def _is_grazing(disparity: Depth, focal: float) -> Bool[np.ndarray, "h w"]:
 
 
 def _smaller_difference(values: Depth) -> Depth:
-    """Difference per row to the next or the last row, whichever is less: no slope over an edge."""
+    """Difference to the next or from the previous row, whichever is less: no slope over an edge."""
     steps = np.pad(np.diff(values, axis=0), ((1, 1), (0, 0)), mode="edge")
     return np.where(np.abs(steps[1:]) < np.abs(steps[:-1]), steps[1:], steps[:-1])
 
@@ -133,6 +136,6 @@ def filter_depth(depth: Depth, sigma_px: float = 2.0, sigma_range: float = 0.1) 
     valid = depth > 0
     # Far from every real depth an invalid pixel has no weight; zero would pull at 0.4 m.
     marked = np.where(valid, depth, -10.0 * sigma_range - 1.0).astype(np.float32)
-    diameter = 2 * int(np.ceil(2 * sigma)) + 1
+    diameter = 2 * int(np.ceil(2 * sigma)) + 1  # pixels: two standard deviations to either side
     smooth = cv2.bilateralFilter(marked, diameter, sigma_range, sigma)
     return np.where(valid, smooth.astype(np.float64), 0.0)

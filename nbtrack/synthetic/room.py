@@ -69,14 +69,18 @@ class Room:
         return distance
 
     def first_hit(self, origins: Origins, directions: Points) -> tuple[Values, Indices]:
-        """Ray parameter and index in `parts` of the first surface from points in free space."""
+        """Ray parameter and index in `parts` of the first surface from points in free space.
+
+        Where nothing is hit, they are infinity and 0.
+        """
         t = np.full(len(directions), np.inf)
         index = np.zeros(len(directions), dtype=np.int64)
         lengths = np.sqrt(row_dot(directions, directions))
         for number, part in enumerate(self.parts):
             towards = part.solid.center - origins
-            # Only lines through the bounding sphere may meet the solid. It is slightly enlarged, so
-            # that rounding never drops a ray that grazes.
+            # The squared distance (m²) of each line from the center. Only lines through the
+            # bounding sphere may meet the solid; the sphere is slightly enlarged, so that rounding
+            # never drops a ray that grazes.
             passing = row_dot(towards, towards) - (row_dot(directions, towards) / lengths) ** 2
             rays = np.flatnonzero(passing < (part.solid.reach * 1.001) ** 2)
             starts = origins if origins.ndim == 1 else origins[rays]
@@ -105,7 +109,10 @@ class Room:
 
 
 def description(name: str) -> dict[str, Any]:
-    """What both files say of a room. Raises ConfigError, naming the nearest, for any other."""
+    """What `rooms.toml` and `paths.toml` say of a room.
+
+    Raises ConfigError, which names the nearest room, if there is none of that name.
+    """
     table = look_up("synthetic room", name, _TABLES)
     walk = table["walk"] | _PATHS[name]
     return {**table, "walk": walk, "materials": _PALETTE | table["materials"]}
@@ -130,7 +137,10 @@ def build_room(name: str) -> Room:
 
 
 def _resolved(value: Any, named: dict[str, Material]) -> Any:
-    """A value of the file with its materials made or looked up and its lists as tuples."""
+    """A value of the file with its materials made or looked up in `named`, its lists as tuples.
+
+    A table with a `kind` is a material to be made, and a text is the name of one.
+    """
     if isinstance(value, list):
         return tuple(_resolved(item, named) for item in value)
     if not isinstance(value, dict):
