@@ -19,10 +19,10 @@ from nbtrack.tables import STANDING_STILL
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 DEPTH, DISTANCE = "depth (m)", "|signed distance| (cm)"
-# Without an anchor: else panels with a bar are lower than those without.
+# Panels keep their own anchor (panchor): else those with a bar stand lower than those without.
 _BAR = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max", "panchor": False}
 _MARKS = "os^Dv"  # matplotlib's markers of up to five methods
-# A title, an image (colours or numbers), and the label of the numbers' bar; colours have none.
+# A title, an image (colours or numbers), and the label of the numbers' colour bar; "" for colours.
 Panel = tuple[str, np.ndarray, str]
 Curves = Mapping[str, Values]  # numbers by label
 Keys = str | list[str]  # columns whose values make groups of rows
@@ -35,9 +35,10 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     With a slider, where `fixed` is that of ipywidgets: `interact(plot_frame,
     sequence=fixed(sequence), index=(0, len(sequence) - 1), title=fixed("A room"))`.
     """
-    some_mm = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]  # one scale for all frames
+    # One scale for all frames, from a sixteenth of the pixels of about 20 of them.
+    some_mm = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]
     far = MILLIMETRE * _most(np.ma.masked_equal(some_mm, 0))
-    depth = np.ma.masked_equal(sequence.depth(index), 0)
+    depth = np.ma.masked_equal(sequence.depth(index), 0)  # 0 is an unmeasured pixel
     color = (f"frame {sequence.frame_ids[index]}: colour", sequence.color(index), "")
     return plot_images([[color, ("depth", depth, DEPTH)]], title, far)
 
@@ -66,7 +67,7 @@ def plot_views(
 def plot_distances(frame: Frame, distances: Curves, title: str = "") -> Figure:
     """A frame's colour, and by label |d| (cm) of its points in a map; unmeasured pixels are grey.
 
-    The distances (m) are those of `frame.measured_pixels()`, in this order.
+    `distances` (m) of a label are those at the pixels of `frame.measured_pixels()`, in their order.
     """
     rows, columns = frame.measured_pixels().cpu().numpy()
     panels = [("observed colour", frame.color.cpu().numpy(), "")]
@@ -79,12 +80,14 @@ def plot_distances(frame: Frame, distances: Curves, title: str = "") -> Figure:
 
 @style.styled
 def plot_images(rows: list[list[Panel]], title: str = "", far: float | None = None) -> Figure:
-    """Images in rows, each with a title and its bar's label, "" for colours.
+    """Images in rows, each with a title and the label of its colour bar, "" for colours.
 
-    Those of a label share a bar, and a scale that ends at `far` or where 98 % of the values end.
+    Images of one label share a bar, and a scale from 0 to `far`, by default to the 98 % quantile of
+    their values.
     """
     _, first, _ = rows[0][0]
     height, width = first.shape[:2]
+    # The figure's title and bars, and in each row the panels' titles and images.
     inches = 0.9 + len(rows) * (0.2 + style.WIDTH / len(rows[0]) * height / width)
     grid = style.new_axes(title, inches, len(rows), len(rows[0]))
     with_bar: dict[str, list[AxesImage]] = {}
@@ -102,13 +105,16 @@ def plot_images(rows: list[list[Panel]], title: str = "", far: float | None = No
 
 
 def _most(images: np.ndarray) -> float:
-    """The 98 % quantile of what is known, so that a few wild pixels do not hide the rest."""
+    """The 98 % quantile of known values, so that a few wild pixels do not hide the rest.
+
+    It is 1 where nothing is known: a scale needs an end.
+    """
     values = np.ma.compressed(images)
     return float(np.quantile(values, 0.98)) if len(values) else 1.0
 
 
 def show_image(axes: Axes, image: np.ndarray, title: str, colors: str = "viridis") -> AxesImage:
-    """An image without ticks, grid and frame; unknown pixels are grey."""
+    """An image without ticks, grid and frame; masked pixels are grey. `colors` names a colormap."""
     axes.set_title(title)
     axes.set_axis_off()
     return axes.imshow(image, cmap=matplotlib.colormaps[colors].with_extremes(bad="#bdbdbd"))
@@ -118,10 +124,10 @@ def show_image(axes: Axes, image: np.ndarray, title: str, colors: str = "viridis
 def plot_along_ray(
     depths: Values, curves: Curves, measured_depth: float, title: str = "", together: str = ""
 ) -> Figure:
-    """Quantities by label with its unit, below each other over the same z-depths (m) of a ray.
+    """Curves below each other over the z-depths (m) of a ray's samples; labels have their units.
 
-    With the name of what all of them are, "weight", they are drawn `together`, every second dashed.
-    The last samples may be left out, as by the weights of sections between samples.
+    With a label of y, such as "weight", as `together` they share one panel, every second dashed. A
+    curve may be shorter than `depths`: weights of sections lack the last sample.
     """
     index = depths.cpu().numpy()
     columns = {k: pd.Series(c.detach().cpu(), index[: len(c)]) for k, c in curves.items()}
@@ -140,9 +146,9 @@ def plot_along_ray(
 
 @style.styled
 def plot_columns(tables: Sequence[pd.DataFrame], title: str = "") -> Figure:
-    """Columns of a table below each other, over its index, whose name labels x.
+    """The columns of each table below each other, over its index, whose name labels x.
 
-    Tables of the same columns, which are named with their units, stand side by side.
+    Tables stand side by side and have the same columns, whose names, with units, label y.
     """
     n = len(tables[0].columns)
     grid = style.new_axes(title, 0.9 + 1.3 * n, n, len(tables), sharex="col", sharey="row")
@@ -158,7 +164,7 @@ def plot_columns(tables: Sequence[pd.DataFrame], title: str = "") -> Figure:
 def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """Errors of every frame over time: position (cm, logarithmic) and orientation (degrees).
 
-    `frames` are those of runs by method on the same frames, as in frames.csv. Above the dashed
+    `frames` has by method the rows of a run's frames.csv, of the same frames. Above the dashed
     line, 0.2 m, the paper calls the camera lost; the dotted one is a camera that stands still.
     """
     above, below = style.new_axes(title, 4.9, 2, sharex=True)[:, 0]
@@ -191,11 +197,11 @@ def _seconds(frames: pd.DataFrame) -> pd.Series:
 def plot_panels(
     panels: Mapping[str, pd.DataFrame], x: str, title: str = "", same_x: bool = False
 ) -> Figure:
-    """Numbers of methods (columns) at the texts of the index, by title, which has a panel.
+    """A panel for each table, by its title: a column is a method, whose numbers are points along x.
 
-    Panels share these texts, from the top; x is logarithmic, if wanted of one range in all panels.
-    A pale line joins those of a row. A text may have several rows; methods then lie one below
-    another.
+    Tables share the texts of their index, which stand along y from the top. A text may have several
+    rows; methods then lie one below another. A pale line joins the numbers of a row. x is
+    logarithmic, labelled by `x`, and with `same_x` of one range in all panels.
     """
     texts = pd.Index(np.concatenate([table.index for table in panels.values()])).unique()
     grid = style.new_axes(title, 3.4, 1, len(panels), sharex=same_x, sharey=True)[0]
@@ -218,13 +224,14 @@ def plot_panels(
 def plot_curves(
     table: pd.DataFrame, x: str, y: str, by: Keys, title: str = "", log: str = "xy", line: str = ""
 ) -> Figure:
-    """One column over another, a line a group; groups of one row are points with their labels.
+    """Column `y` over column `x`, a line for each group of rows with the same values of `by`.
 
-    Axes are labelled by the names of x and y, "time a frame (ms)". Text on x keeps the order of its
-    first appearance; its points stand side by side, without lines. Of several columns of groups the
-    first has the colours, which are the methods' own, the last the marks; dashes tell methods of
-    one colour apart. Columns `from` and `to` are drawn as intervals of y, and the mean of a column
-    `standing still` as a dotted line. Axes of `log` are logarithmic; line "none" leaves points.
+    Groups of one row are points beside their labels. Axes are labelled by the names of the columns,
+    as "time a frame (ms)". If x is text, it keeps the order of its first appearance, and points of
+    the groups stand side by side, without lines. The first column of `by` chooses the colour, a
+    method's own, the last the mark; dashes tell groups of one colour apart. Columns `from` and `to`
+    are drawn as intervals of y, the mean of a column `standing still` as a dotted line. `log` names
+    the logarithmic axes; `line` is matplotlib's style of all lines, and "none" leaves points.
     """
     axes = style.new_axes(title, 3.6)[0, 0]
     groups = table[[by] if isinstance(by, str) else by]
@@ -252,8 +259,11 @@ def plot_curves(
 
 
 def _looks(groups: pd.DataFrame, line: str) -> pd.DataFrame:
-    """How `plot_curves` draws the group of each label, the index: colour by the first column, mark
-    by the last; without a given line, dashes by the number of earlier groups of this colour."""
+    """How `plot_curves` draws each group; the index has the labels of groups.
+
+    The first column chooses the colour, the last the mark. Without a given style of `line`, dashes
+    count the earlier groups of the same colour.
+    """
     groups = groups[~groups.index.duplicated()]
     first, last = groups.iloc[:, 0], groups.iloc[:, -1]
     looks = first.map(style.method_colors(first)).to_frame("color")
@@ -264,7 +274,11 @@ def _looks(groups: pd.DataFrame, line: str) -> pd.DataFrame:
 
 
 def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray:
-    """Make texts the ticks of x, turned if they are long; where points lie, shifted by group."""
+    """Make texts the ticks of x, turned if they are long; returns where each point lies on x.
+
+    Points of a text are shifted by the group that their label names: groups share half the distance
+    of two ticks, and fewer than four stand as close as four.
+    """
     codes, ticks = pd.factorize(texts)
     letters = sum(max(map(len, tick.split("\n"))) for tick in ticks)
     turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}

@@ -28,20 +28,20 @@ def plot_idea(
 ) -> Figure:
     """What a tracker asks a map around the measured point of one pixel (row, column) of a frame.
 
-    The slice is the plane of all rays of the pixel's row, from the camera at `T_world_camera` (m),
-    an estimate that may be off; the pixel's ray runs to the right. In a map of a density it shows
-    the samples of iMAP along this ray, the larger the more they weigh, and the distance that they
-    render. In one of a signed distance d it shows the row's measured points, one query each, and
-    from each a step of length |d| against the gradient.
+    The slice lies in the plane of all rays of the pixel's row, from the camera at `T_world_camera`
+    (m), an estimate that may be off; the pixel's ray runs to the right. In a map of a density it
+    shows the samples of iMAP along this ray, the larger the more they weigh, and the distance that
+    they render. In one of a signed distance d it shows the row's measured points, one query each,
+    and from each a step of length |d| against the gradient.
     """
     axes = new_axes(title, 3.8)[0, 0]
     rows, all_columns = frame.measured_pixels()
     columns = all_columns[rows == row]
-    points_camera, _ = frame.points(torch.full_like(columns, row), columns)
+    points_camera, _ = frame.points(torch.full_like(columns, row), columns)  # of the whole row
     point_camera = points_camera[columns == column][0]
     distance = point_camera.norm().item()
     along = point_camera / distance
-    left = along * along[0] - torch.tensor([1.0, 0, 0])  # minus x, but for its share along the ray
+    left = along * along[0] - torch.tensor([1.0, 0, 0])  # minus x, without its part along the ray
     page_camera = torch.stack([along, left / left.norm()])  # the page's axes, (2, 3)
     x = np.arange(distance - _BEFORE, distance + _BEHIND, _STEP)
     places = np.stack(np.meshgrid(x, np.arange(-_ASIDE, _ASIDE + _STEP, _STEP)), axis=-1)
@@ -54,6 +54,7 @@ def plot_idea(
         _draw_queries(axes, field, pose, points_camera, page_camera)
     else:
         _draw_samples(axes, field, pose, point_camera)
+    # Without points: it only names the surface, which `draw_slice` drew, in the legend.
     axes.plot([], [], "k-", label=f"surface of {field.label}")
     axes.set(xlim=(distance - _BEFORE, distance + _BEHIND), ylim=(-_ASIDE, _ASIDE), aspect="equal")
     axes.set(xlabel="along the ray (m)", ylabel="to its left (m)")
@@ -61,15 +62,18 @@ def plot_idea(
 
 
 def _draw_samples(axes: Axes, field: LearnedField, pose: Tensor, point_camera: Tensor) -> None:
-    """iMAP's samples on the ray to a measured point (m), and the distance that they render."""
+    """iMAP's samples on the ray to a measured point (m), and the distance that they render.
+
+    `pose` is the camera's (camera to world, m). Distances on the page are along the ray, not z.
+    """
     direction = point_camera[None] / point_camera[2]  # of z = 1 in the camera, so that depth is z
-    not_used = torch.zeros(1, 3)  # observed colour and depth
+    not_used = torch.zeros(1, 3)  # for observed colour and depth, which rendering does not ask for
     rays = Rays(pose[None, :3, 3], direction @ pose[:3, :3].T, not_used, not_used[:, 0])
     with torch.no_grad():
         depths = field.hierarchical_depths(rays, _N_STRATIFIED, _N_IMPORTANCE)
         rendered = field.render(rays, depths)
     distances = depths[0] * direction.norm().item()
-    sizes = 12 + 400 * rendered.weights[0]
+    sizes = 12 + 400 * rendered.weights[0]  # areas in square points; none vanishes
     label = f"{len(distances)} samples, by weight"
     axes.scatter(distances, 0 * distances, s=sizes, label=label, color=_COLORS["VR"], **_DOT)
     measured, found = point_camera.norm().item(), rendered.depth.item() * direction.norm().item()
@@ -83,10 +87,14 @@ def _draw_samples(axes: Axes, field: LearnedField, pose: Tensor, point_camera: T
 def _draw_queries(
     axes: Axes, field: LearnedField, pose: Tensor, points_camera: Tensor, page_camera: Tensor
 ) -> None:
-    """Measured points (m) on the page, and from each a step of length |d| against the gradient."""
+    """Measured points (m) on the page, and from each a step of length |d| against the gradient.
+
+    `pose` is the camera's (camera to world, m), and the rows of `page_camera` are the page's axes.
+    """
     points_world = transform_points(pose, points_camera).requires_grad_()
     _, sdf = field(points_world)
     (gradient,) = torch.autograd.grad(sdf.sum(), points_world)
+    # The last factor turns steps from the world into the camera's frame.
     ends_camera = points_camera - sdf.detach()[:, None] * normalize(gradient) @ pose[:3, :3]
     start = (points_camera @ page_camera.T).numpy()
     end = (ends_camera @ page_camera.T).numpy()

@@ -28,9 +28,10 @@ def extract_mesh(
     """Coloured mesh (m, world frame) of a field's surface, by marching cubes; points as they are.
 
     A field has a value everywhere, also where no camera looked. With a sequence, a face is kept
-    only if all its corners were seen, in any frame of it or in one of `frames`.
+    only if each of its corners was seen in a frame of it, or in one of `frames` if they are given.
 
-    The grid's cells have an edge of `voxel` metres. Raises DataError where there is no surface.
+    The grid's cells have an edge of `voxel` metres. A `PointCloud` has no surface: it is returned
+    with its colours. Raises DataError where there is no surface.
     """
     if isinstance(field, PointCloud):
         colors = (255 * field.colors).round().byte()
@@ -62,8 +63,9 @@ def extract_mesh(
 def mesh_bytes(mesh: Mesh, kind: str, origin: Position) -> bytes:
     """A mesh as a file, "ply" or "glb", in the world of the recording: moved by its origin (m).
 
-    Single precision resolves decimetres in map coordinates. There a PLY file gets double precision;
-    a GLB file knows none, and says by how much its node is moved.
+    With an origin of millions of metres, as in the coordinates of geographic maps, single precision
+    resolves decimetres only. So a moved PLY file has double precision; a GLB file, which knows
+    none, holds the unmoved mesh and by how much its node is moved.
     """
     if kind == "glb":
         scene = trimesh.Scene()
@@ -72,7 +74,7 @@ def mesh_bytes(mesh: Mesh, kind: str, origin: Position) -> bytes:
     content = mesh.export(file_type=kind, vertex_normal=False)
     if not origin.any():
         return content
-    # Its vertices, the first of the body, are replaced.
+    # The vertices, which are the first part of the body, are replaced.
     head, end, body = content.partition(b"end_header\n")
     single = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)])
     double = np.dtype([("xyz", "<f8", 3), ("rgba", "u1", 4)])
@@ -95,9 +97,9 @@ def query_field(field: Field, points_world: GridPoints) -> tuple[np.ndarray, np.
 def seen_by(
     points_world: GridPoints, sequence: RgbdSequence, frames: Frames | None = None
 ) -> Bool[np.ndarray, "*shape"]:
-    """Whether points (m) lie in view of given frames, by default all, before what was measured.
+    """Whether points (m) were seen: in view of a frame, at most 0.1 m behind what it measured.
 
-    See `min_depth_behind`.
+    `frames` are indices in the sequence, by default all; see `min_depth_behind`.
     """
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32)).view(-1, 3)
     frames = np.arange(len(sequence)) if frames is None else frames

@@ -22,9 +22,9 @@ _WIDTH = 240  # pixels of the map's view
 _NEAR = 0.1  # m; nearer surfaces are not drawn
 _POINT_SIZE = 0.02  # m; half the side of what is drawn for a point
 _SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-_DPI = 72
-_RATE_HZ = 10
-_GIF_COLORS = 64
+_DPI = 72  # of the movie's pictures
+_RATE_HZ = 10  # pictures a second
+_GIF_COLORS = 64  # of each picture: a GIF holds at most 256
 
 
 def movie_pictures(
@@ -39,7 +39,7 @@ def movie_pictures(
 
     Left the observed image, in the middle the map's surface seen from the estimated pose, right the
     estimated path so far from above. `run` has the rows of frames.csv of the sequence's frames,
-    `T_estimated` their camera-to-world poses (m).
+    `T_estimated` their camera-to-world poses (m). `progress` is told how many are drawn.
     """
     left, middle, right = new_axes(title, 2.8, 1, 3, width_ratios=[1, 1, 0.9])[0]
     page = draw_cloud(right, cloud_of(surface), {"tracked": T_estimated})
@@ -61,14 +61,17 @@ def movie_pictures(
         error = "" if np.isnan(error_cm) else f", off by {error_cm:.1f} cm"
         words.set_text(f"frame {row.frame_id}{error}")
         canvas.draw()
-        left.figure.set_layout_engine("none")  # from now on nothing moves in the layout
+        left.figure.set_layout_engine("none")  # the first picture's layout stays: nothing jumps
         progress(index + 1)
         yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(_GIF_COLORS)
 
 
 @styled
 def movie_bytes(pictures: Iterator[Image.Image]) -> bytes:
-    """A GIF that repeats; its pictures are drawn, in the house style, while it is written."""
+    """A GIF that repeats, of at least one picture.
+
+    A lazy iterator, as that of `movie_pictures`, draws in the house style while this writes.
+    """
     content = io.BytesIO()
     options = {"duration": 1000 // _RATE_HZ, "loop": 0, "optimize": True}
     next(pictures).save(content, "GIF", save_all=True, append_images=pictures, **options)
@@ -79,8 +82,8 @@ def view_of(surface: Mesh, camera: Intrinsics, T_world_camera: Pose) -> np.ndarr
     """The surface (m, world frame) as a camera sees it, (height, width, 3; uint8); white elsewhere.
 
     The picture is `_WIDTH` pixels wide. Faces, and squares in place of points, are painted from the
-    farthest to the nearest, also those that show their back: the fields differ in the side that
-    they call the front.
+    farthest to the nearest. Faces that show their back are painted too: a density and a distance
+    differ in the side that marching cubes makes the front.
     """
     scale = _WIDTH / camera.width
     height = round(scale * camera.height)
@@ -88,7 +91,7 @@ def view_of(surface: Mesh, camera: Intrinsics, T_world_camera: Pose) -> np.ndarr
     is_cloud = isinstance(surface, trimesh.PointCloud)
     parts = np.arange(len(points_camera))[:, None] if is_cloud else surface.faces
     corners = points_camera[parts] + (_POINT_SIZE * _SQUARE if is_cloud else 0)
-    depth = np.maximum(corners[..., 2:], _NEAR)
+    depth = np.maximum(corners[..., 2:], _NEAR)  # no division by zero; what is nearer is left out
     pixels = scale * (corners[..., :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
     in_view = ((pixels.max(axis=1) > 0) & (pixels.min(axis=1) < [_WIDTH, height])).all(axis=1)
     seen = np.flatnonzero(in_view & (corners[..., 2] > _NEAR).all(axis=1))
@@ -101,7 +104,7 @@ def view_of(surface: Mesh, camera: Intrinsics, T_world_camera: Pose) -> np.ndarr
 
 
 def cloud_of(surface: Mesh) -> pd.DataFrame:
-    """Vertices or points: x, y, z (m, world frame), red, green, blue (0 to 255)."""
+    """A row for each vertex or point: x, y, z (m, world frame), red, green, blue (0 to 255)."""
     cloud = pd.DataFrame(surface.vertices, columns=["x", "y", "z"])
     cloud[["red", "green", "blue"]] = surface.visual.vertex_colors[:, :3]
     return cloud

@@ -15,7 +15,7 @@ _ARROW = {"arrowstyle": "-|>", "color": "0.3", "shrinkA": 0, "shrinkB": 0}
 def plot_network(network: FourierMlp, value: str, title: str = "") -> Figure:
     """From a point to colour and a value: a box is a layer, with its activation and shape.
 
-    `value` names the fourth output, "density (1/m)".
+    `value` names the fourth output with its unit, as "density (1/m)".
     """
     hidden = f"{network.activation.__name__}(W h + b)"
     layers = [("sin(x B)", network.frequencies)]
@@ -32,7 +32,7 @@ def plot_network(network: FourierMlp, value: str, title: str = "") -> Figure:
     for place, (start, end) in enumerate(pairwise(boxes)):
         arrow = _ARROW | {"patchA": start, "patchB": end}
         axes.annotate("", (place + 1, 0), (place, 0), arrowprops=arrow)
-    # From the sines to the third layer.
+    # From the sines, box 1, to the third layer, box 4: box 0 is the point.
     skip = {"connectionstyle": "bar,fraction=-0.12", "patchA": boxes[1], "patchB": boxes[4]}
     axes.annotate("", (4, 0), (1, 0), arrowprops=_ARROW | skip)
     axes.text(2.5, 0.8, "sin(x B) once more, beside the output of the second layer", **_CENTRED)

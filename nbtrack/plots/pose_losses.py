@@ -38,9 +38,9 @@ def move_sideways(frame: Frame, x_cm: float, y_deg: float) -> Transform:
 def pose_losses(
     density: LearnedField, distance: Field, frame: Frame, y_deg: float = 0.0
 ) -> pd.DataFrame:
-    """Losses of the same pixels by the camera's offset along its x (cm), turned about its y.
+    """Losses of the same pixels, with the camera moved along its x (index, cm) and turned about y.
 
-    SDF's is Eq. 2 in a map of a signed distance, VR's is iMAP's in one of a density, with default
+    SDF's loss is Eq. 2 in the map `distance`, VR's is iMAP's in the map `density`, with default
     settings and nothing random. The third column is the mean density at the observed points.
     """
     measured = frame.measured_pixels()
@@ -67,9 +67,10 @@ def pose_losses(
 def plot_pose_losses(
     density: LearnedField, distance: Field, frame: Frame, x_cm: float = 0.0, y_deg: float = 0.0
 ) -> Figure:
-    """The view of a density at a moved pose, and both losses of `pose_losses` along x, turned.
+    """Both losses of `pose_losses` along x, and what the density renders at a moved pose.
 
-    Curves have the colour of the map's method, pale without a turn. With sliders:
+    Curves have the colour of their method, full with the camera turned by `y_deg`, pale without. A
+    dot is the pose moved by `x_cm` and turned, the line through it the gradient. With sliders:
     `interact(plot_pose_losses, density=fixed(...), ..., x_cm=(-20, 20), y_deg=(-10, 10))`.
     """
     straight = pose_losses(density, distance, frame)
@@ -82,7 +83,7 @@ def plot_pose_losses(
     view.imshow(rendered_color)
     view.set_title("the view from this pose")
     view.axis("off")
-    along = np.array([-5, 0, 5])  # cm, of the tangent
+    along = np.array([-5, 0, 5])  # cm from the pose, of three points on the tangent
     for axes, (name, color) in zip(panels, _COLORS.items(), strict=True):
         axes.plot(straight[name], color=color, alpha=0.4, label="not turned")
         axes.plot(turned[name], color=color, label=f"turned by {y_deg:g}°")
@@ -93,14 +94,17 @@ def plot_pose_losses(
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
     figure = view.figure.legend_below()
-    for line in figure.legends[0].get_lines():  # they hold for the curves of both methods
+    for line in figure.legends[0].get_lines():  # grey: they stand for curves of both colours
         line.set_color("0.3")
     return figure
 
 
 @styled
 def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
-    """SDF's loss and the mean density of `pose_losses`, and where each would pull the camera."""
+    """SDF's loss and the mean density of `pose_losses`, with dots where each would pull the camera.
+
+    That is where the loss is lowest, and where the density is highest.
+    """
     left, right = new_axes(title, 2.9, 1, 2)[0]
     loss, density = curves[_SDF_LOSS], curves[_DENSITY]
     _draw_with_best(left, loss, _COLORS[_SDF_LOSS], loss.idxmin(), "lowest")
@@ -109,7 +113,7 @@ def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
 
 
 def _draw_with_best(axes: Axes, curve: pd.Series, color: str, best_cm: int, told: str) -> None:
-    """A curve of `pose_losses` with a dot where it is best, which the legend tells."""
+    """A curve of `pose_losses` with a dot where it is best; the legend calls it `told`."""
     axes.plot(curve, color=color)
     axes.plot(best_cm, curve[best_cm], "o", color="0.3", label=f"{told}, at {best_cm} cm")
     axes.axvline(0, label="the true pose", **DASHED)
@@ -119,11 +123,11 @@ def _draw_with_best(axes: Axes, curve: pd.Series, color: str, best_cm: int, told
 
 @styled
 def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, near: float) -> Figure:
-    """Steps of trackers in one map, by label, on the mean |d| of a frame, and their errors.
+    """The path of each tracker's steps over the mean |d| of a frame, and its error at each step.
 
-    The title says after how many steps of its budget each is `near` (m). |d| is the mean of at most
-    2000 measured points, on the plane of the true camera's x and z, with the true orientation;
-    trackers also turn.
+    Trackers, by label, share one map. The title says after how many steps of its budget each is
+    first within `near` metres of the true position. The mean |d| is that of at most some 2000
+    points, with the camera moved along its true x and z and not turned; trackers also turn.
     """
     paths_cm = {label: _path_cm(tracker, frame, T_start) for label, tracker in trackers.items()}
     errors_mm = {label: 10 * np.linalg.norm(path, axis=1) for label, path in paths_cm.items()}
@@ -143,15 +147,17 @@ def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, nea
     plane.plot(0, 0, "*", markersize=10, label="true pose", **marks)
     plane.set(xlabel="camera off along x (cm)", ylabel="off along z (cm)", aspect="equal")
     by_step.axhline(1000 * near, **DASHED)
-    look = {"ha": "right", "va": "bottom"}
-    by_step.text(by_step.get_xlim()[1], 1000 * near, f"{1000 * near:.0f} mm", **look)
+    corner = {"ha": "right", "va": "bottom"}
+    by_step.text(by_step.get_xlim()[1], 1000 * near, f"{1000 * near:.0f} mm", **corner)
     by_step.set(xlabel="step", ylabel="position error (mm)")
     return plane.figure.legend_below()
 
 
 def _draw_mean_distance(axes: Axes, field: Field, frame: Frame, places_cm: np.ndarray) -> None:
-    """The mean |d| (cm) of a frame's points, over offsets of the true camera along its x and z (cm)
-    that reach 1 cm beyond the places (n, 3)."""
+    """Draw the mean |d| (cm) of a frame's points over offsets (cm) of the true camera's x and z.
+
+    Offsets form a grid of 21 by 21 that reaches 1 cm beyond `places_cm` (n, 3; camera's frame).
+    """
     x, _, z = np.linspace(places_cm.min(axis=0) - 1, places_cm.max(axis=0) + 1, 21).T
     pixels = frame.measured_pixels()
     points_camera, _ = frame.points(*pixels[:, :: 1 + pixels.shape[1] // 2000])
@@ -165,7 +171,7 @@ def _draw_mean_distance(axes: Axes, field: Field, frame: Frame, places_cm: np.nd
 
 
 def _path_cm(tracker: Tracker, frame: Frame, T_start: Pose) -> np.ndarray:
-    """Positions of a tracker's steps (steps + 1, 3), in the true camera's frame (cm)."""
+    """Positions of the start and after each step (steps + 1, 3; cm, in the true camera's frame)."""
     tracker.begin(frame.to(tracker.device), torch.from_numpy(T_start)[None])
     poses = [T_start]
     for _ in tracker.budget.frame():

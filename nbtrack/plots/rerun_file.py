@@ -40,6 +40,6 @@ def rerun_bytes(surface: Mesh, seen: RgbdSequence, run: Trajectory, title: str) 
             recording.log("world/camera/color", rr.Image(seen.colors[i]).compress())
             recording.log("world/camera/depth", rr.DepthImage(seen.depths_mm[i], meter=1000))
         recording.log("error_m", rr.Scalars(row.translation_error_m))
-        # Not all trackers judge themselves.
+        # Of a tracker that does not judge itself, frames without depth are the lost ones.
         recording.log("lost", rr.Scalars(float(getattr(row, "lost", row.without_depth))))
     return stream.read()

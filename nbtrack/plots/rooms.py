@@ -33,14 +33,15 @@ def plot_slice(
 ) -> Figure:
     """A field's values on the horizontal plane `height` metres up, drawn as `draw_slice` does.
 
-    Fields of one recording stand side by side, with the colours of the first. Dashed green is the
-    true surface. `sequence` are the frames that the maps were made of, `room` is the exact scene,
-    if it is a synthetic one: its distance stands beside that of a single field. The axes end
-    around the path and what the frames have seen, in the room if that is known.
+    Fields of one recording stand side by side, in the colour scale of the first. `sequence` are the
+    frames that the maps were made of. `room` is the exact scene, if it is a synthetic one: its
+    surface is dashed green, and its distance stands beside that of a single field. The axes end
+    around the path and what the frames have seen, within the room if that is known.
     """
     drawn = [fields] if isinstance(fields, Field) else [*fields]
     if len(drawn) == 1 and room is not None and drawn[0].is_distance:
         drawn.append(_ExactDistance(room, drawn[0]))
+    # Lower with more panels, which are narrower.
     panels = new_axes(title, 5.4 - 0.9 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
     norm = None  # the first field's, for all
     for axes, field in zip(panels, drawn, strict=True):
@@ -52,7 +53,7 @@ def plot_slice(
         bar = {"ax": panels, "aspect": 25, "pad": 0.015, "label": label}
         shown = seen_by(points, sequence)
         norm = scene.draw_slice(axes, field, points, places, shown, norm, **bar)
-        axes.plot([], [], "k-", label="surface")
+        axes.plot([], [], "k-", label="surface")  # only names the lines drawn above in the legend
         if room is not None:
             shown = shown & _draw_true_level(axes, room, points, places)
         axes.set_title(field.label)
@@ -70,7 +71,7 @@ def _draw_true_level(axes: Axes, room: Room, points: np.ndarray, places: np.ndar
 
 
 def _end_around(axes: Axes, *places: np.ndarray) -> None:
-    """Axes 0.1 m around places on the page (n, 2); of panels side by side one has numbers on y."""
+    """End axes 0.1 m around places on the page (n, 2); side by side only the first labels y."""
     x, y = np.concatenate(places).T
     axes.set_xbound(x.min() - 0.1, x.max() + 0.1)
     axes.set_ybound(y.min() - 0.1, y.max() + 0.1)  # an axis that is turned around stays so
@@ -78,7 +79,7 @@ def _end_around(axes: Axes, *places: np.ndarray) -> None:
 
 
 class _ExactDistance(Field):
-    """The distance (m) of a known room, grey, within the bounds of its map."""
+    """The exact distance (m) of a room as a field: its colour is grey, its bounds are the map's."""
 
     name, label, surface_level = "exact", "Exact distance", 0.0
 
@@ -87,18 +88,22 @@ class _ExactDistance(Field):
         self.room = room
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
-        """Its value is that of the room."""
+        """Grey, and the room's signed distance (m), at points (n, 3; m, world frame)."""
         sdf = self.room.sdf(points_world.cpu().numpy().astype(float))
         return torch.full_like(points_world, 0.5), torch.from_numpy(sdf).float()
 
 
 def _level_grid(
-    page: np.ndarray, low: np.ndarray, high: np.ndarray, step: float, up: np.ndarray
+    page: np.ndarray, low: np.ndarray, high: np.ndarray, step: float, raised: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (rows, columns, 3; m, world frame) of a level plane, and their places on a page."""
+    """Points (rows, columns, 3; m, world frame) of a level plane, and their places on a page.
+
+    The rows of `page` are its axes in the world. Places run from `low` to `high` on it, `step`
+    metres apart; `raised` is the vector (m) from the world's origin up to the plane.
+    """
     sides = [np.arange(a, b, step) for a, b in zip(low, high, strict=True)]
     places = np.stack(np.meshgrid(*sides), axis=-1)
-    return places @ page + up, places
+    return places @ page + raised, places
 
 
 @styled
@@ -107,7 +112,8 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Paths, title: str = "") -> Figure:
 
     Every face that shows its back is left out, and one looks from where most surface shows. The
     projection is parallel; lengths across the picture are true (m). The camera-to-world poses by
-    label are drawn on top; "true" is green, "tracked" red. Several paths are larger beside it.
+    label are drawn on top; "true" is green, "tracked" red. Several paths are drawn once more,
+    larger, beside the room.
     """
     widths = [2, 1] if len(T_paths) > 1 else [1]
     room, *enlarged = new_axes(title, 5.0, 1, len(widths), width_ratios=widths)[0]
@@ -119,7 +125,7 @@ def plot_mesh(mesh: trimesh.Trimesh, T_paths: Paths, title: str = "") -> Figure:
 
 
 def _draw_enlarged(axes: Axes, T_paths: Paths, to_page: np.ndarray) -> None:
-    """The paths of a room alone, in its projection."""
+    """Only the paths of a room, in the same projection, so that they fill their panel."""
     scene.draw_paths(axes, T_paths, to_page)
     scene.look_through(axes)
     axes.set_title("The path, larger")
@@ -141,11 +147,12 @@ def plot_map_and_slice(
     axes, enlarged = new_axes(title, 4.6, 1, 2, width_ratios=[5, 1])[0]
     to_screen = scene.draw_mesh(axes, mesh, up)
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
-    # From the room to where the slice is drawn: to the picture's right, the first row, and down
-    # from the cameras' height to the middle of the room's.
+    # From the room to where the slice is drawn: to the picture's right, the first row, by the
+    # room's width, 4 % of it and a cell as a gap; and down from the cameras' height to the middle
+    # of the room's.
     aside = (1.04 * np.ptp(mesh.vertices @ to_screen[0]) + voxel) * to_screen[0]
     aside -= (height - (mesh.vertices @ up).mean()) * up
-    page = np.eye(3)[up == 0]
+    page = np.eye(3)[up == 0]  # the two level axes of the world
     points, _ = _level_grid(page, *mesh.bounds @ page.T, voxel, height * up)
     places = (points + aside) @ to_screen[:2].T
     bar = {"location": "bottom", "shrink": 0.4, "aspect": 30, "pad": 0.0}
@@ -156,7 +163,7 @@ def plot_map_and_slice(
         x, y = on_page.T
         axes.text((x.min() + x.max()) / 2, y.max() + 2 * voxel, name, ha="center")
     scene.draw_paths(axes, T_paths, to_screen[:2], 0.7)
-    axes.figure.legend_below()  # before the paths are drawn once more, in the slice
+    axes.figure.legend_below()  # now, while each path is drawn once: the slice repeats them
     scene.draw_paths(axes, T_paths, to_screen[:2], 0.7, aside)
     axes.set_axis_off()
     _draw_enlarged(enlarged, T_paths, to_screen[:2])

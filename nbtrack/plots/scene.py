@@ -29,15 +29,21 @@ _LINES_M = np.arange(-1.0, 1.01, 0.25).tolist()  # distances with a thin line
 
 
 def up_of(*T_paths: Poses) -> np.ndarray:
-    """The world's axis, with its sign, that is nearest to the mean up of cameras."""
+    """The world's axis, with its sign, that is nearest to the mean up of cameras.
+
+    A camera's up is minus its y.
+    """
     above = -np.concatenate(T_paths)[:, :3, 1].mean(axis=0)
     axis = np.abs(above).argmax()
     return np.sign(above[axis]) * np.eye(3)[axis]
 
 
 def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
-    """Rows: the picture's right, its upward direction, and the way to the viewer (world frame)."""
-    side = np.roll(up, 1)  # any horizontal axis is azimuth 0
+    """Rows: the picture's right, its upward direction, and the way to the viewer (world frame).
+
+    The viewer stands 45 degrees above the horizon, at `azimuth_deg` about up.
+    """
+    side = np.roll(up, 1)  # azimuth 0 is the horizontal axis after up: which one does not matter
     azimuth = np.radians(azimuth_deg)
     level = np.cos(azimuth) * side + np.sin(azimuth) * np.cross(up, side)
     viewer = np.cos(_ELEVATION) * level + np.sin(_ELEVATION) * up
@@ -57,7 +63,9 @@ def inward_side(mesh: trimesh.Trimesh) -> float:
 
 
 def draw_mesh(axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
-    """The faces of a room's mesh that show their front, shaded, the nearest on top.
+    """Draw the faces of a room's mesh that show their front, shaded, the nearest on top.
+
+    A face's front is its side towards free space, of walls the one inside the room.
 
     Returns the `screen_axes` of the view, from where most surface shows its front. Lengths across
     the picture are true (m).
@@ -73,7 +81,7 @@ def draw_mesh(axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
     # Smoothed normals: those of single marching-cubes faces flicker.
     normals = side * mesh.vertex_normals[faces].mean(axis=1)
     right, _, viewer = to_screen
-    light = viewer + 0.5 * right + 0.6 * up
+    light = viewer + 0.5 * right + 0.6 * up  # comes from above the viewer's right shoulder
     shade = _AMBIENT + (1 - _AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)
     colors = mesh.visual.vertex_colors[faces, :3].mean(axis=1) / 255 * shade[:, None]
     order = corners[..., 2].mean(axis=1).argsort()  # from the farthest to the nearest
@@ -84,30 +92,35 @@ def draw_mesh(axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
 
 
 def look_through(axes: Axes) -> None:
-    """Axes of a parallel projection."""
+    """Set up axes for a parallel projection: equal scales, and only lengths across have numbers."""
     axes.set(aspect="equal", xlabel="left to right (m)", yticks=[])
     axes.spines["left"].set_visible(False)
     axes.grid(False)
 
 
 def draw_from_above(axes: Axes, T_paths: Paths) -> tuple[np.ndarray, np.ndarray]:
-    """Paths, and axes in metres, equal, and turned so that nothing is mirrored.
+    """Draw paths from above, on axes in metres of equal scales, so that nothing is mirrored.
 
-    Returns up, and the world's axes to the right and ahead on the page, (2, 3).
+    Returns the world's axis that is up, and those to the right and ahead on the page, (2, 3).
     """
     up = up_of(*T_paths.values())
     page = np.eye(3)[up == 0]
     draw_paths(axes, T_paths, page)
     right, ahead = np.array(list("xyz"))[up == 0]
     axes.set(xlabel=f"{right} (m)", ylabel=f"{ahead} (m)", aspect="equal")
-    axes.yaxis.set_inverted(np.cross(*page) @ up < 0)  # right, page-up and up are right-handed
+    # Seen from above, the page's right, its upward direction and up must be right-handed.
+    axes.yaxis.set_inverted(np.cross(*page) @ up < 0)
     return up, page
 
 
 def draw_paths(
     axes: Axes, T_paths: Paths, to_page: np.ndarray, width: float = 1, aside: np.ndarray | float = 0
 ) -> None:
-    """Trajectories by label on a page, (2, 3), with a dot at the first one's start; aside (m)."""
+    """Draw trajectories by label, with a dot where the first one starts.
+
+    The rows of `to_page`, (2, 3), are the page's axes in the world. `width` multiplies lines and
+    dot. `aside` (m, world frame) moves everything, as to a slice beside the room.
+    """
     dashes = cycle(("--", "-.", ":"))
     for label, color in method_colors(T_paths).items():
         x, y = to_page @ (T_paths[label][:, :3, 3] + aside).T
@@ -116,22 +129,22 @@ def draw_paths(
         look = {"linewidth": width * (4.0 if label == "true" else 1.6), "color": color, "zorder": 3}
         axes.plot(x, y, line, label=label, **look)
     start_x, start_y = to_page @ (next(iter(T_paths.values()))[0, :3, 3] + aside)
-    look = {"color": "black", "markersize": 5 * width, "zorder": 4}
-    # A legend has four keys at most.
-    axes.plot(start_x, start_y, "o", label="start" if len(T_paths) < 4 else "", **look)
+    dot = {"color": "black", "markersize": 5 * width, "zorder": 4}
+    # A legend has four keys at most: beside four paths the start has no label.
+    axes.plot(start_x, start_y, "o", label="start" if len(T_paths) < 4 else "", **dot)
 
 
 def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Paths) -> np.ndarray:
-    """Coloured points from above, but for those higher than all cameras; and paths.
+    """Draw paths from above, and coloured points, without those higher than all cameras.
 
-    Returns the world's axes to the right and ahead, (2, 3).
+    So no ceiling hides the room. Returns the world's axes to the right and ahead, (2, 3).
     """
     up, page = draw_from_above(axes, T_paths)
     places = cloud[["x", "y", "z"]]
     inside = (places >= places.quantile(_CUT)) & (places <= places.quantile(1 - _CUT))
     heights = (places @ up)[inside.all(axis=1)].sort_values()  # drawn from the floor up
     highest = max((path[:, :3, 3] @ up).max() for path in T_paths.values())
-    heights_shown = heights[heights <= highest + 0.1]  # m
+    heights_shown = heights[heights <= highest + 0.1]  # 0.1 m above the highest camera
     shown = cloud.loc[heights_shown.index]
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
     axes.scatter(*page @ shown[["x", "y", "z"]].to_numpy().T, c=colors, s=4, linewidths=0)
@@ -151,13 +164,13 @@ def draw_slice(
 
     A signed distance is blue in free space and red in matter, with thin lines 0.25 m apart; a
     density or an occupancy has a logarithmic scale. Black is the surface (the field's
-    `surface_level`). What no frame has seen is pale: there the field invents. The scale is
-    returned; with that of another slice as `norm` no bar is drawn.
+    `surface_level`). What no frame has seen is pale: there the field invents. `bar` holds options
+    of `Figure.colorbar`. Returns the scale; with that of another slice as `norm` no bar is drawn.
     """
     _, values = query_field(field, points)
     level = field.surface_level
     if field.is_distance:
-        limit = np.clip(np.quantile(np.abs(values), 0.98), 0.2, 1.5)
+        limit = np.clip(np.quantile(np.abs(values), 0.98), 0.2, 1.5)  # m, the ends of the scale
         own_norm, colors = Normalize(-limit, limit), "RdBu"
     else:
         own_norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
@@ -181,6 +194,7 @@ def draw_slice(
 def draw_levels(
     axes: Axes, places: np.ndarray, values: np.ndarray, levels: Sequence[float], **look: object
 ) -> None:
-    """Lines where values reach levels, if they do: else matplotlib warns."""
+    """Draw lines where values on a grid equal one of `levels`."""
+    # Where they equal none, matplotlib would warn.
     if values.min() < max(levels) and min(levels) < values.max():
         axes.contour(*np.moveaxis(places, -1, 0), values, levels, **look)

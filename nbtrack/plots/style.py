@@ -48,17 +48,22 @@ def in_house_style() -> Iterator[None]:
 
 
 styled = in_house_style()
-"""The same as a decorator."""
+"""The same as a decorator of functions; each call enters the style anew."""
 
 
 class NotebookFigure(Figure):
-    """A figure that is shown once where a cell ends with it; it is not registered with pyplot."""
+    """A figure that a notebook shows once, where a cell ends with it.
+
+    It is not registered with pyplot, which would show it a second time.
+    """
 
     def _repr_mimebundle_(self, **chosen: object) -> tuple[dict, dict]:
-        """What is said of the picture that `_repr_png_` draws: its title, for who cannot see it,
-        and the size at which it is shown, the figure's own (pixels), half of the picture's.
+        """The metadata of the picture that `_repr_png_` draws; no picture of its own.
+
+        They are the title as alternative text, and the size (pixels) at which it is shown: the
+        figure's own, half of the picture's.
         """
-        from IPython import get_ipython  # it asks for this, and others may lack it
+        from IPython import get_ipython  # only IPython calls this; it may not be installed
 
         if shell := get_ipython():
             # Sliders load pyplot's inline backend, which would draw it instead, cropped and small.
@@ -69,7 +74,10 @@ class NotebookFigure(Figure):
         return {}, {"image/png": {"alt": alt, "width": width, "height": height}}
 
     def _repr_png_(self) -> bytes:
-        """A picture for dense screens, without transparency: notebooks stay small."""
+        """A PNG of twice the figure's resolution, for dense screens.
+
+        It has no transparency and is packed tightly, so that notebooks stay small.
+        """
         drawn = io.BytesIO()
         self.savefig(drawn, dpi=2 * self.dpi)
         picture = io.BytesIO()
@@ -77,7 +85,10 @@ class NotebookFigure(Figure):
         return picture.getvalue()
 
     def legend_below(self) -> "NotebookFigure":
-        """The figure, with the first panel's legend for all below, in one row if it fits."""
+        """Draw the first panel's legend below all panels, for which it holds; returns the figure.
+
+        It has one row, or three columns if its labels are long.
+        """
         handles, labels = self.axes[0].get_legend_handles_labels()
         ncols = 3 if len("".join(labels)) > 100 else len(labels)
         self.legend(handles, labels, loc="outside lower center", ncols=ncols)
@@ -85,7 +96,7 @@ class NotebookFigure(Figure):
 
 
 def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **more: Any) -> np.ndarray:
-    """A grid of axes in a new figure of a height (inches), with its finding as title.
+    """A grid of axes, an array (rows, columns), in a new figure `WIDTH` by `height` (inches).
 
     A dollar sign of the title, as in the name of a recording, begins no formula. More options are
     those of `Figure.subplots`.
@@ -100,8 +111,8 @@ def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **more:
 def method_colors(labels: Iterable[str]) -> dict[str, str]:
     """One colour a label: that of its method, if it has one in all figures, else a free one.
 
-    A label begins with its method; what it says behind a comma does not change the colour. Those of
-    the paper's methods are never free.
+    The method is what the label says before its first comma. Free are the colours of the palette
+    that no other label has, without the first two, those of the paper's methods.
     """
     known = {label: _FIXED.get(label.split(",")[0]) for label in labels}
     free = cycle([color for color in PALETTE[2:] if color not in known.values()])
@@ -118,6 +129,7 @@ def label_points(axes: Axes, x: Iterable, y: Iterable, colors: dict[str, str]) -
     axes.figure.draw_without_rendering()  # else the axes have no place in the figure yet
     points = sorted(zip(x, y, colors, strict=True), key=lambda point: point[1])
     pixels = axes.transData.transform([point[:2] for point in points])
+    # The points' own marks, in squares of 10 pixels.
     taken = [Bbox.from_bounds(left - 5, bottom - 5, 10, 10) for left, bottom in pixels]
     for x_point, y_point, label in points:
         text = axes.annotate(label, (x_point, y_point), (0, 0), textcoords="offset points")
@@ -134,6 +146,7 @@ def _move_to_free_place(text: Annotation, taken: list[Bbox]) -> None:
     within = text.axes.bbox
     shifts = sorted(range(-60, 61, 3), key=abs)  # points, up
     for shift, (aside, align) in product(shifts, [(6, "left"), (-6, "right")]):
+        # 3 points lower, half a letter's height: unshifted texts are level with their points.
         text.set(position=(aside, shift - 3), horizontalalignment=align)
         box = text.get_window_extent()
         is_inside = (box.min > within.min).all() and (box.max < within.max).all()
@@ -142,9 +155,9 @@ def _move_to_free_place(text: Annotation, taken: list[Bbox]) -> None:
 
 
 def log_axes(axes: Axes, names: str) -> None:
-    """Make "x", "y" or "xy" logarithmic, with plain numbers at 1, 2 and 5.
+    """Make the axes that `names` has as letters, "x", "y" or "xy", logarithmic.
 
-    What spans less than a factor of ten has more of them.
+    Ticks have plain numbers at 1, 2 and 5; an axis that spans less than a factor of ten has more.
     """
     for name in names:
         axes.set(**{f"{name}scale": "log"})
