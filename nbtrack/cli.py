@@ -19,20 +19,24 @@ _INTERRUPTED = 130  # what shells say of a command that ended by Ctrl-C
 
 
 def a_path(text: str) -> Path:
-    """A path, from `~` on too; an empty one would be the working folder by accident."""
+    """A path, with `~` expanded. An empty text is refused: it would mean the working folder."""
     if not text.strip():
         raise argparse.ArgumentTypeError("the path is empty")
     return Path(text).expanduser()
 
 
 def a_count(text: str, minimum: int = 1, maximum: int = _MAX_COUNT) -> int:
-    """A whole number within limits: a number of things, or of a seed."""
+    """Parse a whole number from `minimum` to `maximum`, as of seeds or processes.
+
+    Another text raises what argparse reports as a user's error.
+    """
     if not (text.lstrip("-").isdecimal() and minimum <= int(text) <= maximum):
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number from {minimum} to {maximum}")
     return int(text)
 
 
 def _option(help: str, type: Any = str, **more: Any) -> dict[str, Any]:
+    """The keyword arguments of argparse's `add_argument` for an option that takes a value."""
     return {"help": help, "type": type, **more}
 
 
@@ -116,9 +120,10 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit status: 0, or 2 after a user's mistake.
+    """Run a command; returns the exit status.
 
-    With `NBTRACK_DEBUG` set, the traceback of whatever ended it is printed too.
+    It is 0, or 2 after a user's mistake, 130 after Ctrl-C, and 1 where whoever read the output has
+    closed it. With `NBTRACK_DEBUG` set, the traceback of a mistake or of Ctrl-C is printed too.
     """
     sys.stdout = _writable(sys.stdout)
     sys.stderr = _writable(sys.stderr)
@@ -135,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(end="", flush=True)  # a closed pipe is found here, not after the return
         return 0
     except BrokenPipeError:  # whoever read the output, as `head` does, has enough
-        for descriptor in (1, 2):  # what Python flushes at its end goes nowhere
+        for descriptor in (1, 2):  # stdout and stderr: what Python flushes at its end goes nowhere
             os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
         return 1
     except (NbtrackError, OSError, MemoryError, KeyboardInterrupt) as error:
@@ -146,9 +151,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _writable(stream: TextIO | None) -> TextIO:
-    """A stream that takes every text: one that is closed, as a daemon's, leads nowhere from now on.
+    """The stream, changed so that it takes every text; a stream to nowhere where it is None.
 
-    Letters that its encoding lacks, as of a path, are escaped.
+    Python has None for a stream that is closed, as a daemon's is. Letters that the encoding lacks,
+    as those of a path, are escaped.
     """
     if stream is None:
         stream = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
@@ -162,6 +168,7 @@ def _message_of(error: BaseException) -> str:
     if isinstance(error, NbtrackError):
         return " ".join(str(error).split())
     if isinstance(error, OSError):  # a disk that is full, a file where a folder should be
+        # The second name is the target of a file that was to be renamed.
         where = error.filename2 or error.filename or "the output"
         return f"{where}: {error.strerror or error}; mend it and run again"
     if isinstance(error, MemoryError):  # where no job says what needs it
@@ -182,7 +189,9 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
         command = group.add_parser(last, help=about, description=about)
         for word in [*words.split(), "--import"]:
             command.add_argument(word, **OPTIONS[word])
+        # Not every command has --device, and `main` asks for it.
         command.set_defaults(command=last, parser=command, device=None)
+    # `parse_args` would report unknown ones itself, without the nearest name.
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         given = unknown[0].partition("=")[0]

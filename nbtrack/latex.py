@@ -30,11 +30,12 @@ OUR_WORDING = Wording()
 
 
 def latex_file(styler: Any, path: Path, note: str, own: Wording = OUR_WORDING) -> str:
-    """A styled table of cells as the text of a `.tex` file.
+    """The text of the `.tex` file for `styler`, a `TableStyler` of `nbtrack.tables`.
 
-    The file's name, `table_1`, `table_2` or `table_3`, chooses the caption; its folder's name goes
-    into the label; a plain note tells how the numbers came about. An author's own caption is that
-    of Table I or III; Table II then has the usual one without the note.
+    The name of `path`, `table_1`, `table_2` or `table_3`, chooses the caption, and its folder's
+    name goes into the label; nothing is written here. `note`, plain text, tells how the numbers
+    came about. An author's own caption is that of Table I or III; Table II then has the usual one
+    without the note.
     """
     cells = styler.data
     groups = {}  # the rows of a rate by method, or of a tracker by n
@@ -55,7 +56,7 @@ def latex_file(styler: Any, path: Path, note: str, own: Wording = OUR_WORDING) -
 
 
 def _plain(text: object) -> str:
-    """Text with LaTeX's special characters made printable, and n = 64 as in the paper."""
+    """Text with LaTeX's special characters escaped, and what reads `n = 64` set as a formula."""
     return re.sub(r"\bn = \d+", r"$\g<0>$", str(text).translate(str.maketrans(_SPECIAL)))
 
 

@@ -25,17 +25,17 @@ _INSTALLED = (*_LIBRARY_FOLDERS, *site.getsitepackages(), site.getusersitepackag
 
 
 @cache
-def package_code(*rooms: str) -> str:
+def package_code(*folders: str) -> str:
     """Twelve hexadecimal digits that change with the files of some folders of this package."""
-    files = sorted(file for room in rooms for file in (PACKAGE / room).rglob("*.py"))
+    files = sorted(file for folder in folders for file in (PACKAGE / folder).rglob("*.py"))
     return fingerprint({str(file.relative_to(PACKAGE)): file.read_text("utf-8") for file in files})
 
 
 def code_fingerprint(*kinds: type) -> str:
     """Twelve hexadecimal digits that change with the code that maps and tracks with some classes.
 
-    That is this package's, and where a class or a base class was written elsewhere, all the code
-    that this process has loaded from there; see `own_code`.
+    That is this package's. Where a class or a base class was written elsewhere, it is also what
+    `own_code` finds: the code that this process has loaded from there, and a user's own files.
     """
     packages = {base.__module__.partition(".")[0] for kind in kinds for base in kind.__mro__}
     own = packages.difference(_LIBRARIES)
@@ -43,9 +43,10 @@ def code_fingerprint(*kinds: type) -> str:
 
 
 def own_code(packages: set[str]) -> dict[str, str]:
-    """The text of each loaded module that is not installed, or belongs to one of some packages.
+    """By name, the text of each loaded module that belongs to one of `packages` or is a user's own.
 
-    Helpers that a user's file imports count as the file does. Of a notebook, which has no file,
+    A user's own are those that are not installed, and not nbtrack's, which `package_code` covers:
+    helpers that a user's file imports count as the file does. Of a notebook, which has no file,
     those statements of the executed cells count that define a class, a function or a constant.
     """
     texts = {}
@@ -55,7 +56,7 @@ def own_code(packages: set[str]) -> dict[str, str]:
         is_library = top == "nbtrack" or file.startswith(_INSTALLED)
         if (top in packages or not is_library) and file.endswith(".py") and Path(file).is_file():
             texts[name] = Path(file).read_text("utf-8")
-    for cell in getattr(sys.modules["__main__"], "In", []):
+    for cell in getattr(sys.modules["__main__"], "In", []):  # IPython's list of executed cells
         with contextlib.suppress(SyntaxError):  # of a cell that ended with an error
             for statement in ast.parse(cell).body:
                 texts |= _definition(statement)
@@ -63,9 +64,10 @@ def own_code(packages: set[str]) -> dict[str, str]:
 
 
 def _definition(statement: ast.stmt) -> dict[str, str]:
-    """The text of a statement that defines a class, a function or a constant, by the name.
+    """The text of a statement that defines a class, a function or a constant, by its name.
 
-    A constant is what is assigned a value in which no other name occurs.
+    A constant is what is assigned a value in which no other name occurs. Other statements give
+    nothing.
     """
     if isinstance(statement, ast.ClassDef | ast.FunctionDef):
         return {statement.name: ast.unparse(statement)}

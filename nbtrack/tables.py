@@ -53,12 +53,12 @@ def naming_points(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
-    """Table I in long form from a row for every seed; rates fall, dataset's scenes are labelled.
+    """Table I in long form, from results with a row for each cell and seed: means over the seeds.
 
-    Columns are rate_hz, method, scene, ate_m, and with several seeds ate_std_m, their std (m) as a
-    sample. A cell with a seed that failed is NaN: a mean over the others would hide the failure.
-    Where results have a column still_ate_m, the method `STANDING_STILL` is added. Raises DataError
-    where two rows have one place.
+    Columns are rate_hz (falling), method, scene (the dataset's by their printed names), ate_m, and
+    with several seeds ate_std_m, their sample std (m). A cell with a failed seed is NaN: a mean of
+    the others would hide the failure. A column still_ate_m in the results adds the method
+    `STANDING_STILL`. Raises DataError where two rows are of one cell and seed.
     """
     keys = [*_CELL_1, "seed"] if "seed" in results else _CELL_1
     _refuse_doubles(results, keys)
@@ -70,7 +70,7 @@ def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
     groups = results.groupby(_CELL_1, sort=False)["ate_m"]
     averaged = groups.mean(skipna=False).reset_index()
     if groups.size().max() > 1:
-        spread = groups.std(skipna=False).to_numpy()  # of standing still it would say nothing
+        spread = groups.std(skipna=False).to_numpy()  # standing still does not depend on a seed
         averaged["ate_std_m"] = np.where(averaged["method"] == STANDING_STILL, np.nan, spread)
     return averaged.sort_values("rate_hz", ascending=False, kind="stable", ignore_index=True)
 
@@ -78,8 +78,8 @@ def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
 def table_1(results: pd.DataFrame, value: str = "ate_m") -> pd.DataFrame:
     """Table I as printed: ATE (m), a row per rate and method, a column per scene.
 
-    Results and what is raised: see `average_over_seeds`; for the std over seeds the value is
-    "ate_std_m". Methods and scenes keep the order of their first appearance. Every method
+    Results and errors are those of `average_over_seeds`. With the value "ate_std_m" the table holds
+    the std over seeds. Methods and scenes keep the order of their first appearance. Every method
     gets a row at every rate; what has no result is NaN.
     """
     cells = average_over_seeds(results)
@@ -99,7 +99,7 @@ def table_2(steps: pd.DataFrame, value: str = "steps") -> pd.DataFrame:
 
 
 def beside_published(results: pd.DataFrame) -> pd.DataFrame:
-    """Our Table I beside the paper's: scene by scene if ours hold scenes of the paper's.
+    """Our Table I beside the paper's: scene by scene where ours has scenes of the paper.
 
     Errors in different rooms say nothing about each other. Of our own rooms a summary is compared:
     the median ATE (m), and the share of scenes where it is above 0.2 m, or there is no result.
@@ -116,21 +116,21 @@ def beside_published(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def beside(ours: pd.DataFrame, paper: pd.DataFrame) -> pd.DataFrame:
-    """Two wide tables in one: ours, the paper's where it has such a row, ours less the paper's."""
+    """Two wide tables in one: below each row of ours the paper's, and ours less the paper's."""
     same = paper.reindex(index=ours.index, columns=ours.columns)
     sources = {"ours": ours, "paper": same, "difference": ours - same}
     both = pd.concat(sources, names=["source"]).reorder_levels([1, 2, 0])
-    # Ours alone where the paper has no such row.
+    # Ours stands alone where the paper has no such row.
     rows = []
     for row in ours.index:
-        there = sources if row in paper.index else ["ours"]
-        rows += [(*row, source) for source in there]
+        shown = sources if row in paper.index else ["ours"]
+        rows += [(*row, source) for source in shown]
     return both.loc[rows]
 
 
 def _wide(cells: pd.DataFrame, keys: list[str], value: str) -> pd.DataFrame:
-    """The last key across, the others down; a value that there is not is NaN."""
-    cells = cells.reindex(columns=[*keys, value])
+    """Long to wide form: columns by the third key, rows by the first two, gaps NaN."""
+    cells = cells.reindex(columns=[*keys, value])  # a value such as ate_std_m may be missing
     return cells.pivot(index=keys[:2], columns=keys[2], values=value).astype(float)
 
 
@@ -146,7 +146,7 @@ def _refuse_doubles(cells: pd.DataFrame, keys: list[str]) -> None:
 class Cell:
     """A number as it is printed, perhaps with a std, and its marks.
 
-    They stand in the text too, because pages that do not trust a notebook drop its style sheets.
+    The marks are in its text too: pages that do not trust a notebook drop its style sheets.
     """
 
     value: str
@@ -158,11 +158,11 @@ class Cell:
         return f"{self.value} ± {self.std}" if self.std else self.value
 
     def css(self) -> str:
-        """Its style."""
+        """Its declarations in a style sheet."""
         return ("color: red;" if self.is_lost else "") + (_BOLD if self.is_best else "")
 
     def html(self) -> str:
-        """Its text."""
+        """Its content as HTML, with a dagger and bold type as marks."""
         text = f"{self} †" if self.is_lost else str(self)
         return f"<b>{text}</b>" if self.is_best else text
 
@@ -222,19 +222,19 @@ def style_table_2(
 
 
 def _texts(wide: pd.DataFrame, form: str, missing: str = "") -> pd.DataFrame:
-    """Numbers as texts by a format such as `{:.3f}`; NaN as another text."""
+    """Numbers as texts by a format such as `{:.3f}`; NaN as the text `missing`."""
     return wide.map(lambda value: missing if pd.isna(value) else form.format(value))
 
 
 def _styled(texts: pd.DataFrame, stds: pd.DataFrame, is_best: Marks, is_lost: Marks) -> TableStyler:
-    """A table of cells of these parts, each a table of one shape, or one value for all."""
+    """A styled table of `Cell`s; marks are tables of the shape of the texts, or a flag for all."""
     cells = np.vectorize(Cell, otypes=[object])(texts, stds, is_best, is_lost)
     styler = TableStyler(pd.DataFrame(cells, texts.index, texts.columns))
     return styler.format(Cell.html).map(Cell.css)
 
 
 def _labelled(styler: TableStyler, caption: str | None, legend: str) -> TableStyler:
-    """With a caption that explains the marks, and an id made of all that the table shows.
+    """The styler, given a caption that explains the marks, and an id from all that it shows.
 
     A page's style sheets go by ids: tables that share one would colour each other.
     """

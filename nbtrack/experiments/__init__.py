@@ -20,7 +20,7 @@ from nbtrack.core.progress import tell
 for plugin in entry_points(group="nbtrack"):
     try:
         plugin.load()
-    except Exception as error:  # of somebody else's package, without which all others still work
+    except Exception as error:  # in somebody else's package: without it all others still work
         reason = f"{type(error).__name__}: {error}"
         tell(f"nbtrack: warning: plug-in {plugin.value} is left out ({reason}): mend or remove it")
 
@@ -46,7 +46,8 @@ def import_own(source: str) -> None:
         module = importlib.import_module(name)
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
-        is_in_python = place.filename.startswith("<frozen")  # importing itself
+        # Python's own import system, as for a module that is not there: no place to mend.
+        is_in_python = place.filename.startswith("<frozen")
         where = "" if is_in_python else f" at {place.filename}, line {place.lineno}"
         reason = f"{type(error).__name__}: {error}"
         raise ConfigError(f"importing {source} failed{where} ({reason}): mend it") from error

@@ -41,7 +41,7 @@ def tables_command(options: Namespace) -> None:
 
     Raises NbtrackError at the end where cells failed, and left gaps.
     """
-    # A setting is a text in TOML, which writes a list of words as Python does.
+    # A setting's value is TOML, where a list of texts looks as Python prints it.
     names = [f"scenes.names={options.scenes.split(',')}"] if options.scenes else []
     preset = load_preset(options.preset, options.config, [*options.settings, *names])
     usual = TABLE_3 if options.beyond else TABLE_1
@@ -61,10 +61,14 @@ def tables_command(options: Namespace) -> None:
 def _fill_tables(
     options: Namespace, preset: Preset, methods: Methods, execution: Execution, wording: Wording
 ) -> pd.DataFrame:
-    """Track, print and write; the results, a row a run."""
+    """Track what is missing, print and write the tables; returns the results, a row for each run.
+
+    `wording` is what the user's LaTeX says in place of ours.
+    """
     clock = options.budget == "clock"
     scenes = open_scenes(preset)
     results = track_scenes(
+        # Without rates of its own a table has those of the preset.
         scenes, methods, preset, RATES_3_HZ if options.beyond else None, clock=clock,
         seeds=range(options.seeds), execution=execution,
     )  # fmt: skip
@@ -80,17 +84,19 @@ def _fill_tables(
         print(tables.style_table_1(shown))
         print("Table I beside the paper's")
         print(tables.beside_published(shown).to_string(float_format="%.3f", na_rep="–"))
+        # One scene is enough: a step costs the same in all. Table II is always by the clock.
         steps = _table_2(preset, scenes[0], methods)
         pixels, by_clock = default_pixels(preset, methods), _note(preset, clock=True)
         paths = tables.write_tables(folder, shown, steps, note, pixels, by_clock, wording)
     cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
+    # With all digits: benchmarks/documents.py computes tables of the documents from such files.
     paths.append(tables.write_csv(cells, results.filter(_CELL_COLUMNS), float_format=None))
     print("\n".join(map(str, paths)))
     return results
 
 
 def _label_of(text: str) -> tuple[str, str]:
-    """The name of a scene in tables and its label, of a `NAME=LABEL` text."""
+    """From a `NAME=LABEL` text: the name that our tables print for a scene, and its LaTeX label."""
     name, equals, label = str(text).partition("=")
     if not equals:
         raise ConfigError(f"scenes.labels has {text!r}: write 'NAME=LABEL', as 'office=Office'")
@@ -101,7 +107,8 @@ def bench_command(options: Namespace) -> None:
     """Measure and print Table II; write it as CSV."""
     # The paper's sizes unless something else is asked for: small networks measure bookkeeping.
     name = options.preset or os.environ.get("NBTRACK_PRESET", "synthetic")
-    # One image is enough, and hardly a map: a step costs the same whatever the weights are.
+    # The fewest images that a room may have, and hardly a map: a step costs the same whatever the
+    # weights are.
     quick = ("scenes.n_frames=2", "mapping.imap.iterations=1", "mapping.neus.iterations=1")
     preset = load_preset(name, options.config, [*options.settings, *quick])
     prepare(options.out)
@@ -111,7 +118,7 @@ def bench_command(options: Namespace) -> None:
 
 
 def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
-    """Measure and print Table II; returns its steps."""
+    """Measure and print Table II; returns what `measure_steps` does."""
     steps = measure_steps(preset, scene, methods)
     machine = f"{device_name(choose_device())}, {torch.get_num_threads()} threads"
     print(f"Table II: steps, {preset.name} networks, on {machine}")
@@ -120,10 +127,10 @@ def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.Dat
 
 
 def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
-    """Steps within each budget for every tracker, in its first method's field, and its n (pixels).
+    """Steps within each budget, for every tracker and each n (pixels) that the preset lists for it.
 
-    A tracker first spends one frame that is not counted, so that allocations and compilations are
-    done. The scene's first frame with a pose feeds it, in the scene's map, made if not cached.
+    A tracker works in the field of the first method that has it, in the scene's map, made if not
+    cached, and always on the scene's first frame with a pose.
 
     A row is a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames) and
     steps_std (over frames). Source: paper, Table II and evaluation protocol.
@@ -144,6 +151,7 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
             settings = replace(own.tracking_of(name), n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
                 field = map_scene(scene, method.field, own).field
+                # The budget is replaced for every cell.
                 tracker = make_tracker(name, field, frame.T_world_camera, StepBudget(1), settings)
                 for budget_ms in preset.tables.budgets_ms:
                     counts = _steps_within(tracker, frame, budget_ms)
@@ -154,8 +162,11 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
 
 
 def _steps_within(tracker: Tracker, frame: Frame, budget_ms: float) -> list[int]:
-    """The steps that a tracker takes within a budget, frame by frame, after one not counted."""
-    tracker.budget = ClockBudget(1000 / budget_ms)
+    """The steps that a tracker takes within a budget, frame by frame, always from the true pose.
+
+    A first frame, in which it allocates and compiles, is not counted.
+    """
+    tracker.budget = ClockBudget(1000 / budget_ms)  # Hz
     counts = []
     for _ in range(1 + _FRAMES_A_CELL):
         tracker.restart(frame.T_world_camera)
@@ -173,18 +184,19 @@ def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]
 
 
 def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
-    """For captions: how the camera of some runs moves, and how far a frame in the mean."""
+    """For captions: how the camera of some runs moves, and its mean motion from frame to frame."""
     are_rooms = set(preset.scenes.names) <= set(ROOMS)
     kind = f"{preset.scenes.motion} motion" if are_rooms else "recorded motion"
     if "path_m" not in results:
         return f"Camera: {kind}"
-    frame_mm = 1e3 * (results["path_m"] / results["frames"]).mean()
-    return f"Camera: {kind}, {frame_mm:.1f} mm a frame"
+    motion_mm = 1e3 * (results["path_m"] / results["frames"]).mean()
+    return f"Camera: {kind}, {motion_mm:.1f} mm a frame"
 
 
 def _note(preset: Preset, clock: bool) -> str:
-    """How the numbers were measured, in a sentence. The columns name the scenes."""
+    """How the numbers were measured, in a sentence: preset, changed settings, budget, device."""
     changed = changed_settings(preset.settings, PRESETS[preset.name].settings)
+    # The table's columns name the scenes.
     changed = [text for text in changed if not text.startswith(("scenes.names", "scenes.labels"))]
     label = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name
     budget = "wall clock" if clock else preset.step_counts

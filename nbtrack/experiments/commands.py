@@ -35,10 +35,10 @@ from nbtrack.tracking import Trajectory, make_budget
 from nbtrack.tracking.methods import METHODS
 from nbtrack.tracking.trajectories import number_lines, read_tum
 
-_FRAMES_APART = 10  # of a mesh: neighbours see the same
-_FRAMES_SHOWN = 20  # of an overview: they tell what was seen
-_CELLS = 120  # across an overview
-_MOVIE_FRAMES = 100
+_FRAMES_APART = 10  # every tenth frame tells what of a mesh was seen: neighbours see the same
+_FRAMES_SHOWN = 20  # about so many frames tell what an overview shows
+_CELLS = 120  # of an overview's mesh, along the longest side of its map
+_MOVIE_FRAMES = 100  # at most, evenly spread over a run
 
 
 def methods_command(options: Namespace) -> None:
@@ -67,7 +67,7 @@ def map_command(options: Namespace) -> None:
 
 
 def _write_mesh(job: MapJob, finished: Map) -> None:
-    """The mesh of what was seen, beside a map."""
+    """Write the mesh of what was seen beside a finished map, or print why there is none."""
     try:
         recording = job.scene.recording
         mapped = reading.select_frames(recording, reading.parse_frames(job.frames))
@@ -109,7 +109,7 @@ def track_command(options: Namespace) -> None:
     output.prepare(options.out)
     if not given:
         _make_map(job)
-    # Made anew: recording and map may lie elsewhere now, and clocks differ.
+    # A finished run is made anew: recording and map may lie elsewhere now, and its times change.
     (run.folder / METRICS_FILE).unlink(missing_ok=True)
     (metrics,) = run_jobs([run])
     _draw_overview(run)
@@ -119,7 +119,7 @@ def track_command(options: Namespace) -> None:
 
 
 def _print_run(metrics: dict[str, Any]) -> None:
-    """The errors of a finished run, and what is to be said of them."""
+    """Print the errors of a finished run and its device; warn where they may not be trusted."""
     _print_numbers(metrics)
     if "ate_rmse_m" not in metrics:
         print("  no true pose is known of the tracked frames: errors cannot be computed")
@@ -131,7 +131,7 @@ def _print_run(metrics: dict[str, Any]) -> None:
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:
-    """The scene that is named, and a warning where it is likely read wrongly."""
+    """The named scene. Warns where it is likely read wrongly, as a room made here never is."""
     scene = open_scene(options.sequence, preset, options.format)
     if not scene.made and (warning := quick_warning(scene.recording)):
         tell(f"nbtrack: warning: {warning}; `data check` tells more")
@@ -139,7 +139,7 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
 
 
 def _check_fits(given: Map, field: str, options: Namespace) -> None:
-    """Raises ConfigError where a given map is of another field or other settings than asked for."""
+    """Raises ConfigError where a given map contradicts the options: its frames, field, settings."""
     made, record = given.field.name, given.record
     if options.map_frames:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
@@ -158,7 +158,7 @@ def _check_fits(given: Map, field: str, options: Namespace) -> None:
 
 
 def _make_map(job: MapJob) -> None:
-    """Map, unless the map is there, and say so."""
+    """Print whether the map is cached, and make it if not, without the frames that lack a pose."""
     folder = job.folder
     print(f"map found in {folder}" if job.is_done else f"no finished map in {folder}: mapping")
     has_pose = job.scene.recording.has_pose[reading.parse_frames(job.frames)]
@@ -168,14 +168,14 @@ def _make_map(job: MapJob) -> None:
 
 
 def _print_numbers(results: dict[str, Any]) -> None:
-    """Print the numbers among some results by what they mean, and zeros only of lost frames."""
+    """Print the numbers among `results` by their `MEANINGS`; zeros only of lost frames."""
     for name, value in results.items():
         if isinstance(value, int | float) and (value or name in ("lost_frames", "flagged_frames")):
             print(f"  {MEANINGS.get(name, name)}: {value:.5g}")
 
 
 def _draw_overview(run: TrackJob) -> None:
-    """A picture of a finished run, beside its files: the path in what was seen of the map."""
+    """Draw a finished run beside its files: the path in what was seen of the map, from above."""
     tracked = read_trajectory(run.folder)
     field, metrics, n_frames = run.needs.map().field, tracked.metrics, len(tracked.frames)
     shown = np.arange(0, n_frames, max(1, n_frames // _FRAMES_SHOWN))
@@ -192,7 +192,7 @@ def _draw_overview(run: TrackJob) -> None:
         paths["true"] = tracked.T_true[np.isfinite(tracked.T_true).all(axis=(1, 2))]
     paths["tracked"] = tracked.T_estimated
     figure = plot_overview(cloud_of(surface), paths, tracked.frames, title)
-    output.save_picture(figure, run.folder / output.OVERVIEW_FILE, dpi=120)
+    output.save_picture(figure, run.folder / output.OVERVIEW_FILE, dpi=120)  # 1080 pixels wide
 
 
 def _seen(tracked: Trajectory, rows: np.ndarray, recording: Recording) -> RgbdSequence:
@@ -203,12 +203,12 @@ def _seen(tracked: Trajectory, rows: np.ndarray, recording: Recording) -> RgbdSe
 
 
 def _surface(field: Any, seen: RgbdSequence, n_cells: int) -> Any:
-    """What was seen of a map, in so many cells across it; a map below 6 m counts as 6 m wide."""
+    """A mesh of what was seen of a map; `n_cells` span its longest side, or 6 m if that is less."""
     return extract_mesh(field, seen, voxel=max(6.0, 2 * field.bounds.metres_per_unit) / n_cells)
 
 
 def export_command(options: Namespace) -> None:
-    """Write a run's trajectory, or a map (of folders or files), in another format; print what."""
+    """Write a run or a map in another format, and print what was written."""
     export = look_up("format", options.to, _EXPORTS)
     output.check_no_recording(options.out)
     if options.out.exists():
@@ -219,14 +219,14 @@ def export_command(options: Namespace) -> None:
 
 
 def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
-    """A coloured mesh: of what was seen of the map, where that is known."""
+    """A map as a coloured mesh: of what was seen where the map's folder has that mesh, else all."""
     finished = read_map(source)
     seen = source / MESH_FILE
     is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
     origin = np.array(finished.record["origin"])
     with naming_damaged(seen, "mesh", "remove it and map again"):
         mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)
-        if is_seen:  # the file stands in the world of the recording
+        if is_seen:  # its vertices are in the recording's world, and `mesh_bytes` moves them there
             mesh.vertices -= origin
         content = mesh_bytes(mesh, format_name, origin)
     what = "what was seen" if is_seen else "all"
@@ -234,7 +234,7 @@ def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
 
 
 def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
-    """A movie of a run or a recording for Rerun; its recording and map must be where they were."""
+    """A run as a movie or for Rerun. Its recording and map must lie where they did in tracking."""
     if format_name == "rrd" and importlib.util.find_spec("rerun") is None:
         raise MissingError("--to rrd needs Rerun: pip install 'nbtrack[rerun]'")
     tracked = read_trajectory(source)
@@ -244,7 +244,7 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
         raise DataError(f"{metrics['map']} is not the map of this run any more: track again")
     shown = np.unique(np.linspace(0, n_frames - 1, _MOVIE_FRAMES).round().astype(int))
     seen = _seen(tracked, shown, open_recording(metrics["recording"], metrics["format"]))
-    surface = _surface(stored.field, seen, 2 * _CELLS)
+    surface = _surface(stored.field, seen, 2 * _CELLS)  # cells half as large as in an overview
     title = f"{metrics['scene']}: {metrics['tracker']} in {stored.field.label}"
     if format_name == "rrd":
         content = rerun_bytes(surface, seen, tracked, title)
@@ -256,7 +256,7 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
 
 
 def _export_trajectory(source: Path, format_name: str) -> tuple[str, str]:
-    """The tracked poses of a run in KITTI's format."""
+    """The tracked poses of a run in KITTI's format, the only one of trajectories."""
     n_poses = len(read_trajectory(source).frames)  # raises for what is no run
     _, T_world_camera = read_tum(source / "trajectory.txt")  # m, in the recording's world
     what = "KITTI: three rows of the matrix (m), no time stamps"
@@ -279,13 +279,13 @@ def make_command(options: Namespace) -> None:
 
 
 def check_command(options: Namespace) -> None:
-    """Validate a recording; print what it holds and what is wrong, and draw it if asked to."""
+    """Validate a recording; print what it holds and what is wrong, and draw it into --out."""
     output.prepare(options.out)
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     report = check_recording(recording, progress=True)
     print(report)
     if options.out:
-        apart_mm = 1e3 * report.conventions[0].median_m
+        apart_mm = 1e3 * report.conventions[0].median_m  # as the recording's files are declared
         title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart (median)"
         figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)
         output.save_picture(figure, options.out / output.CHECK_FILE)

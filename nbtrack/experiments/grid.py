@@ -32,7 +32,7 @@ def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
 def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -> pd.DataFrame:
     """A row a map of some scenes: field, scene, seed, seconds, and the scores, `SCORES`.
 
-    Those that are not cached are made. Raises ConfigError where scenes or fields are no lists.
+    Maps that are not cached are made. Raises ConfigError where scenes or fields are no lists.
     """
     check_lists(scenes=scenes, fields=fields)
     jobs = [MapJob.of(scene, field, preset) for field, scene in product(fields, scenes)]
@@ -65,7 +65,7 @@ def track_scenes(
         tracked: other recordings of the same rooms, in the same order, which no map has seen.
 
     Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), the metrics,
-    ate_m (NaN where not known), failure (why). Raises ConfigError for no list; what a job raised.
+    ate_m (NaN if unknown), failure (why). Raises ConfigError for a list that is none; as jobs do.
     """
     check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
     rates = [None] if steps else rates_hz or preset.tables.rates_hz
@@ -86,17 +86,22 @@ def track_scenes(
 
 
 def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[str, Any]:
-    """A row with its run's metrics, all but their scene, the tracked one; or with its failure."""
+    """A row with its run's metrics, or with its failure.
+
+    The row's own values win over metrics of the same name: its scene is the mapped one, that of the
+    metrics the tracked one.
+    """
     if isinstance(result, NbtrackError):
         return {**row, "failure": str(result), "ate_m": float("nan")}
+    # Without the metrics that are dictionaries.
     metrics = {k: v for k, v in result.items() if k not in ("config", "map_record", "versions")}
     return {**metrics, **row, "failure": "", "ate_m": result.get("ate_rmse_m", float("nan"))}
 
 
 def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:
-    """The results of some jobs, run side by side, or by the clock one after the other.
+    """The results of some jobs, run side by side; by the clock only their maps are made so.
 
-    With a clock nothing else may run beside it, so only the maps are made side by side.
+    Runs whose frames end by the clock follow each other, since what runs beside them costs steps.
     """
     missing = [job for job in jobs if not job.is_done]
     for job in missing:

@@ -40,13 +40,16 @@ Report = Callable[[float, str], None]
 
 
 class Job:
-    """One piece of work: picklable, kept in a folder of its own, perhaps made of another's."""
+    """One piece of work: picklable, its result kept in its own folder, perhaps made from another's.
+
+    `needs` is the job whose result it is made from.
+    """
 
     kind: str  # the part of the cache where it is kept
     name: str  # for readers
     key: str  # changes with everything that the result depends on
     doing: str = "computing"  # what its progress is called
-    work: float = 1.0  # how long it takes, in runs: it weighs so much in the time that is left
+    work: float = 1.0  # how long it takes, in tracked runs: its weight in the time that is left
     needs: "Job | None"
     is_done: bool
     result: Callable[[], Any]  # what a finished job has kept
@@ -58,10 +61,11 @@ class Job:
         return runs_folder() / self.kind / f"{self.name}-{self.key}"
 
     def outcome(self, needed: Any, report: Report) -> Any:
-        """Its `result`, made where it is missing, or the user's mistake that kept it from that.
+        """Its `result`, made where it is missing, or the NbtrackError that ended it.
 
-        What another process is computing is waited for. A lock keeps others out, which
-        the system frees when that process ends.
+        `needed` is the outcome of the job that it needs: if that is an error, this one is not run.
+        A lock keeps other processes out, and waits for one that makes the same; the system frees it
+        when its process ends.
         """
         if isinstance(needed, NbtrackError):
             return NbtrackError(f"not run, because {self.needs.name} failed: {needed}")
@@ -103,14 +107,16 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
     bar = ProgressBar(Job.doing, sum(job.work for job in missing.values()))
 
     def show(job: Job, share: float = 0.0, status: str = "running") -> None:
-        """Where the work is: `share` of a job that runs in this process, and all that ended."""
+        """Move the bar: to all that ended, and the `share` of a job that runs in this process."""
         worked = sum(missing[folder].work for folder in results) + share * job.work
-        if 0 < share < 1 and not bar.warm_up_work:  # a first frame waits for what is compiled
+        # Compilation makes the first frame slow, which says nothing of the time that is left.
+        if 0 < share < 1 and not bar.warm_up_work:
             bar.end_warm_up(worked)
         bar.set_description_str(job.doing, refresh=False)
         bar.move_to(worked, f"{len(results)} of {len(missing)} done, {job.name}: {status}")
 
     outcomes = _outcomes(missing, show, execution)
+    # Closing the generator leaves its `with` blocks: so workers end at once after an error too.
     with bar, contextlib.closing(outcomes):
         for folder, outcome in outcomes:
             if isinstance(outcome, NbtrackError) and not execution.keep_going:
@@ -121,16 +127,19 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
 
 
 def _missing(job: Job | None) -> list[Job]:
-    """What is not done of a job and what it needs, in the order in which it can be done."""
+    """A job and those that it needs, as far as they are not done, what is needed first."""
     return [] if job is None or job.is_done else [*_missing(job.needs), job]
 
 
 def _outcomes(jobs: Mapping[Path, Job], show: Callable, execution: Execution) -> Iterator[tuple]:
-    """What becomes of each job, as they end; each begins when the one that it needs has ended."""
+    """Pairs of each job's folder and outcome, as jobs end; a job begins after the one it needs.
+
+    `show` is that of `run_jobs`. `jobs` are in an order in which they can be run.
+    """
     usual = usable_cores() if choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, len(jobs))
     if execution.dask is not None or workers > 1:
-        limit = len(jobs) if execution.dask else workers
+        limit = len(jobs) if execution.dask else workers  # Dask shares them among its workers
         with _submitting(execution.dask, workers) as submit:
             yield from _elsewhere(jobs, submit, limit, show)
         return
@@ -142,19 +151,19 @@ def _outcomes(jobs: Mapping[Path, Job], show: Callable, execution: Execution) ->
 
 
 def _elsewhere(jobs: Mapping[Path, Job], submit: Callable, limit: int, show: Callable) -> Iterator:
-    """As `_outcomes`, of jobs that `submit` begins elsewhere; so many run at a time at most."""
+    """As `_outcomes`, of jobs that `submit` begins elsewhere, at most `limit` at a time."""
     needs = {folder: job.needs.folder if job.needs else None for folder, job in jobs.items()}
     results: dict[Path, Any] = {}
     waiting = list(jobs)
     running: dict[Future, Path] = {}
     while waiting or running:
-        # Those that need nothing, what is cached already, or what has ended.
+        # Jobs that need nothing, something that is cached already, or a job that has ended.
         ready = [f for f in waiting if needs[f] in results or needs[f] not in jobs]
         for folder in ready[: limit - len(running)]:
             running[submit(jobs[folder], results.get(needs[folder]))] = folder
             waiting.remove(folder)
         names = " or ".join(folder.name for folder in running.values())
-        show(jobs[next(iter(running.values()))])  # that runs for the longest
+        show(jobs[next(iter(running.values()))])  # the job that began first
         ended, _ = wait(running, _LOOK_SECONDS, FIRST_COMPLETED)
         for future in ended:
             folder = running.pop(future)
@@ -163,7 +172,10 @@ def _elsewhere(jobs: Mapping[Path, Job], submit: Callable, limit: int, show: Cal
 
 
 def _result_of(future: Future, names: str) -> Any:
-    """What a job gave. Raises NbtrackError where its process died, beside jobs of some names."""
+    """What a job gave. Raises NbtrackError where a process died.
+
+    `names` are those of all jobs that ran then: which of their processes died is not known.
+    """
     error = future.exception()
     if type(error).__name__ not in ("BrokenProcessPool", "KilledWorker"):  # the latter is Dask's
         return future.result()
@@ -174,14 +186,16 @@ def _result_of(future: Future, names: str) -> Any:
 
 @contextlib.contextmanager
 def _submitting(address: str | None, workers: int) -> Iterator[Callable[[Job, Any], Future]]:
-    """A function that begins a job elsewhere, given what became of the one that it needs.
+    """A function that begins a job elsewhere, given the outcome of the one that it needs.
 
+    Elsewhere is a Dask cluster at `address`, or so many processes here, which end with the block.
     Folders, device, search path, fields and trackers there are those of this process. Classes of a
     notebook or script travel whole, those of files by the name of their module.
     """
     settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
     if "NBTRACK_DEVICE" in os.environ:
         settings["NBTRACK_DEVICE"] = os.environ["NBTRACK_DEVICE"]
+    # Small networks gain nothing from a second thread; processes here share this one's threads.
     n_threads = 1 if address else max(1, torch.get_num_threads() // workers)
     workplace = _cluster(address) if address else _pool(workers)
     with workplace as executor:
@@ -196,23 +210,29 @@ def _submitting(address: str | None, workers: int) -> Iterator[Callable[[Job, An
 def _outcome_there(settings: Mapping, search_path: list[str], n_threads: int, work: bytes) -> Any:
     """What becomes of a job: runs in a worker, which may have been started elsewhere."""
     os.environ |= settings
+    # Before the work is unpickled, which imports the modules of its classes.
     sys.path += [folder for folder in search_path if folder not in sys.path]
     fields, trackers, job, needed = pickle.loads(work)
     FIELDS.update(fields)
     TRACKERS.update(trackers)
     with threads(n_threads):
-        return job.outcome(needed, lambda share, status: None)
+        return job.outcome(needed, lambda share, status: None)  # only outcomes are sent back
 
 
 @contextlib.contextmanager
 def _pool(workers: int) -> Iterator[Executor]:
-    """Processes of this machine, which end with the block, or with this process if it is killed."""
+    """Processes of this machine, which end with the block, or with this process if it is killed.
+
+    Each watches a pipe whose other end, `ours`, is closed in both cases. At the block's end that
+    comes first, so that the pool does not wait for jobs that still run.
+    """
     context = multiprocessing.get_context(_START)
     theirs, ours = context.Pipe(duplex=False)
     with ProcessPoolExecutor(workers, context, _end_with, (theirs,)) as executor, ours:
         with _spared():
             for _ in range(workers):
-                executor.submit(int)  # a process is begun for each, since none is idle yet
+                # Calls that do nothing: a process is begun for each, since none is idle yet.
+                executor.submit(int)
         yield executor
 
 
@@ -220,8 +240,8 @@ def _end_with(pipe: Connection) -> None:
     """End this worker, whatever it does, as soon as the other end of a pipe is closed."""
 
     def watch() -> None:
-        pipe.poll(None)
-        os._exit(1)
+        pipe.poll(None)  # waits without limit: nothing is ever sent
+        os._exit(1)  # at once, in the middle of a job
 
     threading.Thread(target=watch, daemon=True).start()
 
@@ -234,7 +254,8 @@ def _spared() -> Iterator[None]:
     processes from within them: Python runs again what `sys.modules` holds as `__main__`.
     """
     script = sys.modules["__main__"]
-    is_main = threading.current_thread() is threading.main_thread()  # others have no handlers
+    # Python lets only the main thread set a handler.
+    is_main = threading.current_thread() is threading.main_thread()
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -247,8 +268,8 @@ def _spared() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _cluster(address: str) -> Iterator[Executor]:
-    """The workers of a Dask scheduler. Raises MissingError where there are none."""
-    from distributed import Client
+    """The workers of a Dask scheduler, as an executor. Raises MissingError where there are none."""
+    from distributed import Client  # an extra
 
     try:
         client = Client(address, timeout=_SECONDS_TO_CONNECT)
@@ -256,5 +277,6 @@ def _cluster(address: str) -> Iterator[Executor]:
     except (OSError, ValueError):
         advice = "start 'dask scheduler', and 'dask worker ADDRESS --nthreads 1'"
         raise MissingError(f"no Dask scheduler at {address!r} with a worker: {advice}") from None
+    # Not pure: Dask would answer an equal call with the result of the earlier one.
     with client, client.get_executor(pure=False) as executor:
         yield executor

@@ -26,11 +26,15 @@ OF_MAPS = ("network.", "mapping.", "correction.")
 """How keys of settings begin that only matter where a map is made."""
 PLAIN_PRESET = "synthetic"
 """The preset whose settings are the classes' own."""
-_FRAMES_LOOKED_AT = 20  # that tell a map's unit before there is a map
+_FRAMES_LOOKED_AT = 20  # at most, to estimate a map's unit before there is a map
 
 
 def setting_tree(field: str, network: Any, settings: Any, voxel: float) -> dict[str, Any]:
-    """The settings of a map, corrected in cells of `voxel` (m; 0: not), where a preset has them."""
+    """A map's settings as a tree of the form of `Preset.settings`.
+
+    `network` and `settings` are the map's own, of its network and of mapping; `voxel` (m) is the
+    edge of the cells in which it was corrected, 0 if it was not.
+    """
     plain = PRESETS[PLAIN_PRESET].settings
     of_network = field if field in plain["network"] else "neus"  # whose network the field has
     return {
@@ -51,11 +55,12 @@ class MapJob(Job):
     frames: str = ":"
     seed: int = 0
     correction_voxel: float = 0.0  # m, of the cells in which the map is corrected; 0: it is not
-    # m, of the cells in which the job that needs this map will correct it.
+    # m, of the cells in which another job will correct this map: so a size that cannot work is told
+    # before this one is made. It changes nothing in this map.
     later_voxel: float = field(default=0.0, compare=False)
 
     kind, doing = "maps", "mapping"
-    work = 4.0  # by the queries of a field with `smoke`
+    work = 4.0  # with `smoke` it asks the field about as many queries as four tracked runs
 
     @classmethod
     def of(cls, scene: Scene, field: str, preset: Preset, frames: str = ":", seed: int = 0) -> Self:
@@ -101,17 +106,17 @@ class MapJob(Job):
 
     @property
     def metres_per_unit(self) -> float:
-        """The unit of the map; about that of one that is still to be made."""
+        """Metres a unit of the map; an estimate for a map that is still to be made."""
         if self.is_done:
             return self.map().field.bounds.metres_per_unit
         return _rough_unit(self.scene, self.frames)
 
     def _stored(self) -> Map:
-        """The finished map as it was read; read anew where its file has changed since."""
+        """The finished map, from a cache of this process as long as its file is unchanged."""
         return _read(self.folder, (self.folder / MAP_FILE).stat().st_mtime_ns)
 
     def compute(self, report: Report) -> dict[str, Any]:
-        """Map and score, or resume; write the map's files."""
+        """Map and score, or resume from a checkpoint; write the map's files. Returns its record."""
         checkpoint = self.folder / CHECKPOINT_FILE
 
         def tell(share: float, losses: dict[str, float | int]) -> None:
@@ -143,10 +148,10 @@ class MapJob(Job):
 
 @dataclass(frozen=True, eq=False)
 class GivenMap:
-    """What a run needs of a finished `MapJob`, of a map that is only read."""
+    """A map that the user gave. It has what a run asks of a finished `MapJob`; it is only read."""
 
     finished: Map
-    folder: Path  # or its file
+    folder: Path  # as the user gave it: perhaps the map's file
 
     is_done = True
 
@@ -168,7 +173,7 @@ class GivenMap:
 
     @property
     def metres_per_unit(self) -> float:
-        """The unit of the map."""
+        """Metres a unit of the map."""
         return self.finished.field.bounds.metres_per_unit
 
     def map(self) -> Map:
@@ -178,7 +183,7 @@ class GivenMap:
 
 @lru_cache
 def _rough_unit(scene: Scene, frames: str) -> float:
-    """Metres a unit, told by a few frames before there is a map."""
+    """Metres a unit of the map that will be made, estimated from a few of its frames."""
     ids = select_frames(scene.recording, parse_frames(frames))
     some = ids[np.linspace(0, len(ids) - 1, min(len(ids), _FRAMES_LOOKED_AT)).astype(int)]
     return observed_bounds(read_frames(scene.recording, some)).metres_per_unit
@@ -186,8 +191,8 @@ def _rough_unit(scene: Scene, frames: str) -> float:
 
 @lru_cache(maxsize=4)
 def _read(folder: Path, modified_ns: int) -> Map:
-    """The map of a folder, read once for all runs in it, and anew where its file has another time.
+    """The map of a folder, kept for all runs in it: reading a corrected one takes seconds.
 
-    A corrected one samples its network, which takes seconds.
+    `modified_ns` is no input: with another time the cache has no answer, and the file is read anew.
     """
     return read_map(folder)

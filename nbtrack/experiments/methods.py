@@ -22,9 +22,10 @@ RATES_3_HZ = (30.0, 10.0, 5.0, 2.0)
 def method_of(name: str | None, field: str | None, tracker: str | None) -> Method:
     """A row of `METHODS` by its name, or a free combination of a field and a tracker.
 
-    A field alone takes the first of lm, icp and vr that works in it, a tracker alone the field of
-    the first row with it; without anything it is `DEFAULT_METHOD`. Raises ConfigError for a name
-    beside the others, and as `find_methods` does.
+    A field alone takes the first tracker that works in it, of lm, icp, vr and then all others. A
+    tracker alone takes the field of the first row that has it, or NeuS. Without anything it is
+    `DEFAULT_METHOD`. Raises ConfigError for a name beside the others, for a field in which no
+    tracker works, and as `find_methods` does.
     """
     if name and (field or tracker):
         raise ConfigError("--method names a field and a tracker: leave --field and --tracker out")

@@ -29,7 +29,7 @@ def is_own_output(folder: Path) -> bool:
 
 
 def prepare(folder: Path | None) -> None:
-    """Mark a folder, before the work, as one for nbtrack's results. None stands for the cache.
+    """Mark a folder, before the work, as one for nbtrack's results. For None nothing is done.
 
     Raises ConfigError where it holds a recording, or files of somebody else that are named like
     results; OSError where nothing can be written.
@@ -44,9 +44,10 @@ def prepare(folder: Path | None) -> None:
 
 
 def deliver(cached: Path, names: Sequence[str], folder: Path | None) -> Path:
-    """Copy a result's files from the cache to a folder, if one is given; where the result then is.
+    """Copy a result's files from the cache to a folder, if one is given.
 
-    A file that an earlier result left there, and that this one lacks, is removed.
+    Returns the folder where the result then is. A file that an earlier result left there, and that
+    this one lacks, is removed. The last of `names` is written last, as the sign that all are there.
     """
     if folder is None:
         return cached
@@ -67,7 +68,7 @@ def check_no_recording(path: Path) -> None:
 
 
 def save_picture(figure: Figure, path: Path, dpi: float | str = "figure") -> None:
-    """Writes a figure as a PNG."""
+    """Writes a figure as a PNG, by default with the dots per inch of the figure itself."""
     content = io.BytesIO()
     with in_house_style():
         figure.savefig(content, dpi=dpi)

@@ -47,7 +47,7 @@ class TablesConfig:
 
     rates_hz: tuple[float, ...] = limited((10.0, 5.0, 2.0), 0.01, 100.0)  # paper, Table I
     budgets_ms: tuple[float, ...] = limited((50.0, 100.0, 500.0), 0.1, 1e5)  # paper, Table II
-    # Pixels n of each tracker in Table II (paper); others take those of the SDF tracker.
+    # By tracker the n (pixels) of Table II (paper); trackers not named here take those of "sdf".
     pixels: dict[str, tuple[int, ...]] = field(
         default_factory=lambda: {"vr": (128, 512, 1024), "sdf": (2048, 4096, 16384)}
     )
@@ -61,7 +61,7 @@ _NETWORKS = {
     "neus": NetworkSettings(),
     "occupancy": NetworkSettings(embedding_sigma=4.0),
 }
-# Whose changes by a preset hold for all of a part that the preset does not name.
+# What a preset changes in these holds for all fields or trackers that it does not name.
 _USUAL = {"network": "neus", "mapping": "neus", "tracking": "sdf"}
 
 
@@ -122,7 +122,7 @@ class Preset:
             part, *names = key.split(".")
             known = tree.get(part)
             if names and isinstance(known, dict):
-                # The nearest whole key would be something else's.
+                # First the field or tracker: of whole keys the nearest may belong to another one.
                 look_up(f"config key, {part} of", names[0], known)
         checked = flat(with_values(tree, values))
         return {key: checked[key] for key in values}
@@ -132,7 +132,7 @@ class Preset:
         return replace(self, chosen=self.chosen | self._checked(values))
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
-        """The preset with the `key=value` texts of a method, but for what a user chose."""
+        """The preset with the `key=value` texts of a method, over which a user's values win."""
         values = {key: value for text in settings for key, value in read_setting(text).items()}
         return replace(self, of_method=self.of_method | self._checked(values))
 
@@ -152,7 +152,7 @@ class Preset:
         return self.settings["correction"]
 
     def network_of(self, field_name: str) -> Any:
-        """Network of a field, by default that of NeuS; None of a field that learns nothing."""
+        """Settings of a field's network, by default those of NeuS; None if it learns nothing."""
         networks = self.settings["network"]
         is_learned = issubclass(field_class(field_name), LearnedField)
         return networks.get(field_name, networks["neus"]) if is_learned else None
@@ -167,7 +167,7 @@ class Preset:
 
     @property
     def step_counts(self) -> str:
-        """For captions of tables with the paper's step counts: the sizes of the paper and ours."""
+        """For captions: with which sizes the paper measured its step counts, and what ours are."""
         paper = " and ".join(f"{n} ({tracker})" for tracker, n in PAPER_PIXELS.items())
         own = " and ".join(f"{self.tracking_of(t.lower()).n_pixels} ({t})" for t in PAPER_PIXELS)
         width, own_width = NetworkSettings().width, self.network_of("neus").width
@@ -193,10 +193,10 @@ def load_preset(
 ) -> Preset:
     """A preset, by default that of `NBTRACK_PRESET`, else `smoke`, with all overrides applied.
 
-    They are the `key=value` texts of a method, a TOML file, by default the one that
-    `NBTRACK_CONFIG` names, and `key=value` texts, after those in `NBTRACK_SET`. Raises ConfigError
-    for an unknown preset or key, or a value of the wrong type; MissingError if the file does not
-    exist, DataError if it is no TOML.
+    Each overrides those before it: the `key=value` texts `of_method`; a TOML file, by default the
+    one that `NBTRACK_CONFIG` names; the texts in `NBTRACK_SET`; `settings`. Raises ConfigError for
+    an unknown preset or key, or a value of the wrong type; MissingError if the file does not exist,
+    DataError if it is no TOML.
     """
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
     config_file = config_file or os.environ.get("NBTRACK_CONFIG")
@@ -210,14 +210,15 @@ def load_preset(
     except ValueError as error:
         advice = "quote each setting as in a shell"
         raise ConfigError(f"NBTRACK_SET cannot be split ({error}): {advice}") from None
+    # The method comes last here, but `Preset.settings` lets a user's values win over it.
     return with_settings(preset, *before, *settings).with_method(of_method)
 
 
 def claim(preset: Preset, holds: bool, text: str, usual: Sequence[str] = ()) -> None:
     """Print what a notebook claims of its results, or warn that it does not hold.
 
-    What is claimed was found with `smoke` and the notebook's usual `key=value` texts: there it must
-    hold, or it is an AssertionError.
+    The claim was found with `smoke` and the notebook's `usual` texts, `key=value`: with just these
+    settings it must hold, and raises AssertionError if not.
     """
     if holds:
         print(text)

@@ -30,9 +30,11 @@ POINTS_SCORED = 20_000  # on surfaces and along rays; as many pixels
 
 
 def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -> Scores:
-    """`SCORES` of a map of a sequence; None where its field has no such answer, or without truth.
+    """`SCORES` of a map of a sequence; None where a score cannot be told.
 
-    Distances and surfaces count where mapped frames saw them. Only synthetic rooms tell the truth.
+    Images are scored only for learned fields and held-out frames, distances only for fields of a
+    distance, and distances and surfaces only in a synthetic `room`, whose geometry is known: there
+    they count where mapped frames saw them.
     """
     field = finished.field
     scores = dict.fromkeys(SCORES)
@@ -50,20 +52,23 @@ def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -
 
 
 def _random_rays(sequence: RgbdSequence, frames: Frames, generator: torch.Generator) -> Rays:
-    """Rays through random pixels of some frames, on the device of the generator."""
-    numbers = torch.from_numpy(frames).to(generator.device)
-    return PixelSampler(sequence, generator.device).draw(POINTS_SCORED, generator, numbers)
+    """Rays through `POINTS_SCORED` random pixels of some frames, on the generator's device."""
+    indices = torch.from_numpy(frames).to(generator.device)
+    return PixelSampler(sequence, generator.device).draw(POINTS_SCORED, generator, indices)
 
 
 def _score_images(field: LearnedField, rays: Rays, room: Room | None) -> Scores:
-    """PSNR (dB) and depth L1 (m) over rays of held-out frames whose pixels are measured."""
-    hit = rays.depth > 0
-    if not hit.any():
+    """PSNR (dB) and depth L1 (m) over rays of held-out frames whose pixels are measured.
+
+    The depth is compared with the room's exact one, or with the measured one without a room.
+    """
+    measured = rays.depth > 0
+    if not measured.any():
         return {}
-    origins, directions = rays.origins_world[hit], rays.directions_world[hit]
+    origins, directions = rays.origins_world[measured], rays.directions_world[measured]
     color, depth = field.render_rays(origins, directions)
-    psnr_db = -10 * float(np.log10((color - rays.color[hit]).square().mean().item()))
-    reference = (rays.depth if room is None else _exact_depths(rays, room))[hit]
+    psnr_db = -10 * float(np.log10((color - rays.color[measured]).square().mean().item()))
+    reference = (rays.depth if room is None else _exact_depths(rays, room))[measured]
     return {"psnr_db": psnr_db, "depth_l1_m": (depth - reference).cpu().abs().mean().item()}
 
 
@@ -98,8 +103,8 @@ def _score_surface(
 ) -> Scores:
     """Accuracy, completion (m) and F-score of the seen part of a map's surface, if it has one.
 
-    The true surface is where rays of mapped frames meet the room, one point a cell of 5 cm: what is
-    near the camera counts no more than what is far.
+    The true surface is where `rays` of mapped frames meet the room, thinned to one point in a cell
+    of 5 cm: so what is near the camera, where rays are dense, counts no more than what is far.
     """
     try:
         mesh = extract_mesh(field, sequence, mapped)
@@ -118,5 +123,5 @@ def _score_surface(
     return {
         "mesh_accuracy_m": float(to_truth.mean()),
         "mesh_completion_m": float(to_map.mean()),
-        "mesh_f_score": 2 * precision * recall / max(precision + recall, 1e-9),
+        "mesh_f_score": 2 * precision * recall / max(precision + recall, 1e-9),  # 0, not NaN
     }

@@ -23,11 +23,12 @@ MEANINGS = {  # printed in place of names in metrics.json that say too little
 
 
 def write_run(folder: Path, run: Trajectory) -> None:
-    """Writes the files of a finished run, whose metrics tell the origin that its poses refer to.
+    """Writes the files of a finished run.
 
-    `trajectory.txt` and `groundtruth.txt` (TUM) hold the tracked frames, without a first one whose
-    pose was given: so public tools report the error of the paper's formula. Where no true pose is
-    known there is no `groundtruth.txt`.
+    Its poses are relative to the origin that its metrics name, those in the files are in the world
+    of the recording. `trajectory.txt` and `groundtruth.txt` (TUM) hold the tracked frames, without
+    a first one whose pose was given: so public tools report the error of the paper's formula. Where
+    no true pose is known there is no `groundtruth.txt`.
     """
     times, origin = run.frames["time"].to_numpy(), np.array(run.metrics["origin"])
     texts = {
@@ -42,7 +43,7 @@ def write_run(folder: Path, run: Trajectory) -> None:
 
 
 def read_trajectory(folder: Path) -> Trajectory:
-    """A finished run from its folder, its poses relative to the map's origin as in tracking.
+    """A finished run from its folder, its poses relative to the map's origin, as in tracking.
 
     Raises MissingError if there is none.
     """
@@ -64,7 +65,10 @@ def read_trajectory(folder: Path) -> Trajectory:
 
 
 def scores_of(tracked: Trajectory) -> dict[str, Any]:
-    """Errors of a run, the tracker's own verdicts against them, and its speed."""
+    """Errors of a run, how well the tracker's own verdicts tell them, and its speed.
+
+    Verdicts, the column `lost`, are compared in frames with a true pose only.
+    """
     rows = tracked.frames
     metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
     if "lost" in rows:
@@ -87,7 +91,8 @@ def over_rooms(results: pd.DataFrame, by: list[str], value: str = "ate_m") -> pd
     """Geometric mean of a positive column by groups, and its 95 % interval: columns `from`, `to`.
 
     A room counts once, with the mean of its seeds' logarithms: rooms differ more than seeds do.
-    The interval is Student's of the rooms' logarithms, NaN for a single room (our choice).
+    The interval is Student's, of the means of the rooms' logarithms, and NaN for a single room (our
+    choice).
     """
     logarithms = np.log(results.set_index([*by, "scene"])[value])
     of_rooms = logarithms.groupby([*by, "scene"], sort=False).mean()

@@ -27,7 +27,7 @@ class Scene:
     name: str
     folder: Path
     format: str | None = None  # None: told by the files that are there
-    made: ScenesConfig | None = None  # how, if it is a room of the cache
+    made: ScenesConfig | None = None  # the settings of a synthetic room that was made in the cache
 
     @property
     def room(self) -> Room | None:
@@ -45,7 +45,7 @@ class Scene:
         return fingerprint(*self.recording.contents(), package_code("data", "recordings"))
 
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
-        """The frames of a slice such as `10:50:2`, without outliers.
+        """The frames of a slice such as `10:50:2`, without depths that are outliers.
 
         More options, and what is raised, are those of `read_frames`.
         """
@@ -87,9 +87,9 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
 def open_scenes(preset: Preset) -> list[Scene]:
     """The preset's scenes; synthetic rooms that are not there are made.
 
-    Scenes that lack a folder, or whose folder is damaged, are named at once, and the others
-    returned. Raises ConfigError where no name is given, or one twice, or an unknown one; where no
-    scene is whole, what is wrong with the first.
+    Scenes that lack a folder, or whose folder is damaged, are left out, and a line names them.
+    Raises ConfigError where no name is given, or one twice, or an unknown one; where no scene is
+    whole, what is wrong with the first.
     """
     names = preset.scenes.names
     if not names or len({absolute(name).name for name in names}) < len(names):
@@ -100,7 +100,7 @@ def open_scenes(preset: Preset) -> list[Scene]:
     for name in names:
         try:
             scene = open_scene(name, preset)
-            scene.count(":")  # so that a damaged folder is told here
+            scene.count(":")  # opens the recording, so that a damaged folder is found here
             scenes.append(scene)
         except (MissingError, DataError) as error:
             missing[name] = error
@@ -112,7 +112,7 @@ def open_scenes(preset: Preset) -> list[Scene]:
 
 
 def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
-    """A room as a sequence folder, under a bar."""
+    """Write a synthetic room as a sequence folder, and show a progress bar."""
     with ProgressBar(f"room {name}", config.n_frames) as bar:
         width, height = config.width, config.width * 3 // 4
         seed, motion = config.seed, config.motion
@@ -120,10 +120,10 @@ def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
 
 
 def _room(name: str, config: ScenesConfig) -> Scene:
-    """A room of this size, length and seed in the cache, made if it is not there."""
+    """The recording of a synthetic room with these `SIZES`, in the cache, made if missing."""
     recipe = f"{config.motion}-{config.n_frames}x{config.width}-seed{config.seed}"
     folder = runs_folder() / "rooms" / f"{name}-{recipe}-{room_version(name)}" / name
-    if not folder.is_dir():  # it appears when it is complete
+    if not folder.is_dir():  # `write_sequence` puts it in place when it is complete
         check_no_recording(runs_folder())
         # Another command that needs the same room waits, and then reads it.
         with locked(folder.with_suffix(".lock")):

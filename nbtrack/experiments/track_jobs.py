@@ -39,8 +39,8 @@ _OTHER_WORLD = (
     "rigid motion that explains the difference, and errors are those that remain"
 )
 # A user is warned of larger ones. Hands start and stop, and a search catches up (our choice).
-_GREEDY_ATE = 0.01  # m, of a greedy follower
-_SHARE = 0.5  # of the frames, in which it moves farther than a search reaches
+_GREEDY_ATE = 0.01  # m, the ATE of a greedy search with the run's reach
+_SHARE = 0.5  # of the frames: those in which the camera moves farther than a search reaches
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class _Start:
     """Where a run begins, and what that says of a given map."""
 
     T_world_camera: Pose  # m, the first frame's; of no meaning where it is not known
-    is_known: bool
-    warning: str | None = None
-    is_in_other_world: bool = False  # the recording, whose poses the map does not fit
+    is_known: bool  # else the tracker finds the camera first
+    warning: str | None = None  # where it cannot be told whether a given map fits the first frame
+    is_in_other_world: bool = False  # the recording's poses are in another world than the map
 
 
 @dataclass(frozen=True)
 class TrackJob(Job):
-    """One tracked run in a map, under one budget: so many steps a frame, or a rate by the clock."""
+    """One tracked run in a map, under one budget: `steps` a frame, or by the clock `rate_hz`."""
 
     needs: MapJob | GivenMap
     scene: Scene  # the mapped one, or another recording of the same room
@@ -107,12 +107,13 @@ class TrackJob(Job):
     def check(self) -> None:
         """Raises ConfigError or DataError, before anything is made, where a run cannot begin."""
         is_known = self.start == "given" and np.isfinite(self._true_path()[0]).all()
-        expected_poses(self.settings.motion_model, [np.eye(4)])  # raises for an unknown model
+        # With any pose: it raises for an unknown motion model.
+        expected_poses(self.settings.motion_model, [np.eye(4)])
         if not is_known:
             tracker_class(self.tracker).check_finds(in_corrected=self.needs.correction_voxel > 0)
 
     def expected_reach(self) -> dict[str, float]:
-        """What `reach_metrics` will say of it; nothing where its steps are not known before."""
+        """What `reach_metrics` will say of the run; empty by the clock, where steps are unknown."""
         if self.steps is not None:
             with contextlib.suppress(NbtrackError):  # the run itself will say what is wrong
                 return self._reach(self.steps, self.needs.metres_per_unit, self._true_path())
@@ -160,7 +161,8 @@ class TrackJob(Job):
         has_pose = bool(np.isfinite(T_first).all())
         is_known = has_pose and self.start == "given"
         start = _Start(T_first if is_known else np.eye(4), is_known)
-        # Another path of a room that is mapped here may begin where the map does not reach.
+        # Only given maps are checked: one made here is of the right room, but another path in the
+        # room may begin where it does not reach.
         if not (has_pose and isinstance(self.needs, GivenMap)):
             return start
         try:
@@ -235,7 +237,7 @@ class TrackJob(Job):
         options = {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
         options |= {"start": self.start, "frames": self.frames, "seed": self.seed}
         options |= {"format": self.scene.format, "device": choose_device().type}
-        options["preset"] = PLAIN_PRESET
+        options["preset"] = PLAIN_PRESET  # settings are given as changes of the classes' own
         settings: dict[str, Any] = {"tracking": {self.tracker: self.settings}}
         sequence = str(self.scene.folder)
         made = self.needs
@@ -259,7 +261,8 @@ class TrackJob(Job):
 def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
     """A line for each kind of run whose search falls behind its camera, whatever the map is.
 
-    It tells of the scene where a greedy follower is off by most.
+    A kind is a tracker with its settings and steps. The line tells of the scene in which a greedy
+    search with this reach has the largest ATE.
     """
     behind: dict[tuple, dict[str, dict[str, float]]] = {}  # by kind of run, reaches by scene
     for run in runs:
