@@ -36,7 +36,7 @@ from nbtrack.tracking.methods import METHODS
 from nbtrack.tracking.trajectories import number_lines, read_tum
 
 _FRAMES_APART = 10  # every tenth frame tells what of a mesh was seen: neighbours see the same
-_FRAMES_SHOWN = 20  # about so many frames tell what an overview shows
+_FRAMES_SHOWN = 20  # of a longer run at least so many frames tell what an overview shows
 _CELLS = 120  # of an overview's mesh, along the longest side of its map
 _MOVIE_FRAMES = 100  # at most, evenly spread over a run
 

@@ -188,7 +188,7 @@ def _result_of(future: Future, names: str) -> Any:
 def _submitting(address: str | None, workers: int) -> Iterator[Callable[[Job, Any], Future]]:
     """A function that begins a job elsewhere, given the outcome of the one that it needs.
 
-    Elsewhere is a Dask cluster at `address`, or so many processes here, which end with the block.
+    Elsewhere is a Dask cluster at `address`, or `workers` processes here, which end with the block.
     Folders, device, search path, fields and trackers there are those of this process. Classes of a
     notebook or script travel whole, those of files by the name of their module.
     """

@@ -129,6 +129,7 @@ class MapJob(Job):
         if self.needs:
             finished = correct_map(self.needs.map(), sequence, self.correction_voxel)
         else:
+            # `code`: a checkpoint that was written under another key is not resumed.
             finished = map_sequence(
                 self.field, sequence, self.network, self.settings, self.seed, choose_device(),
                 checkpoint=checkpoint, on_iteration=tell, code=self.key,

@@ -35,7 +35,7 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     With a slider, where `fixed` is that of ipywidgets: `interact(plot_frame,
     sequence=fixed(sequence), index=(0, len(sequence) - 1), title=fixed("A room"))`.
     """
-    # One scale for all frames, from a sixteenth of the pixels of about 20 of them.
+    # One scale for all frames, from a sixteenth of the pixels of at most 20 of them.
     some_mm = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]
     far = MILLIMETRE * _most(np.ma.masked_equal(some_mm, 0))
     depth = np.ma.masked_equal(sequence.depth(index), 0)  # 0 is an unmeasured pixel

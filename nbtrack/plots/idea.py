@@ -99,6 +99,7 @@ def _draw_queries(
     start = (points_camera @ page_camera.T).numpy()
     end = (ends_camera @ page_camera.T).numpy()
     axes.scatter(*start.T, s=40, label="measured points", color=_COLORS["true"], **_DOT)
+    # For the legend, which would not show arrows.
     axes.plot([], [], color=_COLORS["SDF"], label="|d| against the gradient")
     look = {"color": _COLORS["SDF"], "angles": "xy", "scale_units": "xy", "scale": 1, "zorder": 5}
     axes.quiver(*start.T, *(end - start).T, width=0.003, **look)

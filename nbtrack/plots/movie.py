@@ -21,6 +21,7 @@ from nbtrack.plots.style import new_axes, styled
 _WIDTH = 240  # pixels of the map's view
 _NEAR = 0.1  # m; nearer surfaces are not drawn
 _POINT_SIZE = 0.02  # m; half the side of what is drawn for a point
+# The corners of what is drawn for a point, which faces the camera.
 _SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 _DPI = 72  # of the movie's pictures
 _RATE_HZ = 10  # pictures a second

@@ -126,7 +126,7 @@ def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, nea
     """The path of each tracker's steps over the mean |d| of a frame, and its error at each step.
 
     Trackers, by label, share one map. The title says after how many steps of its budget each is
-    first within `near` metres of the true position. The mean |d| is that of at most some 2000
+    first within `near` metres of the true position. The mean |d| is that of at most 2000
     points, with the camera moved along its true x and z and not turned; trackers also turn.
     """
     paths_cm = {label: _path_cm(tracker, frame, T_start) for label, tracker in trackers.items()}
