@@ -25,7 +25,7 @@ class SceneBounds:
 
     @property
     def metres_per_unit(self) -> float:
-        """The unit of the map: networks see coordinates in it, and Adam moves a camera by it.
+        """The unit of the map (m): that of networks' inputs, and of Adam's rate of the position.
 
         It is the declared one, else half of the longest side, as NeuS and the Neural RGB-D dataset
         normalise their scenes to about [-1, 1]^3.
@@ -33,11 +33,12 @@ class SceneBounds:
         return self.declared_unit or float(np.subtract(self.maximum, self.minimum).max() / 2)
 
     def far_bound(self, origins_world: Points, directions_world: Points) -> Values:
-        """Where rays from inside leave the box, in units of the direction (z-depth, m, for z = 1).
+        """The t at which points origin + t * direction, which start inside, leave the box.
 
-        Rays that start outside, as a lost camera's do, may give small or negative values.
+        It is a z-depth (m) where directions have z = 1 in the camera frame. Rays that start
+        outside, as a lost camera's do, may give small or negative values.
         """
-        # An axis that a ray runs along is left at infinity, never at 0/0.
+        # Along an axis in which a ray does not move its t becomes huge; 0 could give 0/0.
         safe = torch.where(directions_world.abs() < 1e-9, 1e-9, directions_world)
         device, dtype = origins_world.device, origins_world.dtype
         to_minimum = (constant(self.minimum, device, dtype) - origins_world) / safe

@@ -30,7 +30,7 @@ def choose_device() -> torch.device:
         return accelerator or torch.device("cpu")
     try:
         device = torch.device(name)
-        torch.zeros(1, device=device).item()  # which a device without memory cannot say
+        torch.zeros(1, device=device).item()  # raises on `meta`, too, whose tensors have no values
     except (RuntimeError, AssertionError, NotImplementedError, ImportError):
         there = ["cpu", *(f"{accelerator}:{i}" for i in range(torch.accelerator.device_count()))]
         raise ConfigError(f"no device {name!r}: this machine has {', '.join(there)}") from None
@@ -90,7 +90,7 @@ def threads(number: int) -> contextlib.AbstractContextManager[None]:
 
 @contextlib.contextmanager
 def _changed(setter: Callable[[Any], object], before: Any, within: Any) -> Iterator[None]:
-    """Run a block with another value of a setting of PyTorch's, and set the one before again."""
+    """Run a block with a setting of PyTorch's at the value `within`, then set it to `before`."""
     setter(within)
     try:
         yield
@@ -101,7 +101,8 @@ def _changed(setter: Callable[[Any], object], before: Any, within: Any) -> Itera
 def suitable_threads(width: int) -> contextlib.AbstractContextManager[None]:
     """Run a block with the number of CPU threads that suits a network's width.
 
-    Narrow networks get one, wide ones as many as the process already has.
+    Narrow networks get one, since sharing their small matrix products takes longer than it saves;
+    wide ones get as many as the process already has.
     """
     return threads(1 if width < _WIDTH_FOR_THREADS else torch.get_num_threads())
 

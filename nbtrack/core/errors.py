@@ -39,16 +39,17 @@ def look_up(what: str, name: str, known: Mapping[str, Entry]) -> Entry:
 
 
 def check_lists(**arguments: object) -> None:
-    """Raises ConfigError for an argument that is one thing, where several are asked for."""
+    """Raises ConfigError for an argument that is no list, but a text or a single thing."""
     for name, value in arguments.items():
         if isinstance(value, str) or not isinstance(value, Iterable):
             raise ConfigError(f"{name} = {value!r:.80} is no list: write {name}=[...] around it")
 
 
 def look_up_kind(what: str, name: str, known: Mapping[str, type], needed: Sequence[str]) -> type:
-    """A class by the name that it calls itself, with all that its kind needs.
+    """The class that is known by a name, checked.
 
-    Raises ConfigError for another name, an unknown one, and for attributes that it lacks.
+    Raises ConfigError for an unknown name, for a class whose own `name` is another, and for one
+    that lacks a `needed` attribute or an abstract method.
     """
     kind = look_up(what, name, known)
     lacks = [word for word in needed if not hasattr(kind, word)]
@@ -62,7 +63,7 @@ def look_up_kind(what: str, name: str, known: Mapping[str, type], needed: Sequen
 
 
 def nearest_name(text: str, allowed: list[str]) -> str:
-    """Hint for a misspelt name, with every valid one in the order given; of many, the nearest few.
+    """A hint for a misspelt name: the nearest one, then all that are allowed, or of many a few.
 
     >>> nearest_name("imapp", ["imap", "neus"])
     "did you mean 'imap'? Allowed: imap, neus"

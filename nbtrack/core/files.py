@@ -26,13 +26,13 @@ from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.settings import as_dict
 
 PACKAGE = Path(nbtrack.__file__).resolve().parent
-# Content of a file makes readers raise anything else: these are a program's mistakes, or speak of
-# a device, or say already what is wrong.
+# Errors in reading a file that do not come from its content: they are a program's mistakes, or a
+# device's, or say already what is wrong. All others count as a damaged file.
 _NOT_BY_CONTENT = (
     NbtrackError, MemoryError, torch.OutOfMemoryError, torch.AcceleratorError, NameError,
     AttributeError, AssertionError,
 )  # fmt: skip
-_NO_LOCKS = errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP  # what their lack is called
+_NO_LOCKS = errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP  # of file systems without locks
 
 
 def project_folder() -> Path:
@@ -42,12 +42,15 @@ def project_folder() -> Path:
 
 
 def absolute(path: Path | str) -> Path:
-    """An absolute path without `~` and `..`, in which links stay: a recording has their names."""
+    """An absolute path without `~` and `..`.
+
+    Links are not followed: a recording has the name by which it is given, also that of a link.
+    """
     return Path(os.path.abspath(os.path.expanduser(path)))
 
 
 def resolved(path: Path | str) -> Path:
-    """An absolute path without links or `~`. Where links form a loop, whoever opens it is told."""
+    """An absolute path without links or `~`. A loop of links fails only where it is opened."""
     return Path(os.path.realpath(absolute(path)))
 
 
@@ -85,9 +88,10 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def loaded_checkpoint(path: Path) -> Iterator[dict[str, Any]]:
-    """What `save_checkpoint` wrote, on the CPU, within a block that takes it up.
+    """What `save_checkpoint` wrote, on the CPU, for a `with` block that restores from it.
 
-    Raises DataError if the file is damaged, or its content is not what the block takes.
+    Raises DataError if the file is damaged, and also in place of an error that the block itself
+    raises because the content is not what it needs.
     """
     with naming_damaged(path):
         with zipfile.ZipFile(path) as archive:  # torch checks no checksums
@@ -115,13 +119,13 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # A new folder of a random name: nobody else writes there, or has put a link in its place.
-        with tempfile.TemporaryDirectory(".tmp", ".", folder) as aside:
+        with tempfile.TemporaryDirectory(suffix=".tmp", prefix=".", dir=folder) as aside:
             for name, content in contents.items():
                 # Paths whose letters the system's encoding lacks come as surrogates.
                 is_text = isinstance(content, str)
                 encoded = content.encode(errors="surrogateescape") if is_text else content
                 Path(aside, name).write_bytes(encoded)
-            if len(contents) > 1:
+            if len(contents) > 1:  # the old sign goes first: it must not stand among new files
                 (folder / last).unlink(missing_ok=True)
             for name in contents:
                 os.replace(Path(aside, name), folder / name)
@@ -137,6 +141,7 @@ def json_text(content: Any) -> str:
 def read_json(path: Path) -> dict[str, Any]:
     """An object from a JSON file of a finished result. Raises DataError if it is none."""
     with naming_damaged(path, "JSON object"):
+        # Braces, since they raise TypeError for a list or a number.
         return {**json.loads(path.read_text(encoding="utf-8", errors="surrogateescape"))}
 
 
@@ -144,10 +149,10 @@ def read_json(path: Path) -> dict[str, Any]:
 def naming_damaged(
     path: Path, kind: str = "checkpoint", advice: str = "remove it and run the same command again"
 ) -> Iterator[None]:
-    """Turn what goes wrong in reading a file and taking up its content into a DataError in a line.
+    """Turn an error in a block that reads a file and uses its content into a DataError in a line.
 
-    Mistakes of a program, as a name that is not there, pass, and so does a device that fails, which
-    says nothing about the file.
+    The line names the file and what `kind` of file it should be, and ends with the `advice`. Errors
+    that say nothing about the file pass: see `_NOT_BY_CONTENT`.
     """
     try:
         yield
@@ -162,8 +167,9 @@ def naming_damaged(
 def locked(path: Path) -> Iterator[None]:
     """Keep other processes out of a block by a lock file.
 
-    The system frees the lock when this process ends, however it ends. Some file systems know none:
-    there two processes may do the same work, and either's files stay whole.
+    The system frees the lock when this process ends, however it ends. Where the file system knows
+    no locks, the block runs without one: two processes may then do the same work, and the files of
+    either stay whole.
     """
     lock = FileLock(path)
     try:

@@ -43,9 +43,10 @@ def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
 def matrix_to_quaternion(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternion (w, x, y, z) of a rotation matrix; w >= 0.
 
-    Every row of 4 q qᵀ is a multiple of q. The one whose own component is the largest is taken, so
-    that no rotation angle divides by a small number.
+    Every row of 4 q qᵀ is a multiple of q. The row with the largest entry on the diagonal is taken,
+    so that no rotation angle divides by a small number.
     """
+    # Off the diagonal, names tell the entries of 4 q qᵀ: `wx` is 4 w x.
     difference = rotation - rotation.mT
     total = rotation + rotation.mT
     xx, yy, zz = rotation.diagonal(dim1=-2, dim2=-1).unbind(-1)

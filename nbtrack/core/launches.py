@@ -22,9 +22,10 @@ _WAITS = "called a synchronizing CUDA operation"  # how PyTorch warns of it
 class Recording:
     """Calls work; on CUDA a few times, after which it is recorded, and replayed from then on.
 
-    The work always reads and writes the same tensors, and draws from one generator. Anything else
-    that it depends on counts as it was at the recording. Work that waits for a value of the device,
-    as shapes that depend on values do, is called each time, which is told once.
+    The work always reads and writes the same tensors, and draws from one generator. A replay runs
+    no Python: anything else that the work depends on stays as it was at the recording. Work that
+    waits for a value of the device, as shapes that depend on values do, cannot be recorded; it is
+    called each time, and a message says so once.
     """
 
     def __init__(self, name: str, generator: torch.Generator) -> None:
@@ -35,19 +36,22 @@ class Recording:
         self.replay: Callable[[], None] | None = None
 
     def run(self, work: Callable[[], Tensor]) -> Tensor:
-        """What the work returns."""
+        """Do the work once, by a call or a replay; returns its result."""
         if not self.is_recordable:
             return work()
         self.n_calls += 1
         if self.n_calls <= CALLS_BEFORE_RECORDING:
             return self._watch(work)
         if self.replay is None:
-            self.replay, self.result = record(work, self.generator)
+            self.replay, self.result = record(work, self.generator)  # which runs nothing yet
         self.replay()
         return self.result.clone()  # the next replay writes over it
 
     def _watch(self, work: Callable[[], Tensor]) -> Tensor:
-        """Call the work; if it waits for the device when it should no more, do not record it."""
+        """Call the work; if it waits for the device in the last of these calls, it is not recorded.
+
+        The first call may wait, since it loads and allocates.
+        """
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             torch.cuda.set_sync_debug_mode("warn")
@@ -69,7 +73,7 @@ def can_record(device: torch.device) -> bool:
 
 
 def record(work: Callable[[], Tensor], generator: torch.Generator) -> tuple[Callable, Tensor]:
-    """What does the work again, and where its result then lies."""
+    """Record the work without running it: what replays it, and where its result will then lie."""
     graph = torch.cuda.CUDAGraph()
     graph.register_generator_state(generator)
     with torch.cuda.graph(graph):
@@ -80,7 +84,8 @@ def record(work: Callable[[], Tensor], generator: torch.Generator) -> tuple[Call
 def make_adam(groups: list[dict[str, Any]], device: torch.device) -> torch.optim.Adam:
     """Adam whose state and learning rates are tensors that keep their place.
 
-    On a CPU in double precision, as numbers would be; CUDA's kernel takes single ones.
+    Learning rates are in double precision on a CPU, as Python's numbers would be; CUDA's fused
+    kernel takes single precision.
     """
     is_recorded = can_record(device)
     like = {"dtype": torch.float32 if is_recorded else torch.float64, "device": device}

@@ -31,10 +31,10 @@ class _Line:
     The latter needs no widget, so that stored notebooks and exported pages end with the last text.
     """
 
-    handle: Any = None
+    handle: Any = None  # of the cell's output, once there is one
 
     def write(self, text: str) -> None:
-        """Show a text, without what moves it to the beginning of a line."""
+        """Show a text without tqdm's carriage return and line end; blanks show nothing."""
         text = text.strip()
         if not text:
             return
@@ -51,7 +51,7 @@ class _Line:
 class ProgressBar(tqdm):
     """Progress with an ETA over a known amount of work, to be used in a `with` block."""
 
-    # What says nothing of the time that is left: work, and its seconds.
+    # Work done in a warm-up, and its seconds: its speed says nothing of the time that is left.
     warm_up_work: float | int = 0
     warm_up_seconds = 0.0
 
@@ -62,6 +62,7 @@ class ProgressBar(tqdm):
             options |= {"file": _Line(), "mininterval": 1.0}
         elif not sys.stderr.isatty():
             options |= {"file": _Line(), "mininterval": _LINE_SECONDS, "bar_format": _LINE_FORMAT}
+        # "miniters" 0: only the time decides when to show; "ascii" False: bars of block characters.
         options |= {"disable": not is_shown, "delay": _DELAY_SECONDS, "miniters": 0, "ascii": False}
         super().__init__(total=total, desc=title, **options)
 

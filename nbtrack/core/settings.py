@@ -16,7 +16,7 @@ from nbtrack.core.errors import ConfigError, look_up
 
 Config = TypeVar("Config")
 _MANY = 1_000_000
-_DEEPEST = 10  # dots of a key: more than any has
+_DEEPEST = 10  # dots of a key, more than any has: what lies deeper is not taken apart
 _USUAL_LIMITS = {int: (1, _MANY), float: (0.0, _MANY)}
 
 
@@ -41,9 +41,9 @@ def as_dict(config: Any) -> dict[str, Any]:
 
 
 def with_settings(preset: Any, *settings: str) -> Any:
-    """What has a method `with_values`, as presets do, with some `key=value` texts applied in order.
+    """A preset, or anything with its method `with_values`, after some `key=value` texts in order.
 
-    Raises ConfigError as that and `read_setting` do.
+    Raises ConfigError as `with_values` and `read_setting` do.
     """
     for setting in settings:
         preset = preset.with_values(read_setting(setting))
@@ -87,7 +87,10 @@ def changed_settings(config: Config, original: Config) -> list[str]:
 
 
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:
-    """The values of a config, or of a tree as TOML gives it, by their dotted keys."""
+    """The values of a config, or of a tree as TOML gives it, by their dotted keys.
+
+    `prefix` is the dotted key of the config itself, where it is a part of another.
+    """
     if dataclasses.is_dataclass(config):
         config = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
     if not isinstance(config, dict) or prefix.count(".") > _DEEPEST:
@@ -114,7 +117,8 @@ def _replaced(node: Any, path: list[str], key: str, value: Any, allowed: Mapping
 def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
     """A value in the type of the old one; ConfigError for another type, or one not allowed.
 
-    One value stands for a list of one, and a whole number for a float; nothing else is converted.
+    `allowed` is the metadata of its field: limits or choices, if any. One value stands for a list
+    of one, and a whole number for a float; nothing else is converted.
     """
     wanted = type(old)
     if wanted is tuple and isinstance(value, list | tuple | str | int | float):

@@ -60,7 +60,10 @@ class Frame:
         return replace(self, color=self.color.to(device), depth_mm=self.depth_mm.to(device))
 
     def measured_pixels(self, stride: int = 1, first: int = 0) -> Int[Tensor, "2 n"]:
-        """Rows and columns of pixels that have a depth; all, or those on a regular grid."""
+        """Rows and columns of the pixels that have a depth.
+
+        All are looked at, or every `stride`-th row and column from number `first` on.
+        """
         return first + stride * torch.nonzero(self.depth_mm[first::stride, first::stride]).T
 
     def at(self, rows: Indices, columns: Indices) -> tuple[Colors, Values]:
@@ -88,7 +91,10 @@ def _in_millimetres(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]
 
 
 def _check(what: str, image: np.ndarray, shape: tuple, kinds: list, asked: str) -> None:
-    """Raises DataError for another shape, or a type that is none of the kinds."""
+    """Raises DataError for another shape, or a type that is none of the kinds (jaxtyping's).
+
+    The message calls the image `what`, and the types that it may have `asked`.
+    """
     wanted = " ".join(map(str, shape))
     if not any(isinstance(image, kind[np.ndarray, wanted]) for kind in kinds):
         found = f"of type {type(image).__name__}"

@@ -36,7 +36,7 @@ class Rays:
 
 
 class PixelSampler:
-    """Draws measured pixels of a sequence, for a network on some device.
+    """Draws random pixels of a sequence, measured or not, for a network on some device.
 
     Only drawn pixels become floating point. The images lie on the device too if it has room to
     spare, else on the host, from where drawn pixels travel; what is drawn is the same.
@@ -61,13 +61,14 @@ class PixelSampler:
         return Rays(T_world_camera[:, :3, 3], directions_world, color, depth)
 
     def normals_camera(self, frames: Indices, rows: Indices, columns: Indices) -> Points:
-        """Unit normals (camera frame, towards it) of the surface at pixels.
+        """Unit normals of the surface at pixels, in the camera frame and towards the camera.
 
         The tangent plane goes through neighbours to all sides, some pixels away, so that noise
-        tilts it little. 0 where one of them is not measured, or lies on another surface.
+        tilts it little. 0 where the pixel or one of these is not measured, or where one lies on
+        another surface.
         """
         _, height, width = self.depths_mm.shape
-        reach = max(1, round(width * PLANE_REACH))
+        reach = max(1, round(width * PLANE_REACH))  # pixels
         _, depth = self.measured(frames, rows, columns)
         points = {}  # m, camera frame
         is_whole = depth > 0
@@ -76,9 +77,9 @@ class PixelSampler:
             row, column = rows + row_step, columns + column_step
             is_whole &= (row >= 0) & (row < height) & (column >= 0) & (column < width)
             row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
-            _, near = self.measured(frames, row, column)
-            is_whole &= (near > 0) & ((near - depth).abs() < PLANE_JUMP * depth)
-            points[side] = backproject(self.intrinsics, column, row, near)
+            _, side_depth = self.measured(frames, row, column)
+            is_whole &= (side_depth > 0) & ((side_depth - depth).abs() < PLANE_JUMP * depth)
+            points[side] = backproject(self.intrinsics, column, row, side_depth)
         # Rightwards cross upwards: x cross -y is -z, towards the camera.
         normal = torch.linalg.cross(points["right"] - points["left"], points["up"] - points["down"])
         return torch.nn.functional.normalize(normal, dim=-1) * is_whole[:, None]
@@ -87,13 +88,16 @@ class PixelSampler:
         """Colour in [0, 1] and z-depth (m, 0 = none) of pixels."""
         where = tuple(indices.to(self.colors.device) for indices in (frames, rows, columns))
         color = self.colors[where].to(self.device).float() / 255
-        depth_mm = self.depths_mm[where].to(self.device).int() & 0xFFFF
+        depth_mm = self.depths_mm[where].to(self.device).int() & 0xFFFF  # unsigned again
         return color, depth_mm.float() * MILLIMETRE
 
     def draw(
         self, n_rays: int, generator: torch.Generator, frames: Indices, tangent_planes: bool = False
     ) -> Rays:
-        """Rays through random pixels of the given frames; with planes, if asked for."""
+        """Rays through random pixels of the given frames, measured or not (depth 0).
+
+        With `tangent_planes` they have normals, which are 0 where not known.
+        """
 
         def below(limit: int) -> Indices:
             return torch.randint(limit, (n_rays,), generator=generator, device=generator.device)

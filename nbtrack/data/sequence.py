@@ -35,7 +35,7 @@ class RgbdSequence:
     T_world_camera: Poses  # OpenCV camera axes; NaN where not known
     frame_ids: Int[np.ndarray, "frames"]  # position in the folder's natural order
     times: Float[np.ndarray, "frames"]  # s, the recording's own, or by its numbers and rate
-    # Of poses, in the recording's world.
+    # m, where the origin of these poses lies in the recording's own world.
     origin: Position = field(default_factory=lambda: np.zeros(3))
     declared_unit: float | None = None  # m, see `SceneBounds`
 

@@ -18,9 +18,11 @@ Times = Float[np.ndarray, "_"]  # s
 _TOLERANT = {"encoding": "utf-8-sig", "errors": "replace"}  # of a byte-order mark, and of any bytes
 _DECIMAL_COMMA = re.compile(r"(?<!\S)[-+]?\d+,\d+(e[-+]?\d+)?(?!\S)")
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
-_FARTHEST = 1e7  # m from the origin: beyond map coordinates, within what floats can square
-_ALONE = 1000.0  # times as far from the middle as nine in ten, or as 1 m: no camera went there
-_LATEST = 1e11  # s: no timestamp is larger; since 1970 even milliseconds are
+_FARTHEST = 1e7  # m from the origin: beyond geographic coordinates; floats can square it
+# No camera went so many times as far from the middle of its path as nine in ten of the poses lie,
+# or than 1 m, whichever is more.
+_ALONE = 1000.0
+_LATEST = 1e11  # s: no timestamp in seconds is later; one in milliseconds since 1970 is larger
 _RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 
 
@@ -45,7 +47,8 @@ def read_lines(path: Path) -> list[str]:
 def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np.ndarray, "n m"]:
     """A table of numbers, separated by blanks or commas; NaN and infinity are kept.
 
-    Raises DataError for anything else, or if it has not one of the numbers of columns.
+    Raises DataError for anything else, or if the number of columns is none of `columns`. The
+    message says what every line should hold: the `meaning`.
     """
     lines = read_lines(path)
     if path.suffix == ".log":  # Open3D's, with a head of three numbers before each matrix
@@ -62,8 +65,8 @@ def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np
 def in_seconds(times: Times) -> Times:
     """Times in seconds, also where a file has them in milli-, micro- or nanoseconds since 1970.
 
-    The unit is the largest in which the median is a time that can be. A single time that cannot
-    be is NaN.
+    The unit is the largest of these in which the median lies below `_LATEST`. A single time that
+    does not is NaN.
 
     >>> in_seconds(np.array([1403636579763555584.0, 1403636579796888917.0])).round(2).tolist()
     [1403636579.76, 1403636579.8]
@@ -97,7 +100,8 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times]:
 def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> tuple[Poses, Times]:
     """Poses and times (s) of rows with a timestamp, a position and a quaternion.
 
-    NaN for a frame if a number is none, or its quaternion is zero, as tools write a lost frame.
+    `order` is that of the quaternion's four columns, as "xyzw". A pose is NaN if a number of it is
+    not finite or its quaternion is zero, as tools write a lost frame.
     """
     times = in_seconds(rows[:, 0])
     # Clipped, so that absurd numbers are refused and overflow nothing here.
