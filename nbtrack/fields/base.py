@@ -30,12 +30,12 @@ NEAR = 0.05  # m, z-depth before which nothing is looked for: closer than any de
 # field and not the luck of the draw.
 _N_STRATIFIED = 48
 _N_IMPORTANCE = 24
-_RAYS_AT_ONCE = 4096
+_RAYS_AT_ONCE = 4096  # of a picture, so that all its samples need not be in memory
 
 Losses = dict[str, Scalar]
 State = dict[str, Tensor]
 View = tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]
-Draw = Callable[..., Rays]  # of n_rays, and whether with tangent_planes: random measured pixels
+Draw = Callable[..., Rays]  # `PixelSampler.draw` of n_rays and tangent_planes; depth 0: unmeasured
 
 
 @dataclass(frozen=True)
@@ -172,6 +172,7 @@ class LearnedField(Field):
         """Colour in [0, 1] and z-depth (m) from a camera pose. Nothing in it is random."""
         pose = torch.from_numpy(T_world_camera).float().to(self.device)
         shape = (camera.height, camera.width)
+        # The indices of all pixels, row by row.
         rows, columns = torch.ones(shape, device=self.device).nonzero(as_tuple=True)
         directions_world = pixel_directions(camera, columns, rows) @ pose[:3, :3].T
         color, depth = self.render_rays(pose[:3, 3].expand_as(directions_world), directions_world)
@@ -184,7 +185,7 @@ class LearnedField(Field):
         some_origins = origins_world.split(_RAYS_AT_ONCE)
         some_directions = directions_world.split(_RAYS_AT_ONCE)
         for origins, directions in zip(some_origins, some_directions, strict=True):
-            unknown = torch.zeros_like(origins)  # what was observed there
+            unknown = torch.zeros_like(origins)  # observed colours and depths, which none uses
             rays = Rays(origins, directions, unknown, unknown[:, 0])
             parts.append(self.render_hierarchically(rays, _N_STRATIFIED, _N_IMPORTANCE))
         color = torch.cat([part.color.clamp(0, 1) for part in parts])
@@ -194,20 +195,20 @@ class LearnedField(Field):
         self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None
     ) -> tuple[RaySamples, RayColors, RaySamples, RaySamples]:
         """Z-depths (m) of the first pass, colours and values there, and z-depths of the second."""
-        with torch.no_grad():  # where samples lie is given: a pose does not move them along
+        with torch.no_grad():  # z-depths of samples are constants, also where a pose is optimised
             far = rays_end(rays, self.bounds)
             coarse = rendering.stratified_depths(NEAR, far, n_stratified, generator)
         colors, values = self.query_along(rays, coarse)
         with torch.no_grad():
             weights = self.weights(values, rays, coarse)
-            if weights.shape != coarse.shape:  # of sections: both ends of one get a share
+            if weights.shape != coarse.shape:  # of sections: a sample gets those on both sides
                 weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
             fine = rendering.importance_depths(coarse, weights, n_importance, generator)
         return coarse, colors, values, fine
 
 
 def rays_end(rays: Rays, bounds: SceneBounds) -> Values:
-    """Z-depth (m) at which rays leave the scene, at least a little in front of the camera."""
+    """Z-depth (m) at which rays leave the scene; at least twice `NEAR`, where samples begin."""
     return bounds.far_bound(rays.origins_world, rays.directions_world).clamp_min(2 * NEAR)
 
 
@@ -221,9 +222,10 @@ def rendered_losses(
 ) -> Losses:
     """Weighted L1 errors of rendered depth (m) and colour, for mapping and tracking.
 
-    Rays without a depth measurement take part in neither term. Over the standard deviation of a
-    ray's own depth they are iMAP's, of mean(|D - D_rendered| / sqrt(variance)): that std is
-    detached, as in NICE-SLAM, for its gradient would reward blurred surfaces.
+    Rays without a depth measurement take part in neither term. With `over_std` a depth error is
+    divided by the standard deviation of the ray's own rendered depth, as iMAP does:
+    mean(|D - D_rendered| / sqrt(variance)). That std is detached, as in NICE-SLAM, for its gradient
+    would reward blurred surfaces.
     Source: iMAP, Sec. 3.3.
     """
     measured = (rays.depth > 0).float()

@@ -44,4 +44,4 @@ class IMapField(LearnedField):
         # Not guided by measured depths, since VR cannot be (docs/choices.md).
         n_first, n_second = settings.n_stratified, settings.n_surface
         rendered = self.render(rays, self.hierarchical_depths(rays, n_first, n_second, generator))
-        return rendered_losses(rendered, rays, settings.lambda_color, 1.0, over_std=True)
+        return rendered_losses(rendered, rays, settings.lambda_color, lambda_depth=1, over_std=True)

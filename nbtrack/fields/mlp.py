@@ -41,13 +41,14 @@ class FourierMlp(nn.Module):
     def __init__(
         self, settings: NetworkSettings, bounds: SceneBounds, act: Activation, generator: Generator
     ) -> None:
+        """Draw the weights by a generator; `act` is the activation of all hidden layers."""
         super().__init__()
         width = settings.width
         n_frequencies = settings.n_frequencies
         self.activation = act
         self.register_buffer("center", torch.tensor(bounds.center, dtype=torch.float32))
         self.metres_per_unit = bounds.metres_per_unit
-        sigma = settings.embedding_sigma * self.metres_per_unit
+        sigma = settings.embedding_sigma * self.metres_per_unit  # rad per unit of the map
         self.frequencies = nn.Parameter(sigma * torch.randn(3, n_frequencies, generator=generator))
         self.layer_1 = _linear(n_frequencies, width, generator)
         self.layer_2 = _linear(width, width, generator)

@@ -42,7 +42,7 @@ class NeuSField(LearnedField):
     def __init__(self, network: NetworkSettings, bounds: SceneBounds, generator: Generator) -> None:
         super().__init__(bounds)
         self.mlp = self.make_network(network, generator)
-        self.variance = nn.Parameter(torch.tensor(0.3))
+        self.variance = nn.Parameter(torch.tensor(0.3))  # as NeuS's code starts: s = 20 / m
         self._start_as_empty_room(generator)
 
     def make_network(self, settings: NetworkSettings, generator: Generator) -> nn.Module:
@@ -93,15 +93,15 @@ class NeuSField(LearnedField):
         last layer is linear: the start is a least-squares problem with one answer (our choice).
         """
         low, high = torch.tensor(self.bounds.minimum), torch.tensor(self.bounds.maximum)
-        points = low + (high - low) * torch.rand(8192, 3, generator=generator)
-        target = torch.minimum(points - low, high - points).amin(dim=-1)
+        points = low + (high - low) * torch.rand(8192, 3, generator=generator)  # m, in the box
+        target = torch.minimum(points - low, high - points).amin(dim=-1)  # m, to the nearest face
         features = self.mlp.features(points)
         design = torch.cat([features, torch.ones_like(features[:, :1])], dim=-1).double()
         # A little ridge keeps the weights small where features repeat each other.
-        normal = design.T @ design
-        normal.diagonal().add_(1e-3 * normal.diagonal().mean())
+        normal_matrix = design.T @ design
+        normal_matrix.diagonal().add_(1e-3 * normal_matrix.diagonal().mean())
         moments = design.T @ (target / self.mlp.metres_per_unit).double()
-        solution = torch.linalg.solve(normal, moments).float()
+        solution = torch.linalg.solve(normal_matrix, moments).float()
         # Of the head's outputs the first three are the colour, the last is the distance.
         self.mlp.head.weight[3] = solution[:-1]
         self.mlp.head.bias[3] = solution[-1]
@@ -119,6 +119,7 @@ def guided_depths(
     measured = rays.depth > 0
     far = torch.where(measured, rays.depth + settings.surface_band, far_bound)
     coarse = rendering.stratified_depths(base.NEAR, far, settings.n_stratified, generator)
+    # From -1 to 1, in half widths of the band around the surface.
     offsets = rendering.stratified_depths(-1.0, torch.ones_like(far), settings.n_surface, generator)
     center = torch.where(measured, rays.depth, far_bound)
     around = (center[:, None] + settings.surface_band * offsets).clamp_min(base.NEAR)

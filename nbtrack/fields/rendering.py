@@ -59,11 +59,13 @@ def weights_from_sdf(sdf: RaySamples, inverse_std: Scalar) -> Float[Tensor, "ray
     Wang et al. 2021 (NeuS), Eq. 13; the published code extrapolates f from mid-points, where the
     paper's own formula spares second derivatives.
     """
-    # Phi(f_i+1) / Phi(f_i) in logarithms: a plain quotient is 0/0 deep inside objects.
+    # 1 - alpha_i, which is Phi(f_{i+1}) / Phi(f_i) and at most 1, in logarithms: a plain quotient
+    # is 0/0 deep inside objects.
     log_phi = torch.nn.functional.logsigmoid(inverse_std * sdf)
     log_ratio = log_phi.diff(dim=-1).clamp_max(0)
-    passed = log_phi[:, :1] + log_ratio.cumsum(dim=-1) - log_ratio
-    return -torch.expm1(log_ratio) * torch.exp(passed)
+    # Phi(f_0) times all (1 - alpha_j) before a section; its own is taken out of the sum again.
+    log_passed = log_phi[:, :1] + log_ratio.cumsum(dim=-1) - log_ratio
+    return -torch.expm1(log_ratio) * torch.exp(log_passed)
 
 
 def composite(weights: RaySamples, colors: RayColors, depths: RaySamples) -> Rendering:

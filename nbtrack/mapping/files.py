@@ -29,7 +29,7 @@ CHECKPOINT_FILE = "mapping.pt"  # of a map in the making
 _FORMAT = "nbtrack map"
 _VERSION = 4
 FORMS: dict[str, type[Field]] = {}
-"""What may be made of a finished map's field, by its name in map files."""
+"""What may be made of a finished map's field, as a corrected one, by its name in map files."""
 _AGAIN = "map again, and give the folder or its map.safetensors; an earlier nbtrack's are none"
 
 

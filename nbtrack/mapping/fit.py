@@ -33,7 +33,7 @@ _PENDING = 10  # iterations between two looks at the losses, which wait for the 
 _FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
 
 OnIteration = Callable[[float, dict[str, float]], object]
-"""Called with the share that is done and the last losses, a few times a second at most."""
+"""Called every few iterations with the share of them that is done and the last losses."""
 
 
 def learning_rate(settings: MappingSettings, iteration: int) -> float:
@@ -59,9 +59,9 @@ def map_sequence(
 
     Settings are those of the field's `Network`, None where it has none, and of its `Settings`. A
     `checkpoint` is written every few seconds, and resumed with the batches of an uninterrupted run;
-    the caller removes it once the map is written. Raises DataError where no pixel has a depth, or
-    the checkpoint is of another map or `code`; ConfigError where a field's losses are no
-    dictionary; NumericalError; OutOfMemory.
+    the caller removes it once the map is written. `code` is any text that tells versions of the
+    program apart. Raises DataError where no pixel has a depth, or the checkpoint is of another map
+    or `code`; ConfigError where a field's losses are no dictionary; NumericalError; OutOfMemory.
     """
     recipe = recipe_of(field_name, sequence, network, settings, seed)
     start = time.perf_counter()
@@ -71,7 +71,7 @@ def map_sequence(
     kind = field_class(field_name)
     if issubclass(kind, LearnedField):
         with advise_on_memory(f"mapping.{field_name}.n_rays={settings.n_rays}"):
-            with suitable_threads(width=0):  # one, so that its start does not depend on them
+            with suitable_threads(width=0):  # one: sums, and so the start, depend on their number
                 field = make_field(field_name, network, bounds, seed).to(device)
             with suitable_threads(field.width), matrix_products(settings.tf32):
                 fit = _Fit(recipe | {"code": code}, settings, field, sequence, mapped)
@@ -105,7 +105,7 @@ def recipe_of(
 
 
 def check_recipe(path: Path, recipe: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Raises DataError if a map or checkpoint at a path was made of something else."""
+    """Raises DataError if the recipe of a map or checkpoint at a path is not the wanted one."""
     changed = [name.replace("_", " ") for name in wanted if recipe.get(name) != wanted[name]]
     if changed:
         advice = "remove it, or name another"
@@ -118,7 +118,8 @@ class _Fit:
     def __init__(
         self, recipe: dict, settings: Any, field: LearnedField, seen: RgbdSequence, mapped: Frames
     ) -> None:
-        self.recipe = {**recipe, "device": field.device.type}  # each draws other numbers
+        """Make ready to fit a field to the frames `mapped` of the sequence `seen`."""
+        self.recipe = {**recipe, "device": field.device.type}  # each kind draws other numbers
         self.settings = settings
         self.field = field
         parameters = {"params": [*field.parameters()], "lr": settings.learning_rate}
@@ -134,7 +135,7 @@ class _Fit:
         self.terms: list[str] = []  # names of the losses, told by the first batch
 
     def run(self, checkpoint: Path | None, on_iteration: OnIteration) -> None:
-        """From the checkpoint, where there is one, to the last iteration."""
+        """Fit from the checkpoint, if any, to the last iteration; the field then learns no more."""
         if checkpoint and checkpoint.exists():
             self._load(checkpoint)
         last_saved = time.perf_counter()
@@ -149,7 +150,7 @@ class _Fit:
         self.field.eval().requires_grad_(False)
 
     def _advance(self, iterations: range) -> None:
-        """Descend some iterations, whose losses are then looked at all at once."""
+        """Descend some iterations; only then are their losses looked at, which waits for a GPU."""
         start = time.perf_counter()
         pending = []
         for iteration in iterations:

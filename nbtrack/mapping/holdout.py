@@ -10,7 +10,7 @@ from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField
 
-_MISFIT_PIXELS = 500  # of a frame
+_MISFIT_PIXELS = 500  # of a frame, at random
 _MISFIT_FRAMES = 10
 
 
@@ -18,7 +18,7 @@ def split_holdout(n_frames: int, every: int) -> tuple[Frames, Frames]:
     """Indices of the frames to map and of those kept back for scoring.
 
     Every `every`-th frame is kept back, beginning in the middle of the first stretch; with
-    `every` = 0, or too few frames, none is.
+    `every` below 2, or fewer frames than `every`, none is.
 
     >>> split_holdout(6, 3)
     (array([0, 2, 3, 5]), array([1, 4]))

@@ -42,9 +42,10 @@ class ClockBudget:
         return f"wall clock, {1000 / self.rate_hz:g} ms per frame"
 
     def frame(self, device: torch.device = _HOST) -> Generator[int, None, None]:
-        """Starts the next frame of a tracker on a device.
+        """Starts the clock of the next frame, of a tracker on a device.
 
-        Gives 0, 1, 2, ... as long as another step is allowed. Who ends before, closes it.
+        Yields 0, 1, 2, ... as long as another step is allowed. A caller that stops earlier calls
+        `close`, so that its last step is counted.
         """
         return self._steps(self._now(device), device)
 
@@ -54,16 +55,16 @@ class ClockBudget:
         return self._clock()
 
     def _steps(self, start: float, device: torch.device) -> Generator[int, None, None]:
-        """The steps of a frame that began at `start` (s), asked for when it is prepared."""
+        """The steps of a frame begun at `start` (s). It is prepared when the first is asked for."""
         prepared = self._now(device)
         now = prepared
         mean = self.memory
-        self.memory = None
+        self.memory = None  # it stays so after a frame without any step
         step = 0
         while mean is None or start + 1 / self.rate_hz - now >= mean:
             try:
                 yield step
-            finally:  # a search that has converged closes the frame at its last step
+            finally:  # also where the caller closes the frame, as a search does that has converged
                 step += 1
                 now = self._now(device)
                 mean = (now - prepared) / step
@@ -88,7 +89,10 @@ class StepBudget:
         return f"{self.steps_per_frame:g} steps per frame"
 
     def frame(self, device: torch.device = _HOST) -> Generator[int, None, None]:
-        """Starts the next frame, on any device; yields 0, 1, ... while another step is allowed."""
+        """Yields 0, 1, ... while another step is allowed in the next frame, on any device.
+
+        A frame counts once its first step is asked for, whether it may take one or not.
+        """
         steps_before = floor(self.memory * self._exact)
         self.memory += 1
         steps_after = floor(self.memory * self._exact)
@@ -114,7 +118,9 @@ _MEASURED_STEPS = {"vr": (6.8, 36.1), "sdf": (15.3, 79.3)}
 
 
 def paper_steps(tracker: str, rate_hz: Number) -> float:
-    """Steps a frame of "vr" or "sdf" on the paper's hardware, with its n; ConfigError as above.
+    """Steps a frame of "vr" or "sdf" on the paper's hardware, with its n.
+
+    Raises ConfigError for a rate that is not 0.001 to 1e6.
 
     On the line through its 100 and 500 ms figures: time per step and fixed cost of a frame are then
     the same at every rate. Table II has no 200 ms column although Table I has 5 Hz (our choice).

@@ -26,7 +26,7 @@ class Method:
 
         The paper's trackers do not; they take the steps of its slowest rate, 2 Hz.
         """
-        return 30 if tracker_class(self.tracker).converges else self.paper_steps(2)
+        return 30 if tracker_class(self.tracker).converges else self.paper_steps(rate_hz=2)
 
 
 Methods = Sequence[str | Method]

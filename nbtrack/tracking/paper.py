@@ -47,7 +47,7 @@ class AdamTracker(Tracker):
     """
 
     Settings = AdamSettings
-    frame: Frame | None = None  # its images lie where those of the frame before lay
+    frame: Frame | None = None  # a copy, whose tensors are kept and overwritten by the next frame
 
     @abc.abstractmethod
     def loss(
@@ -75,7 +75,7 @@ class AdamTracker(Tracker):
                 T_start = T_starts[losses.argmin()]
             self.position.copy_(T_start[:3, 3])
             self.q_wxyz.copy_(geometry.matrix_to_quaternion(T_start[:3, :3]))
-            for moments in self.optimizer.state.values():  # a fresh Adam
+            for moments in self.optimizer.state.values():  # Adam's, and its number of steps
                 for value in moments.values():
                     value.zero_()
 

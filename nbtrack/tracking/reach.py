@@ -29,10 +29,10 @@ class Reach:
 
 
 def reach(steps: float, rate: float) -> float:
-    """How far that many steps of Adam move a coordinate: at most about its rate in each.
+    """How far that many steps of Adam move a coordinate: by about its learning rate in each.
 
-    By Cauchy and Schwarz at most 1.01 times as far in 7 steps and 1.03 times in 15, where
-    gradients grow in the one way that suits this.
+    This is nearly a bound: a coordinate moves at most 1.01 times as far in 7 steps and 1.03 times
+    in 15 (by Cauchy and Schwarz), and so far only if its gradients grow in one certain way.
     """
     return steps * rate
 
@@ -40,9 +40,10 @@ def reach(steps: float, rate: float) -> float:
 def motion_of(
     T_world_camera: Poses, motion_model: str = "previous_pose"
 ) -> tuple[Motions, Motions]:
-    """Offsets and turns that a path leaves to the search of every frame but the first.
+    """By how much the search of every frame but the first has to move the camera along a path.
 
-    Every frame before is taken to be found exactly.
+    Offsets are in m along the world's axes, turns are rotation vectors (rad) in the axes of the
+    start. The search starts as the motion model says, the frames before being found exactly.
     """
     offsets = np.zeros((len(T_world_camera) - 1, 3))
     turns = np.zeros_like(offsets)
@@ -81,8 +82,8 @@ def reach_metrics(
 ) -> dict[str, float]:
     """The reach of a run, the share of its frames that ask for more, and the greedy ATE (m).
 
-    Nothing of a search without a bound; the reach alone where a pose (m) of the path, the given
-    first one included, is not known.
+    Empty where a search has no bound (`reach` is None). The reach alone where a pose (m) of the
+    path, whose first one is the given start, is not known.
     """
     if reach is None:
         return {}
@@ -98,6 +99,6 @@ def reach_metrics(
 
 
 def _nearest_start(motion_model: str, found: list[np.ndarray], T_true: np.ndarray) -> np.ndarray:
-    """The pose nearest to the true position, of those where a search may start."""
+    """The start nearest to the truth, of those after the poses `found` so far (the last two)."""
     starts = expected_poses(motion_model, found)
     return min(starts, key=lambda T_start: np.linalg.norm(T_start[:3, 3] - T_true[:3, 3]))

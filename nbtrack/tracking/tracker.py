@@ -49,7 +49,7 @@ class Estimate:
 
     @property
     def lost(self) -> bool:
-        """Not to be relied on; a tracker without a verdict fails only frames without depth."""
+        """Whether the pose cannot be relied on: the tracker says so, or no depth was measured."""
         return self.without_depth or bool(self.report.get("lost", False))
 
 
@@ -130,7 +130,7 @@ class Tracker(abc.ABC):
         if self.copes_without_depth or frame.has_depth:
             with suitable_threads(self.field.width), matrix_products(self.settings.tf32):
                 estimate = self._search(frame, T_starts, budget or self.budget)
-        self.estimates.append(estimate.T_world_camera.copy())  # the other one is the user's
+        self.estimates.append(estimate.T_world_camera.copy())  # the user may change the original
         return estimate
 
     def restart(self, T_world_camera: Pose) -> None:
@@ -139,7 +139,7 @@ class Tracker(abc.ABC):
         What the frames before left is forgotten: velocities, and whatever a subclass remembers.
         Random numbers and the budget go on.
         """
-        pose = np.array(T_world_camera, dtype=np.float64)  # a copy: the other one is the user's
+        pose = np.array(T_world_camera, dtype=np.float64)  # a copy: the user may change theirs
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise DataError("T_world_camera is no rigid transform: give 4 x 4 finite numbers")
         self.estimates = [*checked_poses(pose[None], Path("T_world_camera"))]
@@ -149,7 +149,7 @@ class Tracker(abc.ABC):
 
     def restart_anywhere(self) -> None:
         """Track from an unknown pose. ConfigError if this tracker cannot find the camera."""
-        self.check_finds(in_corrected=False)  # raises, as no class can that does not override this
+        self.check_finds(in_corrected=False)  # raises: classes that can find it override this
 
     @classmethod
     def check_finds(cls, in_corrected: bool) -> None:
@@ -180,7 +180,10 @@ class Tracker(abc.ABC):
             setattr(self, name, state[name])
 
     def _warm_up(self, frame: Frame, T_starts: Poses) -> None:
-        """Take steps that count nowhere: first calls load, allocate and record for a second."""
+        """Take steps that count nowhere: first calls load, allocate and record for a second.
+
+        Estimates, budget and random numbers are as before afterwards.
+        """
         state = self.state()
         self._is_warm = True
         self.begin(frame.to(self.device), torch.from_numpy(T_starts[:1]))
@@ -206,7 +209,7 @@ class Tracker(abc.ABC):
             if self.is_converged:
                 break
         synchronize(self.device)
-        allowed.close()  # which counts the last step, also where the search ended by itself
+        allowed.close()  # a clock counts the last step here where `break` ended the search
         seconds = time.perf_counter() - began
         pose = self.T_world_camera.detach().cpu().double().numpy().copy()
         if not np.isfinite(pose).all():

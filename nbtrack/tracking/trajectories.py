@@ -73,7 +73,7 @@ def track_sequence(
             if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
                 files.save_checkpoint(checkpoint, {"rows": rows, "tracker": tracker.state()})
                 last_saved = time.perf_counter()
-    T_estimated = np.stack(tracker.estimates[1:])  # after the start, known or not
+    T_estimated = np.stack(tracker.estimates[1:])  # without the start, be it known or not
     return Trajectory(T_estimated, sequence.T_world_camera[first:], pd.DataFrame(rows))
 
 
@@ -87,7 +87,7 @@ def _check_trackable(sequence: RgbdSequence) -> None:
 
 
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
-    """A frame of `Trajectory.frames`; errors are NaN where its true pose is not known."""
+    """The row of one frame in `Trajectory.frames`; errors are NaN where no true pose is known."""
     T_true, T_first = sequence.T_world_camera[index], sequence.T_world_camera[0]
     error_m, error_deg = np.nan, np.nan
     if np.isfinite(T_true).all():
@@ -100,14 +100,14 @@ def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, An
         "loss": estimate.loss,
         "translation_error_m": float(error_m),
         "rotation_error_deg": float(error_deg),
-        "still_error_m": float(np.linalg.norm((T_true - T_first)[:3, 3])),  # of no motion
+        "still_error_m": float(np.linalg.norm((T_true - T_first)[:3, 3])),  # of standing still
         "without_depth": estimate.without_depth,
         **estimate.report,
     }
 
 
 def shifted(T_world_camera: Poses, by: Position) -> Poses:
-    """Poses (m) in a world whose origin lies `-by` away: positions plus an offset (m)."""
+    """Poses (m) whose positions are moved by an offset (m), as in a world with another origin."""
     T_world_camera = T_world_camera.copy()
     T_world_camera[:, :3, 3] += by
     return T_world_camera
