@@ -28,9 +28,9 @@ from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 
 # All our choice, tried in the two rooms for tuning.
-_N_POINTS = 300_000  # measured points
-# Signed distances (m) of the places along a point's normal that ask for one: the surface first, and
-# the others within a voxel of it, as planes end.
+_N_POINTS = 300_000  # random pixels; those that show a plane are used
+# Places along a measured point's normal, by the signed distance (m) that the map shall have there.
+# The surface comes first, as `corrected` counts on; the others lie within a voxel, as planes end.
 _OFFSETS = (0.0, -0.03, -0.015, 0.015, 0.03)
 # A larger place takes more points, so that a frame sees no cells in which none lies. Rooms have so
 # many a cell anyway; an office of 10 by 11 m had 3 (docs/tried.md).
@@ -39,7 +39,7 @@ _MAX_TIMES = 4  # times `_N_POINTS` are drawn at most
 _HUBER = 0.01  # m; a larger residual counts less
 _ROUNDS = 4  # how often the weights of residuals are computed anew
 _COLOR_REGULARISATION = 0.1  # times that of distances, since colours change faster
-_COLOR_HUBER = 0.05
+_COLOR_HUBER = 0.05  # of colours in [0, 1]
 _COLOR_ROUNDS = 3
 # The least scales of a tracker's residuals (distance, luma): so many times the median residual that
 # the corrected map leaves at measured points, and never below `_MIN_SCALES` (m, luma). Chosen in
@@ -47,7 +47,7 @@ _COLOR_ROUNDS = 3
 # 0.02.
 _SCALES_PER_MEDIAN = np.array([5.5, 2.3])
 _MIN_SCALES = np.array([0.01, 0.05])
-_INLIER_DISTANCE = 0.025  # m
+_INLIER_DISTANCE = 0.025  # m from the surface within which a point fits
 _UNMEASURED = 0.1  # confidence where nothing was measured, and the network interpolates
 CORRECTIONS = ("numbers", "corrections", "cameras", "views", "residual_medians")
 """What a file keeps of a correction, besides the field: see `CorrectedField`."""
@@ -106,7 +106,7 @@ class CorrectedField(BakedField):
 def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
     """A map corrected in cells of `voxel` (m) by the frames it was made from; see `corrected`.
 
-    It says how long that took, and how much memory network and corrections take.
+    Its record says how long that took, and how much memory (bytes) network and corrections take.
     """
     start = time.perf_counter()
     mapped, _ = split_holdout(len(sequence), finished.record["settings"]["holdout_every"])
@@ -173,14 +173,14 @@ class _Planes(NamedTuple):
     normals_world: np.ndarray  # n x 3
     depth: np.ndarray  # n, z-depth in m
     color: np.ndarray  # n x 3, in [0, 1]
-    n_cells: int  # of a grid, in which the points lie
+    n_cells: int  # how many of a grid's cells hold any of them
 
 
 def _measured_planes(sequence: RgbdSequence, frames: Frames, grid: BakedField) -> _Planes:
     """Random measured points with a plane.
 
-    They are `_N_POINTS`. If fewer than `_POINTS_A_CELL` of them lie in a cell on average, as in a
-    large place, so many times more are drawn anew as are lacking, up to `_MAX_TIMES`.
+    They come from `_N_POINTS` random pixels. If fewer than `_POINTS_A_CELL` points lie in a cell on
+    average, as in a large place, all are drawn anew from more pixels, at most `_MAX_TIMES` as many.
     """
     planes = _draw_planes(sequence, frames, grid, _N_POINTS)
     times = min(_POINTS_A_CELL * planes.n_cells / len(planes.depth), _MAX_TIMES)
@@ -190,9 +190,10 @@ def _measured_planes(sequence: RgbdSequence, frames: Frames, grid: BakedField) -
 
 
 def _draw_planes(sequence: RgbdSequence, frames: Frames, grid: BakedField, n: int) -> _Planes:
-    """Those of `n` random measured points that have a plane. Raises DataError if none has.
+    """Those of `n` random pixels that show a plane, as points. Raises DataError if none does.
 
-    Neighbours come one after another: their vertices are then still in the processor's cache.
+    They are ordered by the grid's cells: vertices that neighbours share are then still in the
+    processor's cache.
     """
     sampler = PixelSampler(sequence, torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)

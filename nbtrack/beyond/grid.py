@@ -68,6 +68,7 @@ class BakedField(Field):
         answers = [source(low + voxel * vertices) for vertices in batches]
         color = torch.cat([color for color, _ in answers])
         value = torch.cat([value for _, value in answers])
+        # Channels: red, green, blue, value, and a confidence of 1 everywhere.
         volume = torch.cat([color.T, value[None], torch.ones_like(value)[None]])
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("volume", volume, persistent=False)
@@ -112,7 +113,7 @@ def checked_size(bounds: SceneBounds, voxel: float | int, key: str = "voxel") ->
     extent = np.subtract(bounds.maximum, bounds.minimum)
     # In floating point, where the number of vertices may overflow: 1e-300 m is positive, too.
     with np.errstate(all="ignore"):
-        n_vertices = np.ceil(extent / voxel) + 3
+        n_vertices = np.ceil(extent / voxel) + 3  # two cells to spare, and a vertex at the end
         n_bytes = float(np.prod(n_vertices)) * _BYTES_PER_VERTEX
     if not (0 < voxel < math.inf and n_bytes <= _MAX_BYTES):
         # The smallest that fits, with 5 % for the cells to spare and for rounding.

@@ -100,12 +100,13 @@ class IcpTracker(Tracker):
         self.is_converged = True
         if self.source is None or self.source.size() < _MIN_POINTS:
             return float("nan")
-        # From afar the tree would look for partners for seconds, and find none.
+        # Far from the map the tree would look for partners for seconds, and find none.
         starts = [T for T in self.T_starts if self._is_near(T)]
         if not starts:
             return float("nan")
         if np.abs(self.T_starts - self.T_starts[0]).max() < _FAR_APART:
             starts = starts[:1]
+        # Partners from far away first: of the starts the one that finds partners for more points.
         coarse = max([self._align(T, _WIDE) for T in starts], key=lambda result: result.num_inliers)
         found = self._align(coarse.T_target_source, _NARROW) if coarse.num_inliers else coarse
         if not found.num_inliers or not np.isfinite(found.T_target_source).all():
@@ -149,6 +150,7 @@ class IcpTracker(Tracker):
         distances = self._distances(T_found)
         scale = max(MAD_FACTOR * np.median(distances[np.isfinite(distances)]), _MIN_SCALE)
 
+        # Geman-McClure's, in a form that is 1 at an infinite distance, not NaN.
         def costs_at(T_world_camera: Pose) -> Float[np.ndarray, "n"]:
             return 1 - 1 / (1 + (self._distances(T_world_camera) / scale) ** 2)
 
@@ -156,7 +158,7 @@ class IcpTracker(Tracker):
         R_twist = np.kron(np.eye(2), T_found[:3, :3])
         H_world = R_twist @ self.found.H @ R_twist.T
         covariance = np.linalg.inv(H_world + PRIOR_WEIGHT * np.eye(6))
-        # Two directions, those along a wall, since nothing but planes counts.
+        # Moved along 2 directions, those along a wall, since nothing but planes counts.
         position_std_m = std_when_moved(costs_at, T_found, covariance, 2, _INDEPENDENT)
         inlier_ratio = self.found.num_inliers / self.source.size()
         is_held = p_within(CORRELATED * position_std_m) > _LOST

@@ -13,8 +13,8 @@ from scipy.sparse.linalg import LinearOperator, cg
 from nbtrack.beyond.grid import BakedField
 from nbtrack.core.arrays import WorldPoints
 
-# What a difference between neighbouring corrections, and a correction itself, cost, in points seen
-# from the mean distance.
+# Weights of the squared difference between neighbouring corrections, and of a correction's square;
+# the squared residual of a point that was seen from the mean depth has the weight 1.
 _SMOOTHNESS = 0.1
 _PULL = 0.1
 _FADE = 1  # vertices beyond those that points touch, over which corrections fade out
@@ -55,9 +55,10 @@ def corrected_vertices(
 
 
 def regularisation_of(numbers: Int[np.ndarray, "n"], shape: tuple[int, ...]) -> csr_array:
-    """The regularisation of corrections as a matrix: springs between neighbours, and to zero.
+    """The regularisation of corrections as a matrix R: x' R x is its cost of corrections x.
 
-    Neighbours that are not corrected stand at zero, so that corrections fade out.
+    It has springs between the six neighbours, of `_SMOOTHNESS`, and to zero, of `_PULL`. Neighbours
+    that are not corrected stand at zero, so that corrections fade out.
     """
     column_of = np.full(shape, -1)
     column_of.flat[numbers] = np.arange(len(numbers))
@@ -82,11 +83,11 @@ def solve(
 ) -> tuple[Columns, Float[np.ndarray, "n"]]:
     """The x that minimises |W^(1/2) (A x - wanted)|^2 + x' R x, and the Hessian's diagonal.
 
-    A is the matrix, R the regularisation, W the reliability times Huber's weight: 1 up to a
-    residual of `huber`, else huber / |residual|, of the largest one of a row's columns. Each round
-    solves by conjugate gradients with the weights of the solution before. The diagonal is the last
-    round's, A'WA + R. That is applied to vectors, and never formed: its entries would take several
-    times as long to sum up.
+    A is the matrix, R the regularisation, W the reliability times Huber's weight. A row has one
+    weight for all its columns, by their largest residual: 1 up to `huber`, else huber / |residual|.
+    Each of the `rounds` solves by conjugate gradients, from the solution before and with its
+    weights. The Hessian A'WA + R is applied to vectors, and never formed: its entries would take
+    several times as long to sum up. Its diagonal is that of the last round.
     """
     solution = np.zeros((matrix.shape[1], wanted.shape[1]))
     squares = matrix.power(2)

@@ -26,7 +26,7 @@ from nbtrack.tracking.tracker import Estimate, Tracker, TrackerSettings
 _MIN_POINTS = 20  # below, a frame says too little for six unknowns
 # A descent begins on a part of the points, and ends on all of them: far from the pose the coarse
 # answer is as good and costs less.
-_COARSE_SHARE = 8  # one in so many
+_COARSE_EVERY = 8  # one point in so many
 _MIN_COARSE = 128  # points
 # Starts are compared at wide robust scales (m, luma): at narrow ones all that are off cost alike.
 _WIDE_SCALES = np.array([0.1, 0.2])
@@ -37,10 +37,11 @@ _FAR_APART = 0.06
 _MAX_COARSE_STEPS = 30
 _LOST = 0.5  # a pose is lost if it is wrong with at least this probability
 _DOUBTFUL = 0.1  # and in doubt from this one on: other descents follow
-# The first descent's steps from this one on count as one step, and so does a descent elsewhere.
+# The first descent counts as at most so many steps: what is left of it is all done in the last of
+# them. A descent from another start counts as one step.
 _MAX_FOLLOWING = 20
 _SAME = 0.01  # rad, m; another descent that ends so near a pose confirms it
-_LARGEST_INNOVATION = 1.0  # rad, m; also where no pose is trusted
+_LARGEST_INNOVATION = 1.0  # rad, m; larger ones count as this, and so does it if none is trusted
 _ROUNDING = 0.25 / 255  # median error of 256 grey levels; no intensity is more accurate
 _MIN_CONTRAST = 0.01  # standard deviation of a picture that is not dark, covered or overexposed
 _RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
@@ -93,17 +94,17 @@ class LmTracker(Tracker):
         baked = field if isinstance(field, BakedField) else BakedField(field, self.settings.voxel)
         on_host = baked if baked.device.type == "cpu" else deepcopy(baked).cpu()
         self.grid = grid_of(on_host)
-        # Loads what numba has compiled, the inner functions before those that call them: sums would
-        # else be rounded otherwise in the process that compiles than in later ones.
+        # A search of nothing loads what numba has compiled, the inner functions before those that
+        # call them: else sums would be rounded otherwise in the process that compiles than later.
         any_point = Observed(np.zeros((1, 3)), np.zeros(1), np.empty((0, 3)))
-        LmOptimizer(self.grid, any_point, any_point, 1.0, np.eye(4)).certainty()
+        LmOptimizer(self.grid, any_point, any_point, 1.0, T_start=np.eye(4)).certainty()
         return on_host
 
     def restart_anywhere(self) -> None:
         """Look for the camera near all poses that the map was made from; see `_other_starts`."""
         self.check_finds(in_corrected=self.field.viewpoints is not None)
         self.restart(self.field.viewpoints.T_world_camera[0])  # as good as any: it is not trusted
-        self.was_lost = True
+        self.was_lost = True  # after `restart`, which resets it
 
     def track(self, frame: Frame, budget: Budget | None = None) -> Estimate:
         """The camera's pose, as any tracker's; a good one is kept for where it may get lost."""
@@ -115,15 +116,15 @@ class LmTracker(Tracker):
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Draw the frame's points; take up the descent from the start that fits them best."""
-        starts = T_starts.double().numpy().copy()  # the other ones are the caller's
+        starts = T_starts.double().numpy().copy()  # a copy: they are changed below
         if self.was_lost and self.last_good is not None:
             starts = np.concatenate([starts, self.last_good.numpy()[None]])
         # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
         R = starts[:, :3, :3]
         starts[:, :3, :3] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
         expected, last_good = np.split(starts, [len(T_starts)])  # the latter is one pose or none
-        # Poses that a right one is near. A lost frame says little of where the next one starts:
-        # after it that is the last good one, if there was any.
+        # Poses near which the camera should be: `innovation` is the distance from them.
+        # After a lost frame, which says little of this one, only the last good pose counts, if any.
         self.trusted = last_good if self.was_lost else expected
         self.T_start = expected[0]
         self.best = None
@@ -133,16 +134,17 @@ class LmTracker(Tracker):
         self.is_converged = n_points < _MIN_POINTS
         if self.is_converged:
             return
-        coarse = with_normals(frame, observed, max(_MIN_COARSE, n_points // _COARSE_SHARE))
+        coarse = with_normals(frame, observed, max(_MIN_COARSE, n_points // _COARSE_EVERY))
         has_contrast = observed.intensity.std() > _MIN_CONTRAST  # else the picture says nothing
         self.intensity_weight = self.settings.lambda_intensity if has_contrast else 0.0
-        # Makes this frame's descent from a start.
+        # A function of a start: the descent of this frame from there.
         self.descent_from = partial(LmOptimizer, self.grid, coarse, observed, self.intensity_weight)
         descents = [self.descent_from(T) for T in starts]
         if np.abs(starts - starts[0]).max() > _FAR_APART:
             for descent in descents:
                 descent.run_stage(_MAX_COARSE_STEPS)
         self.best, *_ = _by_cost(descents)
+        # The last expected pose is the previous one, unless the model is constant velocity alone.
         self.remaining_steps = self._steps(frame, expected[-1])
 
     def step(self) -> float:
@@ -174,8 +176,9 @@ class LmTracker(Tracker):
     def _steps(self, frame: Frame, T_expected: Pose) -> Iterator[float]:
         """Steps of the best descent, then other descents while its pose is in doubt.
 
-        Yields the cost before each of them, when it is known whether that is the last one: then
-        the search has converged.
+        Yields the cost before each of them, after it is done. `T_expected` is where the camera
+        may be if no frame was good yet. Before the last cost is yielded `is_converged` is set,
+        so that the caller asks for no more.
         """
         cost = self.best.step()
         for _ in range(_MAX_FOLLOWING - 1):
@@ -212,8 +215,11 @@ class LmTracker(Tracker):
         return bool(_apart(other.T_world_camera, best_so_far.T_world_camera) < _SAME)
 
     def _other_starts(self, frame: Frame, T_expected: Pose) -> list[Pose]:
-        """Where else the camera may be, the likeliest first: around the last good pose or, before
-        there is one, an expected pose. These are `n_restarts` at most, or all if none is trusted.
+        """Where else the camera may be, the likeliest first.
+
+        These are poses around the last good one or, before there is one, around an expected one;
+        where the map has views, those of `_starts_by_views`. At most `n_restarts` are given, or all
+        if no pose is trusted.
         """
         anchor = T_expected if self.last_good is None else self.last_good.numpy()
         if self.field.viewpoints is None:
@@ -249,7 +255,7 @@ class LmTracker(Tracker):
 
 
 def _by_cost(descents: list[LmOptimizer]) -> list[LmOptimizer]:
-    """Descents in the order of their robust costs, all at equal scales."""
+    """Descents in the order of their robust costs, the cheapest first, all at `_WIDE_SCALES`."""
     return sorted(descents, key=lambda descent: descent.cost(_WIDE_SCALES))
 
 

@@ -9,7 +9,8 @@ from nbtrack.beyond.observed import Observed
 from nbtrack.beyond.verdict import MAD_FACTOR, SIGMAS, std_when_moved
 from nbtrack.core.arrays import Pose
 
-# A point fits if it lies as near to the surface as the field says, and is so like it in luma.
+# A point fits if it is nearer to the surface than the field's `inlier_distance`, and if its
+# residual in luma differs by less than this from the median of all points.
 _INLIER_INTENSITY = 0.25
 _FIRST_DAMPING = 1e-4
 _MIN_DAMPING = 1e-9
@@ -46,7 +47,7 @@ class LmOptimizer:
         self.last_step = np.inf  # rad or m, whichever is more
         self.fine_problem = Problem(fine, grid, FINE, lambda_intensity, T_start)
         self._begin_stage(Problem(coarse, grid, COARSE, lambda_intensity=0.0, T_start=T_start))
-        self._start_cost = self.cost(NEAR_SCALES)
+        self._start_cost = self.cost(NEAR_SCALES)  # at the start, of the coarse points
 
     def step(self) -> float:
         """One step, taken or refused; returns the robust cost before it."""
@@ -87,7 +88,7 @@ class LmOptimizer:
 
     @property
     def is_finished(self) -> bool:
-        """Whether further steps would change nothing."""
+        """Whether the fine stage has ended: further steps would change nothing."""
         return self.is_ended and self.problem.stage.is_fine
 
     def cost(self, scales: Float[np.ndarray, "2"]) -> float:
@@ -129,7 +130,8 @@ class LmOptimizer:
         """What `certainty` says of how well the cost holds the pose: stds and condition number."""
         H, _ = lm_solver.normal_equations(self.terms, self.scales, self.problem.lambda_intensity)
         curvatures = np.linalg.eigvalsh(H)
-        covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2  # rad, m
+        # In rad and m. H is in units of the scales, which are `SIGMAS` standard deviations.
+        covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2
         rotation_std = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3]).max())
         position_std_m = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:]).max())
         # Moved along one direction, the least certain.
@@ -154,7 +156,7 @@ class LmOptimizer:
         self.is_ended = False
         self.twist = np.zeros(6)  # of the step before
         self.terms = residual_terms(problem, self.T_world_camera)
-        self.scales = np.full(2, np.inf)
+        self.scales = np.full(2, np.inf)  # they only fall, here to those of the residuals
         self._narrow_scales()
 
     def _narrow_scales(self) -> None:

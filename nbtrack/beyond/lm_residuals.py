@@ -112,7 +112,7 @@ def residual_terms(problem: Problem, T: Pose) -> Terms:
     step_x, step_y = np.uintp(grid.n_vertices[1] * grid.n_vertices[2]), np.uintp(grid.n_vertices[2])
     for i in range(n_points):
         v, x, y, z = np.uintp(cells[i]), in_cell[0, i], in_cell[1, i], in_cell[2, i]
-        for k in range(3 if problem.stage.is_fine else 2):
+        for k in range(3 if problem.stage.is_fine else 2):  # distance, intensity, confidence
             # Trilinear interpolation: c011 is the value at the cell's corner that is low in x, high
             # in y and z; c01 is interpolated along z, c0 along y as well.
             c000, c001 = vertices[v, k], vertices[v + step_z, k]
@@ -165,14 +165,16 @@ def _locate(points: Array, T: Pose, grid: Grid) -> tuple[Array, ...]:
             scaled = min(scaled, last) if scaled > 0 else 0.0
             cell = min(int(scaled), grid.n_vertices[k] - 2)
             in_cell[k, i] = scaled - cell
-            cells[i] = cells[i] * grid.n_vertices[k] + cell
+            cells[i] = cells[i] * grid.n_vertices[k] + cell  # after all axes: z is fastest
     return lever_arms, reliability, cells, in_cell, per_metre
 
 
 @no_type_check
 @compiled
 def _weigh(terms: Terms, normals: Array, T: Pose) -> None:
-    """Complete the terms in place: weigh by gradient norm and normals, and divide by the norm."""
+    """Complete the terms in place: weigh points by their gradient's norm and, if given, by normals;
+    divide distances and their gradients by that norm.
+    """
     gradient = terms.gradients[0]
     for i in range(len(terms.reliability)):
         g = np.sqrt(gradient[0, i] ** 2 + gradient[1, i] ** 2 + gradient[2, i] ** 2)

@@ -46,9 +46,10 @@ class Step(NamedTuple):
 def robust_scales(residuals: Array, before: Array, sigma: Array | tuple, factor: float) -> Array:
     """Robust scales of both residuals (2), given those before: as the module states them.
 
-    Not compiled, since that would take seconds for numpy's `partition`.
+    `sigma` is the least scale of each, `factor` what medians are multiplied by. Not compiled, since
+    that would take seconds for numpy's `partition`.
     """
-    # Scales that cannot fall any more, as in most steps: a median takes as long as many sums.
+    # In most steps scales cannot fall any more: no median then, which takes as long as many sums.
     if (before <= sigma).all():
         return before
     middle = (residuals.shape[1] - 1) // 2
@@ -87,7 +88,7 @@ def normal_equations(terms: Terms, scales: Array, lambda_intensity: float) -> tu
     n_points = len(terms.reliability)
     jacobian, weights = np.empty((6, n_points), np.float32), np.empty(n_points, np.float32)
     matrix, vector = np.zeros((6, 6)), np.zeros(6)
-    for k in range(2):
+    for k in range(2):  # distance, intensity
         scale, factor = np.float32(scales[k]), np.float32(lambda_intensity if k == 1 else 1.0)
         residuals, gradients = terms.residuals[k], terms.gradients[k]
         for i in range(n_points):
@@ -171,13 +172,14 @@ def try_step(
     geometric series: first its limit is tried (Aitken 1926), so far as `_MAX_RATIO` allows, and
     the step alone if that is no better.
 
-    In the fine stage usable points keep the reliabilities of the pose before: from cell to cell of
-    a grid gradients jump, and reliabilities with them, and a pose is no worse for that. In the
-    coarse one, from afar, reliable gradients tell that a surface is near.
+    In the fine stage the cost after a step takes usable points by their reliabilities before it:
+    from cell to cell of a grid gradients jump, and reliabilities with them, and a pose is no worse
+    for that. In the coarse one, from afar, reliable gradients tell that a surface is near.
     """
     twist = damped_step(problem, T, terms, scales, damping)
     before = robust_cost(terms.residuals, terms.reliability, scales, problem.lambda_intensity)
     along, square = (twist * last_twist).sum(), (last_twist * last_twist).sum()
+    # Along the last twist longer than a share of it, and less than 45 degrees off it: cos^2 > 0.5.
     does_creep = along > _MIN_RATIO * square and along**2 > 0.5 * square * (twist * twist).sum()
     stride = 1 / (1 - min(along / square, _MAX_RATIO)) if does_creep else 1.0
     for factor in (stride, 1.0):

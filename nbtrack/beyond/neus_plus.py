@@ -88,17 +88,19 @@ def distance_targets(
     A measured pixel gives the distance from its tangent plane, (D - d) times the ray's length
     times the cosine of incidence: exact where the surface is flat, with noise that averages out.
     In front of the surface it only holds where no other surface is nearer; there, and where the
-    plane is not known, the distance `nearest` from any observed point (m) takes its place. Just
-    behind the surface the plane is continued, unless a camera saw through the place: thin things
-    end there. Farther behind nothing is known.
+    plane is not known, the distance `nearest` from any observed point (m) takes its place, but only
+    farther than `surface_band` from the surface, where it is right to millimetres (see
+    `ObservedDistance`). Just behind the surface the plane is continued, unless a camera saw through
+    the place (`is_free`): thin things end there. Farther behind nothing is known.
 
     Source: distances along the ray as iSDF (Ortiz et al. 2022), nearest points as its "pc" bounds,
     but over all frames rather than one batch; the choice between them is ours.
     """
     before = rays.depth[:, None] - depths  # z-depth from a sample to the surface; negative behind
-    cosine = (rays.normals_world * rays.directions_world).sum(dim=-1).abs()[:, None]
-    plane = before * cosine
-    is_plane_nearest = (cosine > 0) & ((plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
+    # Distance from the plane for one metre of z-depth; 0 where the normal is not known.
+    per_depth = (rays.normals_world * rays.directions_world).sum(dim=-1).abs()[:, None]
+    plane = before * per_depth
+    is_plane_nearest = (per_depth > 0) & ((plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
     target = torch.where(is_plane_nearest, plane, nearest)
     in_front = (before > 0) & (is_plane_nearest | (before > settings.surface_band))
     just_behind = (before <= 0) & (plane > -settings.behind_band)

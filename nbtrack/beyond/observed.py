@@ -33,7 +33,7 @@ class Observed(NamedTuple):
 
     points: np.ndarray  # n x 3, m, camera frame
     intensity: np.ndarray  # n, luma in [0, 1]
-    normals: np.ndarray  # n x 3, camera frame, towards it, 0 where not known; or none (0 x 3)
+    normals: np.ndarray  # n x 3, camera frame, towards the camera; 0: not known. Or none (0 x 3)
 
 
 def compiled(function: Callable) -> Callable:
@@ -50,7 +50,7 @@ def draw_points(
     """Observed points (m, camera frame) of evenly spread pixels, and intensities; no normals.
 
     Not those at depth edges, which may belong to either side, nor at the border: a neighbouring
-    depth that differs by a larger share than `edge_jump` marks an edge, if infinite none. Only a
+    depth that differs by a larger share than `edge_jump` marks an edge; infinity takes all. Only a
     few times as many pixels as wanted are looked at, from a random one on: where little is
     measured, fewer points come back.
     """
@@ -61,7 +61,7 @@ def draw_points(
 
 
 def with_normals(frame: Frame, observed: Observed, n_points: int) -> Observed:
-    """The first points with unit normals (camera frame, towards it); 0 where not known."""
+    """The first `n_points` points with unit normals, towards the camera; 0 where not known."""
     points, intensity = observed.points[:n_points], observed.intensity[:n_points]
     return Observed(points, intensity, _normals(frame.depth_mm.numpy(), _pinhole(frame), points))
 

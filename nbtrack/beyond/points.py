@@ -56,14 +56,14 @@ class PointCloud(Field):
 
     @classmethod
     def from_state(cls, state: State, made: dict[str, Any], bounds: SceneBounds) -> "PointCloud":
-        """ValueError unless points and colours are equally many."""
+        """The cloud of a map file. Raises ValueError unless points and colours are equally many."""
         if len(state["points"]) != len(state["colors"]):
             raise ValueError("points and colours are not equally many")
         return cls(**state, voxel=float(made["settings"]["voxel"]), bounds=bounds)
 
     def diagnostics(self) -> dict[str, float]:
         """How many points there are, and what memory (bytes) they take."""
-        return {"points": len(self.points), "bytes": 2 * self.points.nbytes}
+        return {"points": len(self.points), "bytes": 2 * self.points.nbytes}  # colours are as many
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour of the nearest point, and distance (m, without sign) from it."""
@@ -121,9 +121,10 @@ def fuse_points(
 def cells_of(
     points: WorldPoints, low: Float[np.ndarray, "3"], shape: Int[np.ndarray, "3"], voxel: float
 ) -> tuple[Int[np.ndarray, "_"], np.ndarray]:
-    """The number of the grid's cell that holds each point inside, z fastest; and which these are.
+    """Numbers of the cells that points lie in, z fastest, and a mask of the points they are for.
 
-    The grid begins at `low` (m) and has cells of `voxel` (m). The latter is a mask of the points.
+    The grid begins at `low` (m) and has `shape` cells of `voxel` (m). Points outside get no number:
+    the mask leaves them out.
     """
     cells = np.floor((points - low) / voxel).astype(np.int64)
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
@@ -131,17 +132,18 @@ def cells_of(
 
 
 def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frames) -> Values:
-    """How far (z-depth, m) points (m) lie at least behind what frames measured in their direction.
+    """How far (z-depth, m) points (m) lie behind what frames measured in their direction.
 
-    Negative in front of it; infinite out of view and where nothing was measured. Every fifth of the
-    frames is asked: neighbours see the same.
+    The least of all frames counts: it is negative where any saw what lies behind the point, and
+    infinite where all have it out of view or measured nothing there. Every fifth of the frames is
+    asked: neighbours see the same.
     """
     asked = frames[::_ASKED_EVERY].tolist()
     return reduce(torch.minimum, (_depth_behind(sequence[i], points_world) for i in asked))
 
 
 def _depth_behind(frame: Frame, points_world: Points) -> Values:
-    """`min_depth_behind` of one frame."""
+    """`min_depth_behind` by one frame alone."""
     T_world_camera = torch.from_numpy(frame.T_world_camera).to(points_world)
     points_camera = (points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     columns, rows, depth = project(frame.camera, points_camera)

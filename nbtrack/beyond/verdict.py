@@ -20,6 +20,7 @@ from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 WRONG_M = 0.05
 WRONG_DEG = 3.0
 _LEAST_SHARE = 0.01  # of points; shares of 0 and 1 would have infinite log odds
+# Of the log odds of a wrong pose; the coefficients are those of the four `features`.
 _INTERCEPT = 2.01
 _COEFFICIENTS = np.array([-2.06, -0.28, 2.8, 1.39])
 # Scales of robust costs are 3 medians of |r|: two standard deviations, were residuals normal.
@@ -50,13 +51,13 @@ def p_lost(said: Mapping[str, float]) -> float:
 
     The last step is in rad or m, 0 where the pose has settled.
     """
-    is_right = 1 / (1 + math.exp(_INTERCEPT + _COEFFICIENTS @ features(said)))
+    p_right = 1 / (1 + math.exp(_INTERCEPT + _COEFFICIENTS @ features(said)))
     spread = math.hypot(CORRELATED * said["position_std_m"], said["last_step"])
-    return 1 - is_right * p_within(spread)
+    return 1 - p_right * p_within(spread)
 
 
 def p_within(position_std_m: float) -> float:
-    """The probability that a normal error of the position is below `WRONG_M`."""
+    """The probability that a normal error along one direction, of this std, is below `WRONG_M`."""
     return math.erf(WRONG_M / math.sqrt(2) / position_std_m)
 
 

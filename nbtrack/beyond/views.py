@@ -85,7 +85,7 @@ def retrieve(view: View, viewpoints: Viewpoints, n: int) -> Poses:
     Each is turned about the camera's x and y as it fits best: shifts of a view's cells stand for
     turns.
     """
-    turns = [(down, across) for across in _TURNS_ACROSS for down in _TURNS_DOWN]
+    turns = [(down, across) for across in _TURNS_ACROSS for down in _TURNS_DOWN]  # in cells
     here, there = view.float(), viewpoints.views.float()
     unlikeness = [_unlikeness(_moved(here, y, x), _moved(there, -y, -x)) for y, x in turns]
     minimum, best = torch.stack(unlikeness).min(dim=0)
@@ -108,7 +108,8 @@ def _moved(view: Tensor, down: int, across: int) -> Tensor:
 
 
 def _unlikeness(here: Float[Tensor, "2 _ _"], there: Float[Tensor, "n 2 _ _"]) -> Values:
-    """1 - correlation of luma + `_DEPTH_WEIGHT` times how far depths are apart; 0 for the same.
+    """How unlike a view is to others: 1 - correlation of luma, plus `_DEPTH_WEIGHT` times how far
+    depths are apart; 0 for the same.
 
     Depths are apart by their log ratio, as a share of `_MAX_LOG_RATIO` and at most 1, in the mean
     over cells where both are measured; by 1 if too few are.
