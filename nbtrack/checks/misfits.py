@@ -96,8 +96,8 @@ def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
 
     The correlation is as declared, NaN without contrast. `pairs` must also hold the frames up to
     MAX_SHIFT around those of the pairs. Misfits of colours are looked for if none of depth is
-    significant. Those are left out with which colours correlate by less than MIN_CORRELATION even
-    at the best value: such colours are of another place.
+    significant. One is left out if even at its best value colours correlate by less than
+    MIN_CORRELATION: such colours are of another place.
     """
     found = list(_estimates(_DEPTH_PARAMETERS, own, pairs.depth_costs))
     # Colours are compared at the points whose depths agree as declared.
@@ -105,9 +105,9 @@ def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
     unlikeness = color_costs(own)
     correlation = float(1 - np.nanmedian(unlikeness)) if np.isfinite(unlikeness).any() else np.nan
     if not any(misfit.is_significant for misfit in found):
-        unlike = 1 - correlation  # as declared; at its best a misfit leaves the share `gain` of it
+        # The cost of colours is 1 - correlation; at a misfit's best value the share `gain` is left.
         of_colors = _estimates(_COLOR_PARAMETERS, own, color_costs)
-        found += [m for m in of_colors if m.gain * unlike < 1 - MIN_CORRELATION]
+        found += [m for m in of_colors if m.gain * (1 - correlation) < 1 - MIN_CORRELATION]
     return found, correlation
 
 

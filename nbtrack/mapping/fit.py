@@ -195,7 +195,7 @@ class _Fit:
             check_recipe(checkpoint, state["recipe"], self.recipe)
             self.field.load_state_dict(state["field"])
             self.optimizer.load_state_dict(state["optimizer"])
-            self.optimizer.param_groups[0]["lr"] = self.rate  # the loaded one lies on the host
+            self.optimizer.param_groups[0]["lr"] = self.rate  # the tensor that `_advance` fills
             self.generator.set_state(state["generator"])
             self.seconds = state["seconds"]
             self.history = state["history"]

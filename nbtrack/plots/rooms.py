@@ -147,10 +147,10 @@ def plot_map_and_slice(
     axes, enlarged = new_axes(title, 4.6, 1, 2, width_ratios=[5, 1])[0]
     to_screen = scene.draw_mesh(axes, mesh, up)
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
-    # From the room to where the slice is drawn: to the picture's right, the first row, by the
-    # room's width, 4 % of it and a cell as a gap; and down from the cameras' height to the middle
-    # of the room's.
-    aside = (1.04 * np.ptp(mesh.vertices @ to_screen[0]) + voxel) * to_screen[0]
+    # The slice is drawn aside: to the right in the picture by 1.04 widths of the room and a cell,
+    # and from the cameras' height down to the mean height of the mesh.
+    right = to_screen[0]
+    aside = (1.04 * np.ptp(mesh.vertices @ right) + voxel) * right
     aside -= (height - (mesh.vertices @ up).mean()) * up
     page = np.eye(3)[up == 0]  # the two level axes of the world
     points, _ = _level_grid(page, *mesh.bounds @ page.T, voxel, height * up)

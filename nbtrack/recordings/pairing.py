@@ -203,8 +203,8 @@ class Moments:
         1. Frames take the poses of their numbers if, over the ways to count of `_counted`, just
            one pairing is complete: all frames find a pose, or all poses a frame. Without stamps
            this needs more poses than frames; for equally many there is rule 2.
-        2. Equally many poses and frames are paired in their order. Not so if stamps are uneven and
-           most frames find a pose by them: then the list lacks some frames and has others.
+        2. Equally many poses and frames are paired in order, unless stamps are times, not a count,
+           and most frames find a pose by them: then the list lacks some frames and has others.
         """
         n_frames, n_poses = len(self.images), len(poses)
         pose_numbers = np.arange(n_poses) if stamps is None else stamps * self.rate_hz
@@ -217,9 +217,9 @@ class Moments:
         if len(complete) == 1 and (n_poses > n_frames or stamps is not None):
             note = f"of {n_poses} poses those of the images' numbers" if n_poses > n_frames else ""
             return _at(poses, complete[0]), note
+        are_times = stamps is not None and not _are_even(stamps)  # even ones may only count
         finds_most = (n_paired > _MOST * n_frames).any()
-        some_left_out = finds_most and stamps is not None and not _are_even(stamps)
-        if n_poses != n_frames or some_left_out:
+        if n_poses != n_frames or (are_times and finds_most):
             return None
         counts_up = np.array_equal(self.numbers, np.arange(n_frames))
         return poses, "" if counts_up else "images have the poses one after another"
