@@ -213,7 +213,7 @@ def test_slices_side_by_side_share_their_colours(sequence) -> None:
     """Catches maps that are compared in two scales, and panels without their map's name."""
     left, right, _ = plots.plot_slice([SPHERE, NEAR], sequence, 0.0, title="two").axes
     assert left.collections[0].norm is right.collections[0].norm
-    assert left.get_title("left") == SPHERE.label
+    assert SPHERE.label in left.get_title("left")
 
 
 def test_the_exact_distance_stands_beside_the_map(sequence) -> None:

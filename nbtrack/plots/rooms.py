@@ -49,15 +49,15 @@ def plot_slice(
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / _POINTS_ALONG
         points, places = _level_grid(page, low, high + step, step, height * up)
-        label = field.value_label.replace("(m)", "(m; thin lines: every 0.25 m)")
+        lines = "thin lines: every 0.25 m, " if field.is_distance else ""
+        label = f"{lines}pale: never seen\n{field.value_label}"
         bar = {"ax": panels, "aspect": 25, "pad": 0.015, "label": label}
         shown = seen_by(points, sequence)
         norm = scene.draw_slice(axes, field, points, places, shown, norm, **bar)
         axes.plot([], [], "k-", label="surface")  # only names the lines drawn above in the legend
         if room is not None:
             shown = shown & _draw_true_level(axes, room, points, places)
-        axes.set_title(field.label)
-        axes.set_xlabel(f"height {height:.2f} m; pale: never seen; {axes.get_xlabel()}")
+        axes.set_title(f"{field.label}, {height:.2f} m up")
         _end_around(axes, places[shown], sequence.T_world_camera[:, :3, 3] @ page.T)
     return panels[0].figure.legend_below()
 
