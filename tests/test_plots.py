@@ -224,7 +224,7 @@ def test_the_exact_distance_stands_beside_the_map(sequence) -> None:
     assert exact == pytest.approx(mapped, abs=1e-6)
 
 
-def test_what_was_not_seen_is_pale(sequence) -> None:
+def test_what_was_not_seen_is_veiled(sequence) -> None:
     """Catches a veil that is mirrored, shifted, or over what the frames have measured."""
     axes = plots.plot_slice(SPHERE, sequence, 0.0).axes[0]
     (veil,) = [c for c in axes.collections if c.get_gid() == "unseen"]

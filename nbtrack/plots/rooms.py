@@ -49,14 +49,13 @@ def plot_slice(
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / _POINTS_ALONG
         points, places = _level_grid(page, low, high + step, step, height * up)
-        lines = "thin lines: every 0.25 m, " if field.is_distance else ""
-        label = f"{lines}pale: never seen\n{field.value_label}"
-        bar = {"ax": panels, "aspect": 25, "pad": 0.015, "label": label}
+        bar = {"ax": panels, "aspect": 25, "pad": 0.015}
         shown = seen_by(points, sequence)
         norm = scene.draw_slice(axes, field, points, places, shown, norm, **bar)
         axes.plot([], [], "k-", label="surface")  # only names the lines drawn above in the legend
         if room is not None:
             shown = shown & _draw_true_level(axes, room, points, places)
+        axes.plot([], [], "s", color=scene.UNSEEN, label="never seen")
         axes.set_title(f"{field.label}, {height:.2f} m up")
         _end_around(axes, places[shown], sequence.T_world_camera[:, :3, 3] @ page.T)
     return panels[0].figure.legend_below()
@@ -139,7 +138,7 @@ def plot_map_and_slice(
 
     The surface is drawn as `plot_mesh` draws it, from a grid of `voxel` metres. The slice lies at
     the cameras' mean height and is drawn beside the room, in the same projection. What no frame of
-    `sequence` has seen is pale. The camera-to-world poses (m) by label are drawn in both, and
+    `sequence` has seen is grey. The camera-to-world poses (m) by label are drawn in both, and
     larger beside them.
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
@@ -158,7 +157,7 @@ def plot_map_and_slice(
     bar = {"location": "bottom", "shrink": 0.4, "aspect": 30, "pad": 0.0}
     scene.draw_slice(axes, field, points, places, seen_by(points, sequence), **bar)
     parts = {"Mesh: the zero level": mesh.vertices @ to_screen[:2].T}
-    parts["Slice at the cameras' height; pale: never seen"] = places.reshape(-1, 2)
+    parts["Slice at the cameras' height; grey: never seen"] = places.reshape(-1, 2)
     for name, on_page in parts.items():
         x, y = on_page.T
         axes.text((x.min() + x.max()) / 2, y.max() + 2 * voxel, name, ha="center")

@@ -23,7 +23,8 @@ from nbtrack.plots.style import method_colors
 Paths = Mapping[str, Poses]  # camera-to-world poses (m) by label
 _ELEVATION = np.radians(45)  # of the viewer of a mesh
 _AMBIENT = 0.55  # share of the light on a mesh that comes from everywhere
-_DIMMED = 0.72  # how white the unseen becomes
+UNSEEN = "0.82"
+"""The grey of what no frame has seen; the scales of values hold no grey."""
 _CUT = 0.01  # share of a recording's points cut off at either end: wild depths hide the room
 _LINES_M = np.arange(-1.0, 1.01, 0.25).tolist()  # distances with a thin line
 
@@ -164,7 +165,7 @@ def draw_slice(
 
     A signed distance is blue in free space and red in matter, with thin lines 0.25 m apart; a
     density or an occupancy has a logarithmic scale. Black is the surface (the field's
-    `surface_level`). What no frame has seen is pale: there the field invents. `bar` holds options
+    `surface_level`). What no frame has seen is grey: there the field invents. `bar` holds options
     of `Figure.colorbar`. Returns the scale; with that of another slice as `norm` no bar is drawn.
     """
     _, values = query_field(field, points)
@@ -184,10 +185,9 @@ def draw_slice(
         draw_levels(axes, places, values, _LINES_M, colors="0.35", linewidths=0.4, linestyles="-")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
     if seen is not None:
-        pale = image.to_rgba(values)
-        pale += _DIMMED * (1 - pale)
-        pale[..., 3] = ~seen  # transparent over what was seen
-        axes.pcolormesh(*page, pale, gid="unseen", zorder=2.5, **look)  # above the map's lines
+        veil = np.full((*seen.shape, 4), float(UNSEEN))
+        veil[..., 3] = ~seen  # transparent over what was seen
+        axes.pcolormesh(*page, veil, gid="unseen", zorder=2.5, **look)  # above the map's lines
     return image.norm
 
 
