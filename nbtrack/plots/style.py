@@ -25,6 +25,8 @@ _FIXED = {
     **dict.fromkeys(["NeuS+ corrected (LM)", "NeuS+ corrected"], PALETTE[3]),
     "ICP": PALETTE[4],
     "NeuS+ grid": PALETTE[5],
+    "five rooms of the paper": PALETTE[6],
+    "nine rooms of ours": PALETTE[7],
     # Green and red as in the paper's first figure, of tones that colour-blind readers tell apart
     # (Okabe and Ito).
     "true": "#009e73",
