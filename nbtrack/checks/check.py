@@ -79,9 +79,7 @@ class DataReport:
         return "\n".join(lines)
 
 
-def check_recording(
-    recording: Recording, progress: bool = False, is_whole: bool = True
-) -> DataReport:
+def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     """Read every frame of a recording and report what is there and whether it fits together.
 
     Unless `is_whole`, only a few pairs of frames are read, in about a second. Raises what
@@ -95,7 +93,7 @@ def check_recording(
     # Read as if in mm and z-depth, so that `depths_mm` hold the files' values for any reading.
     as_stored = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
     stored = replace(recording, declared=as_stored)
-    sequence, frames = _read(stored, ids if is_whole else kept, kept, progress)
+    sequence, frames = _read(stored, ids if is_whole else kept, kept)
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     own = Reading(recording.declared, sequence.intrinsics)
@@ -230,7 +228,7 @@ def _kept(pairs: Pairs, ids: Frames, is_whole: bool) -> tuple[Frames, Frames]:
 
 
 def _read(
-    recording: Recording, looked_at: Frames, kept: Frames, progress: bool
+    recording: Recording, looked_at: Frames, kept: Frames
 ) -> tuple[RgbdSequence, pd.DataFrame]:
     """The frames to be kept, as a sequence, and a table with a row for each frame looked at.
 
@@ -243,7 +241,7 @@ def _read(
     """
     parts = []
     rows = []
-    with ProgressBar("reading frames", len(looked_at), progress) as bar:
+    with ProgressBar("reading frames", len(looked_at)) as bar:
         for ids in np.split(looked_at, range(_FRAMES_AT_ONCE, len(looked_at), _FRAMES_AT_ONCE)):
             part = read_frames(recording, ids)
             for values, color in zip(part.depths_mm, part.colors, strict=True):

@@ -282,7 +282,7 @@ def check_command(options: Namespace) -> None:
     """Validate a recording; print what it holds and what is wrong, and draw it into --out."""
     output.prepare(options.out)
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
-    report = check_recording(recording, progress=True)
+    report = check_recording(recording)
     print(report)
     if options.out:
         apart_mm = 1e3 * report.conventions[0].median_m  # as the recording's files are declared
@@ -297,4 +297,4 @@ def convert_command(options: Namespace) -> None:
     frames = reading.parse_frames(options.frames)
     output.check_no_recording(options.out)
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
-    print(convert_sequence(recording, options.out, frames, progress=True))
+    print(convert_sequence(recording, options.out, frames))

@@ -17,7 +17,6 @@ from nbtrack.core.arrays import DepthImage, Frames, Position
 from nbtrack.core.camera import Intrinsics
 from nbtrack.core.errors import DataError
 from nbtrack.core.files import naming_damaged
-from nbtrack.core.progress import ProgressBar
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.recordings.calibration import camera_matrix
 from nbtrack.recordings.formats import IMAGE_SUFFIXES, Declaration
@@ -43,25 +42,20 @@ def parse_frames(text: str) -> slice:
 
 
 def read_sequence(
-    folder: Path | str,
-    frames: slice = slice(None),
-    depth_folder: str | None = None,
-    pose_file: str | None = None,
-    progress: bool = False,
-    format: str | None = None,
+    folder: Path | str, frames: slice = slice(None), **options: str | None
 ) -> RgbdSequence:
-    """Read a recording; arguments and errors are those of `open_recording` and `read_frames`.
+    """Read a recording; `options` are those of `open_recording`: format, depth folder, pose file.
 
     A Neural RGB-D scene also has depth in `depth` and `depth_with_noise`, and poses in
-    `trainval_poses.txt` (BundleFusion's, in another world frame).
+    `trainval_poses.txt` (BundleFusion's, in another world frame). Raises as `open_recording` and
+    `read_frames` do.
     """
-    return read_frames(open_recording(folder, format, depth_folder, pose_file), frames, progress)
+    return read_frames(open_recording(folder, **options), frames)
 
 
 def read_frames(
     recording: Recording,
     frames: slice | Frames = slice(None),
-    progress: bool = False,
     needs_poses: bool = True,
     origin: Position | None = None,
 ) -> RgbdSequence:
@@ -72,7 +66,7 @@ def read_frames(
     image cannot be read, or no frame is left.
     """
     ids = select_frames(recording, frames, needs_poses) if isinstance(frames, slice) else frames
-    camera, colors, depths_mm = decode(recording, ids, progress)
+    camera, colors, depths_mm = decode(recording, ids)
     origin = recording.origin if origin is None else origin
     T_world_camera = recording.T_world_camera[ids]
     T_world_camera[:, :3, 3] -= origin
@@ -116,7 +110,7 @@ def far_limit(depths: np.ndarray) -> float:
 
 
 def decode(
-    recording: Recording, frame_ids: Int[np.ndarray, "n"], progress: bool = False
+    recording: Recording, frame_ids: Int[np.ndarray, "n"]
 ) -> tuple[Intrinsics, UInt8[np.ndarray, "n height width 3"], UInt16[np.ndarray, "n height width"]]:
     """The camera, and RGB colours and depths (mm along the axis) of some frames (at least one).
 
@@ -150,10 +144,8 @@ def decode(
         depths[index] = _in_millimetres(depth, recording.declared, camera, depth_files[index])
         colors[index] = color
 
-    bar = ProgressBar("reading frames", len(frame_ids), progress)
-    with bar, ThreadPoolExecutor(max_workers=4) as pool:  # decoding frees the GIL: a few suffice
-        for done, _ in enumerate(pool.map(read, range(len(frame_ids))), start=1):
-            bar.move_to(done)
+    with ThreadPoolExecutor(max_workers=4) as pool:  # decoding frees the GIL: a few suffice
+        list(pool.map(read, range(len(frame_ids))))  # a list, so that errors are raised here
     return camera, colors, depths
 
 

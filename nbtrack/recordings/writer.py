@@ -82,9 +82,7 @@ def _text(rows: Float[np.ndarray, "n m"]) -> str:
     return "".join(" ".join(map(repr, row)) + "\n" for row in rows.astype(np.float64).tolist())
 
 
-def convert_sequence(
-    recording: Recording, out: Path, frames: slice = slice(None), progress: bool = False
-) -> str:
+def convert_sequence(recording: Recording, out: Path, frames: slice = slice(None)) -> str:
     """Write a recording in the Neural RGB-D layout, and say what a user should know of it.
 
     Only a lens's distortion is removed from images; a camera that the layout cannot say goes to
@@ -94,7 +92,7 @@ def convert_sequence(
     select_frames(recording, frames)  # raises where none has a pose
     numbers = select_frames(recording, frames, needs_poses=False)
     camera, _, _ = decode(recording, numbers[:1])  # one frame tells the size of all
-    with ProgressBar("converting", len(numbers), progress) as bar:
+    with ProgressBar("converting", len(numbers)) as bar:
         times = {TIMES_FILE: _text(recording.times[numbers, None])}
         write_sequence(out, camera, _frames(recording, numbers), times, bar.move_to)
     n_lost = int((~recording.has_pose[numbers]).sum())
