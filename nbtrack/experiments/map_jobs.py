@@ -104,13 +104,6 @@ class MapJob(Job):
         finished = self._stored()
         return replace(finished, field=finished.field.to(choose_device()))
 
-    @property
-    def metres_per_unit(self) -> float:
-        """Metres a unit of the map; an estimate for a map that is still to be made."""
-        if self.is_done:
-            return self.map().field.bounds.metres_per_unit
-        return _rough_unit(self.scene, self.frames)
-
     def _stored(self) -> Map:
         """The finished map, from a cache of this process as long as its file is unchanged."""
         return _read(self.folder, (self.folder / MAP_FILE).stat().st_mtime_ns)
@@ -172,14 +165,16 @@ class GivenMap:
         """Edge (m) of the cells in which it was corrected; 0: it was not."""
         return self.finished.record.get("correction", 0.0)
 
-    @property
-    def metres_per_unit(self) -> float:
-        """Metres a unit of the map."""
-        return self.finished.field.bounds.metres_per_unit
-
     def map(self) -> Map:
         """The map, ready for tracking."""
         return replace(self.finished, field=self.finished.field.to(choose_device()))
+
+
+def map_unit(made: MapJob | GivenMap) -> float:
+    """Metres a unit of a map; an estimate for one that is still to be made."""
+    if made.is_done:
+        return made.map().field.bounds.metres_per_unit
+    return _rough_unit(made.scene, made.frames)
 
 
 @lru_cache

@@ -17,10 +17,11 @@ from nbtrack.core.arrays import Pose, Poses
 from nbtrack.core.device import choose_device, device_name
 from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.core.settings import as_dict, changed_settings
+from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments import IMPORTED
 from nbtrack.experiments.jobs import Job, Report
-from nbtrack.experiments.map_jobs import PLAIN_PRESET, GivenMap, MapJob, setting_tree
+from nbtrack.experiments.map_jobs import PLAIN_PRESET, GivenMap, MapJob, map_unit, setting_tree
 from nbtrack.experiments.presets import PRESETS, SIZES
 from nbtrack.experiments.runs import METRICS_FILE, scores_of, write_run
 from nbtrack.experiments.scenes import Scene
@@ -41,16 +42,6 @@ _OTHER_WORLD = (
 # A user is warned of larger ones. Hands start and stop, and a search catches up (our choice).
 _GREEDY_ATE = 0.01  # m, the ATE of a greedy search with the run's reach
 _SHARE = 0.5  # of the frames: those in which the camera moves farther than a search reaches
-
-
-@dataclass(frozen=True)
-class _Start:
-    """Where a run begins, and what that says of a given map."""
-
-    T_world_camera: Pose  # m, the first frame's; of no meaning where it is not known
-    is_known: bool  # else the tracker finds the camera first
-    warning: str | None = None  # where it cannot be told whether a given map fits the first frame
-    is_in_other_world: bool = False  # the recording's poses are in another world than the map
 
 
 @dataclass(frozen=True)
@@ -106,22 +97,22 @@ class TrackJob(Job):
 
     def check(self) -> None:
         """Raises ConfigError or DataError, before anything is made, where a run cannot begin."""
-        is_known = self.start == "given" and np.isfinite(self._true_path()[0]).all()
+        T_first = self._true_path()[0]
         # With any pose: it raises for an unknown motion model.
         expected_poses(self.settings.motion_model, [np.eye(4)])
-        if not is_known:
+        if not self._starts_at(T_first):
             tracker_class(self.tracker).check_finds(in_corrected=self.needs.correction_voxel > 0)
 
     def expected_reach(self) -> dict[str, float]:
         """What `reach_metrics` will say of the run; empty by the clock, where steps are unknown."""
         if self.steps is not None:
             with contextlib.suppress(NbtrackError):  # the run itself will say what is wrong
-                return self._reach(self.steps, self.needs.metres_per_unit, self._true_path())
+                return self._reach(self.steps, map_unit(self.needs), self._true_path())
         return {}
 
-    def _reach(self, steps: float, metres_per_unit: float, T_true: Poses) -> dict[str, float]:
-        """`reach_metrics` of so many steps a frame along a path (m)."""
-        reach = self.settings.reach(steps, metres_per_unit)
+    def _reach(self, steps: float, unit_m: float, T_true: Poses) -> dict[str, float]:
+        """`reach_metrics` of so many steps a frame along a path (m), in a map of this unit."""
+        reach = self.settings.reach(steps, unit_m)
         return reach_metrics(reach, T_true, self.settings.motion_model)
 
     def result(self) -> dict[str, Any]:
@@ -140,71 +131,67 @@ class TrackJob(Job):
         finished = self.needs.map()
         origin = np.array(finished.record["origin"])
         sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
-        start = self._begin(finished, sequence)
-        tracked, device = self._track(finished, sequence, start, report)
-        notes = self._notes(finished, sequence, start, tracked) | {"device": device}
-        if start.is_in_other_world:
-            tracked, is_explained = in_world_of_map(tracked)
-            notes["map_warning"] = _OTHER_WORLD if is_explained else None
-        metrics = scores_of(tracked) | self._provenance(finished) | notes
-        write_run(self.folder, replace(tracked, metrics=metrics))
-        (self.folder / RUN_FILE).unlink(missing_ok=True)
-        return metrics
-
-    def _begin(self, finished: Map, sequence: RgbdSequence) -> _Start:
-        """Where to begin, and whether a given map fits the first frame at the recording's pose.
-
-        If it does not, and the run would start there, it is a DataError. Where the run does not use
-        that pose, the recording is in another world than the map.
-        """
-        T_first = sequence.T_world_camera[0]
-        has_pose = bool(np.isfinite(T_first).all())
-        is_known = has_pose and self.start == "given"
-        start = _Start(T_first if is_known else np.eye(4), is_known)
-        # Only given maps are checked: one made here is of the right room, but another path in the
-        # room may begin where it does not reach.
-        if not (has_pose and isinstance(self.needs, GivenMap)):
-            return start
-        try:
-            return replace(start, warning=check_belongs(finished, sequence[0]))
-        except DataError:
-            if is_known:
-                raise
-            return replace(start, is_in_other_world=True)
-
-    def _track(
-        self, finished: Map, sequence: RgbdSequence, start: _Start, report: Report
-    ) -> tuple[Trajectory, str]:
-        """The trajectory, and the name of the device that it was tracked on."""
+        warning = self._map_warning(finished, sequence[0])
 
         def tell(done: int, error_m: float) -> None:
             status = f"frame {done}" if np.isnan(error_m) else f"off by {100 * error_m:.1f} cm"
             report(done / len(sequence), status)
 
+        T_first = sequence.T_world_camera[0]
+        is_known = self._starts_at(T_first)
+        T_start = T_first if is_known else np.eye(4)
         budget = make_budget(self.steps, self.rate_hz)
         tracker = make_tracker(
-            self.tracker, finished.field, start.T_world_camera, budget, self.settings, self.seed
+            self.tracker, finished.field, T_start, budget, self.settings, self.seed
         )
-        tracked = track_sequence(tracker, sequence, self.folder / RUN_FILE, tell, start.is_known)
-        return tracked, device_name(tracker.device)  # LM and ICP run on the host
+        tracked = track_sequence(tracker, sequence, self.folder / RUN_FILE, tell, is_known)
+        notes = self._notes(finished, sequence, tracked, warning)
+        notes["device"] = device_name(tracker.device)  # LM and ICP run on the host
+        if warning == _OTHER_WORLD:
+            tracked, is_explained = in_world_of_map(tracked)
+            notes["map_warning"] = warning if is_explained else None
+        metrics = scores_of(tracked) | self._provenance(finished) | notes
+        write_run(self.folder, replace(tracked, metrics=metrics))
+        (self.folder / RUN_FILE).unlink(missing_ok=True)
+        return metrics
+
+    def _starts_at(self, T_first: Pose) -> bool:
+        """Whether the run starts at the first frame's pose, else the camera is found first."""
+        return self.start == "given" and bool(np.isfinite(T_first).all())
+
+    def _map_warning(self, finished: Map, first: Frame) -> str | None:
+        """Where it cannot be told whether a given map fits the first frame, a warning.
+
+        If the map does not fit at the recording's pose, and the run would start there, it is a
+        DataError. Where the run does not use that pose, it is the warning `_OTHER_WORLD`.
+        """
+        # Only given maps are checked: one made here is of the right room, but another path in the
+        # room may begin where it does not reach.
+        if not isinstance(self.needs, GivenMap) or first.T_world_camera is None:
+            return None
+        try:
+            return check_belongs(finished, first)
+        except DataError:
+            if self.start == "given":
+                raise
+            return _OTHER_WORLD
 
     def _notes(
-        self, finished: Map, sequence: RgbdSequence, start: _Start, tracked: Trajectory
+        self, finished: Map, sequence: RgbdSequence, tracked: Trajectory, warning: str | None
     ) -> dict[str, Any]:
-        """What is to be said of a run beside its errors."""
-        T_true = sequence.T_world_camera
-        metres_per_unit = finished.field.bounds.metres_per_unit
-        notes = {"metres_per_unit": metres_per_unit, "map_warning": start.warning}
-        notes["start"] = "given" if start.is_known else "unknown"
+        """What is to be said of a run beside its errors; `warning` is of `_map_warning`."""
+        T_true, T_estimated = sequence.T_world_camera, tracked.T_estimated
+        unit_m = finished.field.bounds.metres_per_unit
+        n_given = len(sequence) - len(tracked.frames)  # a first frame whose pose is given: 1, or 0
+        notes = {"metres_per_unit": unit_m, "map_warning": warning}
+        notes["start"] = "given" if n_given else "unknown"
         if isinstance(self.needs, GivenMap):
-            n_given = len(sequence) - len(tracked.frames)  # a first frame is not tracked
             followed = sequence.select(slice(n_given, None))
-            if start.is_in_other_world:
-                followed = replace(followed, T_world_camera=tracked.T_estimated)
-            field, T_estimated = finished.field, tracked.T_estimated
-            notes["outside_map_share"] = outside_map_share(field, followed, T_estimated)
-            notes["map_misfit"] = map_misfit(field, followed, T_estimated)
-        reach = self._reach(tracked.frames["steps"].mean(), metres_per_unit, T_true)
+            if warning == _OTHER_WORLD:
+                followed = replace(followed, T_world_camera=T_estimated)
+            notes["outside_map_share"] = outside_map_share(finished.field, followed, T_estimated)
+            notes["map_misfit"] = map_misfit(finished.field, followed, T_estimated)
+        reach = self._reach(tracked.frames["steps"].mean(), unit_m, T_true)
         return notes | still_metrics(T_true) | reach
 
     def _provenance(self, finished: Map) -> dict[str, Any]:
