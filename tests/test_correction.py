@@ -100,8 +100,8 @@ def test_the_solution_is_that_of_dense_least_squares() -> None:
     corners = np.array([*np.ndindex(2, 2, 2)])
     cells = np.vstack([rng.integers(0, [4, 3, 5], size=(40, 3)), [[0, 0, 0], [3, 2, 4]]])
     vertices = np.ravel_multi_index((cells[:, None] + corners).transpose(2, 0, 1), shape)
-    numbers, matrix = corrected_vertices(vertices, rng.random((42, 8)), shape)
-    springs, dense = regularisation_of(numbers, shape), matrix.toarray()
+    is_corrected, matrix = corrected_vertices(vertices, rng.random((42, 8)), shape)
+    (numbers, springs), dense = regularisation_of(is_corrected), matrix.toarray()
     np.testing.assert_allclose(springs.toarray(), springs.toarray().T)
     wanted, reliability = rng.normal(size=(42, 2)), rng.random(42)
     expected = np.zeros((len(numbers), 2))
@@ -117,7 +117,9 @@ def test_the_solution_is_that_of_dense_least_squares() -> None:
 
 def test_regularisation_by_hand() -> None:
     """Catches springs across edges and corners of cells: two vertices of a row, one of another."""
-    springs = regularisation_of(np.array([0, 1, 7]), (2, 2, 2))
+    is_corrected = np.zeros((2, 2, 2), bool)
+    is_corrected.flat[[0, 1, 7]] = True
+    _, springs = regularisation_of(is_corrected)
     expected = [[0.7, -0.1, 0.0], [-0.1, 0.7, 0.0], [0.0, 0.0, 0.7]]
     np.testing.assert_allclose(springs.toarray(), expected)
 

@@ -132,8 +132,8 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     n_points = len(seen.points_world)
     asked_world = np.concatenate([seen.points_world + s * seen.normals_world for s in _OFFSETS])
     vertices, weights = interpolation(asked_world, grid)
-    numbers, matrix = corrected_vertices(vertices, weights, grid.n_vertices)
-    regularisation = regularisation_of(numbers, grid.n_vertices)
+    is_corrected, matrix = corrected_vertices(vertices, weights, grid.n_vertices)
+    numbers, regularisation = regularisation_of(is_corrected)
     uncorrected = grid.volume[:4].T.double().numpy()[numbers]
     color_before, distance_before = uncorrected[:, :3], uncorrected[:, 3:]
     reliability = (seen.depth.mean() / seen.depth) ** 2

@@ -5,10 +5,11 @@ sparse matrix.
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation
-from scipy.sparse import coo_array, csr_array, dia_array, eye_array
+from scipy.sparse import csr_array, dia_array, eye_array
 from scipy.sparse.linalg import LinearOperator, cg
+from skimage.graph import pixel_graph
 
 from nbtrack.beyond.grid import BakedField
 from nbtrack.core.arrays import WorldPoints
@@ -21,6 +22,7 @@ _FADE = 1  # vertices beyond those that points touch, over which corrections fad
 Columns = Float[np.ndarray, "rows columns"]
 Vertices = Int[np.ndarray, "points 8"]
 Corners = Float[np.ndarray, "points 8"]
+Mask = Bool[np.ndarray, "x y z"]
 _CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T  # of a cell, 8 x 3: z is fastest
 
 
@@ -39,38 +41,30 @@ def interpolation(points_world: WorldPoints, grid: BakedField) -> tuple[Vertices
 
 def corrected_vertices(
     vertices: Vertices, weights: Corners, shape: tuple[int, ...]
-) -> tuple[Int[np.ndarray, "n"], csr_array]:
-    """Numbers of the vertices to correct, those near points; and the interpolation from them.
+) -> tuple[Mask, csr_array]:
+    """Which of a grid's vertices to correct, those near points; and the interpolation from them.
 
     The latter is a matrix A (points x n): A x is at the points what x is at these vertices.
     """
     is_touched = np.zeros(shape, dtype=bool)
     is_touched.flat[vertices] = True
-    numbers = np.flatnonzero(binary_dilation(is_touched, iterations=_FADE))
-    column_of = np.empty(is_touched.size, dtype=np.int32)
-    column_of[numbers] = np.arange(len(numbers), dtype=np.int32)
+    is_corrected = binary_dilation(is_touched, iterations=_FADE)
+    column_of = is_corrected.cumsum() - 1
     # Every row has eight entries: weights, columns, and where rows begin.
     entries = (weights.ravel(), column_of[vertices].ravel(), np.arange(0, weights.size + 1, 8))
-    return numbers, csr_array(entries, shape=(len(weights), len(numbers)))
+    return is_corrected, csr_array(entries, shape=(len(weights), column_of[-1] + 1))
 
 
-def regularisation_of(numbers: Int[np.ndarray, "n"], shape: tuple[int, ...]) -> csr_array:
-    """The regularisation of corrections as a matrix R: x' R x is its cost of corrections x.
+def regularisation_of(is_corrected: Mask) -> tuple[Int[np.ndarray, "n"], csr_array]:
+    """Numbers of the vertices to correct, and the regularisation of corrections as a matrix R.
 
-    It has springs between the six neighbours, of `_SMOOTHNESS`, and to zero, of `_PULL`. Neighbours
-    that are not corrected stand at zero, so that corrections fade out.
+    x' R x is its cost of corrections x. It has springs between the six neighbours, of
+    `_SMOOTHNESS`, and to zero, of `_PULL`. Neighbours that are not corrected stand at zero, so that
+    corrections fade out.
     """
-    column_of = np.full(shape, -1)
-    column_of.flat[numbers] = np.arange(len(numbers))
-    springs = csr_array((len(numbers), len(numbers)))  # 1 from each vertex to the next one
-    for axis in range(3):
-        first = np.delete(column_of, -1, axis).ravel()
-        second = np.delete(column_of, 0, axis).ravel()
-        joins = (first >= 0) & (second >= 0)
-        entries = (np.ones(joins.sum()), (first[joins], second[joins]))
-        springs += coo_array(entries, shape=springs.shape)
+    springs, numbers = pixel_graph(is_corrected, connectivity=1)  # 1 between neighbours
     own = eye_array(len(numbers)) * (_PULL + 6 * _SMOOTHNESS)
-    return (own - _SMOOTHNESS * (springs + springs.T)).tocsr()
+    return numbers, (own - _SMOOTHNESS * springs).tocsr()
 
 
 def solve(
