@@ -13,13 +13,10 @@ from nbtrack.core.arrays import Pose, Transform
 from nbtrack.core.camera import pixel_directions
 from nbtrack.core.geometry import transform_points
 from nbtrack.data.frame import Frame
-from nbtrack.data.pixels import Rays
 from nbtrack.fields import Field, LearnedField
-from nbtrack.fields.base import rendered_losses
 from nbtrack.plots.meshes import query_field
 from nbtrack.plots.style import DASHED, method_colors, new_axes, styled
-from nbtrack.tracking.paper import SdfSettings, VrSettings, sdf_loss
-from nbtrack.tracking.tracker import Tracker
+from nbtrack.tracking import SdfTracker, StepBudget, Tracker, VrTracker
 
 _SDF_LOSS, _VR_LOSS, _DENSITY = "SDF's loss (no unit)", "VR's loss (no unit)", "mean density (1/m)"
 _OFFSETS_CM = np.arange(-20, 21, 2)
@@ -40,26 +37,23 @@ def pose_losses(
 ) -> pd.DataFrame:
     """Losses of the same pixels, with the camera moved along its x (index, cm) and turned about y.
 
-    SDF's loss is Eq. 2 in the map `distance`, VR's is iMAP's in the map `density`, with default
+    SDF's loss is that of its tracker in the map `distance`, VR's in the map `density`, with default
     settings and nothing random. The third column is the mean density at the observed points.
     """
     measured = frame.measured_pixels()
     rows, columns = measured[:, :: 1 + measured.shape[1] // _N_PIXELS]  # the same for all poses
     directions_camera = pixel_directions(frame.camera, columns, rows)
     color, depth = frame.at(rows, columns)
-    vr, eq_2 = VrSettings(), SdfSettings()
+    points_camera = directions_camera * depth[:, None]
+    own = frame.T_world_camera, StepBudget(1)
+    sdf, vr = SdfTracker(distance, *own), VrTracker(density, *own)
+    vr.generator = None  # without it samples along rays lie in fixed places
     losses = []
     for x_cm in _OFFSETS_CM:
         T_world_camera = move_sideways(frame, x_cm, y_deg)
-        points_world = transform_points(T_world_camera, directions_camera * depth[:, None])
-        field_color, sdf = distance(points_world)
-        directions = directions_camera @ T_world_camera[:3, :3].T
-        rays = Rays(T_world_camera[:3, 3].expand_as(directions), directions, color, depth)
-        rendered = density.render_hierarchically(rays, vr.n_stratified, vr.n_importance)
-        terms = rendered_losses(rendered, rays, vr.lambda_color, vr.lambda_depth, over_std=True)
-        of_sdf = sdf_loss(sdf, field_color, color, eq_2.lambda_sdf, eq_2.lambda_color)
-        _, densities = density(points_world)
-        losses.append([of_sdf.item(), sum(terms.values()).item(), densities.mean().item()])
+        seen = T_world_camera, directions_camera, color, depth
+        _, densities = density(transform_points(T_world_camera, points_camera))
+        losses.append([x.item() for x in (sdf.loss(*seen), vr.loss(*seen), densities.mean())])
     return pd.DataFrame(losses, pd.Index(_OFFSETS_CM, name="x_cm"), [_SDF_LOSS, _VR_LOSS, _DENSITY])
 
 
