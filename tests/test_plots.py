@@ -83,8 +83,7 @@ FIGURES = {
     "network": lambda s: plot_network(IMAP_FIELD.mlp, "density (1/m)", "eight wide"),
     "frame": lambda s: plots.plot_frame(s, 3, "one"),
     "views": lambda s: plots.plot_views(s, [0, 3], [(s.color(0), s.depth(0) + 0.02)] * 2, "x"),
-    "ray": lambda s: plots.plot_along_ray(AT, {"a (1/m)": RAY, "b (m)": RAY[:-1]}, 1.2, "end"),
-    "one": lambda s: plots.plot_along_ray(AT, {"true": RAY, "b": RAY[:-1]}, 1.2, "end", "d (m)"),
+    "ray": lambda s: plots.plot_along_ray(AT, {"true": RAY, "b": RAY[:-1]}, 1.2, "end", "d (m)"),
     "columns": lambda s: plots.plot_columns([COLUMNS, 2 * COLUMNS], "rise"),
     "slice": lambda s: plots.plot_slice(SPHERE, s, 0.0, title="round"),
     "density": lambda s: plots.plot_slice(FOG, s, 0.0, title="round"),
@@ -133,9 +132,12 @@ def test_every_axis_has_a_unit_and_nothing_leaks(name: str, sequence) -> None:
 
 def test_curves_along_a_ray_share_their_depths() -> None:
     """Catches values beside another sample's depth, where a section has none."""
-    for axes, n in zip(FIGURES["ray"](None).axes, (20, 19), strict=True):
-        assert axes.lines[0].get_xdata() == pytest.approx(np.linspace(0, 2, 20)[:n], abs=1e-6)
-        assert list(axes.lines[1].get_xdata()) == [1.2, 1.2]
+    *curves, measured = FIGURES["ray"](None).axes[0].lines
+    for line, n in zip(curves, (20, 19), strict=True):
+        assert line.get_xdata() == pytest.approx(np.linspace(0, 2, 20), abs=1e-6)
+        values = np.ma.compressed(line.get_ydata()).astype(float)
+        assert values == pytest.approx(np.linspace(1, -1, 20)[:n], abs=1e-6)
+    assert list(measured.get_xdata()) == [1.2, 1.2]
 
 
 def test_panels_share_their_rows() -> None:

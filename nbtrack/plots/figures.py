@@ -122,26 +122,20 @@ def show_image(axes: Axes, image: np.ndarray, title: str, colors: str = "viridis
 
 @style.styled
 def plot_along_ray(
-    depths: Values, curves: Curves, measured_depth: float, title: str = "", together: str = ""
+    depths: Values, curves: Curves, measured_depth: float, title: str, ylabel: str
 ) -> Figure:
-    """Curves below each other over the z-depths (m) of a ray's samples; labels have their units.
+    """Curves of one unit over the z-depths (m) of a ray's samples, every second dashed.
 
-    With a label of y, such as "weight", as `together` they share one panel, every second dashed. A
-    curve may be shorter than `depths`: weights of sections lack the last sample.
+    A curve may be shorter than `depths`: weights of sections lack the last sample.
     """
     index = depths.cpu().numpy()
     columns = {k: pd.Series(c.detach().cpu(), index[: len(c)]) for k, c in curves.items()}
-    table = pd.DataFrame(columns).rename_axis("depth (m)")
-    if together:
-        figure = style.new_axes(title, 2.7)[0, 0].figure
-        table.plot(ax=figure.axes[0], style=["-", "--"] * len(curves), ylabel=together,
-                   color=style.method_colors(table))  # fmt: skip
-    else:
-        figure = plot_columns([table], title)
-    for axes in figure.axes:
-        axes.axvline(measured_depth, label="measured depth", **style.DASHED)
-    figure.axes[0].legend()
-    return figure
+    axes = style.new_axes(title, 2.7)[0, 0]
+    look = {"style": ["-", "--"] * len(curves), "color": style.method_colors(columns)}
+    pd.DataFrame(columns).plot(ax=axes, xlabel="depth (m)", ylabel=ylabel, **look)
+    axes.axvline(measured_depth, label="measured depth", **style.DASHED)
+    axes.legend()
+    return axes.figure
 
 
 @style.styled
