@@ -1,7 +1,7 @@
 """What a camera saw beside what a field renders; numbers as curves and bars."""
 
 from collections.abc import Mapping, Sequence
-from itertools import chain
+from itertools import chain, cycle
 
 import matplotlib
 import numpy as np
@@ -25,7 +25,6 @@ _MARKS = "os^Dv"  # matplotlib's markers of up to five methods
 # A title, an image (colours or numbers), and the label of the numbers' colour bar; "" for colours.
 Panel = tuple[str, np.ndarray, str]
 Curves = Mapping[str, Values]  # numbers by label
-Keys = str | list[str]  # columns whose values make groups of rows
 
 
 @style.styled
@@ -220,66 +219,42 @@ def plot_panels(
 
 @style.styled
 def plot_curves(
-    table: pd.DataFrame, x: str, y: str, by: Keys, title: str = "", log: str = "xy", line: str = ""
+    table: pd.DataFrame, x: str, y: str, by: str, title: str = "", log: str = "xy", line: str = "-"
 ) -> Figure:
-    """Column `y` over column `x`, a line for each group of rows with the same values of `by`.
+    """Column `y` over column `x`, a line for each group of rows with the same value of `by`.
 
     Groups of one row are points beside their labels. Axes are labelled by the names of the columns,
     as "time a frame (ms)". If x is text, it keeps the order of its first appearance, and points of
-    the groups stand side by side, without lines. The first column of `by` chooses the colour, a
-    method's own, the last the mark; dashes tell groups of one colour apart. Columns `from` and `to`
-    are drawn as intervals of y, the mean of a column `standing still` as a dotted line. `log` names
-    the logarithmic axes; `line` is matplotlib's style of all lines, and "none" leaves points.
+    the groups stand side by side, without lines. A method has its own colour; marks tell groups
+    apart, too. Columns `from` and `to` are drawn as intervals of y. `log` names the logarithmic
+    axes; `line` is matplotlib's style of all lines, and "none" leaves points.
     """
     axes = style.new_axes(title, 3.6)[0, 0]
-    groups = table[[by] if isinstance(by, str) else by]
-    labels = groups.agg(", ".join, axis=1)
     is_text = not pd.api.types.is_numeric_dtype(table[x])
-    looks = _looks(groups.set_axis(labels), "none" if is_text else line)
-    places = _side_by_side(axes, table[x], labels) if is_text else table[x]
-    for label, rows in table.assign(**{x: places}).groupby(labels, sort=False):
-        look = looks.loc[label]
-        axes.plot(rows[x], rows[y], label=label, **look)
+    places = _side_by_side(axes, table[x], table[by]) if is_text else table[x]
+    colors = style.method_colors(table[by])
+    look = {"linestyle": "none" if is_text else line}
+    groups = table.assign(**{x: places}).groupby(by, sort=False)
+    for (label, rows), mark in zip(groups, cycle(_MARKS), strict=False):
+        axes.plot(rows[x], rows[y], mark, color=colors[label], label=label, **look)
         if "from" in table:
-            axes.vlines(rows[x], rows["from"], rows["to"], look["color"], linewidth=0.8)
-    if STANDING_STILL in table:
-        axes.axhline(table[STANDING_STILL].mean(), label=STANDING_STILL, **style.DOTTED)
+            axes.vlines(rows[x], rows["from"], rows["to"], colors[label], linewidth=0.8)
     axes.set(xlabel=x, ylabel=y)
     style.log_axes(axes, log.replace("x", "") if is_text else log)
-    are_labelled_points = labels.is_unique and len(labels) > 1 and not is_text
-    if not are_labelled_points:
-        axes.figure.legend(loc="outside right center")
+    if table[by].is_unique and not is_text:
+        style.label_points(axes, table[x], table[y], colors)
     else:
-        style.label_points(axes, table[x], table[y], looks["color"].to_dict())
-        if STANDING_STILL in table:
-            axes.legend(handles=axes.lines[-1:])
+        axes.figure.legend(loc="outside right center")
     return axes.figure
 
 
-def _looks(groups: pd.DataFrame, line: str) -> pd.DataFrame:
-    """How `plot_curves` draws each group; the index has the labels of groups.
-
-    The first column chooses the colour, the last the mark. Without a given style of `line`, dashes
-    count the earlier groups of the same colour.
-    """
-    groups = groups[~groups.index.duplicated()]
-    first, last = groups.iloc[:, 0], groups.iloc[:, -1]
-    looks = first.map(style.method_colors(first)).to_frame("color")
-    looks["marker"] = [_MARKS[number % len(_MARKS)] for number in pd.factorize(last)[0]]
-    n_earlier = looks.groupby("color").cumcount()
-    looks["linestyle"] = line or [("-", "--", ":")[number % 3] for number in n_earlier]
-    return looks
-
-
 def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray:
-    """Make texts the ticks of x, turned if they are long; returns where each point lies on x.
+    """Make texts the ticks of x; returns where each point lies on x.
 
     Points of a text are shifted by the group that their label names: groups share half the distance
     of two ticks, and fewer than four stand as close as four.
     """
     codes, ticks = pd.factorize(texts)
-    letters = sum(max(map(len, tick.split("\n"))) for tick in ticks)
-    turned = {"rotation": 20, "ha": "right"} if letters > 90 else {}
-    axes.set_xticks(range(len(ticks)), ticks, **turned)
+    axes.set_xticks(range(len(ticks)), ticks)
     groups, names = pd.factorize(labels)
     return codes + (groups - (len(names) - 1) / 2) * 0.5 / max(len(names), 4)
