@@ -88,7 +88,7 @@ FIGURES = {
     "slice": lambda s: plots.plot_slice(SPHERE, s, 0.0, title="round"),
     "density": lambda s: plots.plot_slice(FOG, s, 0.0, title="round"),
     "distances": lambda s: plots.plot_distances(s[0], {"start": FAR, "end": FAR / 2}, "closer"),
-    "mesh": lambda s: plots.plot_mesh(room_mesh(), {"SDF": s.T_world_camera}, "room"),
+    "mesh": lambda s: plots.plot_mesh({"NeuS": room_mesh()}, {"SDF": s.T_world_camera}, "room"),
     "figure 1": lambda s: plots.plot_map_and_slice(
         NEAR, s, {"true": s.T_world_camera}, "round", voxel=0.1
     ),
@@ -265,10 +265,12 @@ def test_one_looks_into_the_doll_house(inverted, sequence) -> None:
     if inverted:
         mesh.invert()
     paths = {"true": sequence.T_world_camera}
-    assert len(plots.plot_mesh(mesh, paths).axes) == 1  # nothing is compared
-    room, enlarged = plots.plot_mesh(mesh, paths | {"SDF": sequence.T_world_camera}).axes
-    assert np.ptp(enlarged.get_xlim()) < 0.2 < np.ptp(room.get_xlim())  # the path is 5 cm long
+    low = trimesh.creation.box((4.0, 2.0, 0.1))  # alone it would show most from another side
+    low.visual.vertex_colors = mesh.visual.vertex_colors
+    room, other = plots.plot_mesh({"high": mesh, "low": low}, paths).axes
     assert len(room.collections[0].get_paths()) == 6  # triangles of the floor and two far walls
+    in_room, in_other = (axes.lines[0].get_xydata() for axes in (room, other))
+    assert in_room == pytest.approx(in_other)  # both are seen from one place
     screen = screen_axes(np.array([0, 0, -1]), 35.0)
     assert screen @ screen.T == pytest.approx(np.eye(3), abs=1e-12)
     assert np.linalg.det(screen) == pytest.approx(1)
@@ -281,11 +283,13 @@ def test_the_slice_stands_beside_the_room_in_its_projection(sequence, tmp_path) 
     paths = {"true": sequence.T_world_camera, "tracked": sequence.T_world_camera + 0.0}
     figure = plots.plot_map_and_slice(NEAR, sequence, paths, voxel=0.1)
     lines = [line.get_xydata() for line in figure.axes[0].lines if line.get_label() == "true"]
-    in_room, in_slice = lines
+    in_room, in_slice, larger = lines
     assert np.ptp(in_slice - in_room, axis=0) == pytest.approx([0, 0], abs=1e-9)
+    assert np.ptp(larger, axis=0).max() > 5 * np.ptp(in_room, axis=0).max()
     mesh, colors = figure.axes[0].collections[:2]
     corners = np.concatenate([path.vertices for path in mesh.get_paths()])
     assert colors.get_coordinates()[..., 0].min() > corners[:, 0].max()
+    assert larger[:, 0].min() > colors.get_coordinates()[..., 0].max()
     figure.savefig(tmp_path / "figure_1.pdf")
     assert (tmp_path / "figure_1.pdf").read_bytes().startswith(b"%PDF")
 

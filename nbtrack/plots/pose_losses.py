@@ -69,9 +69,10 @@ def plot_pose_losses(
     """
     straight = pose_losses(density, distance, frame)
     turned = pose_losses(density, distance, frame, y_deg)
-    best_cm = turned.idxmin()
-    title = f"Turned by {y_deg:g}°: SDF's loss is lowest at {best_cm[_SDF_LOSS]} cm along x, "
-    *panels, view = new_axes(f"{title}VR's at {best_cm[_VR_LOSS]} cm", 2.9, 1, 3)[0]
+    sdf_cm, vr_cm, _ = turned.idxmin()
+    title = f"Turned by {y_deg:g}°, SDF's loss is lowest at {sdf_cm} cm, VR's at {vr_cm} cm"
+    title += ": a turn is traded for a shift" if sdf_cm and vr_cm else ""
+    *panels, view = new_axes(title.replace("-", "−"), 2.9, 1, 3)[0]
     T_world_camera = move_sideways(frame, x_cm, y_deg).double().numpy()
     rendered_color, _ = density.render_view(frame.camera, T_world_camera)
     view.imshow(rendered_color)

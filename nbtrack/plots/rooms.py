@@ -1,6 +1,6 @@
 """Figures of rooms: a slice, a mesh, the paper's Figure 1, and an overview of a run."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -106,28 +106,20 @@ def _level_grid(
 
 
 @styled
-def plot_mesh(mesh: trimesh.Trimesh, T_paths: Paths, title: str = "") -> Figure:
-    """A vertex-coloured mesh of a room from outside, without the near walls and the ceiling.
+def plot_mesh(meshes: Mapping[str, trimesh.Trimesh], T_paths: Paths, title: str = "") -> Figure:
+    """Vertex-coloured meshes of a room by label, without the near walls and the ceiling.
 
-    Every face that shows its back is left out, and one looks from where most surface shows. The
-    projection is parallel; lengths across the picture are true (m). The camera-to-world poses by
-    label are drawn on top; "true" is green, "tracked" red. Several paths are drawn once more,
-    larger, beside the room.
+    One looks from outside, from where most of the first mesh shows its front; faces that show their
+    back are left out. The projection is parallel; lengths across the picture are true (m). The
+    camera-to-world poses by label are drawn on top; "true" is green, "tracked" red.
     """
-    widths = [2, 1] if len(T_paths) > 1 else [1]
-    room, *enlarged = new_axes(title, 5.0, 1, len(widths), width_ratios=widths)[0]
-    to_screen = scene.draw_mesh(room, mesh, scene.up_of(*T_paths.values()))
-    scene.draw_paths(room, T_paths, to_screen[:2])
-    for axes in enlarged:
-        _draw_enlarged(axes, T_paths, to_screen[:2])
-    return room.figure.legend_below()
-
-
-def _draw_enlarged(axes: Axes, T_paths: Paths, to_page: np.ndarray) -> None:
-    """Only the paths of a room, in the same projection, so that they fill their panel."""
-    scene.draw_paths(axes, T_paths, to_page)
-    scene.look_through(axes)
-    axes.set_title("The path, larger")
+    panels = new_axes(title, 5.0 - 0.4 * len(meshes), 1, len(meshes), sharex=True, sharey=True)[0]
+    to_screen = None  # the first mesh's view, for all
+    for axes, (label, mesh) in zip(panels, meshes.items(), strict=True):
+        to_screen = scene.draw_mesh(axes, mesh, scene.up_of(*T_paths.values()), to_screen)
+        scene.draw_paths(axes, T_paths, to_screen[:2])
+        axes.set_title(label)
+    return panels[0].figure.legend_below()
 
 
 @styled
@@ -136,37 +128,48 @@ def plot_map_and_slice(
 ) -> Figure:
     """A map as in the paper's Figure 1: its surface, a slice through its signed distance, paths.
 
-    The surface is drawn as `plot_mesh` draws it, from a grid of `voxel` metres. The slice lies at
-    the cameras' mean height and is drawn beside the room, in the same projection. What no frame of
-    `sequence` has seen is grey. The camera-to-world poses (m) by label are drawn in both, and
-    larger beside them.
+    The surface is drawn as `plot_mesh` draws it, from a grid of `voxel` metres. Beside it stand, in
+    the same projection, the slice at the cameras' mean height, grey where no frame of `sequence`
+    has seen it, and larger the paths alone, camera-to-world poses (m) by label.
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
-    axes, enlarged = new_axes(title, 4.6, 1, 2, width_ratios=[5, 1])[0]
-    to_screen = scene.draw_mesh(axes, mesh, up)
-    height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
-    # The slice is drawn aside: to the right in the picture by 1.04 widths of the room and a cell,
-    # and from the cameras' height down to the mean height of the mesh.
-    right = to_screen[0]
-    aside = (1.04 * np.ptp(mesh.vertices @ right) + voxel) * right
-    aside -= (height - (mesh.vertices @ up).mean()) * up
-    page = np.eye(3)[up == 0]  # the two level axes of the world
-    points, _ = _level_grid(page, *mesh.bounds @ page.T, voxel, height * up)
-    places = (points + aside) @ to_screen[:2].T
-    bar = {"location": "bottom", "shrink": 0.4, "aspect": 30, "pad": 0.0}
-    scene.draw_slice(axes, field, points, places, seen_by(points, sequence), **bar)
-    parts = {"Mesh: the zero level": mesh.vertices @ to_screen[:2].T}
-    parts["Slice at the cameras' height; grey: never seen"] = places.reshape(-1, 2)
-    for name, on_page in parts.items():
-        x, y = on_page.T
-        axes.text((x.min() + x.max()) / 2, y.max() + 2 * voxel, name, ha="center")
-    scene.draw_paths(axes, T_paths, to_screen[:2], 0.7)
-    axes.figure.legend_below()  # now, while each path is drawn once: the slice repeats them
-    scene.draw_paths(axes, T_paths, to_screen[:2], 0.7, aside)
+    axes = new_axes(title, 4.2)[0, 0]
+    to_page = scene.draw_mesh(axes, mesh, up)[:2]
     axes.set_axis_off()
-    _draw_enlarged(enlarged, T_paths, to_screen[:2])
+    level = np.eye(3)[up == 0]  # the two level axes of the world
+    height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
+    points, _ = _level_grid(level, *mesh.bounds @ level.T, voxel, height * up)
+    paths = np.concatenate([path[:, :3, 3] for path in T_paths.values()])
+    parts = {"Mesh: the zero level": mesh.vertices}
+    parts |= {"Slice at the cameras' height; grey: never seen": points, "The path, larger": paths}
+    on_page = mesh.vertices @ to_page.T
+    corner, size = on_page.min(axis=0), np.ptp(on_page, axis=0)
+    gap, top = 0.12 * size[0], corner[1] + 1.08 * size[1]  # top: of all headings
+    for name, part in parts.items():
+        on_page = (part @ to_page.T).reshape(-1, 2)
+        low, extent = on_page.min(axis=0), np.ptp(on_page, axis=0).clip(1e-3)
+        zoom = (size / extent).min() if part is paths else 1.0  # to the height of the mesh
+        aside = to_page.T @ (corner / zoom - low)  # m, world frame
+        if part is points:
+            places = (points + aside) @ to_page.T
+            bar = {"location": "bottom", "shrink": 0.35, "aspect": 30, "pad": 0.02}
+            scene.draw_slice(axes, field, points, places, seen_by(points, sequence), **bar)
+        scene.draw_paths(axes, T_paths, zoom * to_page, 0.7, aside)
+        if not axes.figure.legends:  # of the first part, while each path is drawn once
+            axes.figure.legend_below()
+        middle = corner[0] + zoom * extent[0] / 2
+        axes.text(middle, top, name, ha="center")
+        _draw_scale(axes, middle, corner[1] - 0.5 * gap, gap, zoom, extent.max())
+        corner = corner + np.array([zoom * extent[0] + gap, 0])
     return axes.figure
+
+
+def _draw_scale(axes: Axes, x: float, y: float, gap: float, zoom: float, extent: float) -> None:
+    """A bar of 1 m, or another power of ten below `extent` (m), in a drawing enlarged by `zoom`."""
+    length = 10.0 ** np.floor(np.log10(extent))
+    axes.plot(x + zoom * length * np.array([-0.5, 0.5]), [y, y], "k-", linewidth=2)
+    axes.text(x, y - 0.1 * gap, f"{length:g} m", ha="center", va="top")
 
 
 @styled

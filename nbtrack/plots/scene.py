@@ -63,21 +63,23 @@ def inward_side(mesh: trimesh.Trimesh) -> float:
     return np.sign((inwards * mesh.face_normals).sum(axis=1) @ mesh.area_faces)
 
 
-def draw_mesh(axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
+def draw_mesh(
+    axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray, to_screen: np.ndarray | None = None
+) -> np.ndarray:
     """Draw the faces of a room's mesh that show their front, shaded, the nearest on top.
 
     A face's front is its side towards free space, of walls the one inside the room.
 
-    Returns the `screen_axes` of the view, from where most surface shows its front. Lengths across
-    the picture are true (m).
+    Returns the `screen_axes` of the view: those given, else those from where most surface shows its
+    front. Lengths across the picture are true (m).
     """
     side = inward_side(mesh)
-    # None of the azimuths looks along the walls of a room aligned to the axes.
-    screens = np.stack([screen_axes(up, azimuth) for azimuth in np.arange(15.0, 360.0, 30.0)])
-    cosines = side * mesh.face_normals @ screens[:, 2].T  # of faces to viewers, (faces, azimuths)
-    best = (mesh.area_faces @ cosines.clip(0)).argmax()
-    to_screen = screens[best]
-    faces = mesh.faces[cosines[:, best] > 0]
+    if to_screen is None:
+        # None of the azimuths looks along the walls of a room aligned to the axes.
+        screens = np.stack([screen_axes(up, azimuth) for azimuth in np.arange(15.0, 360.0, 30.0)])
+        cosines = side * mesh.face_normals @ screens[:, 2].T  # to viewers, (faces, azimuths)
+        to_screen = screens[(mesh.area_faces @ cosines.clip(0)).argmax()]
+    faces = mesh.faces[side * mesh.face_normals @ to_screen[2] > 0]
     corners = (mesh.vertices @ to_screen.T)[faces]
     # Smoothed normals: those of single marching-cubes faces flicker.
     normals = side * mesh.vertex_normals[faces].mean(axis=1)
@@ -88,15 +90,11 @@ def draw_mesh(axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray) -> np.ndarray:
     order = corners[..., 2].mean(axis=1).argsort()  # from the farthest to the nearest
     look = {"edgecolors": "face", "linewidths": 0.4, "rasterized": True}
     axes.add_collection(PolyCollection(corners[order, :, :2], facecolors=colors[order], **look))
-    look_through(axes)
-    return to_screen
-
-
-def look_through(axes: Axes) -> None:
-    """Set up axes for a parallel projection: equal scales, and only lengths across have numbers."""
+    # Only lengths across have numbers: others are shortened.
     axes.set(aspect="equal", xlabel="left to right (m)", yticks=[])
     axes.spines["left"].set_visible(False)
     axes.grid(False)
+    return to_screen
 
 
 def draw_from_above(axes: Axes, T_paths: Paths) -> tuple[np.ndarray, np.ndarray]:
