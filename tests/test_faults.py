@@ -20,8 +20,8 @@ from nbtrack.core.files import save_checkpoint
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file but locks, which are empty."""
-    files = [p for p in folder.rglob("*") if p.is_file() and p.suffix != ".lock"]
+    """Every file but locks, which are empty, and what Python keeps of an imported file."""
+    files = [p for p in folder.rglob("*") if p.is_file() and p.suffix not in (".lock", ".pyc")]
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
