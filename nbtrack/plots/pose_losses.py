@@ -82,9 +82,10 @@ def plot_pose_losses(
     for axes, (name, color) in zip(panels, _COLORS.items(), strict=True):
         axes.plot(straight[name], color=color, alpha=0.4, label="not turned")
         axes.plot(turned[name], color=color, label=f"turned by {y_deg:g}°")
+        axes.plot(turned[name].idxmin(), turned[name].min(), "v", color="0.3", label="lowest")
         loss = np.interp(x_cm, turned.index, turned[name])
         slope = np.interp(x_cm, turned.index, np.gradient(turned[name], turned.index))
-        look = {"marker": "o", "markevery": [1], "label": "this pose and the gradient"}
+        look = {"marker": "o", "markevery": [1], "label": "this pose, its gradient"}
         axes.plot(x_cm + along, loss + slope * along, color="0.3", **look)
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)

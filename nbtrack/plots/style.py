@@ -116,10 +116,10 @@ def method_colors(labels: Iterable[str]) -> dict[str, str]:
     """One colour a label: that of its method, if it has one in all figures, else a free one.
 
     The method is what the label says before its first comma. Free are the colours of the palette
-    that no other label has, without the first two, those of the paper's methods.
+    that no other label has, without the first four, which stand for the paper's methods and for LM.
     """
     known = {label: _FIXED.get(label.split(",")[0]) for label in labels}
-    free = cycle([color for color in PALETTE[2:] if color not in known.values()])
+    free = cycle([color for color in PALETTE[4:] if color not in known.values()])
     return {label: next(free) if color is None else color for label, color in known.items()}
 
 
