@@ -21,8 +21,8 @@ PALETTE = "#3b6fb6", "#e08214", "#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d
 _FIXED = {
     **dict.fromkeys(["iMAP with VR", "iMAP", "VR"], PALETTE[0]),
     **dict.fromkeys(["NeuS with SDF", "NeuS", "SDF", "NeuS+ with SDF (Adam)"], PALETTE[1]),
-    **dict.fromkeys(["NeuS+ baked (LM)", "NeuS+"], PALETTE[2]),
-    **dict.fromkeys(["NeuS+ corrected (LM)", "NeuS+ corrected"], PALETTE[3]),
+    **dict.fromkeys(["NeuS+ baked (LM)", "NeuS+", "LM"], PALETTE[2]),
+    **dict.fromkeys(["NeuS+ corrected (LM)", "NeuS+ corrected", "LM, corrected map"], PALETTE[3]),
     "ICP": PALETTE[4],
     "NeuS+ grid": PALETTE[5],
     "five rooms of the paper": PALETTE[6],
@@ -115,10 +115,11 @@ def new_axes(title: str, height: float, rows: int = 1, columns: int = 1, **more:
 def method_colors(labels: Iterable[str]) -> dict[str, str]:
     """One colour a label: that of its method, if it has one in all figures, else a free one.
 
-    The method is what the label says before its first comma. Free are the colours of the palette
-    that no other label has, without the first four, which stand for the paper's methods and for LM.
+    The method is the label, or what it says before its first comma. Free are the colours of the
+    palette that no other label has, without the first four, which stand for the paper's methods and
+    for LM.
     """
-    known = {label: _FIXED.get(label.split(",")[0]) for label in labels}
+    known = {label: _FIXED.get(label, _FIXED.get(label.split(",")[0])) for label in labels}
     free = cycle([color for color in PALETTE[4:] if color not in known.values()])
     return {label: next(free) if color is None else color for label, color in known.items()}
 
