@@ -43,5 +43,5 @@ class IMapField(LearnedField):
         rays = draw(settings.n_rays)
         # Not guided by measured depths, since VR cannot be (docs/choices.md).
         n_first, n_second = settings.n_stratified, settings.n_surface
-        rendered = self.render(rays, self.hierarchical_depths(rays, n_first, n_second, generator))
+        rendered = self.render_hierarchically(rays, n_first, n_second, generator)
         return rendered_losses(rendered, rays, settings.lambda_color, lambda_depth=1, over_std=True)
