@@ -12,11 +12,11 @@ from torch import Tensor
 
 from nbtrack import Method, make_tracker, map_scene
 from nbtrack.beyond.lm_solver import retract
-from nbtrack.core.progress import ProgressBar
-from nbtrack.core.settings import with_settings
 from nbtrack.experiments.methods import find_methods
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
+from nbtrack.machinery.progress import ProgressBar
+from nbtrack.machinery.settings import with_settings
 from nbtrack.tracking import StepBudget
 
 OFFSETS = ((1, 1), (2, 2), (4, 4), (8, 6), (12, 9), (20, 15), (30, 20), (50, 30))

@@ -18,14 +18,14 @@ from basin import find_from_afar
 from motions import HAND_HELD
 
 from nbtrack import METHODS, Method, load_preset, make_tracker, open_scenes, track_scenes
-from nbtrack.core.device import choose_device, device_name
-from nbtrack.core.files import tables_folder
-from nbtrack.core.settings import with_settings
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_3
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
+from nbtrack.machinery.device import choose_device, device_name
+from nbtrack.machinery.files import tables_folder
+from nbtrack.machinery.settings import with_settings
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.tables import write_csv, write_table_3
 from nbtrack.tracking import StepBudget, track_sequence

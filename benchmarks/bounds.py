@@ -16,8 +16,8 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import lsq_linear
 
-from nbtrack.core.files import data_folder, tables_folder
 from nbtrack.data.dataset import DATASET_SCENES, DATASET_UNITS
+from nbtrack.machinery.files import data_folder, tables_folder
 from nbtrack.recordings.formats import Declaration
 from nbtrack.tables import published_table_1, write_csv
 from nbtrack.tracking import SdfSettings, paper_steps

@@ -20,14 +20,14 @@ import torch
 from motions import HAND_HELD
 
 from nbtrack import METHODS, load_preset, make_tracker, open_scene, open_scenes, read_run
-from nbtrack.core.device import choose_device, device_name
-from nbtrack.core.files import tables_folder
-from nbtrack.core.settings import with_settings
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.grid import Execution, map_scene, run_jobs, track_scenes
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.track_jobs import TrackJob
+from nbtrack.machinery.device import choose_device, device_name
+from nbtrack.machinery.files import tables_folder
+from nbtrack.machinery.settings import with_settings
 from nbtrack.tables import write_csv
 from nbtrack.tracking import StepBudget, Tracker
 

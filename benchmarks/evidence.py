@@ -24,14 +24,14 @@ from motions import HAND_HELD, SPEEDS
 from nine_rooms import SDF, VR, verdicts
 
 from nbtrack import METHODS, Method, load_preset, map_scene, open_scenes, track_scenes
-from nbtrack.core.device import choose_device, device_name
-from nbtrack.core.files import tables_folder
-from nbtrack.core.settings import with_settings
 from nbtrack.experiments.bench import camera_motion
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
+from nbtrack.machinery.device import choose_device, device_name
+from nbtrack.machinery.files import tables_folder
+from nbtrack.machinery.settings import with_settings
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.tables import write_csv, write_table_1
 

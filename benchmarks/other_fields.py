@@ -18,9 +18,9 @@ from evidence import Chunk, add_rows, track
 from motions import HAND_HELD
 
 from nbtrack import load_preset, map_scene, open_scenes
-from nbtrack.core.files import tables_folder
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.experiments.methods import METHODS
+from nbtrack.machinery.files import tables_folder
 from nbtrack.tables import write_csv
 
 ROWS = (

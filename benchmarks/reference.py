@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation
 from nbtrack import METHODS, load_preset, make_tracker, open_scenes, read_sequence
 from nbtrack.beyond.correction import correct_map
 from nbtrack.beyond.observed import draw_points
-from nbtrack.core.device import choose_device, device_name
-from nbtrack.core.files import tables_folder
-from nbtrack.core.settings import with_settings
+from nbtrack.machinery.device import choose_device, device_name
+from nbtrack.machinery.files import tables_folder
+from nbtrack.machinery.settings import with_settings
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.tables import write_csv
 from nbtrack.tracking import StepBudget, track_sequence

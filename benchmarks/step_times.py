@@ -22,9 +22,9 @@ import torch
 from nbtrack import TRACKERS, Tracker, make_tracker
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.device import choose_device, device_name, synchronize
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, field_class, make_field
+from nbtrack.machinery.device import choose_device, device_name, synchronize
 from nbtrack.mapping.fit import _Fit
 from nbtrack.tables import write_csv
 from nbtrack.tracking import StepBudget

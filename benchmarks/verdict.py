@@ -24,13 +24,13 @@ from nbtrack import METHODS, load_preset, make_tracker, map_scene, open_scene, o
 from nbtrack.beyond import LmSettings, verdict
 from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.verdict import WRONG_DEG, WRONG_M, features
-from nbtrack.core.settings import with_settings
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.jobs import run_jobs
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import Field
+from nbtrack.machinery.settings import with_settings
 from nbtrack.tracking import StepBudget, track_sequence
 from nbtrack.tracking.metrics import pose_errors
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 from nbtrack import __version__
-from nbtrack.core.errors import ConfigError, NbtrackError, nearest_name
+from nbtrack.machinery.errors import ConfigError, NbtrackError, nearest_name
 
 _MAX_COUNT = 2**31 - 1  # what every random generator takes
 _INTERRUPTED = 130  # what shells say of a command that ended by Ctrl-C

@@ -14,10 +14,13 @@ from pathlib import Path
 import torch
 
 import nbtrack
-from nbtrack.core.files import PACKAGE, fingerprint
+from nbtrack.machinery.files import PACKAGE, fingerprint
 
 # Folders whose code computes results.
-_FOLDERS = ("beyond", "core", "data", "experiments", "fields", "mapping", "recordings", "tracking")
+_FOLDERS = (
+    "beyond", "core", "data", "experiments", "fields", "machinery", "mapping", "recordings",
+    "tracking",
+)  # fmt: skip
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp")  # that compute results beside torch
 _LIBRARIES = ("nbtrack", "torch", "abc", "typing", "builtins")  # what own classes are built on
 _LIBRARY_FOLDERS = map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib"))

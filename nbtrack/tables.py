@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 from pandas.io.formats.style import Styler
 
-from nbtrack.core.errors import DataError, look_up
-from nbtrack.core.files import fingerprint, write_atomic
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.latex import OUR_WORDING, Wording, latex_file
+from nbtrack.machinery.errors import DataError, look_up
+from nbtrack.machinery.files import fingerprint, write_atomic
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 PAPER_PIXELS = {"VR": 512, "SDF": 4096}

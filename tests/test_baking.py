@@ -9,8 +9,8 @@ from torch import Tensor
 from nbtrack.beyond import grid
 from nbtrack.beyond.grid import BakedField
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.errors import ConfigError
 from nbtrack.fields import FIELDS
+from nbtrack.machinery.errors import ConfigError
 
 BOX = SceneBounds((-0.5, -0.25, 0.25), (0.55, 0.5, 1.0))  # x is no multiple of VOXEL
 VOXEL = 0.125  # exact in binary, as all corners' coordinates are

@@ -14,7 +14,7 @@ from recordings import N_FRAMES, WRITERS, write_recording
 from test_faults import assert_refused
 
 from nbtrack.cli import main
-from nbtrack.core.errors import NbtrackError
+from nbtrack.machinery.errors import NbtrackError
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.recording import open_recording
 

@@ -9,8 +9,8 @@ from box_room import sequence_of
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, backproject, pixel_directions, project
-from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import observed_bounds
+from nbtrack.machinery.errors import DataError
 
 CAMERA = Intrinsics(640, 480, 500.0, 510.0, 300.0, 250.0)
 UNIT = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))

@@ -18,11 +18,11 @@ from tiny import tiny_words
 
 import nbtrack
 from nbtrack.cli import main
-from nbtrack.core import files
-from nbtrack.core.errors import DataError
-from nbtrack.core.files import naming_damaged, runs_folder
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import open_scene
+from nbtrack.machinery import files
+from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.files import naming_damaged, runs_folder
 from nbtrack.mapping.files import read_map
 from nbtrack.recordings.recording import open_recording
 from nbtrack.tracking.trajectories import read_tum

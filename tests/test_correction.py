@@ -15,10 +15,10 @@ from nbtrack.beyond.correction import CorrectedField, correct_map, corrected
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.least_squares import corrected_vertices, regularisation_of, solve
 from nbtrack.beyond.views import retrieve, spread_out, view_of
-from nbtrack.core.errors import DataError
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, NeusMapping, make_field
+from nbtrack.machinery.errors import DataError
 from nbtrack.mapping.files import Map, read_map, write_map
 from nbtrack.tracking import StepBudget
 from nbtrack.tracking.tracker import Estimate

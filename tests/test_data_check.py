@@ -33,11 +33,11 @@ from nbtrack.checks import check as check_module
 from nbtrack.checks.check import DataReport, check_recording, quick_warning
 from nbtrack.checks.conventions import AXES, axes_name
 from nbtrack.cli import main
-from nbtrack.core.errors import DataError
-from nbtrack.core.settings import with_settings
 from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene
+from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.settings import with_settings
 from nbtrack.recordings.formats import WORLD_TO_CAMERA
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.recording import open_recording

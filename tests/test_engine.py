@@ -12,9 +12,9 @@ from box_room import walk
 from test_fields import points_inside
 
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.device import advise_on_memory, device_name, usable_cores
-from nbtrack.core.errors import OutOfMemory
 from nbtrack.fields import Field, NetworkSettings, make_field, mlp
+from nbtrack.machinery.device import advise_on_memory, device_name, usable_cores
+from nbtrack.machinery.errors import OutOfMemory
 from nbtrack.tracking import SdfSettings, StepBudget, make_tracker
 
 BOUNDS = SceneBounds((-2.0, -1.0, -1.0), (2.0, 1.0, 2.0))
@@ -79,7 +79,8 @@ def test_a_child_by_fork_computes() -> None:
     """Catches a child, such as a loader's or a server's, that waits for ever for threads that its
     parent has used and that it does not have."""
     code = (
-        "import os, signal, sys, torch; from nbtrack.core import device; torch.set_num_threads(2)\n"
+        "import os, signal, sys, torch; from nbtrack.machinery import device\n"
+        "torch.set_num_threads(2)\n"
         "work = lambda: torch.rand(1000, 1000).exp().sum()\n"
         "work()\n"
         "if child := os.fork(): sys.exit(os.waitpid(child, 0)[1] != 0)\n"

@@ -16,7 +16,7 @@ import pytest
 from finished import GIVEN, MAP, OWN
 
 from nbtrack.cli import main
-from nbtrack.core.files import save_checkpoint
+from nbtrack.machinery.files import save_checkpoint
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -31,8 +31,8 @@ from recordings import (
 
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import ConfigError, DataError, MissingError
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.machinery.errors import ConfigError, DataError, MissingError
 from nbtrack.recordings.formats import FORMATS
 from nbtrack.recordings.reading import parse_frames, read_frames, read_sequence, select_frames
 from nbtrack.recordings.recording import open_recording

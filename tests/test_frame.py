@@ -10,9 +10,9 @@ from box_room import BoxRoom, box_sequence, narrow_room, walk
 
 from nbtrack.beyond import LmSettings
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.machinery.errors import DataError
 from nbtrack.tracking import StepBudget, make_tracker
 
 SETTINGS = LmSettings(n_restarts=2)

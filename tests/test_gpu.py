@@ -8,12 +8,12 @@ import torch
 from box_room import walk
 
 from nbtrack import TRACKERS, make_tracker
-from nbtrack.core import launches
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.device import choose_device
-from nbtrack.core.errors import DataError
-from nbtrack.core.files import naming_damaged
 from nbtrack.fields import NetworkSettings, field_class, make_field
+from nbtrack.machinery import launches
+from nbtrack.machinery.device import choose_device
+from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.files import naming_damaged
 from nbtrack.mapping.fit import _Fit
 from nbtrack.tracking import StepBudget, track_sequence
 

@@ -23,8 +23,8 @@ from forked import forking
 from tiny import tiny_words
 
 from nbtrack.cli import main
-from nbtrack.core.errors import DataError, NbtrackError
 from nbtrack.experiments.jobs import Execution, Job, Report, run_jobs
+from nbtrack.machinery.errors import DataError, NbtrackError
 
 # Dask's own threads and sockets warn as they are torn down.
 pytestmark = pytest.mark.filterwarnings("default")
@@ -110,7 +110,7 @@ def test_the_bar_moves(monkeypatch, execution: dict) -> None:
     """Catches a bar that stands still for as long as a map takes, or misses jobs elsewhere."""
     seen = []
     monkeypatch.setattr(
-        "nbtrack.core.progress.ProgressBar.move_to",
+        "nbtrack.machinery.progress.ProgressBar.move_to",
         lambda bar, done, status="": seen.append((done, status)),
     )
     run_jobs([Square(1), Square(2)], Execution(**execution))

@@ -13,11 +13,11 @@ from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.points import PointCloud, fuse_points
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import ConfigError, MissingError
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.quality import score_map
 from nbtrack.fields import NetworkSettings
+from nbtrack.machinery.errors import ConfigError, MissingError
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics

@@ -13,7 +13,7 @@ from test_faults import assert_refused
 from tiny import TINY
 
 from nbtrack.beyond import observed
-from nbtrack.core import files
+from nbtrack.machinery import files
 
 
 @pytest.fixture

@@ -16,10 +16,10 @@ from box_room import walk
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from nbtrack.core import launches
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.launches import Recording
 from nbtrack.fields import NetworkSettings, field_class, make_field
+from nbtrack.machinery import launches
+from nbtrack.machinery.launches import Recording
 from nbtrack.mapping.fit import _Fit
 from nbtrack.tracking import AdamTracker, SdfTracker, StepBudget, VrTracker
 from nbtrack.tracking.paper import AdamSettings

@@ -26,9 +26,9 @@ from nbtrack.beyond import PointMapping
 from nbtrack.checks.in_map import check_belongs
 from nbtrack.cli import main
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.experiments.output import MARK
 from nbtrack.fields import NetworkSettings, make_field
+from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.mapping.files import MAP_FILE, Map, _digest, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.mapping.holdout import depth_residual_of

@@ -8,9 +8,9 @@ import torch
 from box_room import Formula, sequence_of
 from torch import Tensor
 
-from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.experiments.quality import score_map
+from nbtrack.machinery.errors import DataError
 from nbtrack.mapping.files import Map
 from nbtrack.plots.meshes import extract_mesh, seen_by
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics

@@ -11,9 +11,9 @@ from box_room import poses_at, sequence_of
 
 from nbtrack.beyond import PointMapping
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError, NumericalError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import MappingSettings, NetworkSettings, field_class
+from nbtrack.machinery.errors import DataError, NumericalError
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import learning_rate, map_sequence
 from nbtrack.mapping.holdout import split_holdout

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond.verdict import score_detection
 from nbtrack.checks.in_map import other_world
-from nbtrack.core.errors import DataError
-from nbtrack.core.files import json_text, write_atomic
+from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.files import json_text, write_atomic
 from nbtrack.tracking.metrics import align_rigidly, pose_errors, still_metrics, trajectory_metrics
 from nbtrack.tracking.trajectories import read_tum, tum_text
 

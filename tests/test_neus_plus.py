@@ -12,12 +12,12 @@ from nbtrack.beyond.feature_grid import FeatureGrid, GridNetwork, GridPlusMappin
 from nbtrack.beyond.neus_plus import ObservedDistance, distance_targets
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
-from nbtrack.core.errors import ConfigError
 from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.experiments.presets import load_preset
 from nbtrack.fields import NetworkSettings
 from nbtrack.fields.neus import guided_depths
+from nbtrack.machinery.errors import ConfigError
 from nbtrack.mapping.files import read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics

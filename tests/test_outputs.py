@@ -20,13 +20,13 @@ from test_faults import assert_refused, contents
 from tiny import tiny_words
 
 from nbtrack.cli import main
-from nbtrack.core import files
-from nbtrack.core.device import threads
-from nbtrack.core.errors import DataError
 from nbtrack.experiments import map_jobs
 from nbtrack.experiments.grid import track_scenes
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
+from nbtrack.machinery import files
+from nbtrack.machinery.device import threads
+from nbtrack.machinery.errors import DataError
 from nbtrack.recordings.recording import open_recording
 from nbtrack.synthetic import make, room
 from nbtrack.tracking.trajectories import read_tum

@@ -20,12 +20,12 @@ from tiny import TINY, tiny_words
 import nbtrack
 from nbtrack import experiments
 from nbtrack.cli import main
-from nbtrack.core.errors import ConfigError, NbtrackError
-from nbtrack.core.files import runs_folder
-from nbtrack.core.settings import with_settings
 from nbtrack.experiments.methods import METHODS, Method, method_of
 from nbtrack.experiments.presets import load_preset
 from nbtrack.fields import FIELDS, NeusMapping
+from nbtrack.machinery.errors import ConfigError, NbtrackError
+from nbtrack.machinery.files import runs_folder
+from nbtrack.machinery.settings import with_settings
 from nbtrack.tracking import TRACKERS, tracker_class
 
 OWN = '''

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nbtrack.core.progress import ProgressBar
+from nbtrack.machinery.progress import ProgressBar
 
 
 class Clock:

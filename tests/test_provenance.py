@@ -10,9 +10,9 @@ from types import ModuleType
 import pytest
 
 from nbtrack import provenance
-from nbtrack.core import files
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import NetworkSettings, NeuSField
+from nbtrack.machinery import files
 from nbtrack.synthetic import make_room
 from nbtrack.tracking import SdfTracker
 

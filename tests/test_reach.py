@@ -9,13 +9,13 @@ import torch
 from box_room import BoxRoom, box_sequence, poses_at, walk
 from numpy.testing import assert_allclose
 
-from nbtrack.core.files import tables_folder
 from nbtrack.data.dataset import DATASET_UNITS
 from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene, open_scene
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
+from nbtrack.machinery.files import tables_folder
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.synthetic import make_room
 from nbtrack.tables import published_table_1

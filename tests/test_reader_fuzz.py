@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from recordings import WRITERS, source, write_recording
 
 from nbtrack.checks.check import check_recording
-from nbtrack.core.errors import NbtrackError
+from nbtrack.machinery.errors import NbtrackError
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.recording import open_recording
 

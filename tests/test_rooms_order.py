@@ -7,6 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "nbtrack"
 ORDER = [
+    "machinery",
     *("core", "data", "fields", "mapping", "tracking", "latex", "tables"),  # what the paper needs
     *("recordings", "checks", "beyond", "provenance", "synthetic", "plots"),
     *("experiments", "cli", "__main__"),

@@ -9,12 +9,12 @@ import pytest
 from tiny import TINY
 
 from nbtrack.beyond.correction import correct_map
-from nbtrack.core.errors import ConfigError, NbtrackError
-from nbtrack.core.settings import changed_settings, flat, with_settings
 from nbtrack.experiments.bench import measure_steps
 from nbtrack.experiments.methods import METHODS, TABLE_1
 from nbtrack.experiments.presets import PRESETS, Preset, claim, load_preset
 from nbtrack.experiments.scenes import open_scene, open_scenes
+from nbtrack.machinery.errors import ConfigError, NbtrackError
+from nbtrack.machinery.settings import changed_settings, flat, with_settings
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.recordings.reading import parse_frames

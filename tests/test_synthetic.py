@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from scipy.spatial import cKDTree
 
-from nbtrack.core.errors import ConfigError, DataError
+from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.synthetic import make_room, room_frames, room_intrinsics, room_of
 from nbtrack.synthetic.keyframes import keyframe_trajectory

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from nbtrack import tables
-from nbtrack.core.errors import ConfigError, DataError
 from nbtrack.experiments.runs import over_rooms, shares
 from nbtrack.latex import Wording, latex_file
+from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.tables import style_table_1, style_table_2, table_1, table_2, write_tables
 
 PROJECT = Path(__file__).parent.parent

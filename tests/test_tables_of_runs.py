@@ -20,9 +20,6 @@ from tiny import TINY, tiny_words
 from nbtrack.beyond import PointCloud
 from nbtrack.beyond.correction import CorrectedField
 from nbtrack.cli import main
-from nbtrack.core.errors import ConfigError, DataError, MissingError, NbtrackError
-from nbtrack.core.files import runs_folder
-from nbtrack.core.settings import with_settings
 from nbtrack.experiments.bench import default_pixels, measure_steps
 from nbtrack.experiments.grid import Execution, map_scene, map_scenes, read_run, track_scenes
 from nbtrack.experiments.map_jobs import MapJob
@@ -30,6 +27,9 @@ from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, M
 from nbtrack.experiments.presets import Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scenes
 from nbtrack.experiments.track_jobs import TrackJob
+from nbtrack.machinery.errors import ConfigError, DataError, MissingError, NbtrackError
+from nbtrack.machinery.files import runs_folder
+from nbtrack.machinery.settings import with_settings
 from nbtrack.tables import table_1
 from nbtrack.tracking import make_tracker
 

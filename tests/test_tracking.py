@@ -11,9 +11,9 @@ import torch
 from box_room import BoxRoom, box_sequence, poses_at, walk
 
 from nbtrack.beyond.grid import BakedField
-from nbtrack.core.errors import ConfigError, DataError, NumericalError
-from nbtrack.core.settings import with_values
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.machinery.errors import ConfigError, DataError, NumericalError
+from nbtrack.machinery.settings import with_values
 from nbtrack.tracking import (
     ClockBudget,
     SdfSettings,

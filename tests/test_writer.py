@@ -10,7 +10,7 @@ from test_faults import assert_refused
 
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError
+from nbtrack.machinery.errors import DataError
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.writer import WrittenFrame, write_sequence
 

@@ -19,11 +19,11 @@ from nbtrack.beyond.observed import LUMA
 from nbtrack.beyond.views import Viewpoints, spread_out, view_of
 from nbtrack.core.arrays import Frames
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.errors import DataError
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, field_class
 from nbtrack.fields.base import State
+from nbtrack.machinery.errors import DataError
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 

@@ -10,7 +10,7 @@ from nbtrack.beyond.grid import trilinear
 from nbtrack.beyond.neus_plus import NeuSPlusField, NeusPlusMapping
 from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.settings import limited
+from nbtrack.machinery.settings import limited
 
 _SMALL = 0.01  # standard deviation of features before the first iteration
 

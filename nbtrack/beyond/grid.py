@@ -16,9 +16,9 @@ from torch.nn.functional import grid_sample
 from nbtrack.beyond.views import Viewpoints
 from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.device import constant
-from nbtrack.core.errors import ConfigError
 from nbtrack.fields.base import Field
+from nbtrack.machinery.device import constant
+from nbtrack.machinery.errors import ConfigError
 
 _POINTS_AT_ONCE = 65_536
 _MAX_BYTES = 500_000_000  # 25 million vertices, sampled in some minutes (our choice)

@@ -14,8 +14,8 @@ from nbtrack.beyond.observed import draw_points
 from nbtrack.beyond.points import PointCloud
 from nbtrack.beyond.verdict import CORRELATED, MAD_FACTOR, p_within, std_when_moved
 from nbtrack.core.arrays import Pose, Transforms
-from nbtrack.core.errors import ConfigError
 from nbtrack.data.frame import Frame
+from nbtrack.machinery.errors import ConfigError
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 # How far from the map a point may be to have a partner there, m: first wide, to get home from

@@ -17,9 +17,9 @@ from nbtrack.beyond.observed import Observed, draw_points, with_normals
 from nbtrack.beyond.verdict import p_lost
 from nbtrack.beyond.views import Viewpoints, retrieve, view_of
 from nbtrack.core.arrays import Pose, Poses, Transform, Transforms
-from nbtrack.core.settings import limited
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
+from nbtrack.machinery.settings import limited
 from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.tracker import Estimate, Tracker, TrackerSettings
 

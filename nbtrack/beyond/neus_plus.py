@@ -12,11 +12,11 @@ from nbtrack.beyond.grid import trilinear
 from nbtrack.beyond.points import cells_of, fuse_points, min_depth_behind
 from nbtrack.core.arrays import Frames, RaySamples
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.settings import limited
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Draw, Losses, measured_mean, rendered_losses
 from nbtrack.fields.neus import NeuSField, NeusMapping, guided_depths
+from nbtrack.machinery.settings import limited
 
 _MIN_VOXEL = 0.05  # m between the corners at which distances are kept
 _MAX_CELLS_A_SIDE = 128  # larger scenes have larger voxels

@@ -13,11 +13,11 @@ from scipy.spatial import cKDTree
 from nbtrack.core.arrays import Colors, Frames, Points, Values, WorldPoints
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import project
-from nbtrack.core.errors import ConfigError
-from nbtrack.core.settings import may_be_zero
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Field, State
+from nbtrack.machinery.errors import ConfigError
+from nbtrack.machinery.settings import may_be_zero
 
 _MAX_CELLS_A_SIDE = 2**20  # so that a cell's number fits into 64 bits
 _ASKED_EVERY = 5  # frames

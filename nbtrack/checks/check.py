@@ -12,9 +12,9 @@ from nbtrack.checks.conventions import PLAUSIBLE_DEPTH, Convention, diagnosis, f
 from nbtrack.checks.misfits import MAX_SHIFT, MIN_CORRELATION, Misfit, find_misfits, main_misfit
 from nbtrack.checks.readings import FramePairs, Pairs, Reading, on_grid
 from nbtrack.core.arrays import Frames, Poses
-from nbtrack.core.errors import DataError
-from nbtrack.core.progress import ProgressBar
 from nbtrack.data.sequence import ARRAYS, RgbdSequence
+from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.progress import ProgressBar
 from nbtrack.recordings.reading import FAR, far_limit, read_frames, select_frames
 from nbtrack.recordings.recording import Recording
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 from nbtrack.checks.readings import FramePairs, Reading
-from nbtrack.core.settings import changed_settings
+from nbtrack.machinery.settings import changed_settings
 from nbtrack.recordings.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA
 from nbtrack.recordings.recording import Recording
 

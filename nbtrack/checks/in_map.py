@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.checks.misfits import SHARES, Parameter, estimate, main_misfit
 from nbtrack.core.arrays import Pose, Poses, WorldPoints
-from nbtrack.core.errors import DataError
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
+from nbtrack.machinery.errors import DataError
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import depth_residual_of
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M, pose_errors

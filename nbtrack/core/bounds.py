@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 
 from nbtrack.core.arrays import Points, Values
-from nbtrack.core.device import constant
+from nbtrack.machinery.device import constant
 
 
 @dataclass(frozen=True)

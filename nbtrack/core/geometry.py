@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.core.device import constant
+from nbtrack.machinery.device import constant
 
 # Rows: the entries of the matrix K with K x = v × x, for each component of v.
 _CROSS = (

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values
 from nbtrack.core.camera import Intrinsics, backproject
-from nbtrack.core.errors import DataError
+from nbtrack.machinery.errors import DataError
 
 MILLIMETRE = 1e-3
 _MAX_MILLIMETRES = np.iinfo(np.uint16).max

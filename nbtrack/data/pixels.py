@@ -8,9 +8,9 @@ from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Indices, Points, RaySamples, Values
 from nbtrack.core.camera import backproject, pixel_directions
-from nbtrack.core.device import has_room_for
 from nbtrack.data.frame import MILLIMETRE
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.machinery.device import has_room_for
 
 # Tangent planes: how far away neighbours are, as a share of the image's width, and by how much of
 # the depth they may differ, which cuts off edges and incidences above some 75 degrees (our choice).

@@ -11,8 +11,8 @@ from jaxtyping import Float, Int, UInt8, UInt16
 from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError
 from nbtrack.data.frame import MILLIMETRE, Frame
+from nbtrack.machinery.errors import DataError
 
 # Of bounds (our choice): pixels looked at in each frame, on a regular grid, and the share of points
 # cut off at either end of each axis, so that a few wild depths do not stretch the box.

@@ -13,9 +13,9 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import nbtrack.beyond  # registers its fields and trackers
-from nbtrack.core.errors import ConfigError, MissingError
-from nbtrack.core.files import resolved
-from nbtrack.core.progress import tell
+from nbtrack.machinery.errors import ConfigError, MissingError
+from nbtrack.machinery.files import resolved
+from nbtrack.machinery.progress import tell
 
 for plugin in entry_points(group="nbtrack"):
     try:

@@ -9,11 +9,6 @@ import pandas as pd
 import torch
 
 from nbtrack import tables
-from nbtrack.core.device import advise_on_memory, choose_device, device_name
-from nbtrack.core.errors import ConfigError, NbtrackError
-from nbtrack.core.files import runs_folder
-from nbtrack.core.progress import ProgressBar
-from nbtrack.core.settings import changed_settings
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.frame import Frame
 from nbtrack.experiments.grid import Execution, map_scene, track_scenes
@@ -22,6 +17,11 @@ from nbtrack.experiments.output import prepare
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.latex import Wording
+from nbtrack.machinery.device import advise_on_memory, choose_device, device_name
+from nbtrack.machinery.errors import ConfigError, NbtrackError
+from nbtrack.machinery.files import runs_folder
+from nbtrack.machinery.progress import ProgressBar
+from nbtrack.machinery.settings import changed_settings
 from nbtrack.recordings.reading import read_frames
 from nbtrack.synthetic import ROOMS
 from nbtrack.tracking import ClockBudget, StepBudget, Tracker, make_tracker

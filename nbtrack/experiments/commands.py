@@ -11,10 +11,6 @@ import trimesh
 
 from nbtrack.beyond import PointCloud
 from nbtrack.checks.check import check_recording, quick_warning
-from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
-from nbtrack.core.files import naming_damaged, write_atomic
-from nbtrack.core.progress import ProgressBar, tell
-from nbtrack.core.settings import flat, read_setting, with_values
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments import output
 from nbtrack.experiments.jobs import run_jobs
@@ -24,6 +20,10 @@ from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
 from nbtrack.experiments.runs import MEANINGS, METRICS_FILE, read_trajectory
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
+from nbtrack.machinery.errors import ConfigError, DataError, MissingError, look_up
+from nbtrack.machinery.files import naming_damaged, write_atomic
+from nbtrack.machinery.progress import ProgressBar, tell
+from nbtrack.machinery.settings import flat, read_setting, with_values
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh, mesh_bytes

@@ -8,15 +8,15 @@ from typing import Any
 
 import pandas as pd
 
-from nbtrack.core.errors import NbtrackError, check_lists
-from nbtrack.core.files import absolute, runs_folder
-from nbtrack.core.progress import tell
 from nbtrack.experiments.jobs import Execution, run_jobs
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.runs import read_trajectory
 from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
+from nbtrack.machinery.errors import NbtrackError, check_lists
+from nbtrack.machinery.files import absolute, runs_folder
+from nbtrack.machinery.progress import tell
 from nbtrack.mapping.files import Map
 from nbtrack.tracking.methods import Methods, find_methods
 from nbtrack.tracking.trajectories import Trajectory

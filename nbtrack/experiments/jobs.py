@@ -24,12 +24,12 @@ from typing import Any
 import cloudpickle
 import torch
 
-from nbtrack.core.device import advise_on_memory, choose_device, threads, usable_cores
-from nbtrack.core.errors import MissingError, NbtrackError
-from nbtrack.core.files import data_folder, locked, runs_folder
-from nbtrack.core.progress import ProgressBar
 from nbtrack.experiments.output import check_no_recording
 from nbtrack.fields import FIELDS
+from nbtrack.machinery.device import advise_on_memory, choose_device, threads, usable_cores
+from nbtrack.machinery.errors import MissingError, NbtrackError
+from nbtrack.machinery.files import data_folder, locked, runs_folder
+from nbtrack.machinery.progress import ProgressBar
 from nbtrack.tracking import TRACKERS
 
 _START = "spawn"  # how worker processes begin: forked ones would lack the threads of libraries

@@ -10,14 +10,14 @@ import numpy as np
 from nbtrack import provenance
 from nbtrack.beyond.correction import correct_map
 from nbtrack.beyond.grid import checked_size
-from nbtrack.core.device import choose_device
-from nbtrack.core.files import fingerprint
 from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.jobs import Job, Report
 from nbtrack.experiments.presets import PRESETS, Preset
 from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
+from nbtrack.machinery.device import choose_device
+from nbtrack.machinery.files import fingerprint
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.recordings.reading import parse_frames, read_frames, select_frames

@@ -1,7 +1,7 @@
 """Which methods the tables have as rows, and the command line takes."""
 
-from nbtrack.core.errors import ConfigError
 from nbtrack.fields import field_class
+from nbtrack.machinery.errors import ConfigError
 from nbtrack.tracking import TRACKERS, tracker_class
 from nbtrack.tracking.methods import METHODS, Method, find_methods
 

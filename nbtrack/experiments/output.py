@@ -6,9 +6,9 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from nbtrack.core.errors import ConfigError
-from nbtrack.core.files import resolved, write_atomic, write_together
 from nbtrack.experiments.runs import METRICS_FILE
+from nbtrack.machinery.errors import ConfigError
+from nbtrack.machinery.files import resolved, write_atomic, write_together
 from nbtrack.mapping.files import HISTORY_FILE, MAP_FILE, MESH_FILE
 from nbtrack.plots.style import in_house_style
 from nbtrack.recordings.formats import holds_recording

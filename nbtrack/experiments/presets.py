@@ -12,12 +12,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from nbtrack.core.errors import ConfigError, MissingError, look_up
-from nbtrack.core.files import absolute
-from nbtrack.core.settings import flat, limited, one_of, read_setting, with_settings, with_values
 from nbtrack.data.dataset import DATASET_SCENES
-from nbtrack.data.text_files import read_object
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
+from nbtrack.machinery.errors import ConfigError, MissingError, look_up
+from nbtrack.machinery.files import absolute
+from nbtrack.machinery.settings import (
+    flat,
+    limited,
+    one_of,
+    read_setting,
+    with_settings,
+    with_values,
+)
+from nbtrack.machinery.text_files import read_object
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.synthetic.make import MOTIONS
 from nbtrack.tables import PAPER_PIXELS

@@ -6,10 +6,10 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from nbtrack.core.arrays import Frames, Values
-from nbtrack.core.errors import DataError
 from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField
+from nbtrack.machinery.errors import DataError
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout
 from nbtrack.plots.meshes import extract_mesh, query_field

@@ -8,8 +8,8 @@ import pandas as pd
 from scipy.special import ndtri, stdtrit
 
 from nbtrack.beyond.verdict import score_detection
-from nbtrack.core import files
-from nbtrack.core.errors import MissingError
+from nbtrack.machinery import files
+from nbtrack.machinery.errors import MissingError
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M, trajectory_metrics
 from nbtrack.tracking.trajectories import Trajectory, read_tum, shifted, tum_text
 

@@ -5,13 +5,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from nbtrack.core.errors import ConfigError, DataError, MissingError, nearest_name
-from nbtrack.core.files import absolute, data_folder, fingerprint, locked, runs_folder
-from nbtrack.core.progress import ProgressBar, tell
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.output import check_no_recording, is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
+from nbtrack.machinery.errors import ConfigError, DataError, MissingError, nearest_name
+from nbtrack.machinery.files import absolute, data_folder, fingerprint, locked, runs_folder
+from nbtrack.machinery.progress import ProgressBar, tell
 from nbtrack.provenance import package_code
 from nbtrack.recordings import reading
 from nbtrack.recordings.recording import Recording, open_recording

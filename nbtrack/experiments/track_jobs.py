@@ -12,11 +12,7 @@ import torch
 
 from nbtrack import provenance
 from nbtrack.checks.in_map import check_belongs, in_world_of_map, map_misfit, outside_map_share
-from nbtrack.core import files
 from nbtrack.core.arrays import Pose, Poses
-from nbtrack.core.device import choose_device, device_name
-from nbtrack.core.errors import DataError, NbtrackError
-from nbtrack.core.settings import as_dict, changed_settings
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments import IMPORTED
@@ -26,6 +22,10 @@ from nbtrack.experiments.presets import PRESETS, SIZES
 from nbtrack.experiments.runs import METRICS_FILE, scores_of, write_run
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
+from nbtrack.machinery import files
+from nbtrack.machinery.device import choose_device, device_name
+from nbtrack.machinery.errors import DataError, NbtrackError
+from nbtrack.machinery.settings import as_dict, changed_settings
 from nbtrack.mapping.files import Map
 from nbtrack.recordings.reading import parse_frames, select_frames
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class

@@ -3,11 +3,11 @@
 import torch
 
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.errors import look_up_kind
 from nbtrack.fields.base import Field, LearnedField, MappingSettings
 from nbtrack.fields.imap import IMapField
 from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.neus import NeuSField, NeusMapping
+from nbtrack.machinery.errors import look_up_kind
 
 FIELDS: dict[str, type[Field]] = {kind.name: kind for kind in (IMapField, NeuSField)}
 """What can be mapped, by name. A field of your own joins by `FIELDS["mine"] = MyField`."""

@@ -14,12 +14,12 @@ from torch import Generator, Tensor, nn
 from nbtrack.core.arrays import Colors, Frames, Points, Pose, RayColors, RaySamples, Scalar, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
-from nbtrack.core.settings import limited, may_be_zero
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import rendering
 from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.rendering import Rendering, Weights
+from nbtrack.machinery.settings import limited, may_be_zero
 
 # Minimum standard deviation (m) that a depth error is divided by: a perfectly sharp ray would
 # otherwise outweigh all others (our choice; depth noise is of this size).

@@ -10,7 +10,7 @@ from torch import Generator, Tensor, nn
 
 from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.settings import limited
+from nbtrack.machinery.settings import limited
 
 _LAYER_SIZE = 2**18  # numbers that are worked on at once: 1 MB, which a core's cache holds
 

@@ -7,12 +7,12 @@ from torch import Generator, Tensor, nn
 
 from nbtrack.core.arrays import Colors, Points, RaySamples, Scalar, Values
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.core.settings import limited
 from nbtrack.data.pixels import Rays
 from nbtrack.fields import base, rendering
 from nbtrack.fields.base import Draw, LearnedField, Losses, rendered_losses
 from nbtrack.fields.mlp import FourierMlp, NetworkSettings
 from nbtrack.fields.rendering import Weights
+from nbtrack.machinery.settings import limited
 
 
 @dataclass(frozen=True)

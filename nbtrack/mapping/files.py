@@ -17,10 +17,10 @@ from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.device import usual_modes
-from nbtrack.core.errors import ConfigError, MissingError
-from nbtrack.core.files import naming_damaged, write_together
 from nbtrack.fields import FIELDS, Field
+from nbtrack.machinery.device import usual_modes
+from nbtrack.machinery.errors import ConfigError, MissingError
+from nbtrack.machinery.files import naming_damaged, write_together
 
 MAP_FILE = "map.safetensors"
 HISTORY_FILE = "history.csv"  # losses over iterations

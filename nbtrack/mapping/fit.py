@@ -12,19 +12,19 @@ import pandas as pd
 import torch
 
 from nbtrack.core.arrays import Frames
-from nbtrack.core.device import (
+from nbtrack.data.pixels import PixelSampler
+from nbtrack.data.sequence import RgbdSequence, observed_bounds
+from nbtrack.fields import LearnedField, MappingSettings, field_class, make_field
+from nbtrack.machinery.device import (
     advise_on_memory,
     device_name,
     matrix_products,
     suitable_threads,
     usual_modes,
 )
-from nbtrack.core.errors import ConfigError, DataError, NumericalError
-from nbtrack.core.files import loaded_checkpoint, save_checkpoint
-from nbtrack.core.launches import Recording, make_adam
-from nbtrack.data.pixels import PixelSampler
-from nbtrack.data.sequence import RgbdSequence, observed_bounds
-from nbtrack.fields import LearnedField, MappingSettings, field_class, make_field
+from nbtrack.machinery.errors import ConfigError, DataError, NumericalError
+from nbtrack.machinery.files import loaded_checkpoint, save_checkpoint
+from nbtrack.machinery.launches import Recording, make_adam
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 

@@ -9,9 +9,9 @@ from skimage.measure import marching_cubes
 from nbtrack.beyond import PointCloud
 from nbtrack.beyond.points import min_depth_behind
 from nbtrack.core.arrays import Frames, Position
-from nbtrack.core.errors import DataError
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
+from nbtrack.machinery.errors import DataError
 
 _POINTS_AT_ONCE = 65_536
 _SEEN_BEHIND = 0.1  # m behind the measured depth that still count as seen

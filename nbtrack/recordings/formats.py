@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from nbtrack.core.arrays import DepthImage, Poses
-from nbtrack.core.errors import ConfigError, DataError, MissingError, look_up
-from nbtrack.core.files import absolute
-from nbtrack.core.settings import limited, one_of, with_values
 from nbtrack.data.dataset import DATASET_UNITS
-from nbtrack.data.text_files import Times, read_object, read_poses
+from nbtrack.data.pose_files import Times, read_poses
+from nbtrack.machinery.errors import ConfigError, DataError, MissingError, look_up
+from nbtrack.machinery.files import absolute
+from nbtrack.machinery.settings import limited, one_of, with_values
+from nbtrack.machinery.text_files import read_object
 from nbtrack.recordings.calibration import Calibration, read_calibration
 from nbtrack.recordings.pairing import frame_keys
 

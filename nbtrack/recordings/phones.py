@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 
 from nbtrack.core.arrays import DepthImage, Poses
-from nbtrack.core.files import naming_damaged
-from nbtrack.data.text_files import Times, from_quaternions, read_object
+from nbtrack.data.pose_files import Times, from_quaternions
+from nbtrack.machinery.files import naming_damaged
+from nbtrack.machinery.text_files import read_object
 from nbtrack.recordings.calibration import Calibration, calibration, camera_matrix
 from nbtrack.recordings.formats import FORMATS, Declaration, Format
 

@@ -15,9 +15,9 @@ from PIL import Image
 
 from nbtrack.core.arrays import DepthImage, Frames, Position
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError
-from nbtrack.core.files import naming_damaged
 from nbtrack.data.sequence import RgbdSequence
+from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.files import naming_damaged
 from nbtrack.recordings.calibration import camera_matrix
 from nbtrack.recordings.formats import IMAGE_SUFFIXES, Declaration
 from nbtrack.recordings.recording import Recording, open_recording

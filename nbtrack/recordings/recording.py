@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Bool
 
 from nbtrack.core.arrays import Poses, Position
-from nbtrack.core.errors import DataError
-from nbtrack.core.files import absolute
-from nbtrack.data.text_files import Times, checked_poses, in_seconds, read_numbers
+from nbtrack.data.pose_files import Times, checked_poses, in_seconds
+from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.files import absolute
+from nbtrack.machinery.text_files import read_numbers
 from nbtrack.recordings.calibration import Calibration
 from nbtrack.recordings.formats import FORMATS, Declaration, Format, declaration, files_of
 from nbtrack.recordings.pairing import TIMES_FILE, Moments, check_paired, pair_lists, stamp_in

@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from nbtrack.core.arrays import ColorImage, DepthImage, Frames, Pose, Poses
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.errors import DataError
-from nbtrack.core.files import write_atomic
-from nbtrack.core.progress import ProgressBar
+from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.files import write_atomic
+from nbtrack.machinery.progress import ProgressBar
 from nbtrack.recordings.calibration import camera_matrix
 from nbtrack.recordings.formats import FORMATS
 from nbtrack.recordings.pairing import TIMES_FILE

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.device import usable_cores
-from nbtrack.core.errors import DataError, look_up
-from nbtrack.core.files import fingerprint, json_text, naming_damaged
+from nbtrack.machinery.device import usable_cores
+from nbtrack.machinery.errors import DataError, look_up
+from nbtrack.machinery.files import fingerprint, json_text, naming_damaged
 from nbtrack.provenance import package_code
 from nbtrack.recordings.writer import WrittenFrame, write_sequence
 from nbtrack.synthetic.keyframes import keyframe_trajectory

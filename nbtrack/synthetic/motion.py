@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from skimage.graph import route_through_array
 
 from nbtrack.core.arrays import Poses
-from nbtrack.core.errors import NumericalError
+from nbtrack.machinery.errors import NumericalError
 from nbtrack.synthetic.primitives import Values
 from nbtrack.synthetic.room import Room, Walk
 

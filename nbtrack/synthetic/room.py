@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nbtrack.core.errors import look_up
+from nbtrack.machinery.errors import look_up
 from nbtrack.synthetic import materials, primitives
 from nbtrack.synthetic.materials import Light, Material, Pair, Part
 from nbtrack.synthetic.primitives import Array3, Indices, Origins, Points, Values, row_dot

@@ -3,8 +3,8 @@
 import importlib.util
 
 from nbtrack.core.arrays import Pose
-from nbtrack.core.errors import ConfigError, MissingError, look_up_kind
 from nbtrack.fields import FIELDS, Field, field_class
+from nbtrack.machinery.errors import ConfigError, MissingError, look_up_kind
 from nbtrack.tracking.budget import Budget, ClockBudget, StepBudget, make_budget, paper_steps
 from nbtrack.tracking.paper import AdamTracker, SdfSettings, SdfTracker, VrSettings, VrTracker
 from nbtrack.tracking.tracker import Tracker, TrackerSettings

@@ -11,8 +11,8 @@ from math import floor
 
 import torch
 
-from nbtrack.core.device import synchronize
-from nbtrack.core.errors import ConfigError
+from nbtrack.machinery.device import synchronize
+from nbtrack.machinery.errors import ConfigError
 
 _HOST = torch.device("cpu")
 Number = float | int

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from nbtrack.core.errors import check_lists, look_up
+from nbtrack.machinery.errors import check_lists, look_up
 from nbtrack.tracking import check_pair, paper_steps, tracker_class
 
 

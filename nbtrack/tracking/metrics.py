@@ -5,7 +5,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Poses
-from nbtrack.core.errors import DataError
+from nbtrack.machinery.errors import DataError
 
 Errors = Float[np.ndarray, "frames"]
 Positions = Float[np.ndarray, "frames 3"]

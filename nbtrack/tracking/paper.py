@@ -8,11 +8,11 @@ import torch
 from nbtrack.core import geometry
 from nbtrack.core.arrays import Colors, Points, Scalar, Transform, Transforms, Values
 from nbtrack.core.camera import pixel_directions
-from nbtrack.core.launches import Recording, make_adam
-from nbtrack.core.settings import limited, one_of
 from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
 from nbtrack.fields.base import rendered_losses
+from nbtrack.machinery.launches import Recording, make_adam
+from nbtrack.machinery.settings import limited, one_of
 from nbtrack.tracking.reach import Reach, reach
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from nbtrack.core.arrays import Pose
-from nbtrack.core.errors import look_up
+from nbtrack.machinery.errors import look_up
 
 
 def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
-from nbtrack.core.device import matrix_products, suitable_threads, synchronize, usual_modes
-from nbtrack.core.errors import ConfigError, DataError, NumericalError
-from nbtrack.core.launches import CALLS_BEFORE_RECORDING
-from nbtrack.core.settings import with_values
 from nbtrack.data.frame import Frame
-from nbtrack.data.text_files import checked_poses
+from nbtrack.data.pose_files import checked_poses
 from nbtrack.fields import Field, LearnedField
+from nbtrack.machinery.device import matrix_products, suitable_threads, synchronize, usual_modes
+from nbtrack.machinery.errors import ConfigError, DataError, NumericalError
+from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
+from nbtrack.machinery.settings import with_values
 from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.reach import Reach
 from nbtrack.tracking.starts import expected_poses

@@ -11,12 +11,12 @@ import pandas as pd
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from nbtrack.core import files
 from nbtrack.core.arrays import Poses, Position
-from nbtrack.core.device import advise_on_memory
-from nbtrack.core.errors import DataError, MissingError
+from nbtrack.data.pose_files import read_poses
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.data.text_files import read_poses
+from nbtrack.machinery import files
+from nbtrack.machinery.device import advise_on_memory
+from nbtrack.machinery.errors import DataError, MissingError
 from nbtrack.tracking.budget import StepBudget
 from nbtrack.tracking.metrics import pose_errors
 from nbtrack.tracking.tracker import Estimate, Tracker

@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from nbtrack.core.errors import ConfigError, look_up
+from nbtrack.machinery.errors import ConfigError, look_up
 
 Config = TypeVar("Config")
 _MANY = 1_000_000

@@ -22,8 +22,8 @@ import torch
 from filelock import FileLock
 
 import nbtrack
-from nbtrack.core.errors import DataError, NbtrackError
-from nbtrack.core.settings import as_dict
+from nbtrack.machinery.errors import DataError, NbtrackError
+from nbtrack.machinery.settings import as_dict
 
 PACKAGE = Path(nbtrack.__file__).resolve().parent
 # Errors in reading a file that do not come from its content: they are a program's mistakes, or a

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nbtrack.core.errors import ConfigError, OutOfMemory
+from nbtrack.machinery.errors import ConfigError, OutOfMemory
 
 # Below this width matrix products are too small to share: on two cores, two threads were slower
 # than one. Rooms and methods then run side by side in processes instead.

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nbtrack.core.progress import tell
+from nbtrack.machinery.progress import tell
 
 CALLS_BEFORE_RECORDING = 2
 """The first call loads and allocates; the second one is watched for what cannot be recorded."""
