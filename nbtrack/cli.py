@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 from nbtrack import __version__
+from nbtrack.data.dataset import DATASET_ZIP
 from nbtrack.machinery.errors import ConfigError, NbtrackError, nearest_name
 
 _MAX_COUNT = 2**31 - 1  # what every random generator takes
@@ -51,6 +52,7 @@ OPTIONS = {
     "sequence": _option("a folder, or the name of a room or dataset scene"),
     "folder": _option("a recording", a_path),
     "room": _option("its name"),
+    "scene": _option("its name, as breakfast_room"),
     "source": _option("folder of a run or a map, or a map file", a_path),
     "out": _option("file or folder to write", a_path),
     "--format": _option("a format's name, as in data/README.md (default: told by the files)"),
@@ -77,6 +79,7 @@ OPTIONS = {
     "--width": _option("pixels; the height is 3/4 of it", int, default=640),
     "--motion": _option("handheld (default), keyframes: the dataset's, tour", default="handheld"),
     "--depth-folder": _option("default: the format's; filtered before raw depth"),
+    "--url": _option("the ZIP file: a mirror's address, or a path", default=DATASET_ZIP),
     "--poses": _option("pose file (default: the format's)", metavar="FILE"),
     "--seed": _option("of all random numbers (default: 0)", partial(a_count, minimum=0), default=0),
     "--out": _option("where to write (default: in runs/; data make needs it)", a_path),
@@ -93,6 +96,7 @@ _PARTS = " --format --depth-folder --poses"
 _TRACKED = " --tracker --rate --steps --map-frames --map-from --start"
 _CELLS = "--budget --scenes --method --beyond --seeds --workers --dask --out"
 _CELLS += " --caption --label --no-still"
+_MODULES = {"tables": "bench", "bench": "bench", "export": "exports"}  # the others: "commands"
 # By name: what it does, and its options. `map` is done by the function `map_command`, `data make`
 # by `make_command`.
 COMMANDS = {
@@ -101,6 +105,7 @@ COMMANDS = {
     "methods": ("list what --method takes", ""),
     "export": ("a run's trajectory or a map elsewhere", "source out --to"),
     "tables": ("the paper's tables, and one beyond, CSV and LaTeX", _CELLS + _RUN),
+    "data fetch": ("bring a scene of the dataset, not all 7 GB", "scene --url"),
     "data make": ("write a synthetic room", "room --out --motion --n-frames --width --seed"),
     "data check": ("what is wrong with a recording", "folder --out" + _PARTS),
     "data convert": ("write a recording as the dataset is", "folder out --frames" + _PARTS),
@@ -134,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         experiments = importlib.import_module("nbtrack.experiments")
         for source in options.imports:
             experiments.import_own(source)
-        module = "bench" if options.command in ("tables", "bench") else "commands"
+        module = _MODULES.get(options.command, "commands")
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)
         print(end="", flush=True)  # a closed pipe is found here, not after the return
@@ -181,7 +186,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
     parser.add_argument("--version", action="version", version=f"nbtrack {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    data = commands.add_parser("data", help="make rooms; check or convert a recording")
+    data = commands.add_parser("data", help="make or fetch recordings, check, convert")
     actions = data.add_subparsers(required=True, metavar="ACTION")
     for name, (about, words) in COMMANDS.items():
         group = actions if name.startswith("data ") else commands

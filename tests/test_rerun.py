@@ -29,7 +29,7 @@ def rows_of(file: Path) -> Counter[tuple[str, bool]]:
 def test_without_rerun(finished: Path, monkeypatch, capsys) -> None:
     """Catches a traceback of imports, or minutes of meshing before it is told."""
     monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.setattr("nbtrack.experiments.commands.extract_mesh", None)
+    monkeypatch.setattr("nbtrack.experiments.exports.extract_mesh", None)
     command = ["export", str(finished / "run"), "--to", "rrd", str(finished / "run.rrd")]
     assert_refused(finished, capsys, command, "pip install 'nbtrack[rerun]'")
 

@@ -173,7 +173,7 @@ def test_every_method_is_made_again_from_its_command(
     runs = track_scenes(scenes[1:], [*METHODS], coarse, **how)
     assert runs["failure"].eq("").all()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("nbtrack.experiments.commands._draw_overview", lambda run: None)
+    monkeypatch.setattr("nbtrack.experiments.commands.draw_overview", lambda run: None)
     here, elsewhere = os.environ["NBTRACK_RUNS"], str(tmp_path / "elsewhere")
     for row in runs.itertuples():
         monkeypatch.setenv("NBTRACK_RUNS", here if row.Index else elsewhere)

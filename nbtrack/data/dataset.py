@@ -1,5 +1,7 @@
-"""The Neural RGB-D dataset of the paper's experiments (Azinović et al. 2022): names and units."""
+"""The Neural RGB-D dataset of the paper's experiments (Azinović et al. 2022)."""
 
+DATASET_ZIP = "https://kaldir.vc.in.tum.de/neural_rgbd/neural_rgbd_data.zip"
+"""Its one file, 7.25 GB."""
 DATASET_SCENES = {
     "breakfast_room": "Breakfast", "complete_kitchen": "Compl. Kitchen",
     "green_room": "Green Room", "grey_white_room": "Grey-white", "kitchen": "Kitchen",

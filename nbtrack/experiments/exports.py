@@ -1,0 +1,125 @@
+"""What was tracked or mapped in other forms: pictures, movies, meshes, lists of poses."""
+
+import importlib.util
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from nbtrack.beyond import PointCloud
+from nbtrack.data.sequence import RgbdSequence
+from nbtrack.experiments import output
+from nbtrack.experiments.runs import read_trajectory
+from nbtrack.experiments.track_jobs import TrackJob
+from nbtrack.machinery.errors import ConfigError, DataError, MissingError, look_up
+from nbtrack.machinery.files import naming_damaged, write_atomic
+from nbtrack.machinery.progress import ProgressBar
+from nbtrack.mapping.files import MESH_FILE, read_map
+from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
+from nbtrack.plots.meshes import extract_mesh, mesh_bytes
+from nbtrack.plots.rerun_file import rerun_bytes
+from nbtrack.recordings import reading
+from nbtrack.recordings.recording import Recording, open_recording
+from nbtrack.tracking import Trajectory
+from nbtrack.tracking.trajectories import number_lines, read_tum
+
+_FRAMES_SHOWN = 20  # of a longer run at least so many frames tell what an overview shows
+_CELLS = 120  # of an overview's mesh, along the longest side of its map
+_MOVIE_FRAMES = 100  # at most, evenly spread over a run
+
+
+def draw_overview(run: TrackJob) -> None:
+    """Draw a finished run beside its files: the path in what was seen of the map, from above."""
+    tracked = read_trajectory(run.folder)
+    field, metrics, n_frames = run.needs.map().field, tracked.metrics, len(tracked.frames)
+    shown = np.arange(0, n_frames, max(1, n_frames // _FRAMES_SHOWN))
+    try:
+        surface = _surface(field, _seen(tracked, shown, run.scene.recording), _CELLS)
+    except DataError as error:
+        print(f"  no picture: {error}")
+        return
+    title = f"{run.scene.name}: {run.tracker} in {field.label}, {n_frames} frames"
+    paths = {}
+    if "ate_rmse_m" in metrics:
+        ate_m, still_m = metrics["ate_rmse_m"], metrics.get("still_ate_m", np.nan)
+        title += f", ATE {100 * ate_m:.2f} cm (standing still {100 * still_m:.0f} cm)"
+        paths["true"] = tracked.T_true[np.isfinite(tracked.T_true).all(axis=(1, 2))]
+    paths["tracked"] = tracked.T_estimated
+    figure = plot_overview(cloud_of(surface), paths, tracked.frames, title)
+    output.save_picture(figure, run.folder / output.OVERVIEW_FILE, dpi=120)  # 1080 pixels wide
+
+
+def _seen(tracked: Trajectory, rows: np.ndarray, recording: Recording) -> RgbdSequence:
+    """What was observed in some rows of a run, from where its camera was estimated to be."""
+    frame_ids = tracked.frames["frame_id"].to_numpy()[rows]
+    sequence = reading.read_frames(recording, frame_ids, needs_poses=False)
+    return replace(sequence, T_world_camera=tracked.T_estimated[rows])
+
+
+def _surface(field: Any, seen: RgbdSequence, n_cells: int) -> Any:
+    """A mesh of what was seen of a map; `n_cells` span its longest side, or 6 m if that is less."""
+    return extract_mesh(field, seen, voxel=max(6.0, 2 * field.bounds.metres_per_unit) / n_cells)
+
+
+def export_command(options: Namespace) -> None:
+    """Write a run or a map in another format, and print what was written."""
+    export = look_up("format", options.to, _EXPORTS)
+    output.check_no_recording(options.out)
+    if options.out.exists():
+        raise ConfigError(f"{options.out} exists: choose another file to write, or remove it first")
+    content, summary = export(options.source, options.to)
+    write_atomic(options.out, content)
+    print(f"{options.out}: {summary}")
+
+
+def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
+    """A map as a coloured mesh: of what was seen where the map's folder has that mesh, else all."""
+    finished = read_map(source)
+    seen = source / MESH_FILE
+    is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
+    origin = np.array(finished.record["origin"])
+    with naming_damaged(seen, "mesh", "remove it and map again"):
+        mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)
+        if is_seen:  # its vertices are in the recording's world, and `mesh_bytes` moves them there
+            mesh.vertices -= origin
+        content = mesh_bytes(mesh, format_name, origin)
+    what = "what was seen" if is_seen else "all"
+    return content, f"{len(mesh.vertices)} coloured vertices of {what}"
+
+
+def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
+    """A run as a movie or for Rerun. Its recording and map must lie where they did in tracking."""
+    if format_name == "rrd" and importlib.util.find_spec("rerun") is None:
+        raise MissingError("--to rrd needs Rerun: pip install 'nbtrack[rerun]'")
+    tracked = read_trajectory(source)
+    metrics, n_frames = tracked.metrics, len(tracked.frames)
+    stored = read_map(metrics["map"])
+    if metrics.get("map_key") != stored.key:
+        raise DataError(f"{metrics['map']} is not the map of this run any more: track again")
+    shown = np.unique(np.linspace(0, n_frames - 1, _MOVIE_FRAMES).round().astype(int))
+    seen = _seen(tracked, shown, open_recording(metrics["recording"], metrics["format"]))
+    surface = _surface(stored.field, seen, 2 * _CELLS)  # cells half as large as in an overview
+    title = f"{metrics['scene']}: {metrics['tracker']} in {stored.field.label}"
+    if format_name == "rrd":
+        content = rerun_bytes(surface, seen, tracked, title)
+    else:
+        with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
+            frames, poses = tracked.frames.iloc[shown], seen.T_world_camera
+            content = movie_bytes(movie_pictures(surface, seen, frames, poses, title, bar.move_to))
+    return content, f"{len(shown)} of {n_frames} frames, {len(content) / 1e6:.1f} MB"
+
+
+def _export_trajectory(source: Path, format_name: str) -> tuple[str, str]:
+    """The tracked poses of a run in KITTI's format, the only one of trajectories."""
+    n_poses = len(read_trajectory(source).frames)  # raises for what is no run
+    _, T_world_camera = read_tum(source / "trajectory.txt")  # m, in the recording's world
+    what = "KITTI: three rows of the matrix (m), no time stamps"
+    given = "the first frame's, which was given, is not among them"
+    return number_lines(T_world_camera[:, :3].reshape(-1, 12)), f"{n_poses} poses, {what}; {given}"
+
+
+_EXPORTS = {"kitti": _export_trajectory, "ply": _export_map, "glb": _export_map}
+_EXPORTS |= {"gif": _export_run, "rrd": _export_run}
