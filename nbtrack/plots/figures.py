@@ -194,25 +194,17 @@ def plot_panels(
 ) -> Figure:
     """A panel for each table, by its title: a column is a method, whose numbers are points along x.
 
-    Tables share the texts of their index, which stand along y from the top. A pale line joins the
-    numbers of a row. Where a text has several rows there is none: methods lie one below another,
-    and marks are open, each on one of three lines. x is logarithmic, labelled by `x`, and with
-    `same_x` of one range in all panels.
+    Tables share the texts of their index, which stand along y from the top; in a table each has one
+    row, whose numbers a pale line joins. x is logarithmic, labelled by `x`, and with `same_x` of
+    one range in all panels.
     """
     texts = pd.Index(np.concatenate([table.index for table in panels.values()])).unique()
     grid = style.new_axes(title, 3.4, 1, len(panels), sharex=same_x, sharey=True)[0]
     for axes, (name, values) in zip(grid, panels.items(), strict=True):
         y = texts.get_indexer(values.index)
-        below = 0.45 if values.index.has_duplicates else 0.0  # else marks hide one another
-        if not below:
-            ends = values.min(axis=1), values.max(axis=1)
-            axes.hlines(y, *ends, color="0.85", linewidth=2, zorder=1)
-        looks = zip(style.method_colors(values).items(), _MARKS, strict=False)
-        for place, ((label, color), mark) in enumerate(looks):
-            shift = place - (values.shape[1] - 1) / 2
-            shift += (values[label].groupby(y).rank("first") % 3 - 1) / 4 if below else 0
-            edge = {"mfc": "none"} if below else {"mec": "white"}
-            axes.plot(values[label], y + below * shift, mark, color=color, label=label, **edge)
+        axes.hlines(y, values.min(axis=1), values.max(axis=1), color="0.85", linewidth=2, zorder=1)
+        for (label, color), mark in zip(style.method_colors(values).items(), _MARKS, strict=False):
+            axes.plot(values[label], y, mark, color=color, mec="white", label=label)
         axes.set_yticks(range(len(texts)), texts)
         axes.set(title=name, xlabel=x, ylim=(len(texts) - 0.5, -0.5))
         style.log_axes(axes, "x")
