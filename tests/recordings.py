@@ -96,6 +96,11 @@ def depth(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     return lambda data: data._replace(depths_mm=np.rint(change(data.depths_mm)).astype(np.uint16))
 
 
+def short(b: float) -> Change:
+    """Depths m as a camera gives them whose quadratic error is b (1/m): true = m + b m²."""
+    return depth(lambda true_mm: (np.sqrt(1 + 4 * b * true_mm / 1000) - 1) / (2 * b / 1000))
+
+
 def color(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     return lambda data: data._replace(colors=change(data.colors))
 

@@ -20,8 +20,10 @@ from recordings import (
     along_rays,
     camera_matrix,
     camera_words,
+    depth,
     larger,
     matrix_text,
+    short,
     source,
     tum_lines,
     write_image,
@@ -258,9 +260,12 @@ def test_calibration_by_the_folders_name(tmp_path: Path) -> None:
 
 
 def test_everything_declared_otherwise(tmp_path: Path) -> None:
-    """Catches a key of `sequence.toml` that is ignored, or applied the wrong way round."""
+    """Catches a key of `sequence.toml` that is ignored, or applied the wrong way round, and one
+    that a converted recording needs once more."""
     data = source()
-    raw = np.where(data.depths_mm == 0, np.uint16(60000), along_rays(data, 4).depths_mm)
+    in_quarters = depth(lambda d: 4.0 * d)(data)  # of a millimetre; with the error of a camera
+    short_by = short(0.0012 / 4)(in_quarters)
+    raw = np.where(data.depths_mm == 0, np.uint16(60000), along_rays(short_by).depths_mm)
     write_images(tmp_path, data._replace(depths_mm=raw), "image/{:06}.png")
     opengl = np.linalg.inv(data.poses @ np.diag([1.0, -1, -1, 1]))
     (tmp_path / "poses.txt").write_text(tum_lines(np.arange(N_FRAMES) / 10, opengl, "wxyz"))
@@ -270,8 +275,11 @@ def test_everything_declared_otherwise(tmp_path: Path) -> None:
     (tmp_path / "sequence.toml").write_text(
         'depth_scale = 4000\nno_depth = 60000\ndepth_along = "ray"\ncamera_axes = "opengl"\n'
         'poses = "world-to-camera"\nquaternion = "wxyz"\nframe_rate = 10\n'
+        "depth_error_per_m = 0.0012\n"
     )
     check_equal(read_sequence(tmp_path), data)
+    convert_sequence(open_recording(tmp_path), tmp_path / "converted")
+    check_equal(read_sequence(tmp_path / "converted"), data)
     assert open_recording(tmp_path).times == pytest.approx(np.arange(N_FRAMES) / 10)
 
 

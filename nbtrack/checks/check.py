@@ -91,7 +91,8 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     pairs = _pairs(T_world_camera, _N_PAIRS if is_whole else _QUICK_PAIRS)
     shown, kept = _kept(pairs, ids, is_whole)
     # Read as if in mm and z-depth, so that `depths_mm` hold the files' values for any reading.
-    as_stored = replace(recording.declared, depth_scale=1000.0, depth_along="axis")
+    values = {"depth_scale": 1000.0, "depth_along": "axis", "depth_error_per_m": 0.0}
+    as_stored = replace(recording.declared, **values)
     stored = replace(recording, declared=as_stored)
     sequence, frames = _read(stored, ids if is_whole else kept, kept)
     if is_whole and not frames.measured.any():

@@ -62,10 +62,11 @@ class Reading:
     def points(self, columns: Tensor, rows: Tensor, values: Tensor) -> Tensor:
         """Points (..., 3; m, camera frame) of pixels with depth values as in the files."""
         directions = pixel_directions(self.calibration, columns, rows)
+        z = values / self.declared.depth_scale  # m
         if self.declared.depth_along == "ray":
-            directions = directions / directions.norm(dim=-1, keepdim=True)
-        lengths = values * ((1 + self.depth_share) / self.declared.depth_scale)  # m
-        return directions * lengths[..., None]
+            z = z / directions.norm(dim=-1)
+        z = z * (1 + self.depth_share + self.declared.depth_error_per_m * z)
+        return directions * z[..., None]
 
     def T_world_camera(self, file_poses: Poses, order: str) -> Poses:
         """Camera-to-world poses with OpenCV's camera axes.

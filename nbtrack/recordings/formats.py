@@ -38,6 +38,8 @@ class Declaration:
     depth_scale: float = limited(1000.0, 1e-8, 1e8)  # depth values a metre
     no_depth: int = limited(0, 0, 65535)  # a value that means "not measured", besides 0
     depth_along: str = one_of("axis", "ray")  # the optical axis (z-depth), or the ray (distance)
+    # 1/m, of true depth = m + depth_error_per_m * m² where m is measured. The bound keeps 65 m > 0.
+    depth_error_per_m: float = limited(0.0, -0.015, 0.015)
     camera_axes: str = "opencv"  # or "opengl", or where x, y, z point: "right up forward"
     poses: str = one_of(CAMERA_TO_WORLD, WORLD_TO_CAMERA)
     quaternion: str = one_of("xyzw", "wxyz")  # the order in pose files with quaternions

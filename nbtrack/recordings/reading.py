@@ -213,6 +213,7 @@ def _in_millimetres(
         y, x = np.indices(depth.shape) + 0.5  # pixel centres
         squares = ((x - camera.cx) / camera.fx) ** 2 + ((y - camera.cy) / camera.fy) ** 2
         depth_mm /= np.sqrt(1 + squares)
+    depth_mm = depth_mm * (1 + declared.depth_error_per_m / 1000 * depth_mm)
     if depth_mm.max() > _MAX_16_BITS:
         found = f"{file} holds {depth_mm.max() / 1000:.4g} m"
         scale = f"{declared.depth_scale:g} depth values a metre"
