@@ -21,7 +21,8 @@ from motions import HAND_HELD
 from scipy.optimize import minimize
 
 from nbtrack import METHODS, load_preset, make_tracker, map_scene, open_scene, open_scenes
-from nbtrack.beyond import LmSettings, verdict
+from nbtrack.beyond import verdict
+from nbtrack.beyond.lm import LmSettings
 from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.verdict import WRONG_DEG, WRONG_M, features
 from nbtrack.data.sequence import RgbdSequence

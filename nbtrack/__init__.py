@@ -28,5 +28,4 @@ def __dir__() -> list[str]:
 def __getattr__(name: str) -> Any:
     if name not in _FACE:
         raise AttributeError(f"module 'nbtrack' has no attribute {name!r}")
-    importlib.import_module("nbtrack.experiments")  # where all fields and trackers are registered
     return getattr(importlib.import_module(f"nbtrack.{_FACE[name]}"), name)

@@ -136,9 +136,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parsed(arguments)
         if options.device:
             os.environ["NBTRACK_DEVICE"] = options.device
-        experiments = importlib.import_module("nbtrack.experiments")
         for source in options.imports:
-            experiments.import_own(source)
+            importlib.import_module("nbtrack.machinery.registry").import_own(source)
         module = _MODULES.get(options.command, "commands")
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         getattr(commands, f"{options.command}_command")(options)

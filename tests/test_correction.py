@@ -10,10 +10,10 @@ import torch
 from box_room import BoxRoom, Formula, box_sequence, poses_at
 from scipy.spatial.transform import Rotation
 
-from nbtrack.beyond import LmSettings, LmTracker
 from nbtrack.beyond.correction import CorrectedField, correct_map, corrected
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.least_squares import corrected_vertices, regularisation_of, solve
+from nbtrack.beyond.lm import LmSettings, LmTracker
 from nbtrack.beyond.views import retrieve, spread_out, view_of
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence

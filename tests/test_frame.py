@@ -8,7 +8,7 @@ import pytest
 import torch
 from box_room import BoxRoom, box_sequence, narrow_room, walk
 
-from nbtrack.beyond import LmSettings
+from nbtrack.beyond.lm import LmSettings
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence

@@ -8,9 +8,9 @@ import pytest
 import torch
 from box_room import PLANES, plane_depths, sequence_of
 
-from nbtrack.beyond import IcpSettings, PointMapping
+from nbtrack.beyond.icp import IcpSettings
 from nbtrack.beyond.lm_solver import retract
-from nbtrack.beyond.points import PointCloud, fuse_points
+from nbtrack.beyond.points import PointCloud, PointMapping, fuse_points
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.frame import Frame

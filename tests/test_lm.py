@@ -7,8 +7,8 @@ import pytest
 import torch
 from box_room import BoxRoom, box_sequence, narrow_room, sequence_of, walk
 
-from nbtrack.beyond import LmSettings, LmTracker
 from nbtrack.beyond.grid import Accuracy, BakedField
+from nbtrack.beyond.lm import LmSettings, LmTracker
 from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.views import Viewpoints, view_of
 from nbtrack.core.camera import Intrinsics

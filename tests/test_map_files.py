@@ -22,7 +22,7 @@ from finished import GIVEN
 from safetensors.torch import save
 from test_mapping import NETWORK, finished_wall, map_wall, wall_sequence
 
-from nbtrack.beyond import PointMapping
+from nbtrack.beyond.points import PointMapping
 from nbtrack.checks.in_map import check_belongs
 from nbtrack.cli import main
 from nbtrack.core.bounds import SceneBounds

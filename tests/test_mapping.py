@@ -9,7 +9,7 @@ import pytest
 import torch
 from box_room import poses_at, sequence_of
 
-from nbtrack.beyond import PointMapping
+from nbtrack.beyond.points import PointMapping
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import MappingSettings, NetworkSettings, field_class

@@ -7,9 +7,8 @@ import pytest
 import torch
 from box_room import sequence_of
 
-from nbtrack.beyond import NeusPlusMapping
 from nbtrack.beyond.feature_grid import FeatureGrid, GridNetwork, GridPlusMapping
-from nbtrack.beyond.neus_plus import ObservedDistance, distance_targets
+from nbtrack.beyond.neus_plus import NeusPlusMapping, ObservedDistance, distance_targets
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.data.pixels import PixelSampler, Rays

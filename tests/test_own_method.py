@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 from unittest import mock
 
@@ -18,13 +19,14 @@ from test_faults import assert_refused
 from tiny import TINY, tiny_words
 
 import nbtrack
-from nbtrack import experiments
 from nbtrack.cli import main
 from nbtrack.experiments.methods import METHODS, Method, method_of
 from nbtrack.experiments.presets import load_preset
 from nbtrack.fields import FIELDS, NeusMapping
+from nbtrack.machinery import registry
 from nbtrack.machinery.errors import ConfigError, NbtrackError
 from nbtrack.machinery.files import runs_folder
+from nbtrack.machinery.registry import Registry
 from nbtrack.machinery.settings import with_settings
 from nbtrack.tracking import TRACKERS, tracker_class
 
@@ -104,11 +106,11 @@ def test_the_field_of_the_notebook_in_every_command(grid_file: None, tmp_path: P
 def importing() -> Iterator[None]:
     """What a command imports is known in the block alone, as in a process of its own."""
     with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
-        for registry in (FIELDS, TRACKERS, METHODS):
-            stack.enter_context(mock.patch.dict(registry))
+        for known in (FIELDS, TRACKERS, METHODS):
+            stack.enter_context(mock.patch.dict(known))
         patch.setattr(sys, "path", [*sys.path])
         yield
-        experiments.IMPORTED.clear()
+        registry.IMPORTED.clear()
         for name in ("my-method", "helper", "own_method"):
             sys.modules.pop(name, None)
 
@@ -123,9 +125,8 @@ def test_installed_packages_join_by_their_entry_points(tmp_path: Path, monkeypat
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: own-method\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[nbtrack]\nmine = own_method\nno = own_broken\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(experiments, "IMPORTED", [])
+    monkeypatch.setattr(registry, "_waiting", [*entry_points(group="nbtrack")])
     with importing():
-        importlib.reload(experiments)
         assert main(["methods"]) == 0
     said = capsys.readouterr()
     assert "Mine" in said.out
@@ -250,7 +251,7 @@ class Blank(nbtrack.Field):
 
 
 @pytest.mark.parametrize(
-    ("registry", "kind", "says"),
+    ("known", "kind", "says"),
     [
         (FIELDS, type("Mine", (), {}), "'mine' lacks name"),
         (TRACKERS, type("Mine", (), {}), "'mine' lacks name"),
@@ -259,12 +260,12 @@ class Blank(nbtrack.Field):
         (FIELDS, Blank, "no tracker works on field 'mine'"),
     ],
 )
-def test_classes_that_lack_something(registry: dict, kind: type, says: str, monkeypatch) -> None:
+def test_classes_that_lack_something(known: Registry, kind: type, says: str, monkeypatch) -> None:
     """Catches an AttributeError in the middle of a command, and a StopIteration where no tracker of
     the package's works in an own field."""
-    monkeypatch.setitem(registry, "mine", kind)
+    monkeypatch.setitem(known, "mine", kind)
     with pytest.raises(ConfigError, match=says):
-        tracker_class("mine") if registry is TRACKERS else method_of(None, "mine", None)
+        tracker_class("mine") if known is TRACKERS else method_of(None, "mine", None)
 
 
 def test_a_place_too_large_for_a_correction() -> None:

@@ -17,8 +17,8 @@ import pytest
 from recordings import write_recording
 from tiny import TINY, tiny_words
 
-from nbtrack.beyond import PointCloud
 from nbtrack.beyond.correction import CorrectedField
+from nbtrack.beyond.points import PointCloud
 from nbtrack.cli import main
 from nbtrack.experiments.bench import default_pixels, measure_steps
 from nbtrack.experiments.grid import Execution, map_scene, map_scenes, read_run, track_scenes

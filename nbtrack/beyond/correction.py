@@ -65,6 +65,8 @@ class CorrectedField(BakedField):
     residuals.
     """
 
+    form = "corrected"
+
     def __init__(self, source: Field, voxel: float) -> None:
         """Sample a field as `BakedField` does; `add` then corrects it."""
         super().__init__(source, voxel)

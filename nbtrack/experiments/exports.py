@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from nbtrack.beyond import PointCloud
+from nbtrack.beyond.points import PointCloud
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments import output
 from nbtrack.experiments.runs import read_trajectory

@@ -15,7 +15,6 @@ from nbtrack.checks.in_map import check_belongs, in_world_of_map, map_misfit, ou
 from nbtrack.core.arrays import Pose, Poses
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.experiments import IMPORTED
 from nbtrack.experiments.jobs import Job, Report
 from nbtrack.experiments.map_jobs import PLAIN_PRESET, GivenMap, MapJob, map_unit, setting_tree
 from nbtrack.experiments.presets import PRESETS, SIZES
@@ -25,6 +24,7 @@ from nbtrack.fields import field_class
 from nbtrack.machinery import files
 from nbtrack.machinery.device import choose_device, device_name
 from nbtrack.machinery.errors import DataError, NbtrackError
+from nbtrack.machinery.registry import IMPORTED
 from nbtrack.machinery.settings import as_dict, changed_settings
 from nbtrack.mapping.files import Map
 from nbtrack.recordings.reading import parse_frames, select_frames

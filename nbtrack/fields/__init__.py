@@ -8,8 +8,9 @@ from nbtrack.fields.imap import IMapField
 from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.neus import NeuSField, NeusMapping
 from nbtrack.machinery.errors import look_up_kind
+from nbtrack.machinery.registry import Registry
 
-FIELDS: dict[str, type[Field]] = {kind.name: kind for kind in (IMapField, NeuSField)}
+FIELDS: Registry[type[Field]] = Registry({"imap": IMapField, "neus": NeuSField})
 """What can be mapped, by name. A field of your own joins by `FIELDS["mine"] = MyField`."""
 
 

@@ -58,6 +58,7 @@ class Field(nn.Module, abc.ABC):
 
     name: str  # on the command line and in file names
     label: str  # in tables and figures
+    form: str = ""  # what was made of a mapped field, by its name in `FORMS`; empty: nothing
     is_distance: bool = True  # whether its value is a signed distance (m)
     value_label: str = "signed distance (m)"  # on axes
     surface_level: float  # the value whose isosurface is drawn as the scene's surface

@@ -19,8 +19,9 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.fields import FIELDS, Field
 from nbtrack.machinery.device import usual_modes
-from nbtrack.machinery.errors import ConfigError, MissingError
+from nbtrack.machinery.errors import ConfigError, MissingError, look_up
 from nbtrack.machinery.files import naming_damaged, write_together
+from nbtrack.machinery.registry import Registry
 
 MAP_FILE = "map.safetensors"
 HISTORY_FILE = "history.csv"  # losses over iterations
@@ -28,7 +29,7 @@ MESH_FILE = "mesh.ply"  # what a map's frames have seen
 CHECKPOINT_FILE = "mapping.pt"  # of a map in the making
 _FORMAT = "nbtrack map"
 _VERSION = 4
-FORMS: dict[str, type[Field]] = {}
+FORMS: Registry[type[Field]] = Registry({})
 """What may be made of a finished map's field, as a corrected one, by its name in map files."""
 _AGAIN = "map again, and give the folder or its map.safetensors; an earlier nbtrack's are none"
 
@@ -49,7 +50,7 @@ class Map:
     def key(self) -> str:
         """Twelve hexadecimal digits that change with the field, its bounds and its weights."""
         field, network = self.field, self.record["network"]
-        plain = [field.name, _form_of(field), network, asdict(field.bounds)]
+        plain = [field.name, field.form, network, asdict(field.bounds)]
         return _digest(plain, _tensors(field))[:12]
 
 
@@ -64,7 +65,7 @@ def write_map(path: Path, finished: Map) -> None:
     header = {
         "format_version": _VERSION,
         "field": finished.field.name,
-        "form": _form_of(finished.field),
+        "form": finished.field.form,
         "bounds": [list(bounds.minimum), list(bounds.maximum)],
         "declared_unit": bounds.declared_unit,
         "camera": asdict(finished.camera),
@@ -121,7 +122,8 @@ def _read_file(file: Path) -> Map:
     if name not in FIELDS:
         advice = "import the file of its class first (--import FILE.py)"
         raise ConfigError(f"{file} is a map of field {name!r}, which is not registered: {advice}")
-    kind = FORMS[header["form"]] if header["form"] else FIELDS[name]
+    form = header["form"]
+    kind = look_up("form of maps", form, FORMS) if form else FIELDS[name]
     return Map(kind.from_state(tensors, record, bounds), Intrinsics(**header["camera"]), record)
 
 
@@ -143,11 +145,6 @@ def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise ValueError(f"{name} is not finite")
-
-
-def _form_of(mapped: Field) -> str:
-    """The name of what was made of the field as mapped, in `FORMS`; empty for that field itself."""
-    return next((name for name, kind in FORMS.items() if isinstance(mapped, kind)), "")
 
 
 def _tensors(mapped: Field) -> dict[str, Tensor]:

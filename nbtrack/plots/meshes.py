@@ -6,8 +6,7 @@ import trimesh
 from jaxtyping import Bool, Float
 from skimage.measure import marching_cubes
 
-from nbtrack.beyond import PointCloud
-from nbtrack.beyond.points import min_depth_behind
+from nbtrack.beyond.points import PointCloud, min_depth_behind
 from nbtrack.core.arrays import Frames, Position
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field

@@ -1,5 +1,1 @@
-"""Recordings of all formats; those of phones join the table as a format of one's own does."""
-
-from nbtrack.recordings import phones
-
-__all__ = ["phones"]
+"""Recordings of all formats."""

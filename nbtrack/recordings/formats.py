@@ -15,6 +15,7 @@ from nbtrack.data.dataset import DATASET_UNITS
 from nbtrack.data.pose_files import Times, read_poses
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.machinery.files import absolute
+from nbtrack.machinery.registry import Registry
 from nbtrack.machinery.settings import limited, one_of, with_values
 from nbtrack.machinery.text_files import read_object
 from nbtrack.recordings.calibration import Calibration, read_calibration
@@ -147,7 +148,7 @@ _TUM_CAMERAS = (
     Calibration(Path("freiburg2"), 520.9, 521.0, (325.6, 250.2), _VGA),
     Calibration(Path("freiburg3"), 535.4, 539.2, (320.6, 248.1), _VGA),
 )  # fmt: skip
-FORMATS: dict[str, Format] = {
+_FORMATS: dict[str, Format | str] = {
     # Azinovic et al. 2022. Filtered depth is what the dataset's own loader takes; intrinsics.txt
     # is an addition of this package.
     "neural_rgbd": Format(
@@ -190,7 +191,10 @@ FORMATS: dict[str, Format] = {
         cameras=("intrinsics.json", "intrinsics.txt", "K.txt",
                  "intrinsic.json", "camera_intrinsic.json", "camera_primesense.json"),
     ),
+    "polycam": "nbtrack.recordings.phones:POLYCAM",
+    "record3d": "nbtrack.recordings.phones:RECORD3D",
 }  # fmt: skip
+FORMATS: Registry[Format] = Registry(_FORMATS)
 
 
 def declaration(folder: Path, format: str | None = None, depth_scale: float = 0.0) -> Declaration:

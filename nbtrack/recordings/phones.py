@@ -29,7 +29,7 @@ from nbtrack.data.pose_files import Times, from_quaternions
 from nbtrack.machinery.files import naming_damaged
 from nbtrack.machinery.text_files import read_object
 from nbtrack.recordings.calibration import Calibration, calibration, camera_matrix
-from nbtrack.recordings.formats import FORMATS, Declaration, Format
+from nbtrack.recordings.formats import Declaration, Format
 
 _ADVICE = "export the recording again, as .r3d which is to be unpacked, or as raw data"
 _INSTEAD = "16-bit PNG files in millimetres into depth/ in place of the .depth files"
@@ -119,14 +119,14 @@ def _polycam_camera(path: Path) -> Calibration:
 
 
 _POLYCAM_FILES = ("keyframes/cameras/*.json",)
-FORMATS["polycam"] = Format(
+POLYCAM = Format(
     "Polycam raw data", color=("keyframes/corrected_images/*", "keyframes/images/*"),
     depth=("keyframes/depth/*",), poses=_POLYCAM_FILES, cameras=_POLYCAM_FILES,
     declared=Declaration(camera_axes="opengl"),
     read_poses=_polycam_pose, read_camera=_polycam_camera,
 )  # fmt: skip
 _RECORD3D_FILES = ("metadata", "metadata.json")
-FORMATS["record3d"] = Format(
+RECORD3D = Format(
     "Record3D", color=("rgbd/*", "rgb/*"), depth=("rgbd/*.depth", "depth/*"),
     poses=_RECORD3D_FILES, cameras=_RECORD3D_FILES,
     # Pose N of the list is that of image N, whatever its time.

@@ -5,12 +5,13 @@ import importlib.util
 from nbtrack.core.arrays import Pose
 from nbtrack.fields import FIELDS, Field, field_class
 from nbtrack.machinery.errors import ConfigError, MissingError, look_up_kind
+from nbtrack.machinery.registry import Registry
 from nbtrack.tracking.budget import Budget, ClockBudget, StepBudget, make_budget, paper_steps
 from nbtrack.tracking.paper import AdamTracker, SdfSettings, SdfTracker, VrSettings, VrTracker
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 from nbtrack.tracking.trajectories import Trajectory, track_sequence
 
-TRACKERS: dict[str, type[Tracker]] = {"vr": VrTracker, "sdf": SdfTracker}
+TRACKERS: Registry[type[Tracker]] = Registry({"vr": VrTracker, "sdf": SdfTracker})
 """What can track, by name. A tracker of your own joins by `TRACKERS["mine"] = MyTracker`."""
 
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from nbtrack.machinery.errors import check_lists, look_up
+from nbtrack.machinery.registry import Registry
 from nbtrack.tracking import check_pair, paper_steps, tracker_class
 
 
@@ -37,7 +38,7 @@ _VR_VELOCITY = ("tracking.vr.motion_model=constant_velocity",)
 _SDF_VELOCITY = ("tracking.sdf.motion_model=constant_velocity",)
 _VR_METRES = ("tracking.vr.position_unit=metre",)
 _SDF_METRES = ("tracking.sdf.position_unit=metre",)
-METHODS = {
+_OF_PAPER: dict[str, Method | str] = {
     "vr": Method("iMAP with VR", "imap", "vr"),
     "sdf": Method("NeuS with SDF", "neus", "sdf"),
     "vr_velocity": Method("iMAP with VR, constant velocity", "imap", "vr", _VR_VELOCITY),
@@ -48,7 +49,8 @@ METHODS = {
     "color": Method("iMAP with VR, colour only", "imap", "vr", _COLOR_ONLY),
     "color_neus": Method("NeuS with VR, colour only", "neus", "vr", _COLOR_ONLY),
 }
-"""The paper's, and variants of them, by name; those of the room `beyond` join where it is imported.
+METHODS: Registry[Method] = Registry(_OF_PAPER)
+"""The paper's, and variants of them, by name; those of the room `beyond` join as a plug-in's do.
 A method of your own joins by `METHODS["mine"] = Method(...)`."""
 
 
