@@ -205,7 +205,8 @@ def write_tum(folder: Path, data: Source) -> None:
         write_image(folder / name / "odd.png", image)
         lists[name].append(f"{times[1] + late:.6f} {name}/odd.png")
     for name, lines in lists.items():
-        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+        # By time, as a recorder writes it: the head's # comes before all digits.
+        (folder / f"{name}.txt").write_text("\n".join(sorted(lines)) + "\n")
     # Between the frames' poses others that must not be taken.
     between = np.tile(np.eye(4), (len(times), 1, 1))
     all_times = np.stack([times + 0.002, times + 0.05], axis=1).ravel()

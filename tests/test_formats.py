@@ -221,6 +221,38 @@ def test_poses_of_a_plain_folder(tmp_path: Path, case: str) -> None:
     check_equal(read_sequence(tmp_path), source())
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-32", "utf-16-le", "utf-8-sig"])
+def test_texts_say_how_they_are_encoded(tmp_path: Path, encoding: str) -> None:
+    """Catches the texts that Windows PowerShell writes, refused as no text or no TOML."""
+    for kind in ("plain", "tum"):
+        folder = write_recording(kind, tmp_path / kind)
+        (folder / "sequence.toml").write_text("no_depth = 9\n")
+        texts = [path for path in folder.iterdir() if path.suffix in (".txt", ".json", ".toml")]
+        assert len(texts) >= 3
+        for path in texts:
+            text = path.read_text().replace("\n", "\r\n").replace(" rgb/", " rgb\\")
+            mark = "\ufeff" if encoding == "utf-16-le" else ""
+            path.write_bytes((mark + text).encode(encoding))
+        check_equal(read_sequence(folder), source())
+        assert open_recording(folder).declared.no_depth == 9
+
+
+SPELLINGS = ["nan", "NaN", "-nan", "NAN(0x8000)", "-nan(ind)", "nan(snan)", "1.#QNAN", "-1.#IND00"]
+SPELLINGS += ["1.#R", "-1.#J", "1.#INF", "sNaN", "-NaN123", "inf", "-Infinity"]
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_a_lost_frame_however_it_is_spelled(tmp_path: Path, spelling: str) -> None:
+    """Catches a pose file that is refused for it, or rows that end where its `#` begins."""
+    folder = write_recording("plain", tmp_path / "r")
+    lines = tum_lines(np.arange(N_FRAMES) / 30, source().poses).splitlines()
+    for between in (" ", ","):
+        row = between.join([lines[2].split()[0], *[spelling] * 7])
+        text = "\n".join(["# a comment", *lines[:2], f"{row} # lost", *lines[3:]])
+        (folder / "trajectory.txt").write_text(text)
+        assert np.flatnonzero(~open_recording(folder).has_pose).tolist() == [2]
+
+
 def test_cameras_of_other_names(scene: Path, tmp_path: Path) -> None:
     """Catches a calibration that is passed over: 7-Scenes' own, one folder up too, and K.txt."""
     (scene / "focal.txt").rename(scene / "K.txt")

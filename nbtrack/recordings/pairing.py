@@ -30,6 +30,7 @@ _SAME_TIME = 1e-6  # s: the last digit of lists
 _ON_TIME = 1e-3  # s between a stamp and the number, over the rate, of the same frame
 _GAP = 0.0505  # s between poses that are interpolated, 20 Hz: at a hand's 2 m/s² 0.6 mm off
 _UNEVEN = 0.1  # share of the median step by which steps of stamps that only count may differ
+_LEAP = 10  # usual steps: a gap in numbers that is no loss of some frames, see `_check_order`
 _MOST = 0.75  # share of frames that find a pose by its stamp, if both are of one clock
 
 
@@ -79,8 +80,49 @@ def frame_keys(files: list[Path]) -> list[tuple[int, ...]]:
     return [tuple(row[i] for i in varying) for row in rows] if varying else rows
 
 
+def check_rising(times: Times, source: Path) -> None:
+    """Raises DataError where times (s; NaN: none), in the order of their source, fall or repeat.
+
+    Whoever sorted them would shuffle a recording whose clock fell back.
+    """
+    rows = np.flatnonzero(np.isfinite(times))
+    steps = np.diff(times[rows])
+    if (steps <= 0).any():
+        i = (steps <= 0).argmax()
+        before, here = times[rows[i : i + 2]]
+        found = f"{source}, row {rows[i + 1] + 1}: {here:.6f} s comes after {before:.6f} s"
+        advice = "write rising times, or cut it there; sort it only if its order means nothing"
+        why = "the clock fell back, or it has two rows of one time, or times of too few digits"
+        raise DataError(f"{found}, so {why}: {advice}")
+
+
+def _check_order(files: list[Path]) -> None:
+    """Raises DataError where the order of names, by their numbers, may not be that of frames."""
+    names = f"{files[0].parent}/{files[0].name}, {files[-1].name} and the others"
+    # Words tell no order: Jan, Feb; neither do 1.5 and 1.25, which may be 1.50 or chapters.
+    kinds = {re.sub("[0-9]+", "0", path.stem.lower()) for path in files}
+    stamps = [stamp_in(path) for path in files]
+    decimals = {tuple(map(len, re.findall(r"\d\.(\d+)", path.stem))) for path in files}
+    if len(kinds) > 1 or (None in stamps and (any(stamps) or len(decimals) > 1)):
+        found = f"{names} differ in more than their numbers, or in how these are written"
+        raise DataError(f"{found}, which tells no order: number the images as they were recorded")
+    for numbers in np.array([_numbers_in(path) for path in files]).T:
+        steps = np.diff(numbers)
+        is_counter = len(set(numbers.tolist())) == len(files) and np.ptp(numbers) < 2 * len(files)
+        if is_counter and (steps < 0).any():
+            raise DataError(f"{names} have numbers that order them in two ways: keep one of both")
+        usual, last = np.median(steps) if len(steps) else 0, numbers[-1]
+        for end in (10 ** len(str(last)), 2**8, 2**16, 2**32):
+            if 0 < numbers[0] + end - last <= 2 * usual and steps.max() > _LEAP * usual:
+                i = steps.argmax()
+                found = f"{names} have the numbers {numbers[0]} to {numbers[i]} and "
+                found += f"{numbers[i + 1]} to {last}: a counter that went back to 0 at {end}?"
+                raise DataError(f"{found} Then add {end} to the first; else leave {last} out")
+
+
 def check_paired(colors: list[Path], others: list[Path]) -> None:
-    """Raises DataError unless every image has its depth map or pose, with the same frame number."""
+    """Raises DataError unless every image has its depth map or pose, with the same frame number,
+    and the numbers tell the order of frames."""
     color_keys, other_keys = frame_keys(colors), frame_keys(others)
     if color_keys != other_keys or len(set(color_keys)) < len(color_keys):
         keys = color_keys + other_keys
@@ -92,6 +134,7 @@ def check_paired(colors: list[Path], others: list[Path]) -> None:
             f"folder one session; rename or remove the {len(odd)} that have none, or two: "
             f"{', '.join(odd[:4])}"
         )
+    _check_order(colors)
 
 
 def nearest(times: Times, others: Times, tolerance: float) -> Frames:
@@ -124,15 +167,16 @@ def pair_lists(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Pat
 
 
 def _read_list(path: Path) -> tuple[Times, list[Path]]:
-    """Times and files of a list with `timestamp file` a line, in the order of time."""
-    words = [line.strip().split(maxsplit=1) for line in read_lines(path)]
+    """Times (s), which rise, and files of a list with `timestamp file` a line."""
+    # Windows separates folders by a backslash.
+    words = [line.replace("\\", "/").strip().split(maxsplit=1) for line in read_lines(path)]
     advice = "every line holds 'timestamp file', such as '1305031102.175 rgb/1305031102.175.png'"
     with naming_damaged(path, "list", advice):
-        rows = sorted((float(time), name) for time, name in words)
-        times = in_seconds(np.array([time for time, _ in rows]))
+        times = in_seconds(np.array([float(time) for time, _ in words]))
         if not np.isfinite(times).all():
             raise ValueError("a time is not finite")
-    files = [path.parent / name for _, name in rows]
+    check_rising(times, path)
+    files = [path.parent / name for _, name in words]
     for file in files:
         if not os.path.isfile(file):  # unlike pathlib's, it takes names that no file can have
             named = f"{str(file)[:200]!r}"
@@ -250,17 +294,16 @@ def _interpolated(
     is said of camera-to-world poses: `flip` makes these of the list's, and afterwards the reverse.
     """
     found = _at(poses, nearest(times, stamps, _TOLERANCE))
-    knots, places = np.unique(stamps, return_index=True)
-    later = np.searchsorted(knots, times).clip(1, len(knots) - 1)
-    before, after = times - knots[later - 1], knots[later] - times  # s, to both stamps beside
+    later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
+    before, after = times - stamps[later - 1], stamps[later] - times  # s, to both stamps beside
     to_nearest = np.minimum(before, after)  # s; negative outside of the list
     is_between = (before + after <= _GAP) & (to_nearest > _SAME_TIME)  # else the nearest stays
     if not is_between.any():
         return found, ""
-    T_knots, wanted = flip(poses[places]), times[is_between]
+    T_knots, wanted = flip(poses), times[is_between]
     T_wanted = np.tile(np.eye(4), (len(wanted), 1, 1))
-    T_wanted[:, :3, 3] = interp1d(knots, T_knots[:, :3, 3], axis=0)(wanted)
-    turning = Slerp(knots, Rotation.from_matrix(T_knots[:, :3, :3]))
+    T_wanted[:, :3, 3] = interp1d(stamps, T_knots[:, :3, 3], axis=0)(wanted)
+    turning = Slerp(stamps, Rotation.from_matrix(T_knots[:, :3, :3]))
     T_wanted[:, :3, :3] = turning(wanted).as_matrix()
     found[is_between] = flip(T_wanted)
     note = f"{len(wanted)} of {len(found)} poses are interpolated, the nearest up to"

@@ -15,7 +15,14 @@ from nbtrack.machinery.files import absolute
 from nbtrack.machinery.text_files import read_numbers
 from nbtrack.recordings.calibration import Calibration
 from nbtrack.recordings.formats import FORMATS, Declaration, Format, declaration, files_of
-from nbtrack.recordings.pairing import TIMES_FILE, Moments, check_paired, pair_lists, stamp_in
+from nbtrack.recordings.pairing import (
+    TIMES_FILE,
+    Moments,
+    check_paired,
+    check_rising,
+    pair_lists,
+    stamp_in,
+)
 
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 
@@ -119,17 +126,21 @@ def open_recording(
 def _own_times(folder: Path, colors: list[Path]) -> Times | None:
     """Times (s) of images that stand in a folder, not in a list with times; None if nothing tells.
 
-    They come from `timestamps.txt`, else from the images' names if all hold a time, and it rises.
+    They come from `timestamps.txt`, else from the images' names if all hold a time.
     """
     path = folder / TIMES_FILE
     if not path.is_file():
         stamps = [stamp_in(file) for file in colors]
-        return None if None in stamps or (np.diff(stamps) <= 0).any() else np.array(stamps)
+        if None in stamps or len(set(stamps)) == 1:  # one of all: when the recording began
+            return None
+        check_rising(np.array(stamps), colors[0].parent)
+        return np.array(stamps)
     times = in_seconds(read_numbers(path, (1,), "the time (s) of a frame").ravel())
-    if len(times) != len(colors) or not (np.diff(times) > 0).all():
+    if len(times) != len(colors) or not np.isfinite(times).all():
         found = f"{path} has {len(times)} times for {len(colors)} images"
         advice = "in seconds, or since 1970 in milli-, micro- or nanoseconds"
         raise DataError(f"{found}: write one each, rising, {advice}")
+    check_rising(times, path)
     return times
 
 
@@ -171,6 +182,9 @@ def _poses_and_times(
     tables = [layout.read_poses(file, declared.quaternion) for file in files]
     listed = checked_poses(np.concatenate([poses for poses, _ in tables]), path)
     stamps = np.concatenate([times for _, times in tables])
+    if len(stamps) > 1 and np.ptp(stamps) == 0:  # as tools that know no times write them
+        stamps = np.full(len(stamps), np.nan)
+    check_rising(stamps, path)
     # Frames without times of their own have those of the poses, if there are as many.
     is_one_each = len(stamps) == len(moments.times) and (np.diff(stamps) > 0).all()
     times = stamps if moments.own is None and is_one_each else moments.times
