@@ -167,9 +167,9 @@ def test_a_long_recording_is_read_in_parts(tmp_path: Path, monkeypatch) -> None:
     )
     whole, sizes, read = check(folder), [], check_module.read_frames
 
-    def counted(recording, frames, *more):
+    def counted(recording, frames, **more):
         sizes.append(len(frames))
-        return read(recording, frames, *more)
+        return read(recording, frames, **more)
 
     monkeypatch.setattr(check_module, "read_frames", counted)
     monkeypatch.setattr(check_module, "_FRAMES_AT_ONCE", 8)

@@ -36,6 +36,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError
 from nbtrack.recordings.formats import FORMATS
+from nbtrack.recordings.images import images_of
 from nbtrack.recordings.reading import parse_frames, read_frames, read_sequence, select_frames
 from nbtrack.recordings.recording import open_recording
 from nbtrack.recordings.writer import convert_sequence
@@ -92,8 +93,8 @@ def test_round_trip(tmp_path: Path, format: str) -> None:
         {"calibration": replace(recording.calibration, fx=9.0)}, {"color_files": other},
         {"declared": replace(recording.declared, depth_scale=9.0)},
     )  # fmt: skip
-    seen = {str(replace(recording, **change).contents()) for change in changes}
-    seen |= {str(open_recording(folder).contents()), str(recording.contents())}
+    seen = {str(images_of(replace(recording, **change)).contents()) for change in changes}
+    seen |= {str(images_of(each).contents()) for each in (open_recording(folder), recording)}
     assert len(seen) == len(changes) + 1
 
 

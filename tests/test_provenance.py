@@ -54,7 +54,7 @@ def test_reading_counts(package: Path, tmp_path: Path) -> None:
     before = Scene("office", folder).fingerprint
     provenance.package_code.cache_clear()
     assert Scene("office", folder).fingerprint == before
-    file = package / "recordings/reading.py"
+    file = package / "recordings/images.py"
     file.write_text(file.read_text().replace("INTER_NEAREST", "INTER_LINEAR"))
     provenance.package_code.cache_clear()
     assert Scene("office", folder).fingerprint != before

@@ -90,11 +90,7 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     T_world_camera[:, :3, 3] -= recording.origin
     pairs = _pairs(T_world_camera, _N_PAIRS if is_whole else _QUICK_PAIRS)
     shown, kept = _kept(pairs, ids, is_whole)
-    # Read as if in mm and z-depth, so that `depths_mm` hold the files' values for any reading.
-    values = {"depth_scale": 1000.0, "depth_along": "axis", "depth_error_per_m": 0.0}
-    as_stored = replace(recording.declared, **values)
-    stored = replace(recording, declared=as_stored)
-    sequence, frames = _read(stored, ids if is_whole else kept, kept)
+    sequence, frames = _read(recording, ids if is_whole else kept, kept)
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     own = Reading(recording.declared, sequence.intrinsics)
@@ -233,8 +229,8 @@ def _read(
 ) -> tuple[RgbdSequence, pd.DataFrame]:
     """The frames to be kept, as a sequence, and a table with a row for each frame looked at.
 
-    Images are read in parts, so that memory holds few besides those kept. `depths_mm` are the
-    files' values, as `check_recording` declares the recording for this.
+    Images are read in parts, so that memory holds few besides those kept; those of a single part
+    are left for whoever reads next. `depths_mm` are the files' values, for any reading of them.
     A row holds the share that is measured, the brightness in [0, 1], the greatest number that
     divides all depth values, whether these are those of the row before, by what the camera moved
     and turned since the frame before, and how far it is off the middle between the frames before
@@ -242,9 +238,10 @@ def _read(
     """
     parts = []
     rows = []
+    is_short = len(looked_at) <= _FRAMES_AT_ONCE
     with ProgressBar("reading frames", len(looked_at)) as bar:
         for ids in np.split(looked_at, range(_FRAMES_AT_ONCE, len(looked_at), _FRAMES_AT_ONCE)):
-            part = read_frames(recording, ids)
+            part = read_frames(recording, ids, as_stored=True, is_kept=is_short)
             for values, color in zip(part.depths_mm, part.colors, strict=True):
                 step = np.gcd.reduce(values, axis=None)
                 rows.append(((values > 0).mean(), color.mean() / 255, step, zlib.crc32(values)))

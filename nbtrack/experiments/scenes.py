@@ -14,6 +14,7 @@ from nbtrack.machinery.files import absolute, data_folder, fingerprint, locked, 
 from nbtrack.machinery.progress import ProgressBar, tell
 from nbtrack.provenance import package_code
 from nbtrack.recordings import reading
+from nbtrack.recordings.images import images_of
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
 
@@ -42,7 +43,9 @@ class Scene:
     @cached_property
     def fingerprint(self) -> str:
         """Changes with what is read, and with the code that reads it."""
-        return fingerprint(*self.recording.contents(), package_code("data", "recordings"))
+        return fingerprint(
+            *images_of(self.recording).contents(), package_code("data", "recordings")
+        )
 
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
         """The frames of a slice such as `10:50:2`, without depths that are outliers.

@@ -102,8 +102,9 @@ class Format:
     # Poses and their times (s; NaN: none) of a file, given the order of its quaternions.
     read_poses: Callable[[Path, str], tuple[Poses, Times]] = read_poses
     read_camera: Callable[[Path], Calibration] = read_calibration
-    # Depth values, `depth_scale` a metre, of a depth map that is no PNG or JPEG file.
-    read_depth: Callable[[Path, Calibration], DepthImage] | None = None
+    # Depth values, `depth_scale` a metre, of a depth map that is no PNG or JPEG, given what is in
+    # its file, its path for messages, and the camera.
+    read_depth: Callable[[bytes, Path, Calibration], DepthImage] | None = None
 
     @property
     def needs(self) -> tuple[tuple[str, ...], ...]:

@@ -72,12 +72,11 @@ def _record3d_camera(path: Path) -> Calibration:
         return _camera(path, [fx, fy, cx, cy, content["w"], content["h"]])
 
 
-def _record3d_depth(path: Path, camera: Calibration) -> DepthImage:
+def _record3d_depth(content: bytes, path: Path, camera: Calibration) -> DepthImage:
     """Depth in millimetres; 0 where there is none, 65535 where it is farther than 16 bits can say.
 
     LZFSE is no part of Python: `liblzfse` reads it, where that is installed.
     """
-    content = path.read_bytes()
     kind = "file of float32 depth, plain or by LZFSE, in the proportions of colour"
     with naming_damaged(path, kind, _ADVICE_ON_DEPTH):
         if content[:3] == b"bvx":  # how LZFSE's blocks begin

@@ -1,6 +1,5 @@
 """A recording: its files found and paired, its texts read, before any pixel is decoded."""
 
-import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -68,17 +67,6 @@ class Recording:
             return np.zeros(3)
         center = np.median(self.T_world_camera[self.has_pose, :3, 3], axis=0)
         return np.round(center, -3) if np.abs(center).max() > _FAR_FROM_ZERO else np.zeros(3)
-
-    def contents(self) -> tuple[list[tuple[str, str, str]], str, Declaration]:
-        """What changes when a recording does: the folder, name and digest of every image, a digest
-        of times, poses and camera, and the declaration. Where the recording lies does not count."""
-        images = []
-        for file in self.color_files + self.depth_files:
-            of_file = hashlib.sha256(file.read_bytes()).hexdigest()
-            images.append((file.parent.name, file.name, of_file))
-        digest = hashlib.sha256(repr(replace(self.calibration, source=Path())).encode())
-        digest.update(self.times.tobytes() + self.file_poses.tobytes())
-        return images, digest.hexdigest(), self.declared
 
 
 def open_recording(

@@ -16,8 +16,9 @@ from nbtrack.machinery.files import write_atomic
 from nbtrack.machinery.progress import ProgressBar
 from nbtrack.recordings.calibration import camera_matrix
 from nbtrack.recordings.formats import FORMATS
+from nbtrack.recordings.images import images_of
 from nbtrack.recordings.pairing import TIMES_FILE
-from nbtrack.recordings.reading import decode, select_frames
+from nbtrack.recordings.reading import read_frames, select_frames
 from nbtrack.recordings.recording import Recording
 
 # RGB colour, depth maps (mm) by depth folder, and pose with OpenCV camera axes.
@@ -91,7 +92,7 @@ def convert_sequence(recording: Recording, out: Path, frames: slice = slice(None
     """
     select_frames(recording, frames)  # raises where none has a pose
     numbers = select_frames(recording, frames, needs_poses=False)
-    camera, _, _ = decode(recording, numbers[:1])  # one frame tells the size of all
+    camera = images_of(recording).camera_of(numbers[0])
     with ProgressBar("converting", len(numbers)) as bar:
         times = {TIMES_FILE: _text(recording.times[numbers, None])}
         write_sequence(out, camera, _frames(recording, numbers), times, bar.move_to)
@@ -108,6 +109,6 @@ def convert_sequence(recording: Recording, out: Path, frames: slice = slice(None
 def _frames(recording: Recording, numbers: Frames) -> Iterator[WrittenFrame]:
     """The frames of some numbers one by one; only `_FRAMES_AT_ONCE` are in memory at a time."""
     for part in np.split(numbers, range(_FRAMES_AT_ONCE, len(numbers), _FRAMES_AT_ONCE)):
-        _, colors, depths = decode(recording, part)
-        for color, depth, T in zip(colors, depths, recording.T_world_camera[part], strict=True):
+        read = read_frames(recording, part, origin=np.zeros(3), is_kept=False)
+        for color, depth, T in zip(read.colors, read.depths_mm, read.T_world_camera, strict=True):
             yield color, {"depth": depth}, T
