@@ -1,20 +1,19 @@
 """The provenance of results: what keys of the cache are made of besides settings and data."""
 
-import ast
-import contextlib
 import importlib.metadata
 import importlib.util
 import platform
+import secrets
 import site
 import sys
 import sysconfig
 from functools import cache
-from pathlib import Path
 
 import torch
 
 import nbtrack
 from nbtrack.machinery.files import PACKAGE, fingerprint
+from nbtrack.machinery.progress import tell
 
 # Folders whose code computes results.
 _FOLDERS = (
@@ -22,9 +21,8 @@ _FOLDERS = (
     "tracking",
 )  # fmt: skip
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp")  # that compute results beside torch
-_LIBRARIES = ("nbtrack", "torch", "abc", "typing", "builtins")  # what own classes are built on
-_LIBRARY_FOLDERS = map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib"))
-_INSTALLED = (*_LIBRARY_FOLDERS, *site.getsitepackages(), site.getusersitepackages())
+_COVERED = {"nbtrack", "torch", *sys.stdlib_module_names}  # by `package_code` and `versions`
+_SITE = (*site.getsitepackages(), site.getusersitepackages(), sysconfig.get_path("platlib"))
 
 
 @cache
@@ -34,50 +32,41 @@ def package_code(*folders: str) -> str:
     return fingerprint({str(file.relative_to(PACKAGE)): file.read_text("utf-8") for file in files})
 
 
-def code_fingerprint(*kinds: type) -> str:
-    """Twelve hexadecimal digits that change with the code that maps and tracks with some classes.
+def code_fingerprint(kind: type) -> str:
+    """Twelve hexadecimal digits that change with the code of a field or tracker, and this package.
 
-    That is this package's. Where a class or a base class was written elsewhere, it is also what
-    `own_code` finds: the code that this process has loaded from there, and a user's own files.
+    Of an installed package the version counts. Of a class from elsewhere, as a user's file, a
+    notebook or an editable installation, its qualified name and its own `version` count, and
+    nothing else; without a `version` the class itself does: nothing of it is kept for another
+    process, and a line says so.
     """
-    packages = {base.__module__.partition(".")[0] for kind in kinds for base in kind.__mro__}
-    own = packages.difference(_LIBRARIES)
-    return fingerprint(package_code(*_FOLDERS), own_code(own) if own else {})
+    return fingerprint(package_code(*_FOLDERS), _code_of(kind))
 
 
-def own_code(packages: set[str]) -> dict[str, str]:
-    """By name, the text of each loaded module that belongs to one of `packages` or is a user's own.
-
-    A user's own are those that are not installed, and not nbtrack's, which `package_code` covers:
-    helpers that a user's file imports count as the file does. Of a notebook, which has no file,
-    those statements of the executed cells count that define a class, a function or a constant.
-    """
-    texts = {}
-    for name, module in [*sys.modules.items()]:
-        file = getattr(module, "__file__", None) or ""
-        top = name.partition(".")[0]
-        is_library = top == "nbtrack" or file.startswith(_INSTALLED)
-        if (top in packages or not is_library) and file.endswith(".py") and Path(file).is_file():
-            texts[name] = Path(file).read_text("utf-8")
-    for cell in getattr(sys.modules["__main__"], "In", []):  # IPython's list of executed cells
-        with contextlib.suppress(SyntaxError):  # of a cell that ended with an error
-            for statement in ast.parse(cell).body:
-                texts |= _definition(statement)
-    return texts
+@cache
+def _code_of(kind: type) -> list[str]:
+    """What keys say of a class besides the code of this package."""
+    installed = {base.__module__: _installed(base.__module__) for base in kind.__mro__}
+    said = sorted({name for names in installed.values() for name in names})
+    if installed[kind.__module__] or kind.__module__.startswith("nbtrack."):
+        return said
+    name, version = f"{kind.__module__}.{kind.__qualname__}", vars(kind).get("version")
+    if version is None:
+        version = secrets.token_hex(6)  # for this class object in this process
+        advice = f'give {kind.__name__} version = "1", and another text whenever its code changes'
+        tell(f"nbtrack: maps and runs with {name} are not kept for another process: {advice}")
+    return [*said, name, str(version)]
 
 
-def _definition(statement: ast.stmt) -> dict[str, str]:
-    """The text of a statement that defines a class, a function or a constant, by its name.
-
-    A constant is what is assigned a value in which no other name occurs. Other statements give
-    nothing.
-    """
-    if isinstance(statement, ast.ClassDef | ast.FunctionDef):
-        return {statement.name: ast.unparse(statement)}
-    is_constant = isinstance(statement, ast.Assign) and not any(
-        isinstance(node, ast.Name) for node in ast.walk(statement.value)
-    )
-    return {ast.unparse(statement.targets[0]): ast.unparse(statement)} if is_constant else {}
+@cache
+def _installed(module: str) -> list[str]:
+    """Name and version of the distributions that a module was installed by; none for others."""
+    top = module.partition(".")[0]
+    file = getattr(sys.modules.get(module), "__file__", None) or ""
+    if top in _COVERED or not file.startswith(_SITE):
+        return []
+    names = importlib.metadata.packages_distributions().get(top, [])
+    return [f"{name} {importlib.metadata.version(name)}" for name in names]
 
 
 def versions() -> dict[str, str]:

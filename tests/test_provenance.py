@@ -2,19 +2,22 @@
 
 import importlib
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
 from nbtrack import provenance
+from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import NetworkSettings, NeuSField
+from nbtrack.experiments.track_jobs import TrackJob
+from nbtrack.fields import FIELDS, NetworkSettings, NeuSField
 from nbtrack.machinery import files
+from nbtrack.machinery.registry import Registry
 from nbtrack.synthetic import make_room
-from nbtrack.tracking import SdfTracker
+from nbtrack.tracking import TRACKERS, SdfTracker, TrackerSettings
 
 
 @pytest.fixture
@@ -29,7 +32,7 @@ def package(tmp_path: Path, monkeypatch) -> Iterator[Path]:
 
 def key() -> str:
     provenance.package_code.cache_clear()
-    return provenance.code_fingerprint(SdfTracker, NeuSField)
+    return provenance.code_fingerprint(SdfTracker)
 
 
 @pytest.mark.parametrize(
@@ -60,57 +63,82 @@ def test_reading_counts(package: Path, tmp_path: Path) -> None:
     assert Scene("office", folder).fingerprint != before
 
 
-def test_own_files_count_with_their_helpers(tmp_path: Path, monkeypatch) -> None:
-    """Catches a tracker of a user's whose loss, in a second file or a base class, is edited and
-    answered from the cache."""
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    files_of = {
-        "own_loss.py": "weight = 1.0\n",
-        "own_base.py": "from nbtrack.tracking import SdfTracker\nclass Base(SdfTracker): pass\n",
-        "own_mine.py": "import own_loss\nfrom own_base import Base\nclass Mine(Base): pass\n",
-    }
-    keys = []
-    for edited in (None, None, *files_of):
-        for name, text in files_of.items():
-            monkeypatch.delitem(sys.modules, Path(name).stem, raising=False)
-            (tmp_path / name).write_text(text + "# edited\n" * (name == edited))
-        importlib.invalidate_caches()
-        keys.append(provenance.code_fingerprint(importlib.import_module("own_mine").Mine))
-    for name in files_of:
-        monkeypatch.delitem(sys.modules, Path(name).stem)
-    assert keys[0] == keys[1]
-    assert len({*keys}) == 1 + len(files_of)
-    assert key() not in keys
-
-
-CELL = """
+SCRIPT = """
+import sys
+from nbtrack.provenance import code_fingerprint
 from nbtrack.tracking import SdfTracker
-HALF = 0.5
-def halved(x):
-    return x * HALF
 class Mine(SdfTracker):
-    name = "mine"
+    weight = {weight}
+class Promised(SdfTracker):
+    weight, version = {weight}, "{version}"
+class Later(Promised):
+    pass
+print(*map(code_fingerprint, (Mine, Promised, Later, SdfTracker)))
 """
 
 
-@pytest.mark.parametrize(
-    ("more", "counts"),
-    [
-        (CELL, False), ("rows = len('abc')", False), ("HALF = 0.5  # of it", False),
-        ("1 +", False), ("%%time", False), ("HALF = 0.4", True), (CELL.replace("*", "+"), True),
-        ('class Mine(SdfTracker):\n    name = "my"', True),
-    ],
-)  # fmt: skip
-def test_cells_count(more: str, counts: bool, monkeypatch) -> None:
-    """Catches an edited cell that is answered from the cache, and maps made anew in each cell."""
-    main = ModuleType("__main__")
-    monkeypatch.setitem(sys.modules, "__main__", main)
-    mine = type("Mine", (SdfTracker,), {"__module__": "__main__"})
-    main.In = ["", CELL]
-    before = provenance.code_fingerprint(mine)
-    main.In.append(more)
-    assert (provenance.code_fingerprint(mine) != before) == counts
+def test_classes_of_ones_own_in_other_processes() -> None:
+    """Catches an edited class that is answered from the cache of another process, one that says its
+    version and is made anew, and a class that lives on the promise of its base."""
+    keys, told = [], []
+    for weight, version in ((0.5, "1"), (0.6, "1"), (0.6, "2")):
+        script = SCRIPT.format(weight=weight, version=version)
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+        keys.append(done.stdout.split())
+        told.append(done.stderr.splitlines())
+    mine, promised, later, ours = zip(*keys, strict=True)
+    assert len({*mine, *later}) == 6
+    assert promised[0] == promised[1] != promised[2]
+    assert len({*ours}) == 1
+    assert ours[0] not in {*mine, *promised, *later}
+    assert [line.split()[5] for line in told[0]] == ["__main__.Mine", "__main__.Later"]
+    assert 'version = "1"' in told[0][0]
+
+
+def test_a_class_is_its_own_key(tmp_path: Path, monkeypatch, capsys) -> None:
+    """Catches a map made anew for each row, or for another tracker, and results of a class that has
+    been written anew, as by a cell that runs again."""
+
+    def keys() -> tuple[str, str]:
+        made = MapJob(scene, "mine", None, settings)
+        return made.key, TrackJob(made, scene, "mine", settings, steps=1).key
+
+    def write_anew(registry: Registry, base: type) -> None:
+        monkeypatch.setitem(registry, "mine", type("Mine", (base,), {"name": "mine"}))
+
+    scene = Scene("office", make_room("office", tmp_path / "office", 2, 16, 12))
+    settings = TrackerSettings()
+    write_anew(FIELDS, NeuSField)
+    write_anew(TRACKERS, SdfTracker)
+    before = keys()
+    assert keys() == before
+    assert len(capsys.readouterr().err.splitlines()) == 2  # for each class once
+    write_anew(TRACKERS, SdfTracker)
+    after = keys()
+    assert after[0] == before[0]
+    assert after[1] != before[1]
+    write_anew(FIELDS, NeuSField)
+    assert not {*keys()} & {*before, *after}
+
+
+def test_classes_of_installed_packages(tmp_path: Path, monkeypatch, capsys) -> None:
+    """Catches an installed package whose results are never kept, or outlive an update."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(provenance, "_SITE", str(tmp_path))
+    text = "from nbtrack.tracking import SdfTracker\nclass Mine(SdfTracker): pass\n"
+    (tmp_path / "own_package.py").write_text(text)
+    found = []
+    for version in ("1.0", "1.0", "1.1"):
+        about = tmp_path / "own_package-1.dist-info"
+        about.mkdir(exist_ok=True)
+        about_it = f"Metadata-Version: 2.1\nName: own-package\nVersion: {version}\n"
+        (about / "METADATA").write_text(about_it)
+        (about / "top_level.txt").write_text("own_package\n")
+        monkeypatch.delitem(sys.modules, "own_package", raising=False)
+        provenance._installed.cache_clear()  # as in another process
+        found.append(provenance.code_fingerprint(importlib.import_module("own_package").Mine))
+    assert found[0] == found[1] != found[2]
+    assert not capsys.readouterr().err
 
 
 def test_what_a_fingerprint_tells_apart() -> None:

@@ -152,7 +152,7 @@ class GivenMap:
     @cached_property
     def key(self) -> str:
         """A digest of the map, its field's code and the device."""
-        code = provenance.code_fingerprint(type(self.finished.field))
+        code = provenance.code_fingerprint(field_class(self.field))
         return fingerprint(self.finished.key, code, choose_device().type)
 
     @property

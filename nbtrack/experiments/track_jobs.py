@@ -20,7 +20,6 @@ from nbtrack.experiments.map_jobs import PLAIN_PRESET, GivenMap, MapJob, map_uni
 from nbtrack.experiments.presets import PRESETS, SIZES
 from nbtrack.experiments.runs import METRICS_FILE, scores_of, write_run
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import field_class
 from nbtrack.machinery import files
 from nbtrack.machinery.device import choose_device, device_name
 from nbtrack.machinery.errors import DataError, NbtrackError
@@ -63,10 +62,10 @@ class TrackJob(Job):
     @cached_property
     def key(self) -> str:
         """A digest of code, map, tracker, budget, frames, seed; by the clock, machine, threads."""
-        tracker, field = tracker_class(self.tracker), field_class(self.needs.field)
+        code = provenance.code_fingerprint(tracker_class(self.tracker))  # the field's: in the map's
         clock = self.rate_hz, device_name(choose_device()), torch.get_num_threads()
         budget = self.steps if self.rate_hz is None else clock
-        parts = [provenance.code_fingerprint(tracker, field), provenance.versions(), self.needs.key]
+        parts = [code, provenance.versions(), self.needs.key]
         parts += [self.tracker, self.settings, budget, self.start]
         parts += [self.frames, self.seed, self.scene.fingerprint]
         return files.fingerprint(*parts)
