@@ -2,18 +2,21 @@
 
 import contextlib
 import copy
+import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tiny import TINY
+from tiny import TINY, tiny_words
 
 from nbtrack.beyond.correction import correct_map
+from nbtrack.cli import main
 from nbtrack.experiments.bench import measure_steps
 from nbtrack.experiments.methods import METHODS, TABLE_1
 from nbtrack.experiments.presets import PRESETS, Preset, claim, load_preset
 from nbtrack.experiments.scenes import open_scene, open_scenes
 from nbtrack.machinery.errors import ConfigError, NbtrackError
+from nbtrack.machinery.files import PACKAGE
 from nbtrack.machinery.settings import changed_settings, flat, with_settings
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import map_sequence
@@ -21,7 +24,7 @@ from nbtrack.recordings.reading import parse_frames
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.synthetic.make import MOTIONS
 from nbtrack.synthetic.room import build_room
-from nbtrack.tracking import StepBudget, make_tracker
+from nbtrack.tracking import TRACKERS, SdfTracker, StepBudget, TrackerSettings, make_tracker
 from nbtrack.tracking.metrics import still_metrics
 
 KEY = "mapping.neus.iterations"
@@ -179,6 +182,32 @@ def test_changed_settings_are_those_that_were_changed(name: str) -> None:
     assert len(changed) == len(settings)
     assert with_settings(PRESETS[name], *changed) == preset
     assert load_preset(name) == PRESETS[name]
+
+
+def test_one_tree_for_a_command_and_a_short_way(monkeypatch) -> None:
+    """Catches settings that are made anew wherever one is asked for, once for each --set before,
+    and a setting that goes through more than eight functions before a tracker has it."""
+    made, way = [], []
+
+    class Counted(SdfTracker):
+        name = "counted"
+
+        @staticmethod
+        def Settings() -> TrackerSettings:
+            made.append(SdfTracker.Settings())
+            return made[-1]
+
+        def __init__(self, *arguments) -> None:
+            files = [frame.filename for frame in traceback.extract_stack()]
+            way.extend(file for file in files if Path(file).is_relative_to(PACKAGE))
+            super().__init__(*arguments)
+
+    monkeypatch.setitem(TRACKERS, "counted", Counted)
+    words = tiny_words("tracking.counted.n_pixels=8", "tracking.counted.lambda_sdf=2.0")
+    run = ["track", "office", "--tracker", "counted", "--field", "neus", "--steps", "1"]
+    assert main([*run, *words]) == 0
+    assert len(made) == 1
+    assert len(way) <= 8
 
 
 EVERY_KEY = flat(PRESETS["smoke"].settings)

@@ -12,7 +12,7 @@ from nbtrack.beyond.correction import correct_map
 from nbtrack.beyond.grid import checked_size
 from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.jobs import Job, Report
-from nbtrack.experiments.presets import PRESETS, Preset
+from nbtrack.experiments.presets import Preset, default_settings
 from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
@@ -24,8 +24,6 @@ from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
 
 OF_MAPS = ("network.", "mapping.", "correction.")
 """How keys of settings begin that only matter where a map is made."""
-PLAIN_PRESET = "synthetic"
-"""The preset whose settings are the classes' own."""
 _FRAMES_LOOKED_AT = 20  # at most, to estimate a map's unit before there is a map
 
 
@@ -35,12 +33,12 @@ def setting_tree(field: str, network: Any, settings: Any, voxel: float) -> dict[
     `network` and `settings` are the map's own, of its network and of mapping; `voxel` (m) is the
     edge of the cells in which it was corrected, 0 if it was not.
     """
-    plain = PRESETS[PLAIN_PRESET].settings
-    of_network = field if field in plain["network"] else "neus"  # whose network the field has
+    known = default_settings()
+    of_network = field if field in known["network"] else "neus"  # whose network the field has
     return {
         "network": {of_network: network} if network else {},
         "mapping": {field: settings},
-        "correction": {field: voxel} if field in plain["correction"] else {},
+        "correction": {field: voxel} if field in known["correction"] else {},
     }
 
 

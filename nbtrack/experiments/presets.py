@@ -9,6 +9,7 @@ import shlex
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,9 @@ from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.synthetic.make import MOTIONS
 from nbtrack.tables import PAPER_PIXELS
 from nbtrack.tracking import TRACKERS, TrackerSettings
+
+Values = tuple[tuple[str, Any], ...]  # dotted keys and values
+Classes = tuple[tuple[str, type], ...]  # names and what is registered by them
 
 
 @dataclass(frozen=True)
@@ -76,55 +80,22 @@ _USUAL = {"network": "neus", "mapping": "neus", "tracking": "sdf"}
 class Preset:
     """Everything that a run depends on, apart from the data and the seed.
 
-    It holds what is changed in the defaults of the settings classes, by dotted keys. Settings are
-    built from that when they are asked for: so what is registered later has settings too.
+    It holds what a method and the user change in the preset of this name, as sorted pairs of a
+    dotted key and a value. All of that is checked.
     """
 
     name: str
-    own: dict[str, Any] = field(default_factory=dict)  # changed by the preset itself
-    of_method: dict[str, Any] = field(default_factory=dict)  # by the method that is run
-    chosen: dict[str, Any] = field(default_factory=dict)  # by the user, over both
+    of_method: Values = ()  # by the method that is run
+    chosen: Values = ()  # by the user, over the preset and the method
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The whole tree, with every field and tracker that is registered now.
-
-        What the preset does not name has the defaults of its class, with what the preset changes in
-        NeuS or in SDF tracking. A user's values change only what they name.
-        """
-        learned = {name: kind for name, kind in FIELDS.items() if issubclass(kind, LearnedField)}
-        networks = {n: k.Network() for n, k in learned.items() if k.Network is not NetworkSettings}
-        tree = {
-            "network": _NETWORKS | networks,
-            "mapping": {name: kind.Settings() for name, kind in FIELDS.items()},
-            # Cells (m) in which the finished map of a distance is corrected; 0: it is not.
-            "correction": {name: 0.0 for name, kind in learned.items() if kind.is_distance},
-            "tracking": {name: kind.Settings() for name, kind in TRACKERS.items()},
-            "scenes": ScenesConfig(),
-            "tables": TablesConfig(),
-        }
-        return with_values(tree, self._usual(tree) | self.own | self.of_method | self.chosen)
-
-    def _usual(self, tree: dict[str, Any]) -> dict[str, Any]:
-        """By dotted keys, what the preset changes in fields and trackers that it does not name.
-
-        That is what it changes in NeuS, or for trackers in SDF, where they have such a setting.
-        """
-        named = {tuple(key.split(".")[:2]) for key in self.own}
-        values = {}
-        for key, value in self.own.items():
-            part, _, rest = key.partition(".")
-            name, _, setting = rest.partition(".")
-            if name != _USUAL.get(part):
-                continue
-            for other, settings in tree[part].items():
-                if (part, other) not in named and hasattr(settings, setting):
-                    values[f"{part}.{other}.{setting}"] = value
-        return values
+        """The whole tree, made once; and once more where a field or tracker is registered later."""
+        return _merged(self, tuple(FIELDS.items()), tuple(TRACKERS.items()))
 
     def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Values in the types of their settings; ConfigError for a key or value not allowed."""
-        tree = self.settings
+        tree = PRESETS[self.name].settings
         for key in values:
             part, *names = key.split(".")
             known = tree.get(part)
@@ -136,12 +107,14 @@ class Preset:
 
     def with_values(self, values: Mapping[str, Any]) -> "Preset":
         """The preset with a user's values, by dotted keys. Raises ConfigError for wrong ones."""
-        return replace(self, chosen=self.chosen | self._checked(values))
+        chosen = dict(self.chosen) | self._checked(values)
+        return replace(self, chosen=tuple(sorted(chosen.items())))
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
         """The preset with the `key=value` texts of a method, over which a user's values win."""
         values = {key: value for text in settings for key, value in read_setting(text).items()}
-        return replace(self, of_method=self.of_method | self._checked(values))
+        of_method = dict(self.of_method) | self._checked(values)
+        return replace(self, of_method=tuple(sorted(of_method.items())))
 
     @property
     def scenes(self) -> ScenesConfig:
@@ -183,13 +156,65 @@ class Preset:
 
 
 _SMALL = flat(read_object(Path(__file__).with_name("smoke.toml")))
-_NINE = {"scenes.names": REPORTED_ROOMS, "scenes.track_frames": ":"}
-PRESETS = {
-    "smoke": Preset("smoke", _SMALL),
-    "nine_rooms": Preset("nine_rooms", _SMALL | _NINE),
-    "synthetic": Preset("synthetic", {"scenes.names": REPORTED_ROOMS}),
-    "paper": Preset("paper", {"scenes.names": tuple(DATASET_SCENES)}),
+# What presets change in the defaults of the settings classes.
+_OWN: dict[str, dict[str, Any]] = {
+    "smoke": _SMALL,
+    "nine_rooms": _SMALL | {"scenes.names": REPORTED_ROOMS, "scenes.track_frames": ":"},
+    "synthetic": {"scenes.names": REPORTED_ROOMS},
+    "paper": {"scenes.names": tuple(DATASET_SCENES)},
 }
+PRESETS = {name: Preset(name) for name in _OWN}
+
+
+def default_settings() -> dict[str, Any]:
+    """The tree of the settings classes' own defaults, for all fields and trackers known now."""
+    return _defaults(tuple(FIELDS.items()), tuple(TRACKERS.items()))
+
+
+@lru_cache(maxsize=1)
+def _defaults(fields: Classes, trackers: Classes) -> dict[str, Any]:
+    """The tree of defaults for some fields and trackers."""
+    learned = {name: kind for name, kind in fields if issubclass(kind, LearnedField)}
+    networks = {n: k.Network() for n, k in learned.items() if k.Network is not NetworkSettings}
+    return {
+        "network": _NETWORKS | networks,
+        "mapping": {name: kind.Settings() for name, kind in fields},
+        # Cells (m) in which the finished map of a distance is corrected; 0: it is not.
+        "correction": {name: 0.0 for name, kind in learned.items() if kind.is_distance},
+        "tracking": {name: kind.Settings() for name, kind in trackers},
+        "scenes": ScenesConfig(),
+        "tables": TablesConfig(),
+    }
+
+
+@lru_cache(maxsize=64)
+def _merged(preset: Preset, fields: Classes, trackers: Classes) -> dict[str, Any]:
+    """The tree of a preset, for some fields and trackers.
+
+    What the preset does not name has the defaults of its class, with what the preset changes in
+    NeuS or in SDF tracking. A user's values change only what they name.
+    """
+    tree, own = _defaults(fields, trackers), _OWN[preset.name]
+    usual = _usual(own, tree)
+    return with_values(tree, usual | own | dict(preset.of_method) | dict(preset.chosen))
+
+
+def _usual(own: dict[str, Any], tree: dict[str, Any]) -> dict[str, Any]:
+    """By dotted keys, what a preset changes in fields and trackers that it does not name.
+
+    That is what it changes in NeuS, or for trackers in SDF, where they have such a setting.
+    """
+    named = {tuple(key.split(".")[:2]) for key in own}
+    values = {}
+    for key, value in own.items():
+        part, _, rest = key.partition(".")
+        name, _, setting = rest.partition(".")
+        if name != _USUAL.get(part):
+            continue
+        for other, settings in tree[part].items():
+            if (part, other) not in named and hasattr(settings, setting):
+                values[f"{part}.{other}.{setting}"] = value
+    return values
 
 
 def load_preset(
@@ -217,7 +242,7 @@ def load_preset(
     except ValueError as error:
         advice = "quote each setting as in a shell"
         raise ConfigError(f"NBTRACK_SET cannot be split ({error}): {advice}") from None
-    # The method comes last here, but `Preset.settings` lets a user's values win over it.
+    # The method comes last here, but what the user has chosen wins over it.
     return with_settings(preset, *before, *settings).with_method(of_method)
 
 

@@ -16,8 +16,8 @@ from nbtrack.core.arrays import Pose, Poses
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.jobs import Job, Report
-from nbtrack.experiments.map_jobs import PLAIN_PRESET, GivenMap, MapJob, map_unit, setting_tree
-from nbtrack.experiments.presets import PRESETS, SIZES
+from nbtrack.experiments.map_jobs import GivenMap, MapJob, map_unit, setting_tree
+from nbtrack.experiments.presets import SIZES, default_settings
 from nbtrack.experiments.runs import METRICS_FILE, scores_of, write_run
 from nbtrack.experiments.scenes import Scene
 from nbtrack.machinery import files
@@ -223,7 +223,7 @@ class TrackJob(Job):
         options = {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
         options |= {"start": self.start, "frames": self.frames, "seed": self.seed}
         options |= {"format": self.scene.format, "device": choose_device().type}
-        options["preset"] = PLAIN_PRESET  # settings are given as changes of the classes' own
+        options["preset"] = "synthetic"  # whose settings are the classes' own
         settings: dict[str, Any] = {"tracking": {self.tracker: self.settings}}
         sequence = str(self.scene.folder)
         made = self.needs
@@ -237,7 +237,7 @@ class TrackJob(Job):
                 sequence = self.scene.name
                 settings["scenes"] = {name: getattr(self.scene.made, name) for name in SIZES}
         words = ["python", "-m", "nbtrack", "track", sequence]
-        changed = changed_settings(settings, PRESETS[PLAIN_PRESET].settings)
+        changed = changed_settings(settings, default_settings())
         words += [f"--set={text}" for text in changed]
         words += [f"--{name}={value}" for name, value in options.items() if value is not None]
         words += [f"--import={source}" for source in IMPORTED]
