@@ -222,7 +222,7 @@ def test_settings_of_own_classes_whenever_they_are_registered(when: str, monkeyp
     preset = load_preset("smoke", settings=chosen)
     register()
     mapping, tracking = preset.mapping_of("mine"), preset.tracking_of("mine")
-    assert (mapping.iterations, mapping.n_rays, mapping.n_surface) == (1200, 96, 5)
+    assert (mapping.iterations, mapping.n_rays, mapping.n_surface) == (2400, 96, 5)
     assert preset.network_of("mine").width == 96
     assert (tracking.n_pixels, tracking.lambda_sdf) == (512, 1.0)
     assert tracking.motion_model == "constant_velocity"

@@ -27,25 +27,27 @@ _TRUE_LINE = {"colors": method_colors(["true"])["true"], "linestyles": "--"}
 def plot_slice(
     fields: Field | Sequence[Field],
     sequence: RgbdSequence,
-    height: float,
+    height: float | None = None,
     room: Room | None = None,
     title: str = "",
 ) -> Figure:
     """A field's values on the horizontal plane `height` metres up, drawn as `draw_slice` does.
 
-    Fields of one recording stand side by side, in the colour scale of the first. `sequence` are the
-    frames that the maps were made of. `room` is the exact scene, if it is a synthetic one: its
-    surface is dashed green, and its distance stands beside that of a single field. The axes end
-    around the path and what the frames have seen, within the room if that is known.
+    Fields of one recording stand side by side, in one colour scale. `sequence` are the frames that
+    the maps were made of; `height` is by default the cameras' mean. `room` is the exact scene, if
+    it is a synthetic one: its surface is dashed green, and its distance stands beside those of the
+    fields. The axes end around the path and what the frames have seen, within a known room.
     """
     drawn = [fields] if isinstance(fields, Field) else [*fields]
-    if len(drawn) == 1 and room is not None and drawn[0].is_distance:
+    if room is not None and drawn[0].is_distance:
         drawn.append(_ExactDistance(room, drawn[0]))
     # Lower with more panels, which are narrower.
     panels = new_axes(title, 5.4 - 0.9 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
     norm = None  # the first field's, for all
     for axes, field in zip(panels, drawn, strict=True):
         up, page = scene.draw_from_above(axes, {"camera path": sequence.T_world_camera})
+        if height is None:
+            height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / _POINTS_ALONG
         points, places = _level_grid(page, low, high + step, step, height * up)

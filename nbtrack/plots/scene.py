@@ -26,7 +26,7 @@ _AMBIENT = 0.55  # share of the light on a mesh that comes from everywhere
 UNSEEN = "0.82"
 """The grey of what no frame has seen; the scales of values hold no grey."""
 _CUT = 0.01  # share of a recording's points cut off at either end: wild depths hide the room
-_LINES_M = np.arange(-1.0, 1.01, 0.25).tolist()  # distances with a thin line
+_LINES_M = np.arange(-5.0, 5.01, 0.25).tolist()  # distances with a thin line
 
 
 def up_of(*T_paths: Poses) -> np.ndarray:
@@ -164,13 +164,16 @@ def draw_slice(
     A signed distance is blue in free space and red in matter, with thin lines 0.25 m apart; a
     density or an occupancy has a logarithmic scale. Black is the surface (the field's
     `surface_level`). What no frame has seen is grey: there the field invents. `bar` holds options
-    of `Figure.colorbar`. Returns the scale; with that of another slice as `norm` no bar is drawn.
+    of `Figure.colorbar`. Returns the scale; with that of another slice as `norm` no bar is drawn,
+    and of distances it is widened for both.
     """
     _, values = query_field(field, points)
     level = field.surface_level
     if field.is_distance:
-        limit = np.clip(np.quantile(np.abs(values), 0.98), 0.2, 1.5)  # m, the ends of the scale
+        limit = max(0.2, np.quantile(np.abs(values), 0.98), norm.vmax if norm else 0)  # m
         own_norm, colors = Normalize(-limit, limit), "RdBu"
+        if norm:
+            norm.vmin, norm.vmax = -limit, limit
     else:
         own_norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
     look = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
