@@ -104,7 +104,7 @@ def test_resume_equals_uninterrupted(field_name: str, tmp_path: Path) -> None:
 
 def test_diverged_loss_names_the_iteration() -> None:
     """Catches NaN that spreads unnoticed: an absurd learning rate must stop the run."""
-    settings = settings_of("neus", iterations=200, learning_rate=1e18)
+    settings = settings_of("neus", iterations=200, learning_rate=1e6)
     with pytest.raises(NumericalError, match=r"at mapping iteration \d+: lower the learning rate"):
         map_sequence("neus", wall_sequence(), NETWORK, settings)
 

@@ -23,7 +23,9 @@ from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, field_class
 from nbtrack.fields.base import State
-from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.device import usual_modes
+from nbtrack.machinery.errors import ConfigError, DataError
+from nbtrack.machinery.files import check_recipe
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 
@@ -105,12 +107,14 @@ class CorrectedField(BakedField):
         return field
 
 
+@usual_modes()
 def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
     """A map corrected in cells of `voxel` (m) by the frames it was made from; see `corrected`.
 
     Its record says how long that took, and how much memory (bytes) network and corrections take.
     """
     start = time.perf_counter()
+    check_recipe("the map", finished.record, {"data": sequence.digest})
     mapped, _ = split_holdout(len(sequence), finished.record["settings"]["holdout_every"])
     field = corrected(finished.field, sequence, mapped, voxel)
     seconds = time.perf_counter() - start
@@ -121,14 +125,17 @@ def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
     return replace(finished, field=field, record=record)
 
 
+@usual_modes()
 def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float) -> CorrectedField:
     """A map with a signed distance, corrected in cells of `voxel` (m) by its mapped frames.
 
     At a measured point p with normal n the interpolated distance at p + s n shall be s, at five
     offsets s, and the colour at p that of the pixel, but at the surface alone: off it a camera saw
     none. These equations, weighted by 1 / depth^2, are linear in the corrections of the vertices
-    around; see `solve`. Raises DataError where no frame shows a plane.
+    around; see `solve`. Raises DataError where no frame shows a plane, ConfigError for a density.
     """
+    if not field.is_distance:
+        raise ConfigError(f"{field.label} is no signed distance: only such a map can be corrected")
     grid = CorrectedField(copy.deepcopy(field).cpu(), voxel)
     seen = _measured_planes(sequence, frames, grid)
     n_points = len(seen.points_world)
@@ -156,7 +163,7 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     medians = [float(np.median(np.abs(each))) for each in (distance_residuals, luma_residuals)]
     corrections = torch.from_numpy(np.column_stack([color, distance, confidence])).float().half()
     correction = {"numbers": torch.from_numpy(numbers).int(), "corrections": corrections}
-    correction["residual_medians"] = torch.tensor(medians)
+    correction["residual_medians"] = torch.tensor(medians, dtype=torch.float32)
     grid.add(correction | _views(sequence, frames))
     return grid
 
@@ -200,7 +207,11 @@ def _draw_planes(sequence: RgbdSequence, frames: Frames, grid: BakedField, n: in
     sampler = PixelSampler(sequence, torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
     rays = sampler.draw(n, generator, torch.from_numpy(frames), tangent_planes=True)
-    has_plane = rays.normals_world.any(dim=-1)
+    ends = rays.points(rays.depth[:, None])[:, 0]
+    low, high = grid.low, grid.low + grid.voxel * (ends.new_tensor(grid.n_vertices) - 1)
+    # The grid says nothing of points outside: a facade seen through a window.
+    is_inside = ((ends >= low) & (ends <= high)).all(dim=-1)
+    has_plane = rays.normals_world.any(dim=-1) & is_inside
     if not has_plane.any():
         raise DataError(f"{sequence.name} shows no surface to correct a map by: check its depth")
     points_world = rays.points(rays.depth[:, None])[has_plane, 0].double().numpy()

@@ -10,6 +10,7 @@ from nbtrack.beyond.grid import trilinear
 from nbtrack.beyond.neus_plus import NeuSPlusField, NeusPlusMapping
 from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.core.bounds import SceneBounds
+from nbtrack.fields.mlp import empty_linear
 from nbtrack.machinery.settings import limited
 
 _SMALL = 0.01  # standard deviation of features before the first iteration
@@ -48,14 +49,17 @@ class FeatureGrid(nn.Module):
     def __init__(self, settings: GridNetwork, bounds: SceneBounds, generator: Generator) -> None:
         super().__init__()
         self.metres_per_unit = bounds.metres_per_unit
-        self.register_buffer("low", torch.tensor(bounds.minimum), persistent=False)
-        extent = torch.tensor(bounds.maximum) - self.low
+        self.register_buffer(
+            "low", torch.tensor(bounds.minimum, dtype=torch.float32), persistent=False
+        )
+        extent = self.low.new_tensor(bounds.maximum) - self.low
         self.voxels = [settings.finest * 2**level for level in range(settings.levels)]
         shapes = [((extent / voxel).ceil().long() + 1).tolist() for voxel in self.voxels]
-        volumes = [torch.randn(settings.features, *shape, generator=generator) for shape in shapes]
+        drawn = {"generator": generator, "dtype": torch.float32}
+        volumes = [torch.randn(settings.features, *shape, **drawn) for shape in shapes]
         self.volumes = nn.ParameterList(_SMALL * volume for volume in volumes)
-        self.layer = nn.Linear(settings.levels * settings.features + 3, settings.hidden)
-        self.head = nn.Linear(settings.hidden, 4)  # colour and value
+        self.layer = empty_linear(settings.levels * settings.features + 3, settings.hidden)
+        self.head = empty_linear(settings.hidden, 4)  # colour and value
         for part in (self.layer, self.head):
             nn.init.normal_(part.weight, std=part.in_features**-0.5, generator=generator)
             nn.init.normal_(part.bias, std=0.5, generator=generator)

@@ -17,7 +17,7 @@ from nbtrack.beyond.views import Viewpoints
 from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.fields.base import Field
-from nbtrack.machinery.device import constant
+from nbtrack.machinery.device import constant, usual_modes
 from nbtrack.machinery.errors import ConfigError
 
 _POINTS_AT_ONCE = 65_536
@@ -47,6 +47,7 @@ class BakedField(Field):
     accuracy = Accuracy()
     viewpoints: Viewpoints | None = None  # from where a lost camera is looked for
 
+    @usual_modes()
     @torch.no_grad()
     def __init__(self, source: Field, voxel: float | int) -> None:
         """Sample a field, on its device, in cells of `voxel` (m), one to spare on each side.
@@ -62,10 +63,11 @@ class BakedField(Field):
         self.voxel = float(voxel)
         self.n_vertices = checked_size(source.bounds, voxel)
         # The first vertex lies one cell below the bounds; z is fastest.
-        low = torch.tensor([x - voxel for x in self.bounds.minimum]).to(source.device)
+        first = [x - voxel for x in self.bounds.minimum]
+        low = torch.tensor(first, dtype=torch.float32).to(source.device)
         axes = [torch.arange(n, dtype=torch.int32, device=low.device) for n in self.n_vertices]
         batches = torch.cartesian_prod(*axes).split(_POINTS_AT_ONCE)
-        answers = [source(low + voxel * vertices) for vertices in batches]
+        answers = [source(low + voxel * vertices.float()) for vertices in batches]
         color = torch.cat([color for color, _ in answers])
         value = torch.cat([value for _, value in answers])
         # Channels: red, green, blue, value, and a confidence of 1 everywhere.

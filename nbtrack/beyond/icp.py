@@ -1,7 +1,6 @@
 """ICP: each frame is aligned with a fused point cloud, without any network."""
 
 import importlib
-from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,7 +68,7 @@ class IcpTracker(Tracker):
             advice = "set a smaller mapping.points.voxel, or map more frames"
             raise ConfigError(f"{found}; ICP needs {_NEIGHBOURS} or more: {advice}")
         self.small_gicp = importlib.import_module(self.package)
-        field = deepcopy(field).cpu()
+        field = field.cpu()
         self.target = self.small_gicp.PointCloud(field.points.double().numpy())
         self.target_tree = self._find_planes(self.target)
         self.map_normals = self.target.normals()[:, :3]

@@ -27,9 +27,13 @@ _CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T  # of a cell, 8 x 3: z is faste
 
 
 def interpolation(points_world: WorldPoints, grid: BakedField) -> tuple[Vertices, Corners]:
-    """Numbers of the eight vertices around points (m), and their weights in the interpolation."""
+    """Numbers of the eight vertices around points (m), and their weights in the interpolation.
+
+    Points outside are moved to the border, as the grid itself does.
+    """
     shape = np.array(grid.n_vertices)
     scaled = (points_world - grid.low.double().numpy()) / grid.voxel
+    scaled = scaled.clip(0, shape - 1)
     cells = np.clip(np.floor(scaled).astype(np.int64), 0, shape - 2)
     # Of the two vertices along each axis: n x 3 x 2. A corner's weight is the product of three.
     along = np.stack([1 - (scaled - cells), scaled - cells], axis=-1)

@@ -1,7 +1,6 @@
 """LM: second-order steps on signed distance and colour at observed points, and restarts."""
 
 from collections.abc import Iterator
-from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 
@@ -92,7 +91,7 @@ class LmTracker(Tracker):
     def prepare(self, field: Field) -> BakedField:
         """The map as a grid on the host; ConfigError where it would be too large."""
         baked = field if isinstance(field, BakedField) else BakedField(field, self.settings.voxel)
-        on_host = baked if baked.device.type == "cpu" else deepcopy(baked).cpu()
+        on_host = baked.cpu()
         self.grid = grid_of(on_host)
         # A search of nothing loads what numba has compiled, the inner functions before those that
         # call them: else sums would be rounded otherwise in the process that compiles than later.
@@ -111,7 +110,7 @@ class LmTracker(Tracker):
         estimate = super().track(frame, budget)
         self.was_lost = estimate.lost
         if not estimate.lost:
-            self.last_good = torch.from_numpy(estimate.T_world_camera)
+            self.last_good = torch.from_numpy(self.estimates[-1])  # the user has the other
         return estimate
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:

@@ -82,7 +82,7 @@ class Terms(NamedTuple):
 
 def grid_of(field: BakedField) -> Grid:
     """The grid of a field on the host."""
-    intensity = field.volume[:3].T @ torch.tensor(LUMA)
+    intensity = field.volume[:3].T @ torch.tensor(LUMA, dtype=torch.float32)
     value, confidence = field.volume[3:]
     return Grid(
         vertices=torch.stack([value, intensity, confidence], dim=-1).numpy(),

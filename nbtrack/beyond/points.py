@@ -67,7 +67,9 @@ class PointCloud(Field):
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour of the nearest point, and distance (m, without sign) from it."""
-        distance, nearest = self.tree.query(points_world.cpu().numpy())
+        asked = points_world.detach().cpu().numpy()
+        distance, nearest = self.tree.query(np.nan_to_num(asked))
+        distance[np.isnan(asked).any(axis=1)] = np.nan
         return self.colors[nearest], torch.from_numpy(distance).to(points_world)
 
     @cached_property

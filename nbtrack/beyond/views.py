@@ -52,8 +52,8 @@ def view_of(frame: Frame) -> View:
     n_rows = max(1, round(camera.height / (camera.fy * _STEP)))
     n_columns = max(1, round(camera.width / (camera.fx * _STEP)))
     blurred = adaptive_avg_pool2d(parts.to("cpu"), (n_rows, n_columns))
-    x = _STEP * (torch.arange(_COLUMNS) - (_COLUMNS - 1) / 2)
-    y = _STEP * (torch.arange(_ROWS) - (_ROWS - 1) / 2)
+    x = _STEP * (torch.arange(_COLUMNS).float() - (_COLUMNS - 1) / 2)
+    y = _STEP * (torch.arange(_ROWS).float() - (_ROWS - 1) / 2)
     # The directions' pixels, as `grid_sample` takes them: the picture spans -1 to 1.
     u = 2 * (camera.fx * x + camera.cx) / camera.width - 1
     v = 2 * (camera.fy * y + camera.cy) / camera.height - 1

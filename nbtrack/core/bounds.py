@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from nbtrack.core.arrays import Points, Values
 from nbtrack.machinery.device import constant
+from nbtrack.machinery.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,20 @@ class SceneBounds:
     minimum: tuple[float, float, float]
     maximum: tuple[float, float, float]
     declared_unit: float | None = None  # m, where the authors of a recording give it
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for corners that are not finite, or no box, or no positive unit."""
+        unit = 1 if self.declared_unit is None else self.declared_unit
+        try:
+            corners = np.array([self.minimum, self.maximum], dtype=np.float64).reshape(2, 3)
+        except (TypeError, ValueError):
+            corners = np.zeros((2, 3))
+        extent = np.append(corners[1] - corners[0], unit)
+        if not (extent.min() > 0 and np.isfinite(extent).all()):
+            advice = "give x, y, z (m) of the minimum, then those of the maximum, all larger"
+            raise ConfigError(f"{self} are no bounds: {advice}")
+        for name, corner in zip(("minimum", "maximum"), corners.tolist(), strict=True):
+            object.__setattr__(self, name, tuple(corner))
 
     @property
     def center(self) -> Float[np.ndarray, "3"]:

@@ -6,9 +6,13 @@ lie at integer + 0.5, so an image of width W spans [0, W].
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Real
 from torch import Tensor
+
+from nbtrack.machinery.errors import ConfigError
+from nbtrack.machinery.settings import whole_number
 
 
 @dataclass(frozen=True)
@@ -21,6 +25,18 @@ class Intrinsics:
     fy: float
     cx: float  # principal point, column; W/2 is the image's middle
     cy: float  # principal point, row; H/2 is the image's middle
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for a size or a focal length that no camera has."""
+        for name in ("width", "height"):
+            size = whole_number(f"a camera's {name}", getattr(self, name), minimum=1)
+            object.__setattr__(self, name, size)
+        if not (
+            min(self.fx, self.fy) > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()
+        ):
+            raise ConfigError(
+                f"{self} is no camera: fx and fy must be positive, all finite (pixels)"
+            )
 
     @classmethod
     def from_focal(cls, width: int, height: int, focal: float) -> "Intrinsics":

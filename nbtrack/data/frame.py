@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int, UInt8, UInt16
 from torch import Tensor
 
-from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values
+from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values, check_array
 from nbtrack.core.camera import Intrinsics, backproject
 from nbtrack.machinery.errors import DataError
 
@@ -27,6 +27,19 @@ class Frame:
     T_world_camera: Pose | None = None  # the true pose, where it is known
     name: str = "the frame"  # what errors call it
 
+    def __post_init__(self) -> None:
+        """Raises DataError for an image of another size or type; rows follow each other then."""
+        size = self.camera.height, self.camera.width
+        is_color = self.color.dtype is torch.uint8 and self.color.shape == (*size, 3)
+        if not is_color or self.depth_mm.is_floating_point() or self.depth_mm.shape != size:
+            found = (
+                f"color {self.color.dtype} {[*self.color.shape]}, depth_mm {self.depth_mm.dtype} "
+            )
+            advice = f"give uint8 and int32 images of {size}, or numpy's to Frame.of_images"
+            raise DataError(f"{self.name} has {found}{[*self.depth_mm.shape]}: {advice}")
+        object.__setattr__(self, "color", self.color.contiguous())
+        object.__setattr__(self, "depth_mm", self.depth_mm.contiguous())
+
     @classmethod
     def of_images(cls, camera: Intrinsics, color: np.ndarray, depth: np.ndarray) -> "Frame":
         """A camera's images, copied: the memory may be used again for the next ones.
@@ -36,17 +49,18 @@ class Frame:
         Args:
             color: RGB, (height, width, 3), uint8.
             depth: z-depth along the optical axis, (height, width): uint16 in millimetres, or
-                floating point in metres, kept to the millimetre. 0, NaN, infinite and negative ones
-                are none, and so are masked ones.
+                floating point in metres, kept to the millimetre. None is measured where it is 0,
+                NaN, infinite, negative, masked, or 65535 mm and more, the end of 16 bits.
         """
-        _check("color", color, (camera.height, camera.width, 3), [UInt8], "uint8")
-        _check("depth", depth, (camera.height, camera.width), [UInt16, Float], _DEPTH_UNITS)
+        check_array("color", color, (camera.height, camera.width, 3), [UInt8], "uint8")
+        check_array("depth", depth, (camera.height, camera.width), [UInt16, Float], _DEPTH_UNITS)
         if np.ma.is_masked(color):
             raise DataError("color has masked pixels: fill them; only depth may lack some")
         rgb = np.array(np.ma.getdata(color), order="C")
         measured = np.ma.filled(depth, 0)
         is_mm = measured.dtype.type == np.uint16  # of any byte order
         depth_mm = (measured if is_mm else _in_millimetres(measured)).astype(np.int32)
+        depth_mm[depth_mm >= _MAX_MILLIMETRES] = 0
         return cls(camera, torch.from_numpy(rgb), torch.from_numpy(depth_mm))
 
     @property
@@ -78,7 +92,7 @@ class Frame:
 
 
 def _in_millimetres(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Depth (m) in whole millimetres; 0 where it is no positive number, or more than 16 bits hold.
+    """Depth (m) in whole millimetres; 0 where it is no positive number.
 
     Raises DataError if the median is no depth in metres.
     """
@@ -86,18 +100,4 @@ def _in_millimetres(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]
     median = np.median(depth[depth > 0]) if depth.any() else 0
     if median > _MAX_METRES:
         raise DataError(f"depth is {median:.4g} m in the median: give {_DEPTH_UNITS}")
-    depth_mm = (depth / MILLIMETRE).round()
-    return np.where(depth_mm > _MAX_MILLIMETRES, 0, depth_mm)
-
-
-def _check(what: str, image: np.ndarray, shape: tuple, kinds: list, asked: str) -> None:
-    """Raises DataError for another shape, or a type that is none of the kinds (jaxtyping's).
-
-    The message calls the image `what`, and the types that it may have `asked`.
-    """
-    wanted = " ".join(map(str, shape))
-    if not any(isinstance(image, kind[np.ndarray, wanted]) for kind in kinds):
-        found = f"of type {type(image).__name__}"
-        if isinstance(image, np.ndarray):
-            found = f"{image.dtype} of shape {image.shape}"
-        raise DataError(f"{what} is {found}: give a numpy array, {asked}, of shape {shape}")
+    return (depth / MILLIMETRE).round().clip(0, _MAX_MILLIMETRES)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.core.arrays import Colors, Indices, Points, RaySamples, Values
+from nbtrack.core.arrays import Colors, Indices, Points, RaySamples, Values, tensor_of
 from nbtrack.core.camera import backproject, pixel_directions
 from nbtrack.data.frame import MILLIMETRE
 from nbtrack.data.sequence import RgbdSequence
@@ -47,10 +47,10 @@ class PixelSampler:
         self.device = device
         self.intrinsics = sequence.intrinsics
         images_device = device if has_room_for(device, n_bytes) else torch.device("cpu")
-        self.colors = torch.from_numpy(sequence.colors).to(images_device)
+        self.colors = tensor_of(sequence.colors).to(images_device)
         # Few torch kernels know unsigned 16 bit: the same bits travel as signed.
-        self.depths_mm = torch.from_numpy(sequence.depths_mm.view("int16")).to(images_device)
-        self.T_world_camera = torch.from_numpy(sequence.T_world_camera).float().to(device)
+        self.depths_mm = tensor_of(sequence.depths_mm).view(torch.int16).to(images_device)
+        self.T_world_camera = tensor_of(sequence.T_world_camera).float().to(device)
 
     def rays(self, frames: Indices, rows: Indices, columns: Indices) -> Rays:
         """Rays through given pixels, with their measurements."""

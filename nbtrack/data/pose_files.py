@@ -1,12 +1,13 @@
 """Poses and times from files, checked."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from nbtrack.core.arrays import Poses
+from nbtrack.core.arrays import Pose, Poses
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.text_files import read_numbers
 
@@ -80,6 +81,17 @@ def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> 
     poses[:, :3, 3] = rows[:, 1:4]
     poses[~is_known] = np.nan
     return checked_poses(poses, path), times
+
+
+def checked_pose(T_world_camera: Any) -> Pose:
+    """One known pose (m), copied in double precision; DataError if it is no rigid transform."""
+    try:
+        pose = np.array(T_world_camera, dtype=np.float64)
+    except (TypeError, ValueError, RuntimeError):  # the last is of a tensor with gradients
+        pose = np.empty(0)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all() or not pose[:3].any():
+        raise DataError("T_world_camera is no rigid transform: give 4 x 4 finite numbers")
+    return checked_poses(pose[None], Path("T_world_camera"))[0]
 
 
 def checked_poses(poses: Poses, path: Path) -> Poses:

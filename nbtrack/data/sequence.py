@@ -2,17 +2,18 @@
 
 import hashlib
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8, UInt16
+from jaxtyping import Float, Int, Integer, Real, UInt8, UInt16
 
-from nbtrack.core.arrays import Poses, Position
+from nbtrack.core.arrays import Poses, Position, check_array
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.frame import MILLIMETRE, Frame
-from nbtrack.machinery.errors import DataError
+from nbtrack.data.pose_files import checked_poses
+from nbtrack.machinery.errors import ConfigError, DataError
 
 # Of bounds (our choice): pixels looked at in each frame, on a regular grid, and the share of points
 # cut off at either end of each axis, so that a few wild depths do not stretch the box.
@@ -39,6 +40,15 @@ class RgbdSequence:
     origin: Position = field(default_factory=lambda: np.zeros(3))
     declared_unit: float | None = None  # m, see `SceneBounds`
 
+    def __post_init__(self) -> None:
+        """Raises DataError for an array whose type or shape is not that of its fellows."""
+        n, size = len(self.frame_ids), (self.intrinsics.height, self.intrinsics.width)
+        check_array("colors", self.colors, (n, *size, 3), [UInt8], "uint8")
+        check_array("depths_mm", self.depths_mm, (n, *size), [UInt16], "uint16")
+        check_array("T_world_camera", self.T_world_camera, (n, 4, 4), [Float], "floating point")
+        check_array("frame_ids", self.frame_ids, (n,), [Integer], "whole numbers")
+        check_array("times", self.times, (n,), [Real], "numbers")
+
     def __len__(self) -> int:
         return len(self.frame_ids)
 
@@ -48,6 +58,8 @@ class RgbdSequence:
 
     def __getitem__(self, index: int) -> Frame:
         """One frame, copied, with the pose that it was recorded with."""
+        if not isinstance(index, int | np.integer):
+            raise ConfigError(f"{self!r}[{index}]: give one frame's number; `select` takes several")
         color = torch.from_numpy(self.colors[index].copy())
         depth_mm = torch.from_numpy(self.depths_mm[index].astype(np.int32))
         name = f"frame {self.frame_ids[index]} of {self.name}"
@@ -63,7 +75,7 @@ class RgbdSequence:
         """Z-depth image in metres, 0 where there is no measurement."""
         return self.depths_mm[index].astype(np.float32) * np.float32(MILLIMETRE)
 
-    @cached_property
+    @property
     def digest(self) -> str:
         """A hash over pixels, poses, frame numbers, camera and unit: sixteen hexadecimal digits."""
         digest = hashlib.blake2b(digest_size=8)
@@ -73,15 +85,26 @@ class RgbdSequence:
         return digest.hexdigest()
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
-        """The sequence of some of the frames, in the order given; slices copy nothing."""
-        return replace(self, **{name: getattr(self, name)[indices] for name in ARRAYS})
+        """The sequence of some of the frames, in the order given; slices copy nothing.
+
+        Raises DataError where there are no such frames.
+        """
+        try:
+            return replace(self, **{name: getattr(self, name)[indices] for name in ARRAYS})
+        except (IndexError, TypeError) as error:
+            raise DataError(f"{self!r} has no frames {indices!r:.80} ({error})") from None
 
 
 def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
     """Box around everything a sequence sees, and its cameras, with `margin` metres to spare.
 
-    Raises DataError if no pixel of the sequence has a depth.
+    Raises DataError if no pixel of the sequence has a depth, or a frame no pose.
     """
+    poses = checked_poses(sequence.T_world_camera, Path(sequence.name))
+    is_posed = np.isfinite(poses).all(axis=(1, 2))
+    if not (len(sequence) and is_posed.all()):
+        found = f"{(~is_posed).sum()} of the {len(sequence)} frames of {sequence.name} have no pose"
+        raise DataError(f"{found}: `select` those that have one, and at least one frame")
     height, width = sequence.depths_mm.shape[1:]
     stride = max(1, round((width * height / _POINTS_PER_FRAME) ** 0.5))
     clouds = []

@@ -26,7 +26,13 @@ import torch
 
 from nbtrack.experiments.output import check_no_recording
 from nbtrack.fields import FIELDS
-from nbtrack.machinery.device import advise_on_memory, choose_device, threads, usable_cores
+from nbtrack.machinery.device import (
+    advise_on_memory,
+    choose_device,
+    threads,
+    usable_cores,
+    usual_modes,
+)
 from nbtrack.machinery.errors import MissingError, NbtrackError
 from nbtrack.machinery.files import data_folder, locked, runs_folder
 from nbtrack.machinery.progress import ProgressBar
@@ -34,7 +40,6 @@ from nbtrack.tracking import TRACKERS
 
 _START = "spawn"  # how worker processes begin: forked ones would lack the threads of libraries
 _LOOK_SECONDS = 1.0  # between two looks at jobs elsewhere, so that the bar's clock moves
-_NAME_BYTES = 180  # of a folder's name; the key, suffixes and those of temporary files follow
 _SECONDS_TO_CONNECT = 10
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""
@@ -59,9 +64,7 @@ class Job:
     @property
     def folder(self) -> Path:
         """Where its files are kept, in the cache."""
-        # A recording's folder may have a name as long as a file system allows, 255 bytes.
-        name = self.name.encode(errors="replace")[:_NAME_BYTES].decode(errors="ignore")
-        return runs_folder() / self.kind / f"{name}-{self.key}"
+        return runs_folder() / self.kind / f"{self.name}-{self.key}"
 
     def outcome(self, needed: Any, report: Report) -> Any:
         """Its `result`, made where it is missing, or the NbtrackError that ended it.
@@ -76,7 +79,11 @@ class Job:
         report(0.0, "begins, or waits for another process that makes the same")
         try:
             check_no_recording(path)
-            with locked(path), advise_on_memory(f"the frames and settings of {self.name}"):
+            with (
+                locked(path),
+                usual_modes(),
+                advise_on_memory(f"the frames and settings of {self.name}"),
+            ):
                 return self.result() if self.is_done else self.compute(report)
         except NbtrackError as error:
             return error

@@ -85,7 +85,7 @@ def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room)
 
     Points lie on rays of mapped frames: half between camera and surface, half near the surface.
     """
-    offsets = torch.rand(len(rays.depth), generator=generator)
+    offsets = torch.rand(len(rays.depth), generator=generator, dtype=torch.float32)
     is_in_front = torch.arange(len(rays.depth)) % 2 == 0
     around = rays.depth + NEAR * (2 * offsets - 1)
     depths = torch.where(is_in_front, rays.depth * offsets, around)

@@ -74,7 +74,7 @@ def scores_of(tracked: Trajectory) -> dict[str, Any]:
     if "lost" in rows:
         rated = rows.dropna(subset="translation_error_m")
         errors_m = rated["translation_error_m"].to_numpy()
-        metrics["flagged_frames"] = int(rows["lost"].sum())
+        metrics["flagged_frames"] = int(rated["lost"].sum())
         metrics |= score_detection(rated["lost"].to_numpy(dtype=bool), errors_m)
     steps = int(rows["steps"].sum())
     seconds = rows["seconds"]

@@ -7,8 +7,10 @@ from nbtrack.fields.base import Field, LearnedField, MappingSettings
 from nbtrack.fields.imap import IMapField
 from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.neus import NeuSField, NeusMapping
+from nbtrack.machinery.device import usual_modes
 from nbtrack.machinery.errors import look_up_kind
 from nbtrack.machinery.registry import Registry
+from nbtrack.machinery.settings import whole_number
 
 FIELDS: Registry[type[Field]] = Registry({"imap": IMapField, "neus": NeuSField})
 """What can be mapped, by name. A field of your own joins by `FIELDS["mine"] = MyField`."""
@@ -19,6 +21,8 @@ def field_class(name: str) -> type[Field]:
     return look_up_kind("field", name, FIELDS, ("name", "label"))
 
 
+@usual_modes()
 def make_field(name: str, network: NetworkSettings, bounds: SceneBounds, seed: int) -> Field:
     """A fresh, seeded field inside `bounds`."""
-    return field_class(name)(network, bounds, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(whole_number("seed", seed))
+    return field_class(name)(network, bounds, generator)

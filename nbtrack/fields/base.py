@@ -15,10 +15,13 @@ from nbtrack.core.arrays import Colors, Frames, Points, Pose, RayColors, RaySamp
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.data.pixels import Rays
+from nbtrack.data.pose_files import checked_pose
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import rendering
 from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.rendering import Rendering, Weights
+from nbtrack.machinery.device import usual_modes
+from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.settings import limited, may_be_zero
 
 # Minimum standard deviation (m) that a depth error is divided by: a perfectly sharp ray would
@@ -68,9 +71,17 @@ class Field(nn.Module, abc.ABC):
         super().__init__()
         self.bounds = bounds
 
+    def __call__(self, points_world: Points) -> tuple[Colors, Values]:
+        """`forward` at points in any precision. DataError if they are no tensor of points."""
+        shape = tuple(getattr(points_world, "shape", ()))
+        if not isinstance(points_world, Tensor) or len(shape) != 2 or shape[1] != 3:
+            found = f"{type(points_world).__name__} of shape {shape}"
+            raise DataError(f"points are a {found}: give a tensor of shape (n, 3), in m")
+        return super().__call__(points_world.float())
+
     @abc.abstractmethod
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
-        """Colour in [0, 1] and the field's value at points (m, world frame)."""
+        """Colour in [0, 1] and the field's value at points (m, world frame, single precision)."""
 
     @classmethod
     def from_state(cls, state: State, made: dict[str, Any], bounds: SceneBounds) -> "Field":
@@ -169,9 +180,10 @@ class LearnedField(Field):
         all_values = torch.cat([values, fine_values], dim=1).gather(1, order)
         return self.composite(all_colors, all_values, rays, depths)
 
+    @usual_modes()
     def render_view(self, camera: Intrinsics, T_world_camera: Pose) -> View:
         """Colour in [0, 1] and z-depth (m) from a camera pose. Nothing in it is random."""
-        pose = torch.from_numpy(T_world_camera).float().to(self.device)
+        pose = torch.from_numpy(checked_pose(T_world_camera)).float().to(self.device)
         shape = (camera.height, camera.width)
         # The indices of all pixels, row by row.
         rows, columns = torch.ones(shape, device=self.device).nonzero(as_tuple=True)

@@ -49,7 +49,8 @@ class FourierMlp(nn.Module):
         self.register_buffer("center", torch.tensor(bounds.center, dtype=torch.float32))
         self.metres_per_unit = bounds.metres_per_unit
         sigma = settings.embedding_sigma * self.metres_per_unit  # rad per unit of the map
-        self.frequencies = nn.Parameter(sigma * torch.randn(3, n_frequencies, generator=generator))
+        drawn = torch.randn(3, n_frequencies, generator=generator, dtype=torch.float32)
+        self.frequencies = nn.Parameter(sigma * drawn)
         self.layer_1 = _linear(n_frequencies, width, generator)
         self.layer_2 = _linear(width, width, generator)
         self.layer_3 = _linear(width + n_frequencies, width, generator)
@@ -80,9 +81,15 @@ class FourierMlp(nn.Module):
 
 def _linear(n_in: int, n_out: int, generator: Generator) -> nn.Linear:
     """Kaiming-uniform weights for a rectifier and zero bias, drawn from a generator of our own."""
-    layer = nn.Linear(n_in, n_out)
+    layer = empty_linear(n_in, n_out)
     bound = math.sqrt(6.0 / n_in)
     with torch.no_grad():
-        layer.weight.copy_((2 * torch.rand(n_out, n_in, generator=generator) - 1) * bound)
+        drawn = torch.rand(n_out, n_in, generator=generator, dtype=torch.float32)
+        layer.weight.copy_((2 * drawn - 1) * bound)
         layer.bias.zero_()
     return layer
+
+
+def empty_linear(n_in: int, n_out: int) -> nn.Linear:
+    """A layer to be filled: PyTorch's own start would draw from the program's random numbers."""
+    return nn.utils.skip_init(nn.Linear, n_in, n_out, dtype=torch.float32)

@@ -42,7 +42,9 @@ class NeuSField(LearnedField):
     def __init__(self, network: NetworkSettings, bounds: SceneBounds, generator: Generator) -> None:
         super().__init__(bounds)
         self.mlp = self.make_network(network, generator)
-        self.variance = nn.Parameter(torch.tensor(0.3))  # as NeuS's code starts: s = 20 / m
+        self.variance = nn.Parameter(
+            torch.tensor(0.3, dtype=torch.float32)
+        )  # as NeuS's code starts: s = 20 / m
         self._start_as_empty_room(generator)
 
     def make_network(self, settings: NetworkSettings, generator: Generator) -> nn.Module:
@@ -92,8 +94,11 @@ class NeuSField(LearnedField):
         NeuS starts from a sphere, by weights that presume raw coordinates among the inputs. The
         last layer is linear: the start is a least-squares problem with one answer (our choice).
         """
-        low, high = torch.tensor(self.bounds.minimum), torch.tensor(self.bounds.maximum)
-        points = low + (high - low) * torch.rand(8192, 3, generator=generator)  # m, in the box
+        single = {"dtype": torch.float32}
+        corners = self.bounds.minimum, self.bounds.maximum
+        low, high = (torch.tensor(corner, **single) for corner in corners)
+        # m, in the box
+        points = low + (high - low) * torch.rand(8192, 3, generator=generator, **single)
         target = torch.minimum(points - low, high - points).amin(dim=-1)  # m, to the nearest face
         features = self.mlp.features(points)
         design = torch.cat([features, torch.ones_like(features[:, :1])], dim=-1).double()

@@ -93,7 +93,9 @@ def stratified_depths(
     if generator is None:
         offsets = far.new_full((len(far), n_samples), 0.5)
     else:
-        offsets = torch.rand(len(far), n_samples, generator=generator, device=far.device)
+        offsets = torch.rand(
+            len(far), n_samples, generator=generator, device=far.device, dtype=far.dtype
+        )
     parts = (torch.arange(n_samples, device=far.device) + offsets) / n_samples
     return near + (far[:, None] - near) * parts
 

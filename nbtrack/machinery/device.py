@@ -3,7 +3,8 @@
 import contextlib
 import os
 import platform
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
@@ -15,6 +16,9 @@ from nbtrack.machinery.errors import ConfigError, OutOfMemory
 # Below this width matrix products are too small to share: on two cores, two threads were slower
 # than one. Rooms and methods then run side by side in processes instead.
 _WIDTH_FOR_THREADS = 192
+_LOCK = threading.Lock()
+# By setting, of each block that changes it: its thread, and what to restore.
+_RUNNING: dict[str, list[tuple[int, Any]]] = {}
 if hasattr(os, "register_at_fork"):  # a child has none of OpenMP's threads, and would wait for them
     os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
@@ -39,8 +43,12 @@ def choose_device() -> torch.device:
 
 @cache
 def constant(numbers: tuple, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Numbers on a device, copied there once: in every step a copy would wait for the device."""
-    return torch.tensor(numbers, dtype=dtype).to(device)
+    """Numbers on a device, copied there once: in every step a copy would wait for the device.
+
+    They are made outside of inference mode, whose tensors would serve no gradient later.
+    """
+    with torch.inference_mode(False):
+        return torch.tensor(numbers, dtype=dtype, device="cpu").to(device)
 
 
 def device_name(device: torch.device) -> str:
@@ -65,12 +73,18 @@ def usable_cores() -> int:
 
 @contextlib.contextmanager
 def usual_modes() -> Iterator[None]:
-    """Run a block as a fresh PyTorch does: with gradients, in single precision.
+    """Run a block with gradients, without autocast, on the CPU where no device is named.
 
-    Also in a program that has switched gradients off, or has another default type.
+    Also in a program that has it otherwise. These modes are the thread's own. The default type is
+    one of the whole process, and stays: types are named where tensors are made.
     """
-    usual_type = _changed(torch.set_default_dtype, torch.get_default_dtype(), torch.float32)
-    with usual_type, torch.inference_mode(False), torch.enable_grad():
+    with contextlib.ExitStack() as modes:
+        modes.enter_context(torch.inference_mode(False))
+        modes.enter_context(torch.enable_grad())
+        for kind in {"cpu", "cuda", torch.get_default_device().type}:
+            modes.enter_context(torch.autocast(kind, enabled=False))
+        if torch.get_default_device().type != "cpu":  # it slows every call
+            modes.enter_context(torch.device("cpu"))
         yield
 
 
@@ -79,23 +93,37 @@ def matrix_products(tf32: bool) -> contextlib.AbstractContextManager[None]:
 
     TF32 keeps 10 of the mantissa's 23 bits, and is several times as fast.
     """
-    before = torch.get_float32_matmul_precision()
-    return _changed(torch.set_float32_matmul_precision, before, "high" if tf32 else "highest")
+    precision = "high" if tf32 else "highest"
+    return _changed("float32_matmul_precision", precision, is_of_thread=False)
 
 
 def threads(number: int) -> contextlib.AbstractContextManager[None]:
     """Run a block with so many CPU threads."""
-    return _changed(torch.set_num_threads, torch.get_num_threads(), number)
+    return _changed("num_threads", number, is_of_thread=True)
 
 
 @contextlib.contextmanager
-def _changed(setter: Callable[[Any], object], before: Any, within: Any) -> Iterator[None]:
-    """Run a block with a setting of PyTorch's at the value `within`, then set it to `before`."""
-    setter(within)
+def _changed(name: str, within: Any, is_of_thread: bool) -> Iterator[None]:
+    """Run a block with a setting of PyTorch's, which has no other way in, at the value `within`.
+
+    Blocks of several threads may overlap: all of them restore what was before the first. A setting
+    that `is_of_thread` is each thread's own, but new threads begin with the last that was set.
+    """
+    get, put = getattr(torch, f"get_{name}"), getattr(torch, f"set_{name}")
+    running = _RUNNING.setdefault(name, [])
+    with _LOCK:
+        is_nested = threading.get_ident() in [thread for thread, _ in running]
+        before = running[0][1] if running and not is_nested else get()
+        block = threading.get_ident(), before
+        running.append(block)
+        put(within)
     try:
         yield
     finally:
-        setter(before)
+        with _LOCK:
+            running.remove(block)
+            if is_of_thread or is_nested or not running:
+                put(before)
 
 
 def suitable_threads(width: int) -> contextlib.AbstractContextManager[None]:

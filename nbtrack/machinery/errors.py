@@ -1,7 +1,7 @@
 """One exception family. A message says what was found, what is allowed and what to do next."""
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 Entry = TypeVar("Entry")
@@ -33,16 +33,22 @@ class OutOfMemory(NbtrackError, MemoryError):
 
 def look_up(what: str, name: str, known: Mapping[str, Entry]) -> Entry:
     """The entry of a name. Raises ConfigError, naming the nearest, for an unknown one."""
-    if name not in known:
-        raise ConfigError(f"unknown {what} {name[:40]!r}: {nearest_name(name, [*known])}")
+    if not isinstance(name, str) or name not in known:
+        raise ConfigError(f"unknown {what} {str(name)[:40]!r}: {nearest_name(str(name), [*known])}")
     return known[name]
 
 
-def check_lists(**arguments: object) -> None:
-    """Raises ConfigError for an argument that is no list, but a text or a single thing."""
+def check_lists(at_least: int = 0, **arguments: object) -> None:
+    """Raises ConfigError for an argument that is no list of at least so many entries.
+
+    A text, a single thing or a dictionary is none, nor what can be gone through only once.
+    """
     for name, value in arguments.items():
-        if isinstance(value, str) or not isinstance(value, Iterable):
+        is_list = hasattr(value, "__getitem__") and hasattr(value, "__len__")
+        if isinstance(value, str | bytes | Mapping) or not is_list:
             raise ConfigError(f"{name} = {value!r:.80} is no list: write {name}=[...] around it")
+        if len(value) < at_least:
+            raise ConfigError(f"{name} = {value!r:.80}: give at least {at_least}")
 
 
 def look_up_kind(what: str, name: str, known: Mapping[str, type], needed: Sequence[str]) -> type:

@@ -12,7 +12,6 @@ import io
 import json
 import os
 import tempfile
-import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -22,7 +21,7 @@ import torch
 from filelock import FileLock
 
 import nbtrack
-from nbtrack.machinery.errors import DataError, NbtrackError
+from nbtrack.machinery.errors import DataError, MissingError, NbtrackError
 from nbtrack.machinery.settings import as_dict
 
 PACKAGE = Path(nbtrack.__file__).resolve().parent
@@ -42,11 +41,14 @@ def project_folder() -> Path:
 
 
 def absolute(path: Path | str) -> Path:
-    """An absolute path without `~` and `..`.
+    """An absolute path without `~` and `..`. Raises MissingError for `~` and no user's name.
 
     Links are not followed: a recording has the name by which it is given, also that of a link.
     """
-    return Path(os.path.abspath(os.path.expanduser(path)))
+    expanded = os.path.expanduser(path)
+    if expanded.startswith("~"):
+        raise MissingError(f"{path}: there is no such user; a folder of this name is ./{path}")
+    return Path(os.path.abspath(expanded))
 
 
 def resolved(path: Path | str) -> Path:
@@ -100,6 +102,23 @@ def loaded_checkpoint(path: Path) -> Iterator[dict[str, Any]]:
         yield torch.load(path, map_location="cpu", weights_only=True)
 
 
+def digest_of(plain: Any, tensors: Mapping[str, torch.Tensor]) -> str:
+    """SHA-256 over plain values and tensors, whatever the order of names."""
+    digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        content = tensor.detach().cpu().contiguous().numpy().tobytes()
+        digest.update(f"{name} {tuple(tensor.shape)}".encode() + content)
+    return digest.hexdigest()
+
+
+def check_recipe(path: Path | str, recipe: dict[str, Any], wanted: dict[str, Any]) -> None:
+    """Raises DataError if the recipe of a map or checkpoint at a path is not the wanted one."""
+    changed = [name.replace("_", " ") for name in wanted if recipe.get(name) != wanted[name]]
+    if changed:
+        advice = "remove it, or name another"
+        raise DataError(f"{path} was made with another {', '.join(changed)}: {advice}")
+
+
 def write_atomic(path: Path, content: str | bytes) -> None:
     """Replaces the file at `path` by `content` in one move, as `write_together` does.
 
@@ -108,8 +127,10 @@ def write_atomic(path: Path, content: str | bytes) -> None:
     write_together(path.parent, {path.name: content})
 
 
-def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
+def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:
     """Replaces several files of a folder, the last one as the sign that all of them are there.
+
+    A file whose content is None is removed.
 
     All are written aside before the first is moved, so that a disk that fills up leaves the
     earlier ones as they were. Whoever is killed between two moves leaves a folder without the last.
@@ -120,33 +141,32 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         # A new folder of a random name: nobody else writes there, or has put a link in its place.
         with tempfile.TemporaryDirectory(suffix=".tmp", prefix=".", dir=folder) as aside:
-            for name, content in contents.items():
+            kept = {name: content for name, content in contents.items() if content is not None}
+            for name, content in kept.items():
                 # Paths whose letters the system's encoding lacks come as surrogates.
                 is_text = isinstance(content, str)
                 encoded = content.encode(errors="surrogateescape") if is_text else content
                 Path(aside, name).write_bytes(encoded)
             if len(contents) > 1:  # the old sign goes first: it must not stand among new files
                 (folder / last).unlink(missing_ok=True)
-            for name in contents:
+            for name in contents.keys() - kept.keys():
+                (folder / name).unlink(missing_ok=True)
+            for name in kept:
                 os.replace(Path(aside, name), folder / name)
     except OSError as error:  # a write that finds the disk full has no name of its own
         raise OSError(error.errno, error.strerror or str(error), str(folder / last)) from None
 
 
 def json_text(content: Any) -> str:
-    """JSON, indented. Raises ValueError for NaN and infinity, which it cannot say: pass None.
-
-    It is UTF-8 whatever a path is called: bytes that are none are escaped.
-    """
-    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
-    return text.encode(errors="backslashreplace").decode() + "\n"
+    """JSON, indented. Raises ValueError for NaN and infinity, which it cannot say: pass None."""
+    return json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """An object from a JSON file of a finished result. Raises DataError if it is none."""
     with naming_damaged(path, "JSON object"):
         # Braces, since they raise TypeError for a list or a number.
-        return {**json.loads(path.read_text(encoding="utf-8"))}
+        return {**json.loads(path.read_text(encoding="utf-8", errors="surrogateescape"))}
 
 
 @contextlib.contextmanager
@@ -175,12 +195,10 @@ def locked(path: Path) -> Iterator[None]:
     no locks, the block runs without one: two processes may then do the same work, and the files of
     either stay whole.
     """
-    lock = FileLock(path)
+    # The presence of a file is no lock: a killed process leaves that file behind.
+    lock = FileLock(path, fallback_to_soft=False)
     try:
-        # Where the file system knows no locks, FileLock warns, and would then take the presence of
-        # a file for one; but a killed process leaves that file behind.
-        with contextlib.suppress(UserWarning), warnings.catch_warnings(action="error"):
-            lock.acquire()
+        lock.acquire()
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             raise

@@ -4,6 +4,7 @@ A step of tracking or mapping consists of a hundred kernels and more, each of so
 Launched from Python one by one they keep a GPU waiting. CUDA records them once, as a graph.
 """
 
+import threading
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +17,7 @@ from nbtrack.machinery.progress import tell
 CALLS_BEFORE_RECORDING = 2
 """The first call loads and allocates; the second one is watched for what cannot be recorded."""
 
+_WATCHING = threading.Lock()
 _WAITS = "called a synchronizing CUDA operation"  # how PyTorch warns of it
 
 
@@ -52,7 +54,8 @@ class Recording:
 
         The first call may wait, since it loads and allocates.
         """
-        with warnings.catch_warnings(record=True) as told:
+        # Warnings are caught in the whole process: one thread at a time, or some are lost for good.
+        with _WATCHING, warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             torch.cuda.set_sync_debug_mode("warn")
             try:

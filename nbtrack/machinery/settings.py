@@ -12,6 +12,8 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+import numpy as np
+
 from nbtrack.machinery.errors import ConfigError, look_up
 
 Config = TypeVar("Config")
@@ -59,13 +61,33 @@ def read_setting(setting: str) -> dict[str, Any]:
     if not equals:
         raise ConfigError(f"setting {setting!r} has no value: write key=value")
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
+        parsed = tomllib.loads(f"value = {text}")
     # Nesting thousands deep ends the parser's recursion, as do thousands of digits.
     except (ValueError, RecursionError):
         if text.startswith(("[", "{", '"', "'")):
             raise ConfigError(f"{text!r:.40} is no TOML: write \"{key}=['a', 'b']\"") from None
-        value = text  # a bare word is a string
-    return flat({key: value})
+        parsed = {"value": text}  # a bare word is a string
+    if len(parsed) > 1:
+        raise ConfigError(f"setting {setting!r} holds more than one: give each by itself")
+    return flat({key: parsed["value"]})
+
+
+def checked(config: Config, kind: type) -> Config:
+    """Settings of a kind whose values all are of their defaults' types and within their limits.
+
+    Raises ConfigError for any other. Numbers of numpy become Python's.
+    """
+    if not isinstance(config, kind):
+        raise ConfigError(f"settings are {config!r:.60}: give {kind.__name__}(...), or a child's")
+    return with_values(type(config)(), flat(config))
+
+
+def whole_number(name: str, value: Any, minimum: int = 0, maximum: int = 2**63 - 1) -> int:
+    """A whole number of Python's. Raises ConfigError, by its name, for any other value."""
+    is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not (is_whole and minimum <= value <= maximum):
+        raise ConfigError(f"{name} is {value!r:.80}: give a whole number, {minimum} or more")
+    return int(value)
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
@@ -121,6 +143,7 @@ def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
     of one, and a whole number for a float; nothing else is converted.
     """
     wanted = type(old)
+    value = value.item() if isinstance(value, np.generic) else value
     if wanted is tuple and isinstance(value, list | tuple | str | int | float):
         values = value if isinstance(value, list | tuple) else [value]
         if not values:

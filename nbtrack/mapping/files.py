@@ -1,12 +1,9 @@
 """A finished map, and the one file that holds it: safetensors, which run no code; all checked."""
 
-import hashlib
 import json
 import math
 import re
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +17,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.fields import FIELDS, Field
 from nbtrack.machinery.device import usual_modes
 from nbtrack.machinery.errors import ConfigError, MissingError, look_up
-from nbtrack.machinery.files import naming_damaged, write_together
+from nbtrack.machinery.files import absolute, digest_of, naming_damaged, write_together
 from nbtrack.machinery.registry import Registry
 
 MAP_FILE = "map.safetensors"
@@ -46,37 +43,46 @@ class Map:
     # One row an iteration: weighted loss terms and diagnostics. Empty where it was not kept.
     history: pd.DataFrame = field(default_factory=pd.DataFrame)
 
-    @cached_property
+    @property
     def key(self) -> str:
         """Twelve hexadecimal digits that change with the field, its bounds and its weights."""
         field, network = self.field, self.record["network"]
         plain = [field.name, field.form, network, asdict(field.bounds)]
-        return _digest(plain, _tensors(field))[:12]
+        return digest_of(plain, _tensors(field))[:12]
 
 
-def write_map(path: Path, finished: Map) -> None:
-    """Writes a map as one file, about 1 MB for the paper's network, and its history beside it.
+@usual_modes()
+def write_map(path: Path | str, finished: Map) -> None:
+    """Writes a map as one file, about 1 MB for the paper's network.
 
     Weights keep every bit, so that tracking in the file gives the trajectory of the map itself.
+    In a folder the file is `MAP_FILE`, with the map's history beside it in place of any other's.
+    Raises ConfigError or DataError, and writes nothing, where `read_map` could not read it.
     """
-    path = Path(path).expanduser()
-    tensors = _tensors(finished.field)
-    bounds = finished.field.bounds
+    path = absolute(path)
+    path = path / MAP_FILE if path.is_dir() else path
+    field, bounds = finished.field, finished.field.bounds
+    if type(field) is not (FORMS.get(field.form) if field.form else FIELDS.get(field.name)):
+        advice = f"write the map it was made from, or register it by FIELDS[{field.name!r}]"
+        raise ConfigError(f"no map file holds a {type(field).__name__}: {advice}")
     header = {
         "format_version": _VERSION,
-        "field": finished.field.name,
-        "form": finished.field.form,
+        "field": field.name,
+        "form": field.form,
         "bounds": [list(bounds.minimum), list(bounds.maximum)],
         "declared_unit": bounds.declared_unit,
         "camera": asdict(finished.camera),
         "made": finished.record,
     }
-    with naming_damaged(path, "map", "give its record what `map_sequence` does"):
-        _check_content(header, tensors)
-    header["digest"] = _digest(header, tensors)
-    content = safetensors.torch.save(tensors, {_FORMAT: json.dumps(header, allow_nan=False)})
-    history = {} if finished.history.empty else {HISTORY_FILE: finished.history.to_csv().encode()}
-    write_together(path.parent, {**history, path.name: content})
+    with naming_damaged(path, "map", "mend its field, or give its record what `map_sequence` does"):
+        tensors = _tensors(field)
+        header["digest"] = digest_of(header, tensors)
+        content = safetensors.torch.save(tensors, {_FORMAT: json.dumps(header, allow_nan=False)})
+        if _map_of(content, path).key != finished.key:
+            raise ValueError("it is read as another map")
+    history = finished.history.rename_axis("iteration")
+    beside = {HISTORY_FILE: None if history.empty else history.to_csv().encode()}
+    write_together(path.parent, {**(beside if path.name == MAP_FILE else {}), path.name: content})
 
 
 @usual_modes()
@@ -87,23 +93,23 @@ def read_map(path: Path | str) -> Map:
     DataError where a file is damaged, of another format version, or no map at all; ConfigError
     where its field is not registered.
     """
-    path = Path(path).expanduser()
+    path = absolute(path)
     file = path / MAP_FILE if path.is_dir() else path
     history = path / HISTORY_FILE  # a single file has none
     if not file.is_file():
         hint = "give a folder or file that it wrote, or run the `map` command of that folder again"
         raise MissingError(f"{path} holds no finished map of this nbtrack: {hint}")
     with naming_damaged(file, "map file", _AGAIN):
-        stored = _read_file(file)
+        # safetensors itself opens no path whose letters are not UTF-8
+        stored = _map_of(file.read_bytes(), file)
     if not history.is_file():
         return stored
     with naming_damaged(history, "history", "remove it, or map again"):
         return replace(stored, history=pd.read_csv(history, index_col="iteration"))
 
 
-def _read_file(file: Path) -> Map:
-    """The map of a file. Raises ValueError, KeyError and others if it is not sound."""
-    content = file.read_bytes()  # safetensors itself opens no path whose letters are not UTF-8
+def _map_of(content: bytes, file: Path) -> Map:
+    """The map of a file's content. Raises ValueError, KeyError and others if it is not sound."""
     tensors = safetensors.torch.load(content)
     # A safetensors file begins with the size of its JSON header, in 8 bytes, and that header.
     size = int.from_bytes(content[:8], "little")
@@ -112,19 +118,23 @@ def _read_file(file: Path) -> Map:
     if header.get("format_version") != _VERSION:
         raise ValueError(f"format {header.get('format_version')!r}; this nbtrack reads {_VERSION}")
     # A bit that flipped on a disk, or a number edited by hand, shows nowhere else.
-    if header.pop("digest", None) != _digest(header, tensors):
+    if header.pop("digest", None) != digest_of(header, tensors):
         raise ValueError("its content is not what was written")
     name = header["field"]
     record = header["made"]
     _check_content(header, tensors)
-    corners = [tuple(map(float, corner)) for corner in header["bounds"]]
-    bounds = SceneBounds(*corners, header.get("declared_unit"))
+    try:
+        low, high = header["bounds"]
+        bounds = SceneBounds(low, high, header.get("declared_unit"))
+        camera = Intrinsics(**header["camera"])
+    except ConfigError as error:
+        raise ValueError(error) from None  # so that the file is named
     if name not in FIELDS:
         advice = "import the file of its class first (--import FILE.py)"
         raise ConfigError(f"{file} is a map of field {name!r}, which is not registered: {advice}")
     form = header["form"]
     kind = look_up("form of maps", form, FORMS) if form else FIELDS[name]
-    return Map(kind.from_state(tensors, record, bounds), Intrinsics(**header["camera"]), record)
+    return Map(kind.from_state(tensors, record, bounds), camera, record)
 
 
 def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
@@ -133,12 +143,9 @@ def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
     Names may hold what moves a terminal's cursor, and one NaN among weights spreads to every pose.
     """
     made = header["made"]
-    camera = header["camera"]
     numbers = [made["seconds"], made["misfit_m"], made["seed"], made["n_frames"], *made["origin"]]
-    numbers += [*chain(*header["bounds"]), *camera.values()]
     are_numbers = all(type(n) in (int, float) and math.isfinite(n) for n in numbers)
-    sizes = [camera[name] for name in ("width", "height", "fx", "fy")]
-    if not (are_numbers and len(made["origin"]) == 3 and min(sizes) > 0):
+    if not (are_numbers and len(made["origin"]) == 3):
         raise ValueError("a number of its header is missing, not finite, or none")
     if not isinstance(made["scene"], str) or re.search(r"[\x00-\x1f\x7f-\x9f]", made["scene"]):
         raise ValueError("its scene has no name that can be printed")
@@ -150,11 +157,3 @@ def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
 def _tensors(mapped: Field) -> dict[str, Tensor]:
     """All that was learnt, by name, on the CPU."""
     return {name: part.detach().cpu().contiguous() for name, part in mapped.state().items()}
-
-
-def _digest(plain: Any, tensors: dict[str, Tensor]) -> str:
-    """SHA-256 over plain values and tensors, whatever the order of names."""
-    digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
-    for name, tensor in sorted(tensors.items()):
-        digest.update(f"{name} {tuple(tensor.shape)}".encode() + tensor.numpy().tobytes())
-    return digest.hexdigest()

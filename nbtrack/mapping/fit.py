@@ -22,13 +22,15 @@ from nbtrack.machinery.device import (
     suitable_threads,
     usual_modes,
 )
-from nbtrack.machinery.errors import ConfigError, DataError, NumericalError
-from nbtrack.machinery.files import loaded_checkpoint, save_checkpoint
+from nbtrack.machinery.errors import ConfigError, NumericalError
+from nbtrack.machinery.files import check_recipe, loaded_checkpoint, save_checkpoint
 from nbtrack.machinery.launches import Recording, make_adam
+from nbtrack.machinery.settings import checked, whole_number
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
+_CPU = torch.device("cpu")
 _PENDING = 10  # iterations between two looks at the losses, which wait for the device
 _FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
 
@@ -57,31 +59,31 @@ def map_sequence(
 ) -> Map:
     """Fit a field to a sequence with known poses; one that learns nothing is made from its frames.
 
-    Settings are those of the field's `Network`, None where it has none, and of its `Settings`. A
-    `checkpoint` is written every few seconds, and resumed with the batches of an uninterrupted run;
-    the caller removes it once the map is written. `code` is any text that tells versions of the
-    program apart. Raises DataError where no pixel has a depth, or the checkpoint is of another map
-    or `code`; ConfigError where a field's losses are no dictionary; NumericalError; OutOfMemory.
+    Settings are of the field's classes `Network`, None where it has none, and `Settings`. From a
+    `checkpoint`, written every few seconds, it goes on with the batches of an uninterrupted run;
+    the caller removes it. `code`, any text, tells versions of the program apart. Raises DataError
+    for frames without depth or pose, or another map's checkpoint; ConfigError; NumericalError.
     """
-    recipe = recipe_of(field_name, sequence, network, settings, seed)
-    start = time.perf_counter()
-    device = device or torch.device("cpu")
-    mapped, _ = split_holdout(len(sequence), settings.holdout_every)
     bounds = observed_bounds(sequence)
     kind = field_class(field_name)
+    settings = checked(settings, kind.Settings)
+    network = network and checked(network, getattr(kind, "Network", object))
+    recipe = recipe_of(field_name, sequence, network, settings, seed)
+    start = time.perf_counter()
+    mapped, _ = split_holdout(len(sequence), settings.holdout_every)
     if issubclass(kind, LearnedField):
         with advise_on_memory(f"mapping.{field_name}.n_rays={settings.n_rays}"):
             with suitable_threads(width=0):  # one: sums, and so the start, depend on their number
-                field = make_field(field_name, network, bounds, seed).to(device)
+                field = make_field(field_name, network, bounds, seed).to(device or _CPU)
             with suitable_threads(field.width), matrix_products(settings.tf32):
                 fit = _Fit(recipe | {"code": code}, settings, field, sequence, mapped)
                 fit.run(checkpoint, on_iteration)
         history, seconds = fit.history, fit.seconds
     else:
-        field = kind.from_frames(sequence, mapped, bounds, settings).to(device)
+        field = kind.from_frames(sequence, mapped, bounds, settings).to(device or _CPU)
         history, seconds = [field.diagnostics()], time.perf_counter() - start
         on_iteration(1.0, history[0])
-    made = {"seconds": seconds, "mapped_frames": len(mapped), "device": device_name(device)}
+    made = {"seconds": seconds, "mapped_frames": len(mapped), "device": device_name(field.device)}
     record = recipe | made | {"misfit_m": usual_depth_residual(field, sequence, mapped)}
     return Map(field, sequence.intrinsics, record, pd.DataFrame(history).rename_axis("iteration"))
 
@@ -98,18 +100,10 @@ def recipe_of(
         "first_and_last_frame": [int(ids[0]), int(ids[-1])],
         "data": sequence.digest,
         "origin": sequence.origin.tolist(),
-        "seed": seed,
+        "seed": whole_number("seed", seed),
         "network": asdict(network) if network else {},
         "settings": asdict(settings),
     }
-
-
-def check_recipe(path: Path, recipe: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Raises DataError if the recipe of a map or checkpoint at a path is not the wanted one."""
-    changed = [name.replace("_", " ") for name in wanted if recipe.get(name) != wanted[name]]
-    if changed:
-        advice = "remove it, or name another"
-        raise DataError(f"{path} was made with another {', '.join(changed)}: {advice}")
 
 
 class _Fit:

@@ -7,6 +7,7 @@ from nbtrack.core.arrays import Frames
 from nbtrack.core.camera import pixel_directions
 from nbtrack.core.geometry import transform_points
 from nbtrack.data.frame import Frame
+from nbtrack.data.pose_files import checked_pose
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField
 
@@ -42,7 +43,7 @@ def depth_residual_of(field: Field, frame: Frame) -> float:
     pixels = frame.measured_pixels()
     order = torch.randperm(pixels.shape[1], generator=torch.Generator().manual_seed(0))
     rows, columns = pixels[:, order[:_MISFIT_PIXELS].to(pixels.device)]
-    T_world_camera = torch.from_numpy(frame.T_world_camera).float().to(rows.device)
+    T_world_camera = torch.from_numpy(checked_pose(frame.T_world_camera)).float().to(rows.device)
     if not isinstance(field, LearnedField):
         points_camera, _ = frame.points(rows, columns)
         _, distance = field(transform_points(T_world_camera, points_camera))

@@ -27,9 +27,10 @@ def check_pair(tracker_name: str, field: str | type) -> None:
     """
     tracker = tracker_class(tracker_name)
     kind = field_class(field) if isinstance(field, str) else field
-    if not tracker.works_in(kind):
+    if not (issubclass(kind, Field) and tracker.works_in(kind)):
         fits = ", ".join(name for name, other in FIELDS.items() if tracker.works_in(other))
-        mismatch = f"tracker {tracker_name!r} does not work on field {kind.name!r}"
+        named = getattr(kind, "name", kind.__name__)
+        mismatch = f"tracker {tracker_name!r} does not work on field {named!r}"
         raise ConfigError(f"{mismatch}: take one of {fits}")
     if tracker.package and importlib.util.find_spec(tracker.package) is None:
         extra = f"pip install 'nbtrack[{tracker_name}]'"

@@ -8,13 +8,15 @@ import time
 from collections.abc import Callable, Generator
 from fractions import Fraction
 from math import floor
+from numbers import Real
 
 import torch
 
 from nbtrack.machinery.device import synchronize
-from nbtrack.machinery.errors import ConfigError
+from nbtrack.machinery.errors import ConfigError, look_up
 
 _HOST = torch.device("cpu")
+_FEWEST = 1e-3  # steps, or Hz
 Number = float | int
 
 
@@ -120,18 +122,23 @@ _MEASURED_STEPS = {"vr": (6.8, 36.1), "sdf": (15.3, 79.3)}
 def paper_steps(tracker: str, rate_hz: Number) -> float:
     """Steps a frame of "vr" or "sdf" on the paper's hardware, with its n.
 
-    Raises ConfigError for a rate that is not 0.001 to 1e6.
+    Raises ConfigError for a rate that is not 0.001 to 1e6, or at which no step is left.
 
     On the line through its 100 and 500 ms figures: time per step and fixed cost of a frame are then
     the same at every rate. Table II has no 200 ms column although Table I has 5 Hz (our choice).
     """
     budget_ms = 1000 / _positive("rate_hz", rate_hz)
-    at_100, at_500 = _MEASURED_STEPS[tracker]
-    return round(at_100 + (at_500 - at_100) * (budget_ms - 100) / 400, 6)
+    at_100, at_500 = look_up("tracker of the paper", tracker, _MEASURED_STEPS)
+    steps = round(at_100 + (at_500 - at_100) * (budget_ms - 100) / 400, 6)
+    if steps < _FEWEST:
+        found = f"rate_hz is {rate_hz:g}: the paper's hardware takes no step of {tracker} in "
+        raise ConfigError(f"{found}{budget_ms:g} ms; take a lower rate, or say how many steps")
+    return steps
 
 
 def _positive(name: str, value: Number) -> float:
     """The value; ConfigError, by its name, if it is not 0.001 to 1e6."""
-    if not 1e-3 <= value <= 1e6:  # beyond, a frame takes no step or never ends
-        raise ConfigError(f"{name} is {value:g}; allowed: 0.001 to 1e+06; take for example 10")
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if not (is_number and _FEWEST <= value <= 1e6):  # beyond, no step is taken, or all without end
+        raise ConfigError(f"{name} is {value}; allowed: 0.001 to 1e+06; take for example 10")
     return float(value)

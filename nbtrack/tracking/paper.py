@@ -88,8 +88,8 @@ class AdamTracker(Tracker):
         """Make room for all that a step reads and changes, for frames of one size."""
         self.frame = replace(frame, color=frame.color.clone(), depth_mm=frame.depth_mm.clone())
         self.pixels = torch.empty(2, self.settings.n_pixels, dtype=torch.int64, device=self.device)
-        self.position = torch.zeros(3, device=self.device, requires_grad=True)
-        self.q_wxyz = torch.zeros(4, device=self.device, requires_grad=True)
+        searched = {"dtype": torch.float32, "device": self.device, "requires_grad": True}
+        self.position, self.q_wxyz = torch.zeros(3, **searched), torch.zeros(4, **searched)
         position_rate = self.settings.position_rate_m(self.field.bounds.metres_per_unit)
         position = {"params": [self.position], "lr": position_rate}
         orientation = {"params": [self.q_wxyz], "lr": self.settings.orientation_rate}

@@ -2,8 +2,8 @@
 
 import abc
 import time
+from copy import copy, deepcopy
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,12 @@ import torch
 
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
 from nbtrack.data.frame import Frame
-from nbtrack.data.pose_files import checked_poses
+from nbtrack.data.pose_files import checked_pose
 from nbtrack.fields import Field, LearnedField
 from nbtrack.machinery.device import matrix_products, suitable_threads, synchronize, usual_modes
-from nbtrack.machinery.errors import ConfigError, DataError, NumericalError
+from nbtrack.machinery.errors import ConfigError, NumericalError
 from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
-from nbtrack.machinery.settings import with_values
+from nbtrack.machinery.settings import checked, whole_number
 from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.reach import Reach
 from nbtrack.tracking.starts import expected_poses
@@ -81,15 +81,20 @@ class Tracker(abc.ABC):
     ) -> None:
         """Begin in a map, from a pose before the first frame (m), with a budget of its own.
 
-        Raises ConfigError for an unknown motion model or too many pixels, DataError for a pose that
-        is not rigid.
+        Field and budget are copied: they stay as they are, whatever becomes of the user's. Raises
+        ConfigError for a setting that is not allowed, an unknown motion model, or a field in which
+        it does not work; DataError for a pose that is not rigid.
         """
-        self.settings = settings or self.Settings()
-        n_pixels = int(self.settings.n_pixels)
-        with_values(self.settings, {"n_pixels": n_pixels})  # raises where it is out of its range
-        self.field = self.prepare(field).eval().requires_grad_(False)
+        self.settings = checked(settings or self.Settings(), self.Settings)
+        kind = type(field)
+        # Of the grid of a density only the object itself says that it holds no distance.
+        if not self.works_in(kind) or kind.is_distance > field.is_distance:
+            mismatch = f"tracker {self.name!r} does not work in {field.label}"
+            raise ConfigError(f"{mismatch}: give a field of another kind, as that of another map")
+        self.field = self.prepare(deepcopy(field)).eval().requires_grad_(False)
         self.device = self.field.device
-        self.budget = budget
+        self.budget = copy(budget)
+        seed = whole_number("seed", seed)
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self._is_warm = False
         self.restart(T_world_camera)
@@ -139,10 +144,7 @@ class Tracker(abc.ABC):
         What the frames before left is forgotten: velocities, and whatever a subclass remembers.
         Random numbers and the budget go on.
         """
-        pose = np.array(T_world_camera, dtype=np.float64)  # a copy: the user may change theirs
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise DataError("T_world_camera is no rigid transform: give 4 x 4 finite numbers")
-        self.estimates = [*checked_poses(pose[None], Path("T_world_camera"))]
+        self.estimates = [checked_pose(T_world_camera)]
         expected_poses(self.settings.motion_model, self.estimates)  # a wrong name is told now
         for name in self.remembers:
             setattr(self, name, getattr(type(self), name))
@@ -178,6 +180,11 @@ class Tracker(abc.ABC):
         self.generator.set_state(state["generator"])
         for name in self.remembers:
             setattr(self, name, state[name])
+
+    def __reduce__(self) -> tuple:
+        """Copies and pickles are made as a resumed run is: anew, with what `state` tells."""
+        made = self.field, self.estimates[-1], self.budget, self.settings
+        return _restored, (type(self), made, self.state())
 
     def _warm_up(self, frame: Frame, T_starts: Poses) -> None:
         """Take steps that count nowhere: first calls load, allocate and record for a second.
@@ -216,3 +223,10 @@ class Tracker(abc.ABC):
             advice = "lower the learning rates or map for longer"
             raise NumericalError(f"the pose of {frame.name} is not finite any more: {advice}")
         return Estimate(pose, not frame.has_depth, steps, seconds, float(loss), self.report())
+
+
+def _restored(kind: type[Tracker], made: tuple, state: dict[str, Any]) -> Tracker:
+    """A tracker made with some arguments, that goes on from a state."""
+    tracker = kind(*made)
+    tracker.restore(state)
+    return tracker

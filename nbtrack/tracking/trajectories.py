@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery import files
 from nbtrack.machinery.device import advise_on_memory
 from nbtrack.machinery.errors import DataError, MissingError
+from nbtrack.machinery.settings import as_dict
 from nbtrack.tracking.budget import StepBudget
 from nbtrack.tracking.metrics import pose_errors
 from nbtrack.tracking.tracker import Estimate, Tracker
@@ -50,10 +52,11 @@ def track_sequence(
     each has `STEPS_TO_FIND` steps, whatever the budget (our choice).
     A checkpoint of this run is written every few seconds and resumed from; `on_frame` is told the
     index in the sequence and the translation error (m; NaN where no true pose is known). Raises
-    DataError if there are fewer than two frames, or none of them has a measured depth.
+    DataError if there are fewer than two frames, or none of them has a measured depth, or the
+    checkpoint is of another run.
     """
     _check_trackable(sequence)
-    rows = []
+    recipe = _recipe(tracker, sequence, is_start_known) if checkpoint else {}
     first = 1 if is_start_known else 0  # the first frame to track
     if is_start_known:
         tracker.restart(sequence.T_world_camera[0])
@@ -61,20 +64,57 @@ def track_sequence(
         tracker.restart_anywhere()
     last_saved = time.perf_counter()
     with advise_on_memory(f"tracking.{tracker.name}.n_pixels={tracker.settings.n_pixels}"):
-        if checkpoint and checkpoint.exists():
-            with files.loaded_checkpoint(checkpoint) as state:
-                tracker.restore(state["tracker"])
-                rows = state["rows"]
+        rows = _resumed(tracker, checkpoint, recipe)
         for index in range(first + len(rows), len(sequence)):
             is_found = is_start_known or not all(row.get("lost", False) for row in rows)
             budget = None if is_found else StepBudget(STEPS_TO_FIND)
             rows.append(_row(sequence, index, tracker.track(sequence[index], budget)))
             on_frame(index, rows[-1]["translation_error_m"])
             if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
-                files.save_checkpoint(checkpoint, {"rows": rows, "tracker": tracker.state()})
+                state = {"recipe": recipe, "rows": rows, "tracker": tracker.state()}
+                files.save_checkpoint(checkpoint, state)
                 last_saved = time.perf_counter()
     T_estimated = np.stack(tracker.estimates[1:])  # without the start, be it known or not
-    return Trajectory(T_estimated, sequence.T_world_camera[first:], pd.DataFrame(rows))
+    return Trajectory(T_estimated, sequence.T_world_camera[first:].copy(), _table_of(rows))
+
+
+def _table_of(rows: list[dict[str, Any]]) -> pd.DataFrame:
+    """The rows of frames; where the tracker has a verdict, it is that of `Estimate.lost`.
+
+    A frame that was not searched has no report, and is lost all the same.
+    """
+    frames = pd.DataFrame(rows)
+    if "lost" in frames:
+        frames["lost"] = frames["lost"].eq(True) | frames["without_depth"]
+    return frames
+
+
+def _recipe(tracker: Tracker, sequence: RgbdSequence, is_start_known: bool) -> dict[str, Any]:
+    """What a run depends on, by names for whoever gives the checkpoint of another."""
+    field = tracker.field
+    tensors = dict(chain(field.named_parameters(), field.named_buffers()))
+    return {
+        "recording": sequence.digest,
+        "map": files.digest_of(field.label, tensors),
+        "tracker": tracker.name,
+        "settings": as_dict(tracker.settings),
+        "budget": str(tracker.budget),
+        "seed": tracker.generator.initial_seed(),
+        "start": is_start_known,
+    }
+
+
+def _resumed(tracker: Tracker, checkpoint: Path | None, recipe: dict) -> list[dict[str, Any]]:
+    """The rows of a checkpoint, if there is one, whose state the tracker takes up.
+
+    Raises DataError if it is damaged, or of a run with another recipe.
+    """
+    if not (checkpoint and checkpoint.exists()):
+        return []
+    with files.loaded_checkpoint(checkpoint) as state:
+        files.check_recipe(checkpoint, state["recipe"], recipe)
+        tracker.restore(state["tracker"])
+        return state["rows"]
 
 
 def _check_trackable(sequence: RgbdSequence) -> None:
