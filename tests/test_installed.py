@@ -76,21 +76,35 @@ def test_without_a_place_for_compiled_code(monkeypatch) -> None:
 
 
 SCRIPT = f"""
-from nbtrack import load_preset, open_scenes, track_scenes
+from nbtrack import FIELDS, TRACKERS, Method, load_preset, open_scenes, track_scenes
 from nbtrack.experiments.grid import Execution
+class Field(FIELDS["neus"]):
+    name = "mine"
+class Base(TRACKERS["sdf"]):
+    pass
+class Tracker(Base):
+    name = "mine"
+FIELDS["mine"], TRACKERS["mine"] = Field, Tracker
 preset = load_preset(settings={[*TINY, "scenes.names=['office','bedroom']"]!r})
-runs = track_scenes(open_scenes(preset), ["sdf"], preset, [10], execution=Execution(workers=2))
+scenes, mine = open_scenes(preset), [Method("Mine", "mine", "mine")]
+for workers in (2, 1):
+    runs = track_scenes(scenes, mine, preset, [10], execution=Execution(workers=workers))
 print(runs["ate_m"].notna().sum(), "runs")
 """
 
 
 def test_a_script_without_a_guard(tmp_path: Path) -> None:
-    """Catches workers that run the user's script once more, and end in hundreds of lines."""
+    """Catches workers that run the user's script once more, and end in hundreds of lines; another
+    class, or another key of one, in workers than in the script or a notebook; and maps of a class
+    without a version that are made twice in one process."""
     (tmp_path / "script.py").write_text(SCRIPT)
     environment = {**os.environ, "NBTRACK_RUNS": str(tmp_path / "runs")}
     command = [sys.executable, "script.py"]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.stdout == "2 runs\n", done.stderr
+    assert {kind: len([*(tmp_path / "runs" / kind).iterdir()]) for kind in ("maps", "tracks")} == {
+        "maps": 2, "tracks": 2,
+    }  # fmt: skip
     assert "Traceback" not in done.stderr
 
 

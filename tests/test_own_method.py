@@ -14,7 +14,6 @@ from unittest import mock
 import nbformat
 import pytest
 from forked import forking
-from nbconvert.preprocessors import ExecutePreprocessor
 from test_faults import assert_refused
 from tiny import TINY, tiny_words
 
@@ -313,41 +312,3 @@ def test_one_thing_in_place_of_several() -> None:
         with pytest.raises(NbtrackError, match=f"^{name} = {wrong!r} is no list: write"):
             nbtrack.track_scenes(**right | {name: wrong})
     assert not (runs_folder() / "maps").exists()
-
-
-CELL = """
-from nbtrack.tracking import SdfTracker
-class Base(SdfTracker):
-    pass
-class Mine(Base):
-    name = "mine"
-"""
-
-
-def test_a_method_in_a_notebook(tmp_path: Path) -> None:
-    """Catches a class in a cell that has no source for a key, or another one in workers."""
-    setting = f"""
-import sys
-sys.path.append({str(Path(__file__).parent)!r})
-from forked import forking
-forked = forking()  # kept
-forked.__enter__()
-import nbtrack
-from nbtrack.experiments.grid import Execution
-from nbtrack.tracking import TRACKERS
-preset = nbtrack.load_preset(settings={[*TINY, "scenes.names=['office']"]!r})
-TRACKERS["mine"] = Mine
-mine = nbtrack.Method("Mine", "neus", "mine", ("tracking.mine.n_pixels=8",))
-scenes = nbtrack.open_scenes(preset)
-"""
-    tracking = [  # two runs are left for the two workers
-        f"print(*nbtrack.track_scenes(scenes, [mine], preset, {rates}, "
-        f"execution=Execution(workers={workers}))['run'])"
-        for rates, workers in (([10], 1), ([10, 8, 5], 2))
-    ]
-    cells = [nbformat.v4.new_code_cell(text) for text in (CELL, setting, *tracking)]
-    notebook = nbformat.v4.new_notebook(cells=cells)
-    ExecutePreprocessor(kernel_name="python3").preprocess(notebook, {})
-    here, there = (cell["outputs"][-1]["text"].split() for cell in cells[2:])
-    assert here == there[:1]
-    assert {path.name for path in (tmp_path / "runs/tracks").iterdir()} == {*there}

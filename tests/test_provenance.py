@@ -51,18 +51,6 @@ def test_what_changes_a_key(package: Path, file: str, counts: bool) -> None:
     assert (key() != before) == counts
 
 
-def test_reading_counts(package: Path, tmp_path: Path) -> None:
-    """Catches frames that are decoded otherwise, and whose results come from the cache."""
-    folder = make_room("office", tmp_path / "office", 2, 16, 12)
-    before = Scene("office", folder).fingerprint
-    provenance.package_code.cache_clear()
-    assert Scene("office", folder).fingerprint == before
-    file = package / "recordings/images.py"
-    file.write_text(file.read_text().replace("INTER_NEAREST", "INTER_LINEAR"))
-    provenance.package_code.cache_clear()
-    assert Scene("office", folder).fingerprint != before
-
-
 SCRIPT = """
 import sys
 from nbtrack.provenance import code_fingerprint

@@ -12,7 +12,6 @@ from nbtrack.experiments.presets import Preset, ScenesConfig
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError, nearest_name
 from nbtrack.machinery.files import absolute, data_folder, fingerprint, locked, runs_folder
 from nbtrack.machinery.progress import ProgressBar, tell
-from nbtrack.provenance import package_code
 from nbtrack.recordings import reading
 from nbtrack.recordings.images import images_of
 from nbtrack.recordings.recording import Recording, open_recording
@@ -42,10 +41,8 @@ class Scene:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Changes with what is read, and with the code that reads it."""
-        return fingerprint(
-            *images_of(self.recording).contents(), package_code("data", "recordings")
-        )
+        """Changes with what is read."""
+        return fingerprint(*images_of(self.recording).contents())
 
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
         """The frames of a slice such as `10:50:2`, without depths that are outliers.

@@ -9,7 +9,7 @@ import importlib
 import pkgutil
 import sys
 import traceback
-from collections.abc import Iterator, MutableMapping
+from collections import UserDict
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TypeVar
@@ -25,7 +25,7 @@ IMPORTED: list[str] = []
 """What `import_own` has imported, for the command that makes a run again."""
 
 
-class Registry(MutableMapping[str, Entry]):
+class Registry(UserDict[str, Entry]):
     """Entries by name, those of plug-ins included, which are imported when it is first used.
 
     An entry may be a text "module:Name", as of entry points: it is loaded when it is asked for.
@@ -34,43 +34,9 @@ class Registry(MutableMapping[str, Entry]):
     def __init__(self, entries: dict[str, Entry | str]) -> None:
         self._entries = entries
 
-    def __getitem__(self, name: str) -> Entry:
-        """The entry of a name; raises ConfigError where its text names nothing that can be loaded.
-
-        That the name is not known is a KeyError, as in every mapping.
-        """
-        entry = self._joined()[name]
-        if isinstance(entry, str):
-            try:
-                self._entries[name] = pkgutil.resolve_name(entry)
-            except (ImportError, AttributeError, ValueError) as error:
-                raise ConfigError(f"{name!r} cannot be loaded from {entry} ({error})") from error
-        return self._entries[name]
-
-    def __setitem__(self, name: str, entry: Entry | str) -> None:
-        self._joined()[name] = entry
-
-    def __delitem__(self, name: str) -> None:
-        del self._joined()[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._joined()
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._joined())
-
-    def __len__(self) -> int:
-        return len(self._joined())
-
-    def __ior__(self, more: MutableMapping[str, Entry | str]) -> "Registry":
-        self.update(more)
-        return self
-
-    def __repr__(self) -> str:
-        return f"Registry({self._joined()})"
-
-    def _joined(self) -> dict[str, Entry | str]:
-        """The entries, once all plug-ins have added theirs."""
+    @property
+    def data(self) -> dict[str, Entry | str]:
+        """What `UserDict` works on: the entries as given, once all plug-ins have added theirs."""
         while _waiting:
             plugin = _waiting.pop(0)  # before it is loaded: it uses registries itself
             try:
@@ -79,6 +45,24 @@ class Registry(MutableMapping[str, Entry]):
                 why = f"({type(error).__name__}: {error}): mend or remove it"
                 tell(f"nbtrack: warning: plug-in {plugin.value} is left out {why}")
         return self._entries
+
+    @data.setter
+    def data(self, entries: dict[str, Entry | str]) -> None:
+        self._entries = entries
+
+    def __getitem__(self, name: str) -> Entry:
+        """The entry of a name. Raises ConfigError where its text names nothing that is there.
+
+        That the name is not known is a KeyError, as in every mapping.
+        """
+        entry = self.data[name]
+        if isinstance(entry, str):
+            try:
+                entry = pkgutil.resolve_name(entry)
+            except (ImportError, AttributeError, ValueError) as error:
+                raise ConfigError(f"{name!r} cannot be loaded from {entry} ({error})") from error
+            self[name] = entry
+        return entry
 
 
 def import_own(source: str) -> None:
