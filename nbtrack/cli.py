@@ -177,7 +177,7 @@ def _message_of(error: BaseException) -> str:
         return f"{where}: {error.strerror or error}; mend it and run again"
     if isinstance(error, MemoryError):  # where no job says what needs it
         return "out of memory: take fewer frames, as with --frames ::2"
-    return "interrupted; run the same command again to go on"
+    return f"interrupted; {str(error) or 'run the same command again to go on'}"
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -223,7 +223,11 @@ def test_names_that_are_no_text(tmp_path: Path, monkeypatch, capsys) -> None:
     assert main(["export", run, "--to", "gif", f"{run}.gif"]) == 0
     assert main(["data", "check", folder, "--out", run]) == 0
     assert (tmp_path / run / "check.png").is_file()
-    assert folder in files.read_json(tmp_path / run / "metrics.json")["command"]
+    metrics = tmp_path / run / "metrics.json"
+    command = files.read_json(metrics)["command"]
+    assert folder in command
+    assert f"--map-from={tmp_path / out}" in command  # it runs from any folder
+    assert json.loads(metrics.read_bytes().decode())  # UTF-8
 
 
 def test_the_home_folder_is_meant_by_its_sign(tmp_path: Path, monkeypatch) -> None:

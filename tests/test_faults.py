@@ -126,7 +126,6 @@ FILES = {
     "a word": (_write(TRAJECTORY, ROW.replace("3", "x")), KITTI, "readable table"),
     "a NaN": (_write(TRAJECTORY, ROW.replace("3", "nan")), KITTI, "not a finite pose"),
     "another order": (_write(TRAJECTORY, "0.5 0 0 1 1 2 3 4"), KITTI, "of norm 5.48"),
-    "a run for a mesh": (_nothing, ["export", "run", "--to", "glb", "m.glb"], "run holds no"),
     "unfinished run": (_gone(RUN), KITTI, "no finished run in run"),
     "mesh cut": (_cut("map/mesh.ply"), MESH, "not a readable mesh"),
 }

@@ -235,30 +235,47 @@ def test_trajectories(work: Path) -> None:
     np.testing.assert_allclose(np.loadtxt("kitti").reshape(-1, 3, 4), expected, atol=1e-15)
 
 
-@pytest.mark.parametrize(("source", "kind"), [("map", "ply"), ("room", "glb")])
+@pytest.mark.parametrize(
+    ("source", "kind"), [("map", "ply"), ("room", "ply"), ("run", "ply"), ("run", "glb")]
+)
 def test_meshes_keep_their_colours(work: Path, source: str, kind: str) -> None:
-    """Catches meshes that come out grey, empty, or on another side of the world."""
+    """Catches meshes that come out grey, empty, or on another side of the world, and that of a run
+    that is refused."""
     assert main(["export", source, "--to", kind, f"mesh.{kind}"]) == 0
     mesh = trimesh.load_mesh(f"mesh.{kind}", process=False)
     mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
     assert len(mesh.faces) > 10
     assert np.asarray(mesh.visual.vertex_colors)[:, :3].std(axis=0).max() > 1
     bounds = read_map("room").field.bounds
-    assert (mesh.bounds[0] > np.array(bounds.minimum) - 0.1).all()
+    assert (mesh.bounds[0] > np.array(bounds.minimum) - 0.1).all()  # y is up in both
     assert (mesh.bounds[1] < np.array(bounds.maximum) + 0.1).all()
 
 
 @pytest.mark.parametrize("kind", ["ply", "glb"])
 def test_map_coordinates(kind: str) -> None:
-    """Catches meshes near 0 beside trajectories in map coordinates, and lost decimetres there."""
+    """Catches meshes near 0 beside trajectories in map coordinates, and lost decimetres there; and
+    colours in a GLB file, where they are linear, that are too bright."""
     mesh, origin = trimesh.creation.icosphere(1), np.array([500_000.0, 4_649_000.0, 0.0])
-    mesh.visual.vertex_colors = [10, 20, 30, 255]
+    mesh.visual.vertex_colors = [10, 128, 255, 255]
     content = trimesh.util.wrap_as_stream(mesh_bytes(mesh, kind, origin))
     read = trimesh.load(content, file_type=kind, process=False)
     read = read.to_mesh() if isinstance(read, trimesh.Scene) else read
     np.testing.assert_allclose(read.vertices, mesh.vertices + origin, rtol=0, atol=1e-6)
     assert (read.faces == mesh.faces).all()
-    assert (np.asarray(read.visual.vertex_colors)[:, :3] == [10, 20, 30]).all()
+    stored = [10, 128, 255] if kind == "ply" else [1, 55, 255]
+    assert (np.asarray(read.visual.vertex_colors)[:, :3] == stored).all()
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, -1, 0], [0, 1, 0], [-1, 0, 0]])
+def test_up_is_up(up: list[int]) -> None:
+    """Catches rooms that lie on their side in a viewer of GLB files, or are mirrored there."""
+    points = np.array([up, [0, 0, 0], [1, 2, 3], [3, -1, 2]], dtype=float)
+    mesh = trimesh.Trimesh(points, [[0, 1, 2], [0, 2, 3], [1, 3, 2]], process=False)
+    content = trimesh.util.wrap_as_stream(mesh_bytes(mesh, "glb", np.ones(3), up))
+    found = trimesh.load(content, file_type="glb", process=False).to_mesh().vertices
+    np.testing.assert_allclose(found[0] - found[1], [0, 1, 0], atol=1e-6)
+    before, after = (np.linalg.det(p[[0, 2, 3]] - p[1]) for p in (points, np.asarray(found)))
+    assert after == pytest.approx(before, rel=1e-5)
 
 
 def test_a_record_that_could_not_be_read_is_not_written(work: Path, tmp_path: Path) -> None:

@@ -205,6 +205,12 @@ def test_far_from_the_origin(tmp_path: Path, capsys) -> None:
         found[name] = read_tum(tmp_path / name / "run/trajectory.txt")[1][:, :3, 3]
     assert np.abs(found["far"] - found["near"] - utm).max() < 1e-4
     # What leaves the package is in the recording's world; recordings of one place share an origin.
+    room = "nbtrack.experiments.exports"
+    with mock.patch.multiple(room, movie_bytes=lambda _: b"", movie_pictures=mock.DEFAULT) as drawn:
+        assert main(["export", run, "--to", "gif", str(tmp_path / "far.gif")]) == 0
+    surface, seen, _, poses, *_ = drawn["movie_pictures"].call_args.args
+    for places in (surface.bounds, seen.T_world_camera[:, :3, 3], poses[:, :3, 3]):
+        assert np.abs(places - utm).max() < 20
     assert np.abs(trimesh.load(tmp_path / "far/map/mesh.ply").bounds - utm).max() < 20
     origin = open_recording(folder).origin.tolist()
     rows[:, 1:4] += [30.0, -40.0, 2.0]  # another end of the building

@@ -41,6 +41,7 @@ def test_what_the_file_holds(finished: Path, tmp_path: Path) -> None:
     assert main(["export", str(finished / "run"), "--to", "rrd", str(out)]) == 0
     n_frames, rows = len(read_trajectory(finished / "run").frames), rows_of(out)
     assert all(rows[f"/world/{name}", True] == 1 for name in ("map", "tracked", "true", "camera"))
+    assert rows["/world", True] == 1  # where the origin lies in the recording's world
     for name in ("world/camera", "world/camera/color", "world/camera/depth", "error_m", "lost"):
         assert rows[f"/{name}", False] == n_frames
 

@@ -41,6 +41,25 @@ def test_converter(tmp_path: Path, capsys) -> None:
     assert_refused(tmp_path, capsys, command, "0 of the 6 frames")
 
 
+def test_what_is_declared_is_converted(tmp_path: Path) -> None:
+    """Catches a unit of the map that a conversion loses, also that of a scene of the dataset."""
+    own, known = (write_recording("neural_rgbd", tmp_path / n) for n in ("own", "breakfast_room"))
+    (own / "sequence.toml").write_text("metres_per_unit = 1.25\n")
+    for folder, unit in ((own, 1.25), (known, 2.5)):
+        assert main(["data", "convert", str(folder), str(tmp_path / f"{unit}")]) == 0
+        assert read_sequence(tmp_path / f"{unit}").declared_unit == unit
+
+
+def test_names_as_long_as_a_file_system_allows(tmp_path: Path) -> None:
+    """Catches names of temporary files and of results that are too long beside a long name."""
+    long, out = tmp_path / ("ä" * 117 + "b"), tmp_path / ("c" * 255)
+    assert main(["data", "make", "office", "--n-frames=3", "--width=32", "--out", str(long)]) == 0
+    assert main(["data", "convert", str(long), str(out)]) == 0
+    made = ["map", str(out), "--field=points", "--out", str(tmp_path / ("d" * 255))]
+    assert main(made) == 0
+    assert main(["export", made[-1], "--to=ply", str(tmp_path / ("e" * 251 + ".ply"))]) == 0
+
+
 def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path) -> None:
     """Catches a half-written scene that a later run would take for a whole one, and one that is
     overwritten."""
@@ -49,7 +68,7 @@ def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path) -> None:
         yield from frames(2)
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match="not kept"):
         write_sequence(tmp_path / "scene", CAMERA, interrupted())
     with pytest.raises(DataError, match=r"exists: choose another"):
         write_sequence(tmp_path, CAMERA, frames(1))

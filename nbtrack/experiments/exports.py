@@ -12,19 +12,19 @@ import trimesh
 from nbtrack.beyond.points import PointCloud
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments import output
-from nbtrack.experiments.runs import read_trajectory
+from nbtrack.experiments.runs import METRICS_FILE, read_trajectory
 from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.machinery.files import naming_damaged, write_atomic
 from nbtrack.machinery.progress import ProgressBar
-from nbtrack.mapping.files import MESH_FILE, read_map
+from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh, mesh_bytes
 from nbtrack.plots.rerun_file import rerun_bytes
 from nbtrack.recordings import reading
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.tracking import Trajectory
-from nbtrack.tracking.trajectories import number_lines, read_tum
+from nbtrack.tracking.trajectories import number_lines, read_tum, shifted
 
 _FRAMES_SHOWN = 20  # of a longer run at least so many frames tell what an overview shows
 _CELLS = 120  # of an overview's mesh, along the longest side of its map
@@ -42,12 +42,15 @@ def draw_overview(run: TrackJob) -> None:
         print(f"  no picture: {error}")
         return
     title = f"{run.scene.name}: {run.tracker} in {field.label}, {n_frames} frames"
+    origin = np.array(metrics["origin"])
+    surface.apply_translation(origin)  # pictures are in the recording's world, as files are
     paths = {}
     if "ate_rmse_m" in metrics:
         ate_m, still_m = metrics["ate_rmse_m"], metrics.get("still_ate_m", np.nan)
         title += f", ATE {100 * ate_m:.2f} cm (standing still {100 * still_m:.0f} cm)"
-        paths["true"] = tracked.T_true[np.isfinite(tracked.T_true).all(axis=(1, 2))]
-    paths["tracked"] = tracked.T_estimated
+        is_known = np.isfinite(tracked.T_true).all(axis=(1, 2))
+        paths["true"] = shifted(tracked.T_true[is_known], origin)
+    paths["tracked"] = shifted(tracked.T_estimated, origin)
     figure = plot_overview(cloud_of(surface), paths, tracked.frames, title)
     output.save_picture(figure, run.folder / output.OVERVIEW_FILE, dpi=120)  # 1080 pixels wide
 
@@ -76,8 +79,11 @@ def export_command(options: Namespace) -> None:
 
 
 def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
-    """A map as a coloured mesh: of what was seen where the map's folder has that mesh, else all."""
-    finished = read_map(source)
+    """A map, or that of a run, as a coloured mesh: of what was seen, if that mesh is beside it."""
+    if (source / METRICS_FILE).is_file():
+        finished, source = _map_of(read_trajectory(source))
+    else:
+        finished = read_map(source)
     seen = source / MESH_FILE
     is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
     origin = np.array(finished.record["origin"])
@@ -85,9 +91,18 @@ def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
         mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)
         if is_seen:  # its vertices are in the recording's world, and `mesh_bytes` moves them there
             mesh.vertices -= origin
-        content = mesh_bytes(mesh, format_name, origin)
+        content = mesh_bytes(mesh, format_name, origin, finished.record.get("up"))
     what = "what was seen" if is_seen else "all"
     return content, f"{len(mesh.vertices)} coloured vertices of {what}"
+
+
+def _map_of(tracked: Trajectory) -> tuple[Map, Path]:
+    """The map of a run, and where it lies. Raises DataError where that is another one by now."""
+    path = Path(tracked.metrics["map"])
+    stored = read_map(path)
+    if tracked.metrics.get("map_key") != stored.key:
+        raise DataError(f"{path} is not the map of this run any more: track again")
+    return stored, path
 
 
 def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
@@ -96,9 +111,7 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
         raise MissingError("--to rrd needs Rerun: pip install 'nbtrack[rerun]'")
     tracked = read_trajectory(source)
     metrics, n_frames = tracked.metrics, len(tracked.frames)
-    stored = read_map(metrics["map"])
-    if metrics.get("map_key") != stored.key:
-        raise DataError(f"{metrics['map']} is not the map of this run any more: track again")
+    stored, _ = _map_of(tracked)
     shown = np.unique(np.linspace(0, n_frames - 1, _MOVIE_FRAMES).round().astype(int))
     seen = _seen(tracked, shown, open_recording(metrics["recording"], metrics["format"]))
     surface = _surface(stored.field, seen, 2 * _CELLS)  # cells half as large as in an overview
@@ -106,6 +119,9 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
     if format_name == "rrd":
         content = rerun_bytes(surface, seen, tracked, title)
     else:
+        origin = np.array(metrics["origin"])
+        surface.apply_translation(origin)
+        seen = replace(seen, T_world_camera=shifted(seen.T_world_camera, origin))
         with ProgressBar(f"movie of {metrics['scene']}", len(shown)) as bar:
             frames, poses = tracked.frames.iloc[shown], seen.T_world_camera
             content = movie_bytes(movie_pictures(surface, seen, frames, poses, title, bar.move_to))

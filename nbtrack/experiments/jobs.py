@@ -40,6 +40,7 @@ from nbtrack.tracking import TRACKERS
 
 _START = "spawn"  # how worker processes begin: forked ones would lack the threads of libraries
 _LOOK_SECONDS = 1.0  # between two looks at jobs elsewhere, so that the bar's clock moves
+_NAME_BYTES = 180  # of a folder's name; the key, suffixes and those of temporary files follow
 _SECONDS_TO_CONNECT = 10
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""
@@ -64,7 +65,9 @@ class Job:
     @property
     def folder(self) -> Path:
         """Where its files are kept, in the cache."""
-        return runs_folder() / self.kind / f"{self.name}-{self.key}"
+        # A recording's folder may have a name as long as a file system allows, 255 bytes.
+        name = self.name.encode(errors="replace")[:_NAME_BYTES].decode(errors="ignore")
+        return runs_folder() / self.kind / f"{name}-{self.key}"
 
     def outcome(self, needed: Any, report: Report) -> Any:
         """Its `result`, made where it is missing, or the NbtrackError that ended it.

@@ -20,6 +20,7 @@ from nbtrack.machinery.device import choose_device
 from nbtrack.machinery.files import fingerprint
 from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
+from nbtrack.plots.scene import up_of
 from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
 
 OF_MAPS = ("network.", "mapping.", "correction.")
@@ -127,6 +128,7 @@ class MapJob(Job):
             )  # fmt: skip
         record = {
             "quality": score_map(finished, sequence, self.scene.room),
+            "up": up_of(sequence.T_world_camera).tolist(),
             "frames": self.frames,
             "key": self.key,
             "correction": self.correction_voxel,

@@ -228,7 +228,7 @@ class TrackJob(Job):
         sequence = str(self.scene.folder)
         made = self.needs
         if self.is_elsewhere:
-            options["map-from"] = made.folder
+            options["map-from"] = files.absolute(made.folder)
         else:
             options |= {"field": made.field, "map-frames": made.frames}
             voxel = made.correction_voxel

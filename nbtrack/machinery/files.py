@@ -158,15 +158,19 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> 
 
 
 def json_text(content: Any) -> str:
-    """JSON, indented. Raises ValueError for NaN and infinity, which it cannot say: pass None."""
-    return json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    """JSON, indented. Raises ValueError for NaN and infinity, which it cannot say: pass None.
+
+    It is UTF-8 whatever a path is called: bytes that are none are escaped.
+    """
+    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
+    return text.encode(errors="backslashreplace").decode() + "\n"
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """An object from a JSON file of a finished result. Raises DataError if it is none."""
     with naming_damaged(path, "JSON object"):
         # Braces, since they raise TypeError for a list or a number.
-        return {**json.loads(path.read_text(encoding="utf-8", errors="surrogateescape"))}
+        return {**json.loads(path.read_text(encoding="utf-8"))}
 
 
 @contextlib.contextmanager

@@ -59,16 +59,30 @@ def extract_mesh(
     return mesh
 
 
-def mesh_bytes(mesh: Mesh, kind: str, origin: Position) -> bytes:
+def mesh_bytes(mesh: Mesh, kind: str, origin: Position, up: Position | None = None) -> bytes:
     """A mesh as a file, "ply" or "glb", in the world of the recording: moved by its origin (m).
+
+    In GLB y is up and colours are linear. `up` is the world's axis that is up (None: y); it is
+    turned there. In PLY the axes stay, and colours are sRGB, as those of images.
 
     With an origin of millions of metres, as in the coordinates of geographic maps, single precision
     resolves decimetres only. So a moved PLY file has double precision; a GLB file, which knows
-    none, holds the unmoved mesh and by how much its node is moved.
+    none, holds the unmoved mesh and by how much its node is turned and moved.
     """
     if kind == "glb":
+        up = np.array([0.0, 1, 0] if up is None else up)
+        side = np.array([0.0, 0, 1] if up[0] else [1.0, 0, 0])
+        T = np.eye(4)
+        T[:3, :3] = side, up, np.cross(side, up)
+        T[:3, 3] = T[:3, :3] @ origin
+        colors = np.array(mesh.visual.vertex_colors)
+        srgb = colors[:, :3] / 255
+        linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+        colors[:, :3] = (255 * linear).round()  # IEC 61966-2-1
+        mesh = mesh.copy()
+        mesh.visual.vertex_colors = colors
         scene = trimesh.Scene()
-        scene.add_geometry(mesh, transform=trimesh.transformations.translation_matrix(origin))
+        scene.add_geometry(mesh, transform=T)
         return scene.export(file_type=kind)
     content = mesh.export(file_type=kind, vertex_normal=False)
     if not origin.any():

@@ -11,6 +11,9 @@ from nbtrack.tracking import Trajectory
 def rerun_bytes(surface: Mesh, seen: RgbdSequence, run: Trajectory, title: str) -> bytes:
     """An `.rrd` file of a map's surface, and of a run's paths, frames, errors and verdicts.
 
+    All are relative to the run's origin, by which the file moves them into the recording's world:
+    the viewer's numbers have single precision.
+
     `seen` has some of the run's frames, at the poses (m) where the camera was estimated to be. In
     the viewer frames and seconds are time lines, and errors (m) and verdicts (1: lost) are curves.
     """
@@ -18,6 +21,7 @@ def rerun_bytes(surface: Mesh, seen: RgbdSequence, run: Trajectory, title: str) 
 
     recording = rr.RecordingStream(f"nbtrack: {title}")
     stream = recording.binary_stream()
+    recording.log("world", rr.Transform3D(translation=run.metrics["origin"]), static=True)
     points, colors = surface.vertices, surface.visual.vertex_colors
     shape = rr.Points3D(points, colors=colors)
     if isinstance(surface, trimesh.Trimesh):

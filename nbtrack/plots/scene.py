@@ -36,7 +36,7 @@ def up_of(*T_paths: Poses) -> np.ndarray:
     """
     above = -np.concatenate(T_paths)[:, :3, 1].mean(axis=0)
     axis = np.abs(above).argmax()
-    return np.sign(above[axis]) * np.eye(3)[axis]
+    return np.sign(above[axis]) * np.eye(3)[axis] + 0.0  # no -0.0
 
 
 def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:

@@ -15,7 +15,7 @@ from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import write_atomic
 from nbtrack.machinery.progress import ProgressBar
 from nbtrack.recordings.calibration import camera_matrix
-from nbtrack.recordings.formats import FORMATS
+from nbtrack.recordings.formats import DECLARATION_FILE, FORMATS
 from nbtrack.recordings.images import images_of
 from nbtrack.recordings.pairing import TIMES_FILE
 from nbtrack.recordings.reading import read_frames, select_frames
@@ -37,30 +37,41 @@ def write_sequence(
     """Write frames, and notes (texts of further files, by name), as a scene in the layout.
 
     It is put in place when it is complete, so that a run that is killed leaves no half-written
-    scene; only if the system ends it at once, a hidden folder `.NAME....unfinished` stays beside.
+    scene; only if the system ends it at once, a hidden folder `.scene.….unfinished` stays beside.
     `progress` is called after each frame with how many are written. At least one frame is needed.
     Raises DataError if the folder exists.
     """
     if folder.exists():
         raise DataError(f"{folder} exists: choose another folder or remove it first")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    # A sibling, so that the final rename stays within one file system.
-    with TemporaryDirectory(".unfinished", f".{folder.name}.", folder.parent) as hidden:
+    # A sibling, so that the final rename stays within one file system. Its name does not hold the
+    # folder's, which may be as long as a file system allows.
+    with TemporaryDirectory(".unfinished", ".scene.", folder.parent) as hidden:
         unfinished = Path(hidden) / "scene"
         unfinished.mkdir()
         poses = []
-        for color, depths_mm, T_world_camera in frames:
-            images = {f"{name}/depth": image for name, image in depths_mm.items()}
-            images["images/img"] = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
-            for prefix, image in images.items():
-                # The fastest compression: rooms are made often and read from a local disk.
-                _, content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-                write_atomic(unfinished / f"{prefix}{len(poses)}.png", content.tobytes())
-            poses.append(T_world_camera)
-            progress(len(poses))
+        try:
+            for color, depths_mm, T_world_camera in frames:
+                _write_images(unfinished, len(poses), color, depths_mm)
+                poses.append(T_world_camera)
+                progress(len(poses))
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"{folder} is not kept: the same command begins anew") from None
         for name, text in {**_texts(camera, np.stack(poses)), **(notes or {})}.items():
             (unfinished / name).write_text(text, encoding="utf-8")
         unfinished.rename(folder)  # fails if another command has finished it meanwhile
+
+
+def _write_images(
+    folder: Path, number: int, color: ColorImage, depths_mm: dict[str, DepthImage]
+) -> None:
+    """Write the images of a frame."""
+    images = {f"{name}/depth": image for name, image in depths_mm.items()}
+    images["images/img"] = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
+    for prefix, image in images.items():
+        # The fastest compression: rooms are made often and read from a local disk.
+        _, content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        write_atomic(folder / f"{prefix}{number}.png", content.tobytes())
 
 
 def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
@@ -94,8 +105,10 @@ def convert_sequence(recording: Recording, out: Path, frames: slice = slice(None
     numbers = select_frames(recording, frames, needs_poses=False)
     camera = images_of(recording).camera_of(numbers[0])
     with ProgressBar("converting", len(numbers)) as bar:
-        times = {TIMES_FILE: _text(recording.times[numbers, None])}
-        write_sequence(out, camera, _frames(recording, numbers), times, bar.move_to)
+        notes = {TIMES_FILE: _text(recording.times[numbers, None])}
+        if unit_m := recording.declared.metres_per_unit:
+            notes[DECLARATION_FILE] = f"metres_per_unit = {unit_m}\n"
+        write_sequence(out, camera, _frames(recording, numbers), notes, bar.move_to)
     n_lost = int((~recording.has_pose[numbers]).sum())
     lost = f" ({n_lost} without a pose)" if n_lost else ""
     said = f"{out}: {len(numbers)} frames{lost} of {camera.width}x{camera.height}, read as "
