@@ -1,19 +1,32 @@
 """Formulas by laws that must hold, or against values worked by hand in another way."""
 
+import math
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
-from box_room import Formula, poses_at, sequence_of
+from box_room import BoxRoom, Formula, box_sequence, poses_at, sequence_of
+from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond.correction import corrected
-from nbtrack.beyond.neus_plus import NeuSPlusField
+from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.lm_optimizer import LmOptimizer
+from nbtrack.beyond.lm_residuals import grid_of
+from nbtrack.beyond.neus_plus import NeuSPlusField, distance_targets
+from nbtrack.beyond.observed import draw_points
+from nbtrack.beyond.points import min_depth_behind
+from nbtrack.beyond.verdict import p_lost, p_within
+from nbtrack.beyond.views import Viewpoints, retrieve, view_of
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.data.pixels import Rays
-from nbtrack.fields import NetworkSettings, NeusMapping
-from nbtrack.fields.base import NEAR
-from nbtrack.fields.neus import NeuSField
+from nbtrack.data.frame import Frame
+from nbtrack.data.pixels import PixelSampler, Rays
+from nbtrack.fields import NetworkSettings, NeusMapping, make_field
+from nbtrack.fields.base import NEAR, rendered_losses
+from nbtrack.fields.neus import NeuSField, guided_depths
 from nbtrack.recordings.reading import FAR, far_limit
+from nbtrack.tracking import SdfSettings, StepBudget, VrSettings, make_tracker
 
 BOX = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 3.0))
 
@@ -77,3 +90,160 @@ def test_where_depths_become_outliers() -> None:
     """Catches another quantile: of a hundred depths the ninetieth decides."""
     assert far_limit(np.array([1.0] * 85 + [3.0] * 10 + [50.0] * 5)) == pytest.approx(3 * FAR)
     assert far_limit(np.array([])) == np.inf
+
+
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_the_start_of_the_network_by_hand(factor: float) -> None:
+    """Catches frequencies that are drawn per unit of the map and not per metre, another scale of
+    iMAP's density, and another first width of NeuS's surfaces: 1/s = exp(-3) m."""
+    far = SceneBounds((-factor,) * 3, (factor,) * 3)
+    neus = make_field("neus", NetworkSettings(embedding_sigma=2.5), far, seed=0)
+    spread = neus.mlp.frequencies.std().item() / far.metres_per_unit  # rad/m
+    assert spread == pytest.approx(2.5, rel=0.1)
+    assert neus.diagnostics()["std_m"] == pytest.approx(math.exp(-3))
+    imap = make_field("imap", NetworkSettings(16), far, seed=0)
+    torch.nn.init.zeros_(imap.mlp.head.weight)
+    color, density = imap(torch.rand(2, 3))
+    torch.testing.assert_close(density, torch.full((2,), 10 * math.log(2)))
+    torch.testing.assert_close(color, torch.full((2, 3), 0.5))
+
+
+@pytest.mark.parametrize("name", ["imap", "neus", "neus_plus"])
+def test_a_mapping_loss_is_the_sum_by_hand(name: str) -> None:
+    """Catches a term with another factor, of other samples, or of a measured point that is taken
+    elsewhere: the terms are computed here from the field's answers and the same random numbers."""
+    sequence = box_sequence([[0.0, 0.0, 0.0], [0.1, 0.0, 0.1]])
+    bounds = BoxRoom().bounds
+    field = make_field(name, NetworkSettings(16), bounds, seed=0)
+    settings = field.Settings(n_rays=40, n_stratified=8, n_surface=4, lambda_color=3.0)
+    draw = PixelSampler(sequence, torch.device("cpu")).draw
+    frames, generator = torch.arange(2), torch.Generator()
+    field.prepare(sequence, np.arange(2)) if name == "neus_plus" else None
+
+    def drawn(n_rays: int, **options: bool) -> Rays:
+        return draw(n_rays, generator, frames, **options)
+
+    found = field.mapping_losses(drawn, settings, generator.manual_seed(1))
+    generator.manual_seed(1)
+    if name == "imap":
+        rays = drawn(40)
+        seen = field.render(rays, field.hierarchical_depths(rays, 8, 4, generator))
+        expected = rendered_losses(seen, rays, 3.0, 1.0, over_std=True)
+    else:
+        rays = drawn(40, tangent_planes=name == "neus_plus")
+        depths = guided_depths(rays, bounds, settings, generator)
+        seen = field.render(rays, depths)
+        expected = {"depth": (seen.depth - rays.depth).abs().mean()}
+        expected["color"] = 3 * (seen.color - rays.color).abs().mean()
+    if name == "neus_plus":
+        surface = drawn(settings.n_surface_points)
+        points = surface.origins_world + surface.depth[:, None] * surface.directions_world
+        color, sdf = field(points)
+        expected["surface"] = 10 * sdf.abs().mean()
+        expected["surface_color"] = 3 * (color - surface.color).abs().mean()
+        answers = field.observed(rays.points(depths))
+        target, known = distance_targets(rays, depths, *answers, settings)
+        off = (field.query_along(rays, depths)[1] - target).abs()
+        expected["sdf"] = 10 * off[known > 0].mean()
+    for term, value in expected.items():
+        torch.testing.assert_close(found[term], value, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", ["map", "metre"])
+def test_the_first_step_of_adam_by_hand(unit: str) -> None:
+    """Catches a rate in another unit, one rate for both parts, and a quaternion that is left
+    longer than one: a first step moves every coordinate by its rate, against the gradient."""
+    room = BoxRoom()
+    sequence = box_sequence([[0.05, -0.04, 0.03]], room)
+    settings = SdfSettings(n_pixels=500, position_unit=unit)
+    tracker = make_tracker("sdf", room, np.eye(4), StepBudget(1), settings)
+    found = tracker.track(sequence[0]).T_world_camera
+    rate_m = 5e-4 * (room.bounds.metres_per_unit if unit == "map" else 1.0)
+    np.testing.assert_allclose(found[:3, 3], [rate_m, -rate_m, rate_m], rtol=1e-3)
+    quaternion = Rotation.from_matrix(found[:3, :3]).as_quat(scalar_first=True)
+    vector = np.abs(quaternion[1:] / quaternion[0])
+    np.testing.assert_allclose(vector, 1e-3, rtol=2e-3)
+
+
+def test_the_trackers_losses_by_hand() -> None:
+    """Catches an inverted pose, rays instead of depths, a forgotten weight, and a mean over pixels
+    in place of channels: Eq. 2 and iMAP's loss in plain numpy, at a pose that is off."""
+    room = BoxRoom()
+    frame = box_sequence([[0.0, 0.0, 0.0]], room)[0]
+    (T_off,) = poses_at([[0.03, 0.02, -0.04]], [0.02, -0.03, 0.01])
+    camera = frame.camera
+    rows, columns = np.indices((camera.height, camera.width)).reshape(2, -1)
+    x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
+    depth = frame.depth_mm.numpy()[rows, columns] / 1000
+    color = frame.color.numpy()[rows, columns] / 255
+    points = np.stack([x * depth, y * depth, depth], axis=1) @ T_off[:3, :3].T + T_off[:3, 3]
+    off = np.abs((np.array([1.0, 0.8, 1.2]) - np.abs(points)).min(axis=1)).mean()
+    unlike = np.abs(0.5 + 0.4 * np.sin(3 * points) - color).mean()
+    settings = SdfSettings(n_pixels=20_000, lambda_sdf=2.0, lambda_color=0.5)
+    tracker = make_tracker("sdf", room, T_off, StepBudget(1), settings)
+    assert tracker.track(frame).loss == pytest.approx(2 * off + 0.5 * unlike, rel=0.02)
+    wide = SceneBounds((-4.0, -4.0, -1.0), (4.0, 4.0, 3.0))
+    wall = Formula(lambda points: 500.0 * (points[:, 2] > 2.0), wide, as_density=True)
+    depth_mm = torch.full_like(frame.depth_mm, 2500)
+    settings = VrSettings(n_pixels=200, lambda_color=0.0, lambda_depth=2.0, n_stratified=200)
+    tracker = make_tracker("vr", wall, np.eye(4), StepBudget(1), settings)
+    ahead = Frame(camera, frame.color, depth_mm, np.eye(4))
+    # Half a metre off, over the least deviation, 2 cm, of what is nearly a step.
+    assert tracker.track(ahead).loss == pytest.approx(2 * 0.5 / 0.02, rel=0.1)
+
+
+def test_how_far_points_lie_behind_what_was_seen() -> None:
+    """Catches a sign, the largest in place of the least, and places that no frame saw."""
+    sequence = sequence_of(np.full((6, 12, 16), 2000.0), Intrinsics.from_focal(16, 12, 14.0))
+    sequence.depths_mm[5] = 3000  # every fifth frame is asked: 0 and 5
+    points = torch.tensor([[0.0, 0.0, 2.5], [0.1, 0.0, 1.5], [9.0, 0.0, 2.0], [0.0, 0.0, -1.0]])
+    behind = min_depth_behind(points, sequence, np.arange(6))
+    torch.testing.assert_close(behind, torch.tensor([-0.5, -1.5, math.inf, math.inf]))
+
+
+def test_the_probability_that_a_pose_is_wrong() -> None:
+    """Catches a sign: it rises where fewer points fit, colours differ, the pose is less certain,
+    farther from where it was expected, or still moves; and by hand, normal errors within 5 cm."""
+    assert p_within(0.05) == pytest.approx(0.6827, abs=1e-4)
+    assert p_within(0.025) == pytest.approx(0.9545, abs=1e-4)
+    good = {"fitting_ratio": 0.9, "known_ratio": 0.8, "intensity_ratio": 1.0, "innovation": 0.03}
+    good |= {"position_std_m": 0.002, "last_step": 0.0}
+    worse = {"fitting_ratio": 0.5, "known_ratio": 0.3, "intensity_ratio": 3.0, "innovation": 0.3}
+    worse |= {"position_std_m": 0.05, "last_step": 0.05}
+    odds = 2.01 - 2.06 * math.log(9) - 0.28 * math.log(4) + 1.39 * math.log(0.03)
+    assert p_lost(good) == pytest.approx(1 / (1 + math.exp(-odds)), rel=1e-6)
+    for name, value in worse.items():
+        assert p_lost({**good, name: value}) > p_lost(good)
+    # Nothing but the spread: two standard deviations of 2.5 cm, and a last step of nothing.
+    found = p_lost({**good, "position_std_m": 0.025})
+    assert 1 - found == pytest.approx((1 - p_lost(good)) * p_within(0.05), rel=1e-6)
+
+
+def test_the_certainty_of_a_pose_by_hand() -> None:
+    """Catches a variance for a deviation, degrees for radians and another unit of the scales: four
+    times the points halve a standard deviation that the points' planes alone decide."""
+    room = BoxRoom(half=(0.6, 0.45, 1.2), contrast=0.0)
+    frame, grid = box_sequence([[0.0, 0.0, 0.0]], room, 96)[0], grid_of(BakedField(room, 0.05))
+    said = []
+    for n_points in (250, 1000, 4000):
+        seen = draw_points(frame, n_points, torch.Generator().manual_seed(0))
+        optimizer = LmOptimizer(grid, seen, seen, 0.0, np.eye(4))
+        optimizer.run()
+        said.append(optimizer.certainty())
+    assert all(each["inlier_ratio"] > 0.9 for each in said), said
+    for few, many in pairwise(said):
+        ratio = many["rotation_std_deg"] / few["rotation_std_deg"]
+        assert ratio == pytest.approx(0.5, abs=0.05)
+    # 1 cm a point, half of the least scale, at effective lever arms of 10 to 50 cm: 250 points.
+    assert 0.06 < said[0]["rotation_std_deg"] < 0.4
+
+
+def test_views_that_are_alike() -> None:
+    """Catches brightness or contrast that count, depths that do not, and an order turned round."""
+    frames = box_sequence([[0.0, 0.0, 0.0], [0.0, 0.0, 0.15], [0.0, 0.0, -0.4]], BoxRoom(), 96)
+    views = torch.stack([view_of(frames[i]) for i in range(3)])
+    cameras = frames.T_world_camera.copy()
+    darker = view_of(Frame(frames.intrinsics, frames[1].color // 2, frames[1].depth_mm, cameras[1]))
+    found = retrieve(darker, Viewpoints(cameras, views), 3)
+    assert found[:, 2, 3].tolist() == [0.15, 0.0, -0.4]
+    np.testing.assert_allclose(found[0], cameras[1], atol=1e-12)  # not turned
