@@ -103,6 +103,9 @@ PAPER_SIZES = load_preset("paper", tables_folder() / "paper_rooms_gpu" / "settin
 # which lies in a folder of its own.
 _UNBIASED = dict.fromkeys(("mapped", "tracked"), "depth_unbiased")
 SENSORS = Case({"sensor": "dataset"}), Case({"sensor": "unbiased"}, depth=_UNBIASED)
+_SIZES_PLUS = {"n_rays": 96, "n_stratified": 8, "n_surface": 8, "n_surface_points": 1024}
+_SIZES_PLUS |= {"learning_rate": 0.003}
+_SMALL_PLUS = [f"mapping.neus_plus.{name}={size}" for name, size in _SIZES_PLUS.items()]
 FASTEST = "860:1000"  # of breakfast_room: half of the frames move farther than VR's reach at 5 Hz
 _OTHERWISE = "vr_metres", "sdf_metres", "vr_velocity", "sdf_velocity", "vr_neus"
 READINGS = {name: METHODS[name] for name in _OTHERWISE}
@@ -132,6 +135,14 @@ GRIDS = {
     # Table I in five of the paper's rooms; a seed takes hours on two cores.
     "paper_rooms": Grid(PAPER_ROOMS, SENSORS, has_table=True, has_maps=True),
     "paper_rooms_gpu": Grid(PAPER_SIZES, SENSORS, has_table=True, has_maps=True),
+    # What the bias of the sensor costs LM, in corrected maps of the sizes of `smoke`, and ICP.
+    "sensors": Grid(
+        with_settings(PAPER_ROOMS, *_SMALL_PLUS),
+        SENSORS,
+        ["corrected", "icp_middle"],
+        {"steps": 30},
+        "paper_rooms",
+    ),
     # What makes VR lose the camera at 5 Hz where breakfast_room's path is fastest.
     "vr_at_5_hz": Grid(
         with_settings(PAPER_ROOMS, "scenes.names=['breakfast_room']"),
