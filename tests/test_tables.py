@@ -249,11 +249,33 @@ def test_latex_for_a_paper(tmp_path: Path) -> None:
     own = Wording(r"My \emph{table}.", "tab:mine", {"room_a": "Mine & x"})
     write_tables(tmp_path, OURS_1, OURS_2, NOTE, own=own)
     first, second = ((tmp_path / f"table_{n}.tex").read_text() for n in (1, 2))
-    assert "\\caption{My \\emph{table}.}\n" in first
+    assert "\\caption{My \\emph{table}. \\textcolor{red}{Red}$^\\dagger$: above" in first
+    assert r"\begin{table}" in first  # two columns fit into one of the page's
     assert "\\label{tab:mine}" in first
     assert r"\begin{tabular}{@{}r@{}}Mine\\\&\\x\end{tabular}" in first
     assert "\\label{tab:mine-steps}" in second
     assert "used for tracking).}\n" in second  # without the note
+
+
+@pytest.mark.parametrize(
+    ("given", "written"),
+    [
+        ("Errors of 95% of R&D_runs #1", r"Errors of 95\% of R\&D\_runs \#1"),
+        (r"\emph{50\% of} $x_1^2$, 5$ each", r"\emph{50\% of} $x_1^2$, 5\$ each"),
+        (r"see \ref{tab:a_b}, \cite{x_y} in \textbf{R_1} ^", None),
+        ("a { brace", r"a \{ brace"),
+        ("two\n\nparagraphs\\", r"two paragraphs\textbackslash{}"),
+    ],
+)
+def test_captions_compile(tmp_path: Path, given: str, written: str | None) -> None:
+    """Catches a caption or label that ends a line, a cell or TeX, and LaTeX that is spoiled."""
+    own = Wording(given, "tab:a_b%c#1")
+    first, *_ = write_tables(tmp_path, OURS_1, OURS_2, NOTE, own=own)
+    text = first.with_suffix(".tex").read_text()
+    if written is None:
+        written = given.replace("R_1", r"R\_1").replace("^", r"\textasciicircum{}")
+    assert rf"\caption{{{written} \textcolor{{red}}" in text
+    assert r"\label{tab:a_b-c-1}" in text
 
 
 def test_millimetres_where_metres_tie(tmp_path: Path) -> None:
