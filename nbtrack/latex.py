@@ -60,6 +60,7 @@ def latex_file(styler: Any, path: Path, note: str, own: Wording = OUR_WORDING) -
         note=" ".join(note.split()),
         has_steps="n_pixels" in cells.index.names,
         has_std=any(cell.std for cell in cells.to_numpy().flat),
+        has_converged=any("‡" in cell.value for cell in cells.to_numpy().flat),
         columns=columns,
         is_wide=_width_pt(cells, columns) > _COLUMN_PT,
         groups=groups.items(),

@@ -24,6 +24,7 @@ PAPER_PIXELS = {"VR": 512, "SDF": 4096}
 """The n that the paper's Table II prints in bold: the one used for Table I."""
 STANDING_STILL = "standing still"
 """The row of a camera that stays at its first pose, the dullest alternative to any tracker."""
+CONVERGED = "‡"  # in Table II: a tracker needed no more steps
 _CELL_1 = ["rate_hz", "method", "scene"]
 _CELL_2 = ["tracker", "n_pixels", "budget_ms"]
 _MISSING = "–"
@@ -44,10 +45,7 @@ def published_table_2() -> pd.DataFrame:
 
 
 def naming_points(results: pd.DataFrame) -> pd.DataFrame:
-    """The results with n, the number of points or pixels, in the names of their methods.
-
-    A name that ends with the bare number, as "LM, 4096", becomes "LM, n = 4096".
-    """
+    """The results with n (points or pixels) in their methods' names, as "LM, n = 4096"."""
     both = zip(results["method"], results["n_pixels"], strict=True)
     return results.assign(method=[f"{m.removesuffix(f', {n}')}, n = {n}" for m, n in both])
 
@@ -203,12 +201,15 @@ def style_table_2(
 ) -> TableStyler:
     """Table II, mean ± std over frames; rows of whole numbers without a std have no decimals.
 
-    The default pixels of each tracker, the n used for Table I, are printed bold with an asterisk.
+    Where a column `converged` is true, they are marked. The default pixels of each tracker, the n
+    used for Table I, are printed bold with an asterisk.
     """
     wide, stds = table_2(steps), table_2(steps, "steps_std")
     is_whole = (wide.isna() | (wide % 1 == 0)).all(axis=1) & stds.isna().all(axis=1)
     texts = _texts(wide, "{:.1f}", _MISSING)
     texts[is_whole] = _texts(wide[is_whole], "{:.0f}", _MISSING)
+    has_ended = table_2(steps, "converged") == 1
+    texts = texts.mask(has_ended, texts + CONVERGED)
     styler = _styled(texts, _texts(stds, "{:.1f}"), is_best=False, is_lost=False)
     styler.default_pixels = default_pixels
     is_default = [default_pixels.get(tracker) == n for tracker, n in wide.index]
@@ -218,7 +219,8 @@ def style_table_2(
     # Notebooks show every row label in bold, so the others are set to normal weight.
     weights = [_BOLD if default else "font-weight: normal;" for default in is_default]
     styler.apply_index(lambda _: weights, axis="index", level="n_pixels")
-    return _labelled(styler, caption, "* and bold: the n used for tracking")
+    ended = f"; {CONVERGED}: until it converged, with time left" if has_ended.any(axis=None) else ""
+    return _labelled(styler, caption, f"* and bold: the n used for tracking{ended}")
 
 
 def _texts(wide: pd.DataFrame, form: str, missing: str = "") -> pd.DataFrame:

@@ -164,6 +164,10 @@ def test_steps_of_our_own_cells() -> None:
         ["", "512", "2", "--"],
     ]
     spread = shown(style_table_2(OURS_2.assign(steps_std=[0.5, 1.5, 0.25, 0.75])))
+    ended = style_table_2(OURS_2.assign(converged=OURS_2["tracker"] == "LM"))
+    assert shown(ended).values.tolist() == [["1.0‡", "3.0‡"], ["4", "–"], ["2", "–"]]
+    assert r"& 1.0\rlap{$^\ddagger$} & 3.0" in latex(ended)
+    assert "until it converged" in ended.caption
     assert spread.loc[("LM", 64)].tolist() == ["1.0 ± 1.5", "3.0 ± 0.5"]
     assert spread.loc[("VR", 16)].tolist() == ["4.0 ± 0.8", "–"]
 

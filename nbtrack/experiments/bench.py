@@ -16,11 +16,11 @@ from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
 from nbtrack.experiments.output import prepare
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
-from nbtrack.latex import Wording
+from nbtrack.latex import Wording, label_of
 from nbtrack.machinery.device import advise_on_memory, choose_device, device_name
 from nbtrack.machinery.errors import ConfigError, NbtrackError
 from nbtrack.machinery.files import runs_folder
-from nbtrack.machinery.progress import ProgressBar
+from nbtrack.machinery.progress import ProgressBar, tell
 from nbtrack.machinery.settings import changed_settings
 from nbtrack.recordings.reading import read_frames
 from nbtrack.synthetic import ROOMS
@@ -48,6 +48,8 @@ def tables_command(options: Namespace) -> None:
     methods = find_methods(options.method.split(",") if options.method else usual)
     # What is wrong is told before a room is made.
     execution = Execution(options.workers, options.dask, keep_going=True)
+    if options.label and (label := label_of(options.label)) != options.label:
+        tell(f"nbtrack: LaTeX has no label {options.label!r}: it is {label!r} in the tables")
     wording = Wording(options.caption, options.label, dict(map(_label_of, preset.scenes.labels)))
     prepare(options.out)
     results = _fill_tables(options, preset, methods, execution, wording)
@@ -132,8 +134,9 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     A tracker works in the field of the first method that has it, in the scene's map, made if not
     cached, and always on the scene's first frame with a pose.
 
-    A row is a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames) and
-    steps_std (over frames). Source: paper, Table II and evaluation protocol.
+    A row is a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames),
+    steps_std (over frames), and converged: whether each frame's search ended before the budget.
+    Source: paper, Table II and evaluation protocol.
     """
     firsts = {}
     for method in find_methods(methods):
@@ -154,24 +157,28 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
                 # The budget is replaced for every cell.
                 tracker = make_tracker(name, field, frame.T_world_camera, StepBudget(1), settings)
                 for budget_ms in preset.tables.budgets_ms:
-                    counts = _steps_within(tracker, frame, budget_ms)
+                    counts, converged = _steps_within(tracker, frame, budget_ms)
                     mean, std = float(np.mean(counts)), float(np.std(counts))
-                    rows.append((name.upper(), n_pixels, budget_ms, mean, std))
+                    rows.append((name.upper(), n_pixels, budget_ms, mean, std, converged))
         bar.move_to(len(plan))
-    return pd.DataFrame(rows, columns=["tracker", "n_pixels", "budget_ms", "steps", "steps_std"])
+    columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_std", "converged"]
+    return pd.DataFrame(rows, columns=columns)
 
 
-def _steps_within(tracker: Tracker, frame: Frame, budget_ms: float) -> list[int]:
-    """The steps that a tracker takes within a budget, frame by frame, always from the true pose.
+def _steps_within(tracker: Tracker, frame: Frame, budget_ms: float) -> tuple[list[int], bool]:
+    """The steps that a tracker takes within a budget, frame by frame, always from the true pose,
+    and whether it ended each time by itself: while one more would have fitted into the budget.
 
     A first frame, in which it allocates and compiles, is not counted.
     """
     tracker.budget = ClockBudget(1000 / budget_ms)  # Hz
-    counts = []
+    counts, with_one_more = [], []
     for _ in range(1 + _FRAMES_A_CELL):
         tracker.restart(frame.T_world_camera)
-        counts.append(tracker.track(frame).steps)
-    return counts[1:]
+        estimate = tracker.track(frame)
+        counts.append(estimate.steps)
+        with_one_more.append(estimate.seconds * (1 + 1 / max(estimate.steps, 1)))  # s
+    return counts[1:], 1000 * max(with_one_more[1:]) < budget_ms
 
 
 def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]:
