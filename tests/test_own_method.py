@@ -1,9 +1,7 @@
 """Adding a field or a tracker: a short file or cell registers it, and it has rows in the tables."""
 
 import contextlib
-import importlib
 import json
-import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -11,15 +9,15 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from unittest import mock
 
-import nbformat
 import pytest
 from forked import forking
 from test_faults import assert_refused
 from tiny import TINY, tiny_words
 
 import nbtrack
+from nbtrack import provenance
 from nbtrack.cli import main
-from nbtrack.experiments.methods import METHODS, Method, method_of
+from nbtrack.experiments.methods import METHODS, method_of
 from nbtrack.experiments.presets import load_preset
 from nbtrack.fields import FIELDS, NeusMapping
 from nbtrack.machinery import registry
@@ -63,42 +61,10 @@ class DistanceTracker(AdamTracker):
 
 FIELDS["fading"] = FadingField
 TRACKERS["distance"] = DistanceTracker
+cells = ("correction.fading=0.3",)
 nbtrack.METHODS["mine"] = nbtrack.Method("Mine", "fading", "distance")
+nbtrack.METHODS |= {"fine": nbtrack.Method("Mine corrected", "fading", "lm", cells)}
 '''
-
-
-@pytest.fixture
-def grid_file(tmp_path: Path, monkeypatch) -> Iterator[None]:
-    """The classes of notebook A4 as a file of one's own."""
-    notebook = Path(__file__).parents[1] / "notebooks/A4_a_field_of_your_own.ipynb"
-    cells = [c.source for c in nbformat.read(notebook, 4).cells if c.cell_type == "code"]
-    own = [cells[0], *(source for source in cells if re.search("^(class|def) ", source, re.M))]
-    (tmp_path / "own_grid.py").write_text("\n\n".join(own))
-    monkeypatch.syspath_prepend(tmp_path)
-    importlib.import_module("own_grid")
-    yield
-    del FIELDS["neus_grid"], TRACKERS["huber"], TRACKERS["gauss_newton"], sys.modules["own_grid"]
-
-
-def test_the_field_of_the_notebook_in_every_command(grid_file: None, tmp_path: Path) -> None:
-    """Catches a field that is no network of the package's, and is lost in a map file, in a key, or
-    in a command: mapped, read, tracked in again, corrected, and a row of a table."""
-    words = tiny_words(
-        "scenes.names=['office']", "network.neus_grid.finest=0.3", "mapping.neus_grid.iterations=4",
-        "mapping.neus_grid.n_rays=8", "tracking.huber.n_pixels=8", "tables.rates_hz=[10]",
-    )  # fmt: skip
-    made, run = str(tmp_path / "map"), ["--steps", "1", "--out", str(tmp_path / "run")]
-    assert main(["map", "office", "--field", "neus_grid", *words, "--out", made]) == 0
-    assert main(["track", "office", "--map-from", made, "--tracker", "huber", *run, *words]) == 0
-    assert (tmp_path / "run/trajectory.txt").is_file()
-    trackers = ("sdf", "huber", "gauss_newton", "vr", "lm")
-    own = {f"grid_{name}": Method(f"Grid {name}", "neus_grid", name) for name in trackers}
-    own["grid"] = Method("Grid corrected", "neus_grid", "sdf", ("correction.neus_grid=0.2",))
-    with mock.patch.dict(METHODS, own):
-        rows = ["--method", ",".join(own), "--workers", "1", "--out", str(tmp_path / "out")]
-        assert main(["tables", *rows, *words]) == 0
-    table = (tmp_path / "out/table_1.csv").read_text()
-    assert re.findall(r"Grid (\w+),office", table) == [*trackers, "corrected"]
 
 
 @contextlib.contextmanager
@@ -115,27 +81,37 @@ def importing() -> Iterator[None]:
 
 
 def test_installed_packages_join_by_their_entry_points(tmp_path: Path, monkeypatch, capsys) -> None:
-    """Catches a package whose methods no command knows unless somebody imports it, and a traceback
-    from every command because of somebody else's broken one."""
+    """Catches a package whose methods no command knows unless somebody imports it, a traceback from
+    every command because of somebody else's broken one, and a package's results that are never
+    kept, or outlive an update."""
     (tmp_path / "own_method.py").write_text(OWN)
     (tmp_path / "own_broken.py").write_text("1 / 0")
     about = tmp_path / "own_method-1.0.dist-info"
     about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: own-method\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[nbtrack]\nmine = own_method\nno = own_broken\n")
+    (about / "top_level.txt").write_text("own_method")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(registry, "_waiting", [*entry_points(group="nbtrack")])
-    with importing():
-        assert main(["methods"]) == 0
+    monkeypatch.setattr(provenance, "_SITE", str(tmp_path))
+    codes = []
+    for version in ("1.0", "1.0", "1.1"):
+        metadata = f"Metadata-Version: 2.1\nName: own-method\nVersion: {version}\n"
+        (about / "METADATA").write_text(metadata)
+        provenance._installed.cache_clear()  # as in another process
+        monkeypatch.setattr(registry, "_waiting", [*entry_points(group="nbtrack")])
+        with importing():
+            assert main(["methods"]) == 0
+            codes.append(provenance.code_fingerprint(TRACKERS["distance"]))
+    assert codes[0] == codes[1] != codes[2]
     said = capsys.readouterr()
     assert "Mine" in said.out
-    assert "plug-in own_broken is left out (ZeroDivisionError: division by zero)" in said.err
+    broken = "plug-in own_broken is left out (ZeroDivisionError: division by zero)"
+    assert [broken in line for line in said.err.splitlines()] == 3 * [True]
 
 
 def test_a_file_joins_by_an_option_of_every_command(tmp_path: Path, monkeypatch, capsys) -> None:
     """Catches an extension that needs more than its own file: presets, layouts, registries; a file
     that some command, or a worker process, does not know; a map of its field that can be read only
-    where it was made, and a command that does not make a run again."""
+    where it was made, or not be corrected, and a command that does not make a run again."""
     assert OWN.count("\n") <= 40
     (tmp_path / "own").mkdir()
     (tmp_path / "own/my-method.py").write_text("from helper import *\n" + OWN)
@@ -145,13 +121,13 @@ def test_a_file_joins_by_an_option_of_every_command(tmp_path: Path, monkeypatch,
         "scenes.n_frames=3", "tables.rates_hz=[10]", "tracking.distance.n_pixels=8",
         "mapping.fading.iterations=6", "mapping.fading.n_rays=8", "mapping.fading.decay=0.1",
     )  # fmt: skip
-    grid = ["--method", "mine", "--workers", "2", "--scenes", "office,bedroom", "--out", "out"]
+    grid = ["--method", "mine,fine", "--workers", "2", "--scenes", "office,bedroom", "--out", "out"]
     monkeypatch.chdir(tmp_path)
     with importing(), forking():
         assert main(["tables", *own, *grid, *words]) == 0
-    assert (tmp_path / "out/table_1.csv").read_text().count("Mine,") == 2
+    assert (tmp_path / "out/table_1.csv").read_text().count("Mine") == 4
     assert "DISTANCE,8," in (tmp_path / "out/table_2.csv").read_text()
-    (made,) = (tmp_path / "runs/maps").glob("office-fading-*")
+    (made,) = (tmp_path / "runs/maps").glob("office-fading-corrected-*")
     run = ["track", "office", "--map-from", str(made), "--steps", "1", "--out", "run", *words]
     error = assert_refused(tmp_path, capsys, run, "'fading', which is not registered")
     assert "--import" in error

@@ -1,6 +1,5 @@
 """Keys follow the code: what changes a result changes its key, what does not leaves it alone."""
 
-import importlib
 import shutil
 import subprocess
 import sys
@@ -107,26 +106,6 @@ def test_a_class_is_its_own_key(tmp_path: Path, monkeypatch, capsys) -> None:
     assert after[1] != before[1]
     write_anew(FIELDS, NeuSField)
     assert not {*keys()} & {*before, *after}
-
-
-def test_classes_of_installed_packages(tmp_path: Path, monkeypatch, capsys) -> None:
-    """Catches an installed package whose results are never kept, or outlive an update."""
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(provenance, "_SITE", str(tmp_path))
-    text = "from nbtrack.tracking import SdfTracker\nclass Mine(SdfTracker): pass\n"
-    (tmp_path / "own_package.py").write_text(text)
-    found = []
-    for version in ("1.0", "1.0", "1.1"):
-        about = tmp_path / "own_package-1.dist-info"
-        about.mkdir(exist_ok=True)
-        about_it = f"Metadata-Version: 2.1\nName: own-package\nVersion: {version}\n"
-        (about / "METADATA").write_text(about_it)
-        (about / "top_level.txt").write_text("own_package\n")
-        monkeypatch.delitem(sys.modules, "own_package", raising=False)
-        provenance._installed.cache_clear()  # as in another process
-        found.append(provenance.code_fingerprint(importlib.import_module("own_package").Mine))
-    assert found[0] == found[1] != found[2]
-    assert not capsys.readouterr().err
 
 
 def test_what_a_fingerprint_tells_apart() -> None:

@@ -50,6 +50,9 @@ class Registry(UserDict[str, Entry]):
     def data(self, entries: dict[str, Entry | str]) -> None:
         self._entries = entries
 
+    def __copy__(self) -> "Registry":
+        return Registry({**self.data})
+
     def __getitem__(self, name: str) -> Entry:
         """The entry of a name. Raises ConfigError where its text names nothing that is there.
 
