@@ -2,6 +2,7 @@
 
 import importlib
 import os
+from pathlib import Path
 
 import pytest
 from jaxtyping import install_import_hook
@@ -29,3 +30,21 @@ def pytest_collectstart(collector: pytest.Collector) -> None:
         for library in LIBRARIES:
             importlib.import_module(library)
         install_import_hook("nbtrack", "beartype.beartype")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With --nbval the notebooks are what is tested; None leaves the question to others."""
+    is_code = collection_path.suffix == ".py"
+    return True if is_code and config.getoption("nbval", False) else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item], config: pytest.Config) -> None:
+    """Notebooks that need the same maps do not begin together: the first, the appendices, 2 to 7,
+    and at last the fifth, which needs the maps and runs of all."""
+    if config.getoption("nbval", False):
+        items.sort(key=lambda item: ("01", "A", "0", "05").index(_group(item.path.stem)))
+
+
+def _group(notebook: str) -> str:
+    """The part of a notebook's name by which it takes its turn."""
+    return notebook[:2] if notebook[:2] in ("01", "05") else notebook[0]

@@ -17,9 +17,7 @@ step "Formatting" "$venv_python" -m ruff format --check --quiet
 # which takes seconds to load in each process.
 step "Unit tests" "$venv_python" -m pytest -q -p no:nbval -n auto --dist loadfile \
     --no-loadscope-reorder
-# Two at a time: parts of each keep one core busy. What one needs of another, it waits for or makes:
-# so those that need the same maps do not begin together, and the fifth, which needs all, is last.
-step "Notebooks against their stored outputs" "$venv_python" -m pytest --nbval \
-    notebooks/01*.ipynb notebooks/[!0]*.ipynb notebooks/0[!15]*.ipynb notebooks/05*.ipynb \
+# Two at a time: parts of each keep one core busy. What one needs of another, it waits for or makes.
+step "Notebooks against their stored outputs" "$venv_python" -m pytest --nbval notebooks \
     -q -n 2 --dist loadfile --no-loadscope-reorder
 printf 'All checks passed in %d min %d s.\n' "$((SECONDS / 60))" "$((SECONDS % 60))"

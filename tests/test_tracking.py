@@ -183,9 +183,19 @@ def test_wrong_arguments() -> None:
 
 def test_a_grid_is_tracked_in_by_one_thread() -> None:
     """Catches a wide network, kept with the grid that was made from it, that sets the threads."""
-    grid = BakedField(BoxRoom(), 0.2)
+    seen = []
+
+    class Watched(BakedField):
+        def forward(self, points_world: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            seen.append(torch.get_num_threads())
+            return super().forward(points_world)
+
+    grid = Watched(BoxRoom(), 0.2)
     grid.source = torch.nn.Linear(3, 512)
-    assert make_tracker("sdf", grid, np.eye(4), StepBudget(1)).field.width == 0
+    torch.set_num_threads(2)
+    make_tracker("sdf", grid, np.eye(4), StepBudget(2)).track(walk(2)[1])
+    assert {*seen} == {1}
+    assert torch.get_num_threads() == 2
 
 
 @pytest.mark.parametrize("name", ["vr", "sdf"])
