@@ -18,6 +18,6 @@ def forking() -> Iterator[Any]:
     context.set_forkserver_preload(IMPORTED)
     with (
         dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
-        mock.patch("nbtrack.experiments.jobs._START", "forkserver"),
+        mock.patch("nbtrack.experiments.workers._START", "forkserver"),
     ):
         yield context

@@ -218,14 +218,19 @@ def test_a_recording_without_reference(preset: Preset, scenes: list[Scene], tmp_
 
 
 def test_a_cached_run_is_checked(preset: Preset, scenes: list[Scene]) -> None:
-    """Catches a table that ends in a traceback, or holds a hole, for a spoilt file of the cache."""
-    (run,) = track_scenes(scenes[:1], ["sdf"], preset, [10])["run"]
+    """Catches a table that ends in a traceback, or as a whole, or holds a hole without a word, for
+    a spoilt file of the cache."""
+    run, _ = track_scenes(scenes, ["sdf"], preset, [10])["run"]
     path = runs_folder() / "tracks" / run / "metrics.json"
     sound = path.read_text()
     for spoilt in ("{}", sound.replace('"key": "', '"key": "0')):
         path.write_text(spoilt)
         with pytest.raises(DataError, match="is not what this run has written"):
-            track_scenes(scenes[:1], ["sdf"], preset, [10])
+            track_scenes(scenes, ["sdf"], preset, [10])
+        on = Execution(workers=1, keep_going=True)
+        results = track_scenes(scenes, ["sdf"], preset, [10], execution=on)
+        assert results["ate_m"].isna().tolist() == [True, False]
+        assert "is not what this run has written" in results["failure"][0]
     path.write_text(sound)
 
 

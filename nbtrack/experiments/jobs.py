@@ -6,25 +6,21 @@ gain nothing from a second thread, so scenes and methods share the cores instead
 
 import contextlib
 import importlib.util
-import multiprocessing
+import json
 import os
 import pickle
-import signal
 import sys
-import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass
-from functools import partial
-from multiprocessing.connection import Connection
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cloudpickle
-import torch
 
 from nbtrack.experiments.output import check_no_recording
+from nbtrack.experiments.workers import DEATHS, Workplace, cluster, processes
 from nbtrack.fields import FIELDS
 from nbtrack.machinery.device import (
     advise_on_memory,
@@ -34,14 +30,17 @@ from nbtrack.machinery.device import (
     usual_modes,
 )
 from nbtrack.machinery.errors import MissingError, NbtrackError
-from nbtrack.machinery.files import data_folder, locked, runs_folder
+from nbtrack.machinery.files import data_folder, locked, runs_folder, write_atomic
 from nbtrack.machinery.progress import ProgressBar
+from nbtrack.recordings.images import images_of
 from nbtrack.tracking import TRACKERS
 
-_START = "spawn"  # how worker processes begin: forked ones would lack the threads of libraries
-_LOOK_SECONDS = 1.0  # between two looks at jobs elsewhere, so that the bar's clock moves
+_LOOK_SECONDS = 1.0  # between two looks at jobs elsewhere, and between two of their reports
+_DIED = (
+    "a worker process died at {}, perhaps for lack of memory: run it again, with fewer --workers "
+    "or smaller settings; what was finished is kept"
+)
 _NAME_BYTES = 180  # of a folder's name; the key, suffixes and those of temporary files follow
-_SECONDS_TO_CONNECT = 10
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""
 
@@ -69,24 +68,22 @@ class Job:
         name = self.name.encode(errors="replace")[:_NAME_BYTES].decode(errors="ignore")
         return runs_folder() / self.kind / f"{name}-{self.key}"
 
-    def outcome(self, needed: Any, report: Report) -> Any:
+    @property
+    def lock(self) -> Path:
+        """A file that keeps other processes out; how far the job is stands in one beside it."""
+        return runs_folder() / "locks" / f"{self.folder.name}.lock"
+
+    def outcome(self, report: Report) -> Any:
         """Its `result`, made where it is missing, or the NbtrackError that ended it.
 
-        `needed` is the outcome of the job that it needs: if that is an error, this one is not run.
-        A lock keeps other processes out, and waits for one that makes the same; the system frees it
-        when its process ends.
+        It waits for another process that makes the same: the system frees the lock when a process
+        ends.
         """
-        if isinstance(needed, NbtrackError):
-            return NbtrackError(f"not run, because {self.needs.name} failed: {needed}")
-        path = runs_folder() / "locks" / f"{self.folder.name}.lock"
         report(0.0, "begins, or waits for another process that makes the same")
         try:
-            check_no_recording(path)
-            with (
-                locked(path),
-                usual_modes(),
-                advise_on_memory(f"the frames and settings of {self.name}"),
-            ):
+            check_no_recording(self.lock)
+            setting = f"the frames and settings of {self.name}"
+            with locked(self.lock), usual_modes(), advise_on_memory(setting):
                 return self.result() if self.is_done else self.compute(report)
         except NbtrackError as error:
             return error
@@ -116,27 +113,30 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
     """
     execution = execution or Execution()
     missing = {part.folder: part for job in jobs for part in _missing(job)}
-    results: dict[Path, Any] = {}
+    outcomes: dict[Path, Any] = {}
     bar = ProgressBar(Job.doing, sum(job.work for job in missing.values()))
 
-    def show(job: Job, share: float = 0.0, status: str = "running") -> None:
-        """Move the bar: to all that ended, and the `share` of a job that runs in this process."""
-        worked = sum(missing[folder].work for folder in results) + share * job.work
+    def show(running: Mapping[Path, tuple[float, str]]) -> None:
+        """Move the bar to what ended, and the shares of jobs that run; the first has its status."""
+        ended = sum(missing[folder].work for folder in outcomes)
+        worked = ended + sum(missing[folder].work * share for folder, (share, _) in running.items())
         # Compilation makes the first frame slow, which says nothing of the time that is left.
-        if 0 < share < 1 and not bar.warm_up_work:
+        if worked > ended and not bar.warm_up_work:
             bar.end_warm_up(worked)
-        bar.set_description_str(job.doing, refresh=False)
-        bar.move_to(worked, f"{len(results)} of {len(missing)} done, {job.name}: {status}")
+        folder, (_, status) = next(iter(running.items()))
+        bar.set_description_str(missing[folder].doing, refresh=False)
+        status = f"{missing[folder].name}: {status}"
+        bar.move_to(worked, f"{len(outcomes)} of {len(missing)} done, {status}")
 
-    outcomes = _outcomes(missing, show, execution)
+    ended = _outcomes(missing, outcomes, show, execution)
     # Closing the generator leaves its `with` blocks: so workers end at once after an error too.
-    with bar, contextlib.closing(outcomes):
-        for folder, outcome in outcomes:
+    with bar, contextlib.closing(ended):
+        for folder, outcome in ended:
             if isinstance(outcome, NbtrackError) and not execution.keep_going:
                 raise outcome
-            results[folder] = outcome
-            show(missing[folder], status="done")
-    return [results[job.folder] if job.folder in results else job.result() for job in jobs]
+            outcomes[folder] = outcome
+            show({folder: (0.0, "done")})
+    return [outcomes[j.folder] if j.folder in outcomes else _kept(j, execution) for j in jobs]
 
 
 def _missing(job: Job | None) -> list[Job]:
@@ -144,80 +144,93 @@ def _missing(job: Job | None) -> list[Job]:
     return [] if job is None or job.is_done else [*_missing(job.needs), job]
 
 
-def _outcomes(jobs: Mapping[Path, Job], show: Callable, execution: Execution) -> Iterator[tuple]:
+def _kept(job: Job, execution: Execution) -> Any:
+    """The result of a finished job, or the error, if it is to keep going, for a damaged file."""
+    try:
+        return job.result()
+    except NbtrackError as error:
+        if not execution.keep_going:
+            raise
+        return error
+
+
+def _outcomes(
+    jobs: Mapping[Path, Job], outcomes: Mapping[Path, Any], show: Callable, execution: Execution
+) -> Iterator[tuple]:
     """Pairs of each job's folder and outcome, as jobs end; a job begins after the one it needs.
 
-    `show` is that of `run_jobs`. `jobs` are in an order in which they can be run.
+    `jobs` are in an order in which they can be run; `outcomes` are those that have ended, and
+    `show` is that of `run_jobs`.
     """
     usual = usable_cores() if choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, len(jobs))
     if execution.dask is not None or workers > 1:
-        limit = len(jobs) if execution.dask else workers  # Dask shares them among its workers
-        with _submitting(execution.dask, workers) as submit:
-            yield from _elsewhere(jobs, submit, limit, show)
+        images_of.cache_clear()  # what was read here takes memory that workers need
+        there = cluster(execution.dask, len(jobs)) if execution.dask else processes(workers)
+        with there as workplace:
+            yield from _elsewhere(jobs, outcomes, show, workplace)
         return
-    results: dict[Path, Any] = {}
     for folder, job in jobs.items():
-        needed = results.get(job.needs.folder) if job.needs else None
-        results[folder] = job.outcome(needed, partial(show, job))
-        yield folder, results[folder]
+
+        def report(share: float, status: str, folder: Path = folder) -> None:
+            show({folder: (share, status)})
+
+        yield folder, _why_not(job, outcomes) or job.outcome(report)
 
 
-def _elsewhere(jobs: Mapping[Path, Job], submit: Callable, limit: int, show: Callable) -> Iterator:
-    """As `_outcomes`, of jobs that `submit` begins elsewhere, at most `limit` at a time."""
-    needs = {folder: job.needs.folder if job.needs else None for folder, job in jobs.items()}
-    results: dict[Path, Any] = {}
-    waiting = list(jobs)
-    running: dict[Future, Path] = {}
-    while waiting or running:
-        # Jobs that need nothing, something that is cached already, or a job that has ended.
-        ready = [f for f in waiting if needs[f] in results or needs[f] not in jobs]
-        for folder in ready[: limit - len(running)]:
-            running[submit(jobs[folder], results.get(needs[folder]))] = folder
-            waiting.remove(folder)
-        names = " or ".join(folder.name for folder in running.values())
-        show(jobs[next(iter(running.values()))])  # the job that began first
-        ended, _ = wait(running, _LOOK_SECONDS, FIRST_COMPLETED)
-        for future in ended:
-            folder = running.pop(future)
-            results[folder] = _result_of(future, names)
-            yield folder, results[folder]
+def _why_not(job: Job, outcomes: Mapping[Path, Any]) -> NbtrackError | None:
+    """What ends a job before it begins: the failure of the one that it needs."""
+    needed = outcomes.get(job.needs.folder) if job.needs else None
+    if isinstance(needed, NbtrackError):
+        return NbtrackError(f"not run, because {job.needs.name} failed: {needed}")
+    return None
 
 
-def _result_of(future: Future, names: str) -> Any:
-    """What a job gave. Raises NbtrackError where a process died.
+def _elsewhere(
+    jobs: Mapping[Path, Job], outcomes: Mapping[Path, Any], show: Callable, workplace: Workplace
+) -> Iterator[tuple]:
+    """As `_outcomes`, of jobs that run side by side.
 
-    `names` are those of all jobs that ran then: which of their processes died is not known.
+    Where a process dies, that is the outcome of the job that ran there.
     """
-    error = future.exception()
-    if type(error).__name__ not in ("BrokenProcessPool", "KilledWorker"):  # the latter is Dask's
-        return future.result()
-    died = f"a worker process died at {names}, perhaps for lack of memory"
-    advice = "run it again, with fewer --workers or smaller settings; what was finished is kept"
-    raise NbtrackError(f"{died}: {advice}")
+    idle, replaced, n_threads = workplace
+    waiting = dict(jobs)
+    running: dict[Future, tuple[Path, Executor]] = {}
+    while waiting or running:
+        unfinished = waiting.keys() | {folder for folder, _ in running.values()}
+        for folder, job in [*waiting.items()]:
+            if job.needs and job.needs.folder in unfinished:
+                continue
+            if why := _why_not(job, outcomes):
+                del waiting[folder]
+                yield folder, why
+            elif idle:
+                del waiting[folder]
+                executor = idle.pop()
+                running[_submit(job, executor, n_threads)] = folder, executor
+        if running:
+            show({folder: _progress_of(jobs[folder]) for folder, _ in running.values()})
+        for future in wait(running, _LOOK_SECONDS, FIRST_COMPLETED).done:
+            folder, executor = running.pop(future)
+            if type(future.exception()).__name__ in DEATHS:
+                idle.append(replaced(executor))
+                yield folder, NbtrackError(_DIED.format(jobs[folder].name))
+            else:
+                idle.append(executor)
+                yield folder, future.result()
 
 
-@contextlib.contextmanager
-def _submitting(address: str | None, workers: int) -> Iterator[Callable[[Job, Any], Future]]:
-    """A function that begins a job elsewhere, given the outcome of the one that it needs.
+def _submit(job: Job, executor: Executor, n_threads: int) -> Future:
+    """Begin a job elsewhere; the future gives its outcome.
 
-    Elsewhere is a Dask cluster at `address`, or `workers` processes here, which end with the block.
     Folders, device, search path, fields and trackers there are those of this process. Classes of a
     notebook or script travel whole, those of files by the name of their module.
     """
-    settings = {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
-    if "NBTRACK_DEVICE" in os.environ:
-        settings["NBTRACK_DEVICE"] = os.environ["NBTRACK_DEVICE"]
-    # Small networks gain nothing from a second thread; processes here share this one's threads.
-    n_threads = 1 if address else max(1, torch.get_num_threads() // workers)
-    workplace = _cluster(address) if address else _pool(workers)
-    with workplace as executor:
-
-        def submit(job: Job, needed: Any) -> Future:
-            work = cloudpickle.dumps((FIELDS, TRACKERS, job, needed))
-            return executor.submit(_outcome_there, settings, sys.path, n_threads, work)
-
-        yield submit
+    settings = {name: text for name, text in os.environ.items() if name.startswith("NBTRACK_")}
+    settings |= {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
+    _progress_file(job).unlink(missing_ok=True)  # of an attempt that was killed
+    work = cloudpickle.dumps((FIELDS, TRACKERS, job))
+    return executor.submit(_outcome_there, settings, sys.path, n_threads, work)
 
 
 def _outcome_there(settings: Mapping, search_path: list[str], n_threads: int, work: bytes) -> Any:
@@ -225,71 +238,30 @@ def _outcome_there(settings: Mapping, search_path: list[str], n_threads: int, wo
     os.environ |= settings
     # Before the work is unpickled, which imports the modules of its classes.
     sys.path += [folder for folder in search_path if folder not in sys.path]
-    fields, trackers, job, needed = pickle.loads(work)
+    fields, trackers, job = pickle.loads(work)
     FIELDS.update(fields)
     TRACKERS.update(trackers)
+    last = -_LOOK_SECONDS
+
+    def report(share: float, status: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= _LOOK_SECONDS:
+            write_atomic(_progress_file(job), json.dumps([share, status]))
+            last = time.monotonic()
+
     with threads(n_threads):
-        return job.outcome(needed, lambda share, status: None)  # only outcomes are sent back
+        return job.outcome(report)
 
 
-@contextlib.contextmanager
-def _pool(workers: int) -> Iterator[Executor]:
-    """Processes of this machine, which end with the block, or with this process if it is killed.
-
-    Each watches a pipe whose other end, `ours`, is closed in both cases. At the block's end that
-    comes first, so that the pool does not wait for jobs that still run.
-    """
-    context = multiprocessing.get_context(_START)
-    theirs, ours = context.Pipe(duplex=False)
-    with ProcessPoolExecutor(workers, context, _end_with, (theirs,)) as executor, ours:
-        with _spared():
-            for _ in range(workers):
-                # Calls that do nothing: a process is begun for each, since none is idle yet.
-                executor.submit(int)
-        yield executor
+def _progress_file(job: Job) -> Path:
+    """Where a job that runs elsewhere tells how far it is: its share and a word on how it goes."""
+    return job.lock.with_suffix(".progress")
 
 
-def _end_with(pipe: Connection) -> None:
-    """End this worker, whatever it does, as soon as the other end of a pipe is closed."""
-
-    def watch() -> None:
-        pipe.poll(None)  # waits without limit: nothing is ever sent
-        os._exit(1)  # at once, in the middle of a job
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-@contextlib.contextmanager
-def _spared() -> Iterator[None]:
-    """Let processes that are started in a block ignore Ctrl-C, and not run the main script again.
-
-    At Ctrl-C each would print a traceback. A main script without a `__main__` guard would start
-    processes from within them: Python runs again what `sys.modules` holds as `__main__`.
-    """
-    script = sys.modules["__main__"]
-    # Python lets only the main thread set a handler.
-    is_main = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
-    sys.modules["__main__"] = ModuleType("__main__")
+def _progress_of(job: Job) -> tuple[float, str]:
+    """How far a job that runs elsewhere is, and how it goes, as it said last."""
     try:
-        yield
-    finally:
-        sys.modules["__main__"] = script
-        if handler is not None:
-            signal.signal(signal.SIGINT, handler)
-
-
-@contextlib.contextmanager
-def _cluster(address: str) -> Iterator[Executor]:
-    """The workers of a Dask scheduler, as an executor. Raises MissingError where there are none."""
-    from distributed import Client  # an extra
-
-    try:
-        client = Client(address, timeout=_SECONDS_TO_CONNECT)
-        client.wait_for_workers(1, timeout=_SECONDS_TO_CONNECT)
-    except (OSError, ValueError):
-        advice = "start 'dask scheduler', and 'dask worker ADDRESS --nthreads 1'"
-        raise MissingError(f"no Dask scheduler at {address!r} with a worker: {advice}") from None
-    # Not pure: Dask would answer an equal call with the result of the earlier one.
-    with client, client.get_executor(pure=False) as executor:
-        yield executor
+        share, status = json.loads(_progress_file(job).read_text("utf-8"))
+    except (OSError, ValueError):  # it has said nothing yet
+        return 0.0, "running"
+    return share, status
