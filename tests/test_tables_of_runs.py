@@ -310,6 +310,10 @@ def test_a_scene_whose_tracked_part_has_no_pose(tmp_path: Path, capsys) -> None:
     errors = pd.read_csv(tmp_path / "out/table_1.csv").set_index(["method", "scene"])["ate_m"]
     assert errors.notna().loc["NeuS with SDF", "whole"].all()
     assert errors.isna().loc["NeuS with SDF", "lost"].all()
+    (damaged,) = runs_folder().glob("maps/lost-*/map.safetensors")
+    damaged.write_bytes(b"")
+    assert main([*command, *words]) == 2
+    assert "map.safetensors is not a readable map file" in capsys.readouterr().err
     assert len(pd.read_csv(tmp_path / "out/table_2.csv")) == 1
 
 

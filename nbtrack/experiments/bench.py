@@ -86,8 +86,11 @@ def _fill_tables(
         print(tables.style_table_1(shown))
         print("Table I beside the paper's")
         print(tables.beside_published(shown).to_string(float_format="%.3f", na_rep="–"))
-        # One scene is enough: a step costs the same in all. Table II is always by the clock.
-        steps = _table_2(preset, scenes[0], methods)
+        # One scene is enough, the first without a gap: a step costs the same in all. Table II is
+        # always by the clock.
+        failed = {*results.loc[results["failure"] != "", "scene"]}
+        whole = next((scene for scene in scenes if scene.name not in failed), scenes[0])
+        steps = _table_2(preset, whole, methods)
         pixels, by_clock = default_pixels(preset, methods), _note(preset, clock=True)
         paths = tables.write_tables(folder, shown, steps, note, pixels, by_clock, wording)
     cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"

@@ -9,7 +9,7 @@ from nbtrack.checks.check import check_recording, quick_warning
 from nbtrack.experiments import output
 from nbtrack.experiments.exports import draw_overview
 from nbtrack.experiments.jobs import run_jobs
-from nbtrack.experiments.map_jobs import OF_MAPS, GivenMap, MapJob, setting_tree
+from nbtrack.experiments.map_jobs import OF_MAPS, MapJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
 from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
 from nbtrack.experiments.runs import MEANINGS, METRICS_FILE
@@ -19,7 +19,7 @@ from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.machinery.files import data_folder, write_atomic
 from nbtrack.machinery.progress import tell
 from nbtrack.machinery.settings import flat, read_setting, with_values
-from nbtrack.mapping.files import MESH_FILE, Map, read_map
+from nbtrack.mapping.files import MESH_FILE, Map
 from nbtrack.plots import plot_overview
 from nbtrack.plots.meshes import extract_mesh, mesh_bytes
 from nbtrack.recordings import reading
@@ -73,9 +73,9 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
 
 def track_command(options: Namespace) -> None:
     """Track a sequence in its map, made first where none fits, or in a given one."""
-    given = read_map(options.map_from) if options.map_from else None
+    given = MapJob.of_given(options.map_from) if options.map_from else None
     is_named = options.field or options.method
-    field = given.field.name if given and not is_named else options.field
+    field = given.field if given and not is_named else options.field
     method = method_of(options.method, field, options.tracker)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     if given:
@@ -84,9 +84,8 @@ def track_command(options: Namespace) -> None:
     steps = options.steps if has_budget else method.usual_steps
     budget = make_budget(steps, options.rate)  # raises for a wrong one, before a room is made
     scene = _opened(options, preset)
-    if given:
-        job = GivenMap(given, options.map_from)
-    else:
+    job = given
+    if not given:
         job = MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
         scene.count(job.frames)  # raises for a wrong slice
     run = TrackJob(
@@ -129,16 +128,15 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
     return scene
 
 
-def _check_fits(given: Map, field: str, options: Namespace) -> None:
+def _check_fits(given: MapJob, field: str, options: Namespace) -> None:
     """Raises ConfigError where a given map contradicts the options: its frames, field, settings."""
-    made, record = given.field.name, given.record
+    made = given.field
     if options.map_frames:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
     if field != made:
         advice = "leave --method and --field out"
         raise ConfigError(f"{options.map_from} is a map of field {made!r}, not {field!r}: {advice}")
-    voxel = record.get("correction", 0.0)  # m
-    known = flat(setting_tree(made, record["network"], record["settings"], voxel))
+    known = flat(given.setting_tree)
     for text in options.settings:
         asked = read_setting(text)
         # Keys that no map has, as those of a tracker, are no contradiction.

@@ -28,26 +28,14 @@ OF_MAPS = ("network.", "mapping.", "correction.")
 _FRAMES_LOOKED_AT = 20  # at most, to estimate a map's unit before there is a map
 
 
-def setting_tree(field: str, network: Any, settings: Any, voxel: float) -> dict[str, Any]:
-    """A map's settings as a tree of the form of `Preset.settings`.
-
-    `network` and `settings` are the map's own, of its network and of mapping; `voxel` (m) is the
-    edge of the cells in which it was corrected, 0 if it was not.
-    """
-    known = default_settings()
-    of_network = field if field in known["network"] else "neus"  # whose network the field has
-    return {
-        "network": {of_network: network} if network else {},
-        "mapping": {field: settings},
-        "correction": {field: voxel} if field in known["correction"] else {},
-    }
-
-
 @dataclass(frozen=True)
 class MapJob(Job):
-    """One map: a field fitted to some frames of a scene, and perhaps corrected by them."""
+    """One map: a field fitted to some frames of a scene, and perhaps corrected by them.
 
-    scene: Scene
+    One that the user gave is only read: it has no scene.
+    """
+
+    scene: Scene | None
     field: str
     network: Any  # settings of the field's network; None where it has none
     settings: Any  # of the mapping
@@ -57,6 +45,7 @@ class MapJob(Job):
     # m, of the cells in which another job will correct this map: so a size that cannot work is told
     # before this one is made. It changes nothing in this map.
     later_voxel: float = field(default=0.0, compare=False)
+    given: Path | None = None  # the user's own map: its folder, or file
 
     kind, doing = "maps", "mapping"
     work = 4.0  # with `smoke` it asks the field about as many queries as four tracked runs
@@ -67,10 +56,34 @@ class MapJob(Job):
         network, settings = preset.network_of(field), preset.mapping_of(field)
         return cls(scene, field, network, settings, frames, seed, preset.correction.get(field, 0.0))
 
+    @classmethod
+    def of_given(cls, path: Path) -> Self:
+        """A finished map that the user gave. Raises as `read_map` does."""
+        finished = _stored(path)
+        record = finished.record
+        made = finished.field.name, record["network"], record["settings"]
+        return cls(None, *made, correction_voxel=record.get("correction", 0.0), given=path)
+
+    @property
+    def setting_tree(self) -> dict[str, Any]:
+        """Its settings as a tree of the form of `Preset.settings`."""
+        known = default_settings()
+        # Whose network the field has.
+        of_network = self.field if self.field in known["network"] else "neus"
+        is_correctable = self.field in known["correction"]
+        return {
+            "network": {of_network: self.network} if self.network else {},
+            "mapping": {self.field: self.settings},
+            "correction": {self.field: self.correction_voxel} if is_correctable else {},
+        }
+
     @cached_property
     def key(self) -> str:
-        """A digest of code, device, data, settings and seed."""
+        """A digest of code, device, data, settings and seed; of a given map in place of the last
+        three."""
         code = provenance.code_fingerprint(field_class(self.field))
+        if self.given:
+            return fingerprint(_stored(self.given).key, code, choose_device().type)
         parts = [code, provenance.versions(), choose_device().type]
         parts += [self.field, self.network, self.settings, self.correction_voxel]
         parts += [self.scene.fingerprint, self.frames, self.seed]
@@ -90,22 +103,23 @@ class MapJob(Job):
         return replace(self, correction_voxel=0.0, later_voxel=self.correction_voxel)
 
     @property
+    def folder(self) -> Path:
+        """Where its files are kept, in the cache, or where the user has it: perhaps its file."""
+        return self.given or super().folder
+
+    @property
     def is_done(self) -> bool:
         """Whether the map is finished and scored."""
-        return (self.folder / MAP_FILE).is_file()
+        return self.given is not None or (self.folder / MAP_FILE).is_file()
 
     def result(self) -> dict[str, Any]:
         """How the finished map was made, and its scores."""
-        return self._stored().record
+        return _stored(self.folder).record
 
     def map(self) -> Map:
         """The finished map, ready for tracking."""
-        finished = self._stored()
+        finished = _stored(self.folder)
         return replace(finished, field=finished.field.to(choose_device()))
-
-    def _stored(self) -> Map:
-        """The finished map, from a cache of this process as long as its file is unchanged."""
-        return _read(self.folder, (self.folder / MAP_FILE).stat().st_mtime_ns)
 
     def compute(self, report: Report) -> dict[str, Any]:
         """Map and score, or resume from a checkpoint; write the map's files. Returns its record."""
@@ -140,37 +154,7 @@ class MapJob(Job):
         return finished.record
 
 
-@dataclass(frozen=True, eq=False)
-class GivenMap:
-    """A map that the user gave. It has what a run asks of a finished `MapJob`; it is only read."""
-
-    finished: Map
-    folder: Path  # as the user gave it: perhaps the map's file
-
-    is_done = True
-
-    @cached_property
-    def key(self) -> str:
-        """A digest of the map, its field's code and the device."""
-        code = provenance.code_fingerprint(field_class(self.field))
-        return fingerprint(self.finished.key, code, choose_device().type)
-
-    @property
-    def field(self) -> str:
-        """The name of its field."""
-        return self.finished.field.name
-
-    @property
-    def correction_voxel(self) -> float:
-        """Edge (m) of the cells in which it was corrected; 0: it was not."""
-        return self.finished.record.get("correction", 0.0)
-
-    def map(self) -> Map:
-        """The map, ready for tracking."""
-        return replace(self.finished, field=self.finished.field.to(choose_device()))
-
-
-def map_unit(made: MapJob | GivenMap) -> float:
+def map_unit(made: MapJob) -> float:
     """Metres a unit of a map; an estimate for one that is still to be made."""
     if made.is_done:
         return made.map().field.bounds.metres_per_unit
@@ -185,10 +169,16 @@ def _rough_unit(scene: Scene, frames: str) -> float:
     return observed_bounds(read_frames(scene.recording, some)).metres_per_unit
 
 
+def _stored(path: Path) -> Map:
+    """The map of a folder or file, from a cache of this process as long as it is unchanged."""
+    file = path / MAP_FILE if path.is_dir() else path
+    return _read(path, file.stat().st_mtime_ns if file.is_file() else 0)
+
+
 @lru_cache(maxsize=4)
-def _read(folder: Path, modified_ns: int) -> Map:
-    """The map of a folder, kept for all runs in it: reading a corrected one takes seconds.
+def _read(path: Path, modified_ns: int) -> Map:
+    """The map of a folder or file, kept for all runs in it: reading a corrected one takes seconds.
 
     `modified_ns` is no input: with another time the cache has no answer, and the file is read anew.
     """
-    return read_map(folder)
+    return read_map(path)

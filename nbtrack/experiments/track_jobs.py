@@ -16,7 +16,7 @@ from nbtrack.core.arrays import Pose, Poses
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.jobs import Job, Report
-from nbtrack.experiments.map_jobs import GivenMap, MapJob, map_unit, setting_tree
+from nbtrack.experiments.map_jobs import MapJob, map_unit
 from nbtrack.experiments.presets import SIZES, default_settings
 from nbtrack.experiments.runs import METRICS_FILE, scores_of, write_run
 from nbtrack.experiments.scenes import Scene
@@ -47,7 +47,7 @@ _SHARE = 0.5  # of the frames: those in which the camera moves farther than a se
 class TrackJob(Job):
     """One tracked run in a map, under one budget: `steps` a frame, or by the clock `rate_hz`."""
 
-    needs: MapJob | GivenMap
+    needs: MapJob
     scene: Scene  # the mapped one, or another recording of the same room
     tracker: str
     settings: TrackerSettings
@@ -81,7 +81,7 @@ class TrackJob(Job):
     @property
     def is_elsewhere(self) -> bool:
         """Whether the map was made from another recording."""
-        return isinstance(self.needs, GivenMap) or self.needs.scene.folder != self.scene.folder
+        return self.needs.given is not None or self.needs.scene.folder != self.scene.folder
 
     @property
     def is_done(self) -> bool:
@@ -166,7 +166,7 @@ class TrackJob(Job):
         """
         # Only given maps are checked: one made here is of the right room, but another path in the
         # room may begin where it does not reach.
-        if not isinstance(self.needs, GivenMap) or first.T_world_camera is None:
+        if not self.needs.given or first.T_world_camera is None:
             return None
         try:
             return check_belongs(finished, first)
@@ -184,7 +184,7 @@ class TrackJob(Job):
         n_given = len(sequence) - len(tracked.frames)  # a first frame whose pose is given: 1, or 0
         notes = {"metres_per_unit": unit_m, "map_warning": warning}
         notes["start"] = "given" if n_given else "unknown"
-        if isinstance(self.needs, GivenMap):
+        if self.needs.given:
             followed = sequence.select(slice(n_given, None))
             if warning == _OTHER_WORLD:
                 followed = replace(followed, T_world_camera=T_estimated)
@@ -231,8 +231,7 @@ class TrackJob(Job):
             options["map-from"] = files.absolute(made.folder)
         else:
             options |= {"field": made.field, "map-frames": made.frames}
-            voxel = made.correction_voxel
-            settings |= setting_tree(made.field, made.network, made.settings, voxel)
+            settings |= made.setting_tree
             if self.scene.made:
                 sequence = self.scene.name
                 settings["scenes"] = {name: getattr(self.scene.made, name) for name in SIZES}
