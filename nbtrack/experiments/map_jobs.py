@@ -17,8 +17,8 @@ from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
 from nbtrack.machinery.device import choose_device
-from nbtrack.machinery.files import fingerprint
-from nbtrack.mapping.files import CHECKPOINT_FILE, MAP_FILE, Map, read_map, write_map
+from nbtrack.machinery.files import absolute, fingerprint
+from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.plots.scene import up_of
 from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
@@ -171,14 +171,15 @@ def _rough_unit(scene: Scene, frames: str) -> float:
 
 def _stored(path: Path) -> Map:
     """The map of a folder or file, from a cache of this process as long as it is unchanged."""
-    file = path / MAP_FILE if path.is_dir() else path
-    return _read(path, file.stat().st_mtime_ns if file.is_file() else 0)
+    path = absolute(path)
+    parts = (path / MAP_FILE, path / HISTORY_FILE) if path.is_dir() else (path,)
+    return _read(path, tuple(part.stat().st_mtime_ns for part in parts if part.is_file()))
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path, modified_ns: int) -> Map:
+def _read(path: Path, modified_ns: tuple[int, ...]) -> Map:
     """The map of a folder or file, kept for all runs in it: reading a corrected one takes seconds.
 
-    `modified_ns` is no input: with another time the cache has no answer, and the file is read anew.
+    `modified_ns` is no input: with others the cache has no answer, and the files are read anew.
     """
     return read_map(path)
