@@ -249,8 +249,9 @@ def chunks_of(grid: Grid, seed: int) -> Iterator[Chunk]:
 
 
 def track(scenes: list[Scene], methods, preset, workers: int | None = None, **how) -> pd.DataFrame:
-    """Rows of `track_scenes`, with the columns that are kept."""
-    return track_scenes(scenes, methods, preset, execution=Execution(workers), **how)[KEPT]
+    """Rows of `track_scenes`, with the columns that are kept; without a reach some are empty."""
+    rows = track_scenes(scenes, methods, preset, execution=Execution(workers), **how)
+    return rows.reindex(columns=KEPT)
 
 
 def with_maps(rows: pd.DataFrame, scene: Scene, preset: Preset, seed: int) -> pd.DataFrame:
