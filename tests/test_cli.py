@@ -24,8 +24,8 @@ from nbtrack.machinery import files
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import naming_damaged, runs_folder
 from nbtrack.mapping.files import read_map
+from nbtrack.recordings.pose_files import read_tum
 from nbtrack.recordings.recording import open_recording
-from nbtrack.tracking.trajectories import read_tum
 
 TINY = tiny_words("scenes.n_frames=6", "tracking.sdf.n_pixels=32")
 TINY_MAP = ["--set", "network.neus.width=32", "--set", "mapping.neus.n_rays=48"]

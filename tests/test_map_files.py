@@ -34,7 +34,7 @@ from nbtrack.mapping.files import MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.mapping.holdout import depth_residual_of
 from nbtrack.plots.meshes import mesh_bytes
-from nbtrack.tracking.trajectories import read_tum
+from nbtrack.recordings.pose_files import read_tum
 
 
 @cache

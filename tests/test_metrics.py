@@ -12,8 +12,8 @@ from nbtrack.beyond.verdict import score_detection
 from nbtrack.checks.in_map import other_world
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import json_text, write_atomic
+from nbtrack.recordings.pose_files import read_tum, tum_text
 from nbtrack.tracking.metrics import align_rigidly, pose_errors, still_metrics, trajectory_metrics
-from nbtrack.tracking.trajectories import read_tum, tum_text
 
 
 def wandering(frames: int, seed: int = 0) -> np.ndarray:

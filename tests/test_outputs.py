@@ -27,9 +27,9 @@ from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.machinery import files
 from nbtrack.machinery.device import threads
 from nbtrack.machinery.errors import DataError
+from nbtrack.recordings.pose_files import read_tum
 from nbtrack.recordings.recording import open_recording
 from nbtrack.synthetic import make, room
-from nbtrack.tracking.trajectories import read_tum
 
 PROJECT = Path(__file__).parents[1]
 

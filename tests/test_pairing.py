@@ -8,8 +8,8 @@ import pytest
 from box_room import poses_at
 from recordings import N_FRAMES, START, matrix_text, source, tum_lines, write_recording
 
-from nbtrack.data.pose_files import read_poses
 from nbtrack.machinery.errors import DataError
+from nbtrack.recordings.pose_files import read_poses
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.recording import Recording, open_recording
 

@@ -9,7 +9,7 @@ from tiny import TINY
 
 from nbtrack.cli import main
 from nbtrack.data.dataset import DATASET_SCENES
-from nbtrack.data.pose_files import read_poses
+from nbtrack.recordings.pose_files import read_poses
 from nbtrack.recordings.writer import write_sequence
 from nbtrack.synthetic import build_room, room_frames, room_intrinsics
 from nbtrack.tables import STANDING_STILL

@@ -82,13 +82,17 @@ class Frame:
 
     def at(self, rows: Indices, columns: Indices) -> tuple[Colors, Values]:
         """Colour in [0, 1] and z-depth (m, 0 = none) of pixels."""
-        depth = self.depth_mm[rows, columns].float() * MILLIMETRE
-        return self.color[rows, columns].float() / 255, depth
+        return measured(self.color[rows, columns], self.depth_mm[rows, columns])
 
     def points(self, rows: Indices, columns: Indices) -> tuple[Points, Colors]:
         """Points (m, camera frame) observed at pixels, and their colours in [0, 1]."""
         color, depth = self.at(rows, columns)
         return backproject(self.camera, columns, rows, depth), color
+
+
+def measured(color: UInt8[Tensor, "n 3"], depth_mm: Int[Tensor, "n"]) -> tuple[Colors, Values]:
+    """Colour in [0, 1] and z-depth (m, 0 = none) of pixels as they are kept."""
+    return color.float() / 255, depth_mm.float() * MILLIMETRE
 
 
 def _in_millimetres(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

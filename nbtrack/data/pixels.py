@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Indices, Points, RaySamples, Values, tensor_of
 from nbtrack.core.camera import backproject, pixel_directions
-from nbtrack.data.frame import MILLIMETRE
+from nbtrack.data.frame import measured
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery.device import has_room_for
 
@@ -87,9 +87,8 @@ class PixelSampler:
     def measured(self, frames: Indices, rows: Indices, columns: Indices) -> tuple[Colors, Values]:
         """Colour in [0, 1] and z-depth (m, 0 = none) of pixels."""
         where = tuple(indices.to(self.colors.device) for indices in (frames, rows, columns))
-        color = self.colors[where].to(self.device).float() / 255
         depth_mm = self.depths_mm[where].to(self.device).int() & 0xFFFF  # unsigned again
-        return color, depth_mm.float() * MILLIMETRE
+        return measured(self.colors[where].to(self.device), depth_mm)
 
     def draw(
         self, n_rays: int, generator: torch.Generator, frames: Indices, tangent_planes: bool = False

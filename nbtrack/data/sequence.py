@@ -11,8 +11,8 @@ from jaxtyping import Float, Int, Integer, Real, UInt8, UInt16
 from nbtrack.core.arrays import Poses, Position, check_array
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
+from nbtrack.core.poses import checked_poses
 from nbtrack.data.frame import MILLIMETRE, Frame
-from nbtrack.data.pose_files import checked_poses
 from nbtrack.machinery.errors import ConfigError, DataError
 
 # Of bounds (our choice): pixels looked at in each frame, on a regular grid, and the share of points

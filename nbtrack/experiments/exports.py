@@ -22,9 +22,9 @@ from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh, mesh_bytes
 from nbtrack.plots.rerun_file import rerun_bytes
 from nbtrack.recordings import reading
+from nbtrack.recordings.pose_files import number_lines, read_tum, shifted
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.tracking import Trajectory
-from nbtrack.tracking.trajectories import number_lines, read_tum, shifted
 
 _FRAMES_SHOWN = 20  # of a longer run at least so many frames tell what an overview shows
 _CELLS = 120  # of an overview's mesh, along the longest side of its map

@@ -10,8 +10,9 @@ from scipy.special import ndtri, stdtrit
 from nbtrack.beyond.verdict import score_detection
 from nbtrack.machinery import files
 from nbtrack.machinery.errors import MissingError
+from nbtrack.recordings.pose_files import read_tum, shifted, tum_text
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M, trajectory_metrics
-from nbtrack.tracking.trajectories import Trajectory, read_tum, shifted, tum_text
+from nbtrack.tracking.trajectories import Trajectory
 
 METRICS_FILE = "metrics.json"  # written last: where it stands, a run is complete
 MEANINGS = {  # printed in place of names in metrics.json that say too little

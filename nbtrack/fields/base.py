@@ -14,8 +14,8 @@ from torch import Generator, Tensor, nn
 from nbtrack.core.arrays import Colors, Frames, Points, Pose, RayColors, RaySamples, Scalar, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
+from nbtrack.core.poses import checked_pose
 from nbtrack.data.pixels import Rays
-from nbtrack.data.pose_files import checked_pose
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import rendering
 from nbtrack.fields.mlp import NetworkSettings

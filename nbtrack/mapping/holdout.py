@@ -6,8 +6,8 @@ import torch
 from nbtrack.core.arrays import Frames
 from nbtrack.core.camera import pixel_directions
 from nbtrack.core.geometry import transform_points
+from nbtrack.core.poses import checked_pose
 from nbtrack.data.frame import Frame
-from nbtrack.data.pose_files import checked_pose
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField
 

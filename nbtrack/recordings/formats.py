@@ -12,7 +12,6 @@ import numpy as np
 
 from nbtrack.core.arrays import DepthImage, Poses
 from nbtrack.data.dataset import DATASET_UNITS
-from nbtrack.data.pose_files import Times, read_poses
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.machinery.files import absolute
 from nbtrack.machinery.registry import Registry
@@ -20,6 +19,7 @@ from nbtrack.machinery.settings import limited, one_of, with_values
 from nbtrack.machinery.text_files import read_object
 from nbtrack.recordings.calibration import Calibration, read_calibration
 from nbtrack.recordings.pairing import frame_keys
+from nbtrack.recordings.pose_files import Times, read_poses
 
 DECLARATION_FILE = "sequence.toml"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")

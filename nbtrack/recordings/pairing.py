@@ -17,10 +17,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from nbtrack.core.arrays import Frames, Poses
-from nbtrack.data.pose_files import Times, in_seconds
 from nbtrack.machinery.errors import DataError, MissingError
 from nbtrack.machinery.files import naming_damaged
 from nbtrack.machinery.text_files import read_lines
+from nbtrack.recordings.pose_files import Times, in_seconds
 
 # Seconds since 1970 with decimals, or as many milli-, micro- or nanoseconds, in 13 to 19 digits.
 _STAMP = re.compile(r"(?a)(?<!\d)(?<!\d\.)([1-9]\d{8,9}\.\d+|1\d{12}(?:\d{3}){0,2})(?!\.?\d)")

@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 
 from nbtrack.core.arrays import DepthImage, Poses
-from nbtrack.data.pose_files import Times, from_quaternions
 from nbtrack.machinery.files import naming_damaged
 from nbtrack.machinery.text_files import read_object
 from nbtrack.recordings.calibration import Calibration, calibration, camera_matrix
 from nbtrack.recordings.formats import Declaration, Format
+from nbtrack.recordings.pose_files import Times, from_quaternions
 
 _ADVICE = "export the recording again, as .r3d which is to be unpacked, or as raw data"
 _INSTEAD = "16-bit PNG files in millimetres into depth/ in place of the .depth files"

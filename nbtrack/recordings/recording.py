@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from nbtrack.core.arrays import Poses, Position
-from nbtrack.data.pose_files import Times, checked_poses, in_seconds
+from nbtrack.core.poses import checked_poses
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import absolute
 from nbtrack.machinery.text_files import read_numbers
@@ -22,6 +22,7 @@ from nbtrack.recordings.pairing import (
     pair_lists,
     stamp_in,
 )
+from nbtrack.recordings.pose_files import Times, in_seconds
 
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
+from nbtrack.core.poses import checked_pose
 from nbtrack.data.frame import Frame
-from nbtrack.data.pose_files import checked_pose
 from nbtrack.fields import Field, LearnedField
 from nbtrack.machinery.device import matrix_products, suitable_threads, synchronize, usual_modes
 from nbtrack.machinery.errors import ConfigError, NumericalError

@@ -1,4 +1,4 @@
-"""Trajectories: tracked through a recorded sequence, and as text files for evaluation tools."""
+"""Trajectories, tracked through a recorded sequence."""
 
 import time
 from collections.abc import Callable
@@ -9,15 +9,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from nbtrack.core.arrays import Poses, Position
-from nbtrack.data.pose_files import read_poses
+from nbtrack.core.arrays import Poses
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery import files
 from nbtrack.machinery.device import advise_on_memory
-from nbtrack.machinery.errors import DataError, MissingError
+from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.settings import as_dict
 from nbtrack.tracking.budget import StepBudget
 from nbtrack.tracking.metrics import pose_errors
@@ -25,7 +22,6 @@ from nbtrack.tracking.tracker import Estimate, Tracker
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 STEPS_TO_FIND = 1000  # a few dozen descents
-_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 
 @dataclass(frozen=True)
@@ -144,43 +140,3 @@ def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, An
         "without_depth": estimate.without_depth,
         **estimate.report,
     }
-
-
-def shifted(T_world_camera: Poses, by: Position) -> Poses:
-    """Poses (m) whose positions are moved by an offset (m), as in a world with another origin."""
-    T_world_camera = T_world_camera.copy()
-    T_world_camera[:, :3, 3] += by
-    return T_world_camera
-
-
-def tum_text(times: Float[np.ndarray, "n"], T_world_camera: Poses) -> str:
-    """Times (s) and camera-to-world poses (m, OpenCV camera axes) in TUM format, qw >= 0.
-
-    A line a frame whose pose is known. Numbers have the digits that restore the same double.
-    Source: TUM RGB-D benchmark.
-    """
-    known = np.isfinite(T_world_camera).all(axis=(1, 2))
-    times, T_world_camera = np.asarray(times)[known], T_world_camera[known]
-    q_xyzw = Rotation.from_matrix(T_world_camera[:, :3, :3]).as_quat(canonical=True)
-    rows = np.column_stack([times, T_world_camera[:, :3, 3], q_xyzw])
-    return f"# {_COLUMNS}\n{number_lines(rows)}"
-
-
-def number_lines(rows: Float[np.ndarray, "n numbers"]) -> str:
-    """Rows of numbers as text, with the digits that restore the same double."""
-    # Adding zero turns -0.0 into 0.0.
-    return "".join(" ".join(map(repr, row)) + "\n" for row in (rows + 0.0).tolist())
-
-
-def read_tum(path: Path) -> tuple[Float[np.ndarray, "n"], Poses]:
-    """Timestamps (s) and camera-to-world poses (m) of a TUM file; `#` lines are skipped.
-
-    Raises MissingError if it is not there, DataError, naming file and place, for any other content.
-    """
-    path = files.absolute(path)
-    if not path.is_file():
-        raise MissingError(f"no file {path}: give a trajectory in TUM format, as `track` writes it")
-    T_world_camera, times = read_poses(path)
-    if not (np.isfinite(times).all() and np.isfinite(T_world_camera).all()):
-        raise DataError(f"{path}: not a finite pose in every line, `{_COLUMNS}`; write it anew")
-    return times, T_world_camera

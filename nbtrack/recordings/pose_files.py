@@ -1,24 +1,21 @@
-"""Poses and times from files, checked."""
+"""Poses and times from and to text files, checked."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from nbtrack.core.arrays import Pose, Poses
-from nbtrack.machinery.errors import DataError
+from nbtrack.core.arrays import Poses, Position
+from nbtrack.core.poses import RIGID, checked_poses
+from nbtrack.machinery.errors import DataError, MissingError
+from nbtrack.machinery.files import absolute
 from nbtrack.machinery.text_files import read_numbers
 
 Times = Float[np.ndarray, "_"]  # s
+_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
-_FARTHEST = 1e7  # m from the origin: beyond geographic coordinates; floats can square it
-# No camera went so many times as far from the middle of its path as nine in ten of the poses lie,
-# or than 1 m, whichever is more.
-_ALONE = 1000.0
 _LATEST = 1e11  # s: no timestamp in seconds is later; one in milliseconds since 1970 is larger
-_RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 
 
 def in_seconds(times: Times) -> Times:
@@ -68,7 +65,7 @@ def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> 
     is_known = np.isfinite(rows[:, 1:]).all(axis=1) & (q_xyzw != 0).any(axis=1)
     q_xyzw[~is_known] = 0.5  # any unit quaternion; these poses become NaN
     norms = np.linalg.norm(q_xyzw, axis=1)
-    is_wrong = (np.abs(norms - 1) > _RIGID) | (is_known & np.isnan(times))
+    is_wrong = (np.abs(norms - 1) > RIGID) | (is_known & np.isnan(times))
     if is_wrong.any():
         i = is_wrong.argmax()  # the first is told
         raise DataError(
@@ -83,42 +80,41 @@ def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> 
     return checked_poses(poses, path), times
 
 
-def checked_pose(T_world_camera: Any) -> Pose:
-    """One known pose (m), copied in double precision; DataError if it is no rigid transform."""
-    try:
-        pose = np.array(T_world_camera, dtype=np.float64)
-    except (TypeError, ValueError, RuntimeError):  # the last is of a tensor with gradients
-        pose = np.empty(0)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all() or not pose[:3].any():
-        raise DataError("T_world_camera is no rigid transform: give 4 x 4 finite numbers")
-    return checked_poses(pose[None], Path("T_world_camera"))[0]
+def shifted(T_world_camera: Poses, by: Position) -> Poses:
+    """Poses (m) whose positions are moved by an offset (m), as in a world with another origin."""
+    T_world_camera = T_world_camera.copy()
+    T_world_camera[:, :3, 3] += by
+    return T_world_camera
 
 
-def checked_poses(poses: Poses, path: Path) -> Poses:
-    """The poses, all NaN where a number is not finite or all are 0: those frames have no pose.
+def tum_text(times: Float[np.ndarray, "n"], T_world_camera: Poses) -> str:
+    """Times (s) and camera-to-world poses (m, OpenCV camera axes) in TUM format, qw >= 0.
 
-    Raises DataError if a pose is no rigid transform, or absurdly far from the origin or from the
-    other poses.
+    A line a frame whose pose is known. Numbers have the digits that restore the same double.
+    Source: TUM RGB-D benchmark.
     """
-    is_known = np.isfinite(poses).all(axis=(1, 2)) & (poses[:, :3] != 0).any(axis=(1, 2))
-    # Clipped, so that absurd numbers are refused and overflow nothing.
-    T = np.where(is_known[:, None, None], poses, np.eye(4)).clip(-1e8, 1e8)
-    R = T[:, :3, :3]
-    is_wrong = (np.abs(R @ R.mT - np.eye(3)) > _RIGID).any(axis=(1, 2))
-    is_wrong |= np.abs(np.linalg.det(R) - 1) > _RIGID
-    is_wrong |= (np.abs(T[:, 3] - [0, 0, 0, 1]) > _RIGID).any(axis=1)
-    is_wrong |= (np.abs(T[:, :3, 3]) > _FARTHEST).any(axis=1)
-    if is_known.any():
-        away = np.linalg.norm(T[:, :3, 3] - np.median(T[is_known, :3, 3], axis=0), axis=1)
-        usual = np.quantile(away[is_known], 0.9, method="lower")
-        is_wrong |= is_known & (away > _ALONE * max(1.0, usual))
-    if is_wrong.any():
-        i = is_wrong.argmax()  # the first is told
-        frame = f" frame {i}" if len(poses) > 1 else ""
-        numbers = " ".join(f"{number:.4g}" for number in poses[i].flat)
-        raise DataError(
-            f"{path}{frame} is no rigid transform in metres ({numbers}): "
-            f"rows must be [R | t], right-handed rotation R and t up to {_FARTHEST:g} and near the "
-            "other frames', and 0 0 0 1; write nan for a frame that is lost"
-        )
-    return np.where(is_known[:, None, None], poses, np.nan)
+    known = np.isfinite(T_world_camera).all(axis=(1, 2))
+    times, T_world_camera = np.asarray(times)[known], T_world_camera[known]
+    q_xyzw = Rotation.from_matrix(T_world_camera[:, :3, :3]).as_quat(canonical=True)
+    rows = np.column_stack([times, T_world_camera[:, :3, 3], q_xyzw])
+    return f"# {_COLUMNS}\n{number_lines(rows)}"
+
+
+def number_lines(rows: Float[np.ndarray, "n numbers"]) -> str:
+    """Rows of numbers as text, with the digits that restore the same double."""
+    # Adding zero turns -0.0 into 0.0.
+    return "".join(" ".join(map(repr, row)) + "\n" for row in (rows + 0.0).tolist())
+
+
+def read_tum(path: Path) -> tuple[Float[np.ndarray, "n"], Poses]:
+    """Timestamps (s) and camera-to-world poses (m) of a TUM file; `#` lines are skipped.
+
+    Raises MissingError if it is not there, DataError, naming file and place, for any other content.
+    """
+    path = absolute(path)
+    if not path.is_file():
+        raise MissingError(f"no file {path}: give a trajectory in TUM format, as `track` writes it")
+    T_world_camera, times = read_poses(path)
+    if not (np.isfinite(times).all() and np.isfinite(T_world_camera).all()):
+        raise DataError(f"{path}: not a finite pose in every line, `{_COLUMNS}`; write it anew")
+    return times, T_world_camera
