@@ -189,22 +189,26 @@ def test_one_tree_for_a_command_and_a_short_way(monkeypatch) -> None:
     and a setting that goes through more than eight functions before a tracker has it."""
     made, way = [], []
 
-    class Counted(SdfTracker):
-        name = "counted"
+    class Unused(SdfTracker):
+        name = "unused"
 
         @staticmethod
         def Settings() -> TrackerSettings:
             made.append(SdfTracker.Settings())
             return made[-1]
 
+    class Mine(SdfTracker):
+        name = "mine"
+
         def __init__(self, *arguments) -> None:
             files = [frame.filename for frame in traceback.extract_stack()]
             way.extend(file for file in files if Path(file).is_relative_to(PACKAGE))
             super().__init__(*arguments)
 
-    monkeypatch.setitem(TRACKERS, "counted", Counted)
-    words = tiny_words("tracking.counted.n_pixels=8", "tracking.counted.lambda_sdf=2.0")
-    run = ["track", "office", "--tracker", "counted", "--field", "neus", "--steps", "1"]
+    monkeypatch.setitem(TRACKERS, "unused", Unused)
+    monkeypatch.setitem(TRACKERS, "mine", Mine)
+    words = tiny_words("tracking.mine.n_pixels=8", "tracking.mine.lambda_sdf=2.0")
+    run = ["track", "office", "--tracker", "mine", "--field", "neus", "--steps", "1"]
     assert main([*run, *words]) == 0
     assert len(made) == 1
     assert len(way) <= 8
