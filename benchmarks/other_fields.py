@@ -1,10 +1,11 @@
-"""VR, VR by colour alone, and SDF in five fields; and how opaque their maps are to VR.
+"""VR, VR by colour alone, and SDF in five fields; and a level of density in the place of SDF.
 
     python benchmarks/other_fields.py [SEEDS]
 
 Rows are added to paper_tables/other_fields/table_1_cells.csv as they are finished; those that are
 there are not made again, whatever has changed since: remove the file to begin anew. The first seed
-takes 90 minutes on one core, a further one, of NeuS and VolSDF alone, 15. Then opacity.csv is made.
+takes 90 minutes on one core, a further one, of NeuS and VolSDF alone, 15. Then density.csv is made:
+the rooms of `smoke` along their whole paths, from the previous pose, with the steps of SDF.
 """
 
 import sys
@@ -12,16 +13,16 @@ from collections.abc import Iterator
 from functools import partial
 from itertools import product
 
-import pandas as pd
-import torch
 from evidence import Chunk, add_rows, track
 from motions import HAND_HELD
 
-from nbtrack import load_preset, map_scene, open_scenes
-from nbtrack.data.pixels import PixelSampler
-from nbtrack.experiments.methods import METHODS
+from nbtrack import METHODS, Method, load_preset, open_scenes
+from nbtrack.core.arrays import Colors, Points, Scalar, Transform, Values
+from nbtrack.core.geometry import transform_points
+from nbtrack.fields.imap import IMapField
 from nbtrack.machinery.files import tables_folder
-from nbtrack.tables import write_csv
+from nbtrack.tracking import TRACKERS
+from nbtrack.tracking.paper import SdfTracker
 
 ROWS = (
     "vr", "color", "vr_neus", "color_neus", "sdf", "vr_volsdf", "color_volsdf", "sdf_volsdf",
@@ -31,24 +32,30 @@ FURTHER = ("vr_neus", "sdf", "vr_volsdf", "sdf_volsdf")  # rows of the seeds aft
 RATES_HZ = (10.0, 2.0)
 
 
-@torch.no_grad()
-def opacity(seeds: int) -> pd.DataFrame:
-    """What VR's own samples see of a map at the true poses: opacity, and how deep (m) it looks.
+class LevelTracker(SdfTracker):
+    """Eq. 2 in a density, for which the paper says that it does not apply.
 
-    A row a map, with the mean over pixels of all frames, and the map's own scale (m).
+    In the place of the distance is the logarithm of the density over that of the drawn surface.
     """
-    preset, rows = load_preset("smoke", settings=HAND_HELD), []
-    vr = preset.tracking_of("vr")
-    for scene, name, seed in product(open_scenes(preset), ("neus", "volsdf"), range(seeds)):
-        field = map_scene(scene, name, preset, seed).field
-        sequence, generator = scene.read(), torch.Generator()
-        draw = PixelSampler(sequence, torch.device("cpu")).draw
-        rays = draw(5000, generator.manual_seed(0), torch.arange(len(sequence)))
-        seen = field.render_hierarchically(rays, vr.n_stratified, vr.n_importance, generator)
-        measured, row = rays.depth > 0, {"field": field.label, "scene": scene.name, "seed": seed}
-        row |= {**field.diagnostics(), "opacity": seen.opacity[measured].mean().item()}
-        rows.append({**row, "depth_bias_m": (seen.depth - rays.depth)[measured].mean().item()})
-    return pd.DataFrame(rows)
+
+    name = "level"
+
+    @classmethod
+    def works_in(cls, field: type) -> bool:
+        """In a density alone."""
+        return issubclass(field, IMapField)
+
+    def loss(
+        self, T_world_camera: Transform, directions_camera: Points, color: Colors, depth: Values
+    ) -> Scalar:
+        """The mean of |ln(density / level)| at the observed points, without colour."""
+        points_world = transform_points(T_world_camera, directions_camera * depth[:, None])
+        _, density = self.field(points_world)
+        return (density.clamp(min=1e-3) / self.field.surface_level).log().abs().mean()
+
+
+TRACKERS["level"] = LevelTracker
+LEVEL = Method("iMAP with a level of density", "imap", "level")
 
 
 def track_rows(seeds: int) -> Iterator[Chunk]:
@@ -62,11 +69,19 @@ def track_rows(seeds: int) -> Iterator[Chunk]:
         yield place, partial(track, [scene], [name], preset, 1, **how)
 
 
+def density_rows(seeds: int) -> Iterator[Chunk]:
+    """Room by room."""
+    preset = load_preset("smoke")
+    for seed, scene in product(range(seeds), open_scenes(preset)):
+        place, how = {"scene": scene.name, "seed": seed}, {"frames": ":", "seeds": [seed]}
+        yield place, partial(track, [scene], [LEVEL], preset, 1, **how)
+
+
 def main(seeds: int) -> None:
     """Make the rows that are missing."""
     folder = tables_folder() / "other_fields"
     add_rows(folder / "table_1_cells.csv", track_rows(seeds))
-    write_csv(folder / "opacity.csv", opacity(seeds), float_format="%.4g")
+    add_rows(folder / "density.csv", density_rows(seeds))
 
 
 if __name__ == "__main__":
