@@ -84,6 +84,7 @@ class Job:
             check_no_recording(self.lock)
             setting = f"the frames and settings of {self.name}"
             with locked(self.lock), usual_modes(), advise_on_memory(setting):
+                report(0.0, "running")
                 return self.result() if self.is_done else self.compute(report)
         except NbtrackError as error:
             return error
@@ -245,7 +246,7 @@ def _outcome_there(settings: Mapping, search_path: list[str], n_threads: int, wo
 
     def report(share: float, status: str) -> None:
         nonlocal last
-        if time.monotonic() - last >= _LOOK_SECONDS:
+        if share == 0 or time.monotonic() - last >= _LOOK_SECONDS:
             write_atomic(_progress_file(job), json.dumps([share, status]))
             last = time.monotonic()
 
