@@ -78,7 +78,8 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
         downloaded = data_folder() / text
         if downloaded.is_dir():
             return Scene(text, downloaded, format)
-        advice = f"see data/README.md, or use a room, which needs no download: {', '.join(ROOMS)}"
+        how = f"`nbtrack data fetch {text}` brings it (data/README.md)"
+        advice = f"{how}, or use a room, which needs no download: {', '.join(ROOMS)}"
         raise MissingError(f"no folder {downloaded} of the Neural RGB-D dataset: {advice}")
     advice = nearest_name(text, _KNOWN)
     raise ConfigError(f"no sequence {text!r}: it is neither a folder nor a known scene; {advice}")

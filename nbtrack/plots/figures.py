@@ -177,6 +177,10 @@ def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
     for label, color in style.method_colors(frames).items():
         error_cm = 100 * frames[label]["translation_error_m"]
         axes.plot(_seconds(frames[label]), error_cm, color=color, label=label)
+        last = error_cm.last_valid_index()
+        if last is not None and len(frames) > 1:  # one curve alone needs no label at its end
+            end = _seconds(frames[label])[last], error_cm[last]
+            axes.annotate(label, end, (5, 0), textcoords="offset points", color=color, va="center")
     still = list(frames.values())[-1]  # the same in every run of these frames
     axes.plot(_seconds(still), 100 * still["still_error_m"], label=STANDING_STILL, **style.DOTTED)
     axes.set_ylabel("translation error (cm)")

@@ -16,7 +16,7 @@ from nbtrack.plots.scene import draw_slice
 from nbtrack.plots.style import method_colors, new_axes, styled
 
 _STEP = 0.01  # m, between the grid points of a slice
-_BEFORE, _BEHIND, _ASIDE = 1.25, 0.45, 0.3  # m, what is drawn around the measured point
+_BEFORE, _BEHIND, _ASIDE = 0.2, 0.45, 0.45  # m, drawn before the camera, behind the measured point
 _N_STRATIFIED, _N_IMPORTANCE = 32, 12  # iMAP's samples along a ray
 _DOT = {"edgecolors": "black", "linewidths": 0.5, "zorder": 4}
 _COLORS = method_colors(["VR", "SDF", "true"])
@@ -26,7 +26,7 @@ _COLORS = method_colors(["VR", "SDF", "true"])
 def plot_idea(
     field: LearnedField, frame: Frame, T_world_camera: Pose, row: int, column: int, title: str = ""
 ) -> Figure:
-    """What a tracker asks a map around the measured point of one pixel (row, column) of a frame.
+    """What a tracker asks a map at the measured pixel of a frame that is nearest to (row, column).
 
     The slice lies in the plane of all rays of the pixel's row, from the camera at `T_world_camera`
     (m), an estimate that may be off; the pixel's ray runs to the right. In a map of a density it
@@ -34,31 +34,34 @@ def plot_idea(
     they render. In one of a signed distance d it shows the row's measured points, one query each,
     and from each a step of length |d| against the gradient.
     """
-    axes = new_axes(title, 3.8)[0, 0]
-    rows, all_columns = frame.measured_pixels()
-    columns = all_columns[rows == row]
-    points_camera, _ = frame.points(torch.full_like(columns, row), columns)  # of the whole row
-    point_camera = points_camera[columns == column][0]
+    axes = new_axes(title, 3.0)[0, 0]
+    pixels = frame.measured_pixels()
+    away = (pixels - torch.tensor([[row], [column]])).abs().sum(dim=0)
+    in_row = pixels[:, pixels[0] == pixels[0, away.argmin()]]
+    points_camera, _ = frame.points(*in_row)  # of the whole row
+    point_camera = points_camera[(in_row[1] - column).abs().argmin()]
     distance = point_camera.norm().item()
     along = point_camera / distance
     left = along * along[0] - along.new_tensor(
         [1.0, 0, 0]
     )  # minus x, without its part along the ray
     page_camera = torch.stack([along, left / left.norm()])  # the page's axes, (2, 3)
-    x = np.arange(distance - _BEFORE, distance + _BEHIND, _STEP)
+    x = np.arange(-_BEFORE, distance + _BEHIND, _STEP)
     places = np.stack(np.meshgrid(x, np.arange(-_ASIDE, _ASIDE + _STEP, _STEP)), axis=-1)
     grid_camera = places @ page_camera.numpy()
     grid_world = grid_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     draw_slice(axes, field, grid_world, places, aspect=25, pad=0.015)
     pose = torch.from_numpy(T_world_camera).float()
-    axes.axhline(0, color="0.2", linewidth=0.8)
+    axes.plot([0, distance + _BEHIND], [0, 0], color="0.2", linewidth=0.8)
+    axes.plot([0, 0.2, 0.2, 0], [0, 0.12, -0.12, 0], "k-", linewidth=1.5)
+    axes.text(0.1, -0.15, "camera", ha="center", va="top")
     if field.is_distance:
         _draw_queries(axes, field, pose, points_camera, page_camera)
     else:
         _draw_samples(axes, field, pose, point_camera)
     # Without points: it only names the surface, which `draw_slice` drew, in the legend.
     axes.plot([], [], "k-", label=f"surface of {field.label}")
-    axes.set(xlim=(distance - _BEFORE, distance + _BEHIND), ylim=(-_ASIDE, _ASIDE), aspect="equal")
+    axes.set(xlim=(-_BEFORE, distance + _BEHIND), ylim=(-_ASIDE, _ASIDE), aspect="equal")
     axes.set(xlabel="along the ray (m)", ylabel="to its left (m)")
     return axes.figure.legend_below()
 
@@ -84,8 +87,8 @@ def _draw_samples(axes: Axes, field: LearnedField, pose: Tensor, point_camera: T
     axes.axvline(found, linestyle="--", color=_COLORS["VR"], label="rendered distance")
     axes.scatter(measured, 0, s=60, label="measured point", color=_COLORS["true"], **_DOT)
     axes.annotate("", (found, 0.1), (measured, 0.1), arrowprops={"arrowstyle": "<->"})
-    error = f"error {100 * abs(found - measured):.0f} cm"
-    axes.annotate(error, ((measured + found) / 2, 0.11), ha="center", va="bottom")
+    error = f"error {100 * abs(found - measured):.0f} cm  "
+    axes.text(min(measured, found), 0.1, error, ha="right", va="center")
 
 
 def _draw_queries(
@@ -102,7 +105,7 @@ def _draw_queries(
     ends_camera = points_camera - sdf.detach()[:, None] * normalize(gradient) @ pose[:3, :3]
     start = (points_camera @ page_camera.T).numpy()
     end = (ends_camera @ page_camera.T).numpy()
-    axes.scatter(*start.T, s=40, label="measured points", color=_COLORS["true"], **_DOT)
+    axes.scatter(*start.T, s=20, label="measured points", color=_COLORS["true"], **_DOT)
     # For the legend, which would not show arrows.
     axes.plot([], [], color=_COLORS["SDF"], label="|d| against the gradient")
     look = {"color": _COLORS["SDF"], "angles": "xy", "scale_units": "xy", "scale": 1, "zorder": 5}

@@ -28,7 +28,7 @@ _FIXED = {
     "five rooms of the paper": PALETTE[6],
     "nine rooms of ours": PALETTE[7],
     # Rates: a method's colour would say which method it is.
-    **{"at 10 Hz": "0.65", "at 5 Hz": "0.4", "at 2 Hz": "black"},
+    **{"at 10 Hz": PALETTE[5], "at 5 Hz": PALETTE[4], "at 2 Hz": PALETTE[6]},
     # Green and red as in the paper's first figure, of tones that colour-blind readers tell apart
     # (Okabe and Ito).
     "true": "#009e73",
