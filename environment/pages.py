@@ -18,6 +18,9 @@ from nbconvert import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 from nbconvert.preprocessors import CellExecutionError, ExecutePreprocessor, TagRemovePreprocessor
 
+from nbtrack import load_preset, open_scenes
+from nbtrack.machinery.errors import NbtrackError
+
 ROOT = Path(__file__).resolve().parents[1]
 RED = "color: #c00000;"  # its contrast with white is 6.5, that of plain red 4.0
 NEEDS_KERNEL = "remove_output"  # nbconvert's usual tag: of cells that show something to be moved
@@ -132,7 +135,12 @@ def main() -> None:
     chosen = parser.parse_args()
     sources = [ROOT / "README.md", *sorted(ROOT.glob("notebooks/*.ipynb"))]
     try:
+        if chosen.execute:
+            open_scenes(load_preset())  # what is missing is told before hours of work
         write_pages(chosen.folder, sources, chosen.execute)
+    except NbtrackError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
     except CellExecutionError as error:
         sys.exit(str(error))
 
