@@ -166,6 +166,7 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     draw_errors(above, frames)
     for label, color in style.method_colors(frames).items():
         below.plot(_seconds(frames[label]), frames[label]["rotation_error_deg"], color=color)
+    above.margins(x=0)  # labels at the ends of curves stand beside the axes
     above.axhline(100 * LOST_THRESHOLD_M, **style.DASHED)
     above.text(0, 100 * LOST_THRESHOLD_M, "the paper's 0.2 m", va="bottom")
     below.set(ylabel="rotation error (degrees)", xlabel="time (s)")

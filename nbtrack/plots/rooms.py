@@ -16,7 +16,7 @@ from nbtrack.plots import scene
 from nbtrack.plots.figures import draw_errors
 from nbtrack.plots.meshes import extract_mesh, seen_by
 from nbtrack.plots.scene import Paths
-from nbtrack.plots.style import method_colors, new_axes, styled
+from nbtrack.plots.style import WIDTH, method_colors, new_axes, styled
 from nbtrack.synthetic import Room
 
 _POINTS_ALONG = 240  # grid points along the longer side of a slice
@@ -141,8 +141,10 @@ def plot_map_and_slice(
     axes.set_axis_off()
     level = np.eye(3)[up == 0]  # the two level axes of the world
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
-    points, _ = _level_grid(level, *mesh.bounds @ level.T, voxel, height * up)
     paths = np.concatenate([path[:, :3, 3] for path in T_paths.values()])
+    shown = np.concatenate([mesh.bounds, paths]) @ level.T  # a path may lead beyond what was seen
+    low, high = shown.min(axis=0) - voxel, shown.max(axis=0) + 2 * voxel
+    points, _ = _level_grid(level, low, high, voxel, height * up)
     parts = {"Mesh: the zero level": mesh.vertices}
     parts |= {"Slice at the cameras' height; grey: never seen": points, "The path, larger": paths}
     on_page = mesh.vertices @ to_page.T
@@ -164,6 +166,7 @@ def plot_map_and_slice(
         axes.text(middle, top, name, ha="center")
         _draw_scale(axes, middle, corner[1] - 0.5 * gap, gap, zoom, extent.max())
         corner = corner + np.array([zoom * extent[0] + gap, 0])
+    axes.figure.set_figheight(1.5 + WIDTH * axes.dataLim.height / axes.dataLim.width)
     return axes.figure
 
 
