@@ -23,7 +23,11 @@ def a_path(text: str) -> Path:
     """A path, with `~` expanded. An empty text is refused: it would mean the working folder."""
     if not text.strip():
         raise argparse.ArgumentTypeError("the path is empty")
-    return Path(text).expanduser()
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        advice = f"a folder of this name is ./{text}"
+        raise argparse.ArgumentTypeError(f"{text!r}: there is no such user; {advice}") from None
 
 
 def a_count(text: str, minimum: int = 1, maximum: int = _MAX_COUNT) -> int:
@@ -56,49 +60,54 @@ OPTIONS = {
     "source": _option("folder of a run or a map, or a map file", a_path),
     "out": _option("file or folder to write", a_path),
     "--format": _option("a format's name, as in data/README.md (default: told by the files)"),
-    "--method": _option("one of `nbtrack methods` (default: corrected); tables take vr,sdf"),
+    "--method": _option("one of `nbtrack methods` (default: corrected)"),
+    "--method:tables": _option("some of `nbtrack methods` (default: vr,sdf)", metavar="A,B"),
     "--field": _option("in place of a method: imap, neus, neus_plus or another field"),
     "--tracker": _option("in place of a method: vr, sdf, lm or another tracker"),
     "--rate": _option("frames a second, by the clock", float, metavar="HZ"),
     "--steps": _option("steps a frame (default: to convergence; vr, sdf: as at 2 Hz)", float),
-    "--frames": _option("Python slice of frames, A:B:S", default=":"),
+    "--frames": _option("Python slice of frames, A:B:S (default: all)", default=":"),
     "--map-frames": _option("Python slice of frames to map (default: all)"),
     "--map-from": _option("track in this map of the room: its folder or file", a_path),
     "--start": _option("given: its own pose, if any (default); unknown: found first", **_STARTS),
     "--to": _option("kitti: trajectory; gif: movie; rrd: Rerun; ply, glb: mesh", required=True),
     "--budget": _option("steps: the paper's counts (default); clock: this machine's", **_BUDGETS),
-    "--scenes": _option("only these scenes of the preset's kind", metavar="A,B"),
-    "--seeds": _option("so many maps and runs a cell: mean ± std", some_seeds, default=1),
+    "--scenes": _option("only these scenes (default: the preset's)", metavar="A,B"),
+    "--seeds": _option("so many maps and runs a cell (default: 1)", some_seeds, default=1),
     "--workers": _option("jobs side by side (default: one a core, or one on a GPU)", a_count),
     "--dask": _option("run on a Dask cluster, as tcp://HOST:8786", metavar="ADDRESS"),
     "--beyond": {"help": "Table III: our methods too, and 30 Hz", **_FLAG},
-    "--caption": _option("of the LaTeX table; without a text: the usual one, short", **_CAPTION),
+    "--caption": _option("of the LaTeX table (default: ours; without a text: short)", **_CAPTION),
     "--label": _option("of the LaTeX table (default: tab:ate-PRESET)"),
     "--no-still": {"help": "without the rows of a camera that stands still", **_FLAG},
     "--n-frames": _option("how many (default: 300)", int, default=300),
-    "--width": _option("pixels; the height is 3/4 of it", int, default=640),
+    "--width": _option("pixels (default: 640; 160 takes a tenth of the time)", int, default=640),
     "--motion": _option("handheld (default), keyframes: the dataset's, tour", default="handheld"),
     "--depth-folder": _option("default: the format's; filtered before raw depth"),
-    "--url": _option("the ZIP file: a mirror's address, or a path", default=DATASET_ZIP),
+    "--url": _option(
+        "address or path of its ZIP file (default: the authors')", default=DATASET_ZIP
+    ),
     "--poses": _option("pose file (default: the format's)", metavar="FILE"),
     "--seed": _option("of all random numbers (default: 0)", partial(a_count, minimum=0), default=0),
-    "--out": _option("where to write (default: in runs/; data make needs it)", a_path),
+    "--out": _option("where to write (default: in runs/)", a_path),
+    "--out:make": _option("the folder to write", a_path, required=True),
+    "--out:check": _option("folder for a picture, check.png (default: none)", a_path),
     "--device": _option("cuda, cuda:1, mps or cpu (default: the first there is)"),
     "--preset": _option("smoke (default), nine_rooms, synthetic or paper"),
+    "--preset:bench": _option("smoke, nine_rooms, synthetic (default) or paper"),
     "--config": _option("TOML file of settings", a_path),
     "--set": _option("one setting, as mapping.neus.iterations=500; may be repeated", **_SETTINGS),
     "--import": _option("your file or module of fields, trackers, methods first", **_IMPORTS),
 }
-_PRESET = " --preset --config --set"
-_RUN = " --device" + _PRESET
+_RUN = " --device --preset --config --set"
 _MADE = " --method --field --format --frames --seed --out" + _RUN
 _PARTS = " --format --depth-folder --poses"
 _TRACKED = " --tracker --rate --steps --map-frames --map-from --start"
-_CELLS = "--budget --scenes --method --beyond --seeds --workers --dask --out"
+_CELLS = "--budget --scenes --method:tables --beyond --seeds --workers --dask --out"
 _CELLS += " --caption --label --no-still"
 _MODULES = {"tables": "bench", "bench": "bench", "export": "exports"}  # the others: "commands"
-# By name: what it does, and its options. `map` is done by the function `map_command`, `data make`
-# by `make_command`.
+# By name: what it does, and its options; a colon and a word choose one of two meanings. `map` is
+# done by the function `map_command`, `data make` by `make_command`.
 COMMANDS = {
     "map": ("fit a field to a sequence with known poses", "sequence" + _MADE),
     "track": ("track a camera; maps first where no map fits", "sequence" + _MADE + _TRACKED),
@@ -106,10 +115,13 @@ COMMANDS = {
     "export": ("a run's trajectory or a map elsewhere", "source out --to"),
     "tables": ("the paper's tables, and one beyond, CSV and LaTeX", _CELLS + _RUN),
     "data fetch": ("bring a scene of the dataset, not all 7 GB", "scene --url"),
-    "data make": ("write a synthetic room", "room --out --motion --n-frames --width --seed"),
-    "data check": ("what is wrong with a recording", "folder --out" + _PARTS),
+    "data make": ("write a synthetic room", "room --out:make --motion --n-frames --width --seed"),
+    "data check": ("what is wrong with a recording", "folder --out:check" + _PARTS),
     "data convert": ("write a recording as the dataset is", "folder out --frames" + _PARTS),
-    "bench": ("Table II on this machine, full-size networks", "--out" + _RUN),
+    "bench": (
+        "Table II on this machine, full-size networks",
+        "--out --device --preset:bench --config --set",
+    ),
 }
 
 
@@ -192,7 +204,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
         last = name.split()[-1]
         command = group.add_parser(last, help=about, description=about)
         for word in [*words.split(), "--import"]:
-            command.add_argument(word, **OPTIONS[word])
+            command.add_argument(word.partition(":")[0], **OPTIONS[word])
         # Not every command has --device, and `main` asks for it.
         command.set_defaults(command=last, parser=command, device=None)
     # `parse_args` would report unknown ones itself, without the nearest name.

@@ -17,7 +17,7 @@ from test_faults import assert_refused
 from tiny import tiny_words
 
 import nbtrack
-from nbtrack.cli import main
+from nbtrack.cli import COMMANDS, main
 from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import open_scene
 from nbtrack.machinery import files
@@ -41,8 +41,11 @@ def test_track_writes_what_it_promises(tmp_path: Path, capsys) -> None:
     """Catches missing files and keys, and an error that the trajectories do not bear out."""
     out = tmp_path / "result"
     assert main(track("living_room", "--out", str(out), "--seed", "3")) == 0
-    assert "ate_rmse_m" in capsys.readouterr().out
+    printed = capsys.readouterr().out
     metrics = json.loads((out / "metrics.json").read_text())
+    assert f"error  {1000 * metrics['ate_rmse_m']:.1f} mm (ATE)" in printed
+    assert "_m" not in printed.replace(str(tmp_path), "")  # no keys, but words
+    assert "2.0 steps" in printed
     promised = (
         "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
         "lost_frames", "steps_per_frame", "seconds_per_step", "seconds_per_frame", "map_seconds",
@@ -167,7 +170,7 @@ def test_a_recording_without_poses_is_tracked_in_a_map(work: Path, capsys, monke
     assert main(["map", str(recording), "--field", "neus", *small, "--out", "corrected"]) == 0
     capsys.readouterr()
     assert main(["track", str(recording), "--map-from", "corrected", "--out", "known"]) == 0
-    assert "still_ate_m" in capsys.readouterr().out
+    assert "stands still" in capsys.readouterr().out
     # A session whose world is its own: refused at its pose, and right where it is found.
     poses = np.loadtxt(recording / "poses.txt").reshape(-1, 4, 4)
     own = Rotation.from_euler("y", 2).as_matrix() @ poses[:, :3] + [[0, 0, 0, 1.5]] * 3
@@ -199,6 +202,25 @@ def test_a_recording_without_poses_is_tracked_in_a_map(work: Path, capsys, monke
     assert_refused(work, capsys, again, "is not the map of this run any more")
     says = "or track in a map of the same place with --map-from"
     assert_refused(work, capsys, ["track", str(recording)], says)
+
+
+def test_help_is_true_for_its_command(capsys) -> None:
+    """Catches a default, or an option that is needed, of another command."""
+    said = {}
+    for command in COMMANDS:
+        with pytest.raises(SystemExit):
+            main([*command.split(), "--help"])
+        said[command] = " ".join(capsys.readouterr().out.split())
+    assert "[--out OUT]" in said["map"]
+    assert "--out OUT" in said["data make"]
+    assert "[--out OUT]" not in said["data make"]
+    assert ("in runs/" in said["tables"], "in runs/" in said["data check"]) == (True, False)
+    assert ("default: corrected" in said["track"], "corrected" in said["tables"]) == (True, False)
+    assert "synthetic (default)" in said["bench"]
+    assert main(["methods"]) == 0
+    trackers = [line for line in capsys.readouterr().out.splitlines() if line[0] != " "]
+    assert trackers == sorted({*trackers}, key=trackers.index)  # each a group
+    assert {"tracker vr", "tracker sdf", "tracker lm"} <= {*trackers}
 
 
 def test_a_pipe_that_nobody_reads() -> None:

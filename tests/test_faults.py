@@ -7,6 +7,7 @@ import resource
 import signal
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
@@ -137,6 +138,12 @@ ARGUMENTS = {
     "below a file": ([*KITTI[:-1], "room/poses.txt"], "room"),
     "into the kernel": ([*KITTI[:-1], "/proc/nbtrack/poses.txt"], "/proc/nbtrack"),
     "a method and a field": ([*OWN, "--method", "sdf"], "leave --field and --tracker out"),
+    "capitals": (["track", "living_room", "--method", "SDF"], "did you mean 'sdf'"),
+    "a phone's archive": (["track", "scan.r3d"], "unpack it by `unzip scan.r3d -d scan`"),
+    "a movie to check": (["data", "check", "map/map.safetensors"], "is a file: give the rec"),
+    "nobody's home": (["data", "check", "~no_such_user/rec"], "no such user; a folder of"),
+    "in nobody's home": ([*MAKE[:-1], "~no_such_user/new"], "no such user"),
+    "of nobody's home": (["track", "~no_such_user/rec"], "no such user"),
     "unknown method": (["track", "living_room", "--method", "corected"], "mean 'corrected'"),
     "a method in another map": ([*GIVEN[:2], "--method", "vr", "--map-from", "map"], "not 'imap'"),
     "tracker not the map's": ([*GIVEN, "map", "--tracker", "icp"], "does not work on field 'neus'"),
@@ -177,6 +184,8 @@ def test_faults(case: str, work: Path, capsys) -> None:
     for whole or repaired in silence; and mistakes that are met after earlier results are gone."""
     spoil, command, says = FAULTS[case]
     spoil()
+    with zipfile.ZipFile("scan.r3d", "w") as archive:
+        archive.writestr("metadata", "{}")
     assert_refused(work, capsys, command, says)
 
 

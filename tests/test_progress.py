@@ -2,7 +2,7 @@
 
 import pytest
 
-from nbtrack.machinery.progress import ProgressBar
+from nbtrack.machinery.progress import ProgressBar, tell
 
 
 class Clock:
@@ -43,6 +43,29 @@ def test_a_warm_up_is_left_out(clock: Clock, capsys) -> None:
     first, second, *_ = capsys.readouterr().err.splitlines()
     assert "? left" in first
     assert "29:58 left" in second  # 58 times 31 s
+
+
+@pytest.mark.parametrize("columns", [60, 120])
+def test_a_narrow_terminal(clock: Clock, monkeypatch, capsys, columns: int) -> None:
+    """Catches a bar of which nothing but a long title is left, and warnings without colour; and
+    colours where they were not asked for, or nobody looks."""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with ProgressBar("tracking living_room-neus_plus-corrected-lm-10hz-seed3", 8) as bar:
+        clock.now = 31
+        bar.move_to(2, "waits for another process that makes the same")
+        line = bar.format_meter(
+            ncols=columns, **{k: v for k, v in bar.format_dict.items() if k != "ncols"}
+        )
+    assert line.startswith(" 25 % |███         | 01:33 left, tracking living_room")
+    capsys.readouterr()
+    for no_color, shown in (
+        ("", "\33[33mnbtrack: warning: w\33[0m\n"),
+        ("1", "nbtrack: warning: w\n"),
+    ):
+        monkeypatch.setenv("NO_COLOR", no_color)
+        tell("nbtrack: warning: w")
+        assert capsys.readouterr().err == shown
 
 
 def test_short_and_hidden_work_is_silent(clock: Clock, capsys) -> None:

@@ -1,6 +1,8 @@
 """What each command does; `tables` and `bench` stand in `bench.py`, `export` in `exports.py`."""
 
+import shlex
 from argparse import Namespace
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,9 +12,9 @@ from nbtrack.experiments import output
 from nbtrack.experiments.exports import draw_overview
 from nbtrack.experiments.jobs import run_jobs
 from nbtrack.experiments.map_jobs import OF_MAPS, MapJob
-from nbtrack.experiments.methods import DEFAULT_METHOD, method_of
+from nbtrack.experiments.methods import DEFAULT_METHOD, TABLE_1, method_of
 from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
-from nbtrack.experiments.runs import MEANINGS, METRICS_FILE
+from nbtrack.experiments.runs import METRICS_FILE
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.machinery.errors import ConfigError, DataError
@@ -28,14 +30,20 @@ from nbtrack.recordings.recording import open_recording
 from nbtrack.recordings.writer import convert_sequence
 from nbtrack.tracking import make_budget
 from nbtrack.tracking.methods import METHODS
+from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 _FRAMES_APART = 10  # every tenth frame tells what of a mesh was seen: neighbours see the same
+_ERRORS = "ate_rmse_m", "max_error_m", "still_ate_m"  # of a run's summary
 
 
 def methods_command(options: Namespace) -> None:
-    """List every method that --method takes."""
-    for name, method in METHODS.items():
-        print(f"  {name:<20}{method.label}{'  (default)' if name == DEFAULT_METHOD else ''}")
+    """List every method that --method takes, by tracker."""
+    notes = dict.fromkeys(TABLE_1, " (the paper's)") | {DEFAULT_METHOD: " (default)"}
+    for tracker in dict.fromkeys(method.tracker for method in METHODS.values()):
+        print(f"tracker {tracker}")
+        for name, method in METHODS.items():
+            if method.tracker == tracker:
+                print(f"  {name:<20}{method.label}{notes.get(name, '')}")
 
 
 def map_command(options: Namespace) -> None:
@@ -52,7 +60,9 @@ def map_command(options: Namespace) -> None:
     folder = output.deliver(job.folder, output.FILES_OF_MAP, options.out)
     print(f"{folder}: {finished.field.label} map of {scene.name}")
     print(f"  mapped in {finished.record['seconds']:.0f} s on {finished.record['device']}")
-    _print_numbers(finished.record["quality"])
+    for name, value in finished.record["quality"].items():
+        if isinstance(value, int | float):
+            print(f"  {name}: {value:.5g}")
     if (folder / MESH_FILE).is_file():
         print(f"  mesh of what was seen: {folder / MESH_FILE}")
 
@@ -82,7 +92,7 @@ def track_command(options: Namespace) -> None:
         _check_fits(given, method.field, options)
     has_budget = options.steps is not None or options.rate is not None
     steps = options.steps if has_budget else method.usual_steps
-    budget = make_budget(steps, options.rate)  # raises for a wrong one, before a room is made
+    make_budget(steps, options.rate)  # raises for a wrong one, before a room is made
     scene = _opened(options, preset)
     job = given
     if not given:
@@ -104,16 +114,38 @@ def track_command(options: Namespace) -> None:
     (metrics,) = run_jobs([run])
     draw_overview(run)
     folder = output.deliver(run.folder, output.FILES_OF_RUN, options.out)
-    print(f"{folder}: {method.tracker} in {job.map().field.label}, {budget}")
-    _print_run(metrics)
+    print(f"{scene.name}: {method.tracker} in {job.map().field.label}, {metrics['frames']} frames")
+    for line in _summary(metrics):
+        print(f"  {line}")
+    print(f"  files  {folder}: trajectory.txt (TUM), overview.png, metrics.json with all numbers")
+    print(f"  next   nbtrack export {shlex.quote(str(folder))} --to gif tracking.gif")
+    _warn(metrics)
 
 
-def _print_run(metrics: dict[str, Any]) -> None:
-    """Print the errors of a finished run and its device; warn where they may not be trusted."""
-    _print_numbers(metrics)
-    if "ate_rmse_m" not in metrics:
-        print("  no true pose is known of the tracked frames: errors cannot be computed")
-    print(f"  on {metrics['device']}")
+def _summary(metrics: dict[str, Any]) -> Iterator[str]:
+    """Lines that tell people how a run went."""
+    n_frames, n_unknown = metrics["frames"], metrics["frames_without_reference"]
+    mm = {name: f"{1e3 * metrics.get(name, np.nan):.1f} mm" for name in _ERRORS}
+    if "ate_rmse_m" in metrics:
+        yield "error  {} (ATE), at most {}; of a camera that stands still {}".format(*mm.values())
+        share = metrics["lost_frames"] / (n_frames - n_unknown)
+        yield f"lost   {share:.1%} of the frames, off by more than {LOST_THRESHOLD_M:g} m"
+    else:
+        yield "error  no true pose is known of the tracked frames: errors cannot be computed"
+    counts = {
+        "of the frames lost, as the tracker itself says": metrics.get("flagged_frames"),
+        "of the frames without a true pose, in no error": n_unknown or None,
+        "of the frames without any depth, not searched": metrics["frames_without_depth"] or None,
+    }
+    for what, count in counts.items():
+        if count is not None:
+            yield f"       {count / n_frames:.1%} {what}"
+    work = f"{metrics['steps_per_frame']:.1f} steps and {1e3 * metrics['seconds_per_frame']:.0f} ms"
+    yield f"work   {work} a frame (budget: {metrics['budget']}) on {metrics['device']}"
+
+
+def _warn(metrics: dict[str, Any]) -> None:
+    """Warn where a run's errors may not be trusted."""
     outside = metrics.get("outside_map_share", 0.0)
     unseen = f"{outside:.0%} of the frames saw little of what was mapped" if outside > 0 else None
     for warning in filter(None, (metrics["map_warning"], unseen, metrics.get("map_misfit"))):
@@ -156,17 +188,8 @@ def _make_map(job: MapJob) -> None:
     run_jobs([job])
 
 
-def _print_numbers(results: dict[str, Any]) -> None:
-    """Print the numbers among `results` by their `MEANINGS`; zeros only of lost frames."""
-    for name, value in results.items():
-        if isinstance(value, int | float) and (value or name in ("lost_frames", "flagged_frames")):
-            print(f"  {MEANINGS.get(name, name)}: {value:.5g}")
-
-
 def make_command(options: Namespace) -> None:
-    """Write a synthetic room as a sequence folder; ConfigError where none is named."""
-    if options.out is None:
-        raise ConfigError(f"--out is missing: name the folder that {options.room} is written to")
+    """Write a synthetic room as a sequence folder."""
     config = with_values(ScenesConfig(), {name: getattr(options, name) for name in SIZES})
     output.check_no_recording(options.out)
     write_room(options.room, options.out, config)

@@ -11,16 +11,10 @@ from nbtrack.beyond.verdict import score_detection
 from nbtrack.machinery import files
 from nbtrack.machinery.errors import MissingError
 from nbtrack.recordings.pose_files import read_tum, shifted, tum_text
-from nbtrack.tracking.metrics import LOST_THRESHOLD_M, trajectory_metrics
+from nbtrack.tracking.metrics import trajectory_metrics
 from nbtrack.tracking.trajectories import Trajectory
 
 METRICS_FILE = "metrics.json"  # written last: where it stands, a run is complete
-MEANINGS = {  # printed in place of names in metrics.json that say too little
-    "lost_frames": f"frames off by more than {LOST_THRESHOLD_M:g} m",
-    "flagged_frames": "frames that the tracker itself calls lost",
-    "frames_without_reference": "frames without a true pose, in no error",
-    "frames_without_depth": "frames without any depth, not searched",
-}
 
 
 def write_run(folder: Path, run: Trajectory) -> None:

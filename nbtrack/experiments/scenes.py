@@ -68,7 +68,8 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     """
     text = str(sequence)
     folder = absolute(sequence)
-    if folder.is_dir() and not (text in _KNOWN and is_own_output(folder)):
+    is_other_file = folder.is_file() and text not in _KNOWN  # what opens it tells what is wrong
+    if is_other_file or (folder.is_dir() and not (text in _KNOWN and is_own_output(folder))):
         if text in _KNOWN:
             tell(f"{text}: the folder {folder} is read, not the room or scene of that name")
         return Scene(folder.name, folder, format)

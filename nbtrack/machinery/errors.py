@@ -74,7 +74,9 @@ def nearest_name(text: str, allowed: list[str]) -> str:
     >>> nearest_name("imapp", ["imap", "neus"])
     "did you mean 'imap'? Allowed: imap, neus"
     """
-    close = difflib.get_close_matches(text, allowed, n=5, cutoff=0.5)
+    small = {name.lower(): name for name in allowed}  # SDF is near sdf
+    near = difflib.get_close_matches(text.lower(), small, n=5, cutoff=0.5)
+    close = [small[name] for name in near]
     hint = f"did you mean '{close[0]}'? " if close else ""
     if len(allowed) > 40:  # a message lists no more
         return f"{hint}Allowed are {len(allowed)} names, such as {', '.join(close or allowed[:5])}"

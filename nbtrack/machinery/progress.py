@@ -1,5 +1,6 @@
 """One progress bar: a line that moves where somebody watches, elsewhere a line now and then."""
 
+import os
 import sys
 import threading
 from typing import Any
@@ -7,7 +8,8 @@ from typing import Any
 from tqdm import tqdm
 
 _DELAY_SECONDS = 1.0  # so that a mistake which ends the work at once is told alone
-_FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+# What matters first: in a narrow terminal the end of a line is cut off.
+_FORMAT = "{percentage:3.0f} % |{bar:12}| {remaining} left, {desc}{postfix}"
 # Where nobody watches: the form of a line, and seconds between two.
 _LINE_FORMAT = "{desc}: {percentage:.0f} %, {elapsed} gone, {remaining} left{postfix}"
 _LINE_SECONDS = 30.0
@@ -15,7 +17,13 @@ tqdm.set_lock(threading.RLock())  # its own is one between processes, which kill
 
 
 def tell(news: str) -> None:
-    """Print news: to standard error, since it is no result; notebooks would show that in red."""
+    """Print news: to standard error, since it is no result; notebooks would show that in red.
+
+    At a terminal warnings are yellow, unless `NO_COLOR` is set.
+    """
+    is_shown = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+    if news.startswith("nbtrack: warning: ") and is_shown and not _is_notebook():
+        news = f"\33[33m{news}\33[0m"
     print(news, file=sys.stdout if _is_notebook() else sys.stderr)
 
 

@@ -7,6 +7,7 @@ recording does otherwise than its format, it says in `sequence.toml`: any field 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from zipfile import is_zipfile
 
 import numpy as np
 
@@ -206,6 +207,10 @@ def declaration(folder: Path, format: str | None = None, depth_scale: float = 0.
     the format is the one with the largest share of what it needs; reading says what is missing.
     Raises MissingError, ConfigError or DataError for what it cannot tell.
     """
+    if folder.is_file():
+        unzip = f"unpack it by `unzip {folder.name} -d {folder.stem}`, and "
+        advice = f"{unzip if is_zipfile(folder) else ''}give the recording's folder"
+        raise DataError(f"{folder} is a file: {advice}")
     if not folder.is_dir():
         raise MissingError(f"no folder {folder}: give a recording's, or a synthetic room's name")
     path = folder / DECLARATION_FILE
