@@ -14,14 +14,8 @@ from nbtrack.machinery.files import absolute
 from nbtrack.machinery.text_files import read_numbers
 from nbtrack.recordings.calibration import Calibration
 from nbtrack.recordings.formats import FORMATS, Declaration, Format, declaration, files_of
-from nbtrack.recordings.pairing import (
-    TIMES_FILE,
-    Moments,
-    check_paired,
-    check_rising,
-    pair_lists,
-    stamp_in,
-)
+from nbtrack.recordings.names import check_rising, stamp_in
+from nbtrack.recordings.pairing import TIMES_FILE, Moments, check_paired, pair_lists
 from nbtrack.recordings.pose_files import Times, in_seconds
 
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
