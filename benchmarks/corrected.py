@@ -91,7 +91,8 @@ def main() -> None:
 def _track(scenes, methods, preset, frames, path, tracked=None, steps=30, seeds=SEEDS):
     """Runs with at most so many steps a frame; without a number those of the paper at 2 Hz."""
     how = {"steps": steps, "frames": frames, "seeds": seeds, "execution": ALONE}
-    found = track_scenes(scenes, methods, preset, [2], tracked=tracked, **how)
+    rates_hz = [2] if steps is None else None
+    found = track_scenes(scenes, methods, preset, rates_hz, tracked=tracked, **how)
     wrong_m = WRONG_M if scenes[0].room else WRONG_IN_RECORDING_M
     counts = pd.DataFrame([_judged(run, wrong_m) for run in found["run"]])
     return found.assign(path=path, frames=frames, **counts)[[*COLUMNS, "run"]]

@@ -32,7 +32,7 @@ class GridPlusMapping(NeusPlusMapping):
 
     iterations: int = 300
     n_rays: int = limited(96, 1, 65536)
-    n_stratified: int = limited(8, 1, 1024)
+    n_stratified: int = limited(8, 2, 1024)
     n_surface: int = limited(8, 0, 1024)
     n_surface_points: int = limited(1024, 1, 65536)
     learning_rate: float = 0.01

@@ -89,7 +89,7 @@ def track_command(options: Namespace) -> None:
     method = method_of(options.method, field, options.tracker)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     if given:
-        _check_fits(given, method.field, options)
+        _check_fits(given, method.field, preset, options)
     has_budget = options.steps is not None or options.rate is not None
     steps = options.steps if has_budget else method.usual_steps
     make_budget(steps, options.rate)  # raises for a wrong one, before a room is made
@@ -160,7 +160,7 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
     return scene
 
 
-def _check_fits(given: MapJob, field: str, options: Namespace) -> None:
+def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -> None:
     """Raises ConfigError where a given map contradicts the options: its frames, field, settings."""
     made = given.field
     if options.map_frames:
@@ -168,6 +168,12 @@ def _check_fits(given: MapJob, field: str, options: Namespace) -> None:
     if field != made:
         advice = "leave --method and --field out"
         raise ConfigError(f"{options.map_from} is a map of field {made!r}, not {field!r}: {advice}")
+    voxels = preset.correction.get(made, 0.0), given.correction_voxel  # m, asked for and there
+    if options.method and (voxels[0] > 0) != (voxels[1] > 0):
+        asked, there = ("a corrected map" if voxel else "no corrected map" for voxel in voxels)
+        advice = "give --tracker in place of --method, or map by the method"
+        where = f"{options.map_from} is {there}"
+        raise ConfigError(f"--method {options.method} asks for {asked}, {where}: {advice}")
     known = flat(given.setting_tree)
     for text in options.settings:
         asked = read_setting(text)

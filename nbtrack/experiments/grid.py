@@ -14,17 +14,20 @@ from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.runs import read_trajectory
 from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
-from nbtrack.machinery.errors import NbtrackError, check_lists
+from nbtrack.machinery.errors import ConfigError, NbtrackError, check_lists
 from nbtrack.machinery.files import absolute, runs_folder
 from nbtrack.machinery.progress import tell
+from nbtrack.machinery.settings import whole_number
 from nbtrack.mapping.files import Map
+from nbtrack.tracking import make_budget
 from nbtrack.tracking.methods import Methods, find_methods
 from nbtrack.tracking.trajectories import Trajectory
 
 
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
     """The map of a scene, from the cache or made now."""
-    job = MapJob.of(scene, field, preset, seed=seed)
+    _check_scenes(scene=[scene])
+    job = MapJob.of(scene, field, preset, seed=whole_number("seed", seed))
     run_jobs([job])
     return job.map()
 
@@ -34,7 +37,8 @@ def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -
 
     Maps that are not cached are made. Raises ConfigError where scenes or fields are no lists.
     """
-    check_lists(scenes=scenes, fields=fields)
+    _check_scenes(scenes=scenes)
+    check_lists(at_least=1, fields=fields)
     jobs = [MapJob.of(scene, field, preset) for field, scene in product(fields, scenes)]
     rows = []
     for job, record in zip(jobs, run_jobs(jobs), strict=True):
@@ -65,24 +69,45 @@ def track_scenes(
         tracked: other recordings of the same rooms, in the same order, which no map has seen.
 
     Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), the metrics,
-    ate_m (NaN if unknown), failure (why). Raises ConfigError for a list that is none; as jobs do.
+    ate_m (NaN if unknown), failure (why). Raises ConfigError for a list that is none, and for
+    steps beside a rate or the clock; as jobs do.
     """
-    check_lists(scenes=scenes, rates_hz=rates_hz or (), seeds=seeds)
-    rates = [None] if steps else rates_hz or preset.tables.rates_hz
-    frames = str(frames or preset.scenes.track_frames)
-    pairs = [*zip(scenes, tracked or scenes, strict=True)]  # the mapped scene and the tracked one
+    rates = preset.tables.rates_hz if rates_hz is None else rates_hz
+    tracked = scenes if tracked is None else tracked
+    _check_scenes(scenes=scenes, tracked=tracked)
+    check_lists(at_least=1, methods=methods, rates_hz=rates, seeds=seeds)
+    if len(tracked) != len(scenes):
+        raise ConfigError(f"{len(tracked)} tracked for {len(scenes)} scenes: give one for each")
+    if steps is not None and (rates_hz is not None or clock):
+        advice = "a frame has one budget; leave steps, or rates_hz and clock, out"
+        raise ConfigError(f"steps={steps} beside rates_hz={rates_hz}, clock={clock}: {advice}")
+    rates = rates if steps is None else [None]
+    frames = preset.scenes.track_frames if frames is None else str(frames)
+    pairs = [*zip(scenes, tracked, strict=True)]  # the mapped scene and the tracked one
     jobs, rows = [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
         settings = own.tracking_of(method.tracker)
-        n_steps = steps if steps or clock else method.paper_steps(rate_hz)  # None by the clock
-        made = MapJob.of(scene, method.field, own, seed=seed)
+        is_counted = steps is None and not clock
+        n_steps = method.paper_steps(rate_hz) if is_counted else steps  # None by the clock
         clock_rate_hz = rate_hz if clock else None
+        make_budget(n_steps, clock_rate_hz)  # raises for a wrong number, before anything is made
+        made = MapJob.of(scene, method.field, own, seed=whole_number("seed", seed))
         job = TrackJob(made, seen, method.tracker, settings, n_steps, clock_rate_hz, frames, seed)
         jobs.append(job)
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
         rows.append(row | {"seed": seed, "run": job.folder.name, "n_pixels": settings.n_pixels})
     return pd.DataFrame(map(_row_of, rows, _run(jobs, clock, execution or Execution())))
+
+
+def _check_scenes(**lists: Sequence[Scene]) -> None:
+    """Raises ConfigError for an argument that is no list of scenes."""
+    check_lists(at_least=1, **lists)
+    for name, scenes in lists.items():
+        for scene in scenes:
+            if not isinstance(scene, Scene):
+                advice = "give what open_scene or open_scenes has returned"
+                raise ConfigError(f"{name} holds {scene!r:.60}, which is no scene: {advice}")
 
 
 def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Maps as jobs: made from a scene, or given."""
 
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -114,11 +115,11 @@ class MapJob(Job):
 
     def result(self) -> dict[str, Any]:
         """How the finished map was made, and its scores."""
-        return _stored(self.folder).record
+        return deepcopy(_stored(self.folder).record)
 
     def map(self) -> Map:
-        """The finished map, ready for tracking."""
-        finished = _stored(self.folder)
+        """The finished map, ready for tracking: a copy of that in the cache."""
+        finished = deepcopy(_stored(self.folder))
         return replace(finished, field=finished.field.to(choose_device()))
 
     def compute(self, report: Report) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import Any
 
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
-from nbtrack.machinery.errors import ConfigError, MissingError, look_up
+from nbtrack.machinery.errors import ConfigError, MissingError, check_lists, look_up
 from nbtrack.machinery.files import absolute
 from nbtrack.machinery.settings import (
     flat,
@@ -232,6 +232,7 @@ def load_preset(
     an unknown preset or key, or a value of the wrong type; MissingError if the file does not exist,
     DataError if it is no TOML.
     """
+    check_lists(settings=settings, of_method=of_method)
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
     config_file = config_file or os.environ.get("NBTRACK_CONFIG")
     if config_file:

@@ -47,7 +47,8 @@ class MappingSettings:
 
     iterations: int = 20_000
     n_rays: int = limited(1024, 1, 65536)  # a batch, drawn over all mapping frames
-    n_stratified: int = limited(32, 1, 1024)  # samples a ray, spread evenly (iMAP)
+    # Samples a ray, spread evenly (iMAP); the rendered depth of a single one has no gradient.
+    n_stratified: int = limited(32, 2, 1024)
     # Samples a ray at the surface: iMAP's second pass, or around the measured depth (NeuS).
     n_surface: int = limited(12, 0, 1024)
     learning_rate: float = 1e-3  # Adam's, at the start; falls to a twentieth along a cosine (NeuS)
