@@ -78,14 +78,11 @@ def usual_modes() -> Iterator[None]:
     Also in a program that has it otherwise. These modes are the thread's own. The default type is
     one of the whole process, and stays: types are named where tensors are made.
     """
-    with contextlib.ExitStack() as modes:
-        modes.enter_context(torch.inference_mode(False))
-        modes.enter_context(torch.enable_grad())
-        for kind in {"cpu", "cuda", torch.get_default_device().type}:
-            modes.enter_context(torch.autocast(kind, enabled=False))
-        if torch.get_default_device().type != "cpu":  # it slows every call
-            modes.enter_context(torch.device("cpu"))
-        yield
+    is_usual = torch.get_default_device().type == "cpu"  # to say so again would slow every call
+    with contextlib.nullcontext() if is_usual else torch.device("cpu"):
+        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+            with torch.inference_mode(False), torch.enable_grad():
+                yield
 
 
 def matrix_products(tf32: bool) -> contextlib.AbstractContextManager[None]:

@@ -1,0 +1,334 @@
+"""Doors: what a public entry is given is right or refused, and what is the user's stays theirs."""
+
+import copy
+import pickle
+import threading
+import warnings
+from collections.abc import Callable
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from box_room import BoxRoom, box_sequence, walk
+from tiny import TINY
+
+import nbtrack
+from nbtrack.beyond import correction
+from nbtrack.beyond.feature_grid import GridNetwork, GridPlusMapping
+from nbtrack.beyond.grid import BakedField
+from nbtrack.beyond.least_squares import interpolation
+from nbtrack.core.bounds import SceneBounds
+from nbtrack.core.camera import Intrinsics
+from nbtrack.data.frame import Frame
+from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, NeusMapping, make_field
+from nbtrack.machinery.device import constant, matrix_products, threads
+from nbtrack.machinery.errors import NbtrackError
+from nbtrack.machinery.files import absolute, locked
+from nbtrack.machinery.settings import read_setting
+from nbtrack.mapping.files import MAP_FILE, Map, read_map, write_map
+from nbtrack.mapping.fit import map_sequence
+from nbtrack.tracking import StepBudget, make_budget, make_tracker, paper_steps, track_sequence
+from nbtrack.tracking.paper import SdfSettings
+
+SEQUENCE, CAMERA = walk(4), walk(1).intrinsics
+NETWORK, UNIT = NetworkSettings(width=16, n_frequencies=8), ((-1.0,) * 3, (1.0,) * 3)
+SMALL = {"iterations": 3, "n_rays": 8, "holdout_every": 0}
+
+
+def mapped(sequence=SEQUENCE, name="neus", settings=None, network=NETWORK, **more) -> Map:
+    return map_sequence(name, sequence, network, settings or NeusMapping(**SMALL), **more)
+
+
+def tracker(field=None, pose: Any = None, name="sdf", budget: Any = 3, **options) -> Any:
+    pose = np.eye(4) if pose is None else pose
+    settings = SdfSettings(**{"n_pixels": 16} | options) if name == "sdf" else None
+    return make_tracker(name, field or BoxRoom(), pose, StepBudget(budget), settings)
+
+
+def scenes() -> dict[str, Any]:
+    preset = nbtrack.load_preset(settings=[*TINY, "scenes.names=['office']"])
+    return {"scenes": nbtrack.open_scenes(preset), "methods": ["sdf"], "preset": preset}
+
+
+def tracked_with(**options: Any) -> Callable[[], object]:
+    return lambda: nbtrack.track_scenes(**scenes() | options)
+
+
+def poses_with(pose: Any) -> np.ndarray:
+    poses = SEQUENCE.T_world_camera.copy()
+    poses[2] = pose
+    return poses
+
+
+DENSITY = make_field("imap", NETWORK, SceneBounds(*UNIT), 0)
+REFUSED: dict[str, Callable[[], object]] = {
+    "zero pose": lambda: tracker(pose=np.zeros((4, 4))),
+    "three rows": lambda: tracker(pose=np.eye(4)[:3]),
+    "no numbers": lambda: tracker(pose="here"),
+    "zero pose for a picture": lambda: DENSITY.render_view(CAMERA, np.zeros((4, 4))),
+    "a map for a field": lambda: tracker(mapped()),
+    "part of a pixel": lambda: tracker(n_pixels=16.7),
+    "part of a seed": lambda: mapped(seed=0.5),
+    "part of an iteration": lambda: mapped(settings=NeusMapping(**SMALL | {"iterations": 2.5})),
+    "settings of others": lambda: mapped(settings=SdfSettings()),
+    "grid of a density": lambda: tracker(BakedField(DENSITY, 0.3)),
+    "density in LM": lambda: tracker(BakedField(DENSITY, 0.3), name="lm"),
+    "density corrected": lambda: correction.corrected(DENSITY, SEQUENCE, np.arange(4), 0.3),
+    "bounds upside down": lambda: SceneBounds((1, 1, 1), (0, 0, 0)),
+    "bounds of NaN": lambda: SceneBounds((0, 0, 0), (1, 1, np.nan)),
+    "unit of zero": lambda: SceneBounds(*UNIT, 0.0),
+    "fx below zero": lambda: Intrinsics(32, 24, -24.0, 24.0, 16.0, 12.0),
+    "half a column": lambda: Intrinsics(32.5, 24, 24.0, 24.0, 16.0, 12.0),
+    "no frames": lambda: mapped(SEQUENCE.select(slice(3, 3))),
+    "a frame without pose": lambda: mapped(replace(SEQUENCE, T_world_camera=poses_with(np.nan))),
+    "a pose that stretches": lambda: mapped(replace(SEQUENCE, T_world_camera=poses_with(2))),
+    "depth in metres": lambda: replace(SEQUENCE, depths_mm=SEQUENCE.depths_mm / 1000),
+    "fewer depths": lambda: replace(SEQUENCE, depths_mm=SEQUENCE.depths_mm[:2]),
+    "frames for a frame": lambda: SEQUENCE[0:3],
+    "a frame for frames": lambda: SEQUENCE.select(3),
+    "points of two": lambda: BoxRoom()(torch.zeros(5, 2)),
+    "points of numpy": lambda: BoxRoom()(np.zeros((5, 3))),
+    "no steps": lambda: make_budget(0, None),
+    "true steps": lambda: make_budget(True, None),
+    "steps as text": lambda: make_budget("3", None),
+    "200 Hz": lambda: paper_steps("vr", 200),
+    "a tracker without a row": lambda: paper_steps("lm", 10),
+    "two lines": lambda: read_setting("a=1\nb=2"),
+    "one text of settings": lambda: nbtrack.load_preset(settings="scenes.width=32"),
+    "nobody": lambda: absolute("~nobody_of_this_name/x"),
+    "nobody's map": lambda: read_map("~nobody_of_this_name/x"),
+    "scenes once": lambda: nbtrack.track_scenes(**scenes() | {"scenes": iter([])}),
+    "names for scenes": tracked_with(scenes=["office"]),
+    "no scenes": tracked_with(scenes=[]),
+    "no methods": tracked_with(methods=[]),
+    "no steps to track": tracked_with(steps=0),
+    "steps and rates": tracked_with(steps=3, rates_hz=[10]),
+    "steps by the clock": tracked_with(steps=3, clock=True),
+    "part of a seed to track": tracked_with(seeds=[0.5]),
+    "fewer tracked": lambda: nbtrack.track_scenes(**scenes(), tracked=2 * scenes()["scenes"]),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_wrong_is_refused(case: str) -> None:
+    """Catches arguments that are taken in silence, or end in somebody else's error later on."""
+    with pytest.raises(NbtrackError):
+        REFUSED[case]()
+
+
+def test_right_in_another_form() -> None:
+    """Catches what depends on the form of right input: its precision, order in memory, or type."""
+    point = torch.tensor([[0.1, 0.2, 0.3]])
+    for field in (DENSITY, BakedField(BoxRoom(), 0.2)):
+        assert torch.equal(field(point.double())[1], field(point)[1])
+    backwards = SEQUENCE.select(slice(None, None, -1))
+    foreign = replace(backwards, depths_mm=backwards.depths_mm.astype(">u2"))
+    assert mapped(foreign).key == mapped(backwards.select(np.arange(4))).key
+    depth = SEQUENCE.depths_mm[0].copy()
+    depth[:, 5:] = 65535
+    for image in (depth, np.asfortranarray(depth), depth / 1000):
+        frame = Frame.of_images(CAMERA, SEQUENCE.colors[0], image)
+        assert frame.depth_mm.is_contiguous()
+        assert frame.depth_mm.max() == depth[:, :5].max()
+    assert SceneBounds(*np.array(UNIT)) == SceneBounds(*UNIT)
+
+
+@contextmanager
+def default_dtype() -> Any:
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+MODES: dict[str, Callable[[], AbstractContextManager]] = {
+    "inference": torch.inference_mode, "no gradients": torch.no_grad, "double": default_dtype,
+    "autocast": lambda: torch.autocast("cpu", torch.bfloat16),
+    "another device": lambda: torch.device("meta"),
+}  # fmt: skip
+
+
+def everything() -> list[np.ndarray]:
+    """Numbers that maps, their grids, pictures and trackers come to."""
+    grid = mapped(name="grid_plus", settings=GridPlusMapping(**SMALL), network=GridNetwork())
+    imap = mapped(name="imap", settings=MappingSettings(**SMALL))
+    better = correction.correct_map(mapped(), SEQUENCE, 0.3).field
+    fields = {"vr": imap.field, "sdf": grid.field, "lm": better}
+    paths = [
+        track_sequence(tracker(field, name=name), SEQUENCE).T_estimated
+        for name, field in fields.items()
+    ]
+    return [*paths, *imap.field.render_view(CAMERA, np.eye(4)), better.volume.numpy()]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_modes_do_not_matter(mode: str, monkeypatch) -> None:
+    """Catches a result, or a failure, by a mode of the program, also one left behind in a cache;
+    and a default or random numbers of the program that are changed."""
+    monkeypatch.setattr(correction, "_N_POINTS", 2000)
+    constant.cache_clear()
+    with MODES[mode]():
+        before = torch.get_default_dtype(), torch.get_rng_state().tolist()
+        found = everything()
+        assert (torch.get_default_dtype(), torch.get_rng_state().tolist()) == before
+    assert all(np.array_equal(a, b) for a, b in zip(found, everything(), strict=True))
+
+
+def test_threads_leave_the_process_as_it_was(tmp_path: Path) -> None:
+    """Catches a setting of the process, or its warnings, that the last of two threads restores to
+    what the first had made of it."""
+    found = []
+
+    def block(entered: threading.Event, leave: threading.Event) -> None:
+        with threads(1), matrix_products(tf32=True):
+            entered.set()
+            leave.wait()
+
+    def settings() -> None:
+        found.append((torch.get_num_threads(), torch.get_float32_matmul_precision()))
+
+    def in_thread(work: Callable, *events: threading.Event) -> threading.Thread:
+        thread = threading.Thread(target=work, args=events)
+        thread.start()
+        return thread
+
+    torch.set_num_threads(2)
+    filters = [*warnings.filters]
+    events = [(threading.Event(), threading.Event()) for _ in range(2)]
+    blocks = []
+    for pair in events:
+        blocks.append(in_thread(block, *pair))
+        pair[0].wait()
+    for thread, (_, leave) in zip(blocks, events, strict=True):
+        leave.set()
+        thread.join()
+    in_thread(settings).join()
+    assert found == [(2, "highest")]
+    with locked(tmp_path / "lock"):
+        waiting = in_thread(lambda: locked(tmp_path / "lock").__enter__())
+        waiting.join(timeout=0.3)
+        assert [*warnings.filters] == filters
+    waiting.join()
+
+
+@pytest.mark.parametrize("name", ["sdf", "lm"])
+@pytest.mark.parametrize(
+    "copied", [copy.copy, copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))]
+)
+def test_trackers_are_copied_and_fields_are_theirs(copied: Callable, name: str) -> None:
+    """Catches a copy that goes elsewhere or moves the original, and a field that the tracker
+    freezes, or that moves the tracker when its owner changes it."""
+    field = make_field("neus", NETWORK, SceneBounds((-1.2,) * 3, (1.2,) * 3), 0)
+    first = tracker(field, name=name)
+    assert field.training
+    assert all(part.requires_grad for part in field.parameters())
+    first.track(SEQUENCE[1])
+    second = copied(first)
+    found = [each.track(SEQUENCE[2]).T_world_camera for each in (first, second)]
+    with torch.no_grad():
+        field.mlp.head.bias += 1.0
+    found += [copied(each).track(SEQUENCE[3]).T_world_camera for each in (first, second)]
+    assert np.array_equal(*found[:2])
+    assert np.array_equal(*found[2:])
+
+
+def test_a_map_of_the_cache_stays_as_it_was_read() -> None:
+    """Catches a change of a map that was handed out in what the next caller gets."""
+    (scene,), preset = scenes()["scenes"], scenes()["preset"]
+    one = nbtrack.map_scene(scene, "neus", preset)
+    key = one.key
+    one.field.mlp.head.bias += 1.0
+    one.record["quality"].clear()
+    assert one.key != key
+    other = nbtrack.map_scene(scene, "neus", preset)
+    assert other.key == key
+    assert other.record["quality"]
+
+
+OTHERS: dict[str, dict[str, Any]] = {
+    "recording": {"sequence": box_sequence([[0, 0.002 * i, 0] for i in range(4)])},
+    "map": {"field": mapped().field}, "budget": {"budget": 4}, "settings": {"lambda_color": 0.1},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", OTHERS)
+def test_a_checkpoint_knows_whose_it_is(case: str, tmp_path: Path, monkeypatch) -> None:
+    """Catches the path of another run, returned as this one's."""
+    monkeypatch.setattr("nbtrack.tracking.trajectories.CHECKPOINT_SECONDS", -1)
+    path = tmp_path / "run.pt"
+    known = track_sequence(tracker(mapped(seed=1).field), SEQUENCE, path)
+    again = track_sequence(tracker(mapped(seed=1).field), SEQUENCE, path)
+    assert np.array_equal(known.T_estimated, again.T_estimated)
+    other = {"field": mapped(seed=1).field, "sequence": SEQUENCE, **OTHERS[case]}
+    sequence = other.pop("sequence")
+    with pytest.raises(NbtrackError, match="was made with another"):
+        track_sequence(tracker(**other), sequence, path)
+
+
+class Kept(FIELDS["neus"]):
+    name = "kept"
+
+    @classmethod
+    def from_state(cls, state: Any, made: Any, bounds: SceneBounds) -> Any:
+        raise NotImplementedError
+
+
+UNREADABLE: dict[str, Callable[[Map], Map]] = {
+    "grid": lambda made: replace(made, field=BakedField(made.field, 0.3)),
+    "class": lambda made: replace(made, field=Kept(NETWORK, made.field.bounds, torch.Generator())),
+    "record": lambda made: replace(made, record={**made.record, "network": {"width": 9}}),
+    "numpy": lambda made: replace(made, record={**made.record, "mine": np.ones(3)}),
+}
+
+
+@pytest.mark.parametrize("case", UNREADABLE)
+def test_what_could_not_be_read_is_not_written(case: str, tmp_path: Path, monkeypatch) -> None:
+    """Catches a map that is lost when it is written, and one with another map's history."""
+    monkeypatch.setitem(FIELDS, "kept", Kept)
+    write_map(tmp_path / MAP_FILE, mapped())
+    with pytest.raises(NbtrackError):
+        write_map(tmp_path / MAP_FILE, UNREADABLE[case](mapped(seed=1)))
+    assert read_map(tmp_path).record["seed"] == 0
+    write_map(tmp_path / "alone", mapped(seed=2))
+    assert len(read_map(tmp_path).history) == 3
+    write_map(tmp_path, read_map(tmp_path / "alone"))
+    assert read_map(tmp_path).history.empty
+
+
+def test_outside_of_a_grid(monkeypatch) -> None:
+    """Catches an interpolation that goes on beyond the grid, where the grid itself does not, and
+    corrections by what lies there, which were three times as large at the border."""
+    monkeypatch.setattr(correction, "_N_POINTS", 20_000)
+    grid = BakedField(BoxRoom(), 0.1)
+    points = np.random.default_rng(0).uniform(-3, 3, (200, 3))
+    vertices, weights = interpolation(points, grid)
+    asked = (grid.volume[3].numpy()[vertices] * weights).sum(axis=1)
+    assert np.allclose(asked, grid(torch.from_numpy(points))[1], atol=1e-5)
+    seen = box_sequence(np.random.default_rng(0).uniform(-0.2, 0.2, (9, 3)), height=48)
+    far = replace(seen, depths_mm=seen.depths_mm.copy())
+    far.depths_mm[:3, 20:25, 30:35] = 12000  # a facade through a window
+    off = BoxRoom(half=(1.01, 0.81, 1.21))
+    most, usual = (
+        correction.corrected(off, each, np.arange(9), 0.06).corrections[:, 3].abs().max()
+        for each in (far, seen)
+    )
+    assert most < 1.1 * usual
+
+
+def test_frames_are_lost_by_one_rule() -> None:
+    """Catches a frame without depth that is lost as an estimate, and neither lost nor found in
+    the table."""
+
+    class Mine(type(tracker())):
+        def report(self) -> dict[str, bool]:
+            return {"lost": False}
+
+    seen = replace(SEQUENCE, depths_mm=SEQUENCE.depths_mm.copy())
+    seen.depths_mm[2] = 0
+    mine = Mine(BoxRoom(), np.eye(4), StepBudget(2), SdfSettings(n_pixels=16))
+    assert track_sequence(mine, seen).frames["lost"].tolist() == [False, True, False]
