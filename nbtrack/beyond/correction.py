@@ -25,7 +25,6 @@ from nbtrack.fields import Field, field_class
 from nbtrack.fields.base import State
 from nbtrack.machinery.device import usual_modes
 from nbtrack.machinery.errors import ConfigError, DataError
-from nbtrack.machinery.files import check_recipe
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 
@@ -114,7 +113,6 @@ def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
     Its record says how long that took, and how much memory (bytes) network and corrections take.
     """
     start = time.perf_counter()
-    check_recipe("the map", finished.record, {"data": sequence.digest})
     mapped, _ = split_holdout(len(sequence), finished.record["settings"]["holdout_every"])
     field = corrected(finished.field, sequence, mapped, voxel)
     seconds = time.perf_counter() - start

@@ -21,17 +21,13 @@ class SceneBounds:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for corners that are not finite, or no box, or no positive unit."""
-        unit = 1 if self.declared_unit is None else self.declared_unit
-        try:
-            corners = np.array([self.minimum, self.maximum], dtype=np.float64).reshape(2, 3)
-        except (TypeError, ValueError):
-            corners = np.zeros((2, 3))
-        extent = np.append(corners[1] - corners[0], unit)
-        if not (extent.min() > 0 and np.isfinite(extent).all()):
+        low, high = (tuple(map(float, corner)) for corner in (self.minimum, self.maximum))
+        unit = 1.0 if self.declared_unit is None else self.declared_unit
+        if len(low) != 3 or not all(0 < x < np.inf for x in (*np.subtract(high, low), unit)):
             advice = "give x, y, z (m) of the minimum, then those of the maximum, all larger"
             raise ConfigError(f"{self} are no bounds: {advice}")
-        for name, corner in zip(("minimum", "maximum"), corners.tolist(), strict=True):
-            object.__setattr__(self, name, tuple(corner))
+        object.__setattr__(self, "minimum", low)
+        object.__setattr__(self, "maximum", high)
 
     @property
     def center(self) -> Float[np.ndarray, "3"]:

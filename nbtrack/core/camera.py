@@ -29,8 +29,7 @@ class Intrinsics:
     def __post_init__(self) -> None:
         """Raises ConfigError for a size or a focal length that no camera has."""
         for name in ("width", "height"):
-            size = whole_number(f"a camera's {name}", getattr(self, name), minimum=1)
-            object.__setattr__(self, name, size)
+            whole_number(f"a camera's {name}", getattr(self, name), minimum=1)
         if not (
             min(self.fx, self.fy) > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()
         ):

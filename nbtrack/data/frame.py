@@ -28,15 +28,7 @@ class Frame:
     name: str = "the frame"  # what errors call it
 
     def __post_init__(self) -> None:
-        """Raises DataError for an image of another size or type; rows follow each other then."""
-        size = self.camera.height, self.camera.width
-        is_color = self.color.dtype is torch.uint8 and self.color.shape == (*size, 3)
-        if not is_color or self.depth_mm.is_floating_point() or self.depth_mm.shape != size:
-            found = (
-                f"color {self.color.dtype} {[*self.color.shape]}, depth_mm {self.depth_mm.dtype} "
-            )
-            advice = f"give uint8 and int32 images of {size}, or numpy's to Frame.of_images"
-            raise DataError(f"{self.name} has {found}{[*self.depth_mm.shape]}: {advice}")
+        """Rows follow each other: compiled functions would be compiled anew for another order."""
         object.__setattr__(self, "color", self.color.contiguous())
         object.__setattr__(self, "depth_mm", self.depth_mm.contiguous())
 

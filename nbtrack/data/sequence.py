@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Integer, Real, UInt8, UInt16
+from jaxtyping import Float, Int, UInt8, UInt16
 
 from nbtrack.core.arrays import Poses, Position, check_array
 from nbtrack.core.bounds import SceneBounds
@@ -42,12 +42,10 @@ class RgbdSequence:
 
     def __post_init__(self) -> None:
         """Raises DataError for an array whose type or shape is not that of its fellows."""
-        n, size = len(self.frame_ids), (self.intrinsics.height, self.intrinsics.width)
+        n, size = len(self.colors), (self.intrinsics.height, self.intrinsics.width)
         check_array("colors", self.colors, (n, *size, 3), [UInt8], "uint8")
         check_array("depths_mm", self.depths_mm, (n, *size), [UInt16], "uint16")
         check_array("T_world_camera", self.T_world_camera, (n, 4, 4), [Float], "floating point")
-        check_array("frame_ids", self.frame_ids, (n,), [Integer], "whole numbers")
-        check_array("times", self.times, (n,), [Real], "numbers")
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -85,14 +83,8 @@ class RgbdSequence:
         return digest.hexdigest()
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
-        """The sequence of some of the frames, in the order given; slices copy nothing.
-
-        Raises DataError where there are no such frames.
-        """
-        try:
-            return replace(self, **{name: getattr(self, name)[indices] for name in ARRAYS})
-        except (IndexError, TypeError) as error:
-            raise DataError(f"{self!r} has no frames {indices!r:.80} ({error})") from None
+        """The sequence of some of the frames, in the order given; slices copy nothing."""
+        return replace(self, **{name: getattr(self, name)[indices] for name in ARRAYS})
 
 
 def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:

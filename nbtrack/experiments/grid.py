@@ -6,6 +6,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from nbtrack.experiments.jobs import Execution, run_jobs
@@ -81,18 +82,19 @@ def track_scenes(
     if steps is not None and (rates_hz is not None or clock):
         advice = "a frame has one budget; leave steps, or rates_hz and clock, out"
         raise ConfigError(f"steps={steps} beside rates_hz={rates_hz}, clock={clock}: {advice}")
-    rates = rates if steps is None else [None]
+    # Numbers of numpy become Python's.
+    rates = np.asarray(rates).tolist() if steps is None else [None]
+    seeds = [whole_number("seed", seed) for seed in seeds]
     frames = preset.scenes.track_frames if frames is None else str(frames)
     pairs = [*zip(scenes, tracked, strict=True)]  # the mapped scene and the tracked one
     jobs, rows = [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
         settings = own.tracking_of(method.tracker)
-        is_counted = steps is None and not clock
-        n_steps = method.paper_steps(rate_hz) if is_counted else steps  # None by the clock
-        clock_rate_hz = rate_hz if clock else None
+        n_steps = steps if rate_hz is None or clock else method.paper_steps(rate_hz)
+        clock_rate_hz = rate_hz if clock else None  # whose number of steps is None
         make_budget(n_steps, clock_rate_hz)  # raises for a wrong number, before anything is made
-        made = MapJob.of(scene, method.field, own, seed=whole_number("seed", seed))
+        made = MapJob.of(scene, method.field, own, seed=seed)
         job = TrackJob(made, seen, method.tracker, settings, n_steps, clock_rate_hz, frames, seed)
         jobs.append(job)
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
@@ -104,10 +106,8 @@ def _check_scenes(**lists: Sequence[Scene]) -> None:
     """Raises ConfigError for an argument that is no list of scenes."""
     check_lists(at_least=1, **lists)
     for name, scenes in lists.items():
-        for scene in scenes:
-            if not isinstance(scene, Scene):
-                advice = "give what open_scene or open_scenes has returned"
-                raise ConfigError(f"{name} holds {scene!r:.60}, which is no scene: {advice}")
+        if not all(isinstance(scene, Scene) for scene in scenes):
+            raise ConfigError(f"{name} = {scenes!r:.80}: give what open_scenes has returned")
 
 
 def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[str, Any]:

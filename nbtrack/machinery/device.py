@@ -79,10 +79,12 @@ def usual_modes() -> Iterator[None]:
     one of the whole process, and stays: types are named where tensors are made.
     """
     is_usual = torch.get_default_device().type == "cpu"  # to say so again would slow every call
-    with contextlib.nullcontext() if is_usual else torch.device("cpu"):
-        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
-            with torch.inference_mode(False), torch.enable_grad():
-                yield
+    with (
+        contextlib.nullcontext() if is_usual else torch.device("cpu"),
+        torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False),
+        torch.inference_mode(False), torch.enable_grad(),
+    ):  # fmt: skip
+        yield
 
 
 def matrix_products(tf32: bool) -> contextlib.AbstractContextManager[None]:

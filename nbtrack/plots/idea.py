@@ -42,9 +42,8 @@ def plot_idea(
     point_camera = points_camera[(in_row[1] - column).abs().argmin()]
     distance = point_camera.norm().item()
     along = point_camera / distance
-    left = along * along[0] - along.new_tensor(
-        [1.0, 0, 0]
-    )  # minus x, without its part along the ray
+    x_camera = along.new_tensor([1.0, 0, 0])
+    left = along * along[0] - x_camera  # minus x, without its part along the ray
     page_camera = torch.stack([along, left / left.norm()])  # the page's axes, (2, 3)
     x = np.arange(-_BEFORE, distance + _BEHIND, _STEP)
     places = np.stack(np.meshgrid(x, np.arange(-_ASIDE, _ASIDE + _STEP, _STEP)), axis=-1)
@@ -72,9 +71,7 @@ def _draw_samples(axes: Axes, field: LearnedField, pose: Tensor, point_camera: T
     `pose` is the camera's (camera to world, m). Distances on the page are along the ray, not z.
     """
     direction = point_camera[None] / point_camera[2]  # of z = 1 in the camera, so that depth is z
-    not_used = torch.zeros(
-        1, 3, dtype=torch.float32
-    )  # for observed colour and depth, which rendering does not ask for
+    not_used = pose.new_zeros(1, 3)  # observed colour and depth, which rendering does not ask for
     rays = Rays(pose[None, :3, 3], direction @ pose[:3, :3].T, not_used, not_used[:, 0])
     with torch.no_grad():
         depths = field.hierarchical_depths(rays, _N_STRATIFIED, _N_IMPORTANCE)

@@ -20,14 +20,16 @@ def tracker_class(name: str) -> type[Tracker]:
     return look_up_kind("tracker", name, TRACKERS, ["name"])
 
 
-def check_pair(tracker_name: str, field: str | type) -> None:
+def check_pair(tracker_name: str, field: str | Field) -> None:
     """Raises ConfigError if a tracker or a field is unknown, or they do not go together.
 
     MissingError, if a package that the tracker needs is not installed.
     """
     tracker = tracker_class(tracker_name)
-    kind = field_class(field) if isinstance(field, str) else field
-    if not (issubclass(kind, Field) and tracker.works_in(kind)):
+    kind = field_class(field) if isinstance(field, str) else type(field)
+    # Of the grid of a density only the object itself says that it holds no distance.
+    is_grid = isinstance(field, Field) and kind.is_distance > field.is_distance
+    if not issubclass(kind, Field) or is_grid or not tracker.works_in(kind):
         fits = ", ".join(name for name, other in FIELDS.items() if tracker.works_in(other))
         named = getattr(kind, "name", kind.__name__)
         mismatch = f"tracker {tracker_name!r} does not work on field {named!r}"
@@ -50,5 +52,5 @@ def make_tracker(
     The arguments are those of `Tracker`. Raises ConfigError or MissingError as `check_pair` does,
     and DataError for a pose that is none.
     """
-    check_pair(name, type(field))
+    check_pair(name, field)
     return tracker_class(name)(field, T_world_camera, budget, settings, seed)

@@ -131,8 +131,8 @@ def paper_steps(tracker: str, rate_hz: Number) -> float:
     at_100, at_500 = look_up("tracker of the paper", tracker, _MEASURED_STEPS)
     steps = round(at_100 + (at_500 - at_100) * (budget_ms - 100) / 400, 6)
     if steps < _FEWEST:
-        found = f"rate_hz is {rate_hz:g}: the paper's hardware takes no step of {tracker} in "
-        raise ConfigError(f"{found}{budget_ms:g} ms; take a lower rate, or say how many steps")
+        found = f"rate_hz is {rate_hz:g}: the paper's hardware takes no step of {tracker}"
+        raise ConfigError(f"{found}; take a lower rate, or say how many steps")
     return steps
 
 

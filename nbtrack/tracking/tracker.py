@@ -82,20 +82,14 @@ class Tracker(abc.ABC):
         """Begin in a map, from a pose before the first frame (m), with a budget of its own.
 
         Field and budget are copied: they stay as they are, whatever becomes of the user's. Raises
-        ConfigError for a setting that is not allowed, an unknown motion model, or a field in which
-        it does not work; DataError for a pose that is not rigid.
+        ConfigError for a setting that is not allowed or an unknown motion model, DataError for a
+        pose that is not rigid.
         """
         self.settings = checked(settings or self.Settings(), self.Settings)
-        kind = type(field)
-        # Of the grid of a density only the object itself says that it holds no distance.
-        if not self.works_in(kind) or kind.is_distance > field.is_distance:
-            mismatch = f"tracker {self.name!r} does not work in {field.label}"
-            raise ConfigError(f"{mismatch}: give a field of another kind, as that of another map")
         self.field = self.prepare(deepcopy(field)).eval().requires_grad_(False)
         self.device = self.field.device
         self.budget = copy(budget)
-        seed = whole_number("seed", seed)
-        self.generator = torch.Generator(self.device).manual_seed(seed)
+        self.generator = torch.Generator(self.device).manual_seed(whole_number("seed", seed))
         self._is_warm = False
         self.restart(T_world_camera)
 
