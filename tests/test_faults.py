@@ -146,6 +146,11 @@ ARGUMENTS = {
     "of nobody's home": (["track", "~no_such_user/rec"], "no such user"),
     "unknown method": (["track", "living_room", "--method", "corected"], "mean 'corrected'"),
     "a method in another map": ([*GIVEN[:2], "--method", "vr", "--map-from", "map"], "not 'imap'"),
+    "a plain map": (
+        [*GIVEN[:2], "--method", "neus_corrected", *GIVEN[-1:], "map"],
+        "a corrected map",
+    ),
+    "nobody's folder": ([*OWN, "--out", "~nobody_of_this_name/run"], "names no user"),
     "tracker not the map's": ([*GIVEN, "map", "--tracker", "icp"], "does not work on field 'neus'"),
     "steps that are none": ([*OWN, "--steps", "nan"], "steps_per_frame is nan"),
     "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames out"),

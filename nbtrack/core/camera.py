@@ -30,12 +30,9 @@ class Intrinsics:
         """Raises ConfigError for a size or a focal length that no camera has."""
         for name in ("width", "height"):
             whole_number(f"a camera's {name}", getattr(self, name), minimum=1)
-        if not (
-            min(self.fx, self.fy) > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()
-        ):
-            raise ConfigError(
-                f"{self} is no camera: fx and fy must be positive, all finite (pixels)"
-            )
+        lengths = self.fx, self.fy, self.cx, self.cy
+        if not (min(lengths[:2]) > 0 and np.isfinite(lengths).all()):
+            raise ConfigError(f"{self} is no camera: give finite pixels, fx and fy above 0")
 
     @classmethod
     def from_focal(cls, width: int, height: int, focal: float) -> "Intrinsics":
