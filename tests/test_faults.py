@@ -104,6 +104,7 @@ MESH = ["export", "map", "--to", "glb", "m.glb"]
 MAKE = ["data", "make", "office", "--out", "new"]
 OTHER = [*OWN, "--seed", "9"]  # whose map is not made: what is refused must not make it first
 NO_STEPS = [*OWN[:4], "--field", "neus"]
+PLAIN = [*GIVEN[:2], "--method", "neus_corrected"]
 CUT = "not a readable checkpoint"
 TRAJECTORY, MAP_FILE, RUN = "run/trajectory.txt", "map/map.safetensors", "run/metrics.json"
 ROW = "0.1 1 2 3 0 0 0 1"
