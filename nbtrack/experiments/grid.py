@@ -27,7 +27,7 @@ from nbtrack.tracking.trajectories import Trajectory
 
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
     """The map of a scene, from the cache or made now."""
-    _check_scenes(scene=[scene])
+    _pairs([scene], [scene])
     job = MapJob.of(scene, field, preset, seed=whole_number("seed", seed))
     run_jobs([job])
     return job.map()
@@ -38,7 +38,7 @@ def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -
 
     Maps that are not cached are made. Raises ConfigError where scenes or fields are no lists.
     """
-    _check_scenes(scenes=scenes)
+    _pairs(scenes, scenes)
     check_lists(at_least=1, fields=fields)
     jobs = [MapJob.of(scene, field, preset) for field, scene in product(fields, scenes)]
     rows = []
@@ -73,20 +73,11 @@ def track_scenes(
     ate_m (NaN if unknown), failure (why). Raises ConfigError for a list that is none, and for
     steps beside a rate or the clock; as jobs do.
     """
-    rates = preset.tables.rates_hz if rates_hz is None else rates_hz
-    tracked = scenes if tracked is None else tracked
-    _check_scenes(scenes=scenes, tracked=tracked)
-    check_lists(at_least=1, methods=methods, rates_hz=rates, seeds=seeds)
-    if len(tracked) != len(scenes):
-        raise ConfigError(f"{len(tracked)} tracked for {len(scenes)} scenes: give one for each")
-    if steps is not None and (rates_hz is not None or clock):
-        advice = "a frame has one budget; leave steps, or rates_hz and clock, out"
-        raise ConfigError(f"steps={steps} beside rates_hz={rates_hz}, clock={clock}: {advice}")
-    # Numbers of numpy become Python's.
-    rates = np.asarray(rates).tolist() if steps is None else [None]
+    pairs = _pairs(scenes, scenes if tracked is None else tracked)
+    rates = _rates(preset.tables.rates_hz, rates_hz, steps, clock)
+    check_lists(at_least=1, methods=methods, seeds=seeds)
     seeds = [whole_number("seed", seed) for seed in seeds]
     frames = preset.scenes.track_frames if frames is None else str(frames)
-    pairs = [*zip(scenes, tracked, strict=True)]  # the mapped scene and the tracked one
     jobs, rows = [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
@@ -102,12 +93,24 @@ def track_scenes(
     return pd.DataFrame(map(_row_of, rows, _run(jobs, clock, execution or Execution())))
 
 
-def _check_scenes(**lists: Sequence[Scene]) -> None:
-    """Raises ConfigError for an argument that is no list of scenes."""
-    check_lists(at_least=1, **lists)
-    for name, scenes in lists.items():
-        if not all(isinstance(scene, Scene) for scene in scenes):
-            raise ConfigError(f"{name} = {scenes!r:.80}: give what open_scenes has returned")
+def _pairs(scenes: Sequence[Scene], tracked: Sequence[Scene]) -> list[tuple[Scene, Scene]]:
+    """Each mapped scene and the tracked one. Raises ConfigError for other lists."""
+    check_lists(at_least=1, scenes=scenes, tracked=tracked)
+    if not all(isinstance(scene, Scene) for scene in (*scenes, *tracked)):
+        raise ConfigError(f"scenes = {[*scenes]!r:.80}: give what open_scenes has returned")
+    if len(tracked) != len(scenes):
+        raise ConfigError(f"{len(tracked)} tracked for {len(scenes)} scenes: give one for each")
+    return [*zip(scenes, tracked, strict=True)]
+
+
+def _rates(usual_hz: Sequence, rates_hz: Sequence | None, steps: Any, clock: bool) -> list:
+    """The rates (Hz) of the cells, None where steps are given. Raises ConfigError for both."""
+    rates = usual_hz if rates_hz is None else rates_hz
+    check_lists(at_least=1, rates_hz=rates)
+    if steps is not None and (rates_hz is not None or clock):
+        advice = "a frame has one budget; leave steps, or rates_hz and clock, out"
+        raise ConfigError(f"steps={steps} beside rates_hz={rates_hz}, clock={clock}: {advice}")
+    return np.asarray(rates).tolist() if steps is None else [None]  # Python's numbers, not numpy's
 
 
 def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[str, Any]:
