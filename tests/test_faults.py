@@ -151,7 +151,7 @@ ARGUMENTS = {
         [*GIVEN[:2], "--method", "neus_corrected", *GIVEN[-1:], "map"],
         "a corrected map",
     ),
-    "nobody's folder": ([*OWN, "--out", "~nobody_of_this_name/run"], "names no user"),
+    "nobody's folder": ([*OWN, "--out", "~nobody_of_this_name/run"], "no such user"),
     "tracker not the map's": ([*GIVEN, "map", "--tracker", "icp"], "does not work on field 'neus'"),
     "steps that are none": ([*OWN, "--steps", "nan"], "steps_per_frame is nan"),
     "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames out"),
