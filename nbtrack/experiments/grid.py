@@ -18,7 +18,6 @@ from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.machinery.errors import ConfigError, NbtrackError, check_lists
 from nbtrack.machinery.files import absolute, runs_folder
 from nbtrack.machinery.progress import tell
-from nbtrack.machinery.settings import whole_number
 from nbtrack.mapping.files import Map
 from nbtrack.tracking import make_budget
 from nbtrack.tracking.methods import Methods, find_methods
@@ -28,7 +27,7 @@ from nbtrack.tracking.trajectories import Trajectory
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
     """The map of a scene, from the cache or made now."""
     _pairs([scene], [scene])
-    job = MapJob.of(scene, field, preset, seed=whole_number("seed", seed))
+    job = MapJob.of(scene, field, preset, seed=seed)
     run_jobs([job])
     return job.map()
 
@@ -70,32 +69,29 @@ def track_scenes(
         tracked: other recordings of the same rooms, in the same order, which no map has seen.
 
     Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), the metrics,
-    ate_m (NaN if unknown), failure (why). Raises ConfigError for a list that is none, and for
-    steps beside a rate or the clock; as jobs do.
+    ate_m (NaN if unknown), failure (why). Raises ConfigError first; as jobs do.
     """
-    pairs = _pairs(scenes, scenes if tracked is None else tracked)
+    pairs = _pairs(scenes, scenes if tracked is None else tracked, seeds)
     rates = _rates(preset.tables.rates_hz, rates_hz, steps, clock)
-    check_lists(at_least=1, methods=methods, seeds=seeds)
-    seeds = [whole_number("seed", seed) for seed in seeds]
     frames = preset.scenes.track_frames if frames is None else str(frames)
     jobs, rows = [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         own = preset.with_method(method.settings)
         settings = own.tracking_of(method.tracker)
         n_steps = steps if rate_hz is None or clock else method.paper_steps(rate_hz)
-        clock_rate_hz = rate_hz if clock else None  # whose number of steps is None
-        make_budget(n_steps, clock_rate_hz)  # raises for a wrong number, before anything is made
+        clock_hz = rate_hz if clock else None  # whose number of steps is None
+        make_budget(n_steps, clock_hz)  # raises for a wrong number, before anything is made
         made = MapJob.of(scene, method.field, own, seed=seed)
-        job = TrackJob(made, seen, method.tracker, settings, n_steps, clock_rate_hz, frames, seed)
+        job = TrackJob(made, seen, method.tracker, settings, n_steps, clock_hz, frames, made.seed)
         jobs.append(job)
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
         rows.append(row | {"seed": seed, "run": job.folder.name, "n_pixels": settings.n_pixels})
     return pd.DataFrame(map(_row_of, rows, _run(jobs, clock, execution or Execution())))
 
 
-def _pairs(scenes: Sequence[Scene], tracked: Sequence[Scene]) -> list[tuple[Scene, Scene]]:
-    """Each mapped scene and the tracked one. Raises ConfigError for other lists."""
-    check_lists(at_least=1, scenes=scenes, tracked=tracked)
+def _pairs(scenes: Sequence, tracked: Sequence, seeds: Sequence = (0,)) -> list[tuple]:
+    """Each mapped scene and the tracked one. Raises ConfigError for what are no such lists."""
+    check_lists(at_least=1, scenes=scenes, tracked=tracked, seeds=seeds)
     if not all(isinstance(scene, Scene) for scene in (*scenes, *tracked)):
         raise ConfigError(f"scenes = {[*scenes]!r:.80}: give what open_scenes has returned")
     if len(tracked) != len(scenes):

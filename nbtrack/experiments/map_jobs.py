@@ -19,6 +19,7 @@ from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import field_class
 from nbtrack.machinery.device import choose_device
 from nbtrack.machinery.files import absolute, fingerprint
+from nbtrack.machinery.settings import whole_number
 from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.plots.scene import up_of
@@ -55,7 +56,8 @@ class MapJob(Job):
     def of(cls, scene: Scene, field: str, preset: Preset, frames: str = ":", seed: int = 0) -> Self:
         """The map of a scene with the settings of a preset."""
         network, settings = preset.network_of(field), preset.mapping_of(field)
-        return cls(scene, field, network, settings, frames, seed, preset.correction.get(field, 0.0))
+        seed, voxel = whole_number("seed", seed), preset.correction.get(field, 0.0)
+        return cls(scene, field, network, settings, frames, seed, voxel)
 
     @classmethod
     def of_given(cls, path: Path) -> Self:

@@ -61,7 +61,7 @@ def find_methods(methods: Methods) -> list[Method]:
     together.
     """
     chosen = []
-    check_lists(methods=methods)
+    check_lists(at_least=1, methods=methods)
     for named in dict.fromkeys(methods):  # each once
         method = look_up("method", named, METHODS) if isinstance(named, str) else named
         check_pair(method.tracker, method.field)
