@@ -139,12 +139,9 @@ def plot_map_and_slice(
     axes = new_axes(title, 4.2)[0, 0]
     to_page = scene.draw_mesh(axes, mesh, up)[:2]
     axes.set_axis_off()
-    level = np.eye(3)[up == 0]  # the two level axes of the world
-    height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
     paths = np.concatenate([path[:, :3, 3] for path in T_paths.values()])
-    shown = np.concatenate([mesh.bounds, paths]) @ level.T  # a path may lead beyond what was seen
-    low, high = shown.min(axis=0) - voxel, shown.max(axis=0) + 2 * voxel
-    points, _ = _level_grid(level, low, high, voxel, height * up)
+    height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
+    points = _level_points(np.concatenate([mesh.bounds, paths]), voxel, up, height)
     parts = {"Mesh: the zero level": mesh.vertices}
     parts |= {"Slice at the cameras' height; grey: never seen": points, "The path, larger": paths}
     on_page = mesh.vertices @ to_page.T
@@ -168,6 +165,17 @@ def plot_map_and_slice(
         corner = corner + np.array([zoom * extent[0] + gap, 0])
     axes.figure.set_figheight(1.5 + WIDTH * axes.dataLim.height / axes.dataLim.width)
     return axes.figure
+
+
+def _level_points(shown: np.ndarray, step: float, up: np.ndarray, height: float) -> np.ndarray:
+    """Points (rows, columns, 3; m, world frame) of a level plane, where some points (m) lie.
+
+    Of those `shown` may be paths, which lead beyond what was seen.
+    """
+    level = np.eye(3)[up == 0]  # the two level axes of the world
+    places = shown @ level.T
+    low, high = places.min(axis=0) - step, places.max(axis=0) + 2 * step
+    return _level_grid(level, low, high, step, height * up)[0]
 
 
 def _draw_scale(axes: Axes, x: float, y: float, gap: float, zoom: float, extent: float) -> None:
