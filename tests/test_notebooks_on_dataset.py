@@ -19,7 +19,7 @@ SETTINGS = """
     mapping.neus_plus.iterations=100 mapping.neus_plus.n_rays=32
     mapping.neus_plus.n_surface_points=128 scenes.track_frames=20:26
     tracking.vr.n_pixels=16 tracking.sdf.n_pixels=64 tracking.lm.n_pixels=128
-    tables.pixels.vr=[8] tables.pixels.sdf=[16]
+    tables.pixels.vr=[16] tables.pixels.sdf=[64]
 """
 
 
