@@ -87,7 +87,8 @@ def _authors(text: str) -> str:
     braces = re.sub(r"\\.", "", text)
     if braces.count("{") != braces.count("}"):
         return _plain(text)
-    return _AUTHORS.sub(lambda found: found[1] or _SPECIAL[found[0]], text)
+    escaped = _AUTHORS.sub(lambda found: found[1] or _SPECIAL[found[0]], text)
+    return re.sub(r"(?<!\\)[%&#]", r"\\\g<0>", escaped)  # those of formulas
 
 
 def label_of(text: str) -> str:

@@ -268,6 +268,7 @@ def test_latex_for_a_paper(tmp_path: Path) -> None:
         (r"\emph{50\% of} $x_1^2$, 5$ each", r"\emph{50\% of} $x_1^2$, 5\$ each"),
         (r"see \ref{tab:a_b}, \cite{x_y} in \textbf{R_1} ^", None),
         ("a { brace", r"a \{ brace"),
+        ("$50% & x$", r"$50\% \& x$"),
         ("two\n\nparagraphs\\", r"two paragraphs\textbackslash{}"),
     ],
 )
