@@ -72,7 +72,8 @@ def plot_distances(frame: Frame, distances: Curves, title: str = "") -> Figure:
     rows, columns = frame.measured_pixels().cpu().numpy()
     panels = [("observed colour", frame.color.cpu().numpy(), "")]
     for label, sdf in distances.items():
-        image_cm = np.ma.masked_all(frame.depth_mm.shape)
+        # `masked_all` leaves its memory as it is, of which drawing may warn.
+        image_cm = np.ma.array(np.zeros(frame.depth_mm.shape), mask=True)
         image_cm[rows, columns] = 100 * sdf.abs().cpu().numpy()
         panels.append((f"{label}: mean {image_cm.mean():.1f} cm", image_cm, DISTANCE))
     return plot_images([panels], title)
