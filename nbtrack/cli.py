@@ -139,8 +139,9 @@ class Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status.
 
-    It is 0, or 2 after a user's mistake, 130 after Ctrl-C, and 1 where whoever read the output has
-    closed it. With `NBTRACK_DEBUG` set, the traceback of a mistake or of Ctrl-C is printed too.
+    It is 0, or 2 after a user's mistake, 130 after Ctrl-C, and 1 where `data check` finds a
+    recording wrong, or whoever read the output has closed it. With `NBTRACK_DEBUG` set, the
+    traceback of a mistake or of Ctrl-C is printed too.
     """
     sys.stdout = _writable(sys.stdout)
     sys.stderr = _writable(sys.stderr)
@@ -152,9 +153,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             importlib.import_module("nbtrack.machinery.registry").import_own(source)
         module = _MODULES.get(options.command, "commands")
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
-        getattr(commands, f"{options.command}_command")(options)
+        status = getattr(commands, f"{options.command}_command")(options)
         print(end="", flush=True)  # a closed pipe is found here, not after the return
-        return 0
+        return status or 0
     except BrokenPipeError:  # whoever read the output, as `head` does, has enough
         for descriptor in (1, 2):  # stdout and stderr: what Python flushes at its end goes nowhere
             os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)

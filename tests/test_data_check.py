@@ -93,7 +93,7 @@ def test_facts(box: Path) -> None:
     report = check(box)
     assert report.warnings == []
     assert report.best.reading.declared.camera_axes == "opengl"
-    assert report.best.median_m < 0.02
+    assert report.best.apart < 0.01
     assert report.best.overlap > 0.5
     lines = str(report).splitlines()
     assert "48.00 and 48.00 px (67.4 deg wide), principal point (32, 24)" in lines[1]
@@ -114,7 +114,7 @@ ONE_WARNING = {
     "still": (walk(8, 0.0, 0.0), 1.0, NOT_PROVED + "the camera moves too little to tell"),
     "one frame": (walk(1), 1.0, NOT_PROVED + "two frames see too little of the same"),
     "turned away": (walk(6, 0.03, 120.0), 1.0, NOT_PROVED + "two frames see too little of"),
-    "no convention": (walk(N_FRAMES), 2.0, "no other convention fits: check focal.txt, the depth"),
+    "no convention": (walk(N_FRAMES), 2.0, "nothing that is tried explains it: no other axes"),
     "jump": (off(*range(8, N_FRAMES), metres=0.5), 1.0, "1 of 16 poses .* 25 cm .*img[78].png"),
     "outliers": (off(3, 8, 12), 1.0, "3 of 16 poses lie up to .*, first img3.png"),
 }
@@ -127,7 +127,8 @@ def test_one_warning(tmp_path: Path, case: str) -> None:
     report = check(write_box(tmp_path / "box", poses, scale))
     assert report.best is report.conventions[0]
     assert len(report.warnings) == 1
-    assert re.search(f"  warning: .*{says}", str(report))
+    assert re.search(f"  verdict: .*{says}", str(report))
+    assert ("  start with: python -m nbtrack track " in str(report)) != bool(report.faults)
 
 
 def test_a_unit_that_only_the_depth_tells(tmp_path: Path) -> None:
@@ -148,7 +149,7 @@ def test_frames_without_pose(box: Path, tmp_path: Path) -> None:
     rewrite_poses(box, poses)
     report = check(box)
     assert len(report.frames) == 13
-    assert report.best.median_m < 0.02
+    assert report.best.apart < 0.01
     assert report.frames.moved_mm.max() == pytest.approx(MOVED_MM)
     assert report.frames.turned_deg.max() == pytest.approx(TURNED_DEG)
     rewrite_poses(box, np.full((N_FRAMES, 4, 4), np.nan))
@@ -177,7 +178,7 @@ def test_a_long_recording_is_read_in_parts(tmp_path: Path, monkeypatch) -> None:
     assert sizes == [8, 8, 4]
     assert report.frames.equals(whole.frames)
     assert list(report.frames.index[report.frames.is_repeated]) == [8]
-    assert report.conventions[0].median_m == whole.conventions[0].median_m
+    assert report.conventions[0].apart == whole.conventions[0].apart
     assert report.best.name == whole.best.name
 
 
@@ -206,7 +207,7 @@ def test_far_outliers(tmp_path: Path) -> None:
     assert np.array_equal(sequences[0].depths_mm, read_sequence(right).depths_mm)
     sizes = [np.array([b.minimum, b.maximum]) for b in map(observed_bounds, sequences)]
     np.testing.assert_allclose(*sizes, atol=0.03)
-    (told,) = (text for text in check(far).warnings if "outliers" in text)
+    (told,) = (text for text in check(far).remarks if "outliers" in text)
     assert float(told.split("%")[0]) / 100 == pytest.approx(share, rel=0.5)
 
 
@@ -247,12 +248,21 @@ def turned(*axes: int) -> Change:
     return depth(lambda d: np.flip(d, axes).copy())
 
 
+def mixed(data: Source) -> Source:
+    """Rotations world-to-camera beside the camera's own place."""
+    wrong = data.poses.copy()
+    wrong[:, :3, :3] = data.poses[:, :3, :3].mT
+    return data._replace(poses=wrong)
+
+
 INVERSE = "world-to-camera"
 MISTAKES = [
     *(
-        Case(re.escape(axes_name(axes, way)) + "; set ", change=poses(axes, way))
+        Case(
+            re.escape(axes_name(axes, way)) + "(, or the images.*)?; set ", change=poses(axes, way)
+        )
         for way in ("camera-to-world", INVERSE)
-        for axes in AXES
+        for axes in (*AXES[:4], *AXES[4::9])
         if (axes, way) != ("opencv", "camera-to-world")
     ),
     Case('OpenCV axes .*; set camera_axes = "opencv" in', 'camera_axes = "opengl"'),
@@ -271,8 +281,9 @@ MISTAKES = [
     Case("one for images half as large; set", change=camera(0.5, 0.5)),
     Case("ones in millimetres; multiply .* by 0.001 ", change=positions(lambda t: 1000 * t)),
     Case("ones in centimetres; multiply .* by 0.01 ", change=positions(lambda t: 100 * t)),
-    Case(".*; or the depth images are turned against", change=turned(1)),
-    Case(".*; or the depth images are turned against", change=turned(1, 2)),
+    Case(".*, or the images, or those of depth alone, are turned", change=turned(1)),
+    Case(".*, or the images, or those of depth alone, are turned", change=turned(1, 2)),
+    Case(".* whose rotations alone are of the other direction; transp", change=mixed),
 ]
 RIGHT = [
     Case("", f'camera_axes = "{axes}"\nposes = "{direction}"', poses(axes, direction))
@@ -340,12 +351,13 @@ def test_key_frames_far_apart(tmp_path: Path) -> None:
 
 
 def test_command_prints_the_sentence_and_draws(tmp_path: Path, capsys) -> None:
-    """Catches a picture that is not written, or written into the recording's folder."""
+    """Catches a picture that is not written, or written into the recording's folder, and a status
+    by which a script goes on."""
     folder = write(tmp_path / "r", "office", Case("", change=poses("opengl")))
     before = sorted(folder.rglob("*"))
     for _ in range(2):  # its own picture is drawn anew
-        assert main(["data", "check", str(folder), "--out", str(tmp_path / "out")]) == 0
-    assert "warning: your poses look like OpenGL axes" in capsys.readouterr().out
+        assert main(["data", "check", str(folder), "--out", str(tmp_path / "out")]) == 1
+    assert "verdict: wrong, because your poses look like OpenGL axes" in capsys.readouterr().out
     assert (tmp_path / "out/check.png").stat().st_size > 5000
     assert sorted(folder.rglob("*")) == before
 

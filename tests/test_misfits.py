@@ -1,6 +1,7 @@
 """Small misfits of recordings: each must be told with its size, and none where there is none."""
 
 import re
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from recordings import (
     depth,
     positions,
     real,
+    short,
     source,
     with_noise,
     write_matrices,
@@ -71,25 +73,70 @@ def of_elsewhere(colors: np.ndarray) -> np.ndarray:
     return np.stack([cv2.resize(image, colors.shape[2:0:-1]) for image in others])
 
 
+def cropped(data: Source) -> Source:
+    """Columns and rows off the left and the top, the camera as it was for the whole image."""
+    left, top = data.camera.width // 12, data.camera.height // 16
+    kept = (slice(None), slice(top, None), slice(left, None))
+    size = {"width": data.camera.width - left, "height": data.camera.height - top}
+    return Source(data.colors[kept], data.depths_mm[kept], data.poses, replace(data.camera, **size))
+
+
+def beside(*metres: float) -> Change:
+    """Poses of a marker from where the camera is so far to the right, below and before."""
+    T_marker_camera = np.eye(4)
+    T_marker_camera[:3, 3] = metres
+    return lambda data: data._replace(poses=data.poses @ np.linalg.inv(T_marker_camera))
+
+
+def fill(value: int, share: float) -> Change:
+    """The farthest so many of the depths as a value that means none."""
+    return depth(lambda d: np.where(d > np.quantile(d[d > 0], 1 - share), value, d))
+
+
+def of_disparity(depths: np.ndarray) -> np.ndarray:
+    return np.where(depths > 0, 1.7e6 / np.maximum(depths, 100), 0)
+
+
+def scaled_by_itself(depths: np.ndarray) -> np.ndarray:
+    return depths * (3000 / depths.max(axis=(1, 2), keepdims=True))
+
+
+def through_a_lens(data: Source) -> Source:
+    """Images of a lens with k1 = -0.3 that nobody has corrected."""
+    c, k1 = data.camera, [-0.3, 0, 0, 0]
+    K = np.array([[c.fx, 0, c.cx - 0.5], [0, c.fy, c.cy - 0.5], [0, 0, 1]])
+    pixels = np.indices((c.height, c.width))[::-1].reshape(2, -1).T.astype(np.float32)
+    at = cv2.undistortPoints(pixels, K, np.array(k1), P=K).reshape(c.height, c.width, 2)
+    images = (np.stack([cv2.remap(i, at, None, cv2.INTER_NEAREST) for i in images])
+              for images in (data.colors, data.depths_mm))  # fmt: skip
+    return Source(*images, data.poses, c)
+
+
+NO_DEPTH = "of the depths are"
 # What is said begins so; of numbers in braces the first must be as near as the second says.
 CASES: dict[str, tuple[Change, str, float, float]] = {
     "depth one frame late": (depth(lambda d: late(d, 1)), "depth comes after", 1, 0.2),
     "poses one frame late": (
         lambda data: data._replace(poses=late(data.poses, 1)), "depth comes after", -1, 0.2
     ),
+    "depth five frames late": (depth(lambda d: late(d, 5)), "depth comes after", 5, 0.3),
     "focal length 5 % short": (camera(0.95), "focal lengths should change", 5.26, 0.7),
+    "focal length 20 % long": (camera(1.2), "focal lengths should change", -16.7, 0.7),
+    "camera of another": (camera(1.15, 1.06), "the calibration is another camera's", -13, 1),
+    "images cropped": (cropped, "the principal point should move", -9.1, 0.5),
+    "camera beside a marker": (beside(0.1, 0, 0), "the camera lies beside .* of, x", 0.1, 0.02),
+    "camera before it": (beside(0, 0, 0.2), "the camera lies beside .* of, .* m, z", 0.2, 0.03),
     "depth 5 % long": (depth(lambda d: 1.05 * d), "depths should change", -4.76, 1),
-    "depth growing by 4 %": (
-        depth(lambda d: d * (1 + 0.04 * line(len(d))[..., None])), "depths grow", 4, 1.2
-    ),
     "positions times 0.9": (positions(lambda t: 0.9 * t), "depths should change", -10, 1),
-    "positions off by 1 cm": (positions(lambda t: t + noise(t)), "positions scatter", 0.016, 0.003),
+    "positions times 1.27": (positions(lambda t: 1.27 * t), "depths should change", 27, 2),
+    "a quadratic error": (short(0.004), "depths are short by a quadratic", 0.004, 0.0015),
+    "depth 8 cm long": (depth(lambda d: d + 80 * (d > 0)), "depths are short by", -0.08, 0.015),
+    "none is 10000": (fill(10000, 0.3), f"30% {NO_DEPTH} 10000.*no_depth =", 10000, 0),
+    "none is 1": (fill(1, 0.1), f"10% {NO_DEPTH} 1, .*no_depth =", 1, 0),
+    "none is in between": (fill(1500, 0.1), f"1.% {NO_DEPTH} 1500.*no_depth =", 1500, 0),
     "one pose off by 20 cm": (
         positions(lambda t: t + 0.2 * (np.arange(len(t)) == 60)[:, None] * [1, 0, 0]),
         "1 of .* poses lie up to", 20, 2,
-    ),
-    "poses drifting by 30 cm": (
-        positions(lambda t: t + 0.3 * line(len(t)) * [0, 1, 0]), "poses drift along y", 0.3, 0.05
     ),
     "every image five times": (
         lambda d: d._replace(colors=five_times(d.colors), depths_mm=five_times(d.depths_mm)),
@@ -100,28 +147,42 @@ CASES: dict[str, tuple[Change, str, float, float]] = {
         positions(lambda t: t / 1000), "your poses look like ones in kilometres; mul.* by", 1000, 0
     ),
     "black colours": (color(lambda c: 0 * c), "the colour images are black", 0, 0),
-    "mirrored colours": (color(lambda c: c[:, :, ::-1]), "colours alone are mirrored: yes", 0, 0),
+    "mirrored colours": (color(lambda c: c[:, :, ::-1]), "colours alone are mirrored", 0, 0),
     "colours 4 % to the right": (
-        color(lambda c: np.roll(c, round(c.shape[2] / 25), 2)), "colours lie too far right", 4, 1
+        color(lambda c: np.roll(c, round(c.shape[2] / 25), 2)), "colours lie", 4, 0
     ),
-    "colours three frames late": (color(lambda c: late(c, 3)), "colours come after depth", 3, 0.2),
+    "colours three frames late": (color(lambda c: late(c, 3)), "colours come", 3, 0),
     "colours of elsewhere": (color(of_elsewhere), "colours do not belong to the depth", 0, 0),
 }  # fmt: skip
+UNTOLD = "surfaces that two frames see lie .* nothing that is tried explains it"
+CASES |= {
+    name: (change, UNTOLD, 0, 0)
+    for name, change in {
+        "disparity": depth(of_disparity),
+        "half floats": depth(lambda d: (d / 1000).astype(np.float16).view(np.uint16)),
+        "each frame scaled by itself": depth(scaled_by_itself),
+        "swapped bytes": lambda data: data._replace(depths_mm=data.depths_mm.byteswap()),
+        "a lens": through_a_lens,
+        "positions off by 2 cm": positions(lambda t: t + 2 * noise(t)),
+        "poses drifting by 50 cm": positions(lambda t: t + 0.5 * line(len(t)) * [0, 1, 0]),
+    }.items()
+}
 SILENT = {
     "right": lambda data: data,
     "saturated depth": depth(saturated),
     "red for blue": color(lambda c: c[..., ::-1].copy()),  # which no pair of frames can tell
 }
 SOME = (
-    "depth one frame late", "focal length 5 % short", "depth 5 % long", "positions off by 1 cm",
-    "mirrored colours", "colours three frames late", "colours of elsewhere",
+    "depth one frame late", "focal length 5 % short", "images cropped", "camera beside a marker",
+    "depth 5 % long", "mirrored colours", "colours three frames late", "disparity",
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["living_room", "office", *REAL])
+@pytest.mark.parametrize("name", ["living_room", "real_room"])
 def test_each_is_told_with_its_size(tmp_path: Path, name: str) -> None:
     """Catches misfits that pass without a word, that are taken for others, and wrong sizes; of some
-    also in other places, so that none is told in one synthetic room alone."""
+    also in another place, so that none is told in one synthetic room alone. What is not among the
+    causes must have none of their names."""
     wrong = {}
     for number, case in enumerate(CASES if name == "living_room" else SOME):
         change, says, size, within = CASES[case]
@@ -139,3 +200,24 @@ def test_nothing_is_told_of_right_recordings(tmp_path: Path, name: str) -> None:
     for case in SILENT if name in ("living_room", "real_room") else ["right"]:
         said = warnings_of(tmp_path / case, SILENT[case](recorded(name)))
         assert [text for text in said if name in REAL or "is not proved" not in text] == []
+
+
+def test_the_interval_holds_the_quadratic_error(tmp_path: Path) -> None:
+    """Catches an estimate of another error than the one that `depth_error_per_m` takes away, and an
+    interval that is too narrow."""
+    b, data = 0.0025, source("office", N_FRAMES, 1)
+    noise_mm = np.random.default_rng(0).normal(scale=8, size=data.depths_mm.shape)
+    noisy = depth(lambda d: np.where(d > 0, d + noise_mm, 0))(short(b)(data))
+    folder = write_matrices(tmp_path / "r", noisy)
+    low, high = interval(folder)
+    assert low < b < high < 2 * b
+    (folder / "sequence.toml").write_text(f"depth_error_per_m = {b}\n")
+    low, high = interval(folder)
+    assert low < 0 < high
+
+
+def interval(folder: Path) -> tuple[float, float]:
+    """That of the quadratic error that is left."""
+    misfits = check_recording(open_recording(folder)).misfits
+    (found,) = (m for m in misfits if m.cause.parts[0].key == "depth_error_per_m")
+    return found.low[0], found.high[0]

@@ -1,39 +1,33 @@
 """Validate a recording, and find from its own depth maps whether its numbers are read rightly."""
 
+import shlex
 import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from nbtrack.checks.conventions import PLAUSIBLE_DEPTH, Convention, diagnosis, fit_all
-from nbtrack.checks.misfits import MAX_SHIFT, MIN_CORRELATION, Misfit, find_misfits, main_misfit
-from nbtrack.checks.readings import FramePairs, Pairs, Reading, on_grid
+from nbtrack.checks import findings
+from nbtrack.checks.conventions import MIN_OVERLAP, Convention, fit_all
+from nbtrack.checks.misfits import CAUSES, Misfit, fit, main_misfits
+from nbtrack.checks.readings import FramePairs, Pairs, Reading, mean_apart, on_grid
 from nbtrack.core.arrays import Frames, Poses
 from nbtrack.data.sequence import ARRAYS, RgbdSequence
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.progress import ProgressBar
-from nbtrack.recordings.reading import FAR, far_limit, read_frames, select_frames
+from nbtrack.recordings.reading import far_limit, read_frames, select_frames
 from nbtrack.recordings.recording import Recording
 
 _FRAMES_AT_ONCE = 32  # 50 MB at 640x480
 _CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
 _N_PAIRS = 60  # of frames that are compared
-_QUICK_PAIRS = 6  # of frames that are compared in a quick look
+_QUICK_PAIRS = 16  # of frames that are compared in a quick look
 _MIN_FRAMES = 30  # without which pairs share too much to tell a small misfit
 _GAPS = (5, 10, 20, 40)  # frames between the two of a pair: they moved, and still see the same
 _TURNED_DEG = 60  # by which the camera may turn in between; more, and they see other things
 _CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
-# A pose is odd if it is off the middle of its neighbours by more than both: metres, and medians of
-# a step. Real recordings, and rooms thinned to every twentieth frame, have up to 1.1 medians.
-_OFF = 0.05
-_OFF_STEPS = 2.5
-_MIN_REPEATED = 0.05  # share of frames whose depth is that of the frame before, though they moved
-_MAX_STEP = 0.01  # share of the depth between depths that a camera can tell (our choice)
-_BLACK = 0.02  # brightness, in [0, 1]
 _PRINTED = ["measured", "brightness", "moved_mm", "turned_deg"]
 _XYZ = ["x", "y", "z"]
 
@@ -48,8 +42,22 @@ class DataReport:
     cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m); no outliers
     conventions: list[Convention]  # the declared one first
     best: Convention  # the declared one unless another is clearly better
-    misfits: list[Misfit]  # of depth and poses, then of colours; where conventions are right
-    warnings: list[str]  # what is wrong, each in a sentence; how numbers are read comes first
+    misfits: list[Misfit]  # what may be a little off; where there are frames enough to tell
+    faults: list[str]  # what is wrong, each in a sentence; how numbers are read comes first
+    doubts: list[str]  # why it cannot be told whether numbers are read rightly
+    remarks: list[str]  # what is worth knowing of a recording that is right
+
+    @property
+    def warnings(self) -> list[str]:
+        """All that is said of the recording, the gravest first."""
+        return self.faults + self.doubts + self.remarks
+
+    @property
+    def verdict(self) -> str:
+        """Whether the recording is read rightly."""
+        if self.faults:
+            return f"wrong, because {self.faults[0]}"
+        return f"cannot be told: {self.doubts[0]}" if self.doubts else "read rightly"
 
     def __str__(self) -> str:
         recording, cloud = self.recording, self.cloud
@@ -60,6 +68,8 @@ class DataReport:
         near, far = cloud.depth.quantile([0.01, 0.99])
         x, y, z = np.ptp(cloud[_XYZ].quantile(_CUT), axis=0)
         facts = self.frames[_PRINTED].agg(["mean", "min", "max"]).T
+        rows = [("  > (in use) ", own), *(("             ", rival) for rival in rivals)]
+        command = "data check" if self.faults else "track"
         lines = [
             f"{recording.name}: {recording.format.label}, {len(self.frames)} of {len(recording)} "
             f"frames have a pose, {c.width} x {c.height} px",
@@ -69,12 +79,17 @@ class DataReport:
             f"  depth: {near:.2f} to {far:.2f} m (1% and 99%)",
             f"  scene: {x:.2f} x {y:.2f} x {z:.2f} m",
             facts.to_string(float_format="{:10.2f}".format),
-            "  overlap of two frames' surfaces (median distance, share of points), read as",
-            *(f"{1e3 * r.median_m:12.1f} mm {r.overlap:5.0%}  {r.name}" for r in (own, *rivals)),
-            f"  misfits, as pairs of frames tell them (95 %): {len(self.misfits)} looked for",
-            *(f"    {misfit}" for misfit in self.misfits),
-            *(f"  warning: {text}" for text in self.warnings),
-            f"  start with: track {recording.folder}",
+            "  surfaces of two frames (mm apart in the mean, share of points), read as",
+            *(
+                f"{m}{1e3 * r.apart * r.depth_m:9.1f} mm {r.overlap:5.0%}  {r.name}"
+                for m, r in rows
+            ),
+            "  what may be off, fitted one by one (95 %), and mm apart then",
+            *(f"{1e3 * mean_apart(m.apart) * own.depth_m:12.1f} mm  {m}" for m in self.misfits),
+            *(f"  warning: {text}" for text in self.warnings if text not in self.verdict),
+            f"  verdict: {self.verdict}",
+            f"  {'then' if self.faults else 'start with'}: python -m nbtrack {command} "
+            f"{shlex.quote(str(recording.folder))}",
         ]
         return "\n".join(lines)
 
@@ -82,7 +97,7 @@ class DataReport:
 def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     """Read every frame of a recording and report what is there and whether it fits together.
 
-    Unless `is_whole`, only a few pairs of frames are read, in about a second. Raises what
+    Unless `is_whole`, only some pairs of frames are read, in a second or two. Raises what
     `read_frames` does, and DataError where the whole has no depth.
     """
     ids = select_frames(recording, slice(None))
@@ -90,30 +105,42 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     T_world_camera[:, :3, 3] -= recording.origin
     pairs = _pairs(T_world_camera, _N_PAIRS if is_whole else _QUICK_PAIRS)
     shown, kept = _kept(pairs, ids, is_whole)
-    sequence, frames = _read(recording, ids if is_whole else kept, kept)
+    sequence, frames, counts = _read(recording, ids if is_whole else kept, kept)
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     own = Reading(recording.declared, sequence.intrinsics)
+    shared = findings.shared_value(counts, len(frames))
+    sequence.depths_mm[sequence.depths_mm == shared] = 0
     seen = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(seen, own)
     cloud = _cloud(own, sequence.select(np.flatnonzero(np.isin(kept, ids[shown]))))
-    is_right = best is conventions[0]
-    misfits, correlation = [], np.nan
-    if is_right and is_whole and len(ids) >= _MIN_FRAMES:
-        misfits, correlation = find_misfits(seen, best.reading)
     is_far = cloud.depth > far_limit(cloud.depth)
-    warnings = list(_of_depth_images(frames, cloud, recording))
-    main = main_misfit(misfits)  # replaces a diagnosis, which would not say why surfaces lie apart
-    needs_proof = is_whole and not warnings  # that the camera moves enough to prove poses
-    warnings.append(main or diagnosis(conventions, best, recording, needs_proof))
-    if is_right:  # else poses and depths mean something else than is judged here
-        warnings += [*_of_poses(frames, recording), *_of_depths(cloud.depth, is_far)]
-    if not main:
-        warnings += _of_colors(frames.brightness, correlation)
+    is_own = best is conventions[0]  # else poses and depths mean something else than is judged
+    is_told = is_own and len(ids) >= _MIN_FRAMES and best.overlap >= MIN_OVERLAP
+    misfits = _misfits(seen, own) if is_told else []
+    faults = list(findings.of_depth_images(frames, shared, counts, recording))
+    main = main_misfits(seen, own, misfits)
+    wrong = findings.misreading(conventions[0], best, main)
+    faults += [wrong] if wrong else findings.of_poses(frames, recording) if is_own else []
+    faults += findings.of_colors(seen, own, frames.brightness, is_told and is_whole and not faults)
+    faults += findings.of_units(cloud.depth[~is_far]) if is_own else []
+    depths = frames, cloud.depth, is_far, recording
+    remarks = list(findings.remarks_on_depths(*depths)) if is_own else []
+    doubt = "" if faults else findings.doubt_of_poses(conventions, recording, is_whole)
     return DataReport(
         recording, frames, T_world_camera, cloud[~is_far], conventions=conventions, best=best,
-        misfits=misfits, warnings=[text for text in warnings if text],
+        misfits=misfits, faults=faults, doubts=[doubt] if doubt else [], remarks=remarks,
     )  # fmt: skip
+
+
+def _misfits(seen: FramePairs, own: Reading) -> list[Misfit]:
+    """The fit of every cause by itself."""
+    misfits = []
+    with ProgressBar("fitting", len(CAUSES)) as bar:
+        for cause in CAUSES:
+            misfits.append(fit(seen, own, cause))
+            bar.update()
+    return misfits
 
 
 def quick_warning(recording: Recording) -> str:
@@ -121,67 +148,6 @@ def quick_warning(recording: Recording) -> str:
     if recording.has_pose.sum() < 2:
         return ""
     return next(iter(check_recording(recording, is_whole=False).warnings), "")
-
-
-def _of_depth_images(
-    frames: pd.DataFrame, cloud: pd.DataFrame, recording: Recording
-) -> Iterator[str]:
-    """What is wrong with depth images, whatever their numbers mean.
-
-    Depths and their steps are both as declared: only the ratio of the two decides.
-    """
-    if not frames.measured.any():
-        advice = "check the depth folder, and no_depth in sequence.toml"
-        yield f"no pixel that was looked at has a depth: all are 0, or saturated (65535); {advice}"
-    step_m = np.gcd.reduce(frames.depth_step) / recording.declared.depth_scale
-    # With fewer than eight steps up to the farthest point, they may be chance.
-    if _MAX_STEP * cloud.depth.median() < step_m < cloud.depth.max() / 8:
-        advice = "look for those that the camera gave, or expect no better poses"
-        yield f"depths come in steps of {100 * step_m:.1f} cm: {advice}"
-    # The first frame repeats none, so that the share is below 1 and 1 / (1 - repeated) is finite.
-    repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
-    if repeated > _MIN_REPEATED:
-        found = f"{repeated:.0%} of the depth images repeat the one before, though the poses move"
-        every = round(1 / (1 - repeated))
-        yield f"{found}: leave them out, as with --frames ::{every} of map and track"
-
-
-def _of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
-    """What is wrong with poses that are read rightly: some lie beside their neighbours' path."""
-    off = frames.off_mm / 1e3  # m
-    is_odd = off > max(_OFF, _OFF_STEPS * frames.moved_mm.median() / 1e3)
-    # Both neighbours of an odd pose are off by half as much: of three in a row the worst counts.
-    odd = off[is_odd & (off == off.rolling(3, 1, center=True).max())]
-    if len(odd):
-        first = recording.color_files[odd.index[0]].name
-        found = f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path"
-        advice = "check the poses there, or leave frames out with --frames of map and track"
-        yield f"{found} of their neighbours, first {first}: {advice}"
-
-
-def _of_depths(depth: pd.Series, is_far: pd.Series) -> Iterator[str]:
-    """What is wrong with depths that are read rightly: no camera measures them."""
-    if is_far.any():
-        low, high = depth[is_far].min(), depth[is_far].max()
-        found = f"{is_far.mean():.2%} of the depths are outliers, {low:.3g} to {high:.3g} m away"
-        rule = f"more than {FAR:g} times as far as nine in ten: maps and tracking leave them out"
-        advice = "check the camera, or set no_depth in sequence.toml to what it gives for none"
-        yield f"{found}, {rule}; {advice}"
-    near, far = PLAUSIBLE_DEPTH
-    median = depth[~is_far].median()
-    if median < near or median > far:
-        advice = "set depth_scale, the depth values a metre, in sequence.toml"
-        yield f"the median depth is {median:.3g} m, outside {near:g} to {far:g} m: {advice}"
-
-
-def _of_colors(brightness: pd.Series, correlation: float) -> Iterator[str]:
-    """What is wrong with colours; a correlation that is not known is NaN, and nothing is said."""
-    if brightness.median() < _BLACK:
-        options = "--set tracking.lm.lambda_intensity=0, or tracking.sdf.lambda_color=0 for sdf"
-        yield f"the colour images are black: check their folder, or track without colour: {options}"
-    if correlation < MIN_CORRELATION:
-        found = f"of points that two frames see they correlate by {correlation:.2f}"
-        yield f"colours do not belong to the depth images: {found}; check their folder and order"
 
 
 def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:
@@ -212,22 +178,23 @@ def _kept(pairs: Pairs, ids: Frames, is_whole: bool) -> tuple[Frames, Frames]:
     """Which frames' points are shown, as indices in `ids`, and ids of those whose images are kept.
 
     If `is_whole`, frames spread over the recording are shown, and kept are these, the compared
-    frames and the neighbours of these, which `find_misfits` needs. In a quick look the frames that
-    are compared are both shown and kept.
+    frames and the neighbours of these, whose colours `of_colors` takes. In a quick look the frames
+    that are compared are both shown and kept.
     """
     compared = np.unique(pairs)
     if not is_whole:
         return compared, ids[compared]
     last = len(ids) - 1
     shown = np.unique(np.linspace(0, last, _CLOUD_FRAMES).astype(int))
-    shifts = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
+    shifts = np.arange(-findings.MAX_SHIFT, findings.MAX_SHIFT + 1)
     return shown, ids[np.union1d(np.add.outer(compared, shifts).clip(0, last), shown)]
 
 
 def _read(
     recording: Recording, looked_at: Frames, kept: Frames
-) -> tuple[RgbdSequence, pd.DataFrame]:
-    """The frames to be kept, as a sequence, and a table with a row for each frame looked at.
+) -> tuple[RgbdSequence, pd.DataFrame, np.ndarray]:
+    """The frames to be kept, as a sequence, a table with a row for each frame looked at, and how
+    often each depth value occurs, and in how many frames many pixels share it (2, 65536).
 
     Images are read in parts, so that memory holds few besides those kept; those of a single part
     are left for whoever reads next. `depths_mm` are the files' values, for any reading of them.
@@ -238,12 +205,15 @@ def _read(
     """
     parts = []
     rows = []
+    counts = np.zeros((2, 65536), int)
     is_short = len(looked_at) <= _FRAMES_AT_ONCE
     with ProgressBar("reading frames", len(looked_at)) as bar:
         for ids in np.split(looked_at, range(_FRAMES_AT_ONCE, len(looked_at), _FRAMES_AT_ONCE)):
             part = read_frames(recording, ids, as_stored=True, is_kept=is_short)
             for values, color in zip(part.depths_mm, part.colors, strict=True):
                 step = np.gcd.reduce(values, axis=None)
+                of_frame = np.bincount(values.ravel(), minlength=65536)
+                counts += of_frame, of_frame > findings.SHARED * values.size
                 rows.append(((values > 0).mean(), color.mean() / 255, step, zlib.crc32(values)))
             parts.append(part.select(np.isin(ids, kept)))
             bar.update(len(part))
@@ -256,7 +226,8 @@ def _read(
     frames["moved_mm"] = np.linalg.norm(moves_mm, axis=1)[looked_at]
     frames["turned_deg"] = np.array([np.nan, *_turned_deg(T_world_camera)])[looked_at]
     frames["off_mm"] = np.linalg.norm(off_mm, axis=1)[looked_at]
-    return replace(parts[0], **arrays), frames
+    counts[:, 0] = 0  # no depth
+    return replace(parts[0], **arrays), frames, counts
 
 
 def _cloud(own: Reading, stored: RgbdSequence) -> pd.DataFrame:

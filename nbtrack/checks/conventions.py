@@ -5,25 +5,34 @@ Under the right one the surfaces that two frames both see coincide.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import permutations, product
 
-from nbtrack.checks.readings import FramePairs, Reading
+from nbtrack.checks.readings import FramePairs, Reading, mean_apart
+from nbtrack.machinery.progress import ProgressBar
 from nbtrack.machinery.settings import changed_settings
 from nbtrack.recordings.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA
-from nbtrack.recordings.recording import Recording
 
 _CLEARLY_BETTER = 1.3  # times as many points agree (our choice)
 _ALIKE = 0.95  # of the highest agreement: the first so good is named
 PLAUSIBLE_DEPTH = (0.2, 20.0)  # m, of a depth camera's median: units in doubt are told by it
-_FAR_APART = 0.05  # m, median distance above which a map of the scene would be blurred (our choice)
-_MIN_OVERLAP = 0.15  # share of points below which a median tells nothing (our choice)
-# The common camera axes first: where several fit alike, the first is named.
-AXES = {
+# Of the depth, in the mean over areas of images. Of 21 right recordings at hand 5.0 mm a metre at
+# most, a Kinect's with poses of KinectFusion; 2.0 of a HoloLens, and 1.7 of rendered rooms.
+_USUAL_APART = 0.0055
+_USUAL_M = 0.025  # and m, whatever the depth
+MIN_OVERLAP = 0.15  # share of points below which nothing is told (our choice)
+_NAMES = {
     "opengl": "OpenGL axes", "opencv": "OpenCV axes", "forward left up": "robot axes",
-    "right up forward": "left-handed axes", "left up forward": "PyTorch3D axes",
-    "left down backward": "right-handed axes", "left down forward": "left-handed axes",
-    "left up backward": "left-handed axes", "right down backward": "left-handed axes",
+    "left up forward": "PyTorch3D axes",
 }  # fmt: skip
+_WORDS = [("left", "right"), ("up", "down"), ("forward", "backward")]
+# All 48 ways of three axes, those that have a name first: where several fit alike, the first is
+# named.
+AXES = list(_NAMES) + [
+    words
+    for three in permutations(_WORDS)
+    for words in map(" ".join, product(*three))
+    if words not in (*_NAMES, *SPELLED_AXES.values())
+]
 # Those that are in use: KITTI, millimetres, RealSense at 0.25 mm, TUM, Replica, 0.1 mm, SUN3D's
 # millimetres and tenths times 8; and metres and micrometres, which 16 bits hold badly.
 _SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 8000.0, 80_000.0, 256.0, 100.0, 1.0, 1e6)
@@ -39,14 +48,31 @@ class Convention:
     subject: str  # what is read otherwise than declared: poses, depth or calibration
     name: str  # completes "your ... look like"
     reading: Reading
-    median_m: float  # median |z difference| over the points that overlap
-    depth_m: float  # their median depth
+    apart: float  # by how much surfaces lie apart in the mean, as a share of the depth
+    depth_m: float  # the median depth of the points that overlap
     overlap: float  # share of all points that fall onto a measured, not nearer, surface
     agreement: float  # the same, where surfaces that coincide count 1 and those far apart 0
+
+    @property
+    def usual_apart(self) -> float:
+        """By how much surfaces of right recordings lie apart at most, as a share of the depth."""
+        return min(_USUAL_APART, _USUAL_M / self.depth_m)
+
+    @property
+    def meets(self) -> bool:
+        """Whether surfaces agree as those of right recordings do, in enough of what is seen."""
+        return self.overlap >= MIN_OVERLAP and self.apart <= self.usual_apart
 
     def is_clearly_better(self, other: "Convention") -> bool:
         """Whether clearly more surfaces coincide than in the other."""
         return self.agreement > _CLEARLY_BETTER * other.agreement
+
+    def __str__(self) -> str:
+        look = "look" if self.subject == "poses" else "looks"
+        # Depth upside down, or turned by 180 degrees, fits like mirrored or turned axes.
+        is_rare = "axes" in self.name and not self.name.startswith(("Open", "robot"))
+        turned = ", or the images, or those of depth alone, are turned or mirrored against them"
+        return f"your {self.subject} {look} like {self.name}{turned if is_rare else ''}"
 
 
 def fit_all(pairs: FramePairs, own: Reading) -> tuple[list[Convention], Convention]:
@@ -60,22 +86,23 @@ def fit_all(pairs: FramePairs, own: Reading) -> tuple[list[Convention], Conventi
     axes = named_axes.get(own.declared.camera_axes, own.declared.camera_axes)
     own = replace(own, declared=replace(own.declared, camera_axes=axes))
     conventions = [_fit(pairs, "poses", axes_name(axes, own.declared.poses), own)]
-    for subject, name, reading in _hypotheses(own):
-        if reading != own:
+    others = [hypothesis for hypothesis in _hypotheses(own) if hypothesis[-1] != own]
+    with ProgressBar("comparing frames", len(others)) as bar:
+        for subject, name, reading in others:
             conventions.append(_fit(pairs, subject, name, reading))
+            bar.update()
     return conventions, _best_of(conventions)
 
 
 def _fit(pairs: FramePairs, subject: str, name: str, reading: Reading) -> Convention:
     """A convention with how well pairs of frames agree under it."""
     compared = pairs.compare(reading)
-    is_valid = compared.is_valid
     n_points = (pairs.values > 0).sum().clamp(1)
     return Convention(
         subject, name, reading,
-        median_m=float(compared.residual[is_valid].abs().median()),
-        depth_m=float(compared.measured[is_valid].median()),
-        overlap=float(is_valid.sum() / n_points),
+        apart=mean_apart(pairs.apart(compared)),
+        depth_m=float(compared.measured[compared.is_valid].median()),
+        overlap=float(compared.is_valid.sum() / n_points),
         agreement=float(compared.agreement.sum() / n_points),
     )  # fmt: skip
 
@@ -83,7 +110,7 @@ def _fit(pairs: FramePairs, subject: str, name: str, reading: Reading) -> Conven
 def axes_name(camera_axes: str, poses: str) -> str:
     """For people: `OpenGL axes (x right, y up, z backward), camera-to-world`."""
     x, y, z = SPELLED_AXES.get(camera_axes, camera_axes).split()
-    return f"{AXES.get(camera_axes, 'axes')} (x {x}, y {y}, z {z}), {poses}"
+    return f"{_NAMES.get(camera_axes, 'axes')} (x {x}, y {y}, z {z}), {poses}"
 
 
 # Subject, name and what is declared otherwise of the mistakes that a `Declaration` can tell.
@@ -113,6 +140,9 @@ def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
             yield "calibration", label, replace(own, camera=replace(camera, **changed))
     for unit, metres in _UNITS.items():
         yield "poses", f"ones in {unit}", replace(own, metres=metres)
+    for poses in (CAMERA_TO_WORLD, WORLD_TO_CAMERA):
+        mixed = replace(own, declared=replace(own.declared, poses=poses), is_mixed=True)
+        yield "poses", f"{poses} ones whose rotations alone are of the other direction", mixed
 
 
 def _best_of(conventions: list[Convention]) -> Convention:
@@ -125,60 +155,34 @@ def _best_of(conventions: list[Convention]) -> Convention:
     """
     own = conventions[0]
     near, far = PLAUSIBLE_DEPTH
-    meeting = [c for c in conventions if c.overlap >= _MIN_OVERLAP and c.median_m < _FAR_APART]
-    plausible = [c for c in meeting if near <= c.depth_m <= far]
+    plausible = [c for c in conventions if c.meets and near <= c.depth_m <= far]
     highest = max((c.agreement for c in plausible), default=0.0)
     best = next((c for c in plausible if c.agreement >= _ALIKE * highest), own)
     return best if best.is_clearly_better(own) else own
 
 
-def diagnosis(
-    conventions: list[Convention], best: Convention, recording: Recording, needs_proof: bool
-) -> str:
-    """What is wrong with how the numbers are read, in a sentence; empty where nothing is.
-
-    The first of these that holds is told: another convention is better; two frames see too little
-    of the same; their surfaces lie apart in every convention; and, where proof is needed, the
-    camera moves too little to tell conventions apart.
-    """
-    own, *others = conventions
-    file = recording.pose_file.name
-    apart = f"lie {1e3 * own.median_m:.0f} mm apart" if own.overlap else "never meet"
-    if best is not own:
-        look = "look" if best.subject == "poses" else "looks"
-        # Depth upside down, or turned by 180 degrees, fits like mirrored or turned axes.
-        is_rare = "axes" in best.name and not best.name.startswith(("Open", "robot"))
-        turned = "; or the depth images are turned against the colour images" if is_rare else ""
-        return (
-            f"your {best.subject} {look} like {best.name}; {_remedy(best.reading, own.reading)} "
-            f"(surfaces that two frames see then lie {1e3 * best.median_m:.0f} mm apart; as "
-            f"declared they {apart}){turned}"
-        )
-    if own.overlap < _MIN_OVERLAP:
-        seen = f"{own.overlap:.0%} of the points, whose surfaces {apart}"
-        found = f"{file} is not proved: two frames see too little of the same ({seen})"
-        return f"{found}: check it, and a piece with smaller steps"
-    if own.median_m > _FAR_APART:
-        return (
-            f"surfaces that two frames see {apart} (median, {own.overlap:.0%} of the points "
-            f"overlap) and no other convention fits: check {recording.calibration.source.name}, "
-            f"the depth unit and {file}, and that image, depth and pose belong to one moment"
-        )
-    alike = [c.name for c in others if c.subject == "poses" and not own.is_clearly_better(c)]
-    if not (needs_proof and alike):
-        return ""
-    little = f"{file} is not proved: the camera moves too little to tell {len(alike)} other"
-    return f"{little} conventions apart, such as {alike[0]}"
-
-
-def _remedy(reading: Reading, own: Reading) -> str:
+def remedy(reading: Reading, own: Reading) -> str:
     """What a user is to change, so that `reading` becomes the declared one, which is now `own`."""
+    if reading.is_mixed:
+        return "transpose the rotations in the pose file, and declare its direction"
     if reading.metres != 1:
         return f"multiply the positions in the pose file by {reading.metres:g}"
-    if (c := reading.camera) != own.camera:
+    if (c := reading.calibration) != own.calibration:
         numbers = f"{c.fx:.6g} {c.fy:.6g} {c.cx - 0.5:.6g} {c.cy - 0.5:.6g}"
         return f"set fx fy cx cy in the calibration to {numbers} (the first pixel's centre at 0)"
+    if reading.late:
+        return "shift one of them against the other, and let both have one clock"
+    if reading.depth_offset:
+        return "add this to the depths, or find out from where the camera counts them"
+    if reading.depth_share:
+        scale = own.declared.depth_scale / (1 + reading.depth_share)
+        return f"set depth_scale = {scale:.6g} in sequence.toml, or scale the positions"
+    if reading.depth_error_per_m:
+        error_per_m = own.declared.depth_error_per_m + reading.depth_error_per_m
+        return f"set depth_error_per_m = {error_per_m:.5f} in sequence.toml"
     changes = changed_settings(reading.declared, own.declared)  # as `depth_scale=5000.0`
+    if not changes:
+        return "multiply each camera-to-world pose by this transform from the right"
     said = " and ".join(text.replace("=", " = ", 1).removesuffix(".0") for text in changes)
     advice = f"set {said} in sequence.toml"
     if "quaternion" in said:

@@ -3,8 +3,8 @@
 Of depths that misfit: at a pose that is right but for a little, a measured point p (camera frame)
 has a distance r in the map, whose gradient is q (camera frame). If all depths of the recording are
 too long by a share s, r = s (q . p) plus what a small motion of the camera explains. The motions
-are projected out of each frame, and the share that leaves the least of r is estimated as
-`data check` estimates its misfits.
+are projected out of each frame, and the share that leaves the least of r is estimated, with
+the interval of `data check`.
 """
 
 import math
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from nbtrack.checks.misfits import SHARES, Parameter, estimate, main_misfit
+from nbtrack.checks.misfits import solved
 from nbtrack.core.arrays import Pose, Poses, WorldPoints
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
@@ -39,10 +39,8 @@ _MIN_FRAMES = 8  # that an estimate needs
 # What motions leave of longer depths, as a share of the points' distances from the camera: before
 # a flat wall 1 %, which is noise of the map's gradients; in rooms 10 % and more.
 _MIN_LEFT = 0.03
-_LONGER = Parameter(  # without a key, since it is no field of a `Reading`
-    "", "residuals in the map grow with depth, as if depths were off by", "+.1%", "", SHARES, 0.01,
-    "the share may be larger, or focal lengths are off; compare both recordings by `data check`",
-)  # fmt: skip
+_NEGLIGIBLE = 0.01  # share of longer depths, as right maps and recordings show it (our choice)
+_GAIN = 0.98  # share of the squared residuals, above which longer depths explain nothing
 
 
 def check_belongs(finished: Map, frame: Frame) -> str | None:
@@ -131,7 +129,7 @@ def map_misfit(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> str:
     """
     if not field.is_distance:
         return ""
-    costs = []  # of each frame at each share s: squared distances (m²) that no motion explains
+    squares = []  # of each frame, in m²: of what longer depths add, both, and of the residual
     for index, points_camera in _some_points(sequence):
         T = T_estimated[index]
         points_world = torch.from_numpy(_to_world(points_camera, T)).float().to(field.device)
@@ -145,8 +143,19 @@ def map_misfit(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> str:
         # What no motion explains: of r, and of q . p, which times s is what longer depths add to r.
         residual, longer = (both - motions @ (motions.T @ both)).T
         if len(p) >= _MIN_POINTS and (longer**2).sum() > _MIN_LEFT**2 * (p**2).sum():
-            costs.append(((residual - SHARES[:, None] * longer) ** 2).sum(axis=1))
-    return main_misfit([estimate(_LONGER, np.array(costs))]) if len(costs) >= _MIN_FRAMES else ""
+            squares.append([longer @ longer, -longer @ residual, residual @ residual])
+    if len(squares) < _MIN_FRAMES:
+        return ""
+    H, g, all_squares = np.array(squares).T
+    (share,), (low,), (high,) = solved(H[:, None, None], g[:, None])
+    gain = 1 + share * g.sum() / all_squares.sum()  # of the least squares: r² - s r l is left
+    if not (low > _NEGLIGIBLE or high < -_NEGLIGIBLE) or gain > _GAIN:
+        return ""
+    return (
+        f"residuals in the map grow with depth, as if depths were off by {share:+.1%} ({low:+.1%} "
+        f"to {high:+.1%}); without it frames differ {gain:.0%} as much: the share may be larger, "
+        "or focal lengths are off; compare both recordings by `data check`"
+    )
 
 
 def _some_points(sequence: RgbdSequence) -> Iterator[tuple[int, np.ndarray]]:

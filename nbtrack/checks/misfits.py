@@ -1,163 +1,187 @@
-"""Small misfits of a recording, estimated: how late, how much too long, how far off.
+"""What may be a little off in how a recording is read, fitted to its own surfaces.
 
-One number at a time is varied. Under each of its values the surfaces that pairs of frames see lie
-so far apart, and the intensities of their common points are so unlike. The value where they agree
-best is the estimate; its interval comes from drawing the pairs anew (bootstrap).
+Each `Cause` is what happens: depth that comes after the poses, a camera beside what its poses are
+of. Its few numbers are those under which surfaces of pairs of frames lie least apart (Gauss-Newton
+with the weights of Geman and McClure). Their interval comes from drawing pairs anew (bootstrap).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from nbtrack.checks.readings import Costs, FramePairs, Reading
+from nbtrack.checks.readings import AREA_SCALE, Apart, FramePairs, Reading, cost_of
 
-MAX_SHIFT = 3  # frames by which depth or colours may be late or early (our choice)
-SHARES = np.linspace(-0.15, 0.15, 13)  # by which lengths may be off
-_METRES = np.linspace(-0.6, 0.6, 13)  # by which poses may drift along an axis, over the recording
-_PIXELS = np.linspace(-0.06, 0.06, 13)  # by which colours may be off, as a share of the width
-_FRAMES = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
-_NO_YES = np.array([0, 1])
-# m, by which positions may scatter. Values below 0 have no meaning: they are there so that 0 lies
-# between others, as in the other ranges.
-_SCATTER = np.linspace(-0.02, 0.04, 13)
-_GAIN = 0.98  # share of the cost as declared, above which an estimate tells nothing (our choice)
-_MIN_PAIRS = 8  # that an estimate needs
-MIN_CORRELATION = 0.75  # of intensities that pairs of a right recording have (our choice)
+_STEPS = 12  # of Gauss-Newton, at most
+_FACTORS = (4.0, 2.0, 1.0, 0.5, 0.2)  # of a step; the best is taken
+_WIDE = 5.0  # medians of what lies apart; so far away half of the weight is left
+_ENOUGH = 0.02  # of what is negligible: a last step
+_GAIN = 0.9  # share of the cost as declared, above which a cause explains nothing (our choice)
+_ALIKE = 0.95  # of two costs: they tell nothing
+_WHOLE = 0.8  # of the cost of a cause: where all numbers together leave less, it is not the whole
+MIN_PAIRS = 8  # that an estimate needs
 _RESAMPLED = 200  # draws of a bootstrap
 _INTERVAL = [0.025, 0.975]  # its quantiles
 
 
-class Parameter(NamedTuple):
-    """A number that is varied; 0 is as declared."""
+class Part(NamedTuple):
+    """A number that is fitted; 0 is as declared."""
 
     key: str  # of `Reading`
-    name: str
-    form: str  # format specification of its estimate; empty for yes or no
+    label: str
+    form: str  # format specification
     unit: str
-    values: Float[np.ndarray, "values"]
-    negligible: float  # as the values; our choice: more than right recordings show
-    advice: str  # with {factor}, 1 + estimate
+    limit: float  # beyond which it is not looked for
+    negligible: float  # our choice: more than right recordings show
 
 
-_POSES = "record or register the poses anew"
-_DEPTH_PARAMETERS = [
-    Parameter("depth_shift", "depth comes after the poses by", "+.1f", " frames", _FRAMES, 0.3,
-              "shift one of them against the other"),
-    Parameter("focal_share", "focal lengths should change by", "+.1%", "", SHARES, 0.01,
-              "calibrate anew, or multiply them by {factor:.3f}"),
-    Parameter("depth_share", "depths should change against the poses by", "+.1%", "", SHARES, 0.01,
-              "divide depth_scale, or the positions, by {factor:.3f}"),
-    Parameter("depth_growth", "depths grow over the recording by", "+.1%", "", SHARES, 0.02,
-              "let the camera warm up before recording"),
-    *(Parameter(f"drift_{axis}", f"poses drift along {axis} by", "+.2f", " m", _METRES, 0.1, _POSES)
-      for axis in "xyz"),
-    Parameter("scatter", "positions scatter by", ".3f", " m", _SCATTER, 5e-3, _POSES),
+class Cause(NamedTuple):
+    """What may be off, and the numbers that say by how much."""
+
+    name: str
+    parts: Sequence[Part]
+
+
+_FOCAL = Part("focal_share", "by ", "+.1%", "", 0.5, 0.01)
+_MIDDLE = [
+    Part("right", "right by ", "+.1%", " of the width", 0.25, 0.005),
+    Part("down", "down by ", "+.1%", " of the height", 0.25, 0.005),
+]
+_PLACE = [Part(axis, f"{axis} ", "+.3f", " m", 1.0, 0.02) for axis in "xyz"]
+_PLACE += [Part(f"turn_{axis}", f"turned {axis} ", "+.1f", " deg", 30.0, 1.0) for axis in "xyz"]
+# Those of fewer numbers first: of several that fit alike the first is named.
+CAUSES = [
+    Cause("depth comes after the poses", [Part("late", "by ", "+.1f", " frames", 10.0, 0.3)]),
+    Cause("focal lengths should change", [_FOCAL]),
+    Cause("depths should change against the poses",
+          [Part("depth_share", "by ", "+.1%", "", 0.5, 0.01)]),
+    Cause("depths are short by a quadratic error",
+          [Part("depth_error_per_m", "of ", "+.5f", " per metre", 0.05, 5e-4)]),
+    Cause("depths are short by one length",
+          [Part("depth_offset", "", "+.3f", " m", 0.5, 0.02)]),
+    Cause("the principal point should move", _MIDDLE),
+    Cause("the calibration is another camera's: focal lengths should change",
+          [_FOCAL, Part("aspect", "the vertical one more by ", "+.1%", "", 0.3, 0.01), *_MIDDLE]),
+    Cause("the camera lies beside what the poses are of,", _PLACE),
 ]  # fmt: skip
-_COLOR_PARAMETERS = [
-    Parameter("color_shift", "colours come after depth by", "+.1f", " frames", _FRAMES, 0.5,
-              "shift one against the other"),
-    Parameter("color_right", "colours lie too far right by", "+.1%", " of the width", _PIXELS, 0.01,
-              "register colour and depth anew"),
-    Parameter("is_mirrored", "colours alone are mirrored", "", "", _NO_YES, 0.5,
-              "mirror them back"),
-]  # fmt: skip
+_ALL = Cause("all of them", list({p.key: p for cause in CAUSES for p in cause.parts}.values()))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Misfit:
-    """The estimate of a parameter, with its interval of 95 %."""
+    """The estimate of a cause's numbers, with its interval of 95 %, and how surfaces then agree."""
 
-    parameter: Parameter
-    estimate: float
-    low: float
-    high: float
-    gain: float  # the cost at the estimate, as a share of that as declared
+    cause: Cause
+    reading: Reading  # with the estimate
+    estimate: Float[np.ndarray, "parts"]
+    low: Float[np.ndarray, "parts"]
+    high: Float[np.ndarray, "parts"]
+    apart: Apart
+    gain: float  # the cost, as a share of that as declared, or that of the opposite if it is less
 
     @property
     def is_significant(self) -> bool:
-        """Whether all of the interval is more than negligible, and frames agree better there."""
-        negligible = self.parameter.negligible
-        return (self.low > negligible or self.high < -negligible) and self.gain < _GAIN
+        """Whether an interval is more than negligible, and surfaces agree better, within limits."""
+        limit, negligible = np.array([(p.limit, p.negligible) for p in self.cause.parts]).T
+        is_off = ((self.low > negligible) | (self.high < -negligible)).any()
+        return bool(is_off and self.gain < _GAIN and (np.abs(self.estimate) < limit).all())
 
     def __str__(self) -> str:
-        name, form, unit = self.parameter.name, self.parameter.form, self.parameter.unit
-        if not form:
-            return f"{name}: {'yes' if self.is_significant else 'no'}"
-        return f"{name} {self.estimate:{form}} ({self.low:{form}} to {self.high:{form}}){unit}"
+        numbers = zip(self.cause.parts, self.estimate, self.low, self.high, strict=True)
+        said = (
+            f"{part.label}{value:{part.form}} ({low:{part.form}} to {high:{part.form}}){part.unit}"
+            for part, value, low, high in numbers
+        )
+        return f"{self.cause.name} {', '.join(said)}"
 
 
-def find_misfits(pairs: FramePairs, own: Reading) -> tuple[list[Misfit], float]:
-    """Estimates of all misfits that pairs of frames can tell, also of those that are not
-    significant, and the correlation of intensities of points that both frames of a pair see.
+def main_misfits(pairs: FramePairs, own: Reading, misfits: list[Misfit]) -> list[Misfit]:
+    """Of the significant misfits the one that explains what there is, and what fits as well.
 
-    The correlation is as declared, NaN without contrast. `pairs` must also hold the frames up to
-    MAX_SHIFT around those of the pairs. Misfits of colours are looked for if none of depth is
-    significant. One is left out if even at its best value colours correlate by less than
-    MIN_CORRELATION: such colours are of another place.
+    Empty where none is, or where all numbers together leave clearly less: then what happens is
+    something else. Of those that fit alike the first stands first, and one whose numbers another
+    has among more is left out.
     """
-    found = list(_estimates(_DEPTH_PARAMETERS, own, pairs.depth_costs))
-    # Colours are compared at the points whose depths agree as declared.
-    color_costs = partial(pairs.color_costs, pairs.compare(own))
-    unlikeness = color_costs(own)
-    correlation = float(1 - np.nanmedian(unlikeness)) if np.isfinite(unlikeness).any() else np.nan
-    if not any(misfit.is_significant for misfit in found):
-        # The cost of colours is 1 - correlation; at a misfit's best value the share `gain` is left.
-        of_colors = _estimates(_COLOR_PARAMETERS, own, color_costs)
-        found += [m for m in of_colors if m.gain * (1 - correlation) < 1 - MIN_CORRELATION]
-    return found, correlation
+    found = [misfit for misfit in misfits if misfit.is_significant]
+    lowest = min((misfit.gain for misfit in found), default=0.0)
+    alike = [misfit for misfit in found if _ALIKE * misfit.gain <= lowest]
+    if not alike:
+        return []
+    together = fit(pairs, own, _ALL, alike[0].reading)
+    if together.gain < _WHOLE * lowest:
+        return []
+    first, *others = alike
+    return [first, *(m for m in others if not set(first.cause.parts) <= set(m.cause.parts))]
 
 
-def main_misfit(misfits: list[Misfit]) -> str:
-    """A sentence on the significant misfit that explains the most; empty if none is significant."""
-    main = min((m for m in misfits if m.is_significant), key=lambda m: m.gain, default=None)
-    if not main:
-        return ""
-    advice = main.parameter.advice.format(factor=1 + main.estimate)
-    return f"{main}; without it frames differ {main.gain:.0%} as much: {advice}"
+def fit(pairs: FramePairs, own: Reading, cause: Cause, start: Reading | None = None) -> Misfit:
+    """Fit the numbers of a cause, from those of `start`, by default from what is declared."""
+    keys = [part.key for part in cause.parts]
+    limit, small = np.array([(part.limit, part.negligible) for part in cause.parts]).T
+
+    def read(values: np.ndarray) -> Reading:
+        return replace(own, **dict(zip(keys, values.tolist(), strict=True)))
+
+    def apart_at(values: np.ndarray) -> Apart:
+        return pairs.apart(pairs.compare(read(values)))
+
+    values = np.array([getattr(start or own, key) for key in keys])
+    apart = apart_at(values)
+    for _ in range(_STEPS):
+        scale = _WIDE * float(np.nanmedian(np.abs(apart)))
+        # Steps are in units of what is negligible, so that all numbers are alike.
+        moved = [apart_at(values + d) for d in np.diag(small)]
+        step, _, _ = solved(*_normal_equations(apart, moved, scale))
+        tried = [(values + factor * small * step).clip(-limit, limit) for factor in _FACTORS]
+        aparts = [apart_at(new) for new in tried]
+        best = int(np.argmin([cost_of(a, scale) for a in aparts]))
+        if cost_of(aparts[best], scale) >= cost_of(apart, scale):
+            break
+        is_near = (np.abs(tried[best] - values) < _ENOUGH * small).all()
+        values, apart = tried[best], aparts[best]
+        if is_near:
+            break
+    H, g = _normal_equations(apart, [apart_at(values + d) for d in np.diag(small)], AREA_SCALE)
+    left, low, high = solved(H, g)
+    # Where the opposite does as well, what helps is something else, as an average of poses.
+    others = [apart_at(0 * values), apart_at(-values)]
+    gain = max(_ratio(apart, other) for other in others)
+    low, high = values + small * (low - left), values + small * (high - left)
+    return Misfit(cause, read(values), values, low, high, apart, gain)
 
 
-def _estimates(
-    parameters: list[Parameter], own: Reading, cost: Callable[[Reading], Costs]
-) -> Iterator[Misfit]:
-    """An estimate of each parameter, by the pairs that have a cost at all of its values.
+def solved(
+    H: Float[np.ndarray, "n k k"], g: Float[np.ndarray, "n k"]
+) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"], Float[np.ndarray, "k"]]:
+    """The k numbers of the normal equations of n observations, and the interval's ends of each.
 
-    A parameter for which these are fewer than `_MIN_PAIRS` is passed over.
+    What nothing tells is 0. The interval is a bootstrap's, which draws the observations anew.
     """
-    for parameter in parameters:
-        readings = [replace(own, **{parameter.key: value}) for value in parameter.values]
-        costs = np.stack([cost(reading) for reading in readings], axis=1)
-        costs = costs[np.isfinite(costs).all(axis=1)]
-        if len(costs) >= _MIN_PAIRS:
-            yield estimate(parameter, costs)
-
-
-def estimate(parameter: Parameter, costs: Float[np.ndarray, "n values"]) -> Misfit:
-    """The value of a parameter at which `n` observations agree best; its interval is a bootstrap's,
-    which draws the observations anew."""
-    values, mean = parameter.values, costs.mean(axis=0)
     # A fixed seed, so that a recording always has the same interval.
-    drawn = np.random.default_rng(0).integers(len(costs), size=(_RESAMPLED, len(costs)))
-    low, high = np.quantile(_lowest(values, costs[drawn].mean(axis=1)), _INTERVAL)
-    gain = float(mean.min() / mean[np.abs(values).argmin()])  # by the mean at 0, as declared
-    return Misfit(parameter, float(_lowest(values, mean)), low, high, gain)
+    drawn = np.random.default_rng(0).integers(len(H), size=(_RESAMPLED, len(H)))
+    each = [(H.sum(axis=0), g.sum(axis=0)), (H[drawn].sum(axis=1), g[drawn].sum(axis=1))]
+    at, resampled = (
+        -(np.linalg.pinv(h, rcond=1e-6, hermitian=True) @ b[..., None])[..., 0] for h, b in each
+    )
+    return at, *np.quantile(resampled, _INTERVAL, axis=0)
 
 
-def _lowest(
-    values: Float[np.ndarray, "values"], costs: Float[np.ndarray, "*n values"]
-) -> Float[np.ndarray, "*n"]:
-    """The value at which costs are lowest, for each row of costs; values have equal steps.
+def _normal_equations(
+    apart: Apart, moved: list[Apart], scale: float
+) -> tuple[Float[np.ndarray, "pairs k k"], Float[np.ndarray, "pairs k"]]:
+    """Those of each pair; `moved` is what lies apart where one of k numbers is a unit more."""
+    J = np.stack(moved) - apart
+    is_known = np.isfinite(J).all(axis=0) & np.isfinite(apart)
+    weights = np.where(is_known, 1 / (1 + (apart / scale) ** 2) ** 2, 0)
+    J, apart = np.nan_to_num(J), np.nan_to_num(apart)
+    return np.einsum("ipa,jpa,pa->pij", J, J, weights), np.einsum(
+        "ipa,pa,pa->pi", J, apart, weights
+    )
 
-    It is the minimum of the parabola through the lowest cost and those on both sides of it. If the
-    lowest cost is the first or the last, it is the value itself.
-    """
-    at, last = costs.argmin(axis=-1), len(values) - 1
-    around = np.clip(at[..., None] + [-1, 0, 1], 0, last)
-    before, middle, after = np.moveaxis(np.take_along_axis(costs, around, axis=-1), -1, 0)
-    bend = before - 2 * middle + after  # 0 where all three are equal: no parabola
-    is_inside = (at > 0) & (at < last) & (bend > 0)
-    offset = np.where(is_inside, (before - after) / 2 / np.where(is_inside, bend, 1), 0)
-    return values[at] + offset * (values[1] - values[0])
+
+def _ratio(apart: Apart, other: Apart) -> float:
+    """The cost of one as a share of that of another, by areas that both know."""
+    is_known = np.isfinite(apart) & np.isfinite(other)
+    return cost_of(apart[is_known]) / cost_of(other[is_known]) if is_known.any() else np.nan

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt16
-from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -26,38 +25,47 @@ _HIDDEN_BEHIND = 0.25  # m behind a surface points are hidden: several times a c
 _SAME_SURFACE = 0.025  # of the depth: where neighbours blend to more, they lie on two surfaces
 _SCALE = 0.01  # of the depth: surfaces so far apart agree by half, several times a camera's noise
 _SAME = 0.2  # least agreement of points whose colours are compared: surfaces 2 * _SCALE apart
-_MIN_OVERLAP = 0.1  # share of a pair's points without which its cost is none
+_MIN_OVERLAP = 0.1  # share of a pair's points without which its colours are not compared
 _MIN_CONTRAST = 0.02  # standard deviation of intensities in [0, 1], below which nothing is seen
 _POINTS_PER_FRAME = 1000  # 20 pairs of frames have enough for a median
-_SMOOTHED = 5  # frames, over which positions are averaged
+_AREAS = (4, 6)  # rows and columns of them in an image
+AREA_SCALE = 0.004  # of the depth: areas that lie so far apart cost by half (our choice)
+_FAR_APART = 0.05  # of the depth: more counts no more
+_MIN_MEASURED = 0.3  # share of an area's points without which nothing is told of it
 Pairs = Int[np.ndarray, "2 pairs"]  # of frames
 Costs = Float[np.ndarray, "pairs"]
+Apart = Float[np.ndarray, "pairs areas"]
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to read a recording. Lengths and shares that are 0 are as declared."""
+    """One way to read a recording. Lengths, angles and shares that are 0 are as declared."""
 
     declared: Declaration
     camera: Intrinsics
     metres: float = 1.0  # of one unit of the poses' positions
+    is_mixed: bool = False  # rotations alone are of the other direction than declared
     focal_share: float = 0.0  # by which focal lengths are longer
+    aspect: float = 0.0  # by which the vertical one is longer still
+    right: float = 0.0  # by which the principal point lies farther right, as a share of the width
+    down: float = 0.0  # and farther down, as a share of the height
     depth_share: float = 0.0  # by which depths are longer
-    depth_growth: float = 0.0  # share by which depths are longer in the end than at first
-    depth_shift: int = 0  # frames by which depth is late
-    drift_x: float = 0.0  # m, by which positions are too far along x in the end
-    drift_y: float = 0.0
-    drift_z: float = 0.0
-    scatter: float = 0.0  # m, by which positions scatter, in the mean square
-    color_shift: int = 0  # frames by which colours are late
-    color_right: float = 0.0  # by which colours are too far right, as a share of the width
-    is_mirrored: bool = False  # colours alone
+    depth_error_per_m: float = 0.0  # 1/m, beside the declared one
+    depth_offset: float = 0.0  # m, by which depths are longer
+    late: float = 0.0  # frames by which depth comes after the poses
+    x: float = 0.0  # m, where the camera is in the frame (OpenCV's axes) of what poses are of
+    y: float = 0.0
+    z: float = 0.0
+    turn_x: float = 0.0  # degrees, the rotation vector from the camera's frame to that one
+    turn_y: float = 0.0
+    turn_z: float = 0.0
 
     @property
     def calibration(self) -> Intrinsics:
-        """The camera with its focal lengths changed."""
-        factor = 1 + self.focal_share
-        return replace(self.camera, fx=factor * self.camera.fx, fy=factor * self.camera.fy)
+        """The camera with its focal lengths and its principal point changed."""
+        c, factor = self.camera, 1 + self.focal_share
+        cx, cy = c.cx + self.right * c.width, c.cy + self.down * c.height
+        return replace(c, fx=factor * c.fx, fy=factor * (1 + self.aspect) * c.fy, cx=cx, cy=cy)
 
     def points(self, columns: Tensor, rows: Tensor, values: Tensor) -> Tensor:
         """Points (..., 3; m, camera frame) of pixels with depth values as in the files."""
@@ -65,7 +73,8 @@ class Reading:
         z = values / self.declared.depth_scale  # m
         if self.declared.depth_along == "ray":
             z = z / directions.norm(dim=-1)
-        z = z * (1 + self.depth_share + self.declared.depth_error_per_m * z)
+        error_per_m = self.declared.depth_error_per_m + self.depth_error_per_m
+        z = z * (1 + self.depth_share + error_per_m * z) + self.depth_offset
         return directions * z[..., None]
 
     def T_world_camera(self, file_poses: Poses, order: str) -> Poses:
@@ -78,15 +87,14 @@ class Reading:
             w_first = order == "wxyz"
             numbers = Rotation.from_matrix(T_file[:, :3, :3]).as_quat(scalar_first=w_first)
             T_file[:, :3, :3] = Rotation.from_quat(numbers, scalar_first=not w_first).as_matrix()
+        if self.is_mixed:
+            T_file[:, :3, :3] = T_file[:, :3, :3].mT
         T_file[:, :3, 3] *= self.metres
-        T_world_camera = self.declared.poses_to_opencv(T_file)
-        drift = [self.drift_x, self.drift_y, self.drift_z]  # m, in the end
-        positions = T_world_camera[:, :3, 3] - np.outer(np.linspace(0, 1, len(T_file)), drift)
-        # Positions move towards averages over their neighbours, by `scatter` in root mean square.
-        off = positions - uniform_filter1d(positions, _SMOOTHED, axis=0, mode="nearest")
-        mean_off = np.sqrt((off**2).sum(axis=1).mean())
-        T_world_camera[:, :3, 3] = positions - self.scatter * off / max(1e-9, mean_off)
-        return T_world_camera
+        T_body_camera = np.eye(4)
+        turn_deg = [self.turn_x, self.turn_y, self.turn_z]
+        T_body_camera[:3, :3] = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
+        T_body_camera[:3, 3] = self.x, self.y, self.z
+        return self.declared.poses_to_opencv(T_file) @ T_body_camera
 
 
 def on_grid(values: UInt16[np.ndarray, "frames h w"], stride: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -104,6 +112,17 @@ class Comparison(NamedTuple):
     is_valid: Tensor  # False where hidden, outside, or between two surfaces
     agreement: Tensor  # 1 where both coincide, 0 where they are far apart or not valid
     seen_at: Tensor  # (pairs, 1, points, 2): -1 at the first pixel, 1 at the last
+
+
+def cost_of(apart: Apart, scale: float = AREA_SCALE) -> float:
+    """The mean cost of Geman and McClure: 0 where surfaces coincide, 1 far from that."""
+    return float(np.nanmean(apart**2 / (apart**2 + scale**2)))
+
+
+def mean_apart(apart: Apart) -> float:
+    """By how much surfaces lie apart in the mean, as a share of the depth; NaN of nothing."""
+    known = np.abs(apart[np.isfinite(apart)])
+    return float(np.minimum(known, _FAR_APART).mean()) if len(known) else np.nan
 
 
 class FramePairs:
@@ -124,6 +143,12 @@ class FramePairs:
         first, second = kept.depths_mm[self.places]  # the files' values, in their unit
         stride = math.ceil((math.prod(first.shape[1:]) / _POINTS_PER_FRAME) ** 0.5)
         self.columns, self.rows, self.values = on_grid(first, stride)  # of the points
+        # Numbers of the points of each area, (areas, n): a few rows and columns are left over.
+        numbers = torch.arange(len(self.columns)).view(-1, len(self.columns.unique()))
+        (n_rows, n_columns), (down, across) = numbers.shape, _AREAS
+        numbers = numbers[: n_rows // down * down, : n_columns // across * across]
+        areas = numbers.view(down, n_rows // down, across, n_columns // across)
+        self.areas = areas.transpose(1, 2).reshape(down * across, -1)
         # Of the second frames; infinite without a depth.
         self.inverse_values = 1 / torch.from_numpy(second[:, None].astype(np.float32))
 
@@ -132,15 +157,14 @@ class FramePairs:
 
         Depth is interpolated between four pixels, in 1/z, which is exact for planes.
         """
-        longer_a, longer_b = self._longer(reading)
-        points_a = reading.points(self.columns, self.rows, self.values / longer_a)
+        points_a = reading.points(self.columns, self.rows, self.values)
         T_b_a = self._T_second_first(reading)
         points_b = points_a @ T_b_a[:, :3, :3].mT + T_b_a[:, None, :3, 3]
         columns, rows, depth = project(reading.calibration, points_b)
         at = self._on_images(columns, rows)[:, None]  # (pairs, 1, points, 2)
         blended = 1 / grid_sample(self.inverse_values, at, "bilinear", align_corners=True)[:, 0, 0]
         nearest = 1 / grid_sample(self.inverse_values, at, "nearest", align_corners=True)[:, 0, 0]
-        _, _, measured = reading.points(columns, rows, blended / longer_b).unbind(-1)  # z-depth
+        _, _, measured = reading.points(columns, rows, blended).unbind(-1)  # z-depth
         residual = depth - measured
         is_valid = (self.values > 0) & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
         is_valid &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
@@ -150,49 +174,58 @@ class FramePairs:
         agreement = torch.where(is_valid, 1 / (1 + (residual / measured / _SCALE) ** 2), 0.0)
         return Comparison(residual, measured, is_valid, agreement, at)
 
-    def _longer(self, reading: Reading) -> Tensor:
-        """Factors by which depths are too long in first and in second frames, (2, pairs, 1).
-
-        They grow evenly over the recording: its first depths are too short by half of
-        `depth_growth`, its last ones too long by as much.
-        """
-        growth = reading.depth_growth * (self.pairs / len(self.file_poses) - 0.5)
-        return torch.from_numpy(1 + growth[..., None]).float()
-
     def _T_second_first(self, reading: Reading) -> Tensor:
         """Poses of the first cameras in the second ones' frames, (pairs, 4, 4; m)."""
         T_world_camera = reading.T_world_camera(self.file_poses, self.order)
-        # Depth that is late by some frames was taken at the pose that is so many frames before.
-        numbers = (self.pairs - reading.depth_shift).clip(0, len(self.file_poses) - 1)
-        T_world_first, T_world_second = T_world_camera[numbers]
-        return torch.from_numpy(np.linalg.solve(T_world_second, T_world_first)).float()
+        # Depth that is late by some frames was taken at the pose that is so many frames before,
+        # which lies between two poses on a straight line.
+        at = (self.pairs - reading.late).clip(0, len(self.file_poses) - 1)
+        before = at.astype(int)
+        T = T_world_camera[before]
+        if reading.late:
+            after = T_world_camera[np.minimum(before + 1, len(T_world_camera) - 1)]
+            share = (at - before).ravel()[:, None]
+            R, R_after = (
+                Rotation.from_matrix(t[..., :3, :3].reshape(-1, 3, 3)) for t in (T, after)
+            )
+            between = R * Rotation.from_rotvec(share * (R.inv() * R_after).as_rotvec())
+            T[..., :3, :3] = between.as_matrix().reshape(T[..., :3, :3].shape)
+            T[..., :3, 3] += share.reshape(*at.shape, 1) * (after - T)[..., :3, 3]
+        return torch.from_numpy(np.linalg.solve(T[1], T[0])).float()
 
     def _on_images(self, columns: Tensor, rows: Tensor) -> Tensor:
         """Pixel indices as `grid_sample` has them, (..., 2): -1 is the first pixel, 1 the last."""
         height, width = self.inverse_values.shape[2:]
         return 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1) - 1
 
-    def depth_costs(self, reading: Reading) -> Costs:
-        """1 - the mean agreement of the points of a pair that are valid; NaN if these are few."""
-        compared = self.compare(reading)
-        overlap = compared.is_valid.float().mean(dim=1)
-        costs = 1 - compared.agreement.mean(dim=1) / overlap
-        return torch.where(overlap >= _MIN_OVERLAP, costs, torch.nan).numpy()
+    def apart(self, compared: Comparison) -> Apart:
+        """By how much surfaces lie apart, as a share of the depth: medians over areas of the image.
 
-    def color_costs(self, compared: Comparison, reading: Reading) -> Costs:
+        Over an area a sensor's noise averages out, while what is read wrongly stays. NaN where few
+        points of an area are valid.
+        """
+        share = torch.where(compared.is_valid, compared.residual / compared.measured, torch.nan)
+        of_areas = share[:, self.areas]
+        is_measured = of_areas.isfinite().float().mean(dim=-1) >= _MIN_MEASURED
+        return torch.where(is_measured, of_areas.nanmedian(dim=-1).values, torch.nan).numpy()
+
+    def color_costs(
+        self, compared: Comparison, shift: int = 0, right: float = 0.0, is_mirrored: bool = False
+    ) -> Costs:
         """1 - the correlation of intensities of points whose depths agree; exposures may differ.
 
-        `compared` tells where points lie and agree, and `reading` how colours are shifted. NaN of
-        pairs with few points, and without contrast.
+        `compared` tells where points lie and agree. Colours are taken so many frames later, so much
+        farther right (as a share of the width), and mirrored. NaN of pairs with few points, and
+        without contrast.
         """
         # The points' places in all first frames, then in all second ones: (2 pairs, 1, points, 2).
         in_first = self._on_images(self.columns, self.rows).expand_as(compared.seen_at[:, 0])
         at = torch.cat([in_first[:, None], compared.seen_at])
-        at[..., 0] += 2 * reading.color_right  # an image is 2 wide, from -1 to 1
-        if reading.is_mirrored:
+        at[..., 0] += 2 * right  # an image is 2 wide, from -1 to 1
+        if is_mirrored:
             at[..., 0] *= -1
         # `kept` holds the neighbours in order, so that so many frames later is so many places on.
-        places = (self.places + reading.color_shift).clip(0, len(self.colors) - 1)
+        places = (self.places + shift).clip(0, len(self.colors) - 1)
         gray = [cv2.cvtColor(self.colors[i], cv2.COLOR_RGB2GRAY) for i in places.ravel()]
         images = torch.from_numpy(np.stack(gray))[:, None].float() / 255
         in_firsts, in_seconds = grid_sample(images, at, align_corners=True)[:, 0, 0].chunk(2)

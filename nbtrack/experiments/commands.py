@@ -202,18 +202,23 @@ def make_command(options: Namespace) -> None:
     print(f"{options.out}: {options.room}, {options.n_frames} frames, seed {options.seed}")
 
 
-def check_command(options: Namespace) -> None:
-    """Validate a recording; print what it holds and what is wrong, and draw it into --out."""
+def check_command(options: Namespace) -> int:
+    """Validate a recording; print what it holds and what is wrong, and draw it into --out.
+
+    Returns the exit status: 1 where it is wrong.
+    """
     output.prepare(options.out)
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     report = check_recording(recording)
     print(report)
     if options.out:
-        apart_mm = 1e3 * report.conventions[0].median_m  # as the recording's files are declared
-        title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart (median)"
+        own = report.conventions[0]
+        apart_mm = 1e3 * own.apart * own.depth_m  # as the recording's files are declared
+        title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart in the mean"
         figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)
         output.save_picture(figure, options.out / output.CHECK_FILE)
         print(f"  picture         {options.out / output.CHECK_FILE}")
+    return int(bool(report.faults))
 
 
 def convert_command(options: Namespace) -> None:

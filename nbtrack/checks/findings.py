@@ -1,0 +1,184 @@
+"""What a recording and its fits say, each in a sentence: faults, doubts and remarks."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Int
+
+from nbtrack.checks.conventions import MIN_OVERLAP, PLAUSIBLE_DEPTH, Convention, remedy
+from nbtrack.checks.misfits import MIN_PAIRS, Misfit
+from nbtrack.checks.readings import FramePairs, Reading, mean_apart
+from nbtrack.recordings.reading import FAR
+from nbtrack.recordings.recording import Recording
+
+# A pose is odd if it is off the middle of its neighbours by more than both: metres, and medians of
+# a step. Real recordings, and rooms thinned to every twentieth frame, have up to 1.1 medians.
+_OFF = 0.05
+_OFF_STEPS = 2.5
+_MIN_REPEATED = 0.05  # share of frames whose depth is that of the frame before, though they moved
+_MAX_STEP = 0.01  # share of the depth between depths that a camera can tell (our choice)
+# A value is shared if it is so much of all depths, in so many frames, and so many times as often
+# as each of so many values beside it (our choice).
+SHARED, _SHARING, _SPIKE, _BESIDE = 0.01, 0.25, 10, 5
+_BLACK = 0.02  # brightness, in [0, 1]
+MAX_SHIFT = 3  # frames by which colours may be late or early (our choice)
+_SHIFTS = range(-MAX_SHIFT, MAX_SHIFT + 1)
+_RIGHTS = (-0.06, -0.04, -0.02, 0.02, 0.04, 0.06)  # of the width, by which they may lie beside
+_MIN_CORRELATION = 0.75  # of intensities that pairs of a right recording have (our choice)
+_UNLIKE = 0.8  # of 1 - correlation as declared, above which another reading tells nothing
+_TRIED = (
+    "no other axes, units or directions of poses and depth, no late depth, no focal lengths or "
+    "principal point, no error of depth (a factor, a length, a square), no offset of the camera"
+)
+_UNTOLD = (
+    "poses that drift or jump, a lens's distortion, and depth images that hold no depth "
+    "(disparity, half floats, each frame scaled by itself)"
+)
+
+
+def misreading(own: Convention, best: Convention, main: list[Misfit]) -> str:
+    """What is wrong with how the numbers are read, in a sentence; empty where nothing is.
+
+    A cause is told if with it surfaces agree as those of right recordings do.
+    """
+    usual_mm = 1e3 * own.usual_apart * own.depth_m
+    apart = f"lie {1e3 * own.apart * own.depth_m:.0f} mm apart" if own.overlap else "never meet"
+    if best is not own:
+        reading, name, left_mm = best.reading, str(best), 1e3 * best.apart * best.depth_m
+    elif main and mean_apart(main[0].apart) <= own.usual_apart:
+        reading, left_mm = main[0].reading, 1e3 * mean_apart(main[0].apart) * own.depth_m
+        name = ", or as well that ".join(str(misfit) for misfit in main)
+    elif own.overlap >= MIN_OVERLAP and own.apart > own.usual_apart:
+        return (
+            f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), "
+            f"and nothing that is tried explains it: {_TRIED}. What cannot be told: {_UNTOLD}"
+        )
+    else:
+        return ""
+    tail = f"surfaces that two frames see then lie {left_mm:.0f} mm apart; as declared they {apart}"
+    return f"{name}; {remedy(reading, own.reading)} ({tail})"
+
+
+def doubt_of_poses(conventions: list[Convention], recording: Recording, needs_proof: bool) -> str:
+    """Why it cannot be told whether poses are read rightly, in a sentence; empty where it can.
+
+    Two frames see too little of the same; or, where proof is needed, the camera moves too little to
+    tell conventions apart.
+    """
+    own, *others = conventions
+    not_proved = f"{recording.pose_file.name} is not proved:"
+    if own.overlap < MIN_OVERLAP:
+        seen = f"({own.overlap:.0%} of the points)"
+        advice = "check it, and a piece with smaller steps"
+        return f"{not_proved} two frames see too little of the same {seen}: {advice}"
+    alike = [c.name for c in others if c.subject == "poses" and not own.is_clearly_better(c)]
+    if not (needs_proof and alike):
+        return ""
+    little = f"the camera moves too little to tell {len(alike)} other conventions apart"
+    return f"{not_proved} {little}, such as {alike[0]}"
+
+
+def shared_value(counts: Int[np.ndarray, "2 values"], n_frames: int) -> int:
+    """The depth value that many pixels share, away from the rest; 0 where there is none.
+
+    `counts` are how often each value occurs, and in how many frames many share it.
+    """
+    (values,) = np.nonzero(counts[0])
+    often = counts[0, values]
+    if len(values) <= _BESIDE:
+        return 0
+    most = int(often.argmax())
+    beside = np.r_[often[max(0, most - _BESIDE) : most], often[most + 1 : most + 1 + _BESIDE]]
+    is_shared = often[most] > max(SHARED * often.sum(), _SPIKE * beside.max())
+    return int(values[most]) if is_shared and counts[1, values[most]] > _SHARING * n_frames else 0
+
+
+def of_depth_images(
+    frames: pd.DataFrame, shared: int, counts: Int[np.ndarray, "2 values"], recording: Recording
+) -> Iterator[str]:
+    """What is wrong with depth images, whatever their numbers mean."""
+    if not frames.measured.any():
+        advice = "check the depth folder, and no_depth in sequence.toml"
+        yield f"no pixel that was looked at has a depth: all are 0, or saturated (65535); {advice}"
+    if shared:
+        found = f"{counts[0, shared] / counts[0].sum():.0%} of the depths are {shared}"
+        yield f"{found}, which is no measurement; set no_depth = {shared} in sequence.toml"
+    # The first frame repeats none, so that the share is below 1 and 1 / (1 - repeated) is finite.
+    repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
+    if repeated > _MIN_REPEATED:
+        found = f"{repeated:.0%} of the depth images repeat the one before, though the poses move"
+        every = round(1 / (1 - repeated))
+        yield f"{found}: leave them out, as with --frames ::{every} of map and track"
+
+
+def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
+    """What is wrong with poses that are read rightly: some lie beside their neighbours' path."""
+    off = frames.off_mm / 1e3  # m
+    is_odd = off > max(_OFF, _OFF_STEPS * frames.moved_mm.median() / 1e3)
+    # Both neighbours of an odd pose are off by half as much: of three in a row the worst counts.
+    odd = off[is_odd & (off == off.rolling(3, 1, center=True).max())]
+    if len(odd):
+        first = recording.color_files[odd.index[0]].name
+        found = f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path"
+        advice = "check the poses there, or leave frames out with --frames of map and track"
+        yield f"{found} of their neighbours, first {first}: {advice}"
+
+
+def of_units(depth: pd.Series) -> Iterator[str]:
+    """What is wrong with depths that fit the poses: no camera measures them."""
+    near, far = PLAUSIBLE_DEPTH
+    median = depth.median()
+    if median < near or median > far:
+        advice = "set depth_scale, the depth values a metre, in sequence.toml"
+        yield f"the median depth is {median:.3g} m, outside {near:g} to {far:g} m: {advice}"
+
+
+def remarks_on_depths(
+    frames: pd.DataFrame, depth: pd.Series, is_far: pd.Series, recording: Recording
+) -> Iterator[str]:
+    """What is worth knowing of depths that are read rightly.
+
+    Depths and their steps are both as declared: only the ratio of the two decides.
+    """
+    if is_far.any():
+        low, high = depth[is_far].min(), depth[is_far].max()
+        found = f"{is_far.mean():.2%} of the depths are outliers, {low:.3g} to {high:.3g} m away"
+        rule = f"more than {FAR:g} times as far as nine in ten: maps and tracking leave them out"
+        advice = "check the camera, or set no_depth in sequence.toml to what it gives for none"
+        yield f"{found}, {rule}; {advice}"
+    step_m = np.gcd.reduce(frames.depth_step) / recording.declared.depth_scale
+    # With fewer than eight steps up to the farthest point, they may be chance.
+    if _MAX_STEP * depth.median() < step_m < depth.max() / 8:
+        advice = "look for those that the camera gave, or expect no better poses"
+        yield f"depths come in steps of {100 * step_m:.1f} cm: {advice}"
+
+
+def of_colors(
+    pairs: FramePairs, own: Reading, brightness: pd.Series, is_compared: bool
+) -> Iterator[str]:
+    """What is wrong with colours; those without contrast tell nothing.
+
+    If `is_compared`, they are compared at the points whose depths agree as declared.
+    """
+    if brightness.median() < _BLACK:
+        options = "--set tracking.lm.lambda_intensity=0, or tracking.sdf.lambda_color=0 for sdf"
+        yield f"the colour images are black: check their folder, or track without colour: {options}"
+    if not is_compared:
+        return
+    compared = pairs.compare(own)
+    as_declared = pairs.color_costs(compared)
+    if np.isfinite(as_declared).sum() < MIN_PAIRS:
+        return
+    tried = [("colours alone are mirrored", {"is_mirrored": True})]
+    tried += [(f"colours come {n:+d} frames after depth", {"shift": n}) for n in _SHIFTS if n]
+    tried += [(f"colours lie {s:+.0%} of the width too far right", {"right": s}) for s in _RIGHTS]
+    unlike = [np.nanmedian(pairs.color_costs(compared, **how)) for _, how in tried]
+    least, declared = min(unlike), np.nanmedian(as_declared)
+    if least < min(1 - _MIN_CORRELATION, _UNLIKE * declared):
+        said = tried[unlike.index(least)][0]
+        better = f"correlate by {1 - least:.2f} then, and by {1 - declared:.2f} now"
+        yield f"{said}: register them anew (where two frames see the same they {better})"
+    elif declared > 1 - _MIN_CORRELATION:
+        found = f"of points that two frames see they correlate by {1 - declared:.2f}"
+        yield f"colours do not belong to the depth images: {found}; check their folder and order"
