@@ -32,7 +32,7 @@ from nbtrack.machinery.settings import read_setting
 from nbtrack.mapping.files import MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.tracking import StepBudget, make_budget, make_tracker, paper_steps, track_sequence
-from nbtrack.tracking.paper import SdfSettings
+from nbtrack.tracking.paper import SdfSettings, SdfTracker
 
 SEQUENCE, CAMERA = walk(4), walk(1).intrinsics
 NETWORK, UNIT = NetworkSettings(width=16, n_frequencies=8), ((-1.0,) * 3, (1.0,) * 3)
@@ -76,6 +76,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "part of an iteration": lambda: mapped(settings=NeusMapping(**SMALL | {"iterations": 2.5})),
     "settings of others": lambda: mapped(settings=SdfSettings()),
     "grid of a density": lambda: tracker(BakedField(DENSITY, 0.3)),
+    "its tracker": lambda: SdfTracker(BakedField(DENSITY, 0.3), np.eye(4), StepBudget(1)),
     "density in LM": lambda: tracker(BakedField(DENSITY, 0.3), name="lm"),
     "density corrected": lambda: correction.corrected(DENSITY, SEQUENCE, np.arange(4), 0.3),
     "bounds upside down": lambda: SceneBounds((1, 1, 1), (0, 0, 0)),
@@ -288,7 +289,8 @@ UNREADABLE: dict[str, Callable[[Map], Map]] = {
 
 @pytest.mark.parametrize("case", UNREADABLE)
 def test_what_could_not_be_read_is_not_written(case: str, tmp_path: Path, monkeypatch) -> None:
-    """Catches a map that is lost when it is written, and one with another map's history."""
+    """Catches a map that is lost when it is written, and one with another map's history
+    or mesh."""
     monkeypatch.setitem(FIELDS, "kept", Kept)
     write_map(tmp_path / MAP_FILE, mapped())
     with pytest.raises(NbtrackError):
@@ -296,8 +298,10 @@ def test_what_could_not_be_read_is_not_written(case: str, tmp_path: Path, monkey
     assert read_map(tmp_path).record["seed"] == 0
     write_map(tmp_path / "alone", mapped(seed=2))
     assert len(read_map(tmp_path).history) == 3
+    (tmp_path / "mesh.ply").write_text("of the first")
     write_map(tmp_path, read_map(tmp_path / "alone"))
     assert read_map(tmp_path).history.empty
+    assert not (tmp_path / "mesh.ply").exists()
 
 
 def test_outside_of_a_grid(monkeypatch) -> None:

@@ -97,8 +97,8 @@ def test_installed_packages_join_by_their_entry_points(tmp_path: Path, monkeypat
         metadata = f"Metadata-Version: 2.1\nName: own-method\nVersion: {version}\n"
         (about / "METADATA").write_text(metadata)
         provenance._installed.cache_clear()  # as in another process
-        monkeypatch.setattr(registry, "_waiting", [*entry_points(group="nbtrack")])
         with importing():
+            monkeypatch.setattr(registry, "_waiting", [*entry_points(group="nbtrack")])
             assert main(["methods"]) == 0
             codes.append(provenance.code_fingerprint(TRACKERS["distance"]))
     assert codes[0] == codes[1] != codes[2]

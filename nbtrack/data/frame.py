@@ -7,9 +7,10 @@ import torch
 from jaxtyping import Float, Int, UInt8, UInt16
 from torch import Tensor
 
-from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values, check_array
+from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values
 from nbtrack.core.camera import Intrinsics, backproject
 from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.inputs import check_array
 
 MILLIMETRE = 1e-3
 _MAX_MILLIMETRES = np.iinfo(np.uint16).max

@@ -6,11 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nbtrack.core.arrays import Colors, Indices, Points, RaySamples, Values, tensor_of
+from nbtrack.core.arrays import Colors, Indices, Points, RaySamples, Values
 from nbtrack.core.camera import backproject, pixel_directions
 from nbtrack.data.frame import measured
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery.device import has_room_for
+from nbtrack.machinery.inputs import tensor_of
 
 # Tangent planes: how far away neighbours are, as a share of the image's width, and by how much of
 # the depth they may differ, which cuts off edges and incidences above some 75 degrees (our choice).

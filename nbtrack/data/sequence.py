@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8, UInt16
 
-from nbtrack.core.arrays import Poses, Position, check_array
+from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.core.poses import checked_poses
 from nbtrack.data.frame import MILLIMETRE, Frame
 from nbtrack.machinery.errors import ConfigError, DataError
+from nbtrack.machinery.inputs import check_array, checked_poses
 
 # Of bounds (our choice): pixels looked at in each frame, on a regular grid, and the share of points
 # cut off at either end of each axis, so that a few wild depths do not stretch the box.

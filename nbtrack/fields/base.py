@@ -14,7 +14,6 @@ from torch import Generator, Tensor, nn
 from nbtrack.core.arrays import Colors, Frames, Points, Pose, RayColors, RaySamples, Scalar, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
-from nbtrack.core.poses import checked_pose
 from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import rendering
@@ -22,6 +21,7 @@ from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.rendering import Rendering, Weights
 from nbtrack.machinery.device import usual_modes
 from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.inputs import checked_pose
 from nbtrack.machinery.settings import limited, may_be_zero
 
 # Minimum standard deviation (m) that a depth error is divided by: a perfectly sharp ray would

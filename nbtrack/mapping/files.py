@@ -56,8 +56,9 @@ def write_map(path: Path | str, finished: Map) -> None:
     """Writes a map as one file, about 1 MB for the paper's network.
 
     Weights keep every bit, so that tracking in the file gives the trajectory of the map itself.
-    In a folder the file is `MAP_FILE`, with the map's history beside it in place of any other's.
-    Raises ConfigError or DataError, and writes nothing, where `read_map` could not read it.
+    In a folder the file is `MAP_FILE`, with the map's history beside it; another's history and mesh
+    are removed. Raises ConfigError or DataError, and writes nothing, where `read_map` could not
+    read it.
     """
     path = absolute(path)
     path = path / MAP_FILE if path.is_dir() else path
@@ -81,7 +82,8 @@ def write_map(path: Path | str, finished: Map) -> None:
         if _map_of(content, path).key != finished.key:
             raise ValueError("it is read as another map")
     history = finished.history.rename_axis("iteration")
-    beside = {HISTORY_FILE: None if history.empty else history.to_csv().encode()}
+    losses = None if history.empty else history.to_csv().encode()
+    beside = {HISTORY_FILE: losses, MESH_FILE: None}
     write_together(path.parent, {**(beside if path.name == MAP_FILE else {}), path.name: content})
 
 

@@ -6,10 +6,10 @@ import torch
 from nbtrack.core.arrays import Frames
 from nbtrack.core.camera import pixel_directions
 from nbtrack.core.geometry import transform_points
-from nbtrack.core.poses import checked_pose
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField
+from nbtrack.machinery.inputs import checked_pose
 
 _MISFIT_PIXELS = 500  # of a frame, at random
 _MISFIT_FRAMES = 10

@@ -7,9 +7,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from nbtrack.core.arrays import Poses, Position
-from nbtrack.core.poses import RIGID, checked_poses
 from nbtrack.machinery.errors import DataError, MissingError
 from nbtrack.machinery.files import absolute
+from nbtrack.machinery.inputs import RIGID, checked_poses
 from nbtrack.machinery.text_files import read_numbers
 
 Times = Float[np.ndarray, "_"]  # s

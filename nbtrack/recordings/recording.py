@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool
 
 from nbtrack.core.arrays import Poses, Position
-from nbtrack.core.poses import checked_poses
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import absolute
+from nbtrack.machinery.inputs import checked_poses
 from nbtrack.machinery.text_files import read_numbers
 from nbtrack.recordings.calibration import Calibration
 from nbtrack.recordings.formats import FORMATS, Declaration, Format, declaration, files_of

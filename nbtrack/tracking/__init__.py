@@ -27,9 +27,7 @@ def check_pair(tracker_name: str, field: str | Field) -> None:
     """
     tracker = tracker_class(tracker_name)
     kind = field_class(field) if isinstance(field, str) else type(field)
-    # Of the grid of a density only the object itself says that it holds no distance.
-    is_grid = isinstance(field, Field) and kind.is_distance > field.is_distance
-    if not issubclass(kind, Field) or is_grid or not tracker.works_in(kind):
+    if not (issubclass(kind, Field) and tracker.works_in(kind)):
         fits = ", ".join(name for name, other in FIELDS.items() if tracker.works_in(other))
         named = getattr(kind, "name", kind.__name__)
         mismatch = f"tracker {tracker_name!r} does not work on field {named!r}"

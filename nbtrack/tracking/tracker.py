@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
-from nbtrack.core.poses import checked_pose
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field, LearnedField
 from nbtrack.machinery.device import matrix_products, suitable_threads, synchronize, usual_modes
 from nbtrack.machinery.errors import ConfigError, NumericalError
+from nbtrack.machinery.inputs import checked_pose
 from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
 from nbtrack.machinery.settings import checked, whole_number
 from nbtrack.tracking.budget import Budget
@@ -82,9 +82,13 @@ class Tracker(abc.ABC):
         """Begin in a map, from a pose before the first frame (m), with a budget of its own.
 
         Field and budget are copied: they stay as they are, whatever becomes of the user's. Raises
-        ConfigError for a setting that is not allowed or an unknown motion model, DataError for a
-        pose that is not rigid.
+        ConfigError for a field it does not work in, a setting that is not allowed or an unknown
+        motion model, DataError for a pose that is not rigid.
         """
+        # Of the grid of a density only the object itself says that it holds no distance.
+        if not self.works_in(type(field)) or field.is_distance < type(field).is_distance:
+            advice = "take one that renders, or a map of signed distances"
+            raise ConfigError(f"tracker {self.name!r} does not work on {field.label}: {advice}")
         self.settings = checked(settings or self.Settings(), self.Settings)
         self.field = self.prepare(deepcopy(field)).eval().requires_grad_(False)
         self.device = self.field.device

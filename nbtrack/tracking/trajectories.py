@@ -93,32 +93,6 @@ def _recipe(tracker: Tracker, sequence: RgbdSequence, is_start_known: bool) -> d
     return {"recording": sequence.digest, "map or method": files.digest_of(method, weights)}
 
 
-def _table_of(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    """The rows of frames; where the tracker has a verdict, it is that of `Estimate.lost`.
-
-    A frame that was not searched has no report, and is lost all the same.
-    """
-    frames = pd.DataFrame(rows)
-    if "lost" in frames:
-        frames["lost"] = frames["lost"].eq(True) | frames["without_depth"]
-    return frames
-
-
-def _recipe(tracker: Tracker, sequence: RgbdSequence, is_start_known: bool) -> dict[str, Any]:
-    """What a run depends on, by names for whoever gives the checkpoint of another."""
-    field = tracker.field
-    tensors = dict(chain(field.named_parameters(), field.named_buffers()))
-    return {
-        "recording": sequence.digest,
-        "map": files.digest_of(field.label, tensors),
-        "tracker": tracker.name,
-        "settings": as_dict(tracker.settings),
-        "budget": str(tracker.budget),
-        "seed": tracker.generator.initial_seed(),
-        "start": is_start_known,
-    }
-
-
 def _resumed(tracker: Tracker, checkpoint: Path | None, recipe: dict) -> list[dict[str, Any]]:
     """The rows of a checkpoint, if there is one, whose state the tracker takes up.
 

@@ -1,13 +1,16 @@
-"""Poses that a user or a file gives, checked."""
+"""Arrays and poses that a user or a file gives, checked."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from nbtrack.core.arrays import Pose, Poses
 from nbtrack.machinery.errors import DataError
 
+Poses = Float[np.ndarray, "_ 4 4"]
 _FARTHEST = 1e7  # m from the origin: beyond geographic coordinates; floats can square it
 # No camera went so many times as far from the middle of its path as nine in ten of the poses lie,
 # or than 1 m, whichever is more.
@@ -15,7 +18,26 @@ _ALONE = 1000.0
 RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 
 
-def checked_pose(T_world_camera: Any) -> Pose:
+def check_array(what: str, array: Any, shape: tuple, kinds: list, asked: str) -> None:
+    """Raises DataError for another shape, or a type that is none of the kinds (jaxtyping's).
+
+    The message calls the array `what`, and the types that it may have `asked`.
+    """
+    wanted = " ".join(map(str, shape))
+    if not any(isinstance(array, kind[np.ndarray, wanted]) for kind in kinds):
+        found = f"of type {type(array).__name__}"
+        if isinstance(array, np.ndarray):
+            found = f"{array.dtype} of shape {array.shape}"
+        raise DataError(f"{what} is {found}: give a numpy array, {asked}, of shape {shape}")
+
+
+def tensor_of(array: np.ndarray) -> Tensor:
+    """An array's memory as a tensor; a copy where PyTorch cannot share it."""
+    is_fine = array.flags.writeable and array.dtype.isnative and min(array.strides, default=0) >= 0
+    return torch.from_numpy(array if is_fine else array.astype(array.dtype.newbyteorder("=")))
+
+
+def checked_pose(T_world_camera: Any) -> Float[np.ndarray, "4 4"]:
     """One known pose (m), copied in double precision; DataError if it is no rigid transform."""
     try:
         pose = np.array(T_world_camera, dtype=np.float64)
