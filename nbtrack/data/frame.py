@@ -4,18 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8, UInt16
+from jaxtyping import Int, UInt8
 from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values
 from nbtrack.core.camera import Intrinsics, backproject
-from nbtrack.machinery.errors import DataError
-from nbtrack.machinery.inputs import check_array
+from nbtrack.machinery.inputs import checked_images
 
 MILLIMETRE = 1e-3
-_MAX_MILLIMETRES = np.iinfo(np.uint16).max
-_MAX_METRES = 100.0  # a median depth beyond it is in another unit (our choice)
-_DEPTH_UNITS = "uint16 in mm, or floating point in metres"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +41,7 @@ class Frame:
                 floating point in metres, kept to the millimetre. None is measured where it is 0,
                 NaN, infinite, negative, masked, or 65535 mm and more, the end of 16 bits.
         """
-        check_array("color", color, (camera.height, camera.width, 3), [UInt8], "uint8")
-        check_array("depth", depth, (camera.height, camera.width), [UInt16, Float], _DEPTH_UNITS)
-        if np.ma.is_masked(color):
-            raise DataError("color has masked pixels: fill them; only depth may lack some")
-        rgb = np.array(np.ma.getdata(color), order="C")
-        measured = np.ma.filled(depth, 0)
-        is_mm = measured.dtype.type == np.uint16  # of any byte order
-        depth_mm = (measured if is_mm else _in_millimetres(measured)).astype(np.int32)
-        depth_mm[depth_mm >= _MAX_MILLIMETRES] = 0
+        rgb, depth_mm = checked_images(color, depth, (camera.height, camera.width))
         return cls(camera, torch.from_numpy(rgb), torch.from_numpy(depth_mm))
 
     @property
@@ -86,15 +74,3 @@ class Frame:
 def measured(color: UInt8[Tensor, "n 3"], depth_mm: Int[Tensor, "n"]) -> tuple[Colors, Values]:
     """Colour in [0, 1] and z-depth (m, 0 = none) of pixels as they are kept."""
     return color.float() / 255, depth_mm.float() * MILLIMETRE
-
-
-def _in_millimetres(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Depth (m) in whole millimetres; 0 where it is no positive number.
-
-    Raises DataError if the median is no depth in metres.
-    """
-    depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float64)
-    median = np.median(depth[depth > 0]) if depth.any() else 0
-    if median > _MAX_METRES:
-        raise DataError(f"depth is {median:.4g} m in the median: give {_DEPTH_UNITS}")
-    return (depth / MILLIMETRE).round().clip(0, _MAX_MILLIMETRES)

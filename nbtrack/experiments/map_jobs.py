@@ -16,7 +16,7 @@ from nbtrack.experiments.jobs import Job, Report
 from nbtrack.experiments.presets import Preset, default_settings
 from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
-from nbtrack.fields import field_class
+from nbtrack.fields import FIELDS, field_class
 from nbtrack.machinery.device import choose_device
 from nbtrack.machinery.files import absolute, fingerprint
 from nbtrack.machinery.settings import whole_number
@@ -173,16 +173,21 @@ def _rough_unit(scene: Scene, frames: str) -> float:
 
 
 def _stored(path: Path) -> Map:
-    """The map of a folder or file, from a cache of this process as long as it is unchanged."""
+    """The map of a folder or file, from a cache of this process as long as it is unchanged.
+
+    So are the registered fields: of a class that is written anew the map is read anew.
+    """
     path = absolute(path)
     parts = (path / MAP_FILE, path / HISTORY_FILE) if path.is_dir() else (path,)
-    return _read(path, tuple(part.stat().st_mtime_ns for part in parts if part.is_file()))
+    modified_ns = tuple(part.stat().st_mtime_ns for part in parts if part.is_file())
+    return _read(path, modified_ns, tuple(FIELDS.items()))
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path, modified_ns: tuple[int, ...]) -> Map:
+def _read(path: Path, modified_ns: tuple[int, ...], fields: tuple) -> Map:
     """The map of a folder or file, kept for all runs in it: reading a corrected one takes seconds.
 
-    `modified_ns` is no input: with others the cache has no answer, and the files are read anew.
+    `modified_ns` and `fields` are no input: with others the cache has no answer, and the files are
+    read anew.
     """
     return read_map(path)

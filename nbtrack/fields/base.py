@@ -20,8 +20,7 @@ from nbtrack.fields import rendering
 from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.rendering import Rendering, Weights
 from nbtrack.machinery.device import usual_modes
-from nbtrack.machinery.errors import DataError
-from nbtrack.machinery.inputs import checked_pose
+from nbtrack.machinery.inputs import check_points, checked_pose
 from nbtrack.machinery.settings import limited, may_be_zero
 
 # Minimum standard deviation (m) that a depth error is divided by: a perfectly sharp ray would
@@ -74,10 +73,7 @@ class Field(nn.Module, abc.ABC):
 
     def __call__(self, points_world: Points) -> tuple[Colors, Values]:
         """`forward` at points in any precision. DataError if they are no tensor of points."""
-        shape = tuple(getattr(points_world, "shape", ()))
-        if not isinstance(points_world, Tensor) or len(shape) != 2 or shape[1] != 3:
-            found = f"{type(points_world).__name__} of shape {shape}"
-            raise DataError(f"points are a {found}: give a tensor of shape (n, 3), in m")
+        check_points(points_world)
         return super().__call__(points_world.float())
 
     @abc.abstractmethod

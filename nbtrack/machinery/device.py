@@ -3,7 +3,6 @@
 import contextlib
 import os
 import platform
-import threading
 from collections.abc import Iterator
 from functools import cache
 from typing import Any
@@ -16,9 +15,6 @@ from nbtrack.machinery.errors import ConfigError, OutOfMemory
 # Below this width matrix products are too small to share: on two cores, two threads were slower
 # than one. Rooms and methods then run side by side in processes instead.
 _WIDTH_FOR_THREADS = 192
-_LOCK = threading.Lock()
-# By setting, of each block that changes it: its thread, and what to restore.
-_RUNNING: dict[str, list[tuple[int, Any]]] = {}
 if hasattr(os, "register_at_fork"):  # a child has none of OpenMP's threads, and would wait for them
     os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
@@ -93,36 +89,31 @@ def matrix_products(tf32: bool) -> contextlib.AbstractContextManager[None]:
     TF32 keeps 10 of the mantissa's 23 bits, and is several times as fast.
     """
     precision = "high" if tf32 else "highest"
-    return _changed("float32_matmul_precision", precision, is_of_thread=False)
+    return _changed("float32_matmul_precision", precision)
 
 
 def threads(number: int) -> contextlib.AbstractContextManager[None]:
     """Run a block with so many CPU threads."""
-    return _changed("num_threads", number, is_of_thread=True)
+    return _changed("num_threads", number)
 
 
 @contextlib.contextmanager
-def _changed(name: str, within: Any, is_of_thread: bool) -> Iterator[None]:
+def _changed(name: str, within: Any) -> Iterator[None]:
     """Run a block with a setting of PyTorch's, which has no other way in, at the value `within`.
 
-    Blocks of several threads may overlap: all of them restore what was before the first. A setting
-    that `is_of_thread` is each thread's own, but new threads begin with the last that was set.
+    Where it is that already, perhaps by the block of another thread, nothing is set or restored: so
+    of two blocks the first to begin restores what was before both.
     """
     get, put = getattr(torch, f"get_{name}"), getattr(torch, f"set_{name}")
-    running = _RUNNING.setdefault(name, [])
-    with _LOCK:
-        is_nested = threading.get_ident() in [thread for thread, _ in running]
-        before = running[0][1] if running and not is_nested else get()
-        block = threading.get_ident(), before
-        running.append(block)
+    before = get()
+    is_other = before != within
+    if is_other:
         put(within)
     try:
         yield
     finally:
-        with _LOCK:
-            running.remove(block)
-            if is_of_thread or is_nested or not running:
-                put(before)
+        if is_other:
+            put(before)
 
 
 def suitable_threads(width: int) -> contextlib.AbstractContextManager[None]:

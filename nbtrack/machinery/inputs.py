@@ -1,20 +1,25 @@
-"""Arrays and poses that a user or a file gives, checked."""
+"""Numbers, arrays, images and poses that a user or a file gives, checked."""
 
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8, UInt16
 from torch import Tensor
 
-from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.errors import ConfigError, DataError
 
 Poses = Float[np.ndarray, "_ 4 4"]
 _FARTHEST = 1e7  # m from the origin: beyond geographic coordinates; floats can square it
 # No camera went so many times as far from the middle of its path as nine in ten of the poses lie,
 # or than 1 m, whichever is more.
 _ALONE = 1000.0
+_MILLIMETRE = 1e-3
+_MAX_MILLIMETRES = np.iinfo(np.uint16).max
+_MAX_METRES = 100.0  # a median depth beyond it is in another unit (our choice)
+_DEPTH_UNITS = "uint16 in mm, or floating point in metres"
 RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 
 
@@ -35,6 +40,44 @@ def tensor_of(array: np.ndarray) -> Tensor:
     """An array's memory as a tensor; a copy where PyTorch cannot share it."""
     is_fine = array.flags.writeable and array.dtype.isnative and min(array.strides, default=0) >= 0
     return torch.from_numpy(array if is_fine else array.astype(array.dtype.newbyteorder("=")))
+
+
+def checked_images(color: Any, depth: Any, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """A camera's images, copied: RGB, and depth in whole millimetres, 0 where none is measured.
+
+    Raises DataError as `Frame.of_images` says. The size is that of both: rows and columns.
+    """
+    check_array("color", color, (*size, 3), [UInt8], "uint8")
+    check_array("depth", depth, size, [UInt16, Float], _DEPTH_UNITS)
+    if np.ma.is_masked(color):
+        raise DataError("color has masked pixels: fill them; only depth may lack some")
+    measured = np.ma.filled(depth, 0)
+    if measured.dtype.type != np.uint16:  # of any byte order
+        metres = np.where(np.isfinite(measured) & (measured > 0), measured, 0).astype(np.float64)
+        median = np.median(metres[metres > 0]) if metres.any() else 0
+        if median > _MAX_METRES:
+            raise DataError(f"depth is {median:.4g} m in the median: give {_DEPTH_UNITS}")
+        measured = (metres / _MILLIMETRE).round().clip(0, _MAX_MILLIMETRES)
+    depth_mm = measured.astype(np.int32)
+    depth_mm[depth_mm >= _MAX_MILLIMETRES] = 0
+    return np.array(np.ma.getdata(color), order="C"), depth_mm
+
+
+def check_points(points: Any) -> None:
+    """Raises DataError for anything but a tensor of points, (n, 3)."""
+    shape = tuple(getattr(points, "shape", ()))
+    if not isinstance(points, Tensor) or len(shape) != 2 or shape[1] != 3:
+        found = f"{type(points).__name__} of shape {shape}"
+        raise DataError(f"points are a {found}: give a tensor of shape (n, 3), in m")
+
+
+def number(name: str, value: Any, minimum: float, maximum: float) -> float:
+    """A real number within limits. Raises ConfigError, by its name, for any other value."""
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if not (is_number and minimum <= value <= maximum):
+        allowed = f"{minimum:g} to {maximum:g}"
+        raise ConfigError(f"{name} is {value}; allowed: {allowed}; take for example 10")
+    return float(value)
 
 
 def checked_pose(T_world_camera: Any) -> Float[np.ndarray, "4 4"]:

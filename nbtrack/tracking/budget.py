@@ -8,15 +8,16 @@ import time
 from collections.abc import Callable, Generator
 from fractions import Fraction
 from math import floor
-from numbers import Real
 
 import torch
 
 from nbtrack.machinery.device import synchronize
 from nbtrack.machinery.errors import ConfigError, look_up
+from nbtrack.machinery.inputs import number
 
 _HOST = torch.device("cpu")
-_FEWEST = 1e-3  # steps, or Hz
+# Steps, or Hz: beyond, no step is taken, or all without end.
+_FEWEST, _MOST = 1e-3, 1e6
 Number = float | int
 
 
@@ -36,7 +37,7 @@ class ClockBudget:
 
     def __init__(self, rate_hz: Number, clock: Callable[[], float] = time.perf_counter) -> None:
         """Take frames a second and a clock (s); ConfigError if the rate is not 0.001 to 1e6."""
-        self.rate_hz = _positive("rate_hz", rate_hz)
+        self.rate_hz = number("rate_hz", rate_hz, _FEWEST, _MOST)
         self._clock = clock
         self.memory: float | None = None  # mean seconds of a step in the last frame
 
@@ -82,7 +83,7 @@ class StepBudget:
 
     def __init__(self, steps_per_frame: Number) -> None:
         """Raises ConfigError if the count is not 0.001 to 1e6."""
-        self.steps_per_frame = _positive("steps_per_frame", steps_per_frame)
+        self.steps_per_frame = number("steps_per_frame", steps_per_frame, _FEWEST, _MOST)
         # The nearest short fraction: 6.8 becomes 34/5, so that ten frames take 68 steps, not 67.
         self._exact = Fraction(self.steps_per_frame).limit_denominator(1_000_000)
         self.memory = 0  # frames so far
@@ -127,18 +128,10 @@ def paper_steps(tracker: str, rate_hz: Number) -> float:
     On the line through its 100 and 500 ms figures: time per step and fixed cost of a frame are then
     the same at every rate. Table II has no 200 ms column although Table I has 5 Hz (our choice).
     """
-    budget_ms = 1000 / _positive("rate_hz", rate_hz)
+    budget_ms = 1000 / number("rate_hz", rate_hz, _FEWEST, _MOST)
     at_100, at_500 = look_up("tracker of the paper", tracker, _MEASURED_STEPS)
     steps = round(at_100 + (at_500 - at_100) * (budget_ms - 100) / 400, 6)
     if steps < _FEWEST:
         found = f"rate_hz is {rate_hz:g}: the paper's hardware takes no step of {tracker}"
         raise ConfigError(f"{found}; take a lower rate, or say how many steps")
     return steps
-
-
-def _positive(name: str, value: Number) -> float:
-    """The value; ConfigError, by its name, if it is not 0.001 to 1e6."""
-    is_number = isinstance(value, Real) and not isinstance(value, bool)
-    if not (is_number and _FEWEST <= value <= 1e6):  # beyond, no step is taken, or all without end
-        raise ConfigError(f"{name} is {value}; allowed: 0.001 to 1e+06; take for example 10")
-    return float(value)
