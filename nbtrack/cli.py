@@ -84,9 +84,7 @@ OPTIONS = {
     "--width": _option("pixels (default: 640; 160 takes a tenth of the time)", int, default=640),
     "--motion": _option("handheld (default), keyframes: the dataset's, tour", default="handheld"),
     "--depth-folder": _option("default: the format's; filtered before raw depth"),
-    "--url": _option(
-        "address or path of its ZIP file (default: the authors')", default=DATASET_ZIP
-    ),
+    "--url": _option("its ZIP file, address or path (default: the authors')", default=DATASET_ZIP),
     "--poses": _option("pose file (default: the format's)", metavar="FILE"),
     "--seed": _option("of all random numbers (default: 0)", partial(a_count, minimum=0), default=0),
     "--out": _option("where to write (default: in runs/)", a_path),
@@ -99,11 +97,11 @@ OPTIONS = {
     "--set": _option("one setting, as mapping.neus.iterations=500; may be repeated", **_SETTINGS),
     "--import": _option("your file or module of fields, trackers, methods first", **_IMPORTS),
 }
-_RUN = " --device --preset --config --set"
-_MADE = " --method --field --format --frames --seed --out" + _RUN
+_RUN = " --out --device --config --set"
+_MADE = " --method --field --format --frames --seed --preset" + _RUN
 _PARTS = " --format --depth-folder --poses"
 _TRACKED = " --tracker --rate --steps --map-frames --map-from --start"
-_CELLS = "--budget --scenes --method:tables --beyond --seeds --workers --dask --out"
+_CELLS = "--budget --scenes --method:tables --beyond --seeds --workers --dask --preset"
 _CELLS += " --caption --label --no-still"
 _MODULES = {"tables": "bench", "bench": "bench", "export": "exports"}  # the others: "commands"
 # By name: what it does, and its options; a colon and a word choose one of two meanings. `map` is
@@ -118,10 +116,7 @@ COMMANDS = {
     "data make": ("write a synthetic room", "room --out:make --motion --n-frames --width --seed"),
     "data check": ("what is wrong with a recording", "folder --out:check" + _PARTS),
     "data convert": ("write a recording as the dataset is", "folder out --frames" + _PARTS),
-    "bench": (
-        "Table II on this machine, full-size networks",
-        "--out --device --preset:bench --config --set",
-    ),
+    "bench": ("Table II on this machine, full-size networks", "--preset:bench" + _RUN),
 }
 
 

@@ -149,7 +149,7 @@ ARGUMENTS = {
     "a method in another map": ([*GIVEN[:2], "--method", "vr", "--map-from", "map"], "not 'imap'"),
     "a plain map": (
         [*GIVEN[:2], "--method", "neus_corrected", *GIVEN[-1:], "map"],
-        "a corrected map",
+        "other settings than --set correction.neus=",
     ),
     "nobody's folder": ([*OWN, "--out", "~nobody_of_this_name/run"], "no such user"),
     "tracker not the map's": ([*GIVEN, "map", "--tracker", "icp"], "does not work on field 'neus'"),

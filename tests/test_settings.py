@@ -270,7 +270,7 @@ class Small:
         elif part == "tables":
             measure_steps(preset, self.scene, ["vr", "sdf"])
         else:
-            [scene.count(preset.scenes.track_frames) for scene in open_scenes(preset)]
+            [len(scene.select(preset.scenes.track_frames)) for scene in open_scenes(preset)]
 
 
 @pytest.fixture(scope="module")

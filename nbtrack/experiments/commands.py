@@ -11,7 +11,7 @@ from nbtrack.checks.check import check_recording, quick_warning
 from nbtrack.experiments import output
 from nbtrack.experiments.exports import draw_overview
 from nbtrack.experiments.jobs import run_jobs
-from nbtrack.experiments.map_jobs import OF_MAPS, MapJob
+from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, TABLE_1, method_of
 from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
 from nbtrack.experiments.runs import METRICS_FILE
@@ -51,7 +51,7 @@ def map_command(options: Namespace) -> None:
     method = method_of(options.method, options.field, tracker=None)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     scene = _opened(options, preset)
-    scene.count(options.frames)  # raises for a wrong slice, before anything is written
+    scene.select(options.frames)  # raises for a wrong slice, before anything is written
     job = MapJob.of(scene, method.field, preset, options.frames, options.seed)
     output.prepare(options.out)
     _make_map(job)
@@ -70,9 +70,8 @@ def map_command(options: Namespace) -> None:
 def _write_mesh(job: MapJob, finished: Map) -> None:
     """Write the mesh of what was seen beside a finished map, or print why there is none."""
     try:
-        recording = job.scene.recording
-        mapped = reading.select_frames(recording, reading.parse_frames(job.frames))
-        seen = reading.without_outliers(reading.read_frames(recording, mapped[::_FRAMES_APART]))
+        some = job.scene.select(job.frames)[::_FRAMES_APART]
+        seen = reading.without_outliers(reading.read_frames(job.scene.recording, some))
         mesh = extract_mesh(finished.field, seen)
     except DataError as error:
         print(f"  no mesh: {error}")
@@ -97,7 +96,7 @@ def track_command(options: Namespace) -> None:
     job = given
     if not given:
         job = MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
-        scene.count(job.frames)  # raises for a wrong slice
+        scene.select(job.frames)  # raises for a wrong slice
     run = TrackJob(
         job, scene, method.tracker, preset.tracking_of(method.tracker),
         steps=steps, rate_hz=options.rate, frames=options.frames, seed=options.seed,
@@ -168,20 +167,14 @@ def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -
     if field != made:
         advice = "leave --method and --field out"
         raise ConfigError(f"{options.map_from} is a map of field {made!r}, not {field!r}: {advice}")
-    voxels = preset.correction.get(made, 0.0), given.correction_voxel  # m, asked for and there
-    if options.method and (voxels[0] > 0) != (voxels[1] > 0):
-        asked, there = ("a corrected map" if voxel else "no corrected map" for voxel in voxels)
-        advice = "give --tracker in place of --method, or map by the method"
-        where = f"{options.map_from} is {there}"
-        raise ConfigError(f"--method {options.method} asks for {asked}, {where}: {advice}")
-    known = flat(given.setting_tree)
-    for text in options.settings:
-        asked = read_setting(text)
-        # Keys that no map has, as those of a tracker, are no contradiction.
-        if any(known[key] != asked[key] for key in asked if key in known):
-            advice = f"leave out what begins with {' or '.join(OF_MAPS)}, or map anew"
-            what = f"{options.map_from} was made with other settings than --set {text}"
-            raise ConfigError(f"{what}: {advice}")
+    known, wanted = flat(given.setting_tree), flat(preset.settings)
+    asked = {key for text in options.settings for key in read_setting(text)}
+    asked |= {f"correction.{made}"} if options.method else set()  # methods say it, or none
+    for key in sorted(asked & known.keys()):  # no map has the others, as those of a tracker
+        if known[key] != wanted[key]:
+            what = f"{options.map_from} was made with other settings than --set {key}={wanted[key]}"
+            advice = "leave it, or a --method that means it, out, or map anew"
+            raise ConfigError(f"{what}, with {known[key]}: {advice}")
 
 
 def _make_map(job: MapJob) -> None:

@@ -129,7 +129,7 @@ def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[An
     """
     missing = [job for job in jobs if not job.is_done]
     for job in missing:
-        job.scene.count(job.frames, needs_poses=False)  # raises before anything is mapped
+        job.scene.select(job.frames, needs_poses=False)  # raises before anything is mapped
     if 0 < len(missing) < len(jobs):
         tell(f"{len(jobs) - len(missing)} of {len(jobs)} runs are cached")
     for warning in reach_warnings(missing):

@@ -23,10 +23,8 @@ from nbtrack.machinery.settings import whole_number
 from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.plots.scene import up_of
-from nbtrack.recordings.reading import parse_frames, read_frames, select_frames
+from nbtrack.recordings.reading import read_frames
 
-OF_MAPS = ("network.", "mapping.", "correction.")
-"""How keys of settings begin that only matter where a map is made."""
 _FRAMES_LOOKED_AT = 20  # at most, to estimate a map's unit before there is a map
 
 
@@ -167,7 +165,7 @@ def map_unit(made: MapJob) -> float:
 @lru_cache
 def _rough_unit(scene: Scene, frames: str) -> float:
     """Metres a unit of the map that will be made, estimated from a few of its frames."""
-    ids = select_frames(scene.recording, parse_frames(frames))
+    ids = scene.select(frames)
     some = ids[np.linspace(0, len(ids) - 1, min(len(ids), _FRAMES_LOOKED_AT)).astype(int)]
     return observed_bounds(read_frames(scene.recording, some)).metres_per_unit
 

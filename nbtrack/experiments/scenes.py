@@ -5,6 +5,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from nbtrack.core.arrays import Frames
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.output import check_no_recording, is_own_output
@@ -52,9 +53,9 @@ class Scene:
         frame_ids = reading.parse_frames(frames)
         return reading.without_outliers(reading.read_frames(self.recording, frame_ids, **options))
 
-    def count(self, frames: str, needs_poses: bool = True) -> int:
-        """How many frames a slice selects; raises as `select_frames` does."""
-        return len(reading.select_frames(self.recording, reading.parse_frames(frames), needs_poses))
+    def select(self, frames: str, needs_poses: bool = True) -> Frames:
+        """Numbers of the frames of a slice; raises as `select_frames` does."""
+        return reading.select_frames(self.recording, reading.parse_frames(frames), needs_poses)
 
 
 def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) -> Scene:
@@ -102,7 +103,7 @@ def open_scenes(preset: Preset) -> list[Scene]:
     for name in names:
         try:
             scene = open_scene(name, preset)
-            scene.count(":")  # opens the recording, so that a damaged folder is found here
+            scene.select(":")  # opens the recording, so that a damaged folder is found here
             scenes.append(scene)
         except (MissingError, DataError) as error:
             missing[name] = error

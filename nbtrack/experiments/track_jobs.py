@@ -26,7 +26,6 @@ from nbtrack.machinery.errors import DataError, NbtrackError
 from nbtrack.machinery.registry import IMPORTED
 from nbtrack.machinery.settings import as_dict, changed_settings
 from nbtrack.mapping.files import Map
-from nbtrack.recordings.reading import parse_frames, select_frames
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import still_metrics
 from nbtrack.tracking.reach import reach_metrics
@@ -90,9 +89,7 @@ class TrackJob(Job):
 
     def _true_path(self) -> Poses:
         """True poses of the frames (m), NaN where not known. Raises as `select_frames` does."""
-        recording = self.scene.recording
-        frame_ids = select_frames(recording, parse_frames(self.frames), needs_poses=False)
-        return recording.T_world_camera[frame_ids]
+        return self.scene.recording.T_world_camera[self.scene.select(self.frames, False)]
 
     def check(self) -> None:
         """Raises ConfigError or DataError, before anything is made, where a run cannot begin."""

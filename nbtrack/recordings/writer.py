@@ -7,7 +7,6 @@ from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
-from jaxtyping import Float
 
 from nbtrack.core.arrays import ColorImage, DepthImage, Frames, Pose, Poses
 from nbtrack.core.camera import Intrinsics
@@ -18,6 +17,7 @@ from nbtrack.recordings.calibration import camera_matrix
 from nbtrack.recordings.formats import DECLARATION_FILE, FORMATS
 from nbtrack.recordings.images import images_of
 from nbtrack.recordings.pairing import TIMES_FILE
+from nbtrack.recordings.pose_files import number_lines
 from nbtrack.recordings.reading import read_frames, select_frames
 from nbtrack.recordings.recording import Recording
 
@@ -79,19 +79,14 @@ def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
     # The layout's y and z axes point the other way than OpenCV's. Turning them is its own inverse,
     # so that the function that reads the layout's poses also writes them.
     T_file = FORMATS["neural_rgbd"].declared.poses_to_opencv(T_world_camera)
-    texts = dict.fromkeys(["poses.txt", "trainval_poses.txt"], _text(T_file.reshape(-1, 4)))
+    texts = dict.fromkeys(["poses.txt", "trainval_poses.txt"], number_lines(T_file.reshape(-1, 4)))
     told_by_focal = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
     if np.allclose(astuple(camera), astuple(told_by_focal), rtol=0, atol=_SAME_CAMERA):
         return texts | {"focal.txt": f"{float(camera.fx)!r}\n"}
     # There is no `focal.txt` then, so that programs that know only this file stop, instead of
     # reading another camera. In `intrinsics.txt` pixel centres are whole numbers, as in OpenCV.
     K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
-    return texts | {"intrinsics.txt": _text(K)}
-
-
-def _text(rows: Float[np.ndarray, "n m"]) -> str:
-    """A line for each row, its numbers with all digits."""
-    return "".join(" ".join(map(repr, row)) + "\n" for row in rows.astype(np.float64).tolist())
+    return texts | {"intrinsics.txt": number_lines(K)}
 
 
 def convert_sequence(recording: Recording, out: Path, frames: slice = slice(None)) -> str:
@@ -105,7 +100,7 @@ def convert_sequence(recording: Recording, out: Path, frames: slice = slice(None
     numbers = select_frames(recording, frames, needs_poses=False)
     camera = images_of(recording).camera_of(numbers[0])
     with ProgressBar("converting", len(numbers)) as bar:
-        notes = {TIMES_FILE: _text(recording.times[numbers, None])}
+        notes = {TIMES_FILE: number_lines(recording.times[numbers, None])}
         if unit_m := recording.declared.metres_per_unit:
             notes[DECLARATION_FILE] = f"metres_per_unit = {unit_m}\n"
         write_sequence(out, camera, _frames(recording, numbers), notes, bar.move_to)
