@@ -137,7 +137,8 @@ def test_a_fetch_goes_on(archive: Path, tmp_path: Path, serve, capsys) -> None:
 
 def test_what_cannot_be_fetched(archive: Path, tmp_path: Path, serve, capsys, monkeypatch) -> None:
     """Catches tracebacks, and a download of all 7 GB, where a server gives no ranges; a file of
-    somebody else that is replaced; and a disk that is filled up to its end."""
+    somebody else that is replaced; a disk that is filled up to its end; and images in a ZIP file
+    that does not say of which scene they are."""
     says = "download the whole file and give its path to --url"
     assert_refused(tmp_path, capsys, [*FETCH, serve(archive, has_ranges=False)[0]], says)
     page = tmp_path / "page.html"
@@ -151,6 +152,10 @@ def test_what_cannot_be_fetched(archive: Path, tmp_path: Path, serve, capsys, mo
         assert_refused(tmp_path, capsys, FETCH[:3], "pip install 'nbtrack[fetch]'")
     other = ["data", "fetch", "whiteroom", "--url", str(archive)]
     assert_refused(tmp_path, capsys, other, "has no images and depth in a folder 'whiteroom'")
+    bare = shutil.make_archive(
+        str(tmp_path / "bare"), "zip", tmp_path / "zip/neural_rgbd_data" / SCENE
+    )
+    assert_refused(tmp_path, capsys, [*other[:-1], bare], "in a folder 'whiteroom'")
     with monkeypatch.context() as patch:
         patch.setattr("shutil.disk_usage", lambda path: shutil._ntuple_diskusage(9, 8, 1))
         assert_refused(tmp_path, capsys, [*FETCH, str(archive)], "has 0 MB free")

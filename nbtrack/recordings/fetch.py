@@ -5,7 +5,7 @@ import re
 import shutil
 import zipfile
 import zlib
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from nbtrack.data.dataset import DATASET_SCENES, DATASET_ZIP
 from nbtrack.machinery.errors import DataError, MissingError, look_up
@@ -76,14 +76,15 @@ def _files_of(name: str, archive: zipfile.ZipFile, source: str) -> Files:
     """What is read of a scene: of the folder of its name, at any depth, that holds most of it."""
     found: dict[str, Files] = {}
     for info in archive.infolist():
-        *above, inside = info.filename.rpartition(f"{name}/")
-        if _NAME.fullmatch(inside) and (not above[0] or above[0].endswith("/")):
-            found.setdefault(above[0], {})[inside] = info
+        above, _, inside = f"/{info.filename}".rpartition(f"/{name}/")
+        if _NAME.fullmatch(inside):
+            found.setdefault(above, {})[inside] = info
     files = max(found.values(), key=len, default={})
-    kinds = {path: PurePosixPath(path).parent.name for path in files}  # "" of texts
+    kinds = {path: path.rpartition("/")[0] for path in files}  # "" of texts
     wanted = [""]
     for patterns in (FORMATS["neural_rgbd"].color, FORMATS["neural_rgbd"].depth):
-        wanted += [f for p in patterns if (f := PurePosixPath(p).parent.name) in kinds.values()][:1]
+        folders = (pattern.rpartition("/")[0] for pattern in patterns)
+        wanted += [folder for folder in folders if folder in kinds.values()][:1]
     if len(wanted) < 3:
         found = f"{source} has no images and depth in a folder {name!r}"
         raise MissingError(f"{found}: name the dataset's own ZIP file with --url")

@@ -37,16 +37,16 @@ def write_sequence(
     """Write frames, and notes (texts of further files, by name), as a scene in the layout.
 
     It is put in place when it is complete, so that a run that is killed leaves no half-written
-    scene; only if the system ends it at once, a hidden folder `.scene.….unfinished` stays beside.
+    scene; only if the system ends it at once, a hidden folder `.NAME.….unfinished` stays beside.
     `progress` is called after each frame with how many are written. At least one frame is needed.
     Raises DataError if the folder exists.
     """
     if folder.exists():
         raise DataError(f"{folder} exists: choose another folder or remove it first")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    # A sibling, so that the final rename stays within one file system. Its name does not hold the
-    # folder's, which may be as long as a file system allows.
-    with TemporaryDirectory(".unfinished", ".scene.", folder.parent) as hidden:
+    # A sibling, so that the final rename stays within one file system. Its name, which messages
+    # hold, begins with the folder's, which may be as long as a file system allows.
+    with TemporaryDirectory(".unfinished", f".{folder.name[:40]}.", folder.parent) as hidden:
         unfinished = Path(hidden) / "scene"
         unfinished.mkdir()
         poses = []
