@@ -134,7 +134,6 @@ def test_rendered_losses_by_hand() -> None:
         color=torch.tensor([[0.3, 0.5, 0.7], [0.4, 0.4, 0.4], [1.0, 1.0, 1.0]]),
         depth=torch.tensor([1.5, 2.0, 3.0]),
         depth_variance=torch.tensor([0.25, 0.0, 1.0], requires_grad=True),
-        opacity=torch.ones(3),
         weights=torch.ones(3, 1),
     )
     color = torch.tensor([[0.1, 0.3, 0.5], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])

@@ -23,8 +23,7 @@ class Rendering:
     color: Float[Tensor, "rays 3"]  # in [0, 1]
     depth: Float[Tensor, "rays"]  # z-depth, m
     depth_variance: Float[Tensor, "rays"]  # m^2
-    opacity: Float[Tensor, "rays"]  # sum of the weights, at most 1
-    weights: RaySamples
+    weights: RaySamples  # their sum is at most 1
 
 
 def weights_from_density(
@@ -78,7 +77,6 @@ def composite(weights: RaySamples, colors: RayColors, depths: RaySamples) -> Ren
         color=(weights[..., None] * colors).sum(dim=-2),
         depth=depth,
         depth_variance=(weights * (depth[:, None] - depths).square()).sum(dim=-1),
-        opacity=weights.sum(dim=-1),
         weights=weights,
     )
 

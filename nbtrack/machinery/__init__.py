@@ -1,1 +1,2 @@
-"""What any program needs: errors, settings, files, text files, progress, and the device's use."""
+"""What any program needs: errors, settings, files, text files, checks of input, progress, and the
+device's use."""
