@@ -1,10 +1,8 @@
 """Tracking: a camera's pose, frame by frame, in a field that is known."""
 
-import importlib.util
-
 from nbtrack.core.arrays import Pose
-from nbtrack.fields import FIELDS, Field, field_class
-from nbtrack.machinery.errors import ConfigError, MissingError, look_up_kind
+from nbtrack.fields import Field, field_class
+from nbtrack.machinery.errors import look_up_kind
 from nbtrack.machinery.registry import Registry
 from nbtrack.tracking.budget import Budget, ClockBudget, StepBudget, make_budget, paper_steps
 from nbtrack.tracking.paper import AdamTracker, SdfSettings, SdfTracker, VrSettings, VrTracker
@@ -20,21 +18,9 @@ def tracker_class(name: str) -> type[Tracker]:
     return look_up_kind("tracker", name, TRACKERS, ["name"])
 
 
-def check_pair(tracker_name: str, field: str | Field) -> None:
-    """Raises ConfigError if a tracker or a field is unknown, or they do not go together.
-
-    MissingError, if a package that the tracker needs is not installed.
-    """
-    tracker = tracker_class(tracker_name)
-    kind = field_class(field) if isinstance(field, str) else type(field)
-    if not (issubclass(kind, Field) and tracker.works_in(kind)):
-        fits = ", ".join(name for name, other in FIELDS.items() if tracker.works_in(other))
-        named = getattr(kind, "name", kind.__name__)
-        mismatch = f"tracker {tracker_name!r} does not work on field {named!r}"
-        raise ConfigError(f"{mismatch}: take one of {fits}")
-    if tracker.package and importlib.util.find_spec(tracker.package) is None:
-        extra = f"pip install 'nbtrack[{tracker_name}]'"
-        raise MissingError(f"tracker {tracker_name} needs the package {tracker.package}: {extra}")
+def check_pair(tracker_name: str, field: str) -> None:
+    """Raises ConfigError if a tracker or a field is unknown, else as `Tracker.check_field` does."""
+    tracker_class(tracker_name).check_field(field_class(field))
 
 
 def make_tracker(
@@ -47,8 +33,6 @@ def make_tracker(
 ) -> Tracker:
     """A tracker by name, for one trajectory; `tracker.track(frame)` then gives pose after pose.
 
-    The arguments are those of `Tracker`. Raises ConfigError or MissingError as `check_pair` does,
-    and DataError for a pose that is none.
+    The arguments are those of `Tracker`. Raises ConfigError for an unknown name, and as it does.
     """
-    check_pair(name, field)
     return tracker_class(name)(field, T_world_camera, budget, settings, seed)

@@ -1,6 +1,7 @@
 """What every tracker is: it takes frame after frame and says where the camera was."""
 
 import abc
+import importlib.util
 import time
 from copy import copy, deepcopy
 from dataclasses import dataclass, field
@@ -11,9 +12,9 @@ import torch
 
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
 from nbtrack.data.frame import Frame
-from nbtrack.fields import Field, LearnedField
+from nbtrack.fields import FIELDS, Field, LearnedField
 from nbtrack.machinery.device import matrix_products, suitable_threads, synchronize, usual_modes
-from nbtrack.machinery.errors import ConfigError, NumericalError
+from nbtrack.machinery.errors import ConfigError, MissingError, NumericalError
 from nbtrack.machinery.inputs import checked_pose
 from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
 from nbtrack.machinery.settings import checked, whole_number
@@ -82,13 +83,10 @@ class Tracker(abc.ABC):
         """Begin in a map, from a pose before the first frame (m), with a budget of its own.
 
         Field and budget are copied: they stay as they are, whatever becomes of the user's. Raises
-        ConfigError for a field it does not work in, a setting that is not allowed or an unknown
-        motion model, DataError for a pose that is not rigid.
+        as `check_field` does, ConfigError for a setting that is not allowed or an unknown motion
+        model, DataError for a pose that is not rigid.
         """
-        # Of the grid of a density only the object itself says that it holds no distance.
-        if not self.works_in(type(field)) or field.is_distance < type(field).is_distance:
-            advice = "take one that renders, or a map of signed distances"
-            raise ConfigError(f"tracker {self.name!r} does not work on {field.label}: {advice}")
+        self.check_field(field)
         self.settings = checked(settings or self.Settings(), self.Settings)
         self.field = self.prepare(deepcopy(field)).eval().requires_grad_(False)
         self.device = self.field.device
@@ -103,6 +101,24 @@ class Tracker(abc.ABC):
         if cls.renders:
             return issubclass(field, LearnedField)
         return field.is_distance
+
+    @classmethod
+    def check_field(cls, field: Field | type[Field]) -> None:
+        """Raises ConfigError for a field, or a class of fields, in which it does not work.
+
+        MissingError, if a package that it needs is not installed.
+        """
+        kind = field if isinstance(field, type) else type(field)
+        # Of the grid of a density only the object itself says that it holds no distance.
+        fits = issubclass(kind, Field) and cls.works_in(kind)
+        if not fits or field.is_distance < kind.is_distance:
+            named = getattr(kind, "name", kind.__name__)
+            known = ", ".join(name for name, other in FIELDS.items() if cls.works_in(other))
+            mismatch = f"tracker {cls.name!r} does not work on field {named!r}"
+            raise ConfigError(f"{mismatch}: take one of {known}")
+        if cls.package and importlib.util.find_spec(cls.package) is None:
+            extra = f"pip install 'nbtrack[{cls.name}]'"
+            raise MissingError(f"tracker {cls.name} needs the package {cls.package}: {extra}")
 
     def prepare(self, field: Field) -> Field:
         """A map in the form, and on the device, in which this tracker asks it."""
