@@ -159,6 +159,13 @@ def camera_words(camera: Intrinsics, width: str, height: str) -> dict[str, float
     return {**sizes, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
 
 
+def change_camera(folder: Path, **values: object) -> None:
+    """Other entries in the camera's file of a plain folder; None takes one out."""
+    content = json.loads((folder / "intrinsics.json").read_text()) | values
+    content = {key: value for key, value in content.items() if value is not None}
+    (folder / "intrinsics.json").write_text(json.dumps(content))
+
+
 def tum_lines(times: np.ndarray, poses: np.ndarray, order: str = "xyzw") -> str:
     q = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=order == "wxyz")
     return matrix_text(np.column_stack([times, poses[:, :3, 3], q]))

@@ -1,6 +1,5 @@
 """Broken recordings, a fault of each class: one clear line, never a traceback or a guess."""
 
-import json
 import shutil
 import struct
 import zlib
@@ -10,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recordings import N_FRAMES, WRITERS, write_recording
+from recordings import N_FRAMES, WRITERS, change_camera, write_recording
 from test_faults import assert_refused
 
 from nbtrack.cli import main
@@ -54,13 +53,7 @@ def line(name: str, number: int, *contents: str) -> Damage:
 
 
 def camera(**values: object) -> Damage:
-    """Change values of a camera's JSON file; None drops a key."""
-
-    def change(content: bytes) -> bytes:
-        entries = (json.loads(content) | values).items()
-        return json.dumps({"camera": {k: v for k, v in entries if v is not None}}).encode()
-
-    return changed("intrinsics.json", change)
+    return lambda folder: change_camera(folder, **values)
 
 
 def toml(content: str) -> Damage:

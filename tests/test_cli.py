@@ -17,13 +17,11 @@ from test_faults import assert_refused
 from tiny import tiny_words
 
 import nbtrack
+from nbtrack import load_preset, open_scene, read_map
 from nbtrack.cli import COMMANDS, main
-from nbtrack.experiments.presets import load_preset
-from nbtrack.experiments.scenes import open_scene
 from nbtrack.machinery import files
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import naming_damaged, runs_folder
-from nbtrack.mapping.files import read_map
 from nbtrack.recordings.pose_files import read_tum
 from nbtrack.recordings.recording import open_recording
 
@@ -61,19 +59,6 @@ def test_track_writes_what_it_promises(tmp_path: Path, capsys) -> None:
     rows = (out / "frames.csv").read_text().splitlines()
     assert rows[0].startswith("frame_id,time,steps,seconds,loss,translation_error_m")
     assert len(rows) == 6
-
-
-def test_a_second_run_finds_the_map(capsys, tmp_path: Path) -> None:
-    """Catches maps that are made again although nothing changed, or not although it did, and a map
-    whose quality or folder is not printed."""
-    assert main(["map", "living_room", "--field", "neus", *TINY]) == 0
-    printed = capsys.readouterr().out
-    assert all(text in printed for text in (str(tmp_path / "runs"), "sdf_near_m", "mesh"))
-    said = []
-    for more in ([], ["--set", "mapping.neus.n_rays=17"]):
-        assert main(track("living_room", *more)) == 0
-        said.append(capsys.readouterr().out.splitlines()[0].partition(" in ")[0])
-    assert said == ["map found", "no finished map"]
 
 
 def test_tracking_command_reads_any_format(tmp_path: Path, capsys) -> None:

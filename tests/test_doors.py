@@ -2,10 +2,10 @@
 
 import copy
 import pickle
-import threading
 import warnings
 from collections.abc import Callable
-from contextlib import AbstractContextManager, contextmanager
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -110,6 +110,10 @@ REFUSED: dict[str, Callable[[], object]] = {
     "steps and rates": tracked_with(steps=3, rates_hz=[10]),
     "steps by the clock": tracked_with(steps=3, clock=True),
     "part of a seed to track": tracked_with(seeds=[0.5]),
+    "a rate for rates": tracked_with(rates_hz=10),
+    "a seed for seeds": tracked_with(seeds=3),
+    "a name for names": tracked_with(methods="huber"),
+    "a name for scenes": tracked_with(scenes="office"),
     "fewer tracked": lambda: nbtrack.track_scenes(**scenes(), tracked=2 * scenes()["scenes"]),
 }
 
@@ -131,7 +135,7 @@ def test_right_in_another_form() -> None:
     assert mapped(foreign).key == mapped(backwards.select(np.arange(4))).key
     depth = SEQUENCE.depths_mm[0].copy()
     depth[:, 5:] = 65535
-    for image in (depth, np.asfortranarray(depth), depth / 1000):
+    for image in (depth, np.asfortranarray(depth), depth.astype(">u2"), depth / 1000):
         frame = Frame.of_images(CAMERA, SEQUENCE.colors[0], image)
         assert frame.depth_mm.is_contiguous()
         assert frame.depth_mm.max() == depth[:, :5].max()
@@ -174,47 +178,32 @@ def test_modes_do_not_matter(mode: str, monkeypatch) -> None:
     monkeypatch.setattr(correction, "_N_POINTS", 2000)
     constant.cache_clear()
     with MODES[mode]():
-        before = torch.get_default_dtype(), torch.get_rng_state().tolist()
+        before = torch.get_default_dtype(), torch.is_grad_enabled(), torch.get_rng_state().tolist()
         found = everything()
-        assert (torch.get_default_dtype(), torch.get_rng_state().tolist()) == before
+        after = torch.get_default_dtype(), torch.is_grad_enabled(), torch.get_rng_state().tolist()
+    assert after == before
     assert all(np.array_equal(a, b) for a, b in zip(found, everything(), strict=True))
 
 
 def test_threads_leave_the_process_as_it_was(tmp_path: Path) -> None:
     """Catches a setting of the process, or its warnings, that the last of two threads restores to
     what the first had made of it."""
-    found = []
-
-    def block(entered: threading.Event, leave: threading.Event) -> None:
-        with threads(1), matrix_products(tf32=True):
-            entered.set()
-            leave.wait()
-
-    def settings() -> None:
-        found.append((torch.get_num_threads(), torch.get_float32_matmul_precision()))
-
-    def in_thread(work: Callable, *events: threading.Event) -> threading.Thread:
-        thread = threading.Thread(target=work, args=events)
-        thread.start()
-        return thread
-
     torch.set_num_threads(2)
     filters = [*warnings.filters]
-    events = [(threading.Event(), threading.Event()) for _ in range(2)]
-    blocks = []
-    for pair in events:
-        blocks.append(in_thread(block, *pair))
-        pair[0].wait()
-    for thread, (_, leave) in zip(blocks, events, strict=True):
-        leave.set()
-        thread.join()
-    in_thread(settings).join()
-    assert found == [(2, "highest")]
+    blocks = [(ThreadPoolExecutor(1), ExitStack()) for _ in range(2)]  # of a thread each
+    for thread, stack in blocks:
+        for block in (threads(1), matrix_products(tf32=True)):
+            thread.submit(stack.enter_context, block).result()
+    for thread, stack in blocks:
+        thread.submit(stack.close).result()
+    fresh = ThreadPoolExecutor(1)
+    assert fresh.submit(torch.get_num_threads).result() == 2
+    assert fresh.submit(torch.get_float32_matmul_precision).result() == "highest"
     with locked(tmp_path / "lock"):
-        waiting = in_thread(lambda: locked(tmp_path / "lock").__enter__())
-        waiting.join(timeout=0.3)
+        waiting = fresh.submit(locked(tmp_path / "lock").__enter__)
+        wait([waiting], timeout=0.3)
         assert [*warnings.filters] == filters
-    waiting.join()
+    waiting.result()
 
 
 @pytest.mark.parametrize("name", ["sdf", "lm"])
@@ -283,6 +272,8 @@ UNREADABLE: dict[str, Callable[[Map], Map]] = {
     "grid": lambda made: replace(made, field=BakedField(made.field, 0.3)),
     "class": lambda made: replace(made, field=Kept(NETWORK, made.field.bounds, torch.Generator())),
     "record": lambda made: replace(made, record={**made.record, "network": {"width": 9}}),
+    "no seconds": lambda made: replace(made, record={**made.record, "seconds": np.nan}),
+    "no record": lambda made: replace(made, record={"network": {}}),
     "numpy": lambda made: replace(made, record={**made.record, "mine": np.ones(3)}),
 }
 

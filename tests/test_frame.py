@@ -102,7 +102,7 @@ def test_a_spoilt_frame_is_survived_and_flagged(case: str) -> None:
     assert error_m(estimate.T_world_camera, sequence, index) < 0.01
 
 
-def test_images_and_poses_that_are_none(monkeypatch) -> None:
+def test_images_that_are_none(monkeypatch) -> None:
     """Catches a traceback for what a camera's driver returns when it has no image, where types are
     not checked at each call."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
@@ -110,8 +110,6 @@ def test_images_and_poses_that_are_none(monkeypatch) -> None:
     for depth in (None, [[1.0]], torch.ones(12, 16)):
         with pytest.raises(DataError, match=f"depth is of type {type(depth).__name__}: give a num"):
             Frame.of_images(CAMERA_OF_BUFFERS, color, depth)
-    with pytest.raises(ValueError, match="is no rigid transform: give 4 x 4 finite numbers"):
-        make_tracker("lm", BoxRoom(), np.eye(4)[:3], StepBudget(1))
 
 
 def test_memory_may_be_used_again() -> None:
@@ -135,11 +133,9 @@ def test_memory_may_be_used_again() -> None:
     assert np.isfinite(tracker.track(sequence[1]).T_world_camera).all()
 
 
-def test_masks_and_byte_orders() -> None:
-    """Catches masked depth that is taken for measured, and big-endian millimetres for metres."""
+def test_masked_depth() -> None:
+    """Catches masked depth that is taken for measured."""
     color, depth = np.zeros((12, 16, 3), np.uint8), np.full((12, 16), 1500, np.uint16)
-    swapped = Frame.of_images(CAMERA_OF_BUFFERS, color, depth.astype(">u2"))
-    assert (swapped.depth_mm == 1500).all()
     masked = np.ma.masked_array(depth, np.arange(192).reshape(12, 16) < 16)
     frame = Frame.of_images(CAMERA_OF_BUFFERS, color, masked)
     assert (frame.depth_mm[0] == 0).all()

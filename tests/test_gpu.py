@@ -58,9 +58,7 @@ def test_tracking_on_a_device(name: str, field_name: str, device: torch.device) 
 
 @pytest.mark.parametrize("device", [cuda], indirect=True)
 @pytest.mark.parametrize(("name", "field_name"), [("sdf", "neus"), ("vr", "imap"), ("vr", "neus")])
-def test_recorded_steps_are_the_steps(
-    name: str, field_name: str, device: torch.device, monkeypatch
-) -> None:
+def test_recorded_steps(name: str, field_name: str, device: torch.device, monkeypatch) -> None:
     """Catches recorded steps that draw other numbers, or keep what changes."""
     recorded = poses(name, field_name, device)
     monkeypatch.setattr(launches, "CALLS_BEFORE_RECORDING", 1_000_000)
@@ -69,9 +67,7 @@ def test_recorded_steps_are_the_steps(
 
 @pytest.mark.parametrize("device", [cuda], indirect=True)
 @pytest.mark.parametrize("name", ["imap", "neus", "neus_plus"])
-def test_recorded_iterations_are_the_iterations(
-    name: str, device: torch.device, monkeypatch
-) -> None:
+def test_recorded_iterations(name: str, device: torch.device, monkeypatch) -> None:
     """Catches tensors left on the host, losses that are not finite, and recorded iterations that
     draw other numbers, or keep what changes."""
     totals = []

@@ -8,17 +8,16 @@ import pytest
 import torch
 from box_room import PLANES, plane_depths, poses_at, sequence_of
 
+from nbtrack import Frame, Map
 from nbtrack.beyond.icp import IcpSettings
 from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.points import PointCloud, PointMapping, fuse_points
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.quality import score_map
 from nbtrack.fields import NetworkSettings
 from nbtrack.machinery.errors import ConfigError, MissingError
-from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
 from nbtrack.tracking import StepBudget, Tracker, make_tracker

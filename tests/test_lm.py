@@ -7,13 +7,12 @@ import pytest
 import torch
 from box_room import BoxRoom, box_sequence, narrow_room, sequence_of, walk
 
+from nbtrack import Field, Frame
 from nbtrack.beyond.grid import Accuracy, BakedField
 from nbtrack.beyond.lm import LmSettings, LmTracker
 from nbtrack.beyond.lm_solver import retract
 from nbtrack.beyond.views import Viewpoints, view_of
 from nbtrack.core.camera import Intrinsics
-from nbtrack.data.frame import Frame
-from nbtrack.fields import Field
 from nbtrack.tracking import StepBudget
 from nbtrack.tracking.metrics import pose_errors
 
@@ -111,14 +110,6 @@ def test_a_restart_forgets_the_past() -> None:
     assert (tracker.was_lost, tracker.last_good is None) == (True, False)
     tracker.restart(T_TRUE)
     assert (tracker.was_lost, tracker.last_good) == (False, None)
-
-
-def test_without_restarts_no_hypotheses_are_evaluated(monkeypatch) -> None:
-    """Catches a thousand poses that are compared and dropped in every lost frame."""
-    tracker = begun(mapped_from(T_TRUE), n_restarts=0)
-    monkeypatch.setattr(tracker, "_other_starts", lambda *_: pytest.fail("evaluated"))
-    assert run(tracker, retract(T_TRUE, FAR), 200)
-    assert tracker.is_converged
 
 
 def test_a_field_is_asked_on_a_grid_of_the_voxel_that_is_set() -> None:

@@ -210,9 +210,7 @@ def test_a_frame_without_depth_tells_nothing() -> None:
     assert "frame 0 of wall has no depth" in check_belongs(finished_wall(), sequence[0])
 
 
-def test_a_file_gives_the_same_trajectory_elsewhere(
-    work: Path, tmp_path: Path, monkeypatch
-) -> None:
+def test_a_file_gives_the_same_trajectory(work: Path, tmp_path: Path, monkeypatch) -> None:
     """Catches weights that lose a bit on the way, a file that needs what is not in it, a folder of
     twice the size, and a map's parts that are not written together."""
     monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
@@ -276,15 +274,6 @@ def test_up_is_up(up: list[int]) -> None:
     np.testing.assert_allclose(found[0] - found[1], [0, 1, 0], atol=1e-6)
     before, after = (np.linalg.det(p[[0, 2, 3]] - p[1]) for p in (points, np.asarray(found)))
     assert after == pytest.approx(before, rel=1e-5)
-
-
-def test_a_record_that_could_not_be_read_is_not_written(work: Path, tmp_path: Path) -> None:
-    """Catches a map that is written and lost, since `read_map` refuses it."""
-    stored = read_map("map")
-    for record in ({**stored.record, "seconds": float("nan")}, {"network": {}}):
-        with pytest.raises(DataError, match="give its record what `map_sequence` does"):
-            write_map(tmp_path / MAP_FILE, replace(stored, record=record))
-    assert not (tmp_path / MAP_FILE).exists()
 
 
 def test_the_readmes_example(work: Path, capsys) -> None:

@@ -7,17 +7,16 @@ import pytest
 import torch
 from box_room import sequence_of
 
+from nbtrack import load_preset, read_map, write_map
 from nbtrack.beyond.feature_grid import FeatureGrid, GridNetwork, GridPlusMapping
 from nbtrack.beyond.neus_plus import NeusPlusMapping, ObservedDistance, distance_targets
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
-from nbtrack.experiments.presets import load_preset
 from nbtrack.fields import NetworkSettings
 from nbtrack.fields.neus import guided_depths
 from nbtrack.machinery.errors import ConfigError
-from nbtrack.mapping.files import read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
 

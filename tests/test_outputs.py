@@ -19,10 +19,9 @@ from recordings import write_recording
 from test_faults import assert_refused, contents
 from tiny import tiny_words
 
+from nbtrack import load_preset, track_scenes
 from nbtrack.cli import main
 from nbtrack.experiments import map_jobs
-from nbtrack.experiments.grid import track_scenes
-from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.machinery import files
 from nbtrack.machinery.device import threads

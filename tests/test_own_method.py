@@ -15,13 +15,12 @@ from test_faults import assert_refused
 from tiny import TINY, tiny_words
 
 import nbtrack
-from nbtrack import provenance
+from nbtrack import load_preset, provenance
 from nbtrack.cli import main
 from nbtrack.experiments.methods import METHODS, method_of
-from nbtrack.experiments.presets import load_preset
 from nbtrack.fields import FIELDS, NeusMapping
 from nbtrack.machinery import registry
-from nbtrack.machinery.errors import ConfigError, NbtrackError
+from nbtrack.machinery.errors import ConfigError
 from nbtrack.machinery.files import runs_folder
 from nbtrack.machinery.registry import Registry
 from nbtrack.machinery.settings import with_settings
@@ -278,13 +277,3 @@ def test_losses_that_are_no_terms(spoilt: Callable, says: str, monkeypatch) -> N
     preset = load_preset(settings=[*TINY, "scenes.names=['office']"])
     with pytest.raises(ConfigError, match=says):
         nbtrack.map_scene(nbtrack.open_scenes(preset)[0], "mine", preset)
-
-
-def test_one_thing_in_place_of_several() -> None:
-    """Catches a number that cannot be looped over, and letters taken for names of methods."""
-    preset = load_preset(settings=[*TINY, "scenes.names=['office']"])
-    right = {"scenes": nbtrack.open_scenes(preset), "methods": ["sdf"], "preset": preset}
-    for name, wrong in {"rates_hz": 10, "seeds": 3, "methods": "huber", "scenes": "office"}.items():
-        with pytest.raises(NbtrackError, match=f"^{name} = {wrong!r} is no list: write"):
-            nbtrack.track_scenes(**right | {name: wrong})
-    assert not (runs_folder() / "maps").exists()

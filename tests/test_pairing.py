@@ -38,9 +38,7 @@ def rename(recording: Path, colors: Sequence[str], depths: Sequence[str] | None 
         ("scan_{:03}.color", "scan_{:03}.depth", (0, 3, 4, 7, 8, 9)),
     ],
 )
-def test_names_are_told_by_what_varies(
-    plain: Path, color: str, depth: str, numbers: tuple[int, ...]
-) -> None:
+def test_numbers_in_names(plain: Path, color: str, depth: str, numbers: tuple[int, ...]) -> None:
     """Catches a number of the camera, the bits or the date that is taken for the frame's, and an
     image that is refused, or put in another place, for it."""
     rename(plain, [color.format(i) for i in numbers], [depth.format(i) for i in numbers])

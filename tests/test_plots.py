@@ -34,7 +34,7 @@ from nbtrack.plots.style import PALETTE, method_colors
 from nbtrack.tracking import SdfSettings, StepBudget, Tracker, make_tracker
 
 CUBE = SceneBounds((-2.0,) * 3, (2.0,) * 3)
-
+ROOM = SimpleNamespace(sdf=lambda points: 1.5 - np.linalg.norm(points, axis=1))
 
 # A hollow sphere around the origin: the distance, positive inside, and a density (1/m).
 SPHERE = Formula(lambda points: 1.5 - points.norm(dim=-1), CUBE)
@@ -186,8 +186,7 @@ def contours(figure: Figure) -> list[np.ndarray]:
 def test_the_zero_level_lies_on_the_sphere(sequence, field, height, up) -> None:
     """Catches swapped grid axes, a wrong height or level, pixels off by half, and a field and the
     true surface drawn in different frames."""
-    room = SimpleNamespace(sdf=lambda points: 1.5 - np.linalg.norm(points, axis=1))
-    circles = contours(plots.plot_slice(field, held(sequence, up), height, room))
+    circles = contours(plots.plot_slice(field, held(sequence, up), height, ROOM))
     for circle in circles:
         radius = np.sqrt(1.5**2 - height**2)
         assert np.linalg.norm(circle, axis=1) == pytest.approx(radius, abs=2e-3)
@@ -207,23 +206,20 @@ def test_names_that_are_no_formulas(tmp_path: Path) -> None:
     assert (tmp_path / "picture.png").stat().st_size > 1000
 
 
-def test_slices_side_by_side_share_their_colours(sequence) -> None:
-    """Catches maps that are compared in two scales, and panels without their map's name."""
+def test_slices_side_by_side(sequence) -> None:
+    """Catches maps that are compared in two scales, panels without their map's name, and a room
+    with another sign, frame or scale than its map."""
     left, right, _ = plots.plot_slice([SPHERE, NEAR], sequence, 0.0, title="two").axes
     assert left.collections[0].norm is right.collections[0].norm
     assert SPHERE.label in left.get_title("left")
-
-
-def test_the_exact_distance_stands_beside_the_map(sequence) -> None:
-    """Catches a room with another sign, frame or scale than its map."""
-    room = SimpleNamespace(sdf=lambda points: 1.5 - np.linalg.norm(points, axis=1))
-    panels = plots.plot_slice(SPHERE, sequence, 0.0, room).axes[:2]
+    panels = plots.plot_slice(SPHERE, sequence, 0.0, ROOM).axes[:2]
     mapped, exact = (np.asarray(axes.collections[0].get_array()) for axes in panels)
     assert exact == pytest.approx(mapped, abs=1e-6)
 
 
 def test_what_was_not_seen_is_veiled(sequence) -> None:
-    """Catches a veil that is mirrored, shifted, or over what the frames have measured."""
+    """Catches a veil that is mirrored, shifted, or over what the frames have measured; and a room
+    that is lost in a wide, unseen surrounding, or cut off."""
     axes = plots.plot_slice(SPHERE, sequence, 0.0).axes[0]
     (veil,) = [c for c in axes.collections if c.get_gid() == "unseen"]
     # Before and just behind the surface; far behind it, behind the camera, out of view.
@@ -231,12 +227,7 @@ def test_what_was_not_seen_is_veiled(sequence) -> None:
     z = np.array([-0.5, -1.05, -1.3, 0.5, -0.5])
     row, column = (((place + 2) / 4 * 240).round().astype(int) for place in (z, x))
     assert veil.get_array()[row, column, 3].tolist() == [0, 0, 1, 1, 1]  # bounds are [-2, 2]
-
-
-def test_a_slice_ends_around_what_was_seen(sequence) -> None:
-    """Catches a room that is lost in a wide, unseen surrounding, or cut off."""
-    axes = plots.plot_slice(SPHERE, sequence, 0.0).axes[0]
-    (veil,) = [c for c in axes.collections if c.get_gid() == "unseen"]
+    # The slice ends around what was seen.
     seen = np.flatnonzero((veil.get_array()[..., 3] == 0).any(axis=0)) / 240 * 4 - 2
     x = np.concatenate([seen, sequence.T_world_camera[:, 0, 3]])
     assert axes.get_xlim() == pytest.approx((x.min() - 0.1, x.max() + 0.1), abs=0.02)

@@ -5,21 +5,19 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import torch
-from box_room import BoxRoom, box_sequence, poses_at, walk
+from box_room import BoxRoom, poses_at, walk
 from numpy.testing import assert_allclose
 
+from nbtrack import load_preset, read_sequence
 from nbtrack.data.dataset import DATASET_UNITS
 from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.map_jobs import MapJob
-from nbtrack.experiments.presets import load_preset
 from nbtrack.experiments.scenes import Scene, open_scene
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.machinery.files import tables_folder
-from nbtrack.recordings.reading import read_sequence
 from nbtrack.synthetic import make_room
 from nbtrack.tables import published_table_1
-from nbtrack.tracking import SdfSettings, StepBudget, VrSettings, make_tracker
+from nbtrack.tracking import SdfSettings, StepBudget, make_tracker
 from nbtrack.tracking.metrics import trajectory_metrics
 from nbtrack.tracking.reach import greedy_ate, greedy_follower, motion_of, reach, reach_metrics
 
@@ -36,26 +34,6 @@ READINGS = "metre", "map", "metre, constant velocity"
 def straight(speed_m: float) -> np.ndarray:
     """Eleven poses that move evenly along x."""
     return poses_at(np.outer(speed_m * np.arange(11), [1, 0, 0]))
-
-
-@pytest.mark.parametrize("scale", [1.0, 2.5])
-@pytest.mark.parametrize(("name", "settings"), [("vr", VrSettings), ("sdf", SdfSettings)])
-def test_a_step_is_a_share_of_the_unit(name: str, settings: type, scale: float) -> None:
-    """Catches rates in metres where the map's unit, half its longest side, is meant, and swapped
-    ones: Adam's first step is the rate, in each coordinate."""
-    half = (1.0 * scale, 0.8 * scale, 1.2 * scale)
-    room = BoxRoom(as_density=name == "vr", half=half)
-    unit = room.bounds.metres_per_unit
-    assert unit == pytest.approx(1.2 * scale + 0.1)
-    frame = box_sequence([[0.05, 0.04, 0.03]], BoxRoom(half=half))[0]
-    for expected, options in ((5e-4 * unit, {}), (5e-4, {"position_unit": "metre"})):
-        tracker = make_tracker(name, room, np.eye(4), StepBudget(1), settings(64, **options))
-        tracker.begin(frame, torch.eye(4)[None])
-        tracker.step()
-        moved, q_wxyz = tracker.position.detach().abs(), tracker.q_wxyz.detach()
-        assert moved.tolist() == pytest.approx([expected] * 3, rel=1e-3)
-        assert q_wxyz[1:].abs().tolist() == pytest.approx([1e-3] * 3, rel=1e-2)
-        assert q_wxyz.norm().item() == pytest.approx(1.0, abs=1e-6)
 
 
 def test_units_of_the_dataset(tmp_path: Path, monkeypatch) -> None:

@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 
 from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.recordings.reading import read_sequence
-from nbtrack.synthetic import make_room, room_frames, room_intrinsics, room_of
-from nbtrack.synthetic.keyframes import keyframe_trajectory
+from nbtrack.synthetic import keyframe_trajectory, make_room, room_frames, room_intrinsics, room_of
 from nbtrack.synthetic.motion import handheld_trajectory, steps_between, tour
 from nbtrack.synthetic.primitives import Box, Cylinder, RoomShell, Sphere
 from nbtrack.synthetic.render import add_kinect_noise, filter_depth, render_frame

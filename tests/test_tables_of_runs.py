@@ -73,9 +73,7 @@ def coarse_methods(monkeypatch) -> None:
         monkeypatch.setitem(METHODS, name, replace(method, settings=settings))
 
 
-def test_table_1_is_complete_cached_and_repeatable(
-    preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch
-) -> None:
+def test_table_1_twice(preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch) -> None:
     """Catches missing cells, runs that are made again, and hidden randomness anywhere."""
     cells = track_scenes(scenes, TABLE_1, preset)
     assert len(cells) == 2 * 2 * 2  # methods, rates, rooms
@@ -185,9 +183,7 @@ def test_every_method_is_made_again_from_its_command(
         assert again.metrics["seed"] == 1
 
 
-def test_a_second_path_is_tracked_in_the_map_of_the_first(
-    preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch
-) -> None:
+def test_a_second_path(preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch) -> None:
     """Catches a run on the mapped path, one taken for it in the cache, and a wrong command."""
     second = open_scenes(with_settings(preset, "scenes.seed=1"))[1:]
     mapped = track_scenes(scenes[1:], ["sdf"], preset, [10])
@@ -243,9 +239,7 @@ def test_table_2_of_this_machine(preset: Preset, scenes: list[Scene]) -> None:
     assert default_pixels(preset) == {"VR": 8, "SDF": 16}
 
 
-def test_table_2_measures_what_a_method_uses(
-    tmp_path: Path, scenes: list[Scene], monkeypatch
-) -> None:
+def test_table_2_measures_own_settings(tmp_path: Path, scenes: list[Scene], monkeypatch) -> None:
     """Catches points without a map, and settings of a method that Table II does not know: then raw,
     untrained networks are measured in place of corrected maps, and another n."""
     fields = {}
@@ -269,9 +263,7 @@ def test_table_2_measures_what_a_method_uses(
     assert "\\bfseries 8 " in (tmp_path / "table_2.tex").read_text()
 
 
-def test_wrong_scenes_are_told_before_anything_is_made(
-    preset: Preset, tmp_path: Path, monkeypatch
-) -> None:
+def test_wrong_scenes_are_told_first(preset: Preset, tmp_path: Path, monkeypatch) -> None:
     """Catches a misspelt column that is left out in silence, a column counted as two seeds, and an
     unhelpful error where the dataset was not downloaded."""
     for names, message in (
@@ -286,9 +278,7 @@ def test_wrong_scenes_are_told_before_anything_is_made(
         open_scenes(load_preset("paper"))
 
 
-def test_frames_that_a_scene_lacks_are_told_before_it_is_mapped(
-    preset: Preset, scenes: list[Scene]
-) -> None:
+def test_frames_that_a_scene_lacks_are_told_first(preset: Preset, scenes: list[Scene]) -> None:
     """Catches minutes of mapping before a recording turns out to be shorter than the part that the
     preset tracks."""
     with pytest.raises(DataError, match=r"0 of the 5 .*scenes.track_frames"):
