@@ -234,26 +234,6 @@ def test_texts_say_how_they_are_encoded(tmp_path: Path, encoding: str) -> None:
         assert open_recording(folder).declared.no_depth == 9
 
 
-SPELLINGS = ["nan", "NaN", "-nan", "NAN(0x8000)", "-nan(ind)", "nan(snan)", "1.#QNAN", "-1.#IND00"]
-SPELLINGS += ["1.#R", "-1.#J", "1.#INF", "sNaN", "-NaN123", "inf", "-Infinity"]
-
-
-LOST = [7 * [spelling] for spelling in SPELLINGS]
-LOST += [row.split() for row in ("0 0 0 0 0 0 0", "1.5 1 2 0 0 0 0", "nan 1 2 0 0 0 1")]
-
-
-@pytest.mark.parametrize("words", LOST, ids=" ".join)
-def test_a_lost_frame_however_it_is_spelled(plain: Path, words: list[str]) -> None:
-    """Catches a whole file that is refused for one frame that a tool has lost, or rows that end
-    where its `#` begins."""
-    path = plain / "trajectory.txt"
-    lines = path.read_text().splitlines()
-    for between in (" ", ","):
-        row = between.join([lines[2].split()[0], *words])
-        path.write_text("\n".join(["# a comment", *lines[:2], f"{row} # lost", *lines[3:]]))
-        assert np.flatnonzero(~open_recording(plain).has_pose).tolist() == [2]
-
-
 def test_cameras_of_other_names(scene: Path, tmp_path: Path) -> None:
     """Catches a calibration that is passed over: 7-Scenes' own, one folder up too, and K.txt."""
     (scene / "focal.txt").rename(scene / "K.txt")
@@ -332,16 +312,12 @@ def test_a_lens_is_corrected(tmp_path: Path) -> None:
 
 
 def test_images_of_other_sizes_and_kinds(plain: Path) -> None:
-    """Catches full-size intrinsics used for reduced images (of cropped ones: BROKEN), gray images
-    refused or copied into one channel, and whole JPEG files refused."""
+    """Catches full-size intrinsics used for reduced images (of cropped ones: BROKEN), and gray
+    images refused or copied into one channel."""
     change_camera(plain, **camera_words(larger(source(), 2).camera, "width", "height"))
     check_equal(read_sequence(plain), source())
     cv2.imwrite(str(plain / "color/000000.png"), np.full((36, 48), 77, np.uint8))
-    (plain / "color/000001.png").unlink()
-    write_image(plain / "color/000001.jpg", source().colors[1])
-    colors = read_sequence(plain).colors
-    assert (colors[0] == 77).all()
-    assert np.abs(colors[1].astype(int) - source().colors[1]).mean() < 6
+    assert (read_sequence(plain).colors[0] == 77).all()
 
 
 def test_formats_are_told_apart(plain: Path, tmp_path: Path) -> None:

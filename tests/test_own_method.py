@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -12,18 +13,21 @@ from unittest import mock
 import pytest
 from forked import forking
 from test_faults import assert_refused
+from test_mapping import finished_wall, wall_sequence
 from tiny import TINY, tiny_words
 
 import nbtrack
 from nbtrack import load_preset, provenance
+from nbtrack.beyond.correction import correct_map
 from nbtrack.cli import main
 from nbtrack.experiments.methods import METHODS, method_of
-from nbtrack.fields import FIELDS, NeusMapping
+from nbtrack.fields import FIELDS, NeusMapping, field_class
 from nbtrack.machinery import registry
 from nbtrack.machinery.errors import ConfigError
 from nbtrack.machinery.files import runs_folder
 from nbtrack.machinery.registry import Registry
 from nbtrack.machinery.settings import with_settings
+from nbtrack.mapping.files import MAP_FILE, write_map
 from nbtrack.tracking import TRACKERS, tracker_class
 
 OWN = '''
@@ -277,3 +281,33 @@ def test_losses_that_are_no_terms(spoilt: Callable, says: str, monkeypatch) -> N
     preset = load_preset(settings=[*TINY, "scenes.names=['office']"])
     with pytest.raises(ConfigError, match=says):
         nbtrack.map_scene(nbtrack.open_scenes(preset)[0], "mine", preset)
+
+
+DOORS = """
+import sys
+from nbtrack import FIELDS, METHODS, Frame, make_tracker, read_sequence
+assert {*FIELDS} > {"neus", "neus_plus"} and {*METHODS} > {"sdf", "corrected"}
+assert not {"numba", "skimage", "nbtrack.experiments"} & {*sys.modules}
+"""
+READ = "import sys; from nbtrack.mapping.files import read_map; print(read_map(sys.argv[1]).key)"
+
+
+def test_what_the_doors_load(tmp_path: Path) -> None:
+    """Catches a single frame or the paper's part that loads numba, and a corrected map that only a
+    program which has imported all of the package can read."""
+    corrected = correct_map(finished_wall(), wall_sequence(), 0.2)
+    write_map(tmp_path / MAP_FILE, corrected)
+    for script, printed in ((DOORS, ""), (READ, f"{corrected.key}\n")):
+        command = [sys.executable, "-c", script, str(tmp_path)]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.stdout, done.stderr) == (printed, "")
+
+
+def test_an_entry_as_a_text(monkeypatch) -> None:
+    """Catches a class of a user's that cannot be named as entry points are, and a traceback where
+    the name is wrong."""
+    monkeypatch.setitem(FIELDS, "neus", "nbtrack.fields.neus:NeuSField")
+    assert field_class("neus").name == "neus"
+    monkeypatch.setitem(FIELDS, "neus", "nbtrack.fields.neus:NeusField")
+    with pytest.raises(ConfigError, match="'neus' cannot be loaded from nbtrack"):
+        field_class("neus")

@@ -111,18 +111,13 @@ def test_times_that_tell_no_order(tmp_path: Path, name: str, times: np.ndarray) 
     folder = write_recording("tum" if name != "timestamps.txt" else "plain", tmp_path / "r")
     lines = [f"{time:.6f}" for time in times]
     if is_list:
-        lines = [
-            f"{t} {row.split()[1]}" for t, row in zip(lines, _rows(folder / name), strict=False)
-        ]
+        rows = (folder / name).read_text().splitlines()[1:]
+        lines = [f"{t} {row.split()[1]}" for t, row in zip(lines, rows, strict=False)]
     elif name == "groundtruth.txt":
         lines = tum_lines(times, source().poses).splitlines()
     (folder / name).write_text("# head\n" + "\n".join(lines))
     with pytest.raises(DataError, match=rf"{name}, row {4 if times is FELL_BACK else 2}: 1305"):
         open_recording(folder)
-
-
-def _rows(path: Path) -> list[str]:
-    return [line for line in path.read_text().splitlines() if line[0] != "#"]
 
 
 # Images' numbers, whole multiples of the frame's time with which poses are stamped (None: without
@@ -180,6 +175,26 @@ def test_poses_of_a_list_without_names(tmp_path: Path, case: str) -> None:
     # What is taken by its place, or left out, is said.
     is_proven = tuple(numbers) == RUN or case == "from 1, stamped"
     assert bool(recording.notes) != is_proven
+
+
+SPELLINGS = ["nan", "NaN", "-nan", "NAN(0x8000)", "-nan(ind)", "nan(snan)", "1.#QNAN", "-1.#IND00"]
+SPELLINGS += ["1.#R", "-1.#J", "1.#INF", "sNaN", "-NaN123", "inf", "-Infinity"]
+
+
+LOST = [7 * [spelling] for spelling in SPELLINGS]
+LOST += [row.split() for row in ("0 0 0 0 0 0 0", "1.5 1 2 0 0 0 0", "nan 1 2 0 0 0 1")]
+
+
+@pytest.mark.parametrize("words", LOST, ids=" ".join)
+def test_a_lost_frame_however_it_is_spelled(plain: Path, words: list[str]) -> None:
+    """Catches a whole file that is refused for one frame that a tool has lost, or rows that end
+    where its `#` begins."""
+    path = plain / "trajectory.txt"
+    lines = path.read_text().splitlines()
+    for between in (" ", ","):
+        row = between.join([lines[2].split()[0], *words])
+        path.write_text("\n".join(["# a comment", *lines[:2], f"{row} # lost", *lines[3:]]))
+        assert np.flatnonzero(~open_recording(plain).has_pose).tolist() == [2]
 
 
 def test_times_of_images_settle_it(tmp_path: Path) -> None:

@@ -32,14 +32,6 @@ def iterations(preset: Preset) -> int:
     return preset.mapping_of("neus").iterations
 
 
-def test_presets_by_name(monkeypatch) -> None:
-    """Catches another default than smoke, and an environment that outdoes an explicit name."""
-    assert load_preset() == PRESETS["smoke"]
-    monkeypatch.setenv("NBTRACK_PRESET", "synthetic")
-    assert load_preset() == PRESETS["synthetic"]
-    assert load_preset("paper") == PRESETS["paper"]
-
-
 @pytest.mark.parametrize(("name", "floor_m"), [("smoke", 0.3), ("nine_rooms", 1.0)])
 def test_tracked_frames_leave_their_start(name: str, floor_m: float) -> None:
     """Catches a preset that tracks frames in which a camera that stands still does nearly as well
@@ -72,8 +64,14 @@ def test_figures_of_the_presets() -> None:
 
 
 def test_precedence(tmp_path: Path, monkeypatch) -> None:
-    """Catches a wrong order: preset < file < environment < explicit; presets never change."""
+    """Catches a wrong order: preset < file < environment < explicit, or smoke < environment <
+    explicit of names; presets never change."""
     before = copy.deepcopy(PRESETS)
+    assert load_preset() == PRESETS["smoke"]
+    with monkeypatch.context() as patch:
+        patch.setenv("NBTRACK_PRESET", "synthetic")
+        assert load_preset() == PRESETS["synthetic"]
+        assert load_preset("paper") == PRESETS["paper"]
     path = tmp_path / "settings.toml"
     path.write_text("[mapping.neus]\niterations = 11\nn_rays = 12\n")
     assert iterations(load_preset(config_file=path)) == 11
