@@ -96,28 +96,6 @@ def test_a_map_is_taken_with_the_settings_that_made_it(tmp_path: Path, capsys, m
     assert main([*given, "--set", "mapping.imap.n_rays=77", "--out", str(tmp_path / "run")]) == 0
 
 
-def test_only_the_first_pose_is_known(tmp_path: Path, capsys) -> None:
-    """Catches a recording that is refused because nothing is known to compare with, an error that
-    is made up, and a reference of an earlier run that stays beside a trajectory without one."""
-    folder, out = write_recording("plain", tmp_path / "r"), tmp_path / "result"
-    assert main(["map", str(folder), "--field", "neus", *TINY, "--out", str(tmp_path / "m")]) == 0
-    given = ["track", str(folder), "--map-from", str(tmp_path / "m"), "--tracker", "sdf"]
-    given += ["--steps", "2", *TINY, "--out", str(out)]
-    assert main(given) == 0
-    assert (out / "groundtruth.txt").is_file()
-    poses = (folder / "trajectory.txt").read_text().splitlines()
-    unknown = [line.split()[0] + " nan" * 7 for line in poses[1:]]
-    (folder / "trajectory.txt").write_text("\n".join([poses[0], *unknown]) + "\n")
-    capsys.readouterr()
-    assert main(given) == 0
-    assert "errors cannot be computed" in capsys.readouterr().out
-    metrics = json.loads((out / "metrics.json").read_text())
-    assert (metrics["frames"], metrics["frames_without_reference"]) == (5, 5)
-    assert "ate_rmse_m" not in metrics
-    assert not (out / "groundtruth.txt").exists()
-    assert len(read_tum(out / "trajectory.txt")[0]) == 5
-
-
 def test_times_are_the_recordings_own(tmp_path: Path) -> None:
     """Catches frame numbers in place of times, which evaluation tools cannot associate with the
     recording's own reference; also after a conversion, and with a declared frame rate."""
@@ -145,7 +123,8 @@ def test_what_completion_offers() -> None:
 
 def test_a_recording_without_poses_is_tracked_in_a_map(work: Path, capsys, monkeypatch) -> None:
     """Catches `no poses in ...` where a map of the room is given: the camera is found first, every
-    frame is tracked, and nothing is said of errors; and a picture that is not there."""
+    frame is tracked, and nothing is said of errors; a picture that is not there; and a reference of
+    an earlier run that stays beside a trajectory without one."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 20_000)
     recording = work / "rec"
     words = ["--set", "mapping.neus.iterations=200", "--set", "correction.neus=0.15"]
@@ -166,24 +145,26 @@ def test_a_recording_without_poses_is_tracked_in_a_map(work: Path, capsys, monke
     assert main([*elsewhere, "--start", "unknown"]) == 0
     assert "in another world than the map" in capsys.readouterr().err
     assert json.loads((work / "elsewhere/metrics.json").read_text())["median_error_m"] < 0.05
+    assert (work / "elsewhere/groundtruth.txt").is_file()
     for name in ("poses.txt", "trainval_poses.txt"):
         (recording / name).unlink()
-    assert main(["track", str(recording), "--map-from", "corrected", "--out", "found"]) == 0
+    assert main(elsewhere) == 0
     assert "errors cannot be computed" in capsys.readouterr().out
-    metrics = json.loads((work / "found/metrics.json").read_text())
+    metrics = json.loads((work / "elsewhere/metrics.json").read_text())
     assert (metrics["start"], metrics["frames"]) == ("unknown", 12)
-    assert not (work / "found/groundtruth.txt").exists()
-    known, found = (read_tum(work / name / "trajectory.txt")[1] for name in ("known", "found"))
+    assert not (work / "elsewhere/groundtruth.txt").exists()
+    runs = work / "known", work / "elsewhere"
+    known, found = (read_tum(run / "trajectory.txt")[1] for run in runs)
     off = np.linalg.norm(found[1:, :3, 3] - known[:, :3, 3], axis=1)
-    flagged = pd.read_csv(work / "found/frames.csv")["lost"].to_numpy()[1:]
+    flagged = pd.read_csv(work / "elsewhere/frames.csv")["lost"].to_numpy()[1:]
     assert (flagged | (off < 0.05)).all()
-    for name in ("known", "found"):
-        assert cv2.imread(str(work / name / "overview.png")).shape[1] > 800
-    assert main(["export", "found", "--to", "gif", "found.gif"]) == 0
+    for run in runs:
+        assert cv2.imread(str(run / "overview.png")).shape[1] > 800
+    assert main(["export", "elsewhere", "--to", "gif", "found.gif"]) == 0
     assert "12 of 12 frames" in capsys.readouterr().out
     shutil.rmtree(work / "corrected")
     shutil.copytree(work / "map", work / "corrected")
-    again = ["export", "found", "--to", "gif", "again.gif"]
+    again = ["export", "elsewhere", "--to", "gif", "again.gif"]
     assert_refused(work, capsys, again, "is not the map of this run any more")
     says = "or track in a map of the same place with --map-from"
     assert_refused(work, capsys, ["track", str(recording)], says)

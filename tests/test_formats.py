@@ -180,9 +180,8 @@ def test_depth_folder_and_pose_file_are_chosen(scene: Path) -> None:
     (folder / "poses.txt").rename(scene / "other.txt")
     check_equal(read_sequence(scene), source())
     # A folder may lie anywhere.
-    check_equal(
-        read_sequence(scene, depth_folder=str(scene / "depth"), pose_file="other.txt"), other
-    )
+    chosen = {"depth_folder": str(scene / "depth"), "pose_file": "other.txt"}
+    check_equal(read_sequence(scene, **chosen), other)
     with pytest.raises(MissingError, match=r"no depth maps .* needs depth_with_noise/\*"):
         read_sequence(scene, depth_folder="depth_with_noise")
     with pytest.raises(MissingError, match=r"needs pose\.txt;"):

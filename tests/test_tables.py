@@ -309,9 +309,8 @@ def test_means_over_rooms() -> None:
     By hand: 4 cm in one room (2 and 8 with two seeds), 1 cm in the other: the mean is 2 cm, and the
     interval 12.7 standard errors of ln 2 either way, for one degree of freedom.
     """
-    results = pd.DataFrame(
-        {"scene": ["a", "a", "b"], "seed": [0, 1, 0], "ate_m": [0.02, 0.08, 0.01]}
-    )
+    rows = {"scene": ["a", "a", "b"], "seed": [0, 1, 0], "ate_m": [0.02, 0.08, 0.01]}
+    results = pd.DataFrame(rows)
     (found,) = over_rooms(results.assign(method="A"), ["method"]).itertuples(index=False)
     assert found[:2] == ("A", pytest.approx(0.02))
     assert found[2:] == pytest.approx((0.02 / 2**12.7062, 0.02 * 2**12.7062), rel=1e-3)
