@@ -23,7 +23,6 @@ from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.least_squares import interpolation
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.data.frame import Frame
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, NeusMapping, make_field
 from nbtrack.machinery.device import constant, matrix_products, threads
 from nbtrack.machinery.errors import NbtrackError
@@ -133,12 +132,6 @@ def test_right_in_another_form() -> None:
     backwards = SEQUENCE.select(slice(None, None, -1))
     foreign = replace(backwards, depths_mm=backwards.depths_mm.astype(">u2"))
     assert mapped(foreign).key == mapped(backwards.select(np.arange(4))).key
-    depth = SEQUENCE.depths_mm[0].copy()
-    depth[:, 5:] = 65535
-    for image in (depth, np.asfortranarray(depth), depth.astype(">u2"), depth / 1000):
-        frame = Frame.of_images(CAMERA, SEQUENCE.colors[0], image)
-        assert frame.depth_mm.is_contiguous()
-        assert frame.depth_mm.max() == depth[:, :5].max()
     assert SceneBounds(*np.array(UNIT)) == SceneBounds(*UNIT)
 
 

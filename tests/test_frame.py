@@ -26,14 +26,19 @@ def error_m(found: np.ndarray, sequence: RgbdSequence, index: int) -> float:
 
 def test_units_and_types_are_what_they_say() -> None:
     """Catches metres taken for millimetres, and a camera's frames that are unlike the same ones of
-    a recording: both kinds of depth are one frame."""
+    a recording, however they lie in memory; and saturated depth that counts as measured."""
     sequence = walk(2)
     color, depth_mm = sequence.colors[1], sequence.depths_mm[1]
     color.flags.writeable = False
-    for depth in (depth_mm, depth_mm / 1000, (depth_mm / 1000).astype(np.float32)):
+    metres, expected = depth_mm / 1000, sequence[1].depth_mm
+    of_other_order = np.asfortranarray(depth_mm), depth_mm.astype(">u2")
+    for depth in (depth_mm, metres, metres.astype(np.float32), *of_other_order):
         frame = Frame.of_images(sequence.intrinsics, color, depth)
         assert torch.equal(frame.color, sequence[1].color)
-        assert torch.equal(frame.depth_mm, sequence[1].depth_mm)
+        assert torch.equal(frame.depth_mm, expected)
+        assert frame.depth_mm.is_contiguous()
+    depth_mm[:, 5:] = 65535
+    assert not Frame.of_images(sequence.intrinsics, color, depth_mm).depth_mm[:, 5:].any()
 
 
 WRONG_IMAGES: dict[str, tuple[Callable, str]] = {

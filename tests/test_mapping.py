@@ -65,9 +65,8 @@ def test_imap_renders_a_wall() -> None:
 def test_points_are_fused_at_once() -> None:
     """Catches held-out frames among the points, and a bar that never ends."""
     seen, settings = [], PointMapping(voxel=0.05, holdout_every=3)
-    mapped = map_sequence(
-        "points", wall_sequence(), NETWORK, settings, on_iteration=lambda *news: seen.append(news)
-    )
+    how = {"settings": settings, "on_iteration": lambda *news: seen.append(news)}
+    mapped = map_sequence("points", wall_sequence(), NETWORK, **how)
     n_points = len(mapped.field.points)
     assert seen == [(1, {"points": n_points, "bytes": 24 * n_points})]
     assert mapped.history.to_dict("records") == [seen[0][1]]
@@ -77,10 +76,8 @@ def test_points_are_fused_at_once() -> None:
 
 
 def map_wall(field_name: str, checkpoint: Path | None, *on_iteration) -> Map:
-    settings = settings_of(field_name)
-    return map_sequence(
-        field_name, wall_sequence(), NETWORK, settings, 3, None, checkpoint, *on_iteration
-    )
+    more = settings_of(field_name), 3, None, checkpoint, *on_iteration
+    return map_sequence(field_name, wall_sequence(), NETWORK, *more)
 
 
 @pytest.mark.parametrize("field_name", ["imap", "neus", "neus_plus"])

@@ -54,18 +54,13 @@ def test_a_narrow_terminal(clock: Clock, monkeypatch, capsys, columns: int) -> N
     with ProgressBar("tracking living_room-neus_plus-corrected-lm-10hz-seed3", 8) as bar:
         clock.now = 31
         bar.move_to(2, "waits for another process that makes the same")
-        line = bar.format_meter(
-            ncols=columns, **{k: v for k, v in bar.format_dict.items() if k != "ncols"}
-        )
+        line = bar.format_meter(**bar.format_dict | {"ncols": columns})
     assert line.startswith(" 25 % |███         | 01:33 left, tracking living_room")
     capsys.readouterr()
-    for no_color, shown in (
-        ("", "\33[33mnbtrack: warning: w\33[0m\n"),
-        ("1", "nbtrack: warning: w\n"),
-    ):
+    for no_color, color, end in (("", "\33[33m", "\33[0m"), ("1", "", "")):
         monkeypatch.setenv("NO_COLOR", no_color)
         tell("nbtrack: warning: w")
-        assert capsys.readouterr().err == shown
+        assert capsys.readouterr().err == f"{color}nbtrack: warning: w{end}\n"
 
 
 def test_short_and_hidden_work_is_silent(clock: Clock, capsys) -> None:

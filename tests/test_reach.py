@@ -117,10 +117,8 @@ def test_bounds_of_the_dataset() -> None:
 def test_a_warning_before_the_work(tmp_path: Path) -> None:
     """Catches a run that cannot follow and says so only by its error; a warning where the steps
     suffice; and a bound that the finished run contradicts."""
-    scene = Scene(
-        "office", make_room("office", tmp_path / "office", 12, 32, 24, motion="keyframes")
-    )
-    few, many = 2, 60
+    folder = make_room("office", tmp_path / "office", 12, 32, 24, motion="keyframes")
+    scene, few, many = Scene("office", folder), 2, 60
     preset = load_preset("smoke")
     job = MapJob.of(scene, "neus", preset)
     sdf, lm = preset.tracking_of("sdf"), preset.tracking_of("lm")

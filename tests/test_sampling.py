@@ -74,9 +74,8 @@ def test_draw_covers_only_the_given_frames() -> None:
     from the global generator, which no seed of a run reaches."""
     sequence = random_sequence(5)
     sampler, frames = PixelSampler(sequence, CPU), torch.tensor([1, 3])
-    rays, again, other = (
-        sampler.draw(6000, torch.Generator().manual_seed(seed), frames) for seed in (0, 0, 1)
-    )
+    generators = (torch.Generator().manual_seed(seed) for seed in (0, 0, 1))
+    rays, again, other = (sampler.draw(6000, generator, frames) for generator in generators)
     assert torch.equal(rays.directions_world, again.directions_world)
     assert not torch.equal(rays.directions_world, other.directions_world)
     expected = torch.from_numpy(sequence.T_world_camera[[1, 3], None, :3, 3]).float()

@@ -241,10 +241,8 @@ class Small:
 
     def track(self, preset: Preset, tracker: str) -> None:
         start, settings = self.sequence.T_world_camera[0], preset.tracking_of(tracker)
-        tracker = make_tracker(
-            tracker, self.fields[FIELD_OF[tracker]], start, StepBudget(1), settings
-        )
-        tracker.track(self.sequence[1])
+        field = self.fields[FIELD_OF[tracker]]
+        make_tracker(tracker, field, start, StepBudget(1), settings).track(self.sequence[1])
 
     def use(self, preset: Preset, key: str) -> None:
         """Run what reads a key."""

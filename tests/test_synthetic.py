@@ -189,9 +189,8 @@ def test_two_paths_see_the_same(room, paths):
 
 def _seen_points(room, poses):
     """Points (m, world) along rays through some frames."""
-    rays = np.stack(
-        np.meshgrid(np.linspace(-0.55, 0.55, 24), np.linspace(-0.4, 0.4, 18), [1.0]), -1
-    )
+    x, y = np.linspace(-0.55, 0.55, 24), np.linspace(-0.4, 0.4, 18)
+    rays = np.stack(np.meshgrid(x, y, [1.0]), -1)
     directions = (rays.reshape(-1, 3) @ poses[::8, :3, :3].mT).reshape(-1, 3)
     origins = poses[::8, :3, 3].repeat(rays.size // 3, axis=0)
     return origins + room.first_hit(origins, directions)[0][:, None] * directions

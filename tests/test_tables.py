@@ -100,9 +100,7 @@ def test_marks_stand_without_the_style_sheet() -> None:
     legend = "bold: best at this rate; † and red: above 0.2 m"
     assert f"<caption>Caption; {legend}</caption>" in html
     assert f"<caption>{legend}</caption>" in style_table_1(OURS_1).to_html()
-    style, html = style_table_2(PUBLISHED_2).to_html().split("</style>")
-    bold = re.search(r"([^}]*)\{\s*font-weight: bold;", style).group(1)
-    assert re.findall(r"level1_row(\d)", bold) == ["1", "4"]
+    html = style_table_2(PUBLISHED_2).to_html().split("</style>")[1]
     labels = re.findall(r'<th [^>]*class="row_heading level1[^>]*>(.*?)</th>', html)
     assert labels == ["128", "<b>512 *</b>", "1024", "2048", "<b>4096 *</b>", "16384"]
     assert "<caption>* and bold: the n used for tracking</caption>" in html
