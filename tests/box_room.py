@@ -13,6 +13,7 @@ from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import LearnedField
 from nbtrack.fields.rendering import weights_from_density, weights_from_sdf
+from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
 
 SHIFT = 0.03  # m behind the wall at which the density is half its largest
 
@@ -103,6 +104,14 @@ def box_sequence(places, room: BoxRoom | None = None, height: int = 24) -> RgbdS
     depth = ((room.half * rays.sign() - origin) / rays).amin(dim=-1)
     colors = (255 * room.color(origin + depth[..., None] * rays)).round().byte().numpy()
     return sequence_of(1000 * depth.numpy(), camera, colors, poses, "box")
+
+
+def room_sequence(name: str, width: int, n_frames: int, stride: int = 1) -> RgbdSequence:
+    """What a hand-held camera sees of a furnished room, with clean depth."""
+    room, camera = build_room(name), room_intrinsics(width, width * 3 // 4)
+    poses = handheld_trajectory(room, n_frames * stride, 0)[::stride]
+    colors, depths, _ = zip(*(render_frame(room, camera, pose) for pose in poses), strict=True)
+    return sequence_of(1000 * np.stack(depths), camera, np.stack(colors), poses)
 
 
 def walk(n_frames: int, *room_and_height: BoxRoom | int) -> RgbdSequence:

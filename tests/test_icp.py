@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from box_room import PLANES, plane_depths, poses_at, sequence_of
+from box_room import PLANES, plane_depths, poses_at, room_sequence, sequence_of
 
 from nbtrack import Frame, Map
 from nbtrack.beyond.icp import IcpSettings
@@ -19,7 +19,7 @@ from nbtrack.experiments.quality import score_map
 from nbtrack.fields import NetworkSettings
 from nbtrack.machinery.errors import ConfigError, MissingError
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
+from nbtrack.synthetic import build_room
 from nbtrack.tracking import StepBudget, Tracker, make_tracker
 from nbtrack.tracking.metrics import pose_errors
 
@@ -36,10 +36,7 @@ def two_pixels(depths_mm: list[list[int]], shades: list[list[int]]) -> RgbdSeque
 @pytest.fixture(scope="module")
 def room() -> Room:
     """A few clean frames of a furnished room, and their points."""
-    of, camera = build_room("bedroom"), room_intrinsics(80, 60)
-    poses = handheld_trajectory(of, 8, 0)
-    colors, depths, _ = zip(*(render_frame(of, camera, pose) for pose in poses), strict=True)
-    sequence = sequence_of(1000 * np.stack(depths), camera, np.stack(colors), poses)
+    sequence = room_sequence("bedroom", 80, 8)
     return sequence, map_sequence("points", sequence, NetworkSettings(), PointMapping())
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from box_room import Formula, sequence_of
+from box_room import Formula, room_sequence
 from torch import Tensor
 
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
@@ -13,7 +13,7 @@ from nbtrack.experiments.quality import score_map
 from nbtrack.machinery.errors import DataError
 from nbtrack.mapping.files import Map
 from nbtrack.plots.meshes import extract_mesh, seen_by
-from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
+from nbtrack.synthetic import build_room
 
 ROOM = build_room("bedroom")
 
@@ -21,9 +21,7 @@ ROOM = build_room("bedroom")
 @pytest.fixture(scope="module")
 def sequence() -> RgbdSequence:
     """What a camera sees of it, with clean depth."""
-    camera, poses = room_intrinsics(40, 30), handheld_trajectory(ROOM, 15, 0)
-    depths = np.stack([render_frame(ROOM, camera, pose)[1] for pose in poses])
-    return sequence_of(1000 * depths, camera, poses=poses)
+    return room_sequence("bedroom", 40, 15)
 
 
 def shifted(sequence: RgbdSequence, shift: float) -> Formula:

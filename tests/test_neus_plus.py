@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from box_room import sequence_of
+from box_room import room_sequence, sequence_of
 
 from nbtrack import load_preset, read_map, write_map
 from nbtrack.beyond.feature_grid import FeatureGrid, GridNetwork, GridPlusMapping
@@ -18,7 +18,7 @@ from nbtrack.fields import NetworkSettings
 from nbtrack.fields.neus import guided_depths
 from nbtrack.machinery.errors import ConfigError
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
+from nbtrack.synthetic import build_room
 
 CONFIG = NeusPlusMapping()
 CAMERA = Intrinsics.from_focal(64, 48, 48.0)
@@ -87,10 +87,7 @@ def test_targets_in_a_furnished_room() -> None:
     """Catches planes believed beyond their own patch, or behind thin things: what was observed is
     part of what is there, so that no distance may be taught that is clearly less than the truth;
     nor one that is more, near what was observed."""
-    room, camera = build_room("office"), room_intrinsics(64, 48)
-    poses = handheld_trajectory(room, 40, 0)[::2]
-    depths = np.stack([1000 * render_frame(room, camera, pose)[1] for pose in poses])
-    sequence = sequence_of(depths, camera, poses=poses)
+    room, sequence = build_room("office"), room_sequence("office", 64, 20, 2)
     bounds, frames, generator = observed_bounds(sequence), np.arange(20), torch.Generator()
     observed = ObservedDistance(sequence, frames, bounds, torch.device("cpu"))
     sampler = PixelSampler(sequence, torch.device("cpu"))

@@ -239,7 +239,6 @@ def test_table_2_of_this_machine(preset: Preset, scenes: list[Scene]) -> None:
     assert default_pixels(preset) == {"VR": 8, "SDF": 16}
 
 
-@pytest.mark.usefixtures("coarse_methods")
 def test_table_2_measures_own_settings(tmp_path: Path, scenes: list[Scene], monkeypatch) -> None:
     """Catches points without a map, and settings of a method that Table II does not know: then raw,
     untrained networks are measured in place of corrected maps, and another n."""
@@ -250,6 +249,9 @@ def test_table_2_measures_own_settings(tmp_path: Path, scenes: list[Scene], monk
         return make_tracker(name, field, *arguments)
 
     monkeypatch.setattr("nbtrack.experiments.bench.make_tracker", seen)
+    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
+    settings = ("correction.neus_plus=0.3", "tracking.lm.n_pixels=64")
+    monkeypatch.setitem(METHODS, "corrected", replace(METHODS["corrected"], settings=settings))
     words = tiny_words("scenes.names=office", "tables.rates_hz=[10]", "scenes.track_frames=:2")
     words += ["--set", "tracking.lm.n_pixels=8", "--workers", "1", "--out", str(tmp_path)]
     assert main(["tables", "--method", "icp,corrected", *words]) == 0
