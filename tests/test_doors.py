@@ -242,7 +242,7 @@ OTHERS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("case", OTHERS)
 def test_a_checkpoint_knows_whose_it_is(case: str, tmp_path: Path, monkeypatch) -> None:
     """Catches the path of another run, returned as this one's."""
-    monkeypatch.setattr("nbtrack.tracking.trajectories.CHECKPOINT_SECONDS", -1)
+    monkeypatch.setattr("nbtrack.machinery.files.CHECKPOINT_SECONDS", -1)
     path = tmp_path / "run.pt"
     known = track_sequence(tracker(mapped(seed=1).field), SEQUENCE, path)
     again = track_sequence(tracker(mapped(seed=1).field), SEQUENCE, path)

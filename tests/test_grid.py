@@ -152,8 +152,7 @@ def test_a_cluster_makes_the_same_table(address: str, tmp_path: Path, undisturbe
 def undertake(folder: Path, workers: str) -> None:
     """The command in a process of its own, which writes checkpoints after every step."""
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()):
-        patch.setattr("nbtrack.mapping.fit.CHECKPOINT_SECONDS", 0.0)
-        patch.setattr("nbtrack.tracking.trajectories.CHECKPOINT_SECONDS", 0.0)
+        patch.setattr("nbtrack.machinery.files.CHECKPOINT_SECONDS", 0.0)
         sys.exit(tables(folder, "--workers", workers))
 
 

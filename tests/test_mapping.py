@@ -90,7 +90,7 @@ def test_resume_equals_uninterrupted(field_name: str, tmp_path: Path) -> None:
             raise InterruptedError
 
     whole = map_wall(field_name, None)
-    now = mock.patch("nbtrack.mapping.fit.CHECKPOINT_SECONDS", 0.0)
+    now = mock.patch("nbtrack.machinery.files.CHECKPOINT_SECONDS", 0.0)
     with now, pytest.raises(InterruptedError):
         map_wall(field_name, checkpoint, kill)
     resumed = map_wall(field_name, checkpoint, lambda done, losses: seen.append(done))

@@ -102,7 +102,7 @@ def test_a_killed_run_goes_on_as_before(name: str, tmp_path: Path, monkeypatch) 
     """Catches pixels drawn twice, a budget that forgets its fractions, frames done again."""
     sequence, frames = walk(6), []
     whole = track(name, sequence, 2.4)
-    monkeypatch.setattr("nbtrack.tracking.trajectories.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("nbtrack.machinery.files.CHECKPOINT_SECONDS", 0.0)
 
     def die_at_fourth(frame: int, error: float) -> None:
         frames.append(frame)

@@ -12,8 +12,9 @@ import io
 import json
 import os
 import tempfile
+import time
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ import nbtrack
 from nbtrack.machinery.errors import DataError, MissingError, NbtrackError
 from nbtrack.machinery.settings import as_dict
 
+CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 PACKAGE = Path(nbtrack.__file__).resolve().parent
 # Errors in reading a file that do not come from its content: they are a program's mistakes, or a
 # device's, or say already what is wrong. All others count as a damaged file.
@@ -111,12 +113,39 @@ def digest_of(plain: Any, tensors: Mapping[str, torch.Tensor]) -> str:
     return digest.hexdigest()
 
 
-def check_recipe(path: Path | str, recipe: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Raises DataError if the recipe of a map or checkpoint at a path is not the wanted one."""
-    changed = [name.replace("_", " ") for name in wanted if recipe.get(name) != wanted[name]]
-    if changed:
-        advice = "remove it, or name another"
-        raise DataError(f"{path} was made with another {', '.join(changed)}: {advice}")
+class Checkpoint:
+    """The file from which a killed run goes on; it is written every few seconds.
+
+    Where there is no path, nothing is written or taken up.
+    """
+
+    def __init__(self, path: Path | None, recipe: dict[str, Any]) -> None:
+        """`recipe` is what the run depends on, by names for whoever gives another run's file."""
+        self.path = path
+        self.recipe = recipe
+        self.last_saved = time.perf_counter()
+
+    def save(self, state_of: Callable[[], dict[str, Any]], is_last: bool = False) -> None:
+        """Write the state if it is time to, or if it is the last one."""
+        is_due = is_last or time.perf_counter() - self.last_saved > CHECKPOINT_SECONDS
+        if self.path and is_due:
+            save_checkpoint(self.path, {"recipe": self.recipe, **state_of()})
+            self.last_saved = time.perf_counter()
+
+    def resume(self, take_up: Callable[[dict[str, Any]], None]) -> None:
+        """Hand over the written state, if there is one.
+
+        Raises DataError if it is damaged, or of a run with another recipe.
+        """
+        if not (self.path and self.path.exists()):
+            return
+        with loaded_checkpoint(self.path) as state:
+            written, wanted = state["recipe"], self.recipe
+            if changed := [name for name in wanted if written.get(name) != wanted[name]]:
+                others = ", ".join(changed).replace("_", " ")
+                advice = "remove it, or name another"
+                raise DataError(f"{self.path} was made with another {others}: {advice}")
+            take_up(state)
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:

@@ -23,13 +23,12 @@ from nbtrack.machinery.device import (
     usual_modes,
 )
 from nbtrack.machinery.errors import ConfigError, NumericalError
-from nbtrack.machinery.files import check_recipe, loaded_checkpoint, save_checkpoint
+from nbtrack.machinery.files import Checkpoint
 from nbtrack.machinery.launches import Recording, make_adam
 from nbtrack.machinery.settings import checked, whole_number
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 
-CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 _CPU = torch.device("cpu")
 _PENDING = 10  # iterations between two looks at the losses, which wait for the device
 _FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
@@ -130,17 +129,13 @@ class _Fit:
 
     def run(self, checkpoint: Path | None, on_iteration: OnIteration) -> None:
         """Fit from the checkpoint, if any, to the last iteration; the field then learns no more."""
-        if checkpoint and checkpoint.exists():
-            self._load(checkpoint)
-        last_saved = time.perf_counter()
+        kept = Checkpoint(checkpoint, self.recipe)
+        kept.resume(self._take_up)
         end = self.settings.iterations
         for first in range(len(self.history), end, _PENDING):
             self._advance(range(first, min(end, first + _PENDING)))
             on_iteration(len(self.history) / end, self.history[-1])
-            is_due = time.perf_counter() - last_saved > CHECKPOINT_SECONDS
-            if checkpoint and (is_due or len(self.history) == end):
-                self._save(checkpoint)
-                last_saved = time.perf_counter()
+            kept.save(self._state, is_last=len(self.history) == end)
         self.field.eval().requires_grad_(False)
 
     def _advance(self, iterations: range) -> None:
@@ -177,19 +172,17 @@ class _Fit:
         self.optimizer.step()
         return losses.detach()
 
-    def _save(self, checkpoint: Path) -> None:
-        """Write all that the next iteration depends on, and what tells of which map it is."""
-        state = {"recipe": self.recipe, "seconds": self.seconds, "history": self.history}
-        state |= {"field": self.field.state_dict(), "optimizer": self.optimizer.state_dict()}
-        save_checkpoint(checkpoint, {**state, "generator": self.generator.get_state()})
+    def _state(self) -> dict[str, Any]:
+        """All that the next iteration depends on."""
+        state = {"field": self.field.state_dict(), "optimizer": self.optimizer.state_dict()}
+        state |= {"seconds": self.seconds, "history": self.history}
+        return {**state, "generator": self.generator.get_state()}
 
-    def _load(self, checkpoint: Path) -> None:
-        """Take up what `_save` wrote; DataError if it is damaged or of another map."""
-        with loaded_checkpoint(checkpoint) as state:
-            check_recipe(checkpoint, state["recipe"], self.recipe)
-            self.field.load_state_dict(state["field"])
-            self.optimizer.load_state_dict(state["optimizer"])
-            self.optimizer.param_groups[0]["lr"] = self.rate  # the tensor that `_advance` fills
-            self.generator.set_state(state["generator"])
-            self.seconds = state["seconds"]
-            self.history = state["history"]
+    def _take_up(self, state: dict[str, Any]) -> None:
+        """Go on from what `_state` gave."""
+        self.field.load_state_dict(state["field"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.optimizer.param_groups[0]["lr"] = self.rate  # the tensor that `_advance` fills
+        self.generator.set_state(state["generator"])
+        self.seconds = state["seconds"]
+        self.history = state["history"]

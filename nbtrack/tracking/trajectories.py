@@ -1,6 +1,5 @@
 """Trajectories, tracked through a recorded sequence."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import chain
@@ -20,7 +19,6 @@ from nbtrack.tracking.budget import StepBudget
 from nbtrack.tracking.metrics import pose_errors
 from nbtrack.tracking.tracker import Estimate, Tracker
 
-CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 STEPS_TO_FIND = 1000  # a few dozen descents
 
 
@@ -53,23 +51,25 @@ def track_sequence(
     """
     _check_trackable(sequence)
     recipe = _recipe(tracker, sequence, is_start_known) if checkpoint else {}
+    kept, rows = files.Checkpoint(checkpoint, recipe), []
+
+    def take_up(state: dict[str, Any]) -> None:
+        tracker.restore(state["tracker"])
+        rows.extend(state["rows"])
+
     first = 1 if is_start_known else 0  # the first frame to track
     if is_start_known:
         tracker.restart(sequence.T_world_camera[0])
     else:
         tracker.restart_anywhere()
-    last_saved = time.perf_counter()
     with advise_on_memory(f"tracking.{tracker.name}.n_pixels={tracker.settings.n_pixels}"):
-        rows = _resumed(tracker, checkpoint, recipe)
+        kept.resume(take_up)
         for index in range(first + len(rows), len(sequence)):
             is_found = is_start_known or not all(row.get("lost", False) for row in rows)
             budget = None if is_found else StepBudget(STEPS_TO_FIND)
             rows.append(_row(sequence, index, tracker.track(sequence[index], budget)))
             on_frame(index, rows[-1]["translation_error_m"])
-            if checkpoint and time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
-                state = {"recipe": recipe, "rows": rows, "tracker": tracker.state()}
-                files.save_checkpoint(checkpoint, state)
-                last_saved = time.perf_counter()
+            kept.save(lambda: {"rows": rows, "tracker": tracker.state()})
     T_estimated = np.stack(tracker.estimates[1:])  # without the start, be it known or not
     return Trajectory(T_estimated, sequence.T_world_camera[first:].copy(), _table_of(rows))
 
@@ -91,19 +91,6 @@ def _recipe(tracker: Tracker, sequence: RgbdSequence, is_start_known: bool) -> d
     method = [tracker.name, as_dict(tracker.settings), budget, seed, is_start_known]
     weights = dict(chain(field.named_parameters(), field.named_buffers()))
     return {"recording": sequence.digest, "map or method": files.digest_of(method, weights)}
-
-
-def _resumed(tracker: Tracker, checkpoint: Path | None, recipe: dict) -> list[dict[str, Any]]:
-    """The rows of a checkpoint, if there is one, whose state the tracker takes up.
-
-    Raises DataError if it is damaged, or of a run with another recipe.
-    """
-    if not (checkpoint and checkpoint.exists()):
-        return []
-    with files.loaded_checkpoint(checkpoint) as state:
-        files.check_recipe(checkpoint, state["recipe"], recipe)
-        tracker.restore(state["tracker"])
-        return state["rows"]
 
 
 def _check_trackable(sequence: RgbdSequence) -> None:
