@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from nbtrack.checks import findings
 from nbtrack.checks.conventions import MIN_OVERLAP, Convention, fit_all
-from nbtrack.checks.misfits import CAUSES, Misfit, fit, main_misfits
-from nbtrack.checks.readings import FramePairs, Pairs, Reading, mean_apart, on_grid
+from nbtrack.checks.misfits import Misfit, fit_causes, main_misfits
+from nbtrack.checks.readings import FramePairs, Pairs, Reading, on_grid
 from nbtrack.core.arrays import Frames, Poses
 from nbtrack.data.sequence import ARRAYS, RgbdSequence
 from nbtrack.machinery.errors import DataError
@@ -22,7 +22,7 @@ from nbtrack.recordings.recording import Recording
 _FRAMES_AT_ONCE = 32  # 50 MB at 640x480
 _CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
-_N_PAIRS = 60  # of frames that are compared
+_N_PAIRS = 32  # of frames that are compared
 _QUICK_PAIRS = 16  # of frames that are compared in a quick look
 _MIN_FRAMES = 30  # without which pairs share too much to tell a small misfit
 _GAPS = (5, 10, 20, 40)  # frames between the two of a pair: they moved, and still see the same
@@ -85,7 +85,7 @@ class DataReport:
                 for m, r in rows
             ),
             "  what may be off, fitted one by one (95 %), and mm apart then",
-            *(f"{1e3 * mean_apart(m.apart) * own.depth_m:12.1f} mm  {m}" for m in self.misfits),
+            *(f"{1e3 * m.apart * own.depth_m:12.1f} mm  {m}" for m in self.misfits),
             *(f"  warning: {text}" for text in self.warnings if text not in self.verdict),
             f"  verdict: {self.verdict}",
             f"  {'then' if self.faults else 'start with'}: python -m nbtrack {command} "
@@ -117,30 +117,20 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     is_far = cloud.depth > far_limit(cloud.depth)
     is_own = best is conventions[0]  # else poses and depths mean something else than is judged
     is_told = is_own and len(ids) >= _MIN_FRAMES and best.overlap >= MIN_OVERLAP
-    misfits = _misfits(seen, own) if is_told else []
-    faults = list(findings.of_depth_images(frames, shared, counts, recording))
+    misfits = fit_causes(seen, own) if is_told else []
+    faults = list(findings.of_images(frames, shared, counts, recording))
     main = main_misfits(seen, own, misfits)
-    wrong = findings.misreading(conventions[0], best, main)
-    faults += [wrong] if wrong else findings.of_poses(frames, recording) if is_own else []
-    faults += findings.of_colors(seen, own, frames.brightness, is_told and is_whole and not faults)
+    said, is_fault = findings.misreading(conventions[0], best, main)
+    faults += [said] if is_fault else findings.of_poses(frames, recording) if is_own else []
     faults += findings.of_units(cloud.depth[~is_far]) if is_own else []
     depths = frames, cloud.depth, is_far, recording
-    remarks = list(findings.remarks_on_depths(*depths)) if is_own else []
+    remarks = [said] if said and not is_fault else []
+    remarks += findings.remarks_on_depths(*depths) if is_own else []
     doubt = "" if faults else findings.doubt_of_poses(conventions, recording, is_whole)
     return DataReport(
         recording, frames, T_world_camera, cloud[~is_far], conventions=conventions, best=best,
         misfits=misfits, faults=faults, doubts=[doubt] if doubt else [], remarks=remarks,
     )  # fmt: skip
-
-
-def _misfits(seen: FramePairs, own: Reading) -> list[Misfit]:
-    """The fit of every cause by itself."""
-    misfits = []
-    with ProgressBar("fitting", len(CAUSES)) as bar:
-        for cause in CAUSES:
-            misfits.append(fit(seen, own, cause))
-            bar.update()
-    return misfits
 
 
 def quick_warning(recording: Recording) -> str:
@@ -177,17 +167,13 @@ def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:
 def _kept(pairs: Pairs, ids: Frames, is_whole: bool) -> tuple[Frames, Frames]:
     """Which frames' points are shown, as indices in `ids`, and ids of those whose images are kept.
 
-    If `is_whole`, frames spread over the recording are shown, and kept are these, the compared
-    frames and the neighbours of these, whose colours `of_colors` takes. In a quick look the frames
-    that are compared are both shown and kept.
+    If `is_whole`, frames spread over the recording are shown, else those that are compared.
     """
     compared = np.unique(pairs)
     if not is_whole:
         return compared, ids[compared]
-    last = len(ids) - 1
-    shown = np.unique(np.linspace(0, last, _CLOUD_FRAMES).astype(int))
-    shifts = np.arange(-findings.MAX_SHIFT, findings.MAX_SHIFT + 1)
-    return shown, ids[np.union1d(np.add.outer(compared, shifts).clip(0, last), shown)]
+    shown = np.unique(np.linspace(0, len(ids) - 1, _CLOUD_FRAMES).astype(int))
+    return shown, ids[np.union1d(compared, shown)]
 
 
 def _read(

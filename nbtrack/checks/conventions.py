@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
-from nbtrack.checks.readings import FramePairs, Reading, mean_apart
+from nbtrack.checks.readings import Apart, FramePairs, Reading
 from nbtrack.machinery.progress import ProgressBar
 from nbtrack.machinery.settings import changed_settings
 from nbtrack.recordings.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA
@@ -41,17 +41,18 @@ _CALIBRATIONS = {"one for images twice as large": 0.5, "one for images half as l
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Convention:
     """A way to read poses, depth and calibration, and how well pairs of frames then agree."""
 
     subject: str  # what is read otherwise than declared: poses, depth or calibration
     name: str  # completes "your ... look like"
     reading: Reading
-    apart: float  # by how much surfaces lie apart in the mean, as a share of the depth
-    depth_m: float  # the median depth of the points that overlap
-    overlap: float  # share of all points that fall onto a measured, not nearer, surface
-    agreement: float  # the same, where surfaces that coincide count 1 and those far apart 0
+    areas: Apart
+    apart: float  # these five are those of `Agreement`
+    depth_m: float
+    overlap: float
+    agreement: float
 
     @property
     def usual_apart(self) -> float:
@@ -85,26 +86,14 @@ def fit_all(pairs: FramePairs, own: Reading) -> tuple[list[Convention], Conventi
     named_axes = {words: name for name, words in SPELLED_AXES.items()}
     axes = named_axes.get(own.declared.camera_axes, own.declared.camera_axes)
     own = replace(own, declared=replace(own.declared, camera_axes=axes))
-    conventions = [_fit(pairs, "poses", axes_name(axes, own.declared.poses), own)]
+    name = axes_name(axes, own.declared.poses)
+    conventions = [Convention("poses", name, own, *pairs.compare(own))]
     others = [hypothesis for hypothesis in _hypotheses(own) if hypothesis[-1] != own]
     with ProgressBar("comparing frames", len(others)) as bar:
         for subject, name, reading in others:
-            conventions.append(_fit(pairs, subject, name, reading))
+            conventions.append(Convention(subject, name, reading, *pairs.compare(reading)))
             bar.update()
     return conventions, _best_of(conventions)
-
-
-def _fit(pairs: FramePairs, subject: str, name: str, reading: Reading) -> Convention:
-    """A convention with how well pairs of frames agree under it."""
-    compared = pairs.compare(reading)
-    n_points = (pairs.values > 0).sum().clamp(1)
-    return Convention(
-        subject, name, reading,
-        apart=mean_apart(pairs.apart(compared)),
-        depth_m=float(compared.measured[compared.is_valid].median()),
-        overlap=float(compared.is_valid.sum() / n_points),
-        agreement=float(compared.agreement.sum() / n_points),
-    )  # fmt: skip
 
 
 def axes_name(camera_axes: str, poses: str) -> str:

@@ -7,8 +7,7 @@ import pandas as pd
 from jaxtyping import Int
 
 from nbtrack.checks.conventions import MIN_OVERLAP, PLAUSIBLE_DEPTH, Convention, remedy
-from nbtrack.checks.misfits import MIN_PAIRS, Misfit
-from nbtrack.checks.readings import FramePairs, Reading, mean_apart
+from nbtrack.checks.misfits import Misfit
 from nbtrack.recordings.reading import FAR
 from nbtrack.recordings.recording import Recording
 
@@ -19,14 +18,9 @@ _OFF_STEPS = 2.5
 _MIN_REPEATED = 0.05  # share of frames whose depth is that of the frame before, though they moved
 _MAX_STEP = 0.01  # share of the depth between depths that a camera can tell (our choice)
 # A value is shared if it is so much of all depths, in so many frames, and so many times as often
-# as each of so many values beside it (our choice).
-SHARED, _SHARING, _SPIKE, _BESIDE = 0.01, 0.25, 10, 5
+# as any other (our choice).
+SHARED, _SHARING, _SPIKE = 0.01, 0.25, 10
 _BLACK = 0.02  # brightness, in [0, 1]
-MAX_SHIFT = 3  # frames by which colours may be late or early (our choice)
-_SHIFTS = range(-MAX_SHIFT, MAX_SHIFT + 1)
-_RIGHTS = (-0.06, -0.04, -0.02, 0.02, 0.04, 0.06)  # of the width, by which they may lie beside
-_MIN_CORRELATION = 0.75  # of intensities that pairs of a right recording have (our choice)
-_UNLIKE = 0.8  # of 1 - correlation as declared, above which another reading tells nothing
 _TRIED = (
     "no other axes, units or directions of poses and depth, no late depth, no focal lengths or "
     "principal point, no error of depth (a factor, a length, a square), no offset of the camera"
@@ -37,27 +31,30 @@ _UNTOLD = (
 )
 
 
-def misreading(own: Convention, best: Convention, main: list[Misfit]) -> str:
-    """What is wrong with how the numbers are read, in a sentence; empty where nothing is.
+def misreading(own: Convention, best: Convention, main: list[Misfit]) -> tuple[str, bool]:
+    """What is off in how the numbers are read, in a sentence, and whether it is a fault.
 
-    A cause is told if with it surfaces agree as those of right recordings do.
+    The sentence is empty where nothing is off. A cause is told if with it surfaces agree as those
+    of right recordings do; it is no fault where it is as small as usual sensors have it.
     """
     usual_mm = 1e3 * own.usual_apart * own.depth_m
     apart = f"lie {1e3 * own.apart * own.depth_m:.0f} mm apart" if own.overlap else "never meet"
+    is_apart = own.overlap >= MIN_OVERLAP and own.apart > own.usual_apart
     if best is not own:
         reading, name, left_mm = best.reading, str(best), 1e3 * best.apart * best.depth_m
-    elif main and mean_apart(main[0].apart) <= own.usual_apart:
-        reading, left_mm = main[0].reading, 1e3 * mean_apart(main[0].apart) * own.depth_m
+    elif main and main[0].apart <= own.usual_apart:
+        reading, left_mm = main[0].reading, 1e3 * main[0].apart * own.depth_m
         name = ", or as well that ".join(str(misfit) for misfit in main)
-    elif own.overlap >= MIN_OVERLAP and own.apart > own.usual_apart:
+    elif is_apart:
         return (
             f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), "
             f"and nothing that is tried explains it: {_TRIED}. What cannot be told: {_UNTOLD}"
-        )
+        ), True
     else:
-        return ""
+        return "", False
     tail = f"surfaces that two frames see then lie {left_mm:.0f} mm apart; as declared they {apart}"
-    return f"{name}; {remedy(reading, own.reading)} ({tail})"
+    is_fault = best is not own or not main[0].is_usual
+    return f"{name}; {remedy(reading, own.reading)} ({tail})", is_fault
 
 
 def doubt_of_poses(conventions: list[Convention], recording: Recording, needs_proof: bool) -> str:
@@ -84,20 +81,17 @@ def shared_value(counts: Int[np.ndarray, "2 values"], n_frames: int) -> int:
 
     `counts` are how often each value occurs, and in how many frames many share it.
     """
-    (values,) = np.nonzero(counts[0])
-    often = counts[0, values]
-    if len(values) <= _BESIDE:
-        return 0
-    most = int(often.argmax())
-    beside = np.r_[often[max(0, most - _BESIDE) : most], often[most + 1 : most + 1 + _BESIDE]]
-    is_shared = often[most] > max(SHARED * often.sum(), _SPIKE * beside.max())
-    return int(values[most]) if is_shared and counts[1, values[most]] > _SHARING * n_frames else 0
+    next_most, most = np.argsort(counts[0])[-2:]
+    often = counts[0, most]
+    # A camera's rounding makes many values frequent, but none so much more than all others.
+    is_shared = often > max(SHARED * counts[0].sum(), _SPIKE * counts[0, next_most])
+    return int(most) if is_shared and counts[1, most] > _SHARING * n_frames else 0
 
 
-def of_depth_images(
+def of_images(
     frames: pd.DataFrame, shared: int, counts: Int[np.ndarray, "2 values"], recording: Recording
 ) -> Iterator[str]:
-    """What is wrong with depth images, whatever their numbers mean."""
+    """What is wrong with images, whatever their numbers mean."""
     if not frames.measured.any():
         advice = "check the depth folder, and no_depth in sequence.toml"
         yield f"no pixel that was looked at has a depth: all are 0, or saturated (65535); {advice}"
@@ -110,6 +104,9 @@ def of_depth_images(
         found = f"{repeated:.0%} of the depth images repeat the one before, though the poses move"
         every = round(1 / (1 - repeated))
         yield f"{found}: leave them out, as with --frames ::{every} of map and track"
+    if frames.brightness.median() < _BLACK:
+        options = "--set tracking.lm.lambda_intensity=0, or tracking.sdf.lambda_color=0 for sdf"
+        yield f"the colour images are black: check their folder, or track without colour: {options}"
 
 
 def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
@@ -152,33 +149,3 @@ def remarks_on_depths(
     if _MAX_STEP * depth.median() < step_m < depth.max() / 8:
         advice = "look for those that the camera gave, or expect no better poses"
         yield f"depths come in steps of {100 * step_m:.1f} cm: {advice}"
-
-
-def of_colors(
-    pairs: FramePairs, own: Reading, brightness: pd.Series, is_compared: bool
-) -> Iterator[str]:
-    """What is wrong with colours; those without contrast tell nothing.
-
-    If `is_compared`, they are compared at the points whose depths agree as declared.
-    """
-    if brightness.median() < _BLACK:
-        options = "--set tracking.lm.lambda_intensity=0, or tracking.sdf.lambda_color=0 for sdf"
-        yield f"the colour images are black: check their folder, or track without colour: {options}"
-    if not is_compared:
-        return
-    compared = pairs.compare(own)
-    as_declared = pairs.color_costs(compared)
-    if np.isfinite(as_declared).sum() < MIN_PAIRS:
-        return
-    tried = [("colours alone are mirrored", {"is_mirrored": True})]
-    tried += [(f"colours come {n:+d} frames after depth", {"shift": n}) for n in _SHIFTS if n]
-    tried += [(f"colours lie {s:+.0%} of the width too far right", {"right": s}) for s in _RIGHTS]
-    unlike = [np.nanmedian(pairs.color_costs(compared, **how)) for _, how in tried]
-    least, declared = min(unlike), np.nanmedian(as_declared)
-    if least < min(1 - _MIN_CORRELATION, _UNLIKE * declared):
-        said = tried[unlike.index(least)][0]
-        better = f"correlate by {1 - least:.2f} then, and by {1 - declared:.2f} now"
-        yield f"{said}: register them anew (where two frames see the same they {better})"
-    elif declared > 1 - _MIN_CORRELATION:
-        found = f"of points that two frames see they correlate by {1 - declared:.2f}"
-        yield f"colours do not belong to the depth images: {found}; check their folder and order"

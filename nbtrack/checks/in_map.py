@@ -1,21 +1,12 @@
-"""Whether a map and a recording belong together, share a world, and see the same.
-
-Of depths that misfit: at a pose that is right but for a little, a measured point p (camera frame)
-has a distance r in the map, whose gradient is q (camera frame). If all depths of the recording are
-too long by a share s, r = s (q . p) plus what a small motion of the camera explains. The motions
-are projected out of each frame, and the share that leaves the least of r is estimated, with
-the interval of `data check`.
-"""
+"""Whether a map and a recording belong together and share a world."""
 
 import math
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
-from nbtrack.checks.misfits import solved
 from nbtrack.core.arrays import Pose, Poses, WorldPoints
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
@@ -33,14 +24,6 @@ _MISFIT_ALLOWED = 0.05  # m
 _N_FRAMES = 40  # looked at
 _N_POINTS = 500  # of each frame, looked at
 _MOSTLY = 0.5  # share of a frame's points outside of the map's bounds, where the frame lies outside
-_MAX_DISTANCE = 0.1  # m; points farther from any surface tell nothing
-_MIN_POINTS = 50  # of a frame, that an estimate needs
-_MIN_FRAMES = 8  # that an estimate needs
-# What motions leave of longer depths, as a share of the points' distances from the camera: before
-# a flat wall 1 %, which is noise of the map's gradients; in rooms 10 % and more.
-_MIN_LEFT = 0.03
-_NEGLIGIBLE = 0.01  # share of longer depths, as right maps and recordings show it (our choice)
-_GAIN = 0.98  # share of the squared residuals, above which longer depths explain nothing
 
 
 def check_belongs(finished: Map, frame: Frame) -> str | None:
@@ -119,43 +102,6 @@ def outside_map_share(field: Field, sequence: RgbdSequence, T_estimated: Poses) 
         is_outside = (points_world < field.bounds.minimum) | (points_world > field.bounds.maximum)
         outside.append(is_outside.any(axis=1).mean() > _MOSTLY)
     return float(np.mean(outside)) if outside else 0.0
-
-
-def map_misfit(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> str:
-    """A sentence where depths of some frames misfit the distances of a map; else an empty one.
-
-    A frame that sees no more than three walls tells nothing: moving the camera there has the same
-    effect as longer depths. The module's text has the method and its symbols p, q, r and s.
-    """
-    if not field.is_distance:
-        return ""
-    squares = []  # of each frame, in m²: of what longer depths add, both, and of the residual
-    for index, points_camera in _some_points(sequence):
-        T = T_estimated[index]
-        points_world = torch.from_numpy(_to_world(points_camera, T)).float().to(field.device)
-        _, distance = field(points_world.requires_grad_())
-        (gradient_world,) = torch.autograd.grad(distance.sum(), points_world)
-        is_near = np.abs(distance.numpy(force=True)) < _MAX_DISTANCE
-        p, r = points_camera[is_near], distance.numpy(force=True)[is_near]
-        q = (gradient_world.numpy(force=True) @ T[:3, :3])[is_near]
-        motions, _ = np.linalg.qr(np.hstack([np.cross(p, q), q]))
-        both = np.column_stack([r, (q * p).sum(axis=1)])
-        # What no motion explains: of r, and of q . p, which times s is what longer depths add to r.
-        residual, longer = (both - motions @ (motions.T @ both)).T
-        if len(p) >= _MIN_POINTS and (longer**2).sum() > _MIN_LEFT**2 * (p**2).sum():
-            squares.append([longer @ longer, -longer @ residual, residual @ residual])
-    if len(squares) < _MIN_FRAMES:
-        return ""
-    H, g, all_squares = np.array(squares).T
-    (share,), (low,), (high,) = solved(H[:, None, None], g[:, None])
-    gain = 1 + share * g.sum() / all_squares.sum()  # of the least squares: r² - s r l is left
-    if not (low > _NEGLIGIBLE or high < -_NEGLIGIBLE) or gain > _GAIN:
-        return ""
-    return (
-        f"residuals in the map grow with depth, as if depths were off by {share:+.1%} ({low:+.1%} "
-        f"to {high:+.1%}); without it frames differ {gain:.0%} as much: the share may be larger, "
-        "or focal lengths are off; compare both recordings by `data check`"
-    )
 
 
 def _some_points(sequence: RgbdSequence) -> Iterator[tuple[int, np.ndarray]]:

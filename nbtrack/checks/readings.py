@@ -7,7 +7,6 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt16
@@ -24,16 +23,12 @@ from nbtrack.recordings.recording import Recording
 _HIDDEN_BEHIND = 0.25  # m behind a surface points are hidden: several times a camera's noise
 _SAME_SURFACE = 0.025  # of the depth: where neighbours blend to more, they lie on two surfaces
 _SCALE = 0.01  # of the depth: surfaces so far apart agree by half, several times a camera's noise
-_SAME = 0.2  # least agreement of points whose colours are compared: surfaces 2 * _SCALE apart
-_MIN_OVERLAP = 0.1  # share of a pair's points without which its colours are not compared
-_MIN_CONTRAST = 0.02  # standard deviation of intensities in [0, 1], below which nothing is seen
 _POINTS_PER_FRAME = 1000  # 20 pairs of frames have enough for a median
 _AREAS = (4, 6)  # rows and columns of them in an image
 AREA_SCALE = 0.004  # of the depth: areas that lie so far apart cost by half (our choice)
 _FAR_APART = 0.05  # of the depth: more counts no more
 _MIN_MEASURED = 0.3  # share of an area's points without which nothing is told of it
 Pairs = Int[np.ndarray, "2 pairs"]  # of frames
-Costs = Float[np.ndarray, "pairs"]
 Apart = Float[np.ndarray, "pairs areas"]
 
 
@@ -104,14 +99,14 @@ def on_grid(values: UInt16[np.ndarray, "frames h w"], stride: int) -> tuple[Tens
     return columns, rows, some.flatten(1)
 
 
-class Comparison(NamedTuple):
-    """Points of first frames beside what the second ones measured: (pairs, points) each."""
+class Agreement(NamedTuple):
+    """How well pairs of frames agree under a reading."""
 
-    residual: Tensor  # m, by which points lie behind the surface that was measured
-    measured: Tensor  # m, the depth of that surface
-    is_valid: Tensor  # False where hidden, outside, or between two surfaces
-    agreement: Tensor  # 1 where both coincide, 0 where they are far apart or not valid
-    seen_at: Tensor  # (pairs, 1, points, 2): -1 at the first pixel, 1 at the last
+    areas: Apart  # by how much surfaces lie apart in each area, as a share of the depth
+    apart: float  # the mean of its sizes; NaN of nothing
+    depth_m: float  # the median depth of the points that overlap
+    overlap: float  # share of all points that fall onto a measured, not nearer, surface
+    agreement: float  # the same, where surfaces that coincide count 1 and those far apart 0
 
 
 def cost_of(apart: Apart, scale: float = AREA_SCALE) -> float:
@@ -132,15 +127,13 @@ class FramePairs:
         """Take the frames of pairs from a sequence whose depth values are as in the files.
 
         `ids` are the numbers of the recording's frames that have a pose, and `pairs` are indices in
-        `ids`. Points are those of the first frame of each pair. `kept` also holds frames around
-        those of the pairs where `color_costs` is to shift colours against depth.
+        `ids`. Points are those of the first frame of each pair.
         """
         self.pairs = pairs
         self.file_poses = recording.file_poses[ids]
         self.order = recording.declared.quaternion
-        self.colors = kept.colors
-        self.places = np.searchsorted(kept.frame_ids, ids[pairs])  # of pairs in `kept`
-        first, second = kept.depths_mm[self.places]  # the files' values, in their unit
+        places = np.searchsorted(kept.frame_ids, ids[pairs])
+        first, second = kept.depths_mm[places]  # the files' values, in their unit
         stride = math.ceil((math.prod(first.shape[1:]) / _POINTS_PER_FRAME) ** 0.5)
         self.columns, self.rows, self.values = on_grid(first, stride)  # of the points
         # Numbers of the points of each area, (areas, n): a few rows and columns are left over.
@@ -152,8 +145,8 @@ class FramePairs:
         # Of the second frames; infinite without a depth.
         self.inverse_values = 1 / torch.from_numpy(second[:, None].astype(np.float32))
 
-    def compare(self, reading: Reading) -> Comparison:
-        """Points of the first frames a beside what was measured in the second ones b.
+    def compare(self, reading: Reading) -> Agreement:
+        """How points of the first frames a agree with what was measured in the second ones b.
 
         Depth is interpolated between four pixels, in 1/z, which is exact for planes.
         """
@@ -161,7 +154,9 @@ class FramePairs:
         T_b_a = self._T_second_first(reading)
         points_b = points_a @ T_b_a[:, :3, :3].mT + T_b_a[:, None, :3, 3]
         columns, rows, depth = project(reading.calibration, points_b)
-        at = self._on_images(columns, rows)[:, None]  # (pairs, 1, points, 2)
+        height, width = self.inverse_values.shape[2:]
+        # As `grid_sample` has them, (pairs, 1, points, 2): -1 is the first pixel, 1 the last.
+        at = 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1)[:, None] - 1
         blended = 1 / grid_sample(self.inverse_values, at, "bilinear", align_corners=True)[:, 0, 0]
         nearest = 1 / grid_sample(self.inverse_values, at, "nearest", align_corners=True)[:, 0, 0]
         _, _, measured = reading.points(columns, rows, blended).unbind(-1)  # z-depth
@@ -170,71 +165,33 @@ class FramePairs:
         is_valid &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
         # A point far in front of the surface stays: it contradicts, while one behind is hidden.
         is_valid &= residual < _HIDDEN_BEHIND
-        # The weight of Geman and McClure of the difference, as a share of the depth.
-        agreement = torch.where(is_valid, 1 / (1 + (residual / measured / _SCALE) ** 2), 0.0)
-        return Comparison(residual, measured, is_valid, agreement, at)
+        share = torch.where(is_valid, residual / measured, torch.nan)
+        # The weight of Geman and McClure: 1 where both coincide, 0 where they are far apart.
+        agreement = 1 / (1 + (share / _SCALE) ** 2)
+        n_points = float((self.values > 0).sum().clamp(1))
+        areas = self._areas(share)
+        return Agreement(
+            areas, mean_apart(areas), float(measured[is_valid].median()),
+            float(is_valid.sum()) / n_points, float(agreement.nansum()) / n_points,
+        )  # fmt: skip
 
     def _T_second_first(self, reading: Reading) -> Tensor:
         """Poses of the first cameras in the second ones' frames, (pairs, 4, 4; m)."""
         T_world_camera = reading.T_world_camera(self.file_poses, self.order)
         # Depth that is late by some frames was taken at the pose that is so many frames before,
-        # which lies between two poses on a straight line.
-        at = (self.pairs - reading.late).clip(0, len(self.file_poses) - 1)
+        # which lies between two poses; they are so near that it may be blended by parts.
+        at = (self.pairs - reading.late).clip(0, len(T_world_camera) - 1)
         before = at.astype(int)
-        T = T_world_camera[before]
-        if reading.late:
-            after = T_world_camera[np.minimum(before + 1, len(T_world_camera) - 1)]
-            share = (at - before).ravel()[:, None]
-            R, R_after = (
-                Rotation.from_matrix(t[..., :3, :3].reshape(-1, 3, 3)) for t in (T, after)
-            )
-            between = R * Rotation.from_rotvec(share * (R.inv() * R_after).as_rotvec())
-            T[..., :3, :3] = between.as_matrix().reshape(T[..., :3, :3].shape)
-            T[..., :3, 3] += share.reshape(*at.shape, 1) * (after - T)[..., :3, 3]
+        share = (at - before)[..., None, None]
+        after = np.minimum(before + 1, len(T_world_camera) - 1)
+        T = (1 - share) * T_world_camera[before] + share * T_world_camera[after]
         return torch.from_numpy(np.linalg.solve(T[1], T[0])).float()
 
-    def _on_images(self, columns: Tensor, rows: Tensor) -> Tensor:
-        """Pixel indices as `grid_sample` has them, (..., 2): -1 is the first pixel, 1 the last."""
-        height, width = self.inverse_values.shape[2:]
-        return 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1) - 1
+    def _areas(self, share: Tensor) -> Apart:
+        """Medians over areas of the image of what lies apart; NaN where few points are valid.
 
-    def apart(self, compared: Comparison) -> Apart:
-        """By how much surfaces lie apart, as a share of the depth: medians over areas of the image.
-
-        Over an area a sensor's noise averages out, while what is read wrongly stays. NaN where few
-        points of an area are valid.
+        Over an area a sensor's noise averages out, while what is read wrongly stays.
         """
-        share = torch.where(compared.is_valid, compared.residual / compared.measured, torch.nan)
         of_areas = share[:, self.areas]
         is_measured = of_areas.isfinite().float().mean(dim=-1) >= _MIN_MEASURED
         return torch.where(is_measured, of_areas.nanmedian(dim=-1).values, torch.nan).numpy()
-
-    def color_costs(
-        self, compared: Comparison, shift: int = 0, right: float = 0.0, is_mirrored: bool = False
-    ) -> Costs:
-        """1 - the correlation of intensities of points whose depths agree; exposures may differ.
-
-        `compared` tells where points lie and agree. Colours are taken so many frames later, so much
-        farther right (as a share of the width), and mirrored. NaN of pairs with few points, and
-        without contrast.
-        """
-        # The points' places in all first frames, then in all second ones: (2 pairs, 1, points, 2).
-        in_first = self._on_images(self.columns, self.rows).expand_as(compared.seen_at[:, 0])
-        at = torch.cat([in_first[:, None], compared.seen_at])
-        at[..., 0] += 2 * right  # an image is 2 wide, from -1 to 1
-        if is_mirrored:
-            at[..., 0] *= -1
-        # `kept` holds the neighbours in order, so that so many frames later is so many places on.
-        places = (self.places + shift).clip(0, len(self.colors) - 1)
-        gray = [cv2.cvtColor(self.colors[i], cv2.COLOR_RGB2GRAY) for i in places.ravel()]
-        images = torch.from_numpy(np.stack(gray))[:, None].float() / 255
-        in_firsts, in_seconds = grid_sample(images, at, align_corners=True)[:, 0, 0].chunk(2)
-        is_inside = (at.abs() <= 1).all(dim=-1)[:, 0].view(2, *self.values.shape).all(dim=0)
-        is_compared = ((compared.agreement > _SAME) & is_inside).numpy()
-        costs = np.full(len(is_compared), np.nan)
-        for pair in np.flatnonzero(is_compared.mean(axis=1) >= _MIN_OVERLAP):
-            first = in_firsts[pair].numpy()[is_compared[pair]]
-            second = in_seconds[pair].numpy()[is_compared[pair]]
-            if min(first.std(), second.std()) >= _MIN_CONTRAST:
-                costs[pair] = 1 - np.corrcoef(first, second)[0, 1]
-        return costs

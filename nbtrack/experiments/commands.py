@@ -147,7 +147,7 @@ def _warn(metrics: dict[str, Any]) -> None:
     """Warn where a run's errors may not be trusted."""
     outside = metrics.get("outside_map_share", 0.0)
     unseen = f"{outside:.0%} of the frames saw little of what was mapped" if outside > 0 else None
-    for warning in filter(None, (metrics["map_warning"], unseen, metrics.get("map_misfit"))):
+    for warning in filter(None, (metrics["map_warning"], unseen)):
         tell(f"nbtrack: warning: {warning}")
 
 

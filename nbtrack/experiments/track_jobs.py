@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from nbtrack import provenance
-from nbtrack.checks.in_map import check_belongs, in_world_of_map, map_misfit, outside_map_share
+from nbtrack.checks.in_map import check_belongs, in_world_of_map, outside_map_share
 from nbtrack.core.arrays import Pose, Poses
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
@@ -186,7 +186,6 @@ class TrackJob(Job):
             if warning == _OTHER_WORLD:
                 followed = replace(followed, T_world_camera=T_estimated)
             notes["outside_map_share"] = outside_map_share(finished.field, followed, T_estimated)
-            notes["map_misfit"] = map_misfit(finished.field, followed, T_estimated)
         reach = self._reach(tracked.frames["steps"].mean(), unit_m, T_true)
         return notes | still_metrics(T_true) | reach
 
