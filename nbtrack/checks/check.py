@@ -60,7 +60,7 @@ class DataReport:
         return f"cannot be told: {self.doubts[0]}" if self.doubts else "read rightly"
 
     def __str__(self) -> str:
-        recording, cloud = self.recording, self.cloud
+        recording, cloud, verdict = self.recording, self.cloud, self.verdict
         own, *others = self.conventions
         rivals = sorted((r for r in others if r.overlap > 0), key=lambda r: -r.agreement)[:3]
         c = own.reading.camera
@@ -86,8 +86,9 @@ class DataReport:
             ),
             "  what may be off, fitted one by one (95 %), and mm apart then",
             *(f"{1e3 * m.apart * own.depth_m:12.1f} mm  {m}" for m in self.misfits),
-            *(f"  warning: {text}" for text in self.warnings if text not in self.verdict),
-            f"  verdict: {self.verdict}",
+            *(f"  warning: {text}" for text in self.faults + self.doubts if text not in verdict),
+            *(f"  note: {text}" for text in self.remarks),
+            f"  verdict: {verdict}",
             f"  {'then' if self.faults else 'start with'}: python -m nbtrack {command} "
             f"{shlex.quote(str(recording.folder))}",
         ]
@@ -109,7 +110,7 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     own = Reading(recording.declared, sequence.intrinsics)
-    shared = findings.shared_value(counts, len(frames))
+    shared = findings.shared_value(counts, frames)
     sequence.depths_mm[sequence.depths_mm == shared] = 0
     seen = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(seen, own)

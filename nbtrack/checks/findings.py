@@ -76,16 +76,17 @@ def doubt_of_poses(conventions: list[Convention], recording: Recording, needs_pr
     return f"{not_proved} {little}, such as {alike[0]}"
 
 
-def shared_value(counts: Int[np.ndarray, "2 values"], n_frames: int) -> int:
-    """The depth value that many pixels share, away from the rest; 0 where there is none.
+def shared_value(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> int:
+    """The depth value that many pixels share though the camera moves; 0 where there is none.
 
     `counts` are how often each value occurs, and in how many frames many share it.
     """
     next_most, most = np.argsort(counts[0])[-2:]
-    often = counts[0, most]
+    is_often = counts[0, most] > SHARED * counts[0].sum() and np.count_nonzero(counts[0]) > _SPIKE
     # A camera's rounding makes many values frequent, but none so much more than all others.
-    is_shared = often > max(SHARED * counts[0].sum(), _SPIKE * counts[0, next_most])
-    return int(most) if is_shared and counts[1, most] > _SHARING * n_frames else 0
+    is_spike = counts[0, most] > _SPIKE * counts[0, next_most]
+    is_shared = counts[1, most] > _SHARING * len(frames) and frames.moved_mm.median() > 0
+    return int(most) if is_often and is_spike and is_shared else 0
 
 
 def of_images(

@@ -19,10 +19,9 @@ _FACTORS = (4.0, 2.0, 1.0, 0.5, 0.2)  # of a step; the best is taken
 _WIDE = 5.0  # medians of what lies apart; so far away half of the weight is left
 _ENOUGH = 0.02  # of what is negligible: a last step
 # Shares of the cost as declared that a cause may leave: a usual sensor's error, and another.
-_USUAL_GAIN, _GAIN = 0.9, 0.5
+_USUAL_GAIN, _GAIN = 0.9, 0.75  # our choice
 _ALIKE = 0.95  # of two costs: they tell nothing
 _WHOLE = 0.8  # of the cost of a cause: where all numbers together leave less, it is not the whole
-MIN_PAIRS = 8  # that an estimate needs
 _RESAMPLED = 200  # draws of a bootstrap
 _INTERVAL = [0.025, 0.975]  # its quantiles
 
@@ -81,8 +80,8 @@ class Misfit:
     def is_significant(self) -> bool:
         """Whether an interval is more than negligible, and surfaces agree better, within limits."""
         told = [(_NUMBERS[key], *ends) for key, ends in self.numbers.items()]
-        is_off = any(low > n.negligible or high < -n.negligible for n, _, low, high in told)
-        is_within = all(abs(value) < n.limit for n, value, _, _ in told)
+        is_off = any(max(low, -high) > number.negligible for number, _, low, high in told)
+        is_within = all(abs(value) < number.limit for number, value, _, _ in told)
         return is_off and is_within and self.gain < (_USUAL_GAIN if self.is_usual else _GAIN)
 
     @property
@@ -93,9 +92,9 @@ class Misfit:
     def __str__(self) -> str:
         said = []
         for key, ends in self.numbers.items():
-            number = _NUMBERS[key]
-            value, low, high = (format(end, number.form) for end in ends)
-            said.append(f"{number.label}{value} ({low} to {high}){number.unit}")
+            label, form, unit, *_ = _NUMBERS[key]
+            value, low, high = (format(end, form) for end in ends)
+            said.append(f"{label}{value} ({low} to {high}){unit}")
         return f"{self.name} {', '.join(said)}"
 
 
@@ -114,8 +113,7 @@ def main_misfits(pairs: FramePairs, own: Reading, misfits: list[Misfit]) -> list
     together = fit(pairs, own, "all", list(_NUMBERS), alike[0].reading)
     if together.gain < _WHOLE * lowest:
         return []
-    first, *others = alike
-    return [first, *(m for m in others if not first.numbers.keys() <= m.numbers.keys())]
+    return [m for m in alike if m is alike[0] or not alike[0].numbers.keys() <= m.numbers.keys()]
 
 
 def fit_causes(pairs: FramePairs, own: Reading) -> list[Misfit]:
@@ -146,7 +144,7 @@ def fit(
         scale = _WIDE * float(np.nanmedian(np.abs(apart)))
         # Steps are in units of what is negligible, so that all numbers are alike.
         moved = [apart_at(values + d) for d in np.diag(small)]
-        step, _, _ = solved(*_normal_equations(apart, moved, scale))
+        step = _solution(*(each.sum(axis=0) for each in _normal_equations(apart, moved, scale)))
         tried = [(values + factor * small * step).clip(-limit, limit) for factor in _FACTORS]
         aparts = [apart_at(new) for new in tried]
         best = int(np.argmin([cost_of(a, scale) for a in aparts]))
@@ -157,29 +155,24 @@ def fit(
         if is_near:
             break
     H, g = _normal_equations(apart, [apart_at(values + d) for d in np.diag(small)], AREA_SCALE)
-    left, low, high = solved(H, g)
+    # A fixed seed, so that a recording always has the same interval.
+    drawn = np.random.default_rng(0).integers(len(H), size=(_RESAMPLED, len(H)))
+    left = _solution(H.sum(axis=0), g.sum(axis=0))
+    steps = _solution(H[drawn].sum(axis=1), g[drawn].sum(axis=1)) - left
+    low, high = values + small * np.quantile(steps, _INTERVAL, axis=0)
     # Where the opposite does as well, what helps is something else, as an average of poses.
     others = [apart_at(0 * values), apart_at(-values)]
     gain = max(_ratio(apart, other) for other in others)
-    ends = np.stack([values, values + small * (low - left), values + small * (high - left)])
-    numbers = dict(zip(keys, map(tuple, ends.T.tolist()), strict=True))
+    ends = np.stack([values, low, high], axis=1)
+    numbers = dict(zip(keys, map(tuple, ends.tolist()), strict=True))
     return Misfit(name, read(values), numbers, mean_apart(apart), gain)
 
 
-def solved(
-    H: Float[np.ndarray, "n k k"], g: Float[np.ndarray, "n k"]
-) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"], Float[np.ndarray, "k"]]:
-    """The k numbers of the normal equations of n observations, and the interval's ends of each.
-
-    What nothing tells is 0. The interval is a bootstrap's, which draws the observations anew.
-    """
-    # A fixed seed, so that a recording always has the same interval.
-    drawn = np.random.default_rng(0).integers(len(H), size=(_RESAMPLED, len(H)))
-    each = [(H.sum(axis=0), g.sum(axis=0)), (H[drawn].sum(axis=1), g[drawn].sum(axis=1))]
-    at, resampled = (
-        -(np.linalg.pinv(h, rcond=1e-6, hermitian=True) @ b[..., None])[..., 0] for h, b in each
-    )
-    return at, *np.quantile(resampled, _INTERVAL, axis=0)
+def _solution(
+    H: Float[np.ndarray, "... k k"], g: Float[np.ndarray, "... k"]
+) -> Float[np.ndarray, "... k"]:
+    """The k numbers of normal equations; what nothing tells is 0."""
+    return -(np.linalg.pinv(H, rcond=1e-6, hermitian=True) @ g[..., None])[..., 0]
 
 
 def _normal_equations(
@@ -190,9 +183,8 @@ def _normal_equations(
     is_known = np.isfinite(J).all(axis=0) & np.isfinite(apart)
     weights = np.where(is_known, 1 / (1 + (apart / scale) ** 2) ** 2, 0)
     J, apart = np.nan_to_num(J), np.nan_to_num(apart)
-    return np.einsum("ipa,jpa,pa->pij", J, J, weights), np.einsum(
-        "ipa,pa,pa->pi", J, apart, weights
-    )
+    H = np.einsum("ipa,jpa,pa->pij", J, J, weights)
+    return H, np.einsum("ipa,pa,pa->pi", J, apart, weights)
 
 
 def _ratio(apart: Apart, other: Apart) -> float:
