@@ -148,7 +148,7 @@ ARGUMENTS = {
     "a method in another map": ([*GIVEN[:2], "--method", "vr", "--map-from", "map"], "not 'imap'"),
     "a plain map": (
         [*GIVEN[:2], "--method", "neus_corrected", *GIVEN[-1:], "map"],
-        "other settings than --set correction.neus=",
+        "was made with correction.neus=0.0, not ",
     ),
     "tracker not the map's": ([*GIVEN, "map", "--tracker", "icp"], "does not work on field 'neus'"),
     "steps that are none": ([*OWN, "--steps", "nan"], "steps_per_frame is nan"),

@@ -172,9 +172,10 @@ def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -
     asked |= {f"correction.{made}"} if options.method else set()  # methods say it, or none
     for key in sorted(asked & known.keys()):  # no map has the others, as those of a tracker
         if known[key] != wanted[key]:
-            what = f"{options.map_from} was made with other settings than --set {key}={wanted[key]}"
-            advice = "leave it, or a --method that means it, out, or map anew"
-            raise ConfigError(f"{what}, with {known[key]}: {advice}")
+            what = (
+                f"{options.map_from} was made with {key}={known[key]}, not {wanted[key]} as asked"
+            )
+            raise ConfigError(f"{what}: leave --set and --method out, or map anew")
 
 
 def _make_map(job: MapJob) -> None:
