@@ -115,22 +115,16 @@ def test_what_cannot_be_fetched(archive: Path, tmp_path: Path, serve, capsys, mo
     that does not say of which scene they are."""
     page, local = tmp_path / "page.html", [*FETCH, str(archive)]
     page.write_text("<html>moved</html>" * 9000)
-    bare = shutil.make_archive(
-        str(tmp_path / "a"), "zip", tmp_path / "zip/neural_rgbd_data" / SCENE
-    )
+    scene = tmp_path / "zip/neural_rgbd_data" / SCENE
+    bare = shutil.make_archive(str(tmp_path / "bare"), "zip", scene)
+    others = [["data", "fetch", "whiteroom", "--url", file] for file in (str(archive), bare)]
     cases = [
         ([*FETCH, serve(archive, has_ranges=False)[0]], "give its path to --url"),
         *(([*FETCH, place], "not a readable ZIP") for place in (serve(page)[0], str(page))),
         ([*FETCH, "http://127.0.0.1:9/data.zip"], "not a readable ZIP file"),
         ([*FETCH, str(tmp_path / "no.zip")], "no file"),
         (["data", "fetch", "breakfast"], "did you mean"),
-        *(
-            (
-                ["data", "fetch", "whiteroom", "--url", file],
-                "no images and depth in a folder 'white",
-            )
-            for file in (str(archive), bare)
-        ),
+        *((other, "no images and depth in a folder 'whiteroom'") for other in others),
     ]
     for command, says in cases:
         assert_refused(tmp_path, capsys, command, says)
