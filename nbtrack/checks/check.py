@@ -121,16 +121,18 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     misfits = fit_causes(seen, own) if is_told else []
     faults = list(findings.of_images(frames, shared, counts, recording))
     main = main_misfits(seen, own, misfits)
-    said, is_fault = findings.misreading(conventions[0], best, main)
-    faults += [said] if is_fault else findings.of_poses(frames, recording) if is_own else []
+    said, kind = findings.misreading(conventions[0], best, main)
+    faults += [said] if kind == "fault" else findings.of_poses(frames, recording) if is_own else []
     faults += findings.of_units(cloud.depth[~is_far]) if is_own else []
     depths = frames, cloud.depth, is_far, recording
-    remarks = [said] if said and not is_fault else []
+    remarks = [said] if kind == "note" else []
     remarks += findings.remarks_on_depths(*depths) if is_own else []
-    doubt = "" if faults else findings.doubt_of_poses(conventions, recording, is_whole)
+    doubts = [said] if kind == "doubt" else []
+    if not (faults or doubts):
+        doubts = findings.doubts_of_poses(conventions, recording, is_whole)
     return DataReport(
         recording, frames, T_world_camera, cloud[~is_far], conventions=conventions, best=best,
-        misfits=misfits, faults=faults, doubts=[doubt] if doubt else [], remarks=remarks,
+        misfits=misfits, faults=faults, doubts=doubts, remarks=remarks,
     )  # fmt: skip
 
 

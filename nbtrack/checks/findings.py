@@ -31,11 +31,12 @@ _UNTOLD = (
 )
 
 
-def misreading(own: Convention, best: Convention, main: list[Misfit]) -> tuple[str, bool]:
-    """What is off in how the numbers are read, in a sentence, and whether it is a fault.
+def misreading(own: Convention, best: Convention, main: list[Misfit]) -> tuple[str, str]:
+    """What is off in how the numbers are read, in a sentence, and its kind: fault, doubt or note.
 
-    The sentence is empty where nothing is off. A cause is told if with it surfaces agree as those
-    of right recordings do; it is no fault where it is as small as usual sensors have it.
+    Both are empty where nothing is off. A cause is told if with it surfaces agree as those of right
+    recordings do, and is a note where usual sensors have it. Where nothing explains what lies apart
+    it is a doubt, and a fault if it is far.
     """
     usual_mm = 1e3 * own.usual_apart * own.depth_m
     apart = f"lie {1e3 * own.apart * own.depth_m:.0f} mm apart" if own.overlap else "never meet"
@@ -49,16 +50,18 @@ def misreading(own: Convention, best: Convention, main: list[Misfit]) -> tuple[s
         return (
             f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), "
             f"and nothing that is tried explains it: {_TRIED}. What cannot be told: {_UNTOLD}"
-        ), True
+        ), "fault" if own.is_far_apart else "doubt"
     else:
-        return "", False
+        return "", ""
     tail = f"surfaces that two frames see then lie {left_mm:.0f} mm apart; as declared they {apart}"
-    is_fault = best is not own or not main[0].is_usual
-    return f"{name}; {remedy(reading, own.reading)} ({tail})", is_fault
+    kind = "note" if best is own and main[0].is_usual else "fault"
+    return f"{name}; {remedy(reading, own.reading)} ({tail})", kind
 
 
-def doubt_of_poses(conventions: list[Convention], recording: Recording, needs_proof: bool) -> str:
-    """Why it cannot be told whether poses are read rightly, in a sentence; empty where it can.
+def doubts_of_poses(
+    conventions: list[Convention], recording: Recording, needs_proof: bool
+) -> list[str]:
+    """Why it cannot be told whether poses are read rightly, in a sentence; none where it can.
 
     Two frames see too little of the same; or, where proof is needed, the camera moves too little to
     tell conventions apart.
@@ -68,12 +71,12 @@ def doubt_of_poses(conventions: list[Convention], recording: Recording, needs_pr
     if own.overlap < MIN_OVERLAP:
         seen = f"({own.overlap:.0%} of the points)"
         advice = "check it, and a piece with smaller steps"
-        return f"{not_proved} two frames see too little of the same {seen}: {advice}"
+        return [f"{not_proved} two frames see too little of the same {seen}: {advice}"]
     alike = [c.name for c in others if c.subject == "poses" and not own.is_clearly_better(c)]
     if not (needs_proof and alike):
-        return ""
+        return []
     little = f"the camera moves too little to tell {len(alike)} other conventions apart"
-    return f"{not_proved} {little}, such as {alike[0]}"
+    return [f"{not_proved} {little}, such as {alike[0]}"]
 
 
 def shared_value(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> int:
