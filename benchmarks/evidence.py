@@ -147,10 +147,10 @@ GRIDS = {
                 place={"iterations": n, **sensor.place},
                 settings=(f"mapping.neus.iterations={n}",),
             )
-            for n, sensor in product((500, 1000, 2000, 4000, 8000), SENSORS)
+            for sensor, n in product(SENSORS, (500, 1000, 2000, 4000, 8000))
         ],
         ["sdf"],
-        {"rates_hz": [5]},
+        {"rates_hz": [5], "frames": ":240"},
         "paper_rooms",
     ),
     # Table I on the mapped path and on a second one; a seed takes an hour on two cores.
