@@ -95,7 +95,14 @@ class Preset:
 
     def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Values in the types of their settings; ConfigError for a key or value not allowed."""
-        checked = flat(with_values(PRESETS[self.name].settings, values))
+        tree = PRESETS[self.name].settings
+        for key in values:
+            part, *names = key.split(".")
+            known = tree.get(part)
+            if names and isinstance(known, dict):
+                # First the field or tracker: of whole keys the nearest may belong to another one.
+                look_up(f"config key, {part} of", names[0], known)
+        checked = flat(with_values(tree, values))
         return {key: checked[key] for key in values}
 
     def with_values(self, values: Mapping[str, Any]) -> "Preset":
