@@ -16,6 +16,7 @@ from nbtrack.core.arrays import Frames, Poses
 from nbtrack.data.sequence import ARRAYS, RgbdSequence
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.progress import ProgressBar
+from nbtrack.recordings.images import images_of
 from nbtrack.recordings.reading import far_limit, read_frames, select_frames
 from nbtrack.recordings.recording import Recording
 
@@ -198,13 +199,15 @@ def _read(
     is_short = len(looked_at) <= _FRAMES_AT_ONCE
     with ProgressBar("reading frames", len(looked_at)) as bar:
         for ids in np.split(looked_at, range(_FRAMES_AT_ONCE, len(looked_at), _FRAMES_AT_ONCE)):
-            part = read_frames(recording, ids, as_stored=True, is_kept=is_short)
+            part = read_frames(recording, ids, as_stored=True)
             for values, color in zip(part.depths_mm, part.colors, strict=True):
                 step = np.gcd.reduce(values, axis=None)
                 of_frame = np.bincount(values.ravel(), minlength=65536)
                 counts += of_frame, of_frame > findings.SHARED * values.size
                 rows.append(((values > 0).mean(), color.mean() / 255, step, zlib.crc32(values)))
             parts.append(part.select(np.isin(ids, kept)))
+            if not is_short:
+                images_of(recording).forget()
             bar.update(len(part))
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
     frames = pd.DataFrame(rows, looked_at, ["measured", "brightness", "depth_step", "checksum"])

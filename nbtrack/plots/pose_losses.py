@@ -101,20 +101,19 @@ def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
 
     That is where the loss is lowest, and where the density is highest.
     """
-    left, right = new_axes(title, 2.9, 1, 2)[0]
-    loss, density = curves[_SDF_LOSS], curves[_DENSITY]
-    _draw_with_best(left, loss, _COLORS[_SDF_LOSS], loss.idxmin(), "lowest")
-    _draw_with_best(right, density, _COLORS[_VR_LOSS], density.idxmax(), "highest")
-    return left.figure
-
-
-def _draw_with_best(axes: Axes, curve: pd.Series, color: str, best_cm: int, told: str) -> None:
-    """A curve of `pose_losses` with a dot where it is best; the legend calls it `told`."""
-    axes.plot(curve, color=color)
-    axes.plot(best_cm, curve[best_cm], "o", color="0.3", label=f"{told}, at {best_cm} cm")
-    axes.axvline(0, label="the true pose", **DASHED)
-    axes.set(xlabel="camera off along x (cm)", ylabel=curve.name)
-    axes.legend()
+    best = {_SDF_LOSS: ("lowest", curves[_SDF_LOSS].idxmin())}
+    best[_DENSITY] = "highest", curves[_DENSITY].idxmax()
+    panels = new_axes(title, 2.9, 1, 2)[0]
+    for axes, name, color in zip(panels, best, _COLORS.values(), strict=True):
+        told, best_cm = best[name]
+        axes.plot(curves[name], color=color)
+        axes.plot(
+            best_cm, curves[name][best_cm], "o", color="0.3", label=f"{told}, at {best_cm} cm"
+        )
+        axes.axvline(0, label="the true pose", **DASHED)
+        axes.set(xlabel="camera off along x (cm)", ylabel=name)
+        axes.legend()
+    return panels[0].figure
 
 
 @styled

@@ -12,7 +12,6 @@ import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.text import Annotation
 from matplotlib.ticker import LogLocator
 from matplotlib.transforms import Bbox
 from PIL import Image
@@ -136,27 +135,17 @@ def label_points(axes: Axes, x: Iterable, y: Iterable, colors: dict[str, str]) -
     pixels = axes.transData.transform([point[:2] for point in points])
     # The points' own marks, in squares of 10 pixels.
     taken = [Bbox.from_bounds(left - 5, bottom - 5, 10, 10) for left, bottom in pixels]
+    shifts = sorted(range(-60, 61, 3), key=abs)  # points, up
     for x_point, y_point, label in points:
         text = axes.annotate(label, (x_point, y_point), (0, 0), textcoords="offset points")
-        text.set(color=colors[label])
-        _move_to_free_place(text, taken)
-        taken.append(text.get_window_extent())
-
-
-def _move_to_free_place(text: Annotation, taken: list[Bbox]) -> None:
-    """Move a text to the nearest place beside its point, within the axes, that none has taken.
-
-    It stays at the farthest if all are taken.
-    """
-    within = text.axes.bbox
-    shifts = sorted(range(-60, 61, 3), key=abs)  # points, up
-    for shift, (aside, align) in product(shifts, [(6, "left"), (-6, "right")]):
-        # 3 points lower, half a letter's height: unshifted texts are level with their points.
-        text.set(position=(aside, shift - 3), horizontalalignment=align)
-        box = text.get_window_extent()
-        is_inside = (box.min > within.min).all() and (box.max < within.max).all()
-        if is_inside and not any(box.overlaps(other) for other in taken):
-            return
+        for shift, (aside, align) in product(shifts, [(6, "left"), (-6, "right")]):
+            # 3 points lower, half a letter's height: unshifted texts are level with their points.
+            text.set(position=(aside, shift - 3), horizontalalignment=align, color=colors[label])
+            box = text.get_window_extent()
+            is_inside = (box.min > axes.bbox.min).all() and (box.max < axes.bbox.max).all()
+            if is_inside and not any(box.overlaps(other) for other in taken):
+                break  # else it stays at the farthest
+        taken.append(box)
 
 
 def log_axes(axes: Axes, names: str) -> None:

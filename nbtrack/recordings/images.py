@@ -5,7 +5,6 @@ Images have one size, and a lens's distortion is taken out.
 
 import hashlib
 import io
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
@@ -43,10 +42,7 @@ def images_of(recording: Recording) -> "Images":
 
 
 class Images:
-    """What was read of the images of a recording.
-
-    The first frame that is decoded tells the size that all must have.
-    """
+    """What was read of the images of a recording; the first frame tells the size of all."""
 
     def __init__(self, recording: Recording) -> None:
         """Begin with nothing read."""
@@ -55,22 +51,26 @@ class Images:
         self._contents: dict[Path, bytes] = {}  # of files that were read and not yet decoded
         self._bytes_left = _MAX_BYTES
         self._first: dict[int, tuple[Pixels, Pixels]] = {}  # decoded to know the size, not yet used
-        self._ids = np.empty(0, int)  # of the frames that are kept, in order
-        self._kept: Decoded | None = None
         self._camera: Intrinsics | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Keep no frames any more, as where a long recording is gone through once."""
+        self._ids = np.empty(0, int)  # of the frames that are kept, in order
+        self._kept: Decoded | tuple[()] = ()
 
     def contents(self) -> tuple[list[tuple[str, str, str]], str, Declaration]:
         """What changes when a recording does: the folder, name and digest of every image, a digest
         of times, poses and camera, and the declaration. Where the recording lies does not count."""
         recording = self.recording
-        images = []
-        for file in recording.color_files + recording.depth_files:
+        files = recording.color_files + recording.depth_files
+        for file in files:
             if file not in self._digests:
                 content = self._content(file)
                 if len(content) < self._bytes_left:
                     self._contents[file] = content
                     self._bytes_left -= len(content)
-            images.append((file.parent.name, file.name, self._digests[file]))
+        images = [(file.parent.name, file.name, self._digests[file]) for file in files]
         digest = hashlib.sha256(repr(replace(recording.calibration, source=Path())).encode())
         digest.update(recording.times.tobytes() + recording.file_poses.tobytes())
         return images, digest.hexdigest(), recording.declared
@@ -79,16 +79,22 @@ class Images:
         """Some frames (at least one), which are kept for whoever wants them next.
 
         They are views of what is kept where their numbers rise evenly, as those of a slice do.
-        Raises as `decoded` does.
+        Raises DataError if a file is damaged, or of another kind or size.
         """
-        missing = np.setdiff1d(ids, self._ids)
-        if len(missing):
-            all_ids = np.union1d(self._ids, missing)
-            arrays = self._empty(len(all_ids), missing[0])
-            for array, before in zip(arrays, self._kept or (), strict=False):
-                array[np.isin(all_ids, self._ids)] = before
-            self._fill(arrays, np.searchsorted(all_ids, missing), missing)
-            self._ids, self._kept = all_ids, arrays
+        camera = self.camera_of(ids[0])
+        all_ids = np.union1d(self._ids, ids)
+        if len(all_ids) > len(self._ids):
+            shape = len(all_ids), camera.height, camera.width
+            colors, depths = np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint16)
+            is_kept = np.isin(all_ids, self._ids)
+            for array, before in zip((colors, depths), self._kept, strict=False):
+                array[is_kept] = before
+            missing = np.flatnonzero(~is_kept)
+            with ThreadPoolExecutor(_THREADS) as pool:
+                decoded = pool.map(self._decoded, all_ids[missing].tolist())
+                for place, frame in zip(missing, decoded, strict=True):
+                    colors[place], depths[place] = frame
+            self._ids, self._kept = all_ids, (colors, depths)
         places = np.searchsorted(self._ids, ids)
         steps = np.unique(np.diff(places)) if len(places) > 1 else [1]
         if len(steps) == 1 and steps[0] > 0:
@@ -96,19 +102,10 @@ class Images:
         colors, depths = self._kept
         return colors[places], depths[places]
 
-    def decoded(self, ids: Frames) -> Decoded:
-        """Some frames (at least one), which are not kept.
-
-        Raises DataError if a file is damaged, or of another kind or size.
-        """
-        arrays = self._empty(len(ids), ids[0])
-        self._fill(arrays, range(len(ids)), ids)
-        return arrays
-
     def camera_of(self, first: int) -> Intrinsics:
         """The camera, told by the frame of this number where none was decoded before.
 
-        Raises DataError as `decoded` does.
+        Raises DataError as `kept` does.
         """
         if self._camera:
             return self._camera
@@ -123,35 +120,20 @@ class Images:
         self._maps = _undistortion(self._camera, recording.calibration.distortion)
         return self._camera
 
-    def _empty(self, n: int, first: int) -> Decoded:
-        """Arrays for so many frames; `first` as in `camera_of`."""
-        camera = self.camera_of(first)
-        shape = n, camera.height, camera.width
-        return np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint16)
-
-    def _fill(self, arrays: Decoded, places: Iterable[int], ids: Frames) -> None:
-        """Decode frames of these numbers into places of the arrays."""
-        colors, depths = arrays
-        height, width = depths.shape[1:]
-
-        def read(place: int, index: int) -> None:
-            color, depth = self._first.pop(index, None) or self._pixels(index)
-            if self._resize:
-                color = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
-            color_file = self.recording.color_files[index]
-            _check(color_file, color, np.uint8, (height, width, 3), self._sized)
-            depth_file = self.recording.depth_files[index]
-            _check(depth_file, depth, np.uint16, (height, width), self._sized)
-            if self._maps:
-                color = cv2.remap(color, *self._maps, cv2.INTER_LINEAR)
-                # No points between two surfaces.
-                depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST)
-            is_none = (depth == self.recording.declared.no_depth) | (depth == _MAX_16_BITS)
-            depths[place] = np.where(is_none, 0, depth)
-            colors[place] = color
-
-        with ThreadPoolExecutor(_THREADS) as pool:
-            list(pool.map(read, places, ids))  # a list, so that errors are raised here
+    def _decoded(self, index: int) -> tuple[Pixels, Pixels]:
+        """A frame of the camera's size, without its lens; depth is 0 where it is not measured."""
+        recording, shape = self.recording, (self._camera.height, self._camera.width)
+        color, depth = self._first.pop(index, None) or self._pixels(index)
+        if self._resize:
+            color = cv2.resize(color, shape[::-1], interpolation=cv2.INTER_AREA)
+        _check(recording.color_files[index], color, np.uint8, (*shape, 3), self._sized)
+        _check(recording.depth_files[index], depth, np.uint16, shape, self._sized)
+        if self._maps:
+            color = cv2.remap(color, *self._maps, cv2.INTER_LINEAR)
+            # No points between two surfaces.
+            depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST)
+        is_none = (depth == recording.declared.no_depth) | (depth == _MAX_16_BITS)
+        return color, np.where(is_none, 0, depth)
 
     def in_millimetres(self, depths: Depths, ids: Frames) -> Depths:
         """Depths (mm along the optical axis) of frames with these numbers.
@@ -185,9 +167,8 @@ class Images:
         file = recording.depth_files[index]
         color = self._read_image(recording.color_files[index], is_color=True)
         if recording.format.read_depth and file.suffix.lower() not in IMAGE_SUFFIXES:
-            return color, recording.format.read_depth(
-                self._content(file), file, recording.calibration
-            )
+            content = self._content(file)
+            return color, recording.format.read_depth(content, file, recording.calibration)
         return color, self._read_image(file, is_color=False)
 
     def _read_image(self, path: Path, is_color: bool) -> Pixels:

@@ -51,18 +51,17 @@ def read_frames(
     needs_poses: bool = True,
     origin: Position | None = None,
     as_stored: bool = False,
-    is_kept: bool = True,
 ) -> RgbdSequence:
     """Frames of an opened recording: those of given numbers, or those of a slice.
 
     Of a slice frames without a pose are left out if `needs_poses`. Positions are relative to
     `origin` (m, the recording's world), by default the recording's own. With `as_stored` the
-    `depths_mm` are the files' values, in any unit. Unless `is_kept`, images do not stay in memory
-    for whoever wants them next. Raises DataError if an image cannot be read, or no frame is left.
+    `depths_mm` are the files' values, in any unit. Images stay in memory for whoever wants them
+    next. Raises DataError if an image cannot be read, or no frame is left.
     """
     ids = select_frames(recording, frames, needs_poses) if isinstance(frames, slice) else frames
     images = images_of(recording)
-    colors, depths = images.kept(ids) if is_kept else images.decoded(ids)
+    colors, depths = images.kept(ids)
     depths_mm = depths if as_stored else images.in_millimetres(depths, ids)
     origin = recording.origin if origin is None else origin
     T_world_camera = recording.T_world_camera[ids]

@@ -117,6 +117,7 @@ def convert_sequence(recording: Recording, out: Path, frames: slice = slice(None
 def _frames(recording: Recording, numbers: Frames) -> Iterator[WrittenFrame]:
     """The frames of some numbers one by one; only `_FRAMES_AT_ONCE` are in memory at a time."""
     for part in np.split(numbers, range(_FRAMES_AT_ONCE, len(numbers), _FRAMES_AT_ONCE)):
-        read = read_frames(recording, part, origin=np.zeros(3), is_kept=False)
+        read = read_frames(recording, part, origin=np.zeros(3))
         for color, depth, T in zip(read.colors, read.depths_mm, read.T_world_camera, strict=True):
             yield color, {"depth": depth}, T
+        images_of(recording).forget()
