@@ -18,9 +18,9 @@ from tiny import TINY
 
 import nbtrack
 from nbtrack.beyond import correction
-from nbtrack.beyond.feature_grid import GridNetwork, GridPlusMapping
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.least_squares import interpolation
+from nbtrack.beyond.neus_plus import GridNetwork, GridPlusMapping
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, NeusMapping, make_field

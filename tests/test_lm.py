@@ -86,7 +86,7 @@ def test_in_a_corridor_the_axis_is_flagged_and_the_pose_stays() -> None:
     position = tracker.T_world_camera[:3, 3]
     assert position[:2].abs().max() < 2e-3
     assert position[2].item() == pytest.approx(0.05, abs=5e-3)  # where the search started
-    assert tracker.report()["condition_number"] > 1e4
+    assert tracker.report()["position_std_m"] > 0.1
 
 
 def test_a_hopeless_start_is_followed_by_restarts_from_the_last_good_pose() -> None:

@@ -8,8 +8,14 @@ import torch
 from box_room import room_sequence, sequence_of
 
 from nbtrack import load_preset, read_map, write_map
-from nbtrack.beyond.feature_grid import FeatureGrid, GridNetwork, GridPlusMapping
-from nbtrack.beyond.neus_plus import NeusPlusMapping, ObservedDistance, distance_targets
+from nbtrack.beyond.neus_plus import (
+    FeatureGrid,
+    GridNetwork,
+    GridPlusMapping,
+    NeusPlusMapping,
+    ObservedDistance,
+    distance_targets,
+)
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
 from nbtrack.data.pixels import PixelSampler, Rays

@@ -12,7 +12,7 @@ from test_faults import assert_refused
 
 from nbtrack.cli import main
 from nbtrack.experiments.runs import read_trajectory
-from nbtrack.plots.rerun_file import rerun_bytes
+from nbtrack.plots.movie import rerun_bytes
 from nbtrack.recordings.reading import read_sequence
 
 

@@ -8,7 +8,7 @@ eight vertices. What the network says away from surfaces stays.
 import copy
 import time
 from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -135,15 +135,15 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     if not field.is_distance:
         raise ConfigError(f"{field.label} is no signed distance: only such a map can be corrected")
     grid = CorrectedField(copy.deepcopy(field).cpu(), voxel)
-    seen = _measured_planes(sequence, frames, grid)
-    n_points = len(seen.points_world)
-    asked_world = np.concatenate([seen.points_world + s * seen.normals_world for s in _OFFSETS])
+    points_world, normals_world, depth, seen_color = _measured_planes(sequence, frames, grid)
+    n_points = len(points_world)
+    asked_world = np.concatenate([points_world + s * normals_world for s in _OFFSETS])
     vertices, weights = interpolation(asked_world, grid)
     is_corrected, matrix = corrected_vertices(vertices, weights, grid.n_vertices)
     numbers, regularisation = regularisation_of(is_corrected)
     uncorrected = grid.volume[:4].T.double().numpy()[numbers]
     color_before, distance_before = uncorrected[:, :3], uncorrected[:, 3:]
-    reliability = (seen.depth.mean() / seen.depth) ** 2
+    reliability = (depth.mean() / depth) ** 2
 
     wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ distance_before
     reliabilities = np.tile(reliability, len(_OFFSETS))
@@ -152,7 +152,7 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     confidence = (1 - _UNMEASURED) * (1 - regularisation.diagonal() / diagonal)
 
     at_surface = matrix[:n_points]  # the rows of the first offset, which is 0
-    wanted_color = seen.color - at_surface @ color_before
+    wanted_color = seen_color - at_surface @ color_before
     springs = regularisation * _COLOR_REGULARISATION
     color, _ = solve(at_surface, wanted_color, reliability, springs, _COLOR_HUBER, _COLOR_ROUNDS)
 
@@ -173,50 +173,35 @@ def _views(sequence: RgbdSequence, frames: Frames) -> State:
     return {"cameras": torch.from_numpy(sequence.T_world_camera[kept]).float(), "views": views}
 
 
-class _Planes(NamedTuple):
-    """Measured points with the planes that they lie on."""
+def _measured_planes(
+    sequence: RgbdSequence, frames: Frames, grid: BakedField
+) -> tuple[np.ndarray, ...]:
+    """Random measured points that show a plane; DataError if there is none.
 
-    points_world: np.ndarray  # n x 3, m
-    normals_world: np.ndarray  # n x 3
-    depth: np.ndarray  # n, z-depth in m
-    color: np.ndarray  # n x 3, in [0, 1]
-    n_cells: int  # how many of a grid's cells hold any of them
-
-
-def _measured_planes(sequence: RgbdSequence, frames: Frames, grid: BakedField) -> _Planes:
-    """Random measured points with a plane.
-
-    They come from `_N_POINTS` random pixels. If fewer than `_POINTS_A_CELL` points lie in a cell on
-    average, as in a large place, all are drawn anew from more pixels, at most `_MAX_TIMES` as many.
+    Returns points (n x 3, m, world), their planes' normals (n x 3), z-depths (n, m) and colours
+    (n x 3, in [0, 1]). They come from `_N_POINTS` random pixels. If fewer than `_POINTS_A_CELL`
+    points lie in a cell on average, as in a large place, all are drawn anew from more pixels, at
+    most `_MAX_TIMES` as many. They are ordered by the grid's cells: vertices that neighbours share
+    are then still in the processor's cache.
     """
-    planes = _draw_planes(sequence, frames, grid, _N_POINTS)
-    times = min(_POINTS_A_CELL * planes.n_cells / len(planes.depth), _MAX_TIMES)
-    if times > 1:
-        planes = _draw_planes(sequence, frames, grid, round(times * _N_POINTS))
-    return planes
-
-
-def _draw_planes(sequence: RgbdSequence, frames: Frames, grid: BakedField, n: int) -> _Planes:
-    """Those of `n` random pixels that show a plane, as points. Raises DataError if none does.
-
-    They are ordered by the grid's cells: vertices that neighbours share are then still in the
-    processor's cache.
-    """
-    sampler = PixelSampler(sequence, torch.device("cpu"))
-    generator = torch.Generator().manual_seed(0)
-    rays = sampler.draw(n, generator, torch.from_numpy(frames), tangent_planes=True)
-    ends = rays.points(rays.depth[:, None])[:, 0]
-    low, high = grid.low, grid.low + grid.voxel * (ends.new_tensor(grid.n_vertices) - 1)
-    # The grid says nothing of points outside: a facade seen through a window.
-    is_inside = ((ends >= low) & (ends <= high)).all(dim=-1)
-    has_plane = rays.normals_world.any(dim=-1) & is_inside
-    if not has_plane.any():
-        raise DataError(f"{sequence.name} shows no surface to correct a map by: check its depth")
-    points_world = rays.points(rays.depth[:, None])[has_plane, 0].double().numpy()
-    vertices, _ = interpolation(points_world, grid)
-    cells = vertices[:, 0]  # a cell has the number of its first vertex
+    sampler, asked = PixelSampler(sequence, torch.device("cpu")), torch.from_numpy(frames)
+    times = 1.0
+    for _ in range(2):
+        generator = torch.Generator().manual_seed(0)
+        rays = sampler.draw(round(times * _N_POINTS), generator, asked, tangent_planes=True)
+        ends = rays.points(rays.depth[:, None])[:, 0]
+        low, high = grid.low, grid.low + grid.voxel * (ends.new_tensor(grid.n_vertices) - 1)
+        # The grid says nothing of points outside: a facade seen through a window.
+        is_inside = ((ends >= low) & (ends <= high)).all(dim=-1)
+        has_plane = rays.normals_world.any(dim=-1) & is_inside
+        if not has_plane.any():
+            found = f"{sequence.name} shows no surface to correct a map by"
+            raise DataError(f"{found}: check its depth")
+        vertices, _ = interpolation(ends[has_plane].double().numpy(), grid)
+        cells = vertices[:, 0]  # a cell has the number of its first vertex
+        times = min(_POINTS_A_CELL * len(np.unique(cells)) / len(cells), _MAX_TIMES)
+        if times <= 1:
+            break
     order = np.argsort(cells, kind="stable")
-    normals_world = rays.normals_world[has_plane].double().numpy()[order]
-    depth = rays.depth[has_plane].double().numpy()[order]
-    color = rays.color[has_plane].double().numpy()[order]
-    return _Planes(points_world[order], normals_world, depth, color, len(np.unique(cells)))
+    drawn = ends, rays.normals_world, rays.depth, rays.color
+    return tuple(each[has_plane].double().numpy()[order] for each in drawn)

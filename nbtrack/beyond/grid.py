@@ -68,8 +68,7 @@ class BakedField(Field):
         axes = [torch.arange(n, dtype=torch.int32, device=low.device) for n in self.n_vertices]
         batches = torch.cartesian_prod(*axes).split(_POINTS_AT_ONCE)
         answers = [source(low + voxel * vertices.float()) for vertices in batches]
-        color = torch.cat([color for color, _ in answers])
-        value = torch.cat([value for _, value in answers])
+        color, value = (torch.cat(parts) for parts in zip(*answers, strict=True))
         # Channels: red, green, blue, value, and a confidence of 1 everywhere.
         volume = torch.cat([color.T, value[None], torch.ones_like(value)[None]])
         self.register_buffer("low", low, persistent=False)

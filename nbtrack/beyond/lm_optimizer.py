@@ -105,10 +105,7 @@ class LmOptimizer:
         `known_ratio` is the mean reliability of the points, `fitting_ratio` the share of those that
         fit, each counted by its reliability: where little was mapped, few can fit at any pose.
         Intensities count by their differences from the median of all; `intensity_mad` is the median
-        of those (MAD), 0 where they have no weight. Standard deviations are along the least certain
-        direction, that of the position also by `std_when_moved`; the condition number is without
-        the pose prior, rotations are at a lever arm of 1 m.
-        Residuals are taken to be independent, which a map's errors are not: these are lower bounds.
+        of those (MAD), 0 where they have no weight.
         """
         distance, intensity = self.terms.residuals
         reliability = self.terms.reliability
@@ -123,26 +120,21 @@ class LmOptimizer:
             "known_ratio": known_ratio,
             "fitting_ratio": float((reliability * is_inlier).mean()) / max(known_ratio, 1e-6),
             "intensity_mad": float(_median(off)),
-            **self._spread(),
+            "position_std_m": self._position_std_m(),
         }
 
-    def _spread(self) -> dict[str, float]:
-        """What `certainty` says of how well the cost holds the pose: stds and condition number."""
+    def _position_std_m(self) -> float:
+        """The position's standard deviation along its least certain direction.
+
+        The larger of those by curvature and by `std_when_moved`. Residuals are taken to be
+        independent, which a map's errors are not: it is a lower bound.
+        """
         H, _ = lm_solver.normal_equations(self.terms, self.scales, self.problem.lambda_intensity)
-        curvatures = np.linalg.eigvalsh(H)
         # In rad and m. H is in units of the scales, which are `SIGMAS` standard deviations.
         covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2
-        rotation_std = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3]).max())
-        position_std_m = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:]).max())
-        # Moved along one direction, the least certain.
-        moved_std_m = std_when_moved(
-            self._costs_at, self.T_world_camera, covariance, 1, n_independent=_INDEPENDENT
-        )
-        return {
-            "position_std_m": float(max(position_std_m, moved_std_m)),
-            "rotation_std_deg": float(np.rad2deg(rotation_std)),
-            "condition_number": float(curvatures.max() / max(curvatures.min(), 1e-9)),
-        }
+        by_curvature = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:]).max())
+        moved = self._costs_at, self.T_world_camera, covariance
+        return float(max(by_curvature, std_when_moved(*moved, 1, _INDEPENDENT)))
 
     def _costs_at(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
         """The points' costs at another pose, at the scales of this one."""

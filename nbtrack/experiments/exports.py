@@ -20,7 +20,7 @@ from nbtrack.machinery.progress import ProgressBar
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh, mesh_bytes
-from nbtrack.plots.rerun_file import rerun_bytes
+from nbtrack.plots.movie import rerun_bytes
 from nbtrack.recordings import reading
 from nbtrack.recordings.pose_files import number_lines, read_tum, shifted
 from nbtrack.recordings.recording import Recording, open_recording

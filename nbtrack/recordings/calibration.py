@@ -63,12 +63,9 @@ class Calibration:
         cx, cy = factor * own_cx, factor * own_cy
         # Resizing rounds sides to whole pixels, so that heights may differ by one.
         if not (abs(factor * own_height - height) <= 1 and 0 <= cx <= width and 0 <= cy <= height):
-            size = f"{own_width}x{own_height}" if self.size else "any size"
-            raise DataError(
-                f"{image} is {width}x{height} but {self.source} is for {size}, with cx, cy then at "
-                f"({cx:.0f}, {cy:.0f}): images may be resized but not cropped; give the camera of "
-                "these images, or the width and height that its numbers hold for"
-            )
+            found = f"{image} is {width}x{height} but {self.source} is for {own_width}x{own_height}"
+            advice = "images may be resized but not cropped; give their own camera, or its size"
+            raise DataError(f"{found}, with cx, cy then at ({cx:.0f}, {cy:.0f}): {advice}")
         return Intrinsics(width, height, factor * self.fx, factor * self.fy, cx, cy)
 
 

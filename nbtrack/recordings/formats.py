@@ -19,8 +19,7 @@ from nbtrack.machinery.registry import Registry
 from nbtrack.machinery.settings import limited, one_of, with_values
 from nbtrack.machinery.text_files import read_object
 from nbtrack.recordings.calibration import Calibration, read_calibration
-from nbtrack.recordings.names import frame_keys
-from nbtrack.recordings.pose_files import Times, read_poses
+from nbtrack.recordings.pose_files import Times, frame_keys, read_poses
 
 DECLARATION_FILE = "sequence.toml"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")

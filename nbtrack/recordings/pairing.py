@@ -19,8 +19,13 @@ from nbtrack.core.arrays import Frames, Poses
 from nbtrack.machinery.errors import DataError, MissingError
 from nbtrack.machinery.files import naming_damaged
 from nbtrack.machinery.text_files import read_lines
-from nbtrack.recordings.names import check_order, check_rising, frame_keys
-from nbtrack.recordings.pose_files import Times, in_seconds
+from nbtrack.recordings.pose_files import (
+    Times,
+    check_order,
+    check_rising,
+    frame_keys,
+    in_seconds,
+)
 
 TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
 _TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
@@ -50,8 +55,6 @@ def check_paired(colors: list[Path], others: list[Path]) -> None:
 
 def nearest(times: Times, others: Times, tolerance: float) -> Frames:
     """For every time the index of the nearest other one; -1 if none is within the tolerance (s)."""
-    if not len(others):
-        return np.full(len(times), -1)
     # In one dimension p=1 is the plain difference, which no square and root round.
     apart, closest = cKDTree(others[:, None]).query(times[:, None], p=1)
     return np.where(apart <= tolerance, closest, -1)
@@ -146,9 +149,8 @@ class Moments:
             if found := self._by_number(poses, stamps if all_stamped else None):
                 return found
         raise DataError(
-            f"{path} has {len(poses)} poses but there are {len(self.images)} images, and nothing "
-            "tells whose each is: write one for every image, 'nan' where there is none, or "
-            f"{TIMES_FILE}, a time (s) an image on the clock of the poses' stamps"
+            f"{path} has {len(poses)} poses but there are {len(self.images)} images; nothing tells "
+            f"whose each is: write one an image ('nan': none), or {TIMES_FILE}, on the poses' clock"
         )
 
     def _by_number(self, poses: Poses, stamps: Times | None) -> tuple[Poses, str] | None:

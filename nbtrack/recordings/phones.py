@@ -17,10 +17,8 @@ the rows of a pose; `corrected_cameras` the same after the app's optimisation, w
 github.com/PolyCam/polyform, README and `core/capture_folder.py`.
 """
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,20 +29,10 @@ from nbtrack.recordings.calibration import Calibration, calibration, camera_matr
 from nbtrack.recordings.formats import Declaration, Format
 from nbtrack.recordings.pose_files import Times, from_quaternions
 
-_ADVICE = "export the recording again, as .r3d which is to be unpacked, or as raw data"
-_INSTEAD = "16-bit PNG files in millimetres into depth/ in place of the .depth files"
-_ADVICE_ON_DEPTH = f"run `pip install pyliblzfse`, or put {_INSTEAD}"
-
-
-@contextmanager
-def _content(path: Path) -> Iterator[dict[str, Any]]:
-    """What an app's JSON file holds, for a `with` block.
-
-    An error in the block, such as a key that is missing, also becomes a DataError that names the
-    file.
-    """
-    with naming_damaged(path, "file of the app", _ADVICE):
-        yield read_object(path, "JSON")
+_ADVICE_ON_DEPTH = (
+    "run `pip install pyliblzfse`, or put 16-bit PNG files in millimetres into depth/ in place of "
+    "the .depth files"
+)
 
 
 def _camera(path: Path, numbers: Sequence[float]) -> Calibration:
@@ -56,20 +44,20 @@ def _camera(path: Path, numbers: Sequence[float]) -> Calibration:
 
 def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times]:
     """The poses and their frames' times (s); `order` is not used: the app always writes xyzw."""
-    with _content(path) as content:
-        rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)  # qx qy qz qw tx ty tz
-        times = np.array(content.get("frameTimestamps", ()), dtype=np.float64)
-        if times.shape != (len(rows),) or not np.isfinite(times).all():
-            times = np.arange(len(rows)) / float(content["fps"])
-        return from_quaternions(np.column_stack([times, rows[:, 4:], rows[:, :4]]), "xyzw", path)
+    content = read_object(path, "JSON")
+    rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)  # qx qy qz qw tx ty tz
+    times = np.array(content.get("frameTimestamps", ()), dtype=np.float64)
+    if times.shape != (len(rows),) or not np.isfinite(times).all():
+        times = np.arange(len(rows)) / float(content["fps"])
+    return from_quaternions(np.column_stack([times, rows[:, 4:], rows[:, :4]]), "xyzw", path)
 
 
 def _record3d_camera(path: Path) -> Calibration:
     """The camera of the first frame, which the app writes; later ones move by a pixel or two."""
-    with _content(path) as content:
-        # The matrix, column by column.
-        fx, _, _, _, fy, _, cx, cy, _ = np.array(content["K"], dtype=np.float64)
-        return _camera(path, [fx, fy, cx, cy, content["w"], content["h"]])
+    content = read_object(path, "JSON")
+    # The matrix, column by column.
+    fx, _, _, _, fy, _, cx, cy, _ = np.array(content["K"], dtype=np.float64)
+    return _camera(path, [fx, fy, cx, cy, content["w"], content["h"]])
 
 
 def _record3d_depth(content: bytes, path: Path, camera: Calibration) -> DepthImage:
@@ -101,18 +89,18 @@ def _polycam_pose(path: Path, order: str) -> tuple[Poses, Times]:
 
     `order` is not used: the poses are matrices.
     """
-    with _content(_corrected(path)) as content:
-        pose = np.eye(4)
-        pose[:3] = [[float(content[f"t_{i}{j}"]) for j in range(4)] for i in range(3)]
-        return pose[None], np.array([int(path.stem) / 1e6])
+    content = read_object(_corrected(path), "JSON")
+    pose = np.eye(4)
+    pose[:3] = [[float(content[f"t_{i}{j}"]) for j in range(4)] for i in range(3)]
+    return pose[None], np.array([int(path.stem) / 1e6])
 
 
 def _polycam_camera(path: Path) -> Calibration:
     """The median of all frames' cameras, which differ by a pixel or two; `path` is any of them."""
     rows = []
-    for file in sorted(path.parent.glob("*.json")):
-        with _content(_corrected(file)) as content:
-            names = "fx", "fy", "cx", "cy", "width", "height"
+    for file in map(_corrected, sorted(path.parent.glob("*.json"))):
+        with naming_damaged(file, "camera of Polycam", "export the recording again"):
+            content, names = read_object(file, "JSON"), ("fx", "fy", "cx", "cy", "width", "height")
             rows.append([float(content[name]) for name in names])
     return _camera(path, np.median(rows, axis=0).tolist())
 

@@ -9,15 +9,15 @@ from jaxtyping import Bool
 
 from nbtrack.core.arrays import Poses, Position
 from nbtrack.machinery.errors import DataError
-from nbtrack.machinery.files import absolute
+from nbtrack.machinery.files import absolute, naming_damaged
 from nbtrack.machinery.inputs import checked_poses
 from nbtrack.machinery.text_files import read_numbers
 from nbtrack.recordings.calibration import Calibration
 from nbtrack.recordings.formats import FORMATS, Declaration, Format, declaration, files_of
-from nbtrack.recordings.names import check_rising, stamp_in
 from nbtrack.recordings.pairing import TIMES_FILE, Moments, check_paired, pair_lists
-from nbtrack.recordings.pose_files import Times, in_seconds
+from nbtrack.recordings.pose_files import Times, check_rising, in_seconds, stamp_in
 
+_AGAIN = "export the recording again, or name another format with --format"
 _FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 
 
@@ -112,17 +112,16 @@ def _own_times(folder: Path, colors: list[Path]) -> Times | None:
     They come from `timestamps.txt`, else from the images' names if all hold a time.
     """
     path = folder / TIMES_FILE
-    if not path.is_file():
+    if path.is_file():
+        times = in_seconds(read_numbers(path, (1,), "the time (s) of a frame").ravel())
+        if len(times) != len(colors) or not np.isfinite(times).all():
+            found = f"{path} has {len(times)} times for {len(colors)} images"
+            raise DataError(f"{found}: write one each, rising, in seconds, ms, us or ns")
+    else:
         stamps = [stamp_in(file) for file in colors]
         if None in stamps or len(set(stamps)) == 1:  # one of all: when the recording began
             return None
-        check_rising(np.array(stamps), colors[0].parent)
-        return np.array(stamps)
-    times = in_seconds(read_numbers(path, (1,), "the time (s) of a frame").ravel())
-    if len(times) != len(colors) or not np.isfinite(times).all():
-        found = f"{path} has {len(times)} times for {len(colors)} images"
-        advice = "in seconds, or since 1970 in milli-, micro- or nanoseconds"
-        raise DataError(f"{found}: write one each, rising, {advice}")
+        path, times = colors[0].parent, np.array(stamps)
     check_rising(times, path)
     return times
 
@@ -137,7 +136,9 @@ def _calibration(folder: Path, layout: Format) -> tuple[Calibration, str]:
         assumed = f"the camera assumed for {layout.label}"
         note = f"{assumed}, {known[0].fx:g} px at 640x480: no {layout.cameras[0]}"
         return replace(known[0], source=folder / assumed), note
-    camera = layout.read_camera(layout.files(folder, layout.cameras, "calibration")[0])
+    file = layout.files(folder, layout.cameras, "calibration")[0]
+    with naming_damaged(file, f"camera of {layout.label}", _AGAIN):
+        camera = layout.read_camera(file)
     unused = ", ".join(camera.unused)
     return camera, f"not used of {camera.source.name}: {unused}" if camera.unused else ""
 
@@ -162,7 +163,10 @@ def _poses_and_times(
     The note is empty where it goes without saying. `path` is the one file of poses, or the pattern
     with `*` where each frame has one.
     """
-    tables = [layout.read_poses(file, declared.quaternion) for file in files]
+    tables = []
+    for file in files:
+        with naming_damaged(file, f"pose file of {layout.label}", _AGAIN):
+            tables.append(layout.read_poses(file, declared.quaternion))
     listed = checked_poses(np.concatenate([poses for poses, _ in tables]), path)
     stamps = np.concatenate([times for _, times in tables])
     if len(stamps) > 1 and np.ptp(stamps) == 0:  # as tools that know no times write them
