@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import pytest
 from box_room import BoxRoom, box_sequence, poses_at
@@ -127,8 +128,19 @@ def test_one_warning(tmp_path: Path, case: str) -> None:
     report = check(write_box(tmp_path / "box", poses, scale))
     assert report.best is report.conventions[0]
     assert len(report.warnings) == 1
-    assert re.search(f"  verdict: .*{says}", str(report))
-    assert ("  start with: python -m nbtrack track " in str(report)) != bool(report.faults)
+    *_, end = str(report).split("\n\n")
+    assert re.match(f"verdict: .*{says}", " ".join(end.split()))
+    assert max(map(len, str(report).replace(str(tmp_path), "").splitlines())) < 100
+    assert ("  next: python -m nbtrack track " in str(report)) != bool(report.faults)
+
+
+def test_depth_too_sparse_to_tell(box: Path) -> None:
+    """Catches a recording that is called right as no area has depth enough to tell it wrong."""
+    for path in (box / "depth_filtered").iterdir():
+        depths = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        depths[:, np.arange(depths.shape[1]) % 8 > 2] = 0
+        cv2.imwrite(str(path), depths)
+    assert "two frames see too little of the same" in check(box).verdict
 
 
 def test_a_unit_that_only_the_depth_tells(tmp_path: Path) -> None:
@@ -277,10 +289,15 @@ MISTAKES = [
     Case("one with its principal point in the middle of the image; set", change=camera(1.0, 0.02)),
     Case("one for images twice as large; set", change=camera(2.0, 2.0)),
     Case("one for images half as large; set", change=camera(0.5, 0.5)),
-    Case("ones in millimetres; multiply .* by 0.001 ", change=positions(lambda t: 1000 * t)),
-    Case("ones in centimetres; multiply .* by 0.01 ", change=positions(lambda t: 100 * t)),
+    Case(
+        "ones in millimetres; multiply .* by 0.001, 0.001 and", change=positions(lambda t: 1000 * t)
+    ),
+    Case("ones in centimetres; multiply .* by 0.01, 0.01 and", change=positions(lambda t: 100 * t)),
     Case(".*, or the images, or those of depth alone, are turned", change=turned(1)),
     Case(".*, or the images, or those of depth alone, are turned", change=turned(1, 2)),
+    Case("ones whose x is mirrored; mul", change=positions(lambda t: t * [-1, 1, 1])),
+    Case("ones whose y is mirrored; mul", change=positions(lambda t: t * [1, -1, 1])),
+    Case("ones whose z is .* and -1 ", change=positions(lambda t: t * [1, 1, -1])),
     Case(".* whose rotations alone are of the other direction; transp", change=mixed),
 ]
 RIGHT = [
@@ -306,7 +323,7 @@ def test_every_mistake_is_named_and_nothing_else(tmp_path: Path, place: int) -> 
     for number, case in enumerate([*MISTAKES, *RIGHT][place::3]):
         folder = write(tmp_path / str(number), name, case)
         recording = open_recording(folder)
-        wanted = f"your (poses look|(depth|calibration) looks) like {case.says}"
+        wanted = f"your ((poses|positions) look|(depth|calibration) looks) like {case.says}"
         said = quick_warning(recording)
         whole = said if number % 4 else next(iter(check_recording(recording).warnings), "")
         for text in (said, whole):

@@ -21,6 +21,7 @@ from recordings import (
 )
 
 from nbtrack.checks.check import DataReport, check_recording
+from nbtrack.checks.readings import cost_of
 from nbtrack.recordings.recording import open_recording
 
 REAL = ["real_room", "real_office"]
@@ -172,3 +173,8 @@ def interval(report: DataReport) -> tuple[float, float]:
     """That of the quadratic error that is left."""
     (found,) = (m for m in report.misfits if "depth_error_per_m" in m.numbers)
     return found.numbers["depth_error_per_m"][1:]
+
+
+def test_no_fit_ends_where_nothing_is_known() -> None:
+    """Catches a fit that ends where the two images of a pair share nothing, as if all were well."""
+    assert cost_of(np.full((2, 3), np.nan)) > cost_of(np.full((2, 3), 0.5))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from test_faults import assert_refused
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.machinery.errors import DataError
+from nbtrack.recordings import writer
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.writer import WrittenFrame, write_sequence
 
@@ -60,9 +62,9 @@ def test_names_as_long_as_a_file_system_allows(tmp_path: Path) -> None:
     assert main(["export", made[-1], "--to=ply", str(tmp_path / ("e" * 251 + ".ply"))]) == 0
 
 
-def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path) -> None:
-    """Catches a half-written scene that a later run would take for a whole one, and one that is
-    overwritten."""
+def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path, monkeypatch) -> None:
+    """Catches a half-written scene that a later run would take for a whole one, one that is
+    overwritten, and words that are not true of what an interrupt leaves, also as writing ends."""
 
     def interrupted() -> Iterator[WrittenFrame]:
         yield from frames(2)
@@ -72,7 +74,24 @@ def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path) -> None:
         write_sequence(tmp_path / "scene", CAMERA, interrupted())
     with pytest.raises(DataError, match=r"exists: choose another"):
         write_sequence(tmp_path, CAMERA, frames(1))
+
+    def number_lines(numbers: object) -> str:
+        raise KeyboardInterrupt
+
+    class Interrupted(TemporaryDirectory):
+        def cleanup(self) -> None:
+            super().cleanup()
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(writer, "number_lines", number_lines)
+        with pytest.raises(KeyboardInterrupt, match="not kept"):
+            write_sequence(tmp_path / "scene", CAMERA, frames(2))
     assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(writer, "TemporaryDirectory", Interrupted)
+    with pytest.raises(KeyboardInterrupt, match="is whole"):
+        write_sequence(tmp_path / "scene", CAMERA, frames(2))
+    assert len(read_sequence(tmp_path / "scene")) == 2
 
 
 def test_two_writers_of_one_scene(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Validate a recording, and find from its own depth maps whether its numbers are read rightly."""
 
 import shlex
+import textwrap
 import zlib
 from dataclasses import dataclass, replace
 
@@ -10,7 +11,7 @@ from jaxtyping import Float
 
 from nbtrack.checks import findings
 from nbtrack.checks.conventions import MIN_OVERLAP, Convention, fit_all
-from nbtrack.checks.misfits import Misfit, fit_causes, main_misfits
+from nbtrack.checks.misfits import CAUSES, Misfit, fit, main_misfits
 from nbtrack.checks.readings import FramePairs, Pairs, Reading, on_grid
 from nbtrack.core.arrays import Frames, Poses
 from nbtrack.data.sequence import ARRAYS, RgbdSequence
@@ -21,7 +22,6 @@ from nbtrack.recordings.reading import far_limit, read_frames, select_frames
 from nbtrack.recordings.recording import Recording
 
 _FRAMES_AT_ONCE = 32  # 50 MB at 640x480
-_CLOUD_FRAMES = 60  # spread over the sequence
 _POINTS_PER_FRAME = 3000
 _N_PAIRS = 32  # of frames that are compared
 _QUICK_PAIRS = 16  # of frames that are compared in a quick look
@@ -31,6 +31,7 @@ _TURNED_DEG = 60  # by which the camera may turn in between; more, and they see 
 _CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
 _PRINTED = ["measured", "brightness", "moved_mm", "turned_deg"]
 _XYZ = ["x", "y", "z"]
+_LINES = textwrap.TextWrapper(98, "", "    ", break_long_words=False, break_on_hyphens=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,7 @@ class DataReport:
         return f"cannot be told: {self.doubts[0]}" if self.doubts else "read rightly"
 
     def __str__(self) -> str:
-        recording, cloud, verdict = self.recording, self.cloud, self.verdict
+        recording, cloud = self.recording, self.cloud
         own, *others = self.conventions
         rivals = sorted((r for r in others if r.overlap > 0), key=lambda r: -r.agreement)[:3]
         c = own.reading.camera
@@ -69,29 +70,25 @@ class DataReport:
         near, far = cloud.depth.quantile([0.01, 0.99])
         x, y, z = np.ptp(cloud[_XYZ].quantile(_CUT), axis=0)
         facts = self.frames[_PRINTED].agg(["mean", "min", "max"]).T
-        rows = [("  > (in use) ", own), *(("             ", rival) for rival in rivals)]
+        row = "{:9.1f} mm {:5.0%}  {}".format
+        used, *tried = [row(1e3 * r.apart * r.depth_m, r.overlap, r.name) for r in (own, *rivals)]
+        told = [f"  warning: {text}" for text in (self.faults + self.doubts)[1:]]  # see `verdict`
+        told += [f"  note: {text}" for text in (*recording.notes, *self.remarks)]
         command = "data check" if self.faults else "track"
         lines = [
             f"{recording.name}: {recording.format.label}, {len(self.frames)} of {len(recording)} "
             f"frames have a pose, {c.width} x {c.height} px",
             f"  camera: focal lengths {c.fx:.2f} and {c.fy:.2f} px ({wide_deg:.1f} deg wide), "
             f"principal point ({c.cx:g}, {c.cy:g})",
-            *(f"  note: {text}" for text in recording.notes),
-            f"  depth: {near:.2f} to {far:.2f} m (1% and 99%)",
-            f"  scene: {x:.2f} x {y:.2f} x {z:.2f} m",
+            f"  depth: {near:.2f} to {far:.2f} m (1 to 99%), scene: {x:.2f} x {y:.2f} x {z:.2f} m",
             facts.to_string(float_format="{:10.2f}".format),
             "  surfaces of two frames (mm apart in the mean, share of points), read as",
-            *(
-                f"{m}{1e3 * r.apart * r.depth_m:9.1f} mm {r.overlap:5.0%}  {r.name}"
-                for m, r in rows
-            ),
-            "  what may be off, fitted one by one (95 %), and mm apart then",
-            *(f"{1e3 * m.apart * own.depth_m:12.1f} mm  {m}" for m in self.misfits),
-            *(f"  warning: {text}" for text in self.faults + self.doubts if text not in verdict),
-            *(f"  note: {text}" for text in self.remarks),
-            f"  verdict: {verdict}",
-            f"  {'then' if self.faults else 'start with'}: python -m nbtrack {command} "
-            f"{shlex.quote(str(recording.folder))}",
+            f"  > (in use) {used}",
+            *(f"             {other}" for other in tried),
+            *map(_LINES.fill, told),
+            f"  next: python -m nbtrack {command} {shlex.quote(str(recording.folder))}",
+            "",
+            _LINES.fill(f"verdict: {self.verdict}"),
         ]
         return "\n".join(lines)
 
@@ -106,7 +103,7 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     T_world_camera = recording.T_world_camera[ids]
     T_world_camera[:, :3, 3] -= recording.origin
     pairs = _pairs(T_world_camera, _N_PAIRS if is_whole else _QUICK_PAIRS)
-    shown, kept = _kept(pairs, ids, is_whole)
+    kept = ids[np.union1d(pairs, [0])]  # those that are compared; a single one is only shown
     sequence, frames, counts = _read(recording, ids if is_whole else kept, kept)
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
@@ -115,22 +112,21 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     sequence.depths_mm[sequence.depths_mm == shared] = 0
     seen = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(seen, own)
-    cloud = _cloud(own, sequence.select(np.flatnonzero(np.isin(kept, ids[shown]))))
+    cloud = _cloud(own, sequence)
     is_far = cloud.depth > far_limit(cloud.depth)
     is_own = best is conventions[0]  # else poses and depths mean something else than is judged
-    is_told = is_own and len(ids) >= _MIN_FRAMES and best.overlap >= MIN_OVERLAP
-    misfits = fit_causes(seen, own) if is_told else []
-    faults = list(findings.of_images(frames, shared, counts, recording))
+    causes = CAUSES if is_own and len(ids) >= _MIN_FRAMES and best.overlap >= MIN_OVERLAP else {}
+    misfits = [fit(seen, own, *cause) for cause in ProgressBar("fitting", causes.items())]
+    faults = list(findings.of_images(frames, shared, counts[0]))
     main = main_misfits(seen, own, misfits)
     said, kind = findings.misreading(conventions[0], best, main)
     faults += [said] if kind == "fault" else findings.of_poses(frames, recording) if is_own else []
     faults += findings.of_units(cloud.depth[~is_far]) if is_own else []
-    depths = frames, cloud.depth, is_far, recording
     remarks = [said] if kind == "note" else []
-    remarks += findings.remarks_on_depths(*depths) if is_own else []
+    remarks += findings.of_depths(frames, cloud.depth, own.declared.depth_scale) if is_own else []
     doubts = [said] if kind == "doubt" else []
     if not (faults or doubts):
-        doubts = findings.doubts_of_poses(conventions, recording, is_whole)
+        doubts = list(findings.doubts_of_poses(conventions, recording.pose_file.name, is_whole))
     return DataReport(
         recording, frames, T_world_camera, cloud[~is_far], conventions=conventions, best=best,
         misfits=misfits, faults=faults, doubts=doubts, remarks=remarks,
@@ -166,18 +162,6 @@ def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:
     gaps = np.minimum(np.resize(_GAPS, maximum), largest_gap)
     first = np.rint(np.linspace(0, 1, maximum) * (n_frames - 1 - gaps)).astype(int)
     return np.unique([first, first + gaps], axis=1)
-
-
-def _kept(pairs: Pairs, ids: Frames, is_whole: bool) -> tuple[Frames, Frames]:
-    """Which frames' points are shown, as indices in `ids`, and ids of those whose images are kept.
-
-    If `is_whole`, frames spread over the recording are shown, else those that are compared.
-    """
-    compared = np.unique(pairs)
-    if not is_whole:
-        return compared, ids[compared]
-    shown = np.unique(np.linspace(0, len(ids) - 1, _CLOUD_FRAMES).astype(int))
-    return shown, ids[np.union1d(compared, shown)]
 
 
 def _read(

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
-from nbtrack.checks.readings import Apart, FramePairs, Reading
+from nbtrack.checks.readings import Agreement, FramePairs, Reading
 from nbtrack.machinery.progress import ProgressBar
 from nbtrack.machinery.settings import changed_settings
 from nbtrack.recordings.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA
@@ -38,22 +38,24 @@ AXES = list(_NAMES) + [
 # millimetres and tenths times 8; and metres and micrometres, which 16 bits hold badly.
 _SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 8000.0, 80_000.0, 256.0, 100.0, 1.0, 1e6)
 # Factors of focal lengths and principal point.
-_CALIBRATIONS = {"one for images twice as large": 0.5, "one for images half as large": 2.0}
-_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
+_CALIBRATIONS = {
+    "one with its principal point in the middle of the image": 1.0,
+    "one for images twice as large": 0.5, "one for images half as large": 2.0,
+}  # fmt: skip
+# Metres of one unit of x, y and z.
+_UNITS = {
+    "ones in millimetres": (1e-3, 1e-3, 1e-3), "ones in centimetres": (1e-2, 1e-2, 1e-2),
+    "ones in kilometres": (1e3, 1e3, 1e3), "ones whose x is mirrored": (-1.0, 1.0, 1.0),
+    "ones whose y is mirrored": (1.0, -1.0, 1.0), "ones whose z is mirrored": (1.0, 1.0, -1.0),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class Convention:
+class Convention(Agreement):
     """A way to read poses, depth and calibration, and how well pairs of frames then agree."""
 
-    subject: str  # what is read otherwise than declared: poses, depth or calibration
+    subject: str  # what is read otherwise than declared: poses, positions, depth or calibration
     name: str  # completes "your ... look like"
-    reading: Reading
-    areas: Apart
-    apart: float  # these five are those of `Agreement`
-    depth_m: float
-    overlap: float
-    agreement: float
 
     @property
     def usual_apart(self) -> float:
@@ -65,17 +67,12 @@ class Convention:
         """Whether surfaces lie farther apart than in any part of a right recording."""
         return self.apart > min(2 * _USUAL_APART, _USUAL_M / self.depth_m)
 
-    @property
-    def meets(self) -> bool:
-        """Whether surfaces agree as those of right recordings do, in enough of what is seen."""
-        return self.overlap >= MIN_OVERLAP and not self.is_far_apart
-
     def is_clearly_better(self, other: "Convention") -> bool:
         """Whether clearly more surfaces coincide than in the other."""
         return self.agreement > _CLEARLY_BETTER * other.agreement
 
     def __str__(self) -> str:
-        look = "look" if self.subject == "poses" else "looks"
+        look = "look" if self.subject.endswith("s") else "looks"
         # Depth upside down, or turned by 180 degrees, fits like mirrored or turned axes.
         is_rare = "axes" in self.name and not self.name.startswith(("Open", "robot"))
         turned = ", or the images, or those of depth alone, are turned or mirrored against them"
@@ -92,13 +89,12 @@ def fit_all(pairs: FramePairs, own: Reading) -> tuple[list[Convention], Conventi
     named_axes = {words: name for name, words in SPELLED_AXES.items()}
     axes = named_axes.get(own.declared.camera_axes, own.declared.camera_axes)
     own = replace(own, declared=replace(own.declared, camera_axes=axes))
-    name = axes_name(axes, own.declared.poses)
-    conventions = [Convention("poses", name, own, *pairs.compare(own))]
-    others = [hypothesis for hypothesis in _hypotheses(own) if hypothesis[-1] != own]
-    with ProgressBar("comparing frames", len(others)) as bar:
-        for subject, name, reading in others:
-            conventions.append(Convention(subject, name, reading, *pairs.compare(reading)))
-            bar.update()
+    ways = [("poses", axes_name(axes, own.declared.poses), own)]
+    ways += [way for way in _hypotheses(own) if way[-1] != own]
+    conventions = [
+        Convention(**vars(pairs.compare(reading)), subject=subject, name=name)
+        for subject, name, reading in ProgressBar("comparing frames", ways)
+    ]
     return conventions, _best_of(conventions)
 
 
@@ -126,15 +122,14 @@ def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
         yield subject, name, replace(own, declared=replace(own.declared, **keys))
     camera = own.camera
     middle = {"cx": camera.width / 2, "cy": camera.height / 2}
-    centred = "one with its principal point in the middle of the image"
-    yield "calibration", centred, replace(own, camera=replace(camera, **middle))
     for label, factor in _CALIBRATIONS.items():
         scaled = {key: factor * getattr(camera, key) for key in ("fx", "fy", "cx", "cy")}
         # A principal point scales too, unless it is the middle of the image at either size.
         for changed in (scaled, scaled | middle):
             yield "calibration", label, replace(own, camera=replace(camera, **changed))
-    for unit, metres in _UNITS.items():
-        yield "poses", f"ones in {unit}", replace(own, metres=metres)
+    for name, metres in _UNITS.items():
+        # A camera that moves in a plane cannot prove what is no doubt: mirrored ones are rare.
+        yield "poses" if min(metres) > 0 else "positions", name, replace(own, metres=metres)
     for poses in (CAMERA_TO_WORLD, WORLD_TO_CAMERA):
         mixed = replace(own, declared=replace(own.declared, poses=poses), is_mixed=True)
         yield "poses", f"{poses} ones whose rotations alone are of the other direction", mixed
@@ -150,7 +145,8 @@ def _best_of(conventions: list[Convention]) -> Convention:
     """
     own = conventions[0]
     near, far = PLAUSIBLE_DEPTH
-    plausible = [c for c in conventions if c.meets and near <= c.depth_m <= far]
+    meet = [c for c in conventions if c.overlap >= MIN_OVERLAP and not c.is_far_apart]
+    plausible = [c for c in meet if near <= c.depth_m <= far]
     highest = max((c.agreement for c in plausible), default=0.0)
     best = next((c for c in plausible if c.agreement >= _ALIKE * highest), own)
     return best if best.is_clearly_better(own) else own
@@ -160,8 +156,9 @@ def remedy(reading: Reading, own: Reading) -> str:
     """What a user is to change, so that `reading` becomes the declared one, which is now `own`."""
     if reading.is_mixed:
         return "transpose the rotations in the pose file, and declare its direction"
-    if reading.metres != 1:
-        return f"multiply the positions in the pose file by {reading.metres:g}"
+    if reading.metres != own.metres:
+        factors = "x, y and z by {:g}, {:g} and {:g}".format(*reading.metres)
+        return f"multiply the positions in the pose file, {factors}"
     if (c := reading.calibration) != own.calibration:
         numbers = f"{c.fx:.6g} {c.fy:.6g} {c.cx - 0.5:.6g} {c.cy - 0.5:.6g}"
         return f"set fx fy cx cy in the calibration to {numbers} (the first pixel's centre at 0)"

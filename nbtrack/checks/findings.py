@@ -8,7 +8,7 @@ from jaxtyping import Int
 
 from nbtrack.checks.conventions import MIN_OVERLAP, PLAUSIBLE_DEPTH, Convention, remedy
 from nbtrack.checks.misfits import Misfit
-from nbtrack.recordings.reading import FAR
+from nbtrack.recordings.reading import FAR, far_limit
 from nbtrack.recordings.recording import Recording
 
 # A pose is odd if it is off the middle of its neighbours by more than both: metres, and medians of
@@ -21,14 +21,6 @@ _MAX_STEP = 0.01  # share of the depth between depths that a camera can tell (ou
 # as any other (our choice).
 SHARED, _SHARING, _SPIKE = 0.01, 0.25, 10
 _BLACK = 0.02  # brightness, in [0, 1]
-_TRIED = (
-    "no other axes, units or directions of poses and depth, no late depth, no focal lengths or "
-    "principal point, no error of depth (a factor, a length, a square), no offset of the camera"
-)
-_UNTOLD = (
-    "poses that drift or jump, a lens's distortion, and depth images that hold no depth "
-    "(disparity, half floats, each frame scaled by itself)"
-)
 
 
 def misreading(own: Convention, best: Convention, main: list[Misfit]) -> tuple[str, str]:
@@ -49,7 +41,11 @@ def misreading(own: Convention, best: Convention, main: list[Misfit]) -> tuple[s
     elif is_apart:
         return (
             f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), "
-            f"and nothing that is tried explains it: {_TRIED}. What cannot be told: {_UNTOLD}"
+            "and nothing that is tried explains it: no other axes, units or directions of poses "
+            "and depth, no late depth, no focal lengths or principal point, no error of depth (a "
+            "factor, a length, a square), no offset of the camera. What cannot be told: poses that "
+            "drift or jump, a lens's distortion, and depth images that hold no depth (disparity, "
+            "half floats, each frame scaled by itself)"
         ), "fault" if own.is_far_apart else "doubt"
     else:
         return "", ""
@@ -58,25 +54,23 @@ def misreading(own: Convention, best: Convention, main: list[Misfit]) -> tuple[s
     return f"{name}; {remedy(reading, own.reading)} ({tail})", kind
 
 
-def doubts_of_poses(
-    conventions: list[Convention], recording: Recording, needs_proof: bool
-) -> list[str]:
+def doubts_of_poses(conventions: list[Convention], file: str, needs_proof: bool) -> Iterator[str]:
     """Why it cannot be told whether poses are read rightly, in a sentence; none where it can.
 
     Two frames see too little of the same; or, where proof is needed, the camera moves too little to
     tell conventions apart.
     """
     own, *others = conventions
-    not_proved = f"{recording.pose_file.name} is not proved:"
-    if own.overlap < MIN_OVERLAP:
-        seen = f"({own.overlap:.0%} of the points)"
-        advice = "check it, and a piece with smaller steps"
-        return [f"{not_proved} two frames see too little of the same {seen}: {advice}"]
     alike = [c.name for c in others if c.subject == "poses" and not own.is_clearly_better(c)]
-    if not (needs_proof and alike):
-        return []
-    little = f"the camera moves too little to tell {len(alike)} other conventions apart"
-    return [f"{not_proved} {little}, such as {alike[0]}"]
+    if own.overlap < MIN_OVERLAP:
+        seen = f"too little of the same ({own.overlap:.0%} of the points)"
+        why = f"two frames see {seen}: check it, and a piece with smaller steps"
+    elif needs_proof and alike:
+        little = f"the camera moves too little to tell {len(alike)} other conventions apart"
+        why = f"{little}, such as {alike[0]}"
+    else:
+        return
+    yield f"{file} is not proved: {why}"
 
 
 def shared_value(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> int:
@@ -92,15 +86,13 @@ def shared_value(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> i
     return int(most) if is_often and is_spike and is_shared else 0
 
 
-def of_images(
-    frames: pd.DataFrame, shared: int, counts: Int[np.ndarray, "2 values"], recording: Recording
-) -> Iterator[str]:
-    """What is wrong with images, whatever their numbers mean."""
+def of_images(frames: pd.DataFrame, shared: int, often: Int[np.ndarray, "_"]) -> Iterator[str]:
+    """What is wrong with images, whatever their numbers mean; `often` each depth value occurs."""
     if not frames.measured.any():
         advice = "check the depth folder, and no_depth in sequence.toml"
         yield f"no pixel that was looked at has a depth: all are 0, or saturated (65535); {advice}"
     if shared:
-        found = f"{counts[0, shared] / counts[0].sum():.0%} of the depths are {shared}"
+        found = f"{often[shared] / often.sum():.0%} of the depths are {shared}"
         yield f"{found}, which is no measurement; set no_depth = {shared} in sequence.toml"
     # The first frame repeats none, so that the share is below 1 and 1 / (1 - repeated) is finite.
     repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
@@ -135,20 +127,19 @@ def of_units(depth: pd.Series) -> Iterator[str]:
         yield f"the median depth is {median:.3g} m, outside {near:g} to {far:g} m: {advice}"
 
 
-def remarks_on_depths(
-    frames: pd.DataFrame, depth: pd.Series, is_far: pd.Series, recording: Recording
-) -> Iterator[str]:
+def of_depths(frames: pd.DataFrame, depth: pd.Series, depth_scale: float) -> Iterator[str]:
     """What is worth knowing of depths that are read rightly.
 
     Depths and their steps are both as declared: only the ratio of the two decides.
     """
+    is_far = depth > far_limit(depth)
     if is_far.any():
         low, high = depth[is_far].min(), depth[is_far].max()
         found = f"{is_far.mean():.2%} of the depths are outliers, {low:.3g} to {high:.3g} m away"
         rule = f"more than {FAR:g} times as far as nine in ten: maps and tracking leave them out"
         advice = "check the camera, or set no_depth in sequence.toml to what it gives for none"
         yield f"{found}, {rule}; {advice}"
-    step_m = np.gcd.reduce(frames.depth_step) / recording.declared.depth_scale
+    step_m = np.gcd.reduce(frames.depth_step) / depth_scale
     # With fewer than eight steps up to the farthest point, they may be chance.
     if _MAX_STEP * depth.median() < step_m < depth.max() / 8:
         advice = "look for those that the camera gave, or expect no better poses"

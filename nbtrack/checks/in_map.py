@@ -1,13 +1,12 @@
 """Whether a map and a recording belong together and share a world."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nbtrack.core.arrays import Pose, Poses, WorldPoints
+from nbtrack.core.arrays import Pose, Poses
 from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
@@ -90,31 +89,19 @@ def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
 
 
 def outside_map_share(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> float:
-    """The share of frames, of some spread evenly, that saw little of what was mapped.
+    """The share of frames with depth, of some spread evenly, that saw little of what was mapped.
 
     Most of such a frame's points lie outside of the map's bounds, at its true pose if that is
     known, else at the estimated one.
     """
     outside = []
-    for index, points_camera in _some_points(sequence):
-        T = sequence.T_world_camera[index]
-        points_world = _to_world(points_camera, T if np.isfinite(T).all() else T_estimated[index])
-        is_outside = (points_world < field.bounds.minimum) | (points_world > field.bounds.maximum)
-        outside.append(is_outside.any(axis=1).mean() > _MOSTLY)
-    return float(np.mean(outside)) if outside else 0.0
-
-
-def _some_points(sequence: RgbdSequence) -> Iterator[tuple[int, np.ndarray]]:
-    """Places in the sequence, and points (n, 3; m, camera frame), of some frames that have depth,
-    spread evenly."""
     stride = math.ceil((sequence.depths_mm[0].size / _N_POINTS) ** 0.5)
     for index in range(0, len(sequence), math.ceil(len(sequence) / _N_FRAMES)):
         frame = sequence[index]
         points_camera, _ = frame.points(*frame.measured_pixels(stride))
-        if len(points_camera):
-            yield index, points_camera.double().numpy()
-
-
-def _to_world(points_camera: np.ndarray, T_world_camera: Pose) -> WorldPoints:
-    """Points (m) of the camera frame in the world."""
-    return points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+        T = T_estimated[index] if frame.T_world_camera is None else frame.T_world_camera
+        points_world = points_camera.double().numpy() @ T[:3, :3].T + T[:3, 3]
+        is_outside = (points_world < field.bounds.minimum) | (points_world > field.bounds.maximum)
+        if len(points_world):
+            outside.append(is_outside.any(axis=1).mean() > _MOSTLY)
+    return float(np.mean(outside)) if outside else 0.0

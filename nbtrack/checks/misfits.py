@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 from nbtrack.checks.readings import AREA_SCALE, Apart, FramePairs, Reading, cost_of, mean_apart
-from nbtrack.machinery.progress import ProgressBar
 
 _STEPS = 12  # of Gauss-Newton, at most
 _FACTORS = (4.0, 2.0, 1.0, 0.5, 0.2)  # of a step; the best is taken
@@ -116,16 +115,6 @@ def main_misfits(pairs: FramePairs, own: Reading, misfits: list[Misfit]) -> list
     return [m for m in alike if m is alike[0] or not alike[0].numbers.keys() <= m.numbers.keys()]
 
 
-def fit_causes(pairs: FramePairs, own: Reading) -> list[Misfit]:
-    """The fit of every cause by itself."""
-    misfits = []
-    with ProgressBar("fitting", len(CAUSES)) as bar:
-        for name, keys in CAUSES.items():
-            misfits.append(fit(pairs, own, name, keys))
-            bar.update()
-    return misfits
-
-
 def fit(
     pairs: FramePairs, own: Reading, name: str, keys: list[str], start: Reading | None = None
 ) -> Misfit:
@@ -190,4 +179,4 @@ def _normal_equations(
 def _ratio(apart: Apart, other: Apart) -> float:
     """The cost of one as a share of that of another, by areas that both know."""
     is_known = np.isfinite(apart) & np.isfinite(other)
-    return cost_of(apart[is_known]) / cost_of(other[is_known]) if is_known.any() else np.nan
+    return cost_of(apart[is_known]) / cost_of(other[is_known])

@@ -5,7 +5,6 @@ Read rightly, the surfaces that two frames both see coincide.
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -38,7 +37,8 @@ class Reading:
 
     declared: Declaration
     camera: Intrinsics
-    metres: float = 1.0  # of one unit of the poses' positions
+    # m, of one unit of x, y and z of the poses' positions; negative where these are mirrored.
+    metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
     is_mixed: bool = False  # rotations alone are of the other direction than declared
     focal_share: float = 0.0  # by which focal lengths are longer
     aspect: float = 0.0  # by which the vertical one is longer still
@@ -99,19 +99,25 @@ def on_grid(values: UInt16[np.ndarray, "frames h w"], stride: int) -> tuple[Tens
     return columns, rows, some.flatten(1)
 
 
-class Agreement(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Agreement:
     """How well pairs of frames agree under a reading."""
 
+    reading: Reading
     areas: Apart  # by how much surfaces lie apart in each area, as a share of the depth
     apart: float  # the mean of its sizes; NaN of nothing
     depth_m: float  # the median depth of the points that overlap
-    overlap: float  # share of all points that fall onto a measured, not nearer, surface
+    overlap: float  # share of all points that fall onto a measured, not nearer, surface, or 0
     agreement: float  # the same, where surfaces that coincide count 1 and those far apart 0
 
 
 def cost_of(apart: Apart, scale: float = AREA_SCALE) -> float:
-    """The mean cost of Geman and McClure: 0 where surfaces coincide, 1 far from that."""
-    return float(np.nanmean(apart**2 / (apart**2 + scale**2)))
+    """The mean cost of Geman and McClure: 0 where surfaces coincide, 1 far from that.
+
+    It is infinite where nothing is known, so that no fit ends there.
+    """
+    known = apart[np.isfinite(apart)]
+    return float((known**2 / (known**2 + scale**2)).mean()) if len(known) else np.inf
 
 
 def mean_apart(apart: Apart) -> float:
@@ -136,12 +142,11 @@ class FramePairs:
         first, second = kept.depths_mm[places]  # the files' values, in their unit
         stride = math.ceil((math.prod(first.shape[1:]) / _POINTS_PER_FRAME) ** 0.5)
         self.columns, self.rows, self.values = on_grid(first, stride)  # of the points
-        # Numbers of the points of each area, (areas, n): a few rows and columns are left over.
+        # Numbers of the points of each area: a few rows and columns are left over.
         numbers = torch.arange(len(self.columns)).view(-1, len(self.columns.unique()))
-        (n_rows, n_columns), (down, across) = numbers.shape, _AREAS
-        numbers = numbers[: n_rows // down * down, : n_columns // across * across]
-        areas = numbers.view(down, n_rows // down, across, n_columns // across)
-        self.areas = areas.transpose(1, 2).reshape(down * across, -1)
+        size = [max(1, n // parts) for n, parts in zip(numbers.shape, _AREAS, strict=True)]
+        blocks = numbers.unfold(0, size[0], size[0]).unfold(1, size[1], size[1])
+        self.areas = blocks[: _AREAS[0], : _AREAS[1]].flatten(2).flatten(0, 1)  # (areas, n)
         # Of the second frames; infinite without a depth.
         self.inverse_values = 1 / torch.from_numpy(second[:, None].astype(np.float32))
 
@@ -168,10 +173,11 @@ class FramePairs:
         share = torch.where(is_valid, residual / measured, torch.nan)
         # The weight of Geman and McClure: 1 where both coincide, 0 where they are far apart.
         agreement = 1 / (1 + (share / _SCALE) ** 2)
-        n_points = float((self.values > 0).sum().clamp(1))
         areas = self._areas(share)
+        # Where no area has enough points, nothing is told of surfaces: they do not overlap.
+        n_points = float((self.values > 0).sum()) if np.isfinite(areas).any() else np.inf
         return Agreement(
-            areas, mean_apart(areas), float(measured[is_valid].median()),
+            reading, areas, mean_apart(areas), float(measured[is_valid].median()),
             float(is_valid.sum()) / n_points, float(agreement.nansum()) / n_points,
         )  # fmt: skip
 

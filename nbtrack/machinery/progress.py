@@ -3,6 +3,7 @@
 import os
 import sys
 import threading
+from collections.abc import Collection
 from typing import Any
 
 from tqdm import tqdm
@@ -57,13 +58,13 @@ class _Line:
 
 
 class ProgressBar(tqdm):
-    """Progress with an ETA over a known amount of work, to be used in a `with` block."""
+    """Progress with an ETA over a known amount of work, in a `with` block, or over a collection."""
 
     # Work done in a warm-up, and its seconds: its speed says nothing of the time that is left.
     warm_up_work: float | int = 0
     warm_up_seconds = 0.0
 
-    def __init__(self, title: str, total: float | int, is_shown: bool = True) -> None:
+    def __init__(self, title: str, work: float | Collection, is_shown: bool = True) -> None:
         """Begin; nothing is shown before a second has gone."""
         options = {"file": sys.stderr, "bar_format": _FORMAT}
         if _is_notebook():  # its kernel drops messages once a thousand wait to be read
@@ -72,7 +73,8 @@ class ProgressBar(tqdm):
             options |= {"file": _Line(), "mininterval": _LINE_SECONDS, "bar_format": _LINE_FORMAT}
         # "miniters" 0: only the time decides when to show; "ascii" False: bars of block characters.
         options |= {"disable": not is_shown, "delay": _DELAY_SECONDS, "miniters": 0, "ascii": False}
-        super().__init__(total=total, desc=title, **options)
+        work_of = "iterable" if isinstance(work, Collection) else "total"
+        super().__init__(desc=title, **{work_of: work}, **options)
 
     @property
     def format_dict(self) -> dict[str, Any]:

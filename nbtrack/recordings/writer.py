@@ -46,20 +46,21 @@ def write_sequence(
     folder.parent.mkdir(parents=True, exist_ok=True)
     # A sibling, so that the final rename stays within one file system. Its name, which messages
     # hold, begins with the folder's, which may be as long as a file system allows.
-    with TemporaryDirectory(".unfinished", f".{folder.name[:40]}.", folder.parent) as hidden:
-        unfinished = Path(hidden) / "scene"
-        unfinished.mkdir()
-        poses = []
-        try:
+    try:
+        with TemporaryDirectory(".unfinished", f".{folder.name[:40]}.", folder.parent) as hidden:
+            unfinished = Path(hidden) / "scene"
+            unfinished.mkdir()
+            poses = []
             for color, depths_mm, T_world_camera in frames:
                 _write_images(unfinished, len(poses), color, depths_mm)
                 poses.append(T_world_camera)
                 progress(len(poses))
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"{folder} is not kept: the same command begins anew") from None
-        for name, text in {**_texts(camera, np.stack(poses)), **(notes or {})}.items():
-            (unfinished / name).write_text(text, encoding="utf-8")
-        unfinished.rename(folder)  # fails if another command has finished it meanwhile
+            for name, text in {**_texts(camera, np.stack(poses)), **(notes or {})}.items():
+                (unfinished / name).write_text(text, encoding="utf-8")
+            unfinished.rename(folder)  # fails if another command has finished it meanwhile
+    except KeyboardInterrupt:
+        left = "is whole" if folder.exists() else "is not kept: the same command begins anew"
+        raise KeyboardInterrupt(f"{folder} {left}") from None
 
 
 def _write_images(
