@@ -107,7 +107,7 @@ class Agreement:
     areas: Apart  # by how much surfaces lie apart in each area, as a share of the depth
     apart: float  # the mean of its sizes; NaN of nothing
     depth_m: float  # the median depth of the points that overlap
-    overlap: float  # share of all points that fall onto a measured, not nearer, surface, or 0
+    overlap: float  # share of all points that fall onto a measured, not nearer, surface
     agreement: float  # the same, where surfaces that coincide count 1 and those far apart 0
 
 
@@ -173,9 +173,8 @@ class FramePairs:
         share = torch.where(is_valid, residual / measured, torch.nan)
         # The weight of Geman and McClure: 1 where both coincide, 0 where they are far apart.
         agreement = 1 / (1 + (share / _SCALE) ** 2)
+        n_points = float((self.values > 0).sum().clamp(1))
         areas = self._areas(share)
-        # Where no area has enough points, nothing is told of surfaces: they do not overlap.
-        n_points = float((self.values > 0).sum()) if np.isfinite(areas).any() else np.inf
         return Agreement(
             reading, areas, mean_apart(areas), float(measured[is_valid].median()),
             float(is_valid.sum()) / n_points, float(agreement.nansum()) / n_points,

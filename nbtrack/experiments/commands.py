@@ -204,14 +204,14 @@ def check_command(options: Namespace) -> int:
     output.prepare(options.out)
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     report = check_recording(recording)
-    print(report)
     if options.out:
         own = report.conventions[0]
         apart_mm = 1e3 * own.apart * own.depth_m  # as the recording's files are declared
         title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart in the mean"
         figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)
         output.save_picture(figure, options.out / output.CHECK_FILE)
-        print(f"  picture         {options.out / output.CHECK_FILE}")
+        print(f"picture: {options.out / output.CHECK_FILE}")
+    print(report)  # its verdict comes last
     return int(bool(report.faults))
 
 
