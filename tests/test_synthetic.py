@@ -207,7 +207,7 @@ def test_a_tour_passes_all_of_the_room(room):
     assert degrees.max() < 3
     assert np.linalg.norm((positions[-1] - positions[0])[::2]) < 2 * mm.max() / 1e3
     # A place at eye level with half a metre around it is at most 2 m of walking away.
-    rng, size = np.random.default_rng(0), room.parts[0].solid.size
+    rng, size = np.random.default_rng(0), 2 * room.parts[0].solid.half
     places = (rng.random((500, 3)) - 0.5) * size * [1, 0, 1] + [0, 1.4, 0]
     free = places[room.sdf(places) > 0.5]
     assert cKDTree(positions[:, ::2]).query(free[:, ::2])[0].max() < 2.0

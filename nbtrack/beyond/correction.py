@@ -37,18 +37,12 @@ _OFFSETS = (0.0, -0.03, -0.015, 0.015, 0.03)
 # many a cell anyway; an office of 10 by 11 m had 3 (docs/tried.md).
 _POINTS_A_CELL = 10
 _MAX_TIMES = 4  # times `_N_POINTS` are drawn at most
-_HUBER = 0.01  # m; a larger residual counts less
-_ROUNDS = 4  # how often the weights of residuals are computed anew
-_COLOR_REGULARISATION = 0.1  # times that of distances, since colours change faster
-_COLOR_HUBER = 0.05  # of colours in [0, 1]
-_COLOR_ROUNDS = 3
 # The least scales of a tracker's residuals (distance, luma): so many times the median residual that
 # the corrected map leaves at measured points, and never below `_MIN_SCALES` (m, luma). Chosen in
 # the rooms for tuning and on a real recording, whose medians are 1.8 mm and 0.002, and 4 mm and
 # 0.02.
 _SCALES_PER_MEDIAN = np.array([5.5, 2.3])
 _MIN_SCALES = np.array([0.01, 0.05])
-_INLIER_DISTANCE = 0.025  # m from the surface within which a point fits
 _UNMEASURED = 0.1  # confidence where nothing was measured, and the network interpolates
 CORRECTIONS = ("numbers", "corrections", "cameras", "views", "residual_medians")
 """What a file keeps of a correction, besides the field: see `CorrectedField`."""
@@ -81,7 +75,7 @@ class CorrectedField(BakedField):
             self.register_buffer(name, correction[name])
         medians = self.residual_medians.double().numpy()  # of distance (m) and luma
         scales = np.maximum(_SCALES_PER_MEDIAN * medians, _MIN_SCALES)
-        self.accuracy = Accuracy(tuple(scales.tolist()), _INLIER_DISTANCE, float(medians[1]))
+        self.accuracy = Accuracy(tuple(scales.tolist()), 0.025, float(medians[1]))
         self.volume[4] = _UNMEASURED  # the channel of confidence
         self.volume[:, self.numbers.long()] += self.corrections.float().T
 
@@ -147,14 +141,14 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
 
     wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ distance_before
     reliabilities = np.tile(reliability, len(_OFFSETS))
-    distance, diagonal = solve(matrix, wanted, reliabilities, regularisation, _HUBER, _ROUNDS)
+    distance, diagonal = solve(matrix, wanted, reliabilities, regularisation, 0.01, rounds=4)
     # The share of measurements, not regularisation, in a vertex's diagonal.
     confidence = (1 - _UNMEASURED) * (1 - regularisation.diagonal() / diagonal)
 
     at_surface = matrix[:n_points]  # the rows of the first offset, which is 0
     wanted_color = seen_color - at_surface @ color_before
-    springs = regularisation * _COLOR_REGULARISATION
-    color, _ = solve(at_surface, wanted_color, reliability, springs, _COLOR_HUBER, _COLOR_ROUNDS)
+    # Colours change faster: a tenth of the regularisation.
+    color, _ = solve(at_surface, wanted_color, reliability, 0.1 * regularisation, 0.05, rounds=3)
 
     distance_residuals = wanted[:n_points] - at_surface @ distance
     luma_residuals = (wanted_color - at_surface @ color) @ LUMA

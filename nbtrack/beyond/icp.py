@@ -22,13 +22,9 @@ from nbtrack.tracking.tracker import Tracker, TrackerSettings
 _WIDE = 0.3
 _NARROW = 0.1
 _FAR_APART = 0.06  # m, rad; starts that differ by less are taken for one, as by LM
-_EDGE_JUMP = np.inf  # points at depth edges are taken too (docs/tried.md)
-_SOURCE_VOXEL = 0.01  # m: points that are closer count once
 _NEIGHBOURS = 20  # points that tell a point's plane
 _MIN_POINTS = 20  # with fewer a frame keeps its start
 _MIN_INLIERS = 0.5  # share of the points; below, a frame is lost
-_MIN_SCALE = 0.005  # m, of robust costs: what a voxel's points scatter by
-_INDEPENDENT = 128  # points: with 256 half of the wrong poses before a flat wall pass
 _LOST = 0.5  # a pose is lost if the probability that it is right is less
 _SEARCH = {"registration_type": "GICP", "num_threads": 1, "max_iterations": 30}
 _SEARCH |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}  # rad, m; smaller moves end it
@@ -86,9 +82,11 @@ class IcpTracker(Tracker):
         self.source = None
         self.is_converged = False
         self.found = None
-        observed = draw_points(frame, self.settings.n_pixels, self.generator, _EDGE_JUMP)
+        # Points at depth edges are taken too (docs/tried.md).
+        observed = draw_points(frame, self.settings.n_pixels, self.generator, edge_jump=np.inf)
         if len(observed.points):
-            self.source = self.small_gicp.voxelgrid_sampling(observed.points, _SOURCE_VOXEL)
+            # Points that are closer than 1 cm count once.
+            self.source = self.small_gicp.voxelgrid_sampling(observed.points, 0.01)
             self._find_planes(self.source)
 
     def step(self) -> float:
@@ -147,7 +145,8 @@ class IcpTracker(Tracker):
             return {"inlier_ratio": 0.0, "lost": True}
         T_found = self.found.T_target_source
         distances = self._distances(T_found)
-        scale = max(MAD_FACTOR * np.median(distances[np.isfinite(distances)]), _MIN_SCALE)
+        # m; at least what a voxel's points scatter by
+        scale = max(MAD_FACTOR * np.median(distances[np.isfinite(distances)]), 0.005)
 
         # Geman-McClure's, in a form that is 1 at an infinite distance, not NaN.
         def costs_at(T_world_camera: Pose) -> Float[np.ndarray, "n"]:
@@ -157,8 +156,9 @@ class IcpTracker(Tracker):
         R_twist = np.kron(np.eye(2), T_found[:3, :3])
         H_world = R_twist @ self.found.H @ R_twist.T
         covariance = np.linalg.inv(H_world + PRIOR_WEIGHT * np.eye(6))
-        # Moved along 2 directions, those along a wall, since nothing but planes counts.
-        position_std_m = std_when_moved(costs_at, T_found, covariance, 2, _INDEPENDENT)
+        # Moved along 2 directions, those along a wall, since nothing but planes counts. With 256
+        # points that count as independent half of the wrong poses before a flat wall would pass.
+        position_std_m = std_when_moved(costs_at, T_found, covariance, 2, n_independent=128)
         inlier_ratio = self.found.num_inliers / self.source.size()
         is_held = p_within(CORRELATED * position_std_m) > _LOST
         lost = inlier_ratio < _MIN_INLIERS or not is_held

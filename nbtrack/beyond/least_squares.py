@@ -18,7 +18,6 @@ from nbtrack.core.arrays import WorldPoints
 # the squared residual of a point that was seen from the mean depth has the weight 1.
 _SMOOTHNESS = 0.1
 _PULL = 0.1
-_FADE = 1  # vertices beyond those that points touch, over which corrections fade out
 Columns = Float[np.ndarray, "rows columns"]
 Vertices = Int[np.ndarray, "points 8"]
 Corners = Float[np.ndarray, "points 8"]
@@ -52,7 +51,7 @@ def corrected_vertices(
     """
     is_touched = np.zeros(shape, dtype=bool)
     is_touched.flat[vertices] = True
-    is_corrected = binary_dilation(is_touched, iterations=_FADE)
+    is_corrected = binary_dilation(is_touched)  # by a vertex, over which corrections fade out
     column_of = is_corrected.cumsum() - 1
     # Every row has eight entries: weights, columns, and where rows begin.
     entries = (weights.ravel(), column_of[vertices].ravel(), np.arange(0, weights.size + 1, 8))

@@ -23,34 +23,20 @@ from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.tracker import Estimate, Tracker, TrackerSettings
 
 _MIN_POINTS = 20  # below, a frame says too little for six unknowns
-# A descent begins on a part of the points, and ends on all of them: far from the pose the coarse
-# answer is as good and costs less.
-_COARSE_EVERY = 8  # one point in so many
-_MIN_COARSE = 128  # points
 # Starts are compared at wide robust scales (m, luma): at narrow ones all that are off cost alike.
 _WIDE_SCALES = np.array([0.1, 0.2])
-_CLEARLY = 0.97  # a pose that costs less than this share of the best one's cost takes over
 # Starts that differ by more (m, rad), as those of a fast camera that may have stopped, are compared
 # after their coarse stages: the costs at the starts do not tell which leads to the true pose.
 _FAR_APART = 0.06
-_MAX_COARSE_STEPS = 30
 _LOST = 0.5  # a pose is lost if it is wrong with at least this probability
 _DOUBTFUL = 0.1  # and in doubt from this one on: other descents follow
 # The first descent counts as at most so many steps: what is left of it is all done in the last of
 # them. A descent from another start counts as one step.
 _MAX_FOLLOWING = 20
-_SAME = 0.01  # rad, m; another descent that ends so near a pose confirms it
-_LARGEST_INNOVATION = 1.0  # rad, m; larger ones count as this, and so does it if none is trusted
-_ROUNDING = 0.25 / 255  # median error of 256 grey levels; no intensity is more accurate
-_MIN_CONTRAST = 0.01  # standard deviation of a picture that is not dark, covered or overexposed
-_RESTART_ANGLE = 0.2  # rad, about each axis both ways from the last good pose
 # Where a map has views, a lost camera is looked for where the views most like the frame were taken,
 # and at random poses. A few steps are taken from each; the cheapest are then followed.
-_ALIKE = 20  # views
+_TRIED = 20  # views, and random poses
 _RANDOM = 1000  # poses, of which the cheapest `_TRIED` are kept
-_RANDOM_STD = 0.3  # m, of their offsets from where a view was taken
-_TRIED = 20
-_TRIED_STEPS = 6
 
 
 @dataclass(frozen=True)
@@ -133,15 +119,18 @@ class LmTracker(Tracker):
         self.is_converged = n_points < _MIN_POINTS
         if self.is_converged:
             return
-        coarse = with_normals(frame, observed, max(_MIN_COARSE, n_points // _COARSE_EVERY))
-        has_contrast = observed.intensity.std() > _MIN_CONTRAST  # else the picture says nothing
+        # A descent begins on a part of the points, and ends on all of them: far from the pose the
+        # coarse answer is as good and costs less.
+        coarse = with_normals(frame, observed, max(128, n_points // 8))
+        # A picture without contrast is dark, covered or overexposed, and says nothing.
+        has_contrast = observed.intensity.std() > 0.01
         self.intensity_weight = self.settings.lambda_intensity if has_contrast else 0.0
         # A function of a start: the descent of this frame from there.
         self.descent_from = partial(LmOptimizer, self.grid, coarse, observed, self.intensity_weight)
         descents = [self.descent_from(T) for T in starts]
         if np.abs(starts - starts[0]).max() > _FAR_APART:
             for descent in descents:
-                descent.run_stage(_MAX_COARSE_STEPS)
+                descent.run_stage(max_steps=30)
         self.best, *_ = _by_cost(descents)
         # The last expected pose is the previous one, unless the model is constant velocity alone.
         self.remaining_steps = self._steps(frame, expected[-1])
@@ -163,12 +152,13 @@ class LmTracker(Tracker):
         if self.best is None:
             return {"inlier_ratio": 0.0, "p_lost": 1.0, "lost": True}
         said = self.best.certainty()
-        usual_mad = max(self.field.accuracy.intensity_mad, _ROUNDING)
+        # No intensity is more accurate than 256 grey levels, with a median error of a quarter.
+        usual_mad = max(self.field.accuracy.intensity_mad, 0.25 / 255)
         innovations = _apart(self.trusted, self.best.T_world_camera)
         ratio = said["intensity_mad"] / usual_mad
         said["intensity_ratio"] = ratio if self.intensity_weight else 1.0
         said["last_step"] = 0.0 if self.best.is_finished else float(self.best.last_step)
-        said["innovation"] = float(innovations.min(initial=_LARGEST_INNOVATION))
+        said["innovation"] = float(innovations.min(initial=1.0))  # rad, m; at most 1, as of none
         probability = p_lost(said)
         return {**said, "p_lost": probability, "lost": probability >= _LOST}
 
@@ -209,9 +199,9 @@ class LmTracker(Tracker):
         """
         other, best_so_far = self.descent_from(T_start), self.best
         other.run()
-        if other.cost(NEAR_SCALES) < _CLEARLY * best_so_far.cost(NEAR_SCALES):
+        if other.cost(NEAR_SCALES) < 0.97 * best_so_far.cost(NEAR_SCALES):
             self.best = other
-        return bool(_apart(other.T_world_camera, best_so_far.T_world_camera) < _SAME)
+        return bool(_apart(other.T_world_camera, best_so_far.T_world_camera) < 0.01)  # rad, m
 
     def _other_starts(self, frame: Frame, T_expected: Pose) -> list[Pose]:
         """Where else the camera may be, the likeliest first.
@@ -223,7 +213,7 @@ class LmTracker(Tracker):
         anchor = T_expected if self.last_good is None else self.last_good.numpy()
         if self.field.viewpoints is None:
             # The anchor, then turned about x, y and z both ways, by ever wider angles.
-            angles = [factor * _RESTART_ANGLE for factor in range(1, self.settings.n_restarts)]
+            angles = [factor * 0.2 for factor in range(1, self.settings.n_restarts)]  # rad
             axes = [sign * axis for axis in np.eye(6)[:3] for sign in (1, -1)]
             starts = [anchor] + [retract(anchor, a * axis) for a in angles for axis in axes]
         else:
@@ -235,11 +225,11 @@ class LmTracker(Tracker):
 
         Of the random ones only the cheapest are tried.
         """
-        alike = retrieve(view_of(frame), viewpoints, _ALIKE)
+        alike = retrieve(view_of(frame), viewpoints, _TRIED)
         random = [self.descent_from(T) for T in self._random_poses(viewpoints.T_world_camera)]
         tried = [self.descent_from(T) for T in (anchor, *alike)] + _by_cost(random)[:_TRIED]
         for descent in tried:
-            descent.run_stage(_TRIED_STEPS)
+            descent.run_stage(max_steps=6)
         return [descent.T_world_camera for descent in _by_cost(tried)]
 
     def _random_poses(self, T_world_camera: Poses) -> Poses:
@@ -249,7 +239,7 @@ class LmTracker(Tracker):
         down = T_world_camera[:, :3, 1].mean(axis=0)
         turns = random.uniform(0, 2 * np.pi, (_RANDOM, 1)) * down / np.linalg.norm(down)
         poses[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix() @ poses[:, :3, :3]
-        poses[:, :3, 3] += random.normal(scale=_RANDOM_STD, size=(_RANDOM, 3))
+        poses[:, :3, 3] += random.normal(scale=0.3, size=(_RANDOM, 3))  # m
         return poses
 
 

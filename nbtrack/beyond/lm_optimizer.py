@@ -9,18 +9,7 @@ from nbtrack.beyond.observed import Observed
 from nbtrack.beyond.verdict import MAD_FACTOR, SIGMAS, std_when_moved
 from nbtrack.core.arrays import Pose
 
-# A point fits if it is nearer to the surface than the field's `inlier_distance`, and if its
-# residual in luma differs by less than this from the median of all points.
-_INLIER_INTENSITY = 0.25
-_FIRST_DAMPING = 1e-4
-_MIN_DAMPING = 1e-9
-_MAX_DAMPING = 1e3
-_DAMPING_UP = 10.0
-_DAMPING_DOWN = 0.2
-_MAX_STEPS = 60  # of a stage
-# Points that count as independent where it is asked whether a pose is held: with 384 some wrong
-# poses before a flat wall pass (docs/tried.md).
-_INDEPENDENT = 256
+_MAX_DAMPING = 1e3  # ends a stage
 # Robust scales (m, luma) at which the ends of descents are compared, also that of a coarse stage
 # with its start, which it may have left for a worse pose.
 NEAR_SCALES = np.array([0.02, 0.05])
@@ -60,13 +49,13 @@ class LmOptimizer:
         self.last_step = step.length
         if step.is_better:
             self._narrow_scales()
-            self.damping = max(self.damping * _DAMPING_DOWN, _MIN_DAMPING)
+            self.damping = max(0.2 * self.damping, 1e-9)
         else:
-            self.damping *= _DAMPING_UP
+            self.damping *= 10
         self.is_ended = step.length < self.problem.stage.min_step or self.damping > _MAX_DAMPING
         return step.cost_before
 
-    def run_stage(self, max_steps: int = _MAX_STEPS) -> None:
+    def run_stage(self, max_steps: int = 60) -> None:
         """Steps of the stage that it is in, until that ends or so many are taken."""
         for _ in range(max_steps):
             if self.is_ended:
@@ -113,7 +102,7 @@ class LmOptimizer:
         has_weight = self.fine_problem.lambda_intensity > 0
         off = np.abs(intensity - _median(intensity)) if has_weight else np.zeros_like(intensity)
         is_near = np.abs(distance) < self.problem.grid.accuracy.inlier_distance
-        is_inlier = is_near & (reliability > 0) & (off < _INLIER_INTENSITY)
+        is_inlier = is_near & (reliability > 0) & (off < 0.25)  # of luma in [0, 1]
         known_ratio = float(reliability.mean())
         return {
             "inlier_ratio": float(is_inlier.mean()),
@@ -133,8 +122,10 @@ class LmOptimizer:
         # In rad and m. H is in units of the scales, which are `SIGMAS` standard deviations.
         covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2
         by_curvature = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:]).max())
-        moved = self._costs_at, self.T_world_camera, covariance
-        return float(max(by_curvature, std_when_moved(*moved, 1, _INDEPENDENT)))
+        moved = self._costs_at, self.T_world_camera, covariance, 1
+        # If more points counted as independent, as 384, some wrong poses before a flat wall would
+        # pass (docs/tried.md).
+        return float(max(by_curvature, std_when_moved(*moved, n_independent=256)))
 
     def _costs_at(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
         """The points' costs at another pose, at the scales of this one."""
@@ -144,7 +135,7 @@ class LmOptimizer:
     def _begin_stage(self, problem: Problem) -> None:
         """Begin a stage at the pose so far, with scales and damping anew."""
         self.problem = problem
-        self.damping = _FIRST_DAMPING
+        self.damping = 1e-4
         self.is_ended = False
         self.twist = np.zeros(6)  # of the step before
         self.terms = residual_terms(problem, self.T_world_camera)

@@ -25,13 +25,10 @@ from nbtrack.machinery.settings import limited
 
 _MIN_VOXEL = 0.05  # m between the corners at which distances are kept
 _MAX_CELLS_A_SIDE = 128  # larger scenes have larger voxels
-_MIN_POINTS = 3  # of a cell whose mean counts as a point of the surface: single ones are noise
 _POINTS_PER_FRAME = 10_000  # about, on a regular grid of its pixels
 # The tangent plane gives a sample's distance if that differs by less (m) from the distance to the
 # nearest point: half a voxel of the points, and the rounding of distances near the surface.
 _PLANE_TOLERANCE = 0.015
-_FREE_IN_FRONT = 0.05  # m in front of a measured depth
-_SMALL = 0.01  # standard deviation of features in grids before the first iteration
 Flags = Bool[Tensor, "rays samples"]
 
 
@@ -46,7 +43,6 @@ class NeusPlusMapping(NeusMapping):
     lambda_sdf: float = 10.0  # per metre
     n_surface_points: int = limited(4096, 1, 65536)  # measured ones, besides the rays
     lambda_rendering: float = 1.0  # factor of rendered depth and colour; 0: none
-    behind_band: float = 0.1  # distances are supervised so far behind surfaces, m
 
 
 class NeuSPlusField(NeuSField):
@@ -109,7 +105,7 @@ def distance_targets(
     is_plane_nearest = (per_depth > 0) & ((plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
     target = torch.where(is_plane_nearest, plane, nearest)
     in_front = (before > 0) & (is_plane_nearest | (before > settings.surface_band))
-    just_behind = (before <= 0) & (plane > -settings.behind_band)
+    just_behind = (before <= 0) & (plane > -0.1)  # m
     known = in_front | (just_behind & is_plane_nearest & ~is_free)
     return target, (known & (rays.depth[:, None] > 0)).float()
 
@@ -132,7 +128,8 @@ class ObservedDistance:
         shape = np.ceil((high - low) / fine).astype(int) + 1
         n_pixels = sequence.intrinsics.width * sequence.intrinsics.height
         stride = max(1, round((n_pixels / _POINTS_PER_FRAME) ** 0.5))
-        cloud = fuse_points(sequence, frames, bounds, fine, stride, _MIN_POINTS)
+        # Fewer than three points of a cell are noise.
+        cloud = fuse_points(sequence, frames, bounds, fine, stride, min_count=3)
         points = cloud.points.double().numpy()
         point_in = np.full(shape, -1)  # each cell's point, by number; -1 where there is none
         cells, inside = cells_of(points, low, shape, fine)
@@ -145,7 +142,7 @@ class ObservedDistance:
         corners = np.stack(np.indices(shape)[:, ::2, ::2, ::2], -1) * fine + low + fine / 2
         distance = torch.from_numpy(np.linalg.norm(corners - nearest, axis=-1)).float()
         corners_world = torch.from_numpy(corners.reshape(-1, 3)).float()
-        is_free = min_depth_behind(corners_world, sequence, frames) < -_FREE_IN_FRONT
+        is_free = min_depth_behind(corners_world, sequence, frames) < -0.05  # m
         self.values = torch.stack([distance, is_free.view(distance.shape).float()]).to(device)
         self.low = corners_world[0].to(device)
 
@@ -200,7 +197,7 @@ class FeatureGrid(nn.Module):
         shapes = [((extent / voxel).ceil().long() + 1).tolist() for voxel in self.voxels]
         drawn = {"generator": generator, "dtype": torch.float32}
         volumes = [torch.randn(settings.features, *shape, **drawn) for shape in shapes]
-        self.volumes = nn.ParameterList(_SMALL * volume for volume in volumes)
+        self.volumes = nn.ParameterList(0.01 * volume for volume in volumes)
         self.layer = empty_linear(settings.levels * settings.features + 3, settings.hidden)
         self.head = empty_linear(settings.hidden, 4)  # colour and value
         for part in (self.layer, self.head):

@@ -20,7 +20,6 @@ from nbtrack.machinery.errors import ConfigError
 from nbtrack.machinery.settings import may_be_zero
 
 _MAX_CELLS_A_SIDE = 2**20  # so that a cell's number fits into 64 bits
-_ASKED_EVERY = 5  # frames
 _FRAMES_AT_ONCE = 8  # frames whose voxels wait to be merged: it bounds the memory
 
 
@@ -140,8 +139,8 @@ def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frame
     infinite where all have it out of view or measured nothing there. Every fifth of the frames is
     asked: neighbours see the same.
     """
-    asked = frames[::_ASKED_EVERY].tolist()
-    return reduce(torch.minimum, (_depth_behind(sequence[i], points_world) for i in asked))
+    asked = (sequence[index] for index in frames[::5].tolist())
+    return reduce(torch.minimum, (_depth_behind(frame, points_world) for frame in asked))
 
 
 def _depth_behind(frame: Frame, points_world: Points) -> Values:

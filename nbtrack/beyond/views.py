@@ -21,14 +21,8 @@ _COLUMNS = 20
 _ROWS = 15
 _STEP = 0.05  # between directions x / z and y / z of a view, which spans 53 by 41 degrees
 _DEPTH_UNIT = 0.05  # m; depths are kept in a byte, 0 where less than half of a cell was measured
-_MAX_VIEWS = 150  # 90 kB
-_RADIAN = 1.0  # m; poses whose optical axes differ by it are as far apart as if moved by so much
-# A camera may be turned against a view: by so many columns and rows, tried in steps of so many.
-_TURNS_ACROSS = np.arange(-6, 7, 3)
-_TURNS_DOWN = np.arange(-3, 4, 3)
 _MAX_LOG_RATIO = 0.3  # of depths; those that differ by more are of other surfaces
 _DEPTH_WEIGHT = 2.0  # of the depths' unlikeness against the luma's
-_MIN_OVERLAP = 30  # cells with both depths; below, they say nothing
 View = UInt8[Tensor, "2 15 20"]
 Views = UInt8[Tensor, "n 2 15 20"]
 
@@ -69,11 +63,11 @@ def spread_out(T_world_camera: Poses) -> Int[np.ndarray, "_"]:
 
     The first, then again and again the one that is farthest from all before it.
     """
-    axes = _RADIAN * T_world_camera[:, :3, 2]
-    places = np.concatenate([T_world_camera[:, :3, 3], axes], axis=1)
+    # Poses whose optical axes differ by 1 are as far apart as if moved by 1 m.
+    places = np.concatenate([T_world_camera[:, :3, 3], T_world_camera[:, :3, 2]], axis=1)
     chosen = [0]
     apart = np.full(len(places), np.inf)
-    while len(chosen) < min(_MAX_VIEWS, len(places)):
+    while len(chosen) < min(150, len(places)):  # 90 kB of views
         apart = np.minimum(apart, np.linalg.norm(places - places[chosen[-1]], axis=1))
         chosen.append(int(apart.argmax()))
     return np.array(chosen)
@@ -85,7 +79,8 @@ def retrieve(view: View, viewpoints: Viewpoints, n: int) -> Poses:
     Each is turned about the camera's x and y as it fits best: shifts of a view's cells stand for
     turns.
     """
-    turns = [(down, across) for across in _TURNS_ACROSS for down in _TURNS_DOWN]  # in cells
+    # A camera may be turned against a view, by so many rows and columns.
+    turns = [(down, across) for across in range(-6, 7, 3) for down in range(-3, 4, 3)]
     here, there = view.float(), viewpoints.views.float()
     unlikeness = [_unlikeness(_moved(here, y, x), _moved(there, -y, -x)) for y, x in turns]
     minimum, best = torch.stack(unlikeness).min(dim=0)
@@ -122,7 +117,8 @@ def _unlikeness(here: Float[Tensor, "2 _ _"], there: Float[Tensor, "n 2 _ _"]) -
     n_measured = are_measured.sum(dim=(1, 2))
     log_ratio = (here[1].clamp(min=1) / there[:, 1].clamp(min=1)).log().abs()
     apart = (log_ratio / _MAX_LOG_RATIO).clamp(max=1) * are_measured
-    mean_apart = torch.where(n_measured > _MIN_OVERLAP, apart.sum(dim=(1, 2)) / n_measured, 1.0)
+    # Up to 30 cells with both depths say nothing.
+    mean_apart = torch.where(n_measured > 30, apart.sum(dim=(1, 2)) / n_measured, 1.0)
     return 1 - correlation + _DEPTH_WEIGHT * mean_apart
 
 

@@ -47,8 +47,7 @@ def plot_idea(
     page_camera = torch.stack([along, left / left.norm()])  # the page's axes, (2, 3)
     x = np.arange(-_BEFORE, distance + _BEHIND, _STEP)
     places = np.stack(np.meshgrid(x, np.arange(-_ASIDE, _ASIDE + _STEP, _STEP)), axis=-1)
-    grid_camera = places @ page_camera.numpy()
-    grid_world = grid_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    grid_world = places @ page_camera.numpy() @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     draw_slice(axes, field, grid_world, places, aspect=25, pad=0.015)
     pose = torch.from_numpy(T_world_camera).float()
     axes.plot([0, distance + _BEHIND], [0, 0], color="0.2", linewidth=0.8)

@@ -13,7 +13,6 @@ from nbtrack.fields import Field
 from nbtrack.machinery.errors import DataError
 
 _POINTS_AT_ONCE = 65_536
-_SEEN_BEHIND = 0.1  # m behind the measured depth that still count as seen
 GridPoints = Float[np.ndarray, "*shape 3"]  # m
 Mesh = trimesh.Trimesh | trimesh.PointCloud
 
@@ -117,4 +116,4 @@ def seen_by(
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32)).view(-1, 3)
     frames = np.arange(len(sequence)) if frames is None else frames
     behind = min_depth_behind(points, sequence, frames).numpy()
-    return behind.reshape(points_world.shape[:-1]) < _SEEN_BEHIND
+    return behind.reshape(points_world.shape[:-1]) < 0.1

@@ -24,12 +24,8 @@ from nbtrack.tracking import Trajectory
 
 _WIDTH = 240  # pixels of the map's view
 _NEAR = 0.1  # m; nearer surfaces are not drawn
-_POINT_SIZE = 0.02  # m; half the side of what is drawn for a point
-# The corners of what is drawn for a point, which faces the camera.
-_SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-_DPI = 72  # of the movie's pictures
-_RATE_HZ = 10  # pictures a second
-_GIF_COLORS = 64  # of each picture: a GIF holds at most 256
+# The corners (m) of what is drawn for a point, which faces the camera.
+_SQUARE = 0.02 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 
 
 def movie_pictures(
@@ -52,7 +48,7 @@ def movie_pictures(
     here.set_color(path.get_color())
     words = right.text(0, 1.03, "", transform=right.transAxes)
     canvas = FigureCanvasAgg(left.figure)
-    left.figure.set_dpi(_DPI)
+    left.figure.set_dpi(72)
     for index, row in enumerate(run.itertuples()):
         view = view_of(surface, sequence.intrinsics, T_estimated[index])
         left.clear()
@@ -68,7 +64,8 @@ def movie_pictures(
         canvas.draw()
         left.figure.set_layout_engine("none")  # the first picture's layout stays: nothing jumps
         progress(index + 1)
-        yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(_GIF_COLORS)
+        # A GIF holds at most 256 colours a picture; 64 keep it small.
+        yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(64)
 
 
 @styled
@@ -78,7 +75,7 @@ def movie_bytes(pictures: Iterator[Image.Image]) -> bytes:
     A lazy iterator, as that of `movie_pictures`, draws in the house style while this writes.
     """
     content = io.BytesIO()
-    options = {"duration": 1000 // _RATE_HZ, "loop": 0, "optimize": True}
+    options = {"duration": 100, "loop": 0, "optimize": True}  # ms a picture
     next(pictures).save(content, "GIF", save_all=True, append_images=pictures, **options)
     return content.getvalue()
 
@@ -95,7 +92,7 @@ def view_of(surface: Mesh, camera: Intrinsics, T_world_camera: Pose) -> np.ndarr
     points_camera = (np.asarray(surface.vertices) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     is_cloud = isinstance(surface, trimesh.PointCloud)
     parts = np.arange(len(points_camera))[:, None] if is_cloud else surface.faces
-    corners = points_camera[parts] + (_POINT_SIZE * _SQUARE if is_cloud else 0)
+    corners = points_camera[parts] + (_SQUARE if is_cloud else 0)
     depth = np.maximum(corners[..., 2:], _NEAR)  # no division by zero; what is nearer is left out
     pixels = scale * (corners[..., :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
     in_view = ((pixels.max(axis=1) > 0) & (pixels.min(axis=1) < [_WIDTH, height])).all(axis=1)

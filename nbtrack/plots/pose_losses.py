@@ -21,7 +21,6 @@ from nbtrack.tracking import SdfTracker, StepBudget, Tracker, VrTracker
 _SDF_LOSS, _VR_LOSS, _DENSITY = "SDF's loss (no unit)", "VR's loss (no unit)", "mean density (1/m)"
 _OFFSETS_CM = np.arange(-20, 21, 2)
 _COLORS = dict(zip((_SDF_LOSS, _VR_LOSS), method_colors(["SDF", "VR"]).values(), strict=True))
-_N_PIXELS = 128  # enough for smooth curves, and fast enough for a slider
 
 
 def move_sideways(frame: Frame, x_cm: float, y_deg: float) -> Transform:
@@ -41,7 +40,8 @@ def pose_losses(
     settings and nothing random. The third column is the mean density at the observed points.
     """
     measured = frame.measured_pixels()
-    rows, columns = measured[:, :: 1 + measured.shape[1] // _N_PIXELS]  # the same for all poses
+    # The same for all poses; 128 give smooth curves, and are fast enough for a slider.
+    rows, columns = measured[:, :: 1 + measured.shape[1] // 128]
     directions_camera = pixel_directions(frame.camera, columns, rows)
     color, depth = frame.at(rows, columns)
     points_camera = directions_camera * depth[:, None]

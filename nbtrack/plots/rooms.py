@@ -19,7 +19,6 @@ from nbtrack.plots.scene import Paths
 from nbtrack.plots.style import WIDTH, method_colors, new_axes, styled
 from nbtrack.synthetic import Room
 
-_POINTS_ALONG = 240  # grid points along the longer side of a slice
 _TRUE_LINE = {"colors": method_colors(["true"])["true"], "linestyles": "--"}
 
 
@@ -49,7 +48,7 @@ def plot_slice(
         if height is None:
             height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
-        step = (high - low).max() / _POINTS_ALONG
+        step = (high - low).max() / 240  # m
         points, places = _level_grid(page, low, high + step, step, height * up)
         bar = {"ax": panels, "aspect": 25, "pad": 0.015}
         shown = seen_by(points, sequence)

@@ -19,7 +19,6 @@ from nbtrack.machinery.text_files import read_numbers, read_object
 
 _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
 _LARGEST = 1e6  # of any number of a camera: no image is so many pixels wide
-_MIN_FOCAL = 0.1  # pixels: rays of a shorter one overflow sooner or later
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
 # Entries of a camera's JSON file, by names of this package, and how many numbers each may have.
 _OTHER_NAMES = {"w": "width", "h": "height", "coeffs": "distortion", "scale": "depth_scale"}
@@ -82,7 +81,8 @@ def calibration(path: Path, K: Float[np.ndarray, "3 3"], size: tuple | None = No
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     # Also false for NaN.
     has_form = np.allclose(K, camera_matrix(fx, fy, cx, cy), rtol=0, atol=1e-6)
-    is_in_range = min(fx, fy) >= _MIN_FOCAL and np.abs(K).max() < _LARGEST
+    # Rays of a focal length below 0.1 pixels overflow sooner or later.
+    is_in_range = min(fx, fy) >= 0.1 and np.abs(K).max() < _LARGEST
     if has_form and is_in_range and (size is None or min(size) >= 1):
         # In the matrix pixel centres are whole numbers.
         return Calibration(path, fx, fy, principal_point=(cx + 0.5, cy + 0.5), size=size)

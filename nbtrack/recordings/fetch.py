@@ -13,7 +13,6 @@ from nbtrack.machinery.files import absolute, naming_damaged, write_atomic
 from nbtrack.machinery.progress import ProgressBar
 from nbtrack.recordings.formats import FORMATS
 
-_TIMEOUT_S = 60  # that a server may stay silent
 # What may be written below a scene's folder. No other name is: it could lead out of there.
 _NAME = re.compile(r"(?a)[\w-]+/[\w-][\w.-]*\.(?:png|jpe?g)|[\w-][\w.-]*\.txt")
 _AGAIN = "run the same command again to go on, or name a mirror or a local ZIP file with --url"
@@ -66,7 +65,7 @@ def _archive(source: str, opened: contextlib.ExitStack) -> zipfile.ZipFile:
         raise MissingError("data fetch needs remotezip: pip install 'nbtrack[fetch]'") from None
     session = opened.enter_context(requests.Session())  # one connection for all files
     try:
-        return remotezip.RemoteZip(source, session=session, timeout=_TIMEOUT_S)
+        return remotezip.RemoteZip(source, session=session, timeout=60)  # s of silence
     except remotezip.RangeNotSupported:
         advice = "take another mirror, or download the whole file and give its path to --url"
         raise DataError(f"{source}: the server gives no ranges of a file: {advice}") from None

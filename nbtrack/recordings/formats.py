@@ -231,9 +231,7 @@ def _told_by_files(folder: Path) -> str:
 
     Raises MissingError if no format has any of its files, and DataError if several have all.
     """
-    shares = {}
-    for name, layout in FORMATS.items():
-        shares[name] = np.mean([_is_there(folder, patterns) for patterns in layout.needs])
+    shares = {name: np.mean([_is_there(folder, p) for p in f.needs]) for name, f in FORMATS.items()}
     maximum = max(shares.values())
     best = [name for name, share in shares.items() if share == maximum]
     if maximum == 0:

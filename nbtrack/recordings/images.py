@@ -25,7 +25,6 @@ from nbtrack.recordings.recording import Recording
 
 _MAX_16_BITS = 65535  # also what cameras write for "farther than I can measure"
 _MAX_BYTES = 1_000_000_000  # of files that were read for a digest and are not decoded yet
-_THREADS = 4  # decoding frees the GIL: a few suffice
 Pixels = Shaped[np.ndarray, "height width *channels"]
 Depths = UInt16[np.ndarray, "n height width"]
 Decoded = tuple[UInt8[np.ndarray, "n height width 3"], Depths]
@@ -90,7 +89,7 @@ class Images:
             for array, before in zip((colors, depths), self._kept, strict=False):
                 array[is_kept] = before
             missing = np.flatnonzero(~is_kept)
-            with ThreadPoolExecutor(_THREADS) as pool:
+            with ThreadPoolExecutor(4) as pool:  # decoding frees the GIL: a few suffice
                 decoded = pool.map(self._decoded, all_ids[missing].tolist())
                 for place, frame in zip(missing, decoded, strict=True):
                     colors[place], depths[place] = frame
@@ -155,9 +154,10 @@ class Images:
             depth_mm *= 1 + declared.depth_error_per_m / 1000 * depth_mm
             if depth_mm.max() > _MAX_16_BITS:
                 found = f"{self.recording.depth_files[index]} holds {depth_mm.max() / 1000:.4g} m"
-                scale = f"{declared.depth_scale:g} depth values a metre"
-                advice = "set depth_scale or no_depth in sequence.toml"
-                raise DataError(f"{found} with {scale}: at most 65.535 m can be kept; {advice}")
+                limit = "at most 65.535 m can be kept; set depth_scale or no_depth in sequence.toml"
+                raise DataError(
+                    f"{found} with {declared.depth_scale:g} depth values a metre: {limit}"
+                )
             depths_mm[place] = np.rint(depth_mm)
         return depths_mm
 
@@ -211,9 +211,8 @@ def _resizing(color: np.ndarray, depth: np.ndarray, recording: Recording) -> tup
     sizes = f"{width}x{height} and {depth_width}x{depth_height}"
     camera = recording.calibration
     if not camera.size:
-        doubt = f"{camera.source} does not say which of both it is for"
-        advice = "write a JSON file with fx, fy, cx, cy and their width and height"
-        raise DataError(f"colour and depth are {sizes}, and {doubt}: {advice}")
+        doubt = f"{camera.source} does not say which of both it is for: write width and height too"
+        raise DataError(f"colour and depth are {sizes}, and {doubt}, into a JSON file")
     return True, f"colour is made as small as depth: {sizes}"
 
 

@@ -19,21 +19,11 @@ from nbtrack.core.arrays import Frames, Poses
 from nbtrack.machinery.errors import DataError, MissingError
 from nbtrack.machinery.files import naming_damaged
 from nbtrack.machinery.text_files import read_lines
-from nbtrack.recordings.pose_files import (
-    Times,
-    check_order,
-    check_rising,
-    frame_keys,
-    in_seconds,
-)
+from nbtrack.recordings.pose_files import Times, check_order, check_rising, frame_keys, in_seconds
 
 TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
 _TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
-_SAME_TIME = 1e-6  # s: the last digit of lists
-_ON_TIME = 1e-3  # s between a stamp and the number, over the rate, of the same frame
 _GAP = 0.0505  # s between poses that are interpolated, 20 Hz: at a hand's 2 m/s² 0.6 mm off
-_UNEVEN = 0.1  # share of the median step by which steps of stamps that only count may differ
-_MOST = 0.75  # share of frames that find a pose by its stamp, if both are of one clock
 
 
 def check_paired(colors: list[Path], others: list[Path]) -> None:
@@ -166,7 +156,7 @@ class Moments:
         """
         n_frames, n_poses = len(self.images), len(poses)
         pose_numbers = np.arange(n_poses) if stamps is None else stamps * self.rate_hz
-        tolerance = min(_ON_TIME * self.rate_hz, 0.25)  # in numbers, which are 1 apart
+        tolerance = min(1e-3 * self.rate_hz, 0.25)  # 1 ms, in numbers, which are 1 apart
         # A row for each way to count: the place of every frame's pose, -1 without one.
         ways = [nearest(numbers, pose_numbers, tolerance) for numbers in self._counted()]
         places = np.unique(np.reshape(ways, (-1, n_frames)), axis=0)
@@ -176,7 +166,7 @@ class Moments:
             note = f"of {n_poses} poses those of the images' numbers" if n_poses > n_frames else ""
             return _at(poses, complete[0]), note
         are_times = stamps is not None and not _are_even(stamps)  # even ones may only count
-        finds_most = (n_paired > _MOST * n_frames).any()
+        finds_most = (n_paired > 0.75 * n_frames).any()  # as on one clock
         if n_poses != n_frames or (are_times and finds_most):
             return None
         counts_up = np.array_equal(self.numbers, np.arange(n_frames))
@@ -192,10 +182,9 @@ class Moments:
             return []
         first = self.numbers[0]
         is_1_to_n = first == 1 and np.ptp(self.numbers) == len(self.numbers) - 1
-        if self.counts_from_0 and not is_1_to_n:
-            return [self.numbers]
-        number_of_place_0 = min(first, 1)  # 1, but 0 where there is a frame 0
-        return [self.numbers, self.numbers - number_of_place_0, self.numbers - first]
+        # The second is 1, but 0 where there is a frame 0.
+        of_place_0 = [0] if self.counts_from_0 and not is_1_to_n else [0, min(first, 1), first]
+        return [self.numbers - number for number in of_place_0]
 
 
 def _interpolated(
@@ -210,7 +199,8 @@ def _interpolated(
     later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
     before, after = times - stamps[later - 1], stamps[later] - times  # s, to both stamps beside
     to_nearest = np.minimum(before, after)  # s; negative outside of the list
-    is_between = (before + after <= _GAP) & (to_nearest > _SAME_TIME)  # else the nearest stays
+    # Else the nearest stays, as that of the very time, to the last digit of lists.
+    is_between = (before + after <= _GAP) & (to_nearest > 1e-6)
     if not is_between.any():
         return found, ""
     T_knots, wanted = flip(poses), times[is_between]
@@ -226,7 +216,7 @@ def _interpolated(
 def _are_even(stamps: Times) -> bool:
     """Whether steps between stamps differ by no more than a tenth of the median step."""
     steps = np.diff(stamps)
-    return len(steps) == 0 or np.ptp(steps) <= _UNEVEN * np.median(np.abs(steps))
+    return len(steps) == 0 or np.ptp(steps) <= 0.1 * np.median(np.abs(steps))
 
 
 def _at(poses: Poses, places: Frames) -> Poses:

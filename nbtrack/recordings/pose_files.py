@@ -23,7 +23,6 @@ _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or
 _LATEST = 1e11  # s: no timestamp in seconds is later; one in milliseconds since 1970 is larger
 # Seconds since 1970 with decimals, or as many milli-, micro- or nanoseconds, in 13 to 19 digits.
 _STAMP = re.compile(r"(?a)(?<!\d)(?<!\d\.)([1-9]\d{8,9}\.\d+|1\d{12}(?:\d{3}){0,2})(?!\.?\d)")
-_LEAP = 10  # usual steps: a gap in numbers that is no loss of some frames
 
 
 def in_seconds(times: Times) -> Times:
@@ -99,9 +98,8 @@ def check_rising(times: Times, source: Path) -> None:
         i = (steps <= 0).argmax()
         before, here = times[rows[i : i + 2]]
         found = f"{source}, row {rows[i + 1] + 1}: {here:.6f} s comes after {before:.6f} s"
-        advice = "write rising times, or cut it there; sort it only if its order means nothing"
         why = "the clock fell back, or it has two rows of one time, or times of too few digits"
-        raise DataError(f"{found}, so {why}: {advice}")
+        raise DataError(f"{found}, so {why}: write rising times, or cut it there")
 
 
 def check_order(files: list[Path]) -> None:
@@ -121,7 +119,7 @@ def check_order(files: list[Path]) -> None:
             raise DataError(f"{names} have numbers that order them in two ways: keep one of both")
         usual, last = np.median(steps) if len(steps) else 0, numbers[-1]
         for end in (10 ** len(str(last)), 2**8, 2**16, 2**32):
-            if 0 < numbers[0] + end - last <= 2 * usual and steps.max() > _LEAP * usual:
+            if 0 < numbers[0] + end - last <= 2 * usual and steps.max() > 10 * usual:
                 i = steps.argmax()
                 found = f"{names} have the numbers {numbers[0]} to {numbers[i]} and "
                 found += f"{numbers[i + 1]} to {last}: a counter that went back to 0 at {end}?"

@@ -15,7 +15,6 @@ from nbtrack.machinery.errors import DataError
 from nbtrack.recordings.images import images_of
 from nbtrack.recordings.recording import Recording, open_recording
 
-_SLICE = r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?"
 # Beyond so many times the distance that nine in ten depths lie within, they are no measurement: of
 # eleven rooms and two real recordings the farthest was 2.1 times as far (our choice).
 FAR = 5.0
@@ -27,7 +26,8 @@ def parse_frames(text: str) -> slice:
     >>> parse_frames("10:50:2"), parse_frames(":100")
     (slice(10, 50, 2), slice(None, 100, None))
     """
-    match = re.fullmatch(_SLICE, text.replace(" ", ""))
+    parts = r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?"
+    match = re.fullmatch(parts, text.replace(" ", ""))
     if not match:
         raise DataError(f"frames {text!r} is no slice: write A:B, or A:B:S with S above 0")
     return slice(*(int(part) if part else None for part in match.groups()))

@@ -18,7 +18,6 @@ from nbtrack.recordings.pairing import TIMES_FILE, Moments, check_paired, pair_l
 from nbtrack.recordings.pose_files import Times, check_rising, in_seconds, stamp_in
 
 _AGAIN = "export the recording again, or name another format with --format"
-_FAR_FROM_ZERO = 1000.0  # m; there single precision still resolves 0.06 mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +53,14 @@ class Recording:
     def origin(self) -> Position:
         """The point (m, world) that is subtracted from positions in sequences.
 
-        It is 0 unless the cameras are far from 0, as in map coordinates, where single precision
-        would lose millimetres. Then it is near them, in whole kilometres, so that recordings of one
-        place have one origin, which is that of its map.
+        It is 0 unless the cameras are more than 1 km from 0, as in map coordinates: there single
+        precision would soon lose millimetres. Then it is near them, in whole kilometres, so that
+        recordings of one place have one origin, which is that of its map.
         """
         if not self.has_pose.any():
             return np.zeros(3)
         center = np.median(self.T_world_camera[self.has_pose, :3, 3], axis=0)
-        return np.round(center, -3) if np.abs(center).max() > _FAR_FROM_ZERO else np.zeros(3)
+        return np.round(center, -3) if np.abs(center).max() > 1000 else np.zeros(3)
 
 
 def open_recording(

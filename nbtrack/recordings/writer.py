@@ -24,7 +24,6 @@ from nbtrack.recordings.recording import Recording
 # RGB colour, depth maps (mm) by depth folder, and pose with OpenCV camera axes.
 WrittenFrame = tuple[ColorImage, dict[str, DepthImage], Pose]
 _FRAMES_AT_ONCE = 32  # converted: 50 MB at 640x480
-_SAME_CAMERA = 1e-6  # pixels: rounding, not another camera
 
 
 def write_sequence(
@@ -82,7 +81,7 @@ def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
     T_file = FORMATS["neural_rgbd"].declared.poses_to_opencv(T_world_camera)
     texts = dict.fromkeys(["poses.txt", "trainval_poses.txt"], number_lines(T_file.reshape(-1, 4)))
     told_by_focal = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
-    if np.allclose(astuple(camera), astuple(told_by_focal), rtol=0, atol=_SAME_CAMERA):
+    if np.allclose(astuple(camera), astuple(told_by_focal), rtol=0, atol=1e-6):  # rounding
         return texts | {"focal.txt": f"{float(camera.fx)!r}\n"}
     # There is no `focal.txt` then, so that programs that know only this file stop, instead of
     # reading another camera. In `intrinsics.txt` pixel centres are whole numbers, as in OpenCV.

@@ -21,20 +21,6 @@ Keys = Float[np.ndarray, "n 7"]  # as `camera_poses` takes them, and the frame t
 # Translation (units of the scene) and rotation (degrees) a frame.
 MEAN_STEP = np.array([5.7e-3, 0.45])
 _FASTEST = np.array([8.5e-3, 0.95])  # at most; the dataset's path: 7.8e-3 and 0.92
-# A camera that stands still should be off by so much (m), or by this share of what it is without a
-# seed's changes.
-_MIN_STILL = 1.0
-_STILL_SHARE = 0.8
-_SHORT = 240  # frames of the shorter of a room's two paths
-# How far a seed moves the key poses (m, along x, y, z) and turns them (rad): the paths of two seeds
-# pass the same things.
-_SHIFTED = (0.2, 0.1, 0.2)
-_TURNED = 0.12
-# x and y of a grid of rays with z = 1, which covers most of an image.
-_ACROSS = np.linspace(-0.55, 0.55, 7)
-_DOWN = np.linspace(-0.4, 0.4, 5)
-_NEAR = 0.8  # m; at most a quarter of an image is nearer
-_MARGIN = 0.1  # m; around what is seen, in a scene's bounds
 
 
 def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
@@ -46,15 +32,16 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     choice). Raises `NumericalError` as `attempts` does.
     """
     of_short, of_long = room.walk.keys
-    keys = np.array(of_short if n_frames <= _SHORT else of_long)
+    keys = np.array(of_short if n_frames <= 240 else of_long)
     base = _calibrated_path(room, keys)
-    # How far (m) a camera that stands still has to be off at least.
-    least = min(_MIN_STILL, _STILL_SHARE * still_metrics(base)["still_ate_m"])
+    # How far (m) a camera that stands still has to be off at least: 1 m, or by this share of what
+    # it is without a seed's changes.
+    least = min(1.0, 0.8 * still_metrics(base)["still_ate_m"])
 
     for rng in attempts(room, seed):
         moved = keys.copy()
-        moved[:, :3] += rng.uniform(-1, 1, (len(keys), 3)) * _SHIFTED
-        moved[:, 4] += rng.uniform(-_TURNED, _TURNED, len(keys))  # yaw
+        moved[:, :3] += rng.uniform(-1, 1, (len(keys), 3)) * (0.2, 0.1, 0.2)  # m
+        moved[:, 4] += rng.uniform(-0.12, 0.12, len(keys))  # yaw, rad
         poses = _calibrated_path(room, moved)
         is_far = still_metrics(poses)["still_ate_m"] > least
         if is_far and is_clear(room, poses) and _is_like_the_dataset(room, poses):
@@ -64,10 +51,13 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
 
 
 def _is_like_the_dataset(room: Room, poses: Poses) -> bool:
-    """Whether a path in free space has the right speed, and looks at things far enough."""
+    """Whether a path in free space has the right speed, and looks at things far enough.
+
+    At most a quarter of an image is nearer than 0.8 m.
+    """
     unit, near = _view(room, poses)
     to_mm = np.array([1e3 * unit, 1.0])  # degrees stay degrees
-    return near > _NEAR and has_speed(poses, MEAN_STEP * to_mm, _FASTEST * to_mm, tolerance=0.03)
+    return near > 0.8 and has_speed(poses, MEAN_STEP * to_mm, _FASTEST * to_mm, tolerance=0.03)
 
 
 def _calibrated_path(room: Room, keys: Keys) -> Poses:
@@ -75,7 +65,7 @@ def _calibrated_path(room: Room, keys: Keys) -> Poses:
     to give it the mean speeds `MEAN_STEP`; the frames of the keys stay."""
     keys = keys.copy()
     spread = [0, 2, 4]  # columns: x, z, yaw
-    unit = np.max(room.parts[0].solid.size) / 2  # m; at first of the whole room, by its shell
+    unit = np.max(room.parts[0].solid.half)  # m; at first of the whole room, by its shell
     for _ in range(4):
         poses = _path(keys)
         if room.sdf(poses[:, :3, 3]).min() > 0:  # only a camera in free space sees something
@@ -119,10 +109,13 @@ def _view(room: Room, poses: Poses) -> tuple[float, float]:
     The unit is that of `SceneBounds`. How near says the lower quartile of the z-depths of a frame,
     of the frame where it is least.
     """
-    rays_camera = np.stack(np.meshgrid(_ACROSS, _DOWN, [1.0]), axis=-1).reshape(-1, 3)
+    # A grid of rays with z = 1, which covers most of an image.
+    across, down = np.linspace(-0.55, 0.55, 7), np.linspace(-0.4, 0.4, 5)
+    rays_camera = np.stack(np.meshgrid(across, down, [1.0]), axis=-1).reshape(-1, 3)
     directions = (rays_camera @ poses[::12, :3, :3].mT).reshape(-1, 3)
     origins = poses[::12, :3, 3].repeat(len(rays_camera), axis=0)
     depths, _ = room.first_hit(origins, directions)
     points_world = np.concatenate([origins + depths[:, None] * directions, poses[:, :3, 3]])
     near = np.quantile(depths.reshape(-1, len(rays_camera)), 0.25, axis=1).min()
-    return float(np.ptp(points_world, axis=0).max() / 2 + _MARGIN), float(near)
+    # With the 0.1 m that a scene's bounds have around what is seen.
+    return float(np.ptp(points_world, axis=0).max() / 2 + 0.1), float(near)

@@ -24,12 +24,11 @@ ROOM_VERSION = 2  # raise it when a room, the motion or the sensor model changes
 _AGAIN = "remove the folder and make the room again"
 _FRAMES_AT_ONCE = 32  # in flight, so that memory is bounded where writing is slower
 MOTIONS = {"keyframes": keyframe_trajectory, "handheld": handheld_trajectory, "tour": tour}
-FIELD_OF_VIEW = np.radians(60.0)  # horizontal, as in the Neural RGB-D dataset
 
 
 def room_intrinsics(width: int, height: int) -> Intrinsics:
-    """The camera of all synthetic rooms: 60 degrees wide, square pixels, centered."""
-    return Intrinsics.from_focal(width, height, float(width / (2 * np.tan(FIELD_OF_VIEW / 2))))
+    """The camera of all synthetic rooms: 60 degrees wide, as that of the Neural RGB-D dataset."""
+    return Intrinsics.from_focal(width, height, float(width / (2 * np.tan(np.radians(60.0) / 2))))
 
 
 def room_frames(

@@ -24,17 +24,7 @@ MEAN_STEP = np.array([6.0, 0.65])
 HEIGHTS = (1.1, 1.7)  # m above the floor
 CLEARANCE = 0.35  # m, least distance of the camera to any surface (our choice)
 _KNOT_SPACING = 0.35  # rad of turning between knots of a glance around, about 35 frames
-_CALIBRATION_FRAMES = 120  # shorter trajectories are the beginning of one of this length
-# How far a seed moves the center of a path (m, along x and z) and turns its start (rad): paths of
-# two seeds cross each other and see the same side of the room.
-_CENTER_REACH = 0.3
-_HEADING_REACH = 0.25
-_FLATTENING = 0.25  # width of the path's ellipse over its length
-_ATTEMPTS = 400
 _CELL = 0.1  # m, of a tour's plan of free space
-_MARGIN = 0.1  # m that the plan keeps in addition to the clearance, since the path is smoothed
-_SMOOTHED = 0.4  # m, std of the tour's smoothing along itself
-_AHEAD = 45.0  # frames, std of the smoothing of the direction of view: 180 degrees in about 120
 
 
 def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
@@ -51,7 +41,7 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     Raises `NumericalError` as `attempts` does.
     Source: our choice; the statistics are those of hand-held RGB-D recordings.
     """
-    length = max(n_frames, _CALIBRATION_FRAMES)
+    length = max(n_frames, 120)
     for rng in attempts(room, seed):
         poses = _glance_around(room.walk, length, rng)
         is_at_height = poses[:, 1, 3].min() >= HEIGHTS[0] and poses[:, 1, 3].max() <= HEIGHTS[1]
@@ -65,7 +55,7 @@ def attempts(room: Room, seed: int) -> Iterator[np.random.Generator]:
 
     Raises `NumericalError` after the last: the room is too full for any to keep `CLEARANCE`.
     """
-    for attempt in range(_ATTEMPTS):
+    for attempt in range(400):
         yield np.random.default_rng([seed, attempt, room.number])
     found = f"room '{room.name}': no path keeps {CLEARANCE} m from surfaces"
     raise NumericalError(f"{found}; move its walk or furniture")
@@ -81,8 +71,9 @@ def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
     wandering = _wandering(walk.pitch, length, rng)
     covered = _before(_relative_speed(length, rng))  # at each frame, in frames at the mean speed
     tremor = _tremor(length, rng)
-    center = np.asarray(walk.center) + rng.uniform(-_CENTER_REACH, _CENTER_REACH, 2)
-    heading = walk.start_yaw + rng.uniform(-_HEADING_REACH, _HEADING_REACH)
+    # Paths of two seeds cross each other and see the same side of the room.
+    center = np.asarray(walk.center) + rng.uniform(-0.3, 0.3, 2)  # m
+    heading = walk.start_yaw + rng.uniform(-0.25, 0.25)  # rad
     # Rows: x and z of the directions forward and left.
     axes = np.array([[-np.sin(heading), -np.cos(heading)], [-np.cos(heading), np.sin(heading)]])
     # Where the adjustment begins, of which each round comes nearer to the wanted mean speeds.
@@ -94,7 +85,7 @@ def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
         turned = walk.turn * angle
         # (forward, left) in radii: on the side of the center opposite to the direction of view, so
         # that the room lies before the camera.
-        ellipse = np.stack([-np.cos(turned + side), -_FLATTENING * np.sin(turned + side)], axis=1)
+        ellipse = np.stack([-np.cos(turned + side), -0.25 * np.sin(turned + side)], axis=1)
         x, z = (center + radius * (1.0 + stretch[:, None]) * (ellipse @ axes)).T
         yaw = heading + turned + glance
         poses = camera_poses(np.stack([x, height, z, pitch, yaw, roll], axis=1) + tremor)
@@ -157,7 +148,8 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     three_rounds = np.concatenate([walked - steps.sum(), walked, walked + steps.sum()])
     forward_x, forward_z = curve(three_rounds, nu=1).T  # the derivative: where the walk leads
     ahead = np.unwrap(np.arctan2(-forward_x, -forward_z))  # yaw
-    yaw = gaussian_filter1d(ahead, _AHEAD)[n_frames : 2 * n_frames]
+    # Smoothed over frames: it turns by 180 degrees in about 120.
+    yaw = gaussian_filter1d(ahead, 45.0)[n_frames : 2 * n_frames]
     height = rng.uniform(1.3, 1.5) + _wander(n_frames, rng, 0.05)
     pitch = room.walk.pitch + _wander(n_frames, rng, 0.09)
     roll = _wander(n_frames, rng, 0.025)
@@ -173,7 +165,7 @@ def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
     heights = np.linspace(HEIGHTS[0], HEIGHTS[1], 5)
     points = np.stack(np.meshgrid(x, heights, z, indexing="ij"), axis=-1)
     clearance = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:3]).min(axis=1)
-    is_free = clearance >= CLEARANCE + _MARGIN
+    is_free = clearance >= CLEARANCE + 0.1  # m to spare, since the path is smoothed
     # Costs fall with the distance from surfaces, which draws routes to the middle. A negative cost
     # is a cell that no route enters.
     costs = np.where(is_free, 1.0 / np.maximum(clearance - CLEARANCE, 0.01), -1.0)
@@ -185,7 +177,7 @@ def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
         walk += route[:-1]  # the next one begins where it ends
     rows, columns = np.array(walk).T
     places = np.stack([x[rows], z[columns]], axis=1)
-    return gaussian_filter1d(places, _SMOOTHED / _CELL, axis=0, mode="wrap")
+    return gaussian_filter1d(places, 0.4 / _CELL, axis=0, mode="wrap")  # over 0.4 m
 
 
 def _wander(

@@ -87,8 +87,7 @@ class Box(Solid):
 
     def __init__(self, center: Vector3, size: Vector3, yaw: float = 0.0) -> None:
         """Of full edge lengths (m) along its own axes; yaw (rad) turns left, seen from above."""
-        self.size = np.asarray(size)
-        super().__init__(np.asarray(center), self.size / 2)
+        super().__init__(np.asarray(center), np.asarray(size) / 2)
         sine, cosine = np.sin(yaw), np.cos(yaw)
         self._axes = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # world from box
 
@@ -135,18 +134,17 @@ class Sphere(Solid):
     def __init__(self, center: Vector3, radius: float) -> None:
         """Of a radius in metres."""
         super().__init__(np.asarray(center), np.array([radius]))
-        self.radius = radius
 
     def _coordinates(self, points: Points) -> Float[np.ndarray, "n 1"]:
         offset = points - self.center
         return np.sqrt(row_dot(offset, offset))[:, None]
 
     def _crossing(self, origins: Origins, directions: Points) -> Interval:
-        return _round_interval(origins - self.center, directions, self.radius)
+        return _round_interval(origins - self.center, directions, self.half[0])
 
     def normals(self, points: Points) -> Points:
         """Unit radial directions."""
-        return (points - self.center) / self.radius
+        return (points - self.center) / self.half
 
 
 class Cylinder(Solid):
@@ -157,7 +155,6 @@ class Cylinder(Solid):
         along = np.asarray(end) - start
         length = float(np.linalg.norm(along))
         super().__init__((np.asarray(start) + end) / 2, np.array([radius, length / 2]))
-        self.radius = radius
         self._axis = along / length
 
     def _split(self, vectors: Origins) -> tuple[Float[np.ndarray, "..."], Origins]:
@@ -173,7 +170,7 @@ class Cylinder(Solid):
     def _crossing(self, origins: Origins, directions: Points) -> Interval:
         offset_along, offset_across = self._split(origins - self.center)
         direction_along, direction_across = self._split(directions)
-        near, far = _round_interval(offset_across, direction_across, self.radius)
+        near, far = _round_interval(offset_across, direction_across, self.half[0])
         caps = _slab_interval(offset_along[..., None], direction_along[:, None], self.half[1:])
         return np.maximum(near, caps[0]), np.minimum(far, caps[1])
 

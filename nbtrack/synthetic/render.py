@@ -13,7 +13,6 @@ Depth = Float[np.ndarray, "h w"]
 Surfaces = Int[np.ndarray, "h w"]
 # Samples of a refined pixel, as offsets from its center in pixels: a 2x2 grid.
 _SUBPIXELS = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)]
-_CONTRAST = 0.06  # difference of color to a neighbor above which a pixel is refined (our choice)
 BASELINE = 0.075  # m between projector and camera (Khoshelham & Elberink 2012, Kinect v1)
 DISPARITY_STEP = 1 / 8  # px at 640 width: the sensor's sub-pixel resolution (the same source)
 DISPARITY_NOISE = 1 / 16  # px at 640 width: half a step of random error (the same source)
@@ -21,7 +20,6 @@ LATERAL_NOISE = 0.5  # px at 640 width; Handa et al. 2014 (ICL-NUIM) shift looku
 RANGE = (0.4, 8.0)  # m; nearer and farther is invalid (our choice, near the sensor's limits)
 MAX_INCIDENCE = np.radians(82.0)  # dropped beyond; Nguyen et al. 2012: noise explodes there
 EDGE_JUMP = 1.0  # px of disparity at 640 width that make a depth edge (our choice)
-EDGE_DROPOUT = 0.6  # probability that a pixel at an edge is lost (our choice)
 
 
 def render_frame(
@@ -56,12 +54,12 @@ def render_frame(
 
 
 def _rough(image: Float[np.ndarray, "h w 3"], surfaces: Surfaces) -> Bool[np.ndarray, "h w"]:
-    """Pixels that differ from a neighbor in surface or color."""
+    """Pixels that differ from a neighbor in surface, or in color by more than 0.06 (our choice)."""
     looks = np.dstack([image, surfaces])  # another surface differs by one or more
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))  # a pixel and its neighbors
     to_largest = cv2.dilate(looks, cross) - looks
     to_smallest = looks - cv2.erode(looks, cross)
-    return np.maximum(to_largest, to_smallest).max(axis=2) > _CONTRAST
+    return np.maximum(to_largest, to_smallest).max(axis=2) > 0.06
 
 
 def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> Depth:
@@ -86,7 +84,7 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     # On planes, however slanted, disparity is affine: where it bends sharply is an edge.
     bends = [np.abs(np.diff(exact, 2, axis=axis)) > EDGE_JUMP for axis in (0, 1)]
     is_edge = np.pad(bends[0], ((1, 1), (0, 0))) | np.pad(bends[1], ((0, 0), (1, 1)))
-    lost |= is_edge & (rng.uniform(size=depth.shape) < EDGE_DROPOUT)
+    lost |= is_edge & (rng.uniform(size=depth.shape) < 0.6)  # (our choice)
     shift = rng.normal(scale=LATERAL_NOISE / per_pixel, size=(2, *depth.shape))
     places = np.indices(depth.shape) + shift
     # Interpolated: at a width of 96 the jitter is below a tenth of a pixel, and the nearest pixel
