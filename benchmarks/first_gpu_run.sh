@@ -43,7 +43,7 @@ part 110 python3 benchmarks/step_times.py steps
 part 110 python3 benchmarks/step_times.py mapping
 part 60 python3 benchmarks/step_times.py kernels
 part 60 python3 -m pytest -q -p no:cacheprovider --noconftest -W default -m gpu \
-  tests/test_gpu.py tests/test_sampling.py
+  tests/test_launches.py tests/test_sampling.py
 sizes=(--preset synthetic)
 [ "$NBTRACK_DEVICE" = cpu ] && sizes=(--preset smoke "${small[@]}")
 part 120 python3 -m nbtrack bench "${sizes[@]}" --out "$OUT/bench"

@@ -6,6 +6,7 @@ What is refused: `test_faults.py`.
 import pytest
 import torch
 
+from nbtrack import METHODS
 from nbtrack.tracking import ClockBudget, StepBudget, paper_steps
 
 
@@ -106,6 +107,9 @@ def test_fractions_accumulate(steps: float | int) -> None:
 
 
 def test_paper_steps() -> None:
-    """Catches wrong figures of Table II. 5 Hz: 6.8 + 29.3 / 4 and 15.3 + 64 / 4."""
+    """Catches wrong figures of Table II, and steps of another tracker or rate where nobody says how
+    many. 5 Hz: 6.8 + 29.3 / 4 and 15.3 + 64 / 4."""
     assert [paper_steps("vr", rate_hz) for rate_hz in (10, 5, 2)] == [6.8, 14.125, 36.1]
     assert [paper_steps("sdf", rate_hz) for rate_hz in (10, 5, 2)] == [15.3, 31.3, 79.3]
+    usual = [METHODS[name].usual_steps for name in ("vr_neus", "sdf", "icp", "corrected")]
+    assert usual == [36.1, 79.3, 30, 30]

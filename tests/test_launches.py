@@ -1,4 +1,4 @@
-"""Steps that are recorded and replayed, without a GPU: a tape stands in for its graph.
+"""Steps that are recorded and replayed: on a GPU, if any, and with a tape in place of its graph.
 
 The tape keeps the operations of one call and does them again into the same memory, so that whatever
 a step takes from elsewhere, or reads on the host, is seen here as on a GPU.
@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +17,16 @@ from box_room import walk
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from nbtrack.beyond.lm import LmTracker
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.fields import NetworkSettings, field_class, make_field
+from nbtrack.fields import NetworkSettings, NeusMapping, field_class, make_field
 from nbtrack.machinery import launches
+from nbtrack.machinery.device import choose_device
+from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.files import naming_damaged
 from nbtrack.machinery.launches import Recording
 from nbtrack.mapping.fit import _Fit
-from nbtrack.tracking import AdamTracker, SdfTracker, StepBudget, VrTracker
+from nbtrack.tracking import AdamTracker, SdfTracker, StepBudget, Tracker, VrTracker
 from nbtrack.tracking.paper import AdamSettings
 
 BOUNDS = SceneBounds((-1.2, -1.0, -1.4), (1.2, 1.0, 1.4))
@@ -78,7 +83,7 @@ def by_calls(work: Callable, generator: torch.Generator) -> tuple[Callable, torc
     return lambda: result.set_(work()), result
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def as_on_a_gpu(monkeypatch) -> None:
     watching = ExitStack()
     modes = {"warn": lambda: watching.enter_context(Waits()), "default": watching.close}
@@ -106,18 +111,22 @@ class Choosy(Own):
         return super().loss(T_world_camera, directions_camera[near], color[near], depth[near])
 
 
-def tracked(kind: type[AdamTracker], field_name: str) -> np.ndarray:
-    field = make_field(field_name, NetworkSettings(width=16), BOUNDS, seed=3)
+CPU, on_tapes = torch.device("cpu"), pytest.mark.usefixtures("as_on_a_gpu")
+
+
+def tracked(kind: type[Tracker], field_name: str, device: torch.device = CPU) -> np.ndarray:
+    field = make_field(field_name, NetworkSettings(width=16), BOUNDS, seed=3).to(device)
     settings = kind.Settings(n_pixels=24)
     tracker = kind(field, SEQUENCE.T_world_camera[0], StepBudget(4), settings)
     poses = [tracker.track(SEQUENCE[index]).T_world_camera for index in (1, 2, 3, 4)]
-    assert tracker.recording.is_recordable == (kind is not Choosy)
     return np.stack(poses)
 
 
+FIELDS = ("imap", "neus", "neus_plus")
 PAIRS = (SdfTracker, "neus"), (VrTracker, "imap"), (VrTracker, "neus"), (Own, "neus")
 
 
+@on_tapes
 @pytest.mark.parametrize(("kind", "field_name"), PAIRS)
 def test_a_replayed_step_is_the_step(kind: type[AdamTracker], field_name: str, monkeypatch) -> None:
     """Catches a step that keeps the pixels, images, moments or random numbers of the recording, and
@@ -130,22 +139,29 @@ def test_a_replayed_step_is_the_step(kind: type[AdamTracker], field_name: str, m
     assert np.abs(np.diff(found[0], axis=0)).max(axis=(1, 2)).min() > 1e-4  # each frame moves
 
 
-@pytest.mark.parametrize("name", ["imap", "neus", "neus_plus"])
+def totals(name: str, device: torch.device = CPU) -> list[float]:
+    """Losses of some iterations."""
+    extra = {"n_surface_points": 8} if name == "neus_plus" else {}
+    settings = field_class(name).Settings(iterations=12, n_rays=16, **extra)
+    field = make_field(name, NetworkSettings(width=16), BOUNDS, seed=3).to(device)
+    fit = _Fit({"seed": 0}, settings, field, SEQUENCE, np.arange(5))
+    fit._advance(range(12))
+    return [row["total"] for row in fit.history]
+
+
+@on_tapes
+@pytest.mark.parametrize("name", FIELDS)
 def test_a_replayed_iteration_is_the_iteration(name: str, monkeypatch) -> None:
     """Catches a batch or a learning rate that stays, and values read on the host."""
     found = []
     for record in (on_tape, by_calls):
         monkeypatch.setattr(launches, "record", record)
-        extra = {"n_surface_points": 8} if name == "neus_plus" else {}
-        settings = field_class(name).Settings(iterations=12, n_rays=16, **extra)
-        field = make_field(name, NetworkSettings(width=16), BOUNDS, seed=3)
-        fit = _Fit({"seed": 0}, settings, field, SEQUENCE, np.arange(5))
-        fit._advance(range(12))
-        found.append([row["total"] for row in fit.history])
+        found.append(totals(name))
     assert found[0] == found[1]
     assert len(set(found[0])) == 12
 
 
+@on_tapes
 def test_what_waits_is_called(capsys, monkeypatch) -> None:
     """Catches a loss that cannot be recorded and is; and one that is told of at every step."""
     monkeypatch.setattr(launches, "record", None)
@@ -153,9 +169,63 @@ def test_what_waits_is_called(capsys, monkeypatch) -> None:
     assert capsys.readouterr().err.count("tracker own waits for a value of the GPU") == 1
 
 
+@on_tapes
 def test_results_are_kept_apart(monkeypatch) -> None:
     """Catches a loss that the next replay writes over."""
     monkeypatch.setattr(launches, "record", by_calls)
     recording, count = Recording("counter", torch.Generator()), torch.zeros(())
     results = [recording.run(partial(torch.add, count, step, out=count)) for step in range(1, 6)]
     assert results[-1] is not results[-2]
+
+
+@pytest.fixture
+def cuda() -> torch.device:
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU")
+    return torch.device("cuda")
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(("kind", "field_name"), [*PAIRS, (LmTracker, "neus")])
+def test_a_gpu_tracks_as_a_cpu(kind: type[Tracker], field_name: str, cuda, monkeypatch) -> None:
+    """Catches tensors left on the host, double precision that a device lacks, other poses than a
+    few steps from the start can reach, and recorded steps that draw other numbers."""
+    recorded = tracked(kind, field_name, cuda)
+    np.testing.assert_allclose(recorded, tracked(kind, field_name), atol=0.02)  # of other pixels
+    monkeypatch.setattr(launches, "CALLS_BEFORE_RECORDING", 1_000_000)
+    np.testing.assert_allclose(recorded, tracked(kind, field_name, cuda), atol=1e-5)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_gpu_maps_what_it_has_recorded(name: str, cuda, monkeypatch) -> None:
+    """Catches recorded iterations that draw other numbers, keep what changes, or are not finite."""
+    recorded = totals(name, cuda)
+    monkeypatch.setattr(launches, "CALLS_BEFORE_RECORDING", 1_000_000)
+    np.testing.assert_allclose(recorded, totals(name, cuda), rtol=1e-3)
+    assert np.isfinite(recorded).all()
+
+
+def test_a_map_goes_on_only_where_it_began(tmp_path: Path) -> None:
+    """Catches a checkpoint from another kind of device that is called damaged."""
+    settings, checkpoint = NeusMapping(iterations=2, n_rays=16), tmp_path / "mapping.pt"
+    field = make_field("neus", NetworkSettings(width=16), BOUNDS, seed=3)
+    fit = _Fit({"seed": 0}, settings, field, SEQUENCE, np.arange(5))
+    fit.run(checkpoint, lambda *_: None)
+    fit.recipe["device"] = "cuda"
+    with pytest.raises(DataError, match=r"mapping.pt was made with another device:"):
+        fit.run(checkpoint, lambda *_: None)
+
+
+@pytest.mark.parametrize("kind", [torch.OutOfMemoryError, torch.AcceleratorError])
+def test_a_device_that_fails_is_no_damage(kind: type, tmp_path: Path) -> None:
+    """Catches the advice to delete a sound file because a GPU was full."""
+    with pytest.raises(kind), naming_damaged(tmp_path):
+        raise kind("CUDA error: out of memory")
+
+
+def test_the_device_is_the_named_one(monkeypatch) -> None:
+    """Catches tests that run commands on a GPU because there is one."""
+    assert choose_device().type == "cpu"
+    monkeypatch.setenv("NBTRACK_DEVICE", "cpu:1")
+    assert choose_device() == torch.device("cpu:1")

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from box_room import BoxRoom, Formula, box_sequence, poses_at, sequence_of
+from box_room import BoxRoom, Formula, box_sequence, narrow_room, poses_at, sequence_of
 from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond.correction import corrected
 from nbtrack.beyond.grid import BakedField
-from nbtrack.beyond.lm_optimizer import LmOptimizer
+from nbtrack.beyond.lm_optimizer import NEAR_SCALES, LmOptimizer
 from nbtrack.beyond.lm_residuals import grid_of
 from nbtrack.beyond.neus_plus import NeuSPlusField, distance_targets
 from nbtrack.beyond.observed import draw_points
@@ -236,6 +236,30 @@ def test_the_certainty_of_a_pose_by_hand() -> None:
     assert 0.01 / 60**0.5 < few < 0.02
 
 
+def test_how_many_points_fit_by_hand() -> None:
+    """Catches points that do not count by their reliability, a sign of the distance, and brightness
+    that counts: a tenth of the points lie too near, a fifth too far; the picture is darker, and
+    confidences differ."""
+    grid, generator = BakedField(narrow_room(), 0.05), torch.Generator().manual_seed(1)
+    grid.volume[4] = torch.rand(grid.n_vertices, generator=generator).flatten()
+    seen = draw_points(box_sequence([[0.0] * 3], narrow_room(), 48)[0], 1000, generator)
+    seen.points[::10] *= 0.8
+    seen.points[1::5] *= 1.1
+    seen = seen._replace(intensity=seen.intensity - 0.2)
+    optimizer = LmOptimizer(grid_of(grid), seen, seen, 1.0, np.eye(4))
+    assert optimizer.cost(NEAR_SCALES) > 1  # since intensities count in the coarse stage, too
+    optimizer.run()
+    said, (distance, intensity) = optimizer.certainty(), optimizer.terms.residuals
+    known = optimizer.terms.reliability
+    off = np.abs(intensity - np.median(intensity))
+    fits = (np.abs(distance) < 0.05) & (known > 0) & (off < 0.25)
+    assert 0.5 < fits.mean() < 0.9
+    expected = {"inlier_ratio": fits.mean(), "fitting_ratio": known[fits].sum() / known.sum()}
+    expected |= {"known_ratio": known.mean(), "intensity_mad": np.median(off)}
+    for name, value in expected.items():
+        assert said[name] == pytest.approx(value, rel=0.01), name
+
+
 def test_views_that_are_alike() -> None:
     """Catches brightness or contrast that count, depths that do not, and an order turned round."""
     frames = box_sequence([[0.0, 0.0, 0.0], [0.0, 0.0, 0.15], [0.0, 0.0, -0.4]], BoxRoom(), 96)
@@ -245,3 +269,17 @@ def test_views_that_are_alike() -> None:
     found = retrieve(darker, Viewpoints(cameras, views), 3)
     assert found[:, 2, 3].tolist() == [0.15, 0.0, -0.4]
     np.testing.assert_allclose(found[0], cameras[1], atol=1e-12)  # not turned
+
+
+def test_a_view_shows_what_lies_where() -> None:
+    """Catches directions that are off by a column or a row, a principal point that is left out, and
+    another unit of depth: of a plane that leans, in units of 5 cm."""
+    camera = Intrinsics(96, 72, 72.0, 72.0, 40.0, 42.0)
+    rows, columns = np.indices((72, 96)) + 0.5
+    depths = 2000 / (1 - 0.9 * (columns - 40) / 72 - 0.6 * (rows - 42) / 72)
+    luma, depth = view_of(sequence_of(depths[None], camera)[0]).float().numpy()
+    rows, columns = np.indices((15, 20))
+    expected = 40 / (1 - 0.9 * 0.05 * (columns - 9.5) - 0.6 * 0.05 * (rows - 7))
+    asked = (luma > 0) & (expected < 60)
+    assert asked.sum() > 100
+    assert np.abs(depth - expected)[asked].max() < 1.5

@@ -13,7 +13,7 @@ from nbtrack.beyond.points import PointMapping
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import MappingSettings, NetworkSettings, field_class
-from nbtrack.machinery.errors import DataError, NumericalError
+from nbtrack.machinery.errors import NumericalError
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import learning_rate, map_sequence
 from nbtrack.mapping.holdout import split_holdout
@@ -104,16 +104,6 @@ def test_diverged_loss_names_the_iteration() -> None:
     settings = settings_of("neus", iterations=200, learning_rate=1e6)
     with pytest.raises(NumericalError, match=r"at mapping iteration \d+: lower the learning rate"):
         map_sequence("neus", wall_sequence(), NETWORK, settings)
-
-
-@pytest.mark.parametrize("field_name", ["imap", "points"])
-def test_no_depth_at_all(field_name: str) -> None:
-    """Catches training on nothing."""
-    sequence = wall_sequence()
-    sequence.depths_mm[:] = 0
-    settings = PointMapping() if field_name == "points" else settings_of(field_name)
-    with pytest.raises(DataError, match="no pixel of wall has a depth"):
-        map_sequence(field_name, sequence, NETWORK, settings)
 
 
 def test_schedule_and_split() -> None:

@@ -131,6 +131,7 @@ LISTS = {
     "chosen, of a dataset": ((2, 3, 5), None, "neural_rgbd", (2, 3, 5)),
     "chosen": ((2, 3, 5), None, "plain", None),
     "chosen, stamped": ((12, 13, 15), (10, 12, 13, 15, 17, 20), "plain", (1, 2, 3)),
+    "from 1, cut and one lost, stamped": ((3, 4, 6), (2, 3, 5, 8), "plain", (0, 1, 2)),
     "from 1, one lost, stamped": ((1, 2, 4, 5, 6), RUN, "plain", (0, 1, 3, 4, 5)),
     "one pose lost, stamped": (RUN, (0, 1, 2, 4, 5), "plain", (0, 1, 2, -1, 3, 4)),
     "stamps of one lost": ((0, 1, 3, 4, 5, 6), RUN, "plain", RUN),

@@ -1,6 +1,7 @@
 """Figures: every axis has its unit, every line lies where the data are, nothing leaks."""
 
 import io
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -283,11 +284,16 @@ def test_the_slice_stands_beside_the_room_in_its_projection(sequence, tmp_path) 
 
 
 def test_steps_begin_at_their_start(sequence) -> None:
-    """Catches a path of steps in the world's axes, in another unit, or without its first pose."""
-    plane, by_step = FIGURES["steps"](sequence).axes[:2]
+    """Catches a path of steps in the world's axes, in another unit, also in its title, or without
+    its first pose."""
+    figure = FIGURES["steps"](sequence)
+    plane, by_step = figure.axes[:2]
     assert plane.lines[0].get_xydata()[0] == pytest.approx([5, 0], abs=1e-6)
-    assert by_step.lines[0].get_ydata()[0] == pytest.approx(50)
-    assert len(by_step.lines[0].get_ydata()) == 4
+    errors_mm = by_step.lines[0].get_ydata()
+    assert len(errors_mm) == 4
+    assert errors_mm[0] == pytest.approx(50)
+    said = re.findall(r"(\d+) mm", figure.get_suptitle())
+    assert said == ["20", f"{errors_mm[-1]:.0f}"]
 
 
 def test_a_method_keeps_its_color() -> None:

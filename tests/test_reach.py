@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from box_room import BoxRoom, poses_at, walk
 from numpy.testing import assert_allclose
@@ -14,21 +13,10 @@ from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.scenes import Scene, open_scene
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
-from nbtrack.machinery.files import tables_folder
 from nbtrack.synthetic import make_room
-from nbtrack.tables import published_table_1
 from nbtrack.tracking import SdfSettings, StepBudget, make_tracker
 from nbtrack.tracking.metrics import trajectory_metrics
 from nbtrack.tracking.reach import greedy_ate, greedy_follower, motion_of, reach, reach_metrics
-
-METHODS = {"vr": "iMAP with VR", "sdf": "NeuS with SDF"}
-# Of the dataset's path, by method and rate (Hz): the bound (m) with rates in metres, with rates in
-# the scene's unit of 2.5 m, and with metres from constant velocity. Two digits, as noted.
-BOUNDS = {
-    ("vr", 10): (1.53, 0.67, 0.00), ("vr", 5): (0.87, 0.015, 0.00), ("vr", 2): (0.009, 0.0, 0.0),
-    ("sdf", 10): (0.78, 0.00, 0.00), ("sdf", 5): (0.062, 0.0, 0.0), ("sdf", 2): (0.0, 0.0, 0.0),
-}  # fmt: skip
-READINGS = "metre", "map", "metre, constant velocity"
 
 
 def straight(speed_m: float) -> np.ndarray:
@@ -94,24 +82,6 @@ def test_motion_and_metrics_by_hand() -> None:
     assert reach_metrics(None, path, "previous_pose") == {}
     path[3] = np.nan
     assert "greedy_ate_m" not in reach_metrics(one, path, "previous_pose")
-
-
-def test_bounds_of_the_dataset() -> None:
-    """Catches a bound that differs from an independent computation of it: two published cells are
-    nine and ten times below what metres and the previous pose allow."""
-    table = pd.read_csv(tables_folder() / "protocol" / "bounds.csv")
-    table = table[table["scene"] == "breakfast_room"]
-    bounds = table.set_index(["tracker", "rate_hz", "reading"])["greedy_ate_m"]
-    for (tracker, rate_hz), noted in BOUNDS.items():
-        for reading, value in zip(READINGS, noted, strict=True):
-            digit = 0.0005 if value in (0.009, 0.015, 0.062) else 0.005
-            assert bounds[tracker, rate_hz, reading] == pytest.approx(value, rel=0.01, abs=digit)
-    published = published_table_1().set_index(["rate_hz", "method", "scene"])["ate_m"]
-    cells = {(t, rate_hz): published[rate_hz, METHODS[t], "Breakfast"] for t, rate_hz in BOUNDS}
-    for cell in (("vr", 5), ("sdf", 10)):
-        assert bounds[*cell, "metre"] > 8 * cells[cell]
-    for cell, published_m in cells.items():
-        assert bounds[*cell, "map"] <= published_m
 
 
 def test_a_warning_before_the_work(tmp_path: Path) -> None:

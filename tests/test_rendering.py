@@ -15,7 +15,7 @@ from nbtrack.fields.rendering import (
     weights_from_sdf,
 )
 
-LN2, LN3 = math.log(2.0), math.log(3.0)
+LN2 = math.log(2.0)
 
 
 @pytest.fixture
@@ -31,40 +31,43 @@ def middles(depths: Tensor) -> Tensor:
     return (depths[:, 1:] + depths[:, :-1]) / 2
 
 
-@pytest.mark.parametrize(
-    ("density", "depths", "length", "expected"),
-    [
-        # sections 1, 2 and, repeated, 2 m: opacities 1/2, 3/4, 0; light in front 1, 1/2, 1/8
-        ([LN2, LN2, 0.0], [1.0, 2.0, 4.0], 1.0, [1 / 2, 3 / 8, 0.0]),
-        # twice as long a ray: opacities 3/4, 15/16, 0; light in front 1, 1/4, 1/64
-        ([LN2, LN2, 0.0], [1.0, 2.0, 4.0], 2.0, [3 / 4, 15 / 64, 0.0]),
-        # a wall of 3 ln 2 at the end leaves 1/8
-        ([0.0, 3 * LN2], [1.0, 2.0], 1.0, [0.0, 7 / 8]),
-    ],
-)
-def test_density_weights_by_hand(density, depths, length, expected) -> None:
-    """Catches sections that are shifted by one, transmittance that includes the sample itself, a
-    forgotten ray length, and a last section of no length, which would let light through a wall."""
-    rays = torch.tensor([density]), torch.tensor([depths]), torch.tensor([length])
-    torch.testing.assert_close(weights_from_density(*rays), torch.tensor([expected]))
+def ends(opacities: Tensor, light: Tensor) -> Tensor:
+    """Where the light ends that comes to the first part of each ray: part after part."""
+    found = []
+    for opacity in opacities.T:
+        found.append(light * opacity)
+        light = light * (1 - opacity)
+    return torch.stack(found, dim=1)
 
 
-@pytest.mark.parametrize(
-    ("sdf", "steepness", "expected"),
-    [
-        # Phi = 3/4, 1/2, 1/4: alphas 1/3 and 1/2; light in front 3/4, 1/2
-        ([LN3, 0.0, -LN3], 1.0, [1 / 4, 1 / 4]),
-        ([LN3 / 2, 0.0, -LN3 / 2], 2.0, [1 / 4, 1 / 4]),  # s = 2 with half the distances: the same
-        ([-LN3, 0.0, LN3], 1.0, [0.0, 0.0]),  # on the way out nothing is seen
-        ([-0.2, 0.2, -0.2], 200.0, [0.0, 0.0]),  # a ray that starts inside is dark
-        ([0.2, -0.2, 0.2, -0.2], 200.0, [1.0, 0.0, 0.0]),  # behind a wall nothing has weight
-    ],
-)
-def test_sdf_weights_by_hand(sdf, steepness, expected) -> None:
-    """Catches a quotient by the wrong neighbour, opacity for rays that leave a surface, a camera
-    that sees out of a solid, and a missing transmittance."""
-    found = weights_from_sdf(torch.tensor([sdf]), torch.tensor(steepness))
-    torch.testing.assert_close(found, torch.tensor([expected]))
+def random_rays(generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Depths, values of both signs and lengths of rays, in double precision."""
+    depths, lengths = ascending_depths(40, 6, generator), 1 + torch.rand(40, generator=generator)
+    values = torch.randn(40, 6, generator=generator)
+    return depths.double(), values.double(), lengths.double()
+
+
+def test_weights_are_products(generator: torch.Generator) -> None:
+    """Catches sections that are shifted by one, transmittance that includes the part itself, a
+    forgotten ray length, a last section of no length, which would let light through a wall; a
+    quotient by the wrong neighbour, opacity for rays that leave a surface, a camera that sees out
+    of a solid; and gradients that are detached, clamped or lost behind what is taken."""
+    depths, values, lengths = random_rays(generator)
+    steps = torch.cat([depths[:, 1:] - depths[:, :-1], depths[:, -1:] - depths[:, -2:-1]], dim=1)
+    whole = torch.ones(40).double()
+    expected = ends(1 - torch.exp(-values.abs() * steps * lengths[:, None]), whole)
+    torch.testing.assert_close(weights_from_density(values.abs(), depths, lengths), expected)
+    passes = 1 / (1 + torch.exp(-3 * values))
+    opacities = (1 - passes[:, 1:] / passes[:, :-1]).clamp(0)
+    found = weights_from_sdf(values, torch.tensor(3.0).double())
+    torch.testing.assert_close(found, ends(opacities, passes[:, 0]))
+    taken = values.abs().clamp(0.0, 1.0)  # of some all
+    torch.testing.assert_close(weights_from_occupancy(taken), ends(taken, whole))
+    sdf = values[:3].requires_grad_(), torch.tensor(3.0).double().requires_grad_()
+    density = (1 + values[:3].abs()).detach().requires_grad_()
+    assert torch.autograd.gradcheck(weights_from_sdf, sdf)
+    assert torch.autograd.gradcheck(weights_from_density, (density, depths[:3], lengths[:3]))
+    assert torch.autograd.gradcheck(weights_from_occupancy, taken.detach()[:9].requires_grad_())
 
 
 def test_density_of_a_distance_by_hand() -> None:
@@ -76,24 +79,6 @@ def test_density_of_a_distance_by_hand() -> None:
     torch.testing.assert_close(found, torch.tensor([[1.0, 0.5, 1.5, 0.0, 2.0]]))
     found.sum().backward()
     torch.testing.assert_close(sdf.grad[0, 1:], torch.tensor([-1.0, -1.0, 0.0, 0.0]))
-
-
-@pytest.mark.parametrize(
-    ("occupancy", "expected"),
-    [
-        ([1 / 2, 1 / 2, 1.0, 1 / 2], [1 / 2, 1 / 4, 1 / 4, 0.0]),  # behind a taken place nothing
-        ([0.0, 1 / 4, 0.0, 1 / 3], [0.0, 1 / 4, 0.0, 1 / 4]),  # half of the light passes
-    ],
-)
-def test_occupancy_weights_by_hand(occupancy, expected) -> None:
-    """Catches light that a sample takes from itself, and gradients lost behind what is taken."""
-    occupancy = torch.tensor([occupancy], requires_grad=True)
-    found = weights_from_occupancy(occupancy)
-    torch.testing.assert_close(found, torch.tensor([expected]))
-    found[0, -1].backward()
-    assert torch.isfinite(occupancy.grad).all()
-    passed = (1 - occupancy[0, :2].detach()).prod()  # what the third one then lets through
-    torch.testing.assert_close(occupancy.grad[0, 2], -occupancy[0, 3].detach() * passed)
 
 
 def test_composite_by_hand() -> None:
@@ -142,15 +127,6 @@ def test_extreme_values_stay_finite(scale: float, generator: torch.Generator) ->
     ((weights * middles(depths)).sum() + (walls * depths).sum()).backward()
     for tensor in (weights, walls, sdf.grad, steepness.grad, density.grad):
         assert torch.isfinite(tensor).all()
-
-
-def test_gradients_match_finite_differences(generator: torch.Generator) -> None:
-    """Catches a detached or clamped path between a field and what is rendered of it."""
-    depths, lengths = ascending_depths(3, 6, generator).double(), 1 + torch.arange(3.0).double()
-    density = torch.rand(3, 6, generator=generator).double().requires_grad_()
-    sdf_rays = (2.0 - depths).requires_grad_(), torch.tensor(3.0).double().requires_grad_()
-    assert torch.autograd.gradcheck(weights_from_sdf, sdf_rays)
-    assert torch.autograd.gradcheck(weights_from_density, (density, depths, lengths))
 
 
 def test_stratified_depths(generator: torch.Generator) -> None:

@@ -1,8 +1,6 @@
 """Maps and runs of scenes: complete, cached, the same when done again, and keyed by what counts."""
 
-import importlib
 import json
-import math
 import os
 import shlex
 import shutil
@@ -331,17 +329,3 @@ def test_a_failed_map_tells_why_in_every_cell(preset: Preset, own_scenes: list[S
     assert results.loc[results["scene"] == "office", "ate_m"].notna().all()
     with pytest.raises(NbtrackError, match="no pixel"):
         track_scenes(own_scenes, ["sdf"], preset)
-
-
-def test_searches_from_afar(preset: Preset, scenes: list[Scene], monkeypatch) -> None:
-    """Catches starts that are off by another amount than they say, and shares without a verdict."""
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
-    basin = importlib.import_module("basin")
-    twist = basin.twist(1, 20, 15)
-    assert float(twist[:3].norm()) == pytest.approx(math.radians(15), abs=1e-6)
-    assert float(twist[3:].norm()) == pytest.approx(0.2, abs=1e-6)
-    methods = {"sdf": 2, "baked": 2}
-    found = basin.find_from_afar(scenes[1], methods, preset, ((0, 0), (4, 4)), 2, "::2")
-    assert len(found) == 2 * 2 * 2
-    shares = found.groupby(["method", "offset"], sort=False)["recovered"].mean()
-    assert shares.index[0] == ("NeuS with SDF", "0 cm, 0°")
