@@ -31,7 +31,7 @@ def cheap_defaults() -> Iterator[None]:
     """Most tests do not look at what their maps are worth; and where none says how many workers it
     wants, jobs run here: each worker would import torch for seconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbtrack.experiments.jobs.usable_cores", lambda: 1)
+        patch.setattr("nbtrack.machinery.device.usable_cores", lambda: 1)
         patch.setattr("nbtrack.experiments.quality.POINTS_SCORED", 200)
         patch.setattr("nbtrack.mapping.holdout._MISFIT_FRAMES", 1)
         yield

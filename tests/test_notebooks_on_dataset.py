@@ -6,7 +6,6 @@ import nbformat
 import pytest
 from IPython.core.interactiveshell import InteractiveShell
 
-from nbtrack.experiments import jobs
 from nbtrack.recordings.writer import write_sequence
 from nbtrack.synthetic import build_room, room_frames, room_intrinsics
 
@@ -42,7 +41,9 @@ def test_every_cell_runs(notebook: Path, folder: Path, monkeypatch, capsys) -> N
     monkeypatch.setenv("NBTRACK_RUNS", str(folder / "runs"))
     monkeypatch.setenv("NBTRACK_PRESET", "paper")
     monkeypatch.setenv("NBTRACK_SET", SETTINGS)
-    monkeypatch.setattr(jobs, "usable_cores", lambda: 1)  # no processes, which start in seconds
+    monkeypatch.setattr(
+        "nbtrack.machinery.device.usable_cores", lambda: 1
+    )  # no processes, which start in seconds
     monkeypatch.chdir(notebook.parent)
     shell = InteractiveShell()
     for cell in nbformat.read(notebook, as_version=4).cells:

@@ -17,7 +17,7 @@ from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Field, State
 from nbtrack.machinery.errors import ConfigError
-from nbtrack.machinery.settings import may_be_zero
+from nbtrack.machinery.settings import MANY, limited
 
 _MAX_CELLS_A_SIDE = 2**20  # so that a cell's number fits into 64 bits
 _FRAMES_AT_ONCE = 8  # frames whose voxels wait to be merged: it bounds the memory
@@ -28,7 +28,7 @@ class PointMapping:
     """Fusing points."""
 
     voxel: float = 0.02  # edge of the cells whose measured points are averaged, m
-    holdout_every: int = may_be_zero(10)  # every n-th frame is left out
+    holdout_every: int = limited(10, 0, MANY)  # every n-th frame is left out
 
 
 class PointCloud(Field):

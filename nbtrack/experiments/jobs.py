@@ -4,7 +4,6 @@ They run one after the other here, or side by side in processes or on a Dask clu
 gain nothing from a second thread, so scenes and methods share the cores instead.
 """
 
-import contextlib
 import importlib.util
 import json
 import os
@@ -13,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,7 @@ import cloudpickle
 from nbtrack.experiments.output import check_no_recording
 from nbtrack.experiments.workers import DEATHS, Workplace, cluster, processes
 from nbtrack.fields import FIELDS
-from nbtrack.machinery.device import (
-    advise_on_memory,
-    choose_device,
-    threads,
-    usable_cores,
-    usual_modes,
-)
+from nbtrack.machinery import device
 from nbtrack.machinery.errors import MissingError, NbtrackError
 from nbtrack.machinery.files import data_folder, locked, runs_folder, write_atomic
 from nbtrack.machinery.progress import ProgressBar
@@ -73,21 +67,18 @@ class Job:
         """A file that keeps other processes out; how far the job is stands in one beside it."""
         return runs_folder() / "locks" / f"{self.folder.name}.lock"
 
-    def outcome(self, report: Report) -> Any:
-        """Its `result`, made where it is missing, or the NbtrackError that ended it.
+    def make(self, report: Report) -> Any:
+        """Its `result`, made where it is missing.
 
         It waits for another process that makes the same: the system frees the lock when a process
         ends.
         """
         report(0.0, "begins, or waits for another process that makes the same")
-        try:
-            check_no_recording(self.lock)
-            setting = f"the frames and settings of {self.name}"
-            with locked(self.lock), usual_modes(), advise_on_memory(setting):
-                report(0.0, "running")
-                return self.result() if self.is_done else self.compute(report)
-        except NbtrackError as error:
-            return error
+        check_no_recording(self.lock)
+        setting = f"the frames and settings of {self.name}"
+        with locked(self.lock), device.usual_modes(), device.advise_on_memory(setting):
+            report(0.0, "running")
+            return self.result() if self.is_done else self.compute(report)
 
 
 @dataclass(frozen=True)
@@ -113,7 +104,8 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
     Raises what the first failing job raised, unless it is to keep going.
     """
     execution = execution or Execution()
-    missing = {part.folder: part for job in jobs for part in _missing(job)}
+    waves = _waves(jobs)
+    missing = {folder: job for wave in waves for folder, job in wave.items()}
     outcomes: dict[Path, Any] = {}
     bar = ProgressBar(Job.doing, sum(job.work for job in missing.values()))
 
@@ -129,95 +121,100 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
         status = f"{missing[folder].name}: {status}"
         bar.move_to(worked, f"{len(outcomes)} of {len(missing)} done, {status}")
 
-    ended = _outcomes(missing, outcomes, show, execution)
-    # Closing the generator leaves its `with` blocks: so workers end at once after an error too.
-    with bar, contextlib.closing(ended):
-        for folder, outcome in ended:
-            if isinstance(outcome, NbtrackError) and not execution.keep_going:
-                raise outcome
-            outcomes[folder] = outcome
-            show({folder: (0.0, "done")})
-    return [outcomes[j.folder] if j.folder in outcomes else _kept(j, execution) for j in jobs]
+    def settle(folder: Path, outcome: Any) -> None:
+        if isinstance(outcome, NbtrackError) and not execution.keep_going:
+            raise outcome
+        outcomes[folder] = outcome
+
+    # Whatever ends the block, the workers end with it at once.
+    with bar, _workplace(execution, max(map(len, waves), default=0)) as workplace:
+        for wave in waves:
+            for folder, outcome in _outcomes(wave, outcomes, show, workplace):
+                settle(folder, outcome)
+                show({folder: (0.0, "done")})
+    for job in jobs:
+        if job.folder not in outcomes:
+            settle(job.folder, _caught(job.result))
+    return [outcomes[job.folder] for job in jobs]
 
 
-def _missing(job: Job | None) -> list[Job]:
-    """A job and those that it needs, as far as they are not done, what is needed first."""
-    return [] if job is None or job.is_done else [*_missing(job.needs), job]
+def _waves(jobs: Sequence[Job]) -> list[dict[Path, Job]]:
+    """Missing jobs, and those that they need, by folder: plain maps, corrected ones, and then runs.
+
+    None of a wave needs another one of it.
+    """
+    waves = []
+    wave = {job.folder: job for job in jobs if not job.is_done}
+    while wave:
+        waves.insert(0, wave)
+        needed = [job.needs for job in wave.values()]
+        wave = {job.folder: job for job in needed if job and not job.is_done}
+    return waves
 
 
-def _kept(job: Job, execution: Execution) -> Any:
-    """The result of a finished job, or the error, if it is to keep going, for a damaged file."""
+def _workplace(execution: Execution, n_jobs: int) -> AbstractContextManager[Workplace | None]:
+    """Where so many jobs run at a time; None is here, one after the other."""
+    usual = device.usable_cores() if device.choose_device().type == "cpu" else 1
+    workers = min(execution.workers or usual, n_jobs)
+    if execution.dask is None and workers <= 1:
+        return nullcontext()
+    images_of.cache_clear()  # what was read here takes memory that workers need
+    return cluster(execution.dask, n_jobs) if execution.dask else processes(workers)
+
+
+def _caught(work: Callable, *arguments: Any) -> Any:
+    """What a call returns, or the NbtrackError that ended it."""
     try:
-        return job.result()
+        return work(*arguments)
     except NbtrackError as error:
-        if not execution.keep_going:
-            raise
         return error
 
 
 def _outcomes(
-    jobs: Mapping[Path, Job], outcomes: Mapping[Path, Any], show: Callable, execution: Execution
-) -> Iterator[tuple]:
-    """Pairs of each job's folder and outcome, as jobs end; a job begins after the one it needs.
+    wave: Mapping[Path, Job], outcomes: Mapping[Path, Any], show: Callable, place: Workplace | None
+) -> Iterator[tuple[Path, Any]]:
+    """Pairs of folder and outcome, as the jobs of a wave end.
 
-    `jobs` are in an order in which they can be run; `outcomes` are those that have ended, and
-    `show` is that of `run_jobs`.
+    `outcomes` are those of earlier waves, which may hold some of this one; `show` is that of
+    `run_jobs`.
     """
-    usual = usable_cores() if choose_device().type == "cpu" else 1
-    workers = min(execution.workers or usual, len(jobs))
-    if execution.dask is not None or workers > 1:
-        images_of.cache_clear()  # what was read here takes memory that workers need
-        there = cluster(execution.dask, len(jobs)) if execution.dask else processes(workers)
-        with there as workplace:
-            yield from _elsewhere(jobs, outcomes, show, workplace)
+    ready = {folder: job for folder, job in wave.items() if folder not in outcomes}
+    for folder, job in wave.items():
+        needed = outcomes.get(job.needs.folder) if job.needs else None
+        if isinstance(needed, NbtrackError) and ready.pop(folder, None):
+            yield folder, NbtrackError(f"not run, because {job.needs.name} failed: {needed}")
+    if place:
+        yield from _elsewhere(ready, show, place)
         return
-    for folder, job in jobs.items():
+    for folder, job in ready.items():
 
         def report(share: float, status: str, folder: Path = folder) -> None:
             show({folder: (share, status)})
 
-        yield folder, _why_not(job, outcomes) or job.outcome(report)
-
-
-def _why_not(job: Job, outcomes: Mapping[Path, Any]) -> NbtrackError | None:
-    """What ends a job before it begins: the failure of the one that it needs."""
-    needed = outcomes.get(job.needs.folder) if job.needs else None
-    if isinstance(needed, NbtrackError):
-        return NbtrackError(f"not run, because {job.needs.name} failed: {needed}")
-    return None
+        yield folder, _caught(job.make, report)
 
 
 def _elsewhere(
-    jobs: Mapping[Path, Job], outcomes: Mapping[Path, Any], show: Callable, workplace: Workplace
-) -> Iterator[tuple]:
-    """As `_outcomes`, of jobs that run side by side.
+    jobs: Mapping[Path, Job], show: Callable, place: Workplace
+) -> Iterator[tuple[Path, Any]]:
+    """Pairs of folder and outcome of jobs that run side by side, as they end.
 
     Where a process dies, that is the outcome of the job that ran there.
     """
-    idle, replaced, n_threads = workplace
-    waiting = dict(jobs)
+    waiting = [*jobs]
     running: dict[Future, tuple[Path, Executor]] = {}
     while waiting or running:
-        unfinished = waiting.keys() | {folder for folder, _ in running.values()}
-        for folder, job in [*waiting.items()]:
-            if job.needs and job.needs.folder in unfinished:
-                continue
-            if why := _why_not(job, outcomes):
-                del waiting[folder]
-                yield folder, why
-            elif idle:
-                del waiting[folder]
-                executor = idle.pop()
-                running[_submit(job, executor, n_threads)] = folder, executor
-        if running:
-            show({folder: _progress_of(jobs[folder]) for folder, _ in running.values()})
+        while waiting and len(running) < place.n_calls:
+            executor = place.idle.pop() if place.idle else place.begin()
+            folder = waiting.pop(0)
+            running[_submit(jobs[folder], executor, place.n_threads)] = folder, executor
+        show({folder: _progress_of(jobs[folder]) for folder, _ in running.values()})
         for future in wait(running, _LOOK_SECONDS, FIRST_COMPLETED).done:
             folder, executor = running.pop(future)
             if type(future.exception()).__name__ in DEATHS:
-                idle.append(replaced(executor))
                 yield folder, NbtrackError(_DIED.format(jobs[folder].name))
             else:
-                idle.append(executor)
+                place.idle.append(executor)
                 yield folder, future.result()
 
 
@@ -250,8 +247,8 @@ def _outcome_there(settings: Mapping, search_path: list[str], n_threads: int, wo
             write_atomic(_progress_file(job), json.dumps([share, status]))
             last = time.monotonic()
 
-    with threads(n_threads):
-        return job.outcome(report)
+    with device.threads(n_threads):
+        return _caught(job.make, report)
 
 
 def _progress_file(job: Job) -> Path:

@@ -53,17 +53,17 @@ class MapJob(Job):
     @classmethod
     def of(cls, scene: Scene, field: str, preset: Preset, frames: str = ":", seed: int = 0) -> Self:
         """The map of a scene with the settings of a preset."""
-        network, settings = preset.network_of(field), preset.mapping_of(field)
+        made = preset.network_of(field), preset.mapping_of(field)
         seed, voxel = whole_number("seed", seed), preset.correction.get(field, 0.0)
-        return cls(scene, field, network, settings, frames, seed, voxel)
+        return cls(scene, field, *made, frames, seed, voxel)
 
     @classmethod
     def of_given(cls, path: Path) -> Self:
         """A finished map that the user gave. Raises as `read_map` does."""
         finished = _stored(path)
-        record = finished.record
-        made = finished.field.name, record["network"], record["settings"]
-        return cls(None, *made, correction_voxel=record.get("correction", 0.0), given=path)
+        made, voxel = finished.record, finished.record.get("correction", 0.0)
+        how = finished.field.name, made["network"], made["settings"]
+        return cls(None, *how, correction_voxel=voxel, given=path)
 
     @property
     def setting_tree(self) -> dict[str, Any]:
@@ -85,10 +85,9 @@ class MapJob(Job):
         code = provenance.code_fingerprint(field_class(self.field))
         if self.given:
             return fingerprint(_stored(self.given).key, code, choose_device().type)
-        parts = [code, provenance.versions(), choose_device().type]
-        parts += [self.field, self.network, self.settings, self.correction_voxel]
-        parts += [self.scene.fingerprint, self.frames, self.seed]
-        return fingerprint(*parts)
+        made = self.field, self.network, self.settings, self.correction_voxel, self.seed
+        machine = code, provenance.versions(), choose_device().type
+        return fingerprint(*made, *machine, self.scene.fingerprint, self.frames)
 
     @property
     def name(self) -> str:

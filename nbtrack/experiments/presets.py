@@ -17,14 +17,7 @@ from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
 from nbtrack.machinery.errors import ConfigError, MissingError, check_lists, look_up
 from nbtrack.machinery.files import absolute
-from nbtrack.machinery.settings import (
-    flat,
-    limited,
-    one_of,
-    read_setting,
-    with_settings,
-    with_values,
-)
+from nbtrack.machinery.settings import flat, limited, one_of, with_settings, with_values
 from nbtrack.machinery.text_files import read_object
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.synthetic.make import MOTIONS
@@ -93,8 +86,8 @@ class Preset:
         """The whole tree, made once; and once more where a field or tracker is registered later."""
         return _merged(self, tuple(FIELDS.items()), tuple(TRACKERS.items()))
 
-    def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values in the types of their settings; ConfigError for a key or value not allowed."""
+    def with_values(self, values: Mapping[str, Any]) -> "Preset":
+        """The preset with a user's values, by dotted keys. Raises ConfigError for wrong ones."""
         tree = PRESETS[self.name].settings
         for key in values:
             part, *names = key.split(".")
@@ -103,17 +96,12 @@ class Preset:
                 # First the field or tracker: of whole keys the nearest may belong to another one.
                 look_up(f"config key, {part} of", names[0], known)
         checked = flat(with_values(tree, values))
-        return {key: checked[key] for key in values}
-
-    def with_values(self, values: Mapping[str, Any]) -> "Preset":
-        """The preset with a user's values, by dotted keys. Raises ConfigError for wrong ones."""
-        chosen = dict(self.chosen) | self._checked(values)
+        chosen = dict(self.chosen) | {key: checked[key] for key in values}
         return replace(self, chosen=tuple(sorted(chosen.items())))
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
         """The preset with the `key=value` texts of a method, over which a user's values win."""
-        values = {key: value for text in settings for key, value in read_setting(text).items()}
-        of_method = dict(self.of_method) | self._checked(values)
+        of_method = dict(self.of_method) | dict(with_settings(PRESETS[self.name], *settings).chosen)
         return replace(self, of_method=tuple(sorted(of_method.items())))
 
     @property

@@ -63,11 +63,10 @@ class TrackJob(Job):
         """A digest of code, map, tracker, budget, frames, seed; by the clock, machine, threads."""
         code = provenance.code_fingerprint(tracker_class(self.tracker))  # the field's: in the map's
         clock = self.rate_hz, device_name(choose_device()), torch.get_num_threads()
+        how = self.tracker, self.settings, self.start, self.frames, self.seed
         budget = self.steps if self.rate_hz is None else clock
-        parts = [code, provenance.versions(), self.needs.key]
-        parts += [self.tracker, self.settings, budget, self.start]
-        parts += [self.frames, self.seed, self.scene.fingerprint]
-        return files.fingerprint(*parts)
+        made = self.needs.key, self.scene.fingerprint, code, provenance.versions()
+        return files.fingerprint(*how, budget, *made)
 
     @property
     def name(self) -> str:
@@ -103,13 +102,9 @@ class TrackJob(Job):
         """What `reach_metrics` will say of the run; empty by the clock, where steps are unknown."""
         if self.steps is not None:
             with contextlib.suppress(NbtrackError):  # the run itself will say what is wrong
-                return self._reach(self.steps, map_unit(self.needs), self._true_path())
+                reach = self.settings.reach(self.steps, map_unit(self.needs))
+                return reach_metrics(reach, self._true_path(), self.settings.motion_model)
         return {}
-
-    def _reach(self, steps: float, unit_m: float, T_true: Poses) -> dict[str, float]:
-        """`reach_metrics` of so many steps a frame along a path (m), in a map of this unit."""
-        reach = self.settings.reach(steps, unit_m)
-        return reach_metrics(reach, T_true, self.settings.motion_model)
 
     def result(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""
@@ -136,10 +131,8 @@ class TrackJob(Job):
         T_first = sequence.T_world_camera[0]
         is_known = self._starts_at(T_first)
         T_start = T_first if is_known else np.eye(4)
-        budget = make_budget(self.steps, self.rate_hz)
-        tracker = make_tracker(
-            self.tracker, finished.field, T_start, budget, self.settings, self.seed
-        )
+        how = make_budget(self.steps, self.rate_hz), self.settings, self.seed
+        tracker = make_tracker(self.tracker, finished.field, T_start, *how)
         tracked = track_sequence(tracker, sequence, self.folder / RUN_FILE, tell, is_known)
         notes = self._notes(finished, sequence, tracked, warning)
         notes["device"] = device_name(tracker.device)  # LM and ICP run on the host
@@ -186,8 +179,9 @@ class TrackJob(Job):
             if warning == _OTHER_WORLD:
                 followed = replace(followed, T_world_camera=T_estimated)
             notes["outside_map_share"] = outside_map_share(finished.field, followed, T_estimated)
-        reach = self._reach(tracked.frames["steps"].mean(), unit_m, T_true)
-        return notes | still_metrics(T_true) | reach
+        reach = self.settings.reach(tracked.frames["steps"].mean(), unit_m)
+        reached = reach_metrics(reach, T_true, self.settings.motion_model)
+        return notes | still_metrics(T_true) | reached
 
     def _provenance(self, finished: Map) -> dict[str, Any]:
         """Where a run comes from: data, map, method, settings, machine; how to make it again."""
@@ -245,21 +239,20 @@ def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
     A kind is a tracker with its settings and steps. The line tells of the scene in which a greedy
     search with this reach has the largest ATE.
     """
-    behind: dict[tuple, dict[str, dict[str, float]]] = {}  # by kind of run, reaches by scene
-    for run in runs:
-        reach = run.expected_reach()
-        is_far_off = reach.get("greedy_ate_m", 0.0) > _GREEDY_ATE
-        if is_far_off or reach.get("beyond_reach_share", 0.0) > _SHARE:
-            behind.setdefault((run.tracker, run.settings, run.steps), {})[run.scene.name] = reach
-    for (tracker, settings, steps), reaches in behind.items():
-        scene, worst = max(reaches.items(), key=lambda pair: pair[1]["greedy_ate_m"])
-        others = f" (of {len(reaches)} scenes)" if len(reaches) > 1 else ""
+    reaches = [(run.scene.name, run.expected_reach(), run) for run in runs]
+    # Those whose true path is known, the worst last: of its kind it stays.
+    known = [reach for reach in reaches if "greedy_ate_m" in reach[1]]
+    known.sort(key=lambda reach: reach[1]["greedy_ate_m"])
+    kinds = {(run.tracker, run.settings, run.steps): (scene, r) for scene, r, run in known}
+    for (tracker, settings, steps), (scene, worst) in kinds.items():
+        if worst["greedy_ate_m"] <= _GREEDY_ATE and worst["beyond_reach_share"] <= _SHARE:
+            continue
         advice = "take more steps, a lower rate, "
         if settings.motion_model == "previous_pose":
             advice += f"--set tracking.{tracker}.motion_model=constant_velocity, "
         yield (
             f"{steps:g} steps of {tracker} move the camera by at most {1e3 * worst['reach_m']:.1f} "
             f"mm along an axis and {worst['reach_deg']:.2f} deg about it; it moves farther in "
-            f"{worst['beyond_reach_share']:.0%} of the frames of {scene}{others}, where a greedy "
+            f"{worst['beyond_reach_share']:.0%} of the frames of {scene}, where a greedy "
             f"follower has an ATE of {worst['greedy_ate_m']:.3f} m: {advice}or --method corrected"
         )

@@ -23,11 +23,12 @@ DEATHS = ("BrokenProcessPool", "KilledWorker")
 
 
 class Workplace(NamedTuple):
-    """Executors, each for one call at a time."""
+    """Executors for one call at a time; one whose process died is not used again."""
 
-    executors: list[Executor]
-    replaced: Callable[[Executor], Executor]  # what takes the place of one whose process died
+    begin: Callable[[], Executor]
+    n_calls: int  # at a time
     n_threads: int  # of each call
+    idle: list[Executor]  # those begun that have no call
 
 
 @contextlib.contextmanager
@@ -41,7 +42,7 @@ def processes(number: int) -> Iterator[Workplace]:
     theirs, ours = context.Pipe(duplex=False)
     with contextlib.ExitStack() as stack, ours:
 
-        def begin(died: Executor | None = None) -> Executor:
+        def begin() -> Executor:
             # One process each: where several share an executor, one that dies ends them all.
             executor = ProcessPoolExecutor(1, context, _end_with, (theirs,))
             stack.enter_context(executor)
@@ -49,8 +50,7 @@ def processes(number: int) -> Iterator[Workplace]:
                 executor.submit(int)  # a call that does nothing: the process is begun for it
             return executor
 
-        n_threads = max(1, torch.get_num_threads() // number)
-        yield Workplace([begin() for _ in range(number)], begin, n_threads)
+        yield Workplace(begin, number, max(1, torch.get_num_threads() // number), [])
 
 
 def _end_with(pipe: Connection) -> None:
@@ -101,6 +101,6 @@ def cluster(address: str, n_calls: int) -> Iterator[Workplace]:
         # Not pure: Dask would answer an equal call with the result of the earlier one.
         executor = client.get_executor(pure=False)
         try:
-            yield Workplace([executor] * n_calls, lambda died: died, n_threads=1)
+            yield Workplace(lambda: executor, n_calls, 1, [])
         finally:
             executor.shutdown(wait=False)  # after an error nothing waits for jobs that still run

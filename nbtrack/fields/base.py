@@ -21,7 +21,7 @@ from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.rendering import Rendering, Weights
 from nbtrack.machinery.device import usual_modes
 from nbtrack.machinery.inputs import check_points, checked_pose
-from nbtrack.machinery.settings import limited, may_be_zero
+from nbtrack.machinery.settings import MANY, limited
 
 # Minimum standard deviation (m) that a depth error is divided by: a perfectly sharp ray would
 # otherwise outweigh all others (our choice; depth noise is of this size).
@@ -52,7 +52,7 @@ class MappingSettings:
     n_surface: int = limited(12, 0, 1024)
     learning_rate: float = 1e-3  # Adam's, at the start; falls to a twentieth along a cosine (NeuS)
     lambda_color: float = 5.0  # iMAP's, whose depth errors are relative to their std
-    holdout_every: int = may_be_zero(10)  # every n-th frame is only scored
+    holdout_every: int = limited(10, 0, MANY)  # every n-th frame is only scored
     tf32: bool = False  # matrix products in TF32, on NVIDIA's GPUs
 
 

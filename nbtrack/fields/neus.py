@@ -42,9 +42,8 @@ class NeuSField(LearnedField):
     def __init__(self, network: NetworkSettings, bounds: SceneBounds, generator: Generator) -> None:
         super().__init__(bounds)
         self.mlp = self.make_network(network, generator)
-        self.variance = nn.Parameter(
-            torch.tensor(0.3, dtype=torch.float32)
-        )  # as NeuS's code starts: s = 20 / m
+        # As NeuS's code starts: s = 20 / m.
+        self.variance = nn.Parameter(torch.tensor(0.3, dtype=torch.float32))
         self._start_as_empty_room(generator)
 
     def make_network(self, settings: NetworkSettings, generator: Generator) -> nn.Module:

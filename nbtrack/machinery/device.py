@@ -106,23 +106,26 @@ def _changed(name: str, within: Any) -> Iterator[None]:
     """
     get, put = getattr(torch, f"get_{name}"), getattr(torch, f"set_{name}")
     before = get()
-    is_other = before != within
-    if is_other:
-        put(within)
+    if before == within:
+        yield
+        return
+    put(within)
     try:
         yield
     finally:
-        if is_other:
-            put(before)
+        put(before)
 
 
-def suitable_threads(width: int) -> contextlib.AbstractContextManager[None]:
-    """Run a block with the number of CPU threads that suits a network's width.
+@contextlib.contextmanager
+def suited_to(width: int, tf32: bool) -> Iterator[None]:
+    """Run a block with `matrix_products`, and the number of CPU threads that suits a network.
 
     Narrow networks get one, since sharing their small matrix products takes longer than it saves;
     wide ones get as many as the process already has.
     """
-    return threads(1 if width < _WIDTH_FOR_THREADS else torch.get_num_threads())
+    number = 1 if width < _WIDTH_FOR_THREADS else torch.get_num_threads()
+    with threads(number), matrix_products(tf32):
+        yield
 
 
 def has_room_for(device: torch.device, n_bytes: int) -> bool:
@@ -143,12 +146,11 @@ def advise_on_memory(setting: str) -> Iterator[None]:
     """
     try:
         yield
-    except OutOfMemory:
-        raise  # somebody nearer has named the setting
     except (RuntimeError, MemoryError) as error:
         # CUDA, the CPU's allocator and MPS say it in words.
         words = ("can't allocate memory", "not enough memory", "out of memory")
-        if not (isinstance(error, MemoryError) or any(word in str(error) for word in words)):
+        is_lack = isinstance(error, MemoryError) or any(word in str(error) for word in words)
+        if isinstance(error, OutOfMemory) or not is_lack:  # somebody nearer has named the setting
             raise
         advice = "lower it with --set, or take fewer frames, as with --frames ::2"
         kept = "what was finished is kept"

@@ -17,14 +17,9 @@ import numpy as np
 from nbtrack.machinery.errors import ConfigError, look_up
 
 Config = TypeVar("Config")
-_MANY = 1_000_000
+MANY = 1_000_000
 _DEEPEST = 10  # dots of a key, more than any has: what lies deeper is not taken apart
-_USUAL_LIMITS = {int: (1, _MANY), float: (0.0, _MANY)}
-
-
-def may_be_zero(default: int) -> Any:
-    """A dataclass field with a count that may also be 0."""
-    return limited(default, 0, _MANY)
+_USUAL_LIMITS = {int: (1, MANY), float: (0.0, MANY)}
 
 
 def limited(default: float | tuple, minimum: float, maximum: float) -> Any:
@@ -150,10 +145,8 @@ def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
             raise ConfigError(f"{key} = []: give at least one, for example {list(old)}")
         return tuple(_converted(key, old[0], part, allowed) if old else part for part in values)
     # Integers of TOML may be too large for a float, or to be printed.
-    if type(value) is int and value.bit_length() > 10_000:
-        value = math.inf
-    if wanted is float and type(value) is int and abs(value) < 1e300:
-        value = float(value)
+    if type(value) is int and (wanted is float or abs(value) > 1e300):
+        value = float(value) if abs(value) < 1e300 else math.inf
     if type(value) is not wanted or (wanted is str and "\0" in value):
         raise ConfigError(f"{key} = {value!r}: it must be {wanted.__name__}, for example {old!r}")
     limits = allowed.get("limits", _USUAL_LIMITS.get(wanted))

@@ -15,13 +15,7 @@ from nbtrack.core.arrays import Frames
 from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import LearnedField, MappingSettings, field_class, make_field
-from nbtrack.machinery.device import (
-    advise_on_memory,
-    device_name,
-    matrix_products,
-    suitable_threads,
-    usual_modes,
-)
+from nbtrack.machinery.device import advise_on_memory, device_name, suited_to, threads, usual_modes
 from nbtrack.machinery.errors import ConfigError, NumericalError
 from nbtrack.machinery.files import Checkpoint
 from nbtrack.machinery.launches import Recording, make_adam
@@ -72,9 +66,9 @@ def map_sequence(
     mapped, _ = split_holdout(len(sequence), settings.holdout_every)
     if issubclass(kind, LearnedField):
         with advise_on_memory(f"mapping.{field_name}.n_rays={settings.n_rays}"):
-            with suitable_threads(width=0):  # one: sums, and so the start, depend on their number
+            with threads(1):  # sums, and so the start, depend on their number
                 field = make_field(field_name, network, bounds, seed).to(device or _CPU)
-            with suitable_threads(field.width), matrix_products(settings.tf32):
+            with suited_to(field.width, settings.tf32):
                 fit = _Fit(recipe | {"code": code}, settings, field, sequence, mapped)
                 fit.run(checkpoint, on_iteration)
         history, seconds = fit.history, fit.seconds

@@ -13,7 +13,7 @@ import torch
 from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
 from nbtrack.data.frame import Frame
 from nbtrack.fields import FIELDS, Field, LearnedField
-from nbtrack.machinery.device import matrix_products, suitable_threads, synchronize, usual_modes
+from nbtrack.machinery.device import suited_to, synchronize, usual_modes
 from nbtrack.machinery.errors import ConfigError, MissingError, NumericalError
 from nbtrack.machinery.inputs import checked_pose
 from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
@@ -147,7 +147,7 @@ class Tracker(abc.ABC):
         T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
         estimate = Estimate(T_starts[0], without_depth=True)
         if self.copes_without_depth or frame.has_depth:
-            with suitable_threads(self.field.width), matrix_products(self.settings.tf32):
+            with suited_to(self.field.width, self.settings.tf32):
                 estimate = self._search(frame, T_starts, budget or self.budget)
         self.estimates.append(estimate.T_world_camera.copy())  # the user may change the original
         return estimate
