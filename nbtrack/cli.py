@@ -23,11 +23,7 @@ def a_path(text: str) -> Path:
     """A path, with `~` expanded. An empty text is refused: it would mean the working folder."""
     if not text.strip():
         raise argparse.ArgumentTypeError("the path is empty")
-    try:
-        return Path(text).expanduser()
-    except RuntimeError:
-        advice = f"a folder of this name is ./{text}"
-        raise argparse.ArgumentTypeError(f"{text!r}: there is no such user; {advice}") from None
+    return Path(os.path.expanduser(text))  # of no such user: as it is, and refused where it is used
 
 
 def a_count(text: str, minimum: int = 1, maximum: int = _MAX_COUNT) -> int:

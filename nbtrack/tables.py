@@ -261,11 +261,10 @@ def write_tables(
     The arguments are those of `table_1`, `table_2`, `latex_file` and `style_table_2`. Table II is
     always measured by the clock and may have a note of its own.
     """
-    paths = write_table_1(folder, results, note, own)
     styled = style_table_2(steps, default_pixels=default_pixels)
-    paths += _write_table(folder / "table_2", steps, styled, steps_note or note, own)
     compared = beside(table_2(steps), table_2(published_table_2()))
-    return [*paths, write_csv(folder / "table_2_vs_paper.csv", compared, index=True)]
+    second = folder / "table_2", steps, styled, steps_note or note, own, compared
+    return write_table_1(folder, results, note, own) + _write_table(*second)
 
 
 def write_table_1(
@@ -273,9 +272,7 @@ def write_table_1(
 ) -> list[Path]:
     """Writes Table I alone as CSV, LaTeX, and beside the paper's; see `write_tables`."""
     cells, styled = average_over_seeds(results), style_table_1(results)
-    paths = _write_table(folder / "table_1", cells, styled, note, own)
-    compared = beside_published(results)
-    return [*paths, write_csv(folder / "table_1_vs_paper.csv", compared, index=True)]
+    return _write_table(folder / "table_1", cells, styled, note, own, beside_published(results))
 
 
 def write_table_3(
@@ -288,12 +285,14 @@ def write_table_3(
 
 
 def _write_table(
-    stem: Path, cells: pd.DataFrame, styler: TableStyler, note: str, own: Wording
+    stem: Path, cells: pd.DataFrame, styler: TableStyler, note: str, own: Wording, *compared: Any
 ) -> list[Path]:
-    """Write a table in long form as CSV and its styled form as LaTeX; returns both paths."""
+    """Write a table in long form as CSV, styled as LaTeX, and compared, if it is; their paths."""
     path = stem.with_suffix(".tex")
     write_atomic(path, latex_file(styler, path, note, own))
-    return [write_csv(stem.with_suffix(".csv"), cells), path]
+    beside_it = stem.with_name(f"{stem.name}_vs_paper.csv")
+    paths = [write_csv(beside_it, table, index=True) for table in compared]
+    return [write_csv(stem.with_suffix(".csv"), cells), path, *paths]
 
 
 def write_csv(path: Path, table: pd.DataFrame, **options: Any) -> Path:

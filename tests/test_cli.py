@@ -18,9 +18,9 @@ from tiny import tiny_words
 
 from nbtrack import load_preset, open_scene, read_map
 from nbtrack.cli import COMMANDS, main
-from nbtrack.machinery import files
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import naming_damaged, runs_folder
+from nbtrack.machinery.inputs import read_object
 from nbtrack.recordings.pose_files import read_tum
 from nbtrack.recordings.recording import open_recording
 
@@ -201,7 +201,7 @@ def test_names_that_are_no_text(tmp_path: Path, monkeypatch, capsys) -> None:
     assert main(["data", "check", folder, "--out", run]) == 0
     assert (tmp_path / run / "check.png").is_file()
     metrics = tmp_path / run / "metrics.json"
-    command = files.read_json(metrics)["command"]
+    command = read_object(metrics)["command"]
     assert folder in command
     assert f"--map-from={tmp_path / out}" in command  # it runs from any folder
     assert json.loads(metrics.read_bytes().decode())  # UTF-8

@@ -26,7 +26,7 @@ from nbtrack.beyond.points import PointMapping
 from nbtrack.checks.in_map import check_belongs
 from nbtrack.cli import main
 from nbtrack.core.bounds import SceneBounds
-from nbtrack.experiments.output import MARK
+from nbtrack.experiments.runs import MARK
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.machinery.files import digest_of

@@ -24,7 +24,7 @@ from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.experiments.output import save_picture
+from nbtrack.experiments.runs import save_picture
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.plots.idea import plot_idea
 from nbtrack.plots.movie import view_of

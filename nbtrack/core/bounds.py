@@ -24,8 +24,7 @@ class SceneBounds:
         low, high = (tuple(map(float, corner)) for corner in (self.minimum, self.maximum))
         unit = 1.0 if self.declared_unit is None else self.declared_unit
         if len(low) != 3 or not all(0 < x < np.inf for x in (*np.subtract(high, low), unit)):
-            advice = "give x, y, z (m) of the minimum, then those of the maximum, all larger"
-            raise ConfigError(f"{self} are no bounds: {advice}")
+            raise ConfigError(f"{self} are no bounds: give (x, y, z) twice, the second larger")
         object.__setattr__(self, "minimum", low)
         object.__setattr__(self, "maximum", high)
 

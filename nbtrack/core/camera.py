@@ -12,7 +12,7 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from nbtrack.machinery.errors import ConfigError
-from nbtrack.machinery.settings import whole_number
+from nbtrack.machinery.inputs import whole_number
 
 
 @dataclass(frozen=True)

@@ -105,9 +105,8 @@ def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
         points_camera, _ = frame.points(*frame.measured_pixels(stride, stride // 2))
         clouds.append(points_camera.numpy() @ T[:3, :3].T + T[:3, 3])
     points_world = np.concatenate(clouds)
-    if len(points_world) == 0:
-        found = f"no pixel of {sequence.name} has a depth, of one in {stride**2}"
-        raise DataError(f"{found}: check its files")
+    if not len(points_world):
+        raise DataError(f"no pixel of {sequence.name} has a depth, of one in {stride**2}: check it")
     positions = sequence.T_world_camera[:, :3, 3]
     low, high = np.quantile(points_world, [_CUT_OFF, 1 - _CUT_OFF], axis=0)
     low = np.minimum(low, positions.min(axis=0)) - margin

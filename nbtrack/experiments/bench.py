@@ -13,8 +13,8 @@ from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.frame import Frame
 from nbtrack.experiments.grid import Execution, map_scene, track_scenes
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
-from nbtrack.experiments.output import prepare
 from nbtrack.experiments.presets import PRESETS, Preset, load_preset
+from nbtrack.experiments.runs import prepare
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.latex import Wording, label_of
 from nbtrack.machinery.device import advise_on_memory, choose_device, device_name
@@ -53,11 +53,9 @@ def tables_command(options: Namespace) -> None:
     wording = Wording(options.caption, options.label, dict(map(_label_of, preset.scenes.labels)))
     prepare(options.out)
     results = _fill_tables(options, preset, methods, execution, wording)
-    failed = results[results["failure"] != ""]
-    if len(failed):
-        first, why = failed.iloc[0][["run", "failure"]]
-        cells = f"{len(failed)} cells of the table failed and are empty, the first of them {first}"
-        raise NbtrackError(f"{cells}: {why}; mend the cause and run again, the rest is kept")
+    if failed := [*filter(None, results["failure"])]:
+        found = f"{len(failed)} cells of the table failed and are empty, the first because"
+        raise NbtrackError(f"{found} {failed[0]}; mend the cause and run again, the rest is kept")
 
 
 def _fill_tables(
@@ -69,11 +67,9 @@ def _fill_tables(
     """
     clock = options.budget == "clock"
     scenes = open_scenes(preset)
-    results = track_scenes(
-        # Without rates of its own a table has those of the preset.
-        scenes, methods, preset, RATES_3_HZ if options.beyond else None, clock=clock,
-        seeds=range(options.seeds), execution=execution,
-    )  # fmt: skip
+    rates = RATES_3_HZ if options.beyond else None  # those of the preset
+    how = {"clock": clock, "seeds": range(options.seeds), "execution": execution}
+    results = track_scenes(scenes, methods, preset, rates, **how)
     shown = results.drop(columns="still_ate_m", errors="ignore") if options.no_still else results
     name = f"{preset.name}_clock" if clock else preset.name
     folder = options.out or runs_folder() / "tables" / name
@@ -148,12 +144,12 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     plan = [(m, n) for m in firsts.values() for n in pixels.get(m.tracker, pixels["sdf"])]
     has_pose = np.flatnonzero(scene.recording.has_pose)
     frame = read_frames(scene.recording, has_pose[:1])[0]
-    rows = []
+    columns, rows = ["tracker", "n_pixels", "budget_ms", "steps", "steps_std", "converged"], []
     with ProgressBar("Table II", len(plan)) as bar:
         for done, (method, n_pixels) in enumerate(plan):
             name = method.tracker
-            own = preset.with_method(method.settings)
             bar.move_to(done, f"{name}={n_pixels}")
+            own = preset.with_method(method.settings)
             settings = replace(own.tracking_of(name), n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
                 field = map_scene(scene, method.field, own).field
@@ -161,10 +157,9 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
                 tracker = make_tracker(name, field, frame.T_world_camera, StepBudget(1), settings)
                 for budget_ms in preset.tables.budgets_ms:
                     counts, converged = _steps_within(tracker, frame, budget_ms)
-                    mean, std = float(np.mean(counts)), float(np.std(counts))
-                    rows.append((name.upper(), n_pixels, budget_ms, mean, std, converged))
+                    found = float(np.mean(counts)), float(np.std(counts)), converged
+                    rows.append((name.upper(), n_pixels, budget_ms, *found))
         bar.move_to(len(plan))
-    columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_std", "converged"]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -196,11 +191,11 @@ def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]
 def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
     """For captions: how the camera of some runs moves, and its mean motion from frame to frame."""
     are_rooms = set(preset.scenes.names) <= set(ROOMS)
-    kind = f"{preset.scenes.motion} motion" if are_rooms else "recorded motion"
+    kind = f"Camera: {preset.scenes.motion if are_rooms else 'recorded'} motion"
     if "path_m" not in results:
-        return f"Camera: {kind}"
+        return kind
     motion_mm = 1e3 * (results["path_m"] / results["frames"]).mean()
-    return f"Camera: {kind}, {motion_mm:.1f} mm a frame"
+    return f"{kind}, {motion_mm:.1f} mm a frame"
 
 
 def _note(preset: Preset, clock: bool) -> str:

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from nbtrack.checks.check import check_recording, quick_warning
-from nbtrack.experiments import output
+from nbtrack.experiments import runs
 from nbtrack.experiments.exports import draw_overview
 from nbtrack.experiments.jobs import run_jobs
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import DEFAULT_METHOD, TABLE_1, method_of
 from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
-from nbtrack.experiments.runs import METRICS_FILE
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.machinery.errors import ConfigError, DataError
@@ -53,11 +52,11 @@ def map_command(options: Namespace) -> None:
     scene = _opened(options, preset)
     scene.select(options.frames)  # raises for a wrong slice, before anything is written
     job = MapJob.of(scene, method.field, preset, options.frames, options.seed)
-    output.prepare(options.out)
+    runs.prepare(options.out)
     _make_map(job)
     finished = job.map()
     _write_mesh(job, finished)
-    folder = output.deliver(job.folder, output.FILES_OF_MAP, options.out)
+    folder = runs.deliver(job.folder, runs.FILES_OF_MAP, options.out)
     print(f"{folder}: {finished.field.label} map of {scene.name}")
     print(f"  mapped in {finished.record['seconds']:.0f} s on {finished.record['device']}")
     for name, value in finished.record["quality"].items():
@@ -97,22 +96,19 @@ def track_command(options: Namespace) -> None:
     if not given:
         job = MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
         scene.select(job.frames)  # raises for a wrong slice
-    run = TrackJob(
-        job, scene, method.tracker, preset.tracking_of(method.tracker),
-        steps=steps, rate_hz=options.rate, frames=options.frames, seed=options.seed,
-        start=options.start,
-    )  # fmt: skip
+    how = steps, options.rate, options.frames, options.seed, options.start
+    run = TrackJob(job, scene, method.tracker, preset.tracking_of(method.tracker), *how)
     run.check()
     for warning in reach_warnings([run]):
         tell(f"nbtrack: warning: {warning}")
-    output.prepare(options.out)
+    runs.prepare(options.out)
     if not given:
         _make_map(job)
     # A finished run is made anew: recording and map may lie elsewhere now, and its times change.
-    (run.folder / METRICS_FILE).unlink(missing_ok=True)
+    (run.folder / runs.METRICS_FILE).unlink(missing_ok=True)
     (metrics,) = run_jobs([run])
     draw_overview(run)
-    folder = output.deliver(run.folder, output.FILES_OF_RUN, options.out)
+    folder = runs.deliver(run.folder, runs.FILES_OF_RUN, options.out)
     print(f"{scene.name}: {method.tracker} in {job.map().field.label}, {metrics['frames']} frames")
     for line in _summary(metrics):
         print(f"  {line}")
@@ -165,17 +161,14 @@ def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -
     if options.map_frames:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
     if field != made:
-        advice = "leave --method and --field out"
-        raise ConfigError(f"{options.map_from} is a map of field {made!r}, not {field!r}: {advice}")
+        raise ConfigError(f"{options.map_from} is a map of {made!r}, not {field!r}: leave that out")
     known, wanted = flat(given.setting_tree), flat(preset.settings)
     asked = {key for text in options.settings for key in read_setting(text)}
     asked |= {f"correction.{made}"} if options.method else set()  # methods say it, or none
     for key in sorted(asked & known.keys()):  # no map has the others, as those of a tracker
         if known[key] != wanted[key]:
-            what = (
-                f"{options.map_from} was made with {key}={known[key]}, not {wanted[key]} as asked"
-            )
-            raise ConfigError(f"{what}: leave --set and --method out, or map anew")
+            what = f"{options.map_from} was made with {key}={known[key]}, not {wanted[key]}"
+            raise ConfigError(f"{what} as asked: leave --set and --method out, or map anew")
 
 
 def _make_map(job: MapJob) -> None:
@@ -191,7 +184,7 @@ def _make_map(job: MapJob) -> None:
 def make_command(options: Namespace) -> None:
     """Write a synthetic room as a sequence folder."""
     config = with_values(ScenesConfig(), {name: getattr(options, name) for name in SIZES})
-    output.check_no_recording(options.out)
+    runs.check_no_recording(options.out)
     write_room(options.room, options.out, config)
     print(f"{options.out}: {options.room}, {options.n_frames} frames, seed {options.seed}")
 
@@ -201,7 +194,7 @@ def check_command(options: Namespace) -> int:
 
     Returns the exit status: 1 where it is wrong.
     """
-    output.prepare(options.out)
+    runs.prepare(options.out)
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     report = check_recording(recording)
     if options.out:
@@ -209,8 +202,8 @@ def check_command(options: Namespace) -> int:
         apart_mm = 1e3 * own.apart * own.depth_m  # as the recording's files are declared
         title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart in the mean"
         figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)
-        output.save_picture(figure, options.out / output.CHECK_FILE)
-        print(f"picture: {options.out / output.CHECK_FILE}")
+        runs.save_picture(figure, options.out / runs.CHECK_FILE)
+        print(f"picture: {options.out / runs.CHECK_FILE}")
     print(report)  # its verdict comes last
     return int(bool(report.faults))
 
@@ -218,7 +211,7 @@ def check_command(options: Namespace) -> int:
 def convert_command(options: Namespace) -> None:
     """Write a recording in the Neural RGB-D layout; print what became of it."""
     frames = reading.parse_frames(options.frames)
-    output.check_no_recording(options.out)
+    runs.check_no_recording(options.out)
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     print(convert_sequence(recording, options.out, frames))
 

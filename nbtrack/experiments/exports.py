@@ -11,8 +11,7 @@ import trimesh
 
 from nbtrack.beyond.points import PointCloud
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.experiments import output
-from nbtrack.experiments.runs import METRICS_FILE, read_trajectory
+from nbtrack.experiments import runs
 from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.machinery.files import naming_damaged, write_atomic
@@ -33,7 +32,7 @@ _MOVIE_FRAMES = 100  # at most, evenly spread over a run
 
 def draw_overview(run: TrackJob) -> None:
     """Draw a finished run beside its files: the path in what was seen of the map, from above."""
-    tracked = read_trajectory(run.folder)
+    tracked = runs.read_trajectory(run.folder)
     field, metrics, n_frames = run.needs.map().field, tracked.metrics, len(tracked.frames)
     shown = np.arange(0, n_frames, max(1, n_frames // _FRAMES_SHOWN))
     try:
@@ -52,7 +51,7 @@ def draw_overview(run: TrackJob) -> None:
         paths["true"] = shifted(tracked.T_true[is_known], origin)
     paths["tracked"] = shifted(tracked.T_estimated, origin)
     figure = plot_overview(cloud_of(surface), paths, tracked.frames, title)
-    output.save_picture(figure, run.folder / output.OVERVIEW_FILE, dpi=120)  # 1080 pixels wide
+    runs.save_picture(figure, run.folder / runs.OVERVIEW_FILE, dpi=120)  # 1080 pixels wide
 
 
 def _seen(tracked: Trajectory, rows: np.ndarray, recording: Recording) -> RgbdSequence:
@@ -70,7 +69,7 @@ def _surface(field: Any, seen: RgbdSequence, n_cells: int) -> Any:
 def export_command(options: Namespace) -> None:
     """Write a run or a map in another format, and print what was written."""
     export = look_up("format", options.to, _EXPORTS)
-    output.check_no_recording(options.out)
+    runs.check_no_recording(options.out)
     if options.out.exists():
         raise ConfigError(f"{options.out} exists: choose another file to write, or remove it first")
     content, summary = export(options.source, options.to)
@@ -80,8 +79,8 @@ def export_command(options: Namespace) -> None:
 
 def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
     """A map, or that of a run, as a coloured mesh: of what was seen, if that mesh is beside it."""
-    if (source / METRICS_FILE).is_file():
-        finished, source = _map_of(read_trajectory(source))
+    if (source / runs.METRICS_FILE).is_file():
+        finished, source = _map_of(runs.read_trajectory(source))
     else:
         finished = read_map(source)
     seen = source / MESH_FILE
@@ -109,7 +108,7 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
     """A run as a movie or for Rerun. Its recording and map must lie where they did in tracking."""
     if format_name == "rrd" and importlib.util.find_spec("rerun") is None:
         raise MissingError("--to rrd needs Rerun: pip install 'nbtrack[rerun]'")
-    tracked = read_trajectory(source)
+    tracked = runs.read_trajectory(source)
     metrics, n_frames = tracked.metrics, len(tracked.frames)
     stored, _ = _map_of(tracked)
     shown = np.unique(np.linspace(0, n_frames - 1, _MOVIE_FRAMES).round().astype(int))
@@ -130,11 +129,10 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
 
 def _export_trajectory(source: Path, format_name: str) -> tuple[str, str]:
     """The tracked poses of a run in KITTI's format, the only one of trajectories."""
-    n_poses = len(read_trajectory(source).frames)  # raises for what is no run
+    n_poses = len(runs.read_trajectory(source).frames)  # raises for what is no run
     _, T_world_camera = read_tum(source / "trajectory.txt")  # m, in the recording's world
-    what = "KITTI: three rows of the matrix (m), no time stamps"
-    given = "the first frame's, which was given, is not among them"
-    return number_lines(T_world_camera[:, :3].reshape(-1, 12)), f"{n_poses} poses, {what}; {given}"
+    summary = f"{n_poses} poses, without a first one that was given, as three rows of numbers (m)"
+    return number_lines(T_world_camera[:, :3].reshape(-1, 12)), summary
 
 
 _EXPORTS = {"kitti": _export_trajectory, "ply": _export_map, "glb": _export_map}

@@ -79,10 +79,10 @@ def track_scenes(
         own = preset.with_method(method.settings)
         settings = own.tracking_of(method.tracker)
         n_steps = steps if rate_hz is None or clock else method.paper_steps(rate_hz)
-        clock_hz = rate_hz if clock else None  # whose number of steps is None
-        make_budget(n_steps, clock_hz)  # raises for a wrong number, before anything is made
+        budget = n_steps, rate_hz if clock else None  # by the clock the number of steps is None
+        make_budget(*budget)  # raises for a wrong number, before anything is made
         made = MapJob.of(scene, method.field, own, seed=seed)
-        job = TrackJob(made, seen, method.tracker, settings, n_steps, clock_hz, frames, made.seed)
+        job = TrackJob(made, seen, method.tracker, settings, *budget, frames, made.seed)
         jobs.append(job)
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
         rows.append(row | {"seed": seed, "run": job.folder.name, "n_pixels": settings.n_pixels})
@@ -104,8 +104,7 @@ def _rates(usual_hz: Sequence, rates_hz: Sequence | None, steps: Any, clock: boo
     rates = usual_hz if rates_hz is None else rates_hz
     check_lists(at_least=1, rates_hz=rates)
     if steps is not None and (rates_hz is not None or clock):
-        advice = "a frame has one budget; leave steps, or rates_hz and clock, out"
-        raise ConfigError(f"steps={steps} beside rates_hz={rates_hz}, clock={clock}: {advice}")
+        raise ConfigError(f"steps={steps} beside rates_hz={rates_hz}, clock={clock}: leave one out")
     return np.asarray(rates).tolist() if steps is None else [None]  # Python's numbers, not numpy's
 
 
@@ -115,11 +114,10 @@ def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[
     The row's own values win over metrics of the same name: its scene is the mapped one, that of the
     metrics the tracked one.
     """
-    if isinstance(result, NbtrackError):
-        return {**row, "failure": str(result), "ate_m": float("nan")}
-    # Without the metrics that are dictionaries.
-    metrics = {k: v for k, v in result.items() if k not in ("config", "map_record", "versions")}
-    return {**metrics, **row, "failure": "", "ate_m": result.get("ate_rmse_m", float("nan"))}
+    failed = isinstance(result, NbtrackError)
+    metrics = {} if failed else {k: v for k, v in result.items() if not isinstance(v, dict)}
+    ate_m = metrics.get("ate_rmse_m", float("nan"))
+    return {**metrics, **row, "failure": str(result) if failed else "", "ate_m": ate_m}
 
 
 def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:
@@ -130,8 +128,6 @@ def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[An
     missing = [job for job in jobs if not job.is_done]
     for job in missing:
         job.scene.select(job.frames, needs_poses=False)  # raises before anything is mapped
-    if 0 < len(missing) < len(jobs):
-        tell(f"{len(jobs) - len(missing)} of {len(jobs)} runs are cached")
     for warning in reach_warnings(missing):
         tell(f"nbtrack: warning: {warning}")
     if clock:

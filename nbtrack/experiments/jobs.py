@@ -19,7 +19,7 @@ from typing import Any
 
 import cloudpickle
 
-from nbtrack.experiments.output import check_no_recording
+from nbtrack.experiments.runs import check_no_recording
 from nbtrack.experiments.workers import DEATHS, Workplace, cluster, processes
 from nbtrack.fields import FIELDS
 from nbtrack.machinery import device

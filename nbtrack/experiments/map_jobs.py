@@ -19,7 +19,7 @@ from nbtrack.experiments.scenes import Scene
 from nbtrack.fields import FIELDS, field_class
 from nbtrack.machinery.device import choose_device
 from nbtrack.machinery.files import absolute, fingerprint
-from nbtrack.machinery.settings import whole_number
+from nbtrack.machinery.inputs import whole_number
 from nbtrack.mapping.files import CHECKPOINT_FILE, HISTORY_FILE, MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.plots.scene import up_of

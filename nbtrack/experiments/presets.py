@@ -17,8 +17,8 @@ from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
 from nbtrack.machinery.errors import ConfigError, MissingError, check_lists, look_up
 from nbtrack.machinery.files import absolute
+from nbtrack.machinery.inputs import read_object
 from nbtrack.machinery.settings import flat, limited, one_of, with_settings, with_values
-from nbtrack.machinery.text_files import read_object
 from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.synthetic.make import MOTIONS
 from nbtrack.tables import PAPER_PIXELS
@@ -231,8 +231,7 @@ def load_preset(
     try:
         before = shlex.split(os.environ.get("NBTRACK_SET", ""))
     except ValueError as error:
-        advice = "quote each setting as in a shell"
-        raise ConfigError(f"NBTRACK_SET cannot be split ({error}): {advice}") from None
+        raise ConfigError(f"NBTRACK_SET cannot be split ({error}): quote as in a shell") from None
     # The method comes last here, but what the user has chosen wins over it.
     return with_settings(preset, *before, *settings).with_method(of_method)
 

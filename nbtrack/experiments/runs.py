@@ -1,20 +1,89 @@
-"""Finished runs: their scores, the files of their folders, and means of errors over rooms."""
+"""Results on disk: where commands may write, the files of finished runs, and means over rooms.
 
+Nothing is written into a recording, and nothing over files that nbtrack did not write.
+"""
+
+import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 from scipy.special import ndtri, stdtrit
 
 from nbtrack.beyond.verdict import score_detection
 from nbtrack.machinery import files
-from nbtrack.machinery.errors import MissingError
+from nbtrack.machinery.errors import ConfigError, MissingError
+from nbtrack.machinery.inputs import read_object
+from nbtrack.mapping.files import HISTORY_FILE, MAP_FILE, MESH_FILE
+from nbtrack.plots.style import in_house_style
+from nbtrack.recordings.formats import holds_recording
 from nbtrack.recordings.pose_files import read_tum, shifted, tum_text
 from nbtrack.tracking.metrics import trajectory_metrics
 from nbtrack.tracking.trajectories import Trajectory
 
 METRICS_FILE = "metrics.json"  # written last: where it stands, a run is complete
+OVERVIEW_FILE = "overview.png"
+CHECK_FILE = "check.png"
+MARK = ".nbtrack"
+"""An empty file in every folder given with --out, where nbtrack may replace its results."""
+# The last one of each tells that the others are there.
+FILES_OF_RUN = ("trajectory.txt", "groundtruth.txt", "frames.csv", OVERVIEW_FILE, METRICS_FILE)
+FILES_OF_MAP = (HISTORY_FILE, MESH_FILE, MAP_FILE)
+_RESULTS = (*FILES_OF_RUN, *FILES_OF_MAP, CHECK_FILE, "table_[123]*")
+
+
+def is_own_output(folder: Path) -> bool:
+    """Whether nbtrack has written results into a folder."""
+    return (folder / MARK).exists()
+
+
+def prepare(folder: Path | None) -> None:
+    """Mark a folder, before the work, as one for nbtrack's results. For None nothing is done.
+
+    Raises ConfigError where it holds a recording, or files of somebody else that are named like
+    results; OSError where nothing can be written.
+    """
+    if folder is None:
+        return
+    check_no_recording(folder)
+    foreign = [path.name for name in _RESULTS for path in sorted(folder.glob(name))]
+    if foreign and not is_own_output(folder):
+        raise ConfigError(f"{folder} has a {foreign[0]} that may not be nbtrack's: move it away")
+    files.write_atomic(folder / MARK, "")
+
+
+def deliver(cached: Path, names: Sequence[str], folder: Path | None) -> Path:
+    """Copy a result's files from the cache to a folder, if one is given.
+
+    Returns the folder where the result then is. A file that an earlier result left there, and that
+    this one lacks, is removed. The last of `names` is written last, as the sign that all are there.
+    """
+    if folder is None:
+        return cached
+    contents = {}
+    for name in names:
+        path = cached / name
+        contents[name] = path.read_bytes() if path.is_file() else None
+    files.write_together(folder, contents)
+    return folder
+
+
+def check_no_recording(path: Path) -> None:
+    """Raises ConfigError if a path that is to be written is a recording, or lies within one."""
+    for folder in (path, *files.resolved(path).parents):
+        if folder.is_dir() and holds_recording(folder):
+            raise ConfigError(f"{folder} holds a recording, where nothing is written: take another")
+
+
+def save_picture(figure: Figure, path: Path, dpi: float | str = "figure") -> None:
+    """Writes a figure as a PNG, by default with the dots per inch of the figure itself."""
+    content = io.BytesIO()
+    with in_house_style():
+        figure.savefig(content, dpi=dpi)
+    files.write_atomic(path, content.getvalue())
 
 
 def write_run(folder: Path, run: Trajectory) -> None:
@@ -50,7 +119,7 @@ def read_trajectory(folder: Path) -> Trajectory:
     if truth.is_file():
         times_known, T_known = read_tum(truth)
         T_true[np.searchsorted(times, times_known)] = T_known  # in the rows of the same times
-    metrics = files.read_json(folder / METRICS_FILE)
+    metrics = read_object(folder / METRICS_FILE)
     with files.naming_damaged(folder / "frames.csv", "table of frames", "track again"):
         frames = pd.read_csv(folder / "frames.csv")
         if len(frames) != len(T_estimated):

@@ -8,8 +8,8 @@ from typing import Any
 from nbtrack.core.arrays import Frames
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.experiments.output import check_no_recording, is_own_output
 from nbtrack.experiments.presets import Preset, ScenesConfig
+from nbtrack.experiments.runs import check_no_recording, is_own_output
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError, nearest_name
 from nbtrack.machinery.files import absolute, data_folder, fingerprint, locked, runs_folder
 from nbtrack.machinery.progress import ProgressBar, tell
@@ -80,11 +80,10 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
         downloaded = data_folder() / text
         if downloaded.is_dir():
             return Scene(text, downloaded, format)
-        how = f"`nbtrack data fetch {text}` brings it (data/README.md)"
-        advice = f"{how}, or use a room, which needs no download: {', '.join(ROOMS)}"
-        raise MissingError(f"no folder {downloaded} of the Neural RGB-D dataset: {advice}")
-    advice = nearest_name(text, _KNOWN)
-    raise ConfigError(f"no sequence {text!r}: it is neither a folder nor a known scene; {advice}")
+        how = f"`nbtrack data fetch {text}` brings it (data/README.md); rooms need no download"
+        raise MissingError(f"no folder {downloaded} of the Neural RGB-D dataset: {how}")
+    found = f"no sequence {text!r}: it is neither a folder nor a known scene"
+    raise ConfigError(f"{found}; {nearest_name(text, _KNOWN)}")
 
 
 def open_scenes(preset: Preset) -> list[Scene]:
@@ -98,8 +97,7 @@ def open_scenes(preset: Preset) -> list[Scene]:
     if not names or len({absolute(name).name for name in names}) < len(names):
         given = ", ".join(names) or "(none)"
         raise ConfigError(f"scenes {given}: give at least one, and of one name only one")
-    scenes = []
-    missing = {}
+    scenes, missing = [], {}
     for name in names:
         try:
             scene = open_scene(name, preset)
@@ -117,9 +115,8 @@ def open_scenes(preset: Preset) -> list[Scene]:
 def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
     """Write a synthetic room as a sequence folder, and show a progress bar."""
     with ProgressBar(f"room {name}", config.n_frames) as bar:
-        width, height = config.width, config.width * 3 // 4
-        seed, motion = config.seed, config.motion
-        make_room(name, folder, config.n_frames, width, height, seed, motion, bar.move_to)
+        size, how = (config.width, config.width * 3 // 4), (config.seed, config.motion)
+        make_room(name, folder, config.n_frames, *size, *how, bar.move_to)
 
 
 def _room(name: str, config: ScenesConfig) -> Scene:

@@ -23,6 +23,7 @@ from nbtrack.experiments.scenes import Scene
 from nbtrack.machinery import files
 from nbtrack.machinery.device import choose_device, device_name
 from nbtrack.machinery.errors import DataError, NbtrackError
+from nbtrack.machinery.inputs import read_object
 from nbtrack.machinery.registry import IMPORTED
 from nbtrack.machinery.settings import as_dict, changed_settings
 from nbtrack.mapping.files import Map
@@ -109,7 +110,7 @@ class TrackJob(Job):
     def result(self) -> dict[str, Any]:
         """What a finished run keeps: errors, speed, device, versions, settings."""
         path = self.folder / METRICS_FILE
-        metrics = files.read_json(path)
+        metrics = read_object(path)
         if metrics.get("key") != self.key:
             raise DataError(f"{path} is not what this run has written: remove {self.folder}")
         return metrics

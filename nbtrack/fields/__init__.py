@@ -9,8 +9,8 @@ from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.neus import NeuSField, NeusMapping
 from nbtrack.machinery.device import usual_modes
 from nbtrack.machinery.errors import look_up_kind
+from nbtrack.machinery.inputs import whole_number
 from nbtrack.machinery.registry import Registry
-from nbtrack.machinery.settings import whole_number
 
 FIELDS: Registry[type[Field]] = Registry({"imap": IMapField, "neus": NeuSField})
 """What can be mapped, by name. A field of your own joins by `FIELDS["mine"] = MyField`."""

@@ -1,2 +1,2 @@
-"""What any program needs: errors, settings, files, text files, checks of input, progress, and the
+"""What any program needs: errors, settings, files, checks of input, progress, and the
 device's use."""

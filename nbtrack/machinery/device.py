@@ -153,8 +153,7 @@ def advise_on_memory(setting: str) -> Iterator[None]:
         if isinstance(error, OutOfMemory) or not is_lack:  # somebody nearer has named the setting
             raise
         advice = "lower it with --set, or take fewer frames, as with --frames ::2"
-        kept = "what was finished is kept"
-        raise OutOfMemory(f"out of memory with {setting}: {advice}; {kept}") from None
+        raise OutOfMemory(f"out of memory with {setting}: {advice}") from None
 
 
 def synchronize(device: torch.device) -> None:

@@ -38,8 +38,7 @@ _NO_LOCKS = errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP  # of file systems with
 
 def project_folder() -> Path:
     """The checkout that the package lies in; the current folder where it is installed elsewhere."""
-    is_checkout = (PACKAGE.parent / "pyproject.toml").is_file()
-    return PACKAGE.parent if is_checkout else Path.cwd()
+    return PACKAGE.parent if (PACKAGE.parent / "pyproject.toml").is_file() else Path.cwd()
 
 
 def absolute(path: Path | str) -> Path:
@@ -143,8 +142,7 @@ class Checkpoint:
             written, wanted = state["recipe"], self.recipe
             if changed := [name for name in wanted if written.get(name) != wanted[name]]:
                 others = ", ".join(changed).replace("_", " ")
-                advice = "remove it, or name another"
-                raise DataError(f"{self.path} was made with another {others}: {advice}")
+                raise DataError(f"{self.path} was made with another {others}: remove it")
             take_up(state)
 
 
@@ -193,13 +191,6 @@ def json_text(content: Any) -> str:
     """
     text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
     return text.encode(errors="backslashreplace").decode() + "\n"
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """An object from a JSON file of a finished result. Raises DataError if it is none."""
-    with naming_damaged(path, "JSON object"):
-        # Braces, since they raise TypeError for a list or a number.
-        return {**json.loads(path.read_text(encoding="utf-8"))}
 
 
 @contextlib.contextmanager

@@ -1,6 +1,10 @@
-"""Numbers, arrays, images and poses that a user or a file gives, checked."""
+"""Numbers, arrays, images, poses and text files that a user gives, checked."""
 
-from numbers import Real
+import codecs
+import json
+import re
+import tomllib
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +14,7 @@ from jaxtyping import Float, UInt8, UInt16
 from torch import Tensor
 
 from nbtrack.machinery.errors import ConfigError, DataError
+from nbtrack.machinery.files import naming_damaged
 
 Poses = Float[np.ndarray, "_ 4 4"]
 _FARTHEST = 1e7  # m from the origin: beyond geographic coordinates; floats can square it
@@ -22,6 +27,15 @@ _MAX_METRES = 100.0  # a median depth beyond it is in another unit (our choice)
 _DEPTH_UNITS = "uint16 in mm, or floating point in metres"
 RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 
+# By the byte-order mark; that of UTF-32 begins with that of UTF-16.
+_ENCODINGS = {
+    codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
+}  # fmt: skip
+# "Not a number" as Python, its decimals, C, and Microsoft's C print it: -nan(ind), 1.#QNAN, 1.#R.
+_NOT_A_NUMBER = re.compile(r"(?i)(?<![^\s,])[-+]?(?:s?nan\d*(?:\(\w*\))?|\d\.#\w*)(?![^\s,])")
+_DECIMAL_COMMA = re.compile(r"(?<!\S)[-+]?\d+,\d+(e[-+]?\d+)?(?!\S)")
+
 
 def check_array(what: str, array: Any, shape: tuple, kinds: list, asked: str) -> None:
     """Raises DataError for another shape, or a type that is none of the kinds (jaxtyping's).
@@ -30,9 +44,8 @@ def check_array(what: str, array: Any, shape: tuple, kinds: list, asked: str) ->
     """
     wanted = " ".join(map(str, shape))
     if not any(isinstance(array, kind[np.ndarray, wanted]) for kind in kinds):
-        found = f"of type {type(array).__name__}"
-        if isinstance(array, np.ndarray):
-            found = f"{array.dtype} of shape {array.shape}"
+        is_array = isinstance(array, np.ndarray)
+        found = f"{array.dtype} of shape {array.shape}" if is_array else type(array).__name__
         raise DataError(f"{what} is {found}: give a numpy array, {asked}, of shape {shape}")
 
 
@@ -71,13 +84,17 @@ def check_points(points: Any) -> None:
         raise DataError(f"points are a {found}: give a tensor of shape (n, 3), in m")
 
 
-def number(name: str, value: Any, minimum: float, maximum: float) -> float:
-    """A real number within limits. Raises ConfigError, by its name, for any other value."""
-    is_number = isinstance(value, Real) and not isinstance(value, bool)
-    if not (is_number and minimum <= value <= maximum):
-        allowed = f"{minimum:g} to {maximum:g}"
-        raise ConfigError(f"{name} is {value}; allowed: {allowed}; take for example 10")
-    return float(value)
+def number(name: str, value: Any, minimum: float, maximum: float, kind: type = Real) -> Any:
+    """A real number within limits, or an `Integral`, as Python's. ConfigError for another value."""
+    if not isinstance(value, kind) or isinstance(value, bool) or not minimum <= value <= maximum:
+        what = "a whole number" if kind is Integral else "a number"
+        raise ConfigError(f"{name} is {value!r:.80}: give {what} from {minimum:g} to {maximum:g}")
+    return int(value) if kind is Integral else float(value)
+
+
+def whole_number(name: str, value: Any, minimum: int = 0) -> int:
+    """A whole number of Python's. Raises ConfigError, by its name, for any other value."""
+    return number(name, value, minimum, 2**63 - 1, Integral)
 
 
 def checked_pose(T_world_camera: Any) -> Float[np.ndarray, "4 4"]:
@@ -119,3 +136,49 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
             "other frames', and 0 0 0 1; write nan for a frame that is lost"
         )
     return np.where(is_known[:, None, None], poses, np.nan)
+
+
+def read_object(path: Path, kind: str = "") -> dict[str, Any]:
+    """A JSON or TOML file, by its name if not said, of an object. Raises DataError otherwise."""
+    kind = kind or ("JSON" if path.suffix.lower() == ".json" else "TOML")
+    with naming_damaged(path, f"{kind} file of names and values", "correct it or write it anew"):
+        text = read_text(path)
+        # Braces, since they raise TypeError for a list or a number.
+        return {**(tomllib.loads(text) if kind == "TOML" else json.loads(text))}
+
+
+def read_text(path: Path) -> str:
+    """The text of a file, decoded by its byte-order mark, else as UTF-8, whatever its bytes are."""
+    with path.open("rb") as file:
+        start = file.read(4)
+    of_mark = (encoding for mark, encoding in _ENCODINGS.items() if start.startswith(mark))
+    return path.read_text(encoding=next(of_mark, "utf-8-sig"), errors="replace")
+
+
+def read_lines(path: Path) -> list[str]:
+    """The lines of a text file that are neither blank nor comments. DataError if there is none."""
+    lines = read_text(path).splitlines()
+    full = [line for line in lines if line.partition("#")[0].strip()]
+    if not full:
+        raise DataError(f"{path} is empty: write it anew")
+    return full
+
+
+def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np.ndarray, "n m"]:
+    """A table of numbers, separated by blanks or commas; NaN, however it is spelled, and infinity
+    are kept.
+
+    Raises DataError for anything else, or if the number of columns is none of `columns`. The
+    message says what every line should hold: the `meaning`.
+    """
+    # First: some spellings hold a `#`, which else begins a comment.
+    lines = [_NOT_A_NUMBER.sub("nan", line) for line in read_lines(path)]
+    if path.suffix == ".log":  # Open3D's, with a head of three numbers before each matrix
+        lines = [line for line in lines if len(line.split()) != 3]
+    with naming_damaged(path, "table", f"every line holds {meaning}"):
+        if any(_DECIMAL_COMMA.search(line) for line in lines):
+            raise ValueError("write decimal points, not commas")
+        numbers = np.loadtxt([line.replace(",", " ") for line in lines], ndmin=2)
+        if numbers.shape[1] not in columns:
+            raise ValueError(f"there are {numbers.shape[1]} columns")
+    return numbers

@@ -77,14 +77,6 @@ def checked(config: Config, kind: type) -> Config:
     return with_values(type(config)(), flat(config))
 
 
-def whole_number(name: str, value: Any, minimum: int = 0, maximum: int = 2**63 - 1) -> int:
-    """A whole number of Python's. Raises ConfigError, by its name, for any other value."""
-    is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not (is_whole and minimum <= value <= maximum):
-        raise ConfigError(f"{name} is {value!r:.80}: give a whole number, {minimum} or more")
-    return int(value)
-
-
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     """The dataclass, or tree of them, with some values of dotted keys, or trees as TOML has them.
 
@@ -151,8 +143,7 @@ def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
         raise ConfigError(f"{key} = {value!r}: it must be {wanted.__name__}, for example {old!r}")
     limits = allowed.get("limits", _USUAL_LIMITS.get(wanted))
     if limits and not limits[0] <= value <= limits[1]:
-        within = f"{limits[0]:g} to {limits[1]:g}"
-        raise ConfigError(f"{key} = {value!r}: it must be {within}, such as {old!r}")
+        raise ConfigError(f"{key} = {value!r}: it must be {limits[0]:g} to {limits[1]:g}")
     if value not in allowed.get("choices", [value]):
         raise ConfigError(f"{key} = {value!r}: write {' or '.join(map(repr, allowed['choices']))}")
     return value

@@ -132,8 +132,8 @@ def _map_of(content: bytes, file: Path) -> Map:
     except ConfigError as error:
         raise ValueError(error) from None  # so that the file is named
     if name not in FIELDS:
-        advice = "import the file of its class first (--import FILE.py)"
-        raise ConfigError(f"{file} is a map of field {name!r}, which is not registered: {advice}")
+        found = f"{file} is a map of field {name!r}, which is not registered"
+        raise ConfigError(f"{found}: import the file of its class first (--import FILE.py)")
     form = header["form"]
     kind = look_up("form of maps", form, FORMS) if form else FIELDS[name]
     return Map(kind.from_state(tensors, record, bounds), camera, record)

@@ -18,8 +18,9 @@ from nbtrack.fields import LearnedField, MappingSettings, field_class, make_fiel
 from nbtrack.machinery.device import advise_on_memory, device_name, suited_to, threads, usual_modes
 from nbtrack.machinery.errors import ConfigError, NumericalError
 from nbtrack.machinery.files import Checkpoint
+from nbtrack.machinery.inputs import whole_number
 from nbtrack.machinery.launches import Recording, make_adam
-from nbtrack.machinery.settings import checked, whole_number
+from nbtrack.machinery.settings import checked
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 
@@ -143,9 +144,8 @@ class _Fit:
         for iteration, row in zip(iterations, torch.stack(pending).tolist(), strict=True):
             values = dict(zip(self.terms, row, strict=True))
             if not all(map(math.isfinite, row)):
-                rate = f"the learning rate ({self.settings.learning_rate:g})"
                 found = f"losses {values} at mapping iteration {iteration}"
-                raise NumericalError(f"{found}: lower {rate} or check the depth and poses")
+                raise NumericalError(f"{found}: lower the learning rate or check depth and poses")
             self.history.append({**values, "total": sum(row), **diagnostics})
         self.seconds += time.perf_counter() - start
 

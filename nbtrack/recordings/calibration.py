@@ -15,7 +15,7 @@ from jaxtyping import Float
 from nbtrack.core.camera import Intrinsics
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import naming_damaged
-from nbtrack.machinery.text_files import read_numbers, read_object
+from nbtrack.machinery.inputs import read_numbers, read_object
 
 _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
 _LARGEST = 1e6  # of any number of a camera: no image is so many pixels wide

@@ -15,9 +15,9 @@ from nbtrack.core.arrays import DepthImage, Poses
 from nbtrack.data.dataset import DATASET_UNITS
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError, look_up
 from nbtrack.machinery.files import absolute
+from nbtrack.machinery.inputs import read_object
 from nbtrack.machinery.registry import Registry
 from nbtrack.machinery.settings import limited, one_of, with_values
-from nbtrack.machinery.text_files import read_object
 from nbtrack.recordings.calibration import Calibration, read_calibration
 from nbtrack.recordings.pose_files import Times, frame_keys, read_poses
 

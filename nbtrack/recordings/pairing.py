@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from nbtrack.core.arrays import Frames, Poses
 from nbtrack.machinery.errors import DataError, MissingError
 from nbtrack.machinery.files import naming_damaged
-from nbtrack.machinery.text_files import read_lines
+from nbtrack.machinery.inputs import read_lines
 from nbtrack.recordings.pose_files import Times, check_order, check_rising, frame_keys, in_seconds
 
 TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images

@@ -24,7 +24,7 @@ import numpy as np
 
 from nbtrack.core.arrays import DepthImage, Poses
 from nbtrack.machinery.files import naming_damaged
-from nbtrack.machinery.text_files import read_object
+from nbtrack.machinery.inputs import read_object
 from nbtrack.recordings.calibration import Calibration, calibration, camera_matrix
 from nbtrack.recordings.formats import Declaration, Format
 from nbtrack.recordings.pose_files import Times, from_quaternions

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from nbtrack.core.arrays import Poses, Position
 from nbtrack.machinery.errors import DataError, MissingError
 from nbtrack.machinery.files import absolute
-from nbtrack.machinery.inputs import RIGID, checked_poses
-from nbtrack.machinery.text_files import read_numbers
+from nbtrack.machinery.inputs import RIGID, checked_poses, read_numbers
 
 Times = Float[np.ndarray, "_"]  # s
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"

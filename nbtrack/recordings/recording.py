@@ -10,8 +10,7 @@ from jaxtyping import Bool
 from nbtrack.core.arrays import Poses, Position
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import absolute, naming_damaged
-from nbtrack.machinery.inputs import checked_poses
-from nbtrack.machinery.text_files import read_numbers
+from nbtrack.machinery.inputs import checked_poses, read_numbers
 from nbtrack.recordings.calibration import Calibration
 from nbtrack.recordings.formats import FORMATS, Declaration, Format, declaration, files_of
 from nbtrack.recordings.pairing import TIMES_FILE, Moments, check_paired, pair_lists

@@ -111,8 +111,7 @@ def make_budget(steps: Number | None, rate_hz: Number | None) -> Budget:
     Raises ConfigError if there are both or neither, or the number is far out.
     """
     if (steps is None) == (rate_hz is None):
-        advice = "a frame has one budget; give --steps or --rate"
-        raise ConfigError(f"steps={steps} and rate_hz={rate_hz}: {advice}")
+        raise ConfigError(f"steps={steps} and rate_hz={rate_hz}: a frame has one budget, give one")
     return StepBudget(steps) if rate_hz is None else ClockBudget(rate_hz)
 
 
@@ -132,6 +131,5 @@ def paper_steps(tracker: str, rate_hz: Number) -> float:
     at_100, at_500 = look_up("tracker of the paper", tracker, _MEASURED_STEPS)
     steps = round(at_100 + (at_500 - at_100) * (budget_ms - 100) / 400, 6)
     if steps < _FEWEST:
-        found = f"rate_hz is {rate_hz:g}: the paper's hardware takes no step of {tracker}"
-        raise ConfigError(f"{found}; take a lower rate, or say how many steps")
+        raise ConfigError(f"rate_hz is {rate_hz:g}, at which no step of {tracker} fits: lower it")
     return steps

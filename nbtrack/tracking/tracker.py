@@ -15,9 +15,9 @@ from nbtrack.data.frame import Frame
 from nbtrack.fields import FIELDS, Field, LearnedField
 from nbtrack.machinery.device import suited_to, synchronize, usual_modes
 from nbtrack.machinery.errors import ConfigError, MissingError, NumericalError
-from nbtrack.machinery.inputs import checked_pose
+from nbtrack.machinery.inputs import checked_pose, whole_number
 from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
-from nbtrack.machinery.settings import checked, whole_number
+from nbtrack.machinery.settings import checked
 from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.reach import Reach
 from nbtrack.tracking.starts import expected_poses
@@ -114,11 +114,9 @@ class Tracker(abc.ABC):
         if not fits or field.is_distance < kind.is_distance:
             named = getattr(kind, "name", kind.__name__)
             known = ", ".join(name for name, other in FIELDS.items() if cls.works_in(other))
-            mismatch = f"tracker {cls.name!r} does not work on field {named!r}"
-            raise ConfigError(f"{mismatch}: take one of {known}")
+            raise ConfigError(f"{cls.name!r} does not work on field {named!r}: take {known}")
         if cls.package and importlib.util.find_spec(cls.package) is None:
-            extra = f"pip install 'nbtrack[{cls.name}]'"
-            raise MissingError(f"tracker {cls.name} needs the package {cls.package}: {extra}")
+            raise MissingError(f"tracker {cls.name} needs more: pip install 'nbtrack[{cls.name}]'")
 
     def prepare(self, field: Field) -> Field:
         """A map in the form, and on the device, in which this tracker asks it."""
@@ -175,8 +173,7 @@ class Tracker(abc.ABC):
         """
         if cls.restart_anywhere is Tracker.restart_anywhere or not in_corrected:
             lacks = f"tracker {cls.name!r} cannot find a camera whose first pose is not known"
-            advice = "take lm in a corrected map (--method corrected)"
-            raise ConfigError(f"{lacks}: {advice}, or begin with a frame that has a pose")
+            raise ConfigError(f"{lacks}: take lm in a corrected map (--method corrected)")
 
     def state(self) -> dict[str, Any]:
         """What the tracker remembers from past frames: tensors and plain values."""
@@ -234,8 +231,7 @@ class Tracker(abc.ABC):
         seconds = time.perf_counter() - began
         pose = self.T_world_camera.detach().cpu().double().numpy().copy()
         if not np.isfinite(pose).all():
-            advice = "lower the learning rates or map for longer"
-            raise NumericalError(f"the pose of {frame.name} is not finite any more: {advice}")
+            raise NumericalError(f"the pose of {frame.name} is not finite: lower learning rates")
         return Estimate(pose, not frame.has_depth, steps, seconds, float(loss), self.report())
 
 
