@@ -30,10 +30,7 @@ from nbtrack.recordings.images import images_of
 from nbtrack.tracking import TRACKERS
 
 _LOOK_SECONDS = 1.0  # between two looks at jobs elsewhere, and between two of their reports
-_DIED = (
-    "a worker process died at {}, perhaps for lack of memory: run it again, with fewer --workers "
-    "or smaller settings; what was finished is kept"
-)
+_DIED = "a worker process died at {}, perhaps for lack of memory: run again with fewer --workers"
 _NAME_BYTES = 180  # of a folder's name; the key, suffixes and those of temporary files follow
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""

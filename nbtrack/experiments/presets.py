@@ -197,13 +197,11 @@ def _usual(own: dict[str, Any], tree: dict[str, Any]) -> dict[str, Any]:
     named = {tuple(key.split(".")[:2]) for key in own}
     values = {}
     for key, value in own.items():
-        part, _, rest = key.partition(".")
-        name, _, setting = rest.partition(".")
-        if name != _USUAL.get(part):
-            continue
-        for other, settings in tree[part].items():
-            if (part, other) not in named and hasattr(settings, setting):
-                values[f"{part}.{other}.{setting}"] = value
+        part, name, *setting = key.split(".")
+        others = tree[part] if name == _USUAL.get(part) else {}
+        for other in others:
+            if (part, other) not in named and hasattr(others[other], setting[0]):
+                values[f"{part}.{other}.{setting[0]}"] = value
     return values
 
 

@@ -74,9 +74,8 @@ def _score_images(field: LearnedField, rays: Rays, room: Room | None) -> Scores:
 
 def _exact_depths(rays: Rays, room: Room) -> Values:
     """The z-depth (m) at which each ray meets the room's surface."""
-    origins_world = rays.origins_world.cpu().double().numpy()
-    directions_world = rays.directions_world.cpu().double().numpy()
-    depth, _ = room.first_hit(origins_world, directions_world)
+    origins_world, directions_world = rays.origins_world.cpu(), rays.directions_world.cpu()
+    depth, _ = room.first_hit(origins_world.double().numpy(), directions_world.double().numpy())
     return torch.from_numpy(depth).to(rays.depth)
 
 

@@ -43,8 +43,7 @@ class FourierMlp(nn.Module):
     ) -> None:
         """Draw the weights by a generator; `act` is the activation of all hidden layers."""
         super().__init__()
-        width = settings.width
-        n_frequencies = settings.n_frequencies
+        width, n_frequencies = settings.width, settings.n_frequencies
         self.activation = act
         self.register_buffer("center", torch.tensor(bounds.center, dtype=torch.float32))
         self.metres_per_unit = bounds.metres_per_unit

@@ -73,12 +73,9 @@ def composite(weights: RaySamples, colors: RayColors, depths: RaySamples) -> Ren
     Source: Sucar et al. 2021 (iMAP), Sec. 3.2. Light that passes the last sample adds nothing.
     """
     depth = (weights * depths).sum(dim=-1)
-    return Rendering(
-        color=(weights[..., None] * colors).sum(dim=-2),
-        depth=depth,
-        depth_variance=(weights * (depth[:, None] - depths).square()).sum(dim=-1),
-        weights=weights,
-    )
+    color = (weights[..., None] * colors).sum(dim=-2)
+    depth_variance = (weights * (depth[:, None] - depths).square()).sum(dim=-1)
+    return Rendering(color, depth, depth_variance, weights)
 
 
 def stratified_depths(
@@ -88,12 +85,9 @@ def stratified_depths(
 
     Without a generator the samples lie in the middle of their parts.
     """
-    if generator is None:
-        offsets = far.new_full((len(far), n_samples), 0.5)
-    else:
-        offsets = torch.rand(
-            len(far), n_samples, generator=generator, device=far.device, dtype=far.dtype
-        )
+    offsets = far.new_full((len(far), n_samples), 0.5)
+    if generator is not None:
+        torch.rand(offsets.shape, generator=generator, out=offsets)
     parts = (torch.arange(n_samples, device=far.device) + offsets) / n_samples
     return near + (far[:, None] - near) * parts
 

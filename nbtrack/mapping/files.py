@@ -122,8 +122,7 @@ def _map_of(content: bytes, file: Path) -> Map:
     # A bit that flipped on a disk, or a number edited by hand, shows nowhere else.
     if header.pop("digest", None) != digest_of(header, tensors):
         raise ValueError("its content is not what was written")
-    name = header["field"]
-    record = header["made"]
+    name, record = header["field"], header["made"]
     _check_content(header, tensors)
     try:
         low, high = header["bounds"]

@@ -98,9 +98,7 @@ class Tracker(abc.ABC):
     @classmethod
     def works_in(cls, field: type) -> bool:
         """Whether it can track in maps of this kind: rendering needs rays, others distances."""
-        if cls.renders:
-            return issubclass(field, LearnedField)
-        return field.is_distance
+        return issubclass(field, LearnedField) if cls.renders else field.is_distance
 
     @classmethod
     def check_field(cls, field: Field | type[Field]) -> None:
