@@ -10,7 +10,6 @@ import pkgutil
 import sys
 import traceback
 from collections import UserDict
-from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TypeVar
@@ -35,7 +34,7 @@ class Registry(UserDict[str, Entry]):
     def __init__(self, entries: dict[str, Entry | str]) -> None:
         self._entries = entries
 
-    @cached_property
+    @property
     def data(self) -> dict[str, Entry | str]:
         """What `UserDict` works on: the entries as given, once all plug-ins have added theirs."""
         while _waiting:
@@ -46,6 +45,13 @@ class Registry(UserDict[str, Entry]):
                 why = f"({type(error).__name__}: {error}): mend or remove it"
                 tell(f"nbtrack: warning: plug-in {plugin.value} is left out {why}")
         return self._entries
+
+    @data.setter
+    def data(self, entries: dict[str, Entry | str]) -> None:
+        self._entries = entries
+
+    def __copy__(self) -> "Registry":
+        return Registry({**self.data})
 
     def __getitem__(self, name: str) -> Entry:
         """The entry of a name. Raises ConfigError where its text names nothing that is there.
@@ -80,11 +86,11 @@ def import_own(source: str) -> None:
         module = importlib.import_module(name)
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
-        # Python's own import system, as for a module that is not there, is no place to mend.
-        is_mine = not place.filename.startswith("<frozen")
-        where = f" at {place.filename}, line {place.lineno}" if is_mine else ""
-        why = f"{where} ({type(error).__name__}: {error})"
-        raise ConfigError(f"importing {source} failed{why}: mend it") from error
+        # Python's own import system, as for a module that is not there: no place to mend.
+        is_in_python = place.filename.startswith("<frozen")
+        where = "" if is_in_python else f" at {place.filename}, line {place.lineno}"
+        reason = f"{type(error).__name__}: {error}"
+        raise ConfigError(f"importing {source} failed{where} ({reason}): mend it") from error
     if is_file and Path(module.__file__ or "") != file:
         raise ConfigError(f"module {name} is {module}, not {source}: mend the path, or rename it")
     IMPORTED.append(str(file) if is_file else source)
