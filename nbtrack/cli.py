@@ -15,9 +15,6 @@ from nbtrack import __version__
 from nbtrack.data.dataset import DATASET_ZIP
 from nbtrack.machinery.errors import ConfigError, NbtrackError, nearest_name
 
-_MAX_COUNT = 2**31 - 1  # what every random generator takes
-_INTERRUPTED = 130  # what shells say of a command that ended by Ctrl-C
-
 
 def a_path(text: str) -> Path:
     """A path, with `~` expanded. An empty text is refused: it would mean the working folder."""
@@ -26,8 +23,8 @@ def a_path(text: str) -> Path:
     return Path(os.path.expanduser(text))  # of no such user: as it is, and refused where it is used
 
 
-def a_count(text: str, minimum: int = 1, maximum: int = _MAX_COUNT) -> int:
-    """Parse a whole number from `minimum` to `maximum`, as of seeds or processes.
+def a_count(text: str, minimum: int = 1, maximum: int = 2**31 - 1) -> int:
+    """Parse a whole number from `minimum` to `maximum`, by default what random generators take.
 
     Another text raises what argparse reports as a user's error.
     """
@@ -155,7 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get("NBTRACK_DEBUG"):
             traceback.print_exception(error)
         print(f"nbtrack: {_message_of(error)}", file=sys.stderr)
-        return _INTERRUPTED if isinstance(error, KeyboardInterrupt) else 2
+        return 130 if isinstance(error, KeyboardInterrupt) else 2  # as shells say it
 
 
 def _writable(stream: TextIO | None) -> TextIO:

@@ -14,7 +14,6 @@ _SPECIAL |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\texta
 # characters), or a character that is meant as text, since bare it would not compile.
 _AS_IS = r"\$[^$]+\$|\\(?:\w*ref|cite\w*)\*?\{[^}]*\}|\\[a-zA-Z]+|\\[^a-zA-Z\s]"
 _AUTHORS = re.compile(rf"({_AS_IS})|[%&#_^$\\]")
-_IN_LABELS = re.compile(r"[^\w:./+ -]")  # other characters end a label, or TeX
 _COLUMN_PT = 235  # width of a column of a paper on letter paper or A4
 _CHARACTER_PT, _GAP_PT = 4, 12  # of \scriptsize, and between two columns of a table
 _KINDS = {"table_1": "ate", "table_2": "runtime", "table_3": "beyond"}  # by a file's name
@@ -93,7 +92,7 @@ def _authors(text: str) -> str:
 
 def label_of(text: str) -> str:
     """An author's label, with a hyphen in place of what no label can hold."""
-    return _IN_LABELS.sub("-", text)
+    return re.sub(r"[^\w:./+ -]", "-", text)  # other characters end a label, or TeX
 
 
 _LATEX.filters |= {"plain": _plain, "authors": _authors, "label": label_of}

@@ -71,8 +71,7 @@ def _fill_tables(
     how = {"clock": clock, "seeds": range(options.seeds), "execution": execution}
     results = track_scenes(scenes, methods, preset, rates, **how)
     shown = results.drop(columns="still_ate_m", errors="ignore") if options.no_still else results
-    name = f"{preset.name}_clock" if clock else preset.name
-    folder = options.out or runs_folder() / "tables" / name
+    folder = options.out or runs_folder() / f"tables/{preset.name}{'_clock' if clock else ''}"
     note = f"{camera_motion(preset, results)}; {_note(preset, clock)}"
     print(f"Table {'III: ATE (mm)' if options.beyond else 'I: ATE (m)'}, {note}")
     if options.beyond:
