@@ -54,8 +54,8 @@ def tables_command(options: Namespace) -> None:
     prepare(options.out)
     results = _fill_tables(options, preset, methods, execution, wording)
     if failed := [*filter(None, results["failure"])]:
-        found = f"{len(failed)} cells of the table failed and are empty, the first because"
-        raise NbtrackError(f"{found} {failed[0]}; mend the cause and run again, the rest is kept")
+        found = f"{len(failed)} cells of the table failed and are empty"
+        raise NbtrackError(f"{found}, the first because {failed[0]}; mend it and run again")
 
 
 def _fill_tables(

@@ -64,8 +64,7 @@ def write_map(path: Path | str, finished: Map) -> None:
     path = path / MAP_FILE if path.is_dir() else path
     field, bounds = finished.field, finished.field.bounds
     if type(field) is not (FORMS.get(field.form) if field.form else FIELDS.get(field.name)):
-        advice = f"write the map it was made from, or register it by FIELDS[{field.name!r}]"
-        raise ConfigError(f"no map file holds a {type(field).__name__}: {advice}")
+        raise ConfigError(f"no map file holds a {type(field).__name__}: write what it comes from")
     header = {
         "format_version": _VERSION,
         "field": field.name,
@@ -99,8 +98,7 @@ def read_map(path: Path | str) -> Map:
     file = path / MAP_FILE if path.is_dir() else path
     history = path / HISTORY_FILE  # a single file has none
     if not file.is_file():
-        hint = "give a folder or file that it wrote, or run the `map` command of that folder again"
-        raise MissingError(f"{path} holds no finished map of this nbtrack: {hint}")
+        raise MissingError(f"{path} holds no finished map of this nbtrack: map again, or give one")
     with naming_damaged(file, "map file", _AGAIN):
         # safetensors itself opens no path whose letters are not UTF-8
         stored = _map_of(file.read_bytes(), file)

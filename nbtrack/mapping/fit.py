@@ -24,7 +24,6 @@ from nbtrack.machinery.settings import checked
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 
-_CPU = torch.device("cpu")
 _PENDING = 10  # iterations between two looks at the losses, which wait for the device
 _FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
 
@@ -68,13 +67,13 @@ def map_sequence(
     if issubclass(kind, LearnedField):
         with advise_on_memory(f"mapping.{field_name}.n_rays={settings.n_rays}"):
             with threads(1):  # sums, and so the start, depend on their number
-                field = make_field(field_name, network, bounds, seed).to(device or _CPU)
+                field = make_field(field_name, network, bounds, seed).to(device or "cpu")
             with suited_to(field.width, settings.tf32):
                 fit = _Fit(recipe | {"code": code}, settings, field, sequence, mapped)
                 fit.run(checkpoint, on_iteration)
         history, seconds = fit.history, fit.seconds
     else:
-        field = kind.from_frames(sequence, mapped, bounds, settings).to(device or _CPU)
+        field = kind.from_frames(sequence, mapped, bounds, settings).to(device or "cpu")
         history, seconds = [field.diagnostics()], time.perf_counter() - start
         on_iteration(1.0, history[0])
     made = {"seconds": seconds, "mapped_frames": len(mapped), "device": device_name(field.device)}

@@ -1,7 +1,7 @@
 """Tracking: a camera's pose, frame by frame, in a field that is known."""
 
 from nbtrack.core.arrays import Pose
-from nbtrack.fields import Field, field_class
+from nbtrack.fields import Field
 from nbtrack.machinery.errors import look_up_kind
 from nbtrack.machinery.registry import Registry
 from nbtrack.tracking.budget import Budget, ClockBudget, StepBudget, make_budget, paper_steps
@@ -16,11 +16,6 @@ TRACKERS: Registry[type[Tracker]] = Registry({"vr": VrTracker, "sdf": SdfTracker
 def tracker_class(name: str) -> type[Tracker]:
     """The tracker of a name. Raises ConfigError, naming the nearest, for any other."""
     return look_up_kind("tracker", name, TRACKERS, ["name"])
-
-
-def check_pair(tracker_name: str, field: str) -> None:
-    """Raises ConfigError if a tracker or a field is unknown, else as `Tracker.check_field` does."""
-    tracker_class(tracker_name).check_field(field_class(field))
 
 
 def make_tracker(

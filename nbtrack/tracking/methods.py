@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from nbtrack.fields import field_class
 from nbtrack.machinery.errors import check_lists, look_up
 from nbtrack.machinery.registry import Registry
-from nbtrack.tracking import check_pair, paper_steps, tracker_class
+from nbtrack.tracking import paper_steps, tracker_class
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,6 @@ def find_methods(methods: Methods) -> list[Method]:
     check_lists(at_least=1, methods=methods)
     for named in dict.fromkeys(methods):  # each once
         method = look_up("method", named, METHODS) if isinstance(named, str) else named
-        check_pair(method.tracker, method.field)
+        tracker_class(method.tracker).check_field(field_class(method.field))
         chosen.append(method)
     return chosen

@@ -98,8 +98,7 @@ def _check_trackable(sequence: RgbdSequence) -> None:
     if len(sequence) < 2:
         raise DataError(f"{sequence!r} is too short to track: give at least two frames")
     if not sequence.depths_mm.any():
-        found = f"no frame of {sequence.name} has a measured depth: check the depth folder and its"
-        raise DataError(f"{found} unit (uint16 millimetres), or choose other --frames")
+        raise DataError(f"no frame of {sequence.name} has a measured depth: check folder and unit")
 
 
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
