@@ -32,6 +32,7 @@ from nbtrack.tracking import TRACKERS
 _LOOK_SECONDS = 1.0  # between two looks at jobs elsewhere, and between two of their reports
 _DIED = "a worker process died at {}, perhaps for lack of memory: run again with fewer --workers"
 _NAME_BYTES = 180  # of a folder's name; the key, suffixes and those of temporary files follow
+Pairs = Iterator[tuple[Path, Any]]  # of a job's folder and what became of it
 Report = Callable[[float, str], None]
 """Called by a job with the share of it that is done and a word on how it goes."""
 
@@ -167,17 +168,15 @@ def _caught(work: Callable, *arguments: Any) -> Any:
         return error
 
 
-def _outcomes(
-    wave: Mapping[Path, Job], outcomes: Mapping[Path, Any], show: Callable, place: Workplace | None
-) -> Iterator[tuple[Path, Any]]:
+def _outcomes(wave: Mapping, before: Mapping, show: Callable, place: Workplace | None) -> Pairs:
     """Pairs of folder and outcome, as the jobs of a wave end.
 
-    `outcomes` are those of earlier waves, which may hold some of this one; `show` is that of
+    Those of earlier waves were `before`, and may hold some of this one; `show` is that of
     `run_jobs`.
     """
-    ready = {folder: job for folder, job in wave.items() if folder not in outcomes}
+    ready = {folder: job for folder, job in wave.items() if folder not in before}
     for folder, job in wave.items():
-        needed = outcomes.get(job.needs.folder) if job.needs else None
+        needed = before.get(job.needs.folder) if job.needs else None
         if isinstance(needed, NbtrackError) and ready.pop(folder, None):
             yield folder, NbtrackError(f"not run, because {job.needs.name} failed: {needed}")
     if place:
@@ -191,9 +190,7 @@ def _outcomes(
         yield folder, _caught(job.make, report)
 
 
-def _elsewhere(
-    jobs: Mapping[Path, Job], show: Callable, place: Workplace
-) -> Iterator[tuple[Path, Any]]:
+def _elsewhere(jobs: Mapping[Path, Job], show: Callable, place: Workplace) -> Pairs:
     """Pairs of folder and outcome of jobs that run side by side, as they end.
 
     Where a process dies, that is the outcome of the job that ran there.
