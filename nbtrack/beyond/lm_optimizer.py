@@ -122,10 +122,11 @@ class LmOptimizer:
         # In rad and m. H is in units of the scales, which are `SIGMAS` standard deviations.
         covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2
         by_curvature = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:]).max())
-        moved = self._costs_at, self.T_world_camera, covariance, 1
         # If more points counted as independent, as 384, some wrong poses before a flat wall would
         # pass (docs/tried.md).
-        return float(max(by_curvature, std_when_moved(*moved, n_independent=256)))
+        pose = self.T_world_camera
+        moved_std_m = std_when_moved(self._costs_at, pose, covariance, 1, n_independent=256)
+        return float(max(by_curvature, moved_std_m))
 
     def _costs_at(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
         """The points' costs at another pose, at the scales of this one."""

@@ -84,15 +84,11 @@ def grid_of(field: BakedField) -> Grid:
     """The grid of a field on the host."""
     intensity = field.volume[:3].T @ torch.tensor(LUMA, dtype=torch.float32)
     value, confidence = field.volume[3:]
-    return Grid(
-        vertices=torch.stack([value, intensity, confidence], dim=-1).numpy(),
-        n_vertices=np.array(field.n_vertices),
-        low=field.low.double().numpy(),
-        voxel=field.voxel,
-        usable_low=np.array(field.bounds.minimum) - MARGIN,
-        usable_high=np.array(field.bounds.maximum) + MARGIN,
-        accuracy=field.accuracy,
-    )
+    vertices = torch.stack([value, intensity, confidence], dim=-1).numpy()
+    low, high = np.array([field.bounds.minimum, field.bounds.maximum])
+    shape, first = np.array(field.n_vertices), field.low.double().numpy()
+    usable = low - MARGIN, high + MARGIN
+    return Grid(vertices, shape, first, field.voxel, *usable, field.accuracy)
 
 
 @no_type_check

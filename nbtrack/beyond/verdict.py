@@ -19,7 +19,6 @@ from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 WRONG_M = 0.05
 WRONG_DEG = 3.0
-_LEAST_SHARE = 0.01  # of points; shares of 0 and 1 would have infinite log odds
 # Of the log odds of a wrong pose; the coefficients are those of the four `features`.
 _INTERCEPT = 2.01
 _COEFFICIENTS = np.array([-2.06, -0.28, 2.8, 1.39])
@@ -38,8 +37,8 @@ def features(said: Mapping[str, float]) -> Float[np.ndarray, "4"]:
     `intensity_ratio` (median difference over the usual one) and `innovation` (how far from where
     the frames before led to, rad or m).
     """
-    fitting = np.clip(said["fitting_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
-    known = np.clip(said["known_ratio"], _LEAST_SHARE, 1 - _LEAST_SHARE)
+    # Shares of 0 and 1 would have infinite log odds.
+    fitting, known = np.clip([said["fitting_ratio"], said["known_ratio"]], 0.01, 0.99)
     intensity = np.clip(said["intensity_ratio"], 0.5, 10)
     innovation = np.clip(said["innovation"], 0.02, 1)
     numbers = fitting / (1 - fitting), known / (1 - known), intensity, innovation

@@ -36,12 +36,9 @@ def extract_mesh(
         return trimesh.PointCloud(field.points.cpu().numpy(), colors.cpu().numpy())
     low, high = np.array([field.bounds.minimum, field.bounds.maximum])
     x, y, z = [np.arange(a, b + voxel, voxel) for a, b in zip(low, high, strict=True)]
-    layers = []  # one at a time: all points of a large place are gigabytes
-    for place in x:
-        (layer,) = np.stack(np.meshgrid(place, y, z, indexing="ij"), axis=-1)
-        _, layer_values = query_field(field, layer)
-        layers.append(layer_values)
-    values = np.stack(layers)
+    # One at a time: all points of a large place are gigabytes.
+    layers = (np.stack(np.meshgrid(place, y, z, indexing="ij"), axis=-1) for place in x)
+    values = np.concatenate([query_field(field, layer)[1] for layer in layers])
     if not values.min() < field.surface_level < values.max():
         span = f"[{values.min():.3g}, {values.max():.3g}]"
         found = f"the {field.label} map has no surface: its values lie in {span}"
@@ -101,8 +98,7 @@ def query_field(field: Field, points_world: GridPoints) -> tuple[np.ndarray, np.
     """Colours (*shape, 3) and values (*shape,) at points, some at a time to bound the memory."""
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32)).view(-1, 3)
     answers = [field(part.to(field.device)) for part in points.split(_POINTS_AT_ONCE)]
-    colors = torch.cat([color for color, _ in answers]).cpu().numpy()
-    values = torch.cat([value for _, value in answers]).cpu().numpy()
+    colors, values = (torch.cat(parts).cpu().numpy() for parts in zip(*answers, strict=True))
     return colors.reshape(points_world.shape), values.reshape(points_world.shape[:-1])
 
 

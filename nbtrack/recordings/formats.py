@@ -220,9 +220,9 @@ def declaration(folder: Path, format: str | None = None, depth_scale: float = 0.
         raise DataError(f"{path}: {error}") from None
     format = format or own_format or _told_by_files(folder)
     usual = look_up("format", format, FORMATS).declared
-    usual = replace(usual, depth_scale=depth_scale or usual.depth_scale)
-    if format == "neural_rgbd" and absolute(folder).name in DATASET_UNITS:
-        usual = replace(usual, metres_per_unit=DATASET_UNITS[absolute(folder).name])
+    unit_m = DATASET_UNITS.get(absolute(folder).name, 0.0) if format == "neural_rgbd" else 0.0
+    depth_scale = depth_scale or usual.depth_scale
+    usual = replace(usual, depth_scale=depth_scale, metres_per_unit=unit_m)
     return replace(with_values(usual, declared), format=format)
 
 

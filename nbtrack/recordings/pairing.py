@@ -83,8 +83,8 @@ def _read_list(path: Path) -> tuple[Times, list[Path]]:
     files = [path.parent / name for _, name in words]
     for file in files:
         if not os.path.isfile(file):  # unlike pathlib's, it takes names that no file can have
-            named = f"{str(file)[:200]!r}"
-            raise MissingError(f"{path} names {named}, which is not there: add it, or take it out")
+            found = f"{path} names {str(file)[:200]!r}, which is not there"
+            raise MissingError(f"{found}: add it, or take it out")
     return times, files
 
 

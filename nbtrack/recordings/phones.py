@@ -29,10 +29,7 @@ from nbtrack.recordings.calibration import Calibration, calibration, camera_matr
 from nbtrack.recordings.formats import Declaration, Format
 from nbtrack.recordings.pose_files import Times, from_quaternions
 
-_ADVICE_ON_DEPTH = (
-    "run `pip install pyliblzfse`, or put 16-bit PNG files in millimetres into depth/ in place of "
-    "the .depth files"
-)
+_ADVICE_ON_DEPTH = "run `pip install pyliblzfse`, or put 16-bit PNG files (mm) into depth/ instead"
 
 
 def _camera(path: Path, numbers: Sequence[float]) -> Calibration:

@@ -100,8 +100,7 @@ def room_of(folder: Path) -> Room | None:
         return None
     with naming_damaged(path, "record of a room", _AGAIN):
         record = json.loads(path.read_text(encoding="utf-8"))
-        name = record["room"]
-        version = record["version"]
+        name, version = record["room"], record["version"]
     if version != ROOM_VERSION:
         raise DataError(f"{path} has version {version}; {ROOM_VERSION} is made here; {_AGAIN}")
     return build_room(name)

@@ -147,9 +147,6 @@ class Light:
 
     lamps: tuple[Vector3, ...]  # positions (m, world)
     strength: float = 0.62  # of each lamp, at its own place
-    reach: float = 2.6  # m at which a lamp's light has halved
-    ambient: float = 0.34
-    sky: float = 0.14  # added where the normal points up
 
     def shade(self, albedo: Points, points: Points, normals: Points, openness: Values) -> Points:
         """RGB in [0, 1] of a matt surface: Lambert's law, wrapped so that its terminator is soft.
@@ -158,12 +155,13 @@ class Light:
         sides and a little less of the lamps', which stands in for contact shadows. Source: our
         choice; it only gives shapes a look.
         """
-        energy = (self.ambient + self.sky * (0.5 + 0.5 * normals[:, 1])) * (0.55 + 0.45 * openness)
+        # Light from all sides, and what is added where the normal points up.
+        energy = (0.34 + 0.14 * (0.5 + 0.5 * normals[:, 1])) * (0.55 + 0.45 * openness)
         for position in self.lamps:
             towards = np.asarray(position) - points
             squared = row_dot(towards, towards)
             cosine = row_dot(towards, normals) / np.sqrt(squared)
             wrapped = np.maximum(cosine + 0.35, 0.0) / 1.35
-            falloff = self.strength / (1.0 + squared / self.reach**2)
+            falloff = self.strength / (1.0 + squared / 2.6**2)  # at 2.6 m it has halved
             energy += falloff * wrapped * (0.85 + 0.15 * openness)
         return np.clip(albedo * energy[:, None], 0.0, 1.0)
