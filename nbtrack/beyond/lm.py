@@ -147,7 +147,7 @@ class LmTracker(Tracker):
     def report(self) -> dict[str, float | bool]:
         """What a descent says of its pose, and how likely that makes it a wrong one: the verdict.
 
-        These are the inliers, standard deviations, the condition number and what `p_lost` takes.
+        These are the inliers, and what `p_lost` takes.
         """
         if self.best is None:
             return {"inlier_ratio": 0.0, "p_lost": 1.0, "lost": True}

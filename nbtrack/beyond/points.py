@@ -1,7 +1,7 @@
 """Points: the measured pixels of posed frames, averaged by voxel, for classical registration."""
 
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 from nbtrack.core.arrays import Colors, Frames, Points, Values, WorldPoints
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import project
-from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import Field, State
 from nbtrack.machinery.errors import ConfigError
@@ -139,19 +138,16 @@ def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frame
     infinite where all have it out of view or measured nothing there. Every fifth of the frames is
     asked: neighbours see the same.
     """
-    asked = (sequence[index] for index in frames[::5].tolist())
-    return reduce(torch.minimum, (_depth_behind(frame, points_world) for frame in asked))
-
-
-def _depth_behind(frame: Frame, points_world: Points) -> Values:
-    """`min_depth_behind` by one frame alone."""
-    T_world_camera = torch.from_numpy(frame.T_world_camera).to(points_world)
-    points_camera = (points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-    columns, rows, depth = project(frame.camera, points_camera)
-    columns, rows = columns.round(), rows.round()
-    inside = (depth > 0) & (columns >= 0) & (rows >= 0)
-    inside &= (columns < frame.camera.width) & (rows < frame.camera.height)
-    _, measured = frame.at(rows[inside].long(), columns[inside].long())
-    behind = torch.full_like(depth, torch.inf)
-    behind[inside] = torch.where(measured > 0, depth[inside] - measured, torch.inf)
+    behind = points_world.new_full(points_world.shape[:1], torch.inf)
+    for index in frames[::5].tolist():
+        frame = sequence[index]
+        T_world_camera = torch.from_numpy(frame.T_world_camera).to(points_world)
+        points_camera = (points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+        columns, rows, depth = project(frame.camera, points_camera)
+        columns, rows = columns.round(), rows.round()
+        inside = (depth > 0) & (columns >= 0) & (rows >= 0)
+        inside &= (columns < frame.camera.width) & (rows < frame.camera.height)
+        _, measured = frame.at(rows[inside].long(), columns[inside].long())
+        found = torch.where(measured > 0, depth[inside] - measured, torch.inf)
+        behind[inside] = torch.minimum(behind[inside], found)
     return behind

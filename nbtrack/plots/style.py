@@ -17,23 +17,21 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 PALETTE = "#3b6fb6", "#e08214", "#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d4d4d", "#a6911a"
-_FIXED = {
-    **dict.fromkeys(["iMAP with VR", "iMAP", "VR"], PALETTE[0]),
-    **dict.fromkeys(["NeuS with SDF", "NeuS", "SDF", "NeuS+ with SDF (Adam)"], PALETTE[1]),
-    **dict.fromkeys(["NeuS+ baked (LM)", "NeuS+", "LM"], PALETTE[2]),
-    **dict.fromkeys(["NeuS+ corrected (LM)", "NeuS+ corrected", "LM, corrected map"], PALETTE[3]),
-    "ICP": PALETTE[4],
-    "NeuS+ grid": PALETTE[5],
-    "five rooms of the paper": PALETTE[6],
-    "nine rooms of ours": PALETTE[7],
-    # Rates: a method's colour would say which method it is.
-    **{"at 10 Hz": PALETTE[5], "at 5 Hz": PALETTE[4], "at 2 Hz": PALETTE[6]},
-    # Green and red as in the paper's first figure, of tones that colour-blind readers tell apart
-    # (Okabe and Ito).
-    "true": "#009e73",
-    "tracked": "#d55e00",
-    "reference": "#7f7f7f",  # the poses that came with a recording: no method of ours
-}
+_LABELS = (  # those of each colour of the palette
+    ("iMAP with VR", "iMAP", "VR"),
+    ("NeuS with SDF", "NeuS", "SDF", "NeuS+ with SDF (Adam)"),
+    ("NeuS+ baked (LM)", "NeuS+", "LM"),
+    ("NeuS+ corrected (LM)", "NeuS+ corrected", "LM, corrected map"),
+    # Of rates, too: a method's colour would say which method it is.
+    ("ICP", "at 5 Hz"),
+    ("NeuS+ grid", "at 10 Hz"),
+    ("five rooms of the paper", "at 2 Hz"),
+    ("nine rooms of ours",),
+)
+_FIXED = {label: color for color, labels in zip(PALETTE, _LABELS, strict=True) for label in labels}
+# Green and red as in the paper's first figure, of tones that colour-blind readers tell apart (Okabe
+# and Ito). The reference are the poses that came with a recording: no method of ours.
+_FIXED |= {"true": "#009e73", "tracked": "#d55e00", "reference": "#7f7f7f"}
 WIDTH = 9.0  # inches of every figure: a notebook's text width
 DASHED = {"color": "0.3", "linestyle": "--", "linewidth": 1}
 DOTTED = {"color": "0.3", "linestyle": ":", "linewidth": 1.5}
