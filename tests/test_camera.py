@@ -13,7 +13,6 @@ from nbtrack.data.sequence import observed_bounds
 from nbtrack.machinery.errors import DataError
 
 CAMERA = Intrinsics(640, 480, 500.0, 510.0, 300.0, 250.0)
-UNIT = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 # 90 degrees wide and high: the corner pixels' centers are seen at 19/20 of the half width.
 SQUARE = Intrinsics.from_focal(20, 20, 10.0)
 AHEAD = np.eye(4)[None]
@@ -50,29 +49,10 @@ def test_project_undoes_backproject(shape: tuple[int, ...]) -> None:
     torch.testing.assert_close(project(CAMERA, points), pixel, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("origin", "direction", "expected"),
-    [
-        ((0, 0, 0), (0, 0, 1), 1.0),  # along an axis
-        ((0, 0, 0), (0, 0, -2), 0.5),  # in units of the direction
-        ((0, 0, 0), (0.5, 0, 1), 1.0),  # z is reached first
-        ((0, 0, 0), (2, 0, 1), 0.5),  # x is reached first
-        ((0.5, 0, 0), (1, 0.1, 0.2), 0.5),  # 0.5 m to go in x
-        ((0.5, 0, 0), (-1, 0.1, 0.2), 1.5),  # and 1.5 m backward
-        ((0.2, 0.3, 0.4), (0, -0.0, 1), 0.6),  # minus zero is no direction either
-        ((0.2, 0.3, 0.4), (1e-12, 0, -1), 1.4),
-        ((0, 0, 3), (0, 0, 1), -2.0),  # outside and away: it left 2 m ago
-    ],
-)
-def test_far_bound(origin: tuple, direction: tuple, expected: float) -> None:
-    """Catches NaN for rays along an axis, the near wall taken for the far, and a wrong unit."""
-    found = UNIT.far_bound(torch.tensor([origin]).float(), torch.tensor([direction]).float())
-    assert found.item() == pytest.approx(expected, abs=1e-6)
-
-
 def test_box_by_hand() -> None:
-    """Catches half and full sides mixed up, a scale of another axis than the longest, and an axis
-    left out: from inside, every exit is on a wall and none is outside."""
+    """Catches half and full sides mixed up, a scale of another axis than the longest, NaN for rays
+    along an axis, the near wall taken for the far, and an axis left out: from inside, every exit is
+    on a wall and none is outside; a ray that begins outside and leads away left it before."""
     box = SceneBounds((0.0, -1.0, 2.0), (4.0, 1.0, 5.0))
     np.testing.assert_allclose(box.center, [2.0, 0.0, 3.5])
     assert box.metres_per_unit == 2.0
@@ -83,6 +63,9 @@ def test_box_by_hand() -> None:
     exits = origins + box.far_bound(origins, directions)[:, None] * directions
     beyond = torch.maximum(low - exits, exits - high).amax(dim=-1)
     torch.testing.assert_close(beyond, torch.zeros(500), rtol=0, atol=1e-5)
+    along = torch.tensor([[0.0, -0.0, 1.0], [1e-12, 0.0, -2.0], [0.0, 0.0, 1.0]])
+    starts = torch.tensor([[1.0, 0.0, 3.0], [1.0, 0.0, 3.0], [1.0, 0.0, 9.0]])
+    assert box.far_bound(starts, along).tolist() == pytest.approx([2.0, 0.5, -4.0])
 
 
 @pytest.mark.parametrize(

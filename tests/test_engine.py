@@ -13,7 +13,7 @@ from test_fields import points_inside
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.fields import Field, NetworkSettings, make_field, mlp
-from nbtrack.machinery.device import advise_on_memory, device_name, usable_cores
+from nbtrack.machinery.device import advise_on_memory
 from nbtrack.machinery.errors import OutOfMemory
 from nbtrack.tracking import SdfSettings, StepBudget, make_tracker
 
@@ -38,13 +38,6 @@ def test_parts_answer_as_the_whole(name: str, monkeypatch) -> None:
     assert rows == [37, 10, 10, 10, 7, 37]
     for whole, parts in zip(*found, strict=True):
         torch.testing.assert_close(parts, whole, rtol=1e-4, atol=1e-5)
-
-
-def test_cores_are_those_that_may_be_used(monkeypatch) -> None:
-    """Catches a process a core of a shared machine, of which a scheduler has left one."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3}, raising=False)
-    assert usable_cores() == 1
-    assert device_name(torch.device("cpu")).endswith(", 1 cores")
 
 
 def test_many_frames_leave_no_memory_behind() -> None:

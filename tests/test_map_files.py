@@ -249,30 +249,26 @@ def test_meshes_keep_their_colours(work: Path, source: str, kind: str) -> None:
     assert (mesh.bounds[1] < np.array(bounds.maximum) + 0.1).all()
 
 
-@pytest.mark.parametrize("kind", ["ply", "glb"])
-def test_map_coordinates(kind: str) -> None:
-    """Catches meshes near 0 beside trajectories in map coordinates, and lost decimetres there; and
-    colours in a GLB file, where they are linear, that are too bright."""
-    mesh, origin = trimesh.creation.icosphere(1), np.array([500_000.0, 4_649_000.0, 0.0])
-    mesh.visual.vertex_colors = [10, 128, 255, 255]
-    content = trimesh.util.wrap_as_stream(mesh_bytes(mesh, kind, origin))
-    read = trimesh.load(content, file_type=kind, process=False)
-    read = read.to_mesh() if isinstance(read, trimesh.Scene) else read
-    np.testing.assert_allclose(read.vertices, mesh.vertices + origin, rtol=0, atol=1e-6)
-    assert (read.faces == mesh.faces).all()
-    stored = [10, 128, 255] if kind == "ply" else [1, 55, 255]
-    assert (np.asarray(read.visual.vertex_colors)[:, :3] == stored).all()
-
-
 @pytest.mark.parametrize("up", [[0, 0, 1], [0, -1, 0], [0, 1, 0], [-1, 0, 0]])
 def test_up_is_up(up: list[int]) -> None:
-    """Catches rooms that lie on their side in a viewer of GLB files, or are mirrored there."""
+    """Catches rooms that lie on their side in a viewer of GLB files, or are mirrored there; meshes
+    near 0 beside trajectories in map coordinates, decimetres that are lost there; and colours in a
+    GLB file, where they are linear, that are too bright."""
     points = np.array([up, [0, 0, 0], [1, 2, 3], [3, -1, 2]], dtype=float)
     mesh = trimesh.Trimesh(points, [[0, 1, 2], [0, 2, 3], [1, 3, 2]], process=False)
-    content = trimesh.util.wrap_as_stream(mesh_bytes(mesh, "glb", np.ones(3), up))
-    found = trimesh.load(content, file_type="glb", process=False).to_mesh().vertices
-    np.testing.assert_allclose(found[0] - found[1], [0, 1, 0], atol=1e-6)
-    before, after = (np.linalg.det(p[[0, 2, 3]] - p[1]) for p in (points, np.asarray(found)))
+    mesh.visual.vertex_colors = [10, 128, 255, 255]
+    origin, found = np.array([500_000.0, 4_649_000.0, 0.0]), {}
+    for kind, colors in (("ply", [10, 128, 255]), ("glb", [1, 55, 255])):
+        content = trimesh.util.wrap_as_stream(mesh_bytes(mesh, kind, origin, up))
+        read = trimesh.load(content, file_type=kind, process=False)
+        read = read.to_mesh() if isinstance(read, trimesh.Scene) else read
+        assert (read.faces == mesh.faces).all()
+        assert (np.asarray(read.visual.vertex_colors)[:, :3] == colors).all()
+        found[kind] = np.asarray(read.vertices)
+    np.testing.assert_allclose(found["ply"], points + origin, rtol=0, atol=1e-6)
+    turned = found["glb"]
+    np.testing.assert_allclose(turned[0] - turned[1], [0, 1, 0], atol=1e-6)
+    before, after = (np.linalg.det(p[[0, 2, 3]] - p[1]) for p in (points, turned))
     assert after == pytest.approx(before, rel=1e-5)
 
 

@@ -24,7 +24,6 @@ from tiny import tiny_words
 
 from nbtrack import load_preset, track_scenes
 from nbtrack.cli import main
-from nbtrack.experiments import map_jobs
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.machinery import files
 from nbtrack.machinery.device import threads
@@ -36,14 +35,6 @@ from nbtrack.recordings.recording import open_recording
 from nbtrack.synthetic import make, room
 
 PROJECT = Path(__file__).parents[1]
-
-
-def test_a_map_is_read_once(work: Path) -> None:
-    """Catches a command that reads its map again and again: a corrected one takes seconds."""
-    map_jobs._read.cache_clear()
-    with mock.patch.object(map_jobs, "read_map", wraps=map_jobs.read_map) as read:
-        assert main([*OWN, "--frames", "1:"]) == 0
-    assert read.call_count == 1
 
 
 def test_a_recording_is_never_written_to(work: Path, capsys, monkeypatch) -> None:

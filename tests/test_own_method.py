@@ -170,8 +170,7 @@ def test_a_file_that_cannot_be_imported(
     assert "Traceback" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("when", ["before", "after"])
-def test_settings_of_own_classes_whenever_they_are_registered(when: str, monkeypatch) -> None:
+def test_settings_of_own_classes_whenever_they_are_registered(monkeypatch) -> None:
     """Catches other settings of one class in a file, in a notebook and in an installed package: its
     own defaults, with what smoke changes in NeuS or SDF, and without a user's values of those; and
     a class written anew, as a cell run again does, that loses what was chosen for it."""
@@ -194,8 +193,6 @@ def test_settings_of_own_classes_whenever_they_are_registered(when: str, monkeyp
         monkeypatch.setitem(FIELDS, "mine", type("Mine", (FIELDS["neus"],), field))
         monkeypatch.setitem(TRACKERS, "mine", type("Mine", (TRACKERS["sdf"],), tracker))
 
-    if when == "before":
-        register()
     chosen = ["mapping.neus.iterations=7", "network.neus.width=33", "tracking.sdf.lambda_sdf=3.0"]
     preset = load_preset("smoke", settings=chosen)
     register()
@@ -208,13 +205,6 @@ def test_settings_of_own_classes_whenever_they_are_registered(when: str, monkeyp
     register()
     again = with_settings(preset, "tracking.mine.lambda_sdf=2.0").tracking_of("mine")
     assert (again.n_pixels, again.lambda_sdf) == (7, 2.0)
-
-
-def test_a_field_that_shares_a_network() -> None:
-    """Catches advice whose nearest key would change another field's network."""
-    with pytest.raises(ConfigError, match=r"network of 'tanh': .*imap, neus, ") as caught:
-        load_preset("smoke", settings=["network.tanh.width=3"])
-    assert "did you mean" not in str(caught.value)
 
 
 class Nameless(nbtrack.LearnedField):

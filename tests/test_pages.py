@@ -1,6 +1,5 @@
 """Pages of notebooks and texts: whole without a network, with right formulas and living links."""
 
-import re
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
@@ -67,13 +66,3 @@ def test_each_page_has_contents_and_a_way_back(pages: dict[Path, bs4.BeautifulSo
         assert links[-len(headings) :] == headings or not headings, path
         back = [(path.parent / link).resolve() for link in links if "#" not in link]
         assert back == ([root] if path != root else []), path
-
-
-def test_formulas_are_mathml() -> None:
-    """Catches letters that are not bold, one bar unlike the other, and TeX left over."""
-    made = PAGES.mathml(r"\lVert\hat{\mathbf c}_k\rVert_1", "block")
-    assert "&#x1D41C;" in made
-    bars = re.findall("<mo[^>]*>&#x02016;</mo>", made)
-    assert len(bars) == 2
-    assert bars[0] == bars[1]
-    assert "\\" not in made

@@ -141,18 +141,6 @@ def test_curves_along_a_ray_share_their_depths() -> None:
     assert list(measured.get_xdata()) == [1.2, 1.2]
 
 
-def test_panels_share_their_rows() -> None:
-    """Catches rows from the bottom, another panel's numbers, and a method in another's colour."""
-    rows = pd.DataFrame({"ICP": [1.0, 2.0], "SDF": [9.0, 8.0]}, index=["b", "a"])
-    panels = plots.plot_panels({"one": rows, "two": 2 * rows}, "ATE (cm)").axes
-    for axes, factor in zip(panels, (1, 2), strict=True):
-        icp, sdf = axes.lines
-        assert [icp.get_color(), sdf.get_color()] == [PALETTE[4], PALETTE[1]]
-        assert [*sdf.get_xdata()] == [9.0 * factor, 8.0 * factor]
-        assert axes.collections[0].get_segments()[0][:, 0].tolist() == [factor, 9.0 * factor]
-        assert axes.get_ylim() == (1.5, -0.5)
-
-
 def test_curves_of_methods_and_sweeps() -> None:
     """Catches a group without its own line, colour or mark, text sorted by letters, and spans drawn
     elsewhere."""
@@ -312,17 +300,6 @@ def test_errors_run_in_seconds() -> None:
     assert line.get_ydata() == pytest.approx([1.0, 30.0])
     assert still.get_label() == "standing still"
     assert still.get_ydata() == pytest.approx([2.0, 4.0])
-
-
-def test_points_carry_their_labels() -> None:
-    """Catches a legend of many entries with repeated colours, and labels that cover each other."""
-    x = np.linspace(1.0, 1.1, 12)
-    near = pd.DataFrame({"time (ms)": x, "ATE (cm)": x, "method": [f"method {v}" for v in x]})
-    figure = plots.plot_curves(near, *near, log="")
-    assert not figure.legends
-    boxes = [text.get_window_extent() for text in figure.axes[0].texts]
-    assert len(boxes) == len(near)
-    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
 
 
 def test_unmeasured_pixels_are_not_errors(sequence) -> None:

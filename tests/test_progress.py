@@ -2,7 +2,7 @@
 
 import pytest
 
-from nbtrack.machinery.progress import ProgressBar, tell
+from nbtrack.machinery.progress import ProgressBar
 
 
 class Clock:
@@ -43,24 +43,6 @@ def test_a_warm_up_is_left_out(clock: Clock, capsys) -> None:
     first, second, *_ = capsys.readouterr().err.splitlines()
     assert "? left" in first
     assert "29:58 left" in second  # 58 times 31 s
-
-
-@pytest.mark.parametrize("columns", [60, 120])
-def test_a_narrow_terminal(clock: Clock, monkeypatch, capsys, columns: int) -> None:
-    """Catches a bar of which nothing but a long title is left, and warnings without colour; and
-    colours where they were not asked for, or nobody looks."""
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    monkeypatch.setenv("COLUMNS", str(columns))
-    with ProgressBar("tracking living_room-neus_plus-corrected-lm-10hz-seed3", 8) as bar:
-        clock.now = 31
-        bar.move_to(2, "waits for another process that makes the same")
-        line = bar.format_meter(**bar.format_dict | {"ncols": columns})
-    assert line.startswith(" 25 % |███         | 01:33 left, tracking living_room")
-    capsys.readouterr()
-    for no_color, color, end in (("", "\33[33m", "\33[0m"), ("1", "", "")):
-        monkeypatch.setenv("NO_COLOR", no_color)
-        tell("nbtrack: warning: w")
-        assert capsys.readouterr().err == f"{color}nbtrack: warning: w{end}\n"
 
 
 def test_short_and_hidden_work_is_silent(clock: Clock, capsys) -> None:

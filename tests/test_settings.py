@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tiny import TINY, tiny_words
+from tiny import TINY
 
 from nbtrack import Map, open_scene, open_scenes
 from nbtrack.beyond.correction import correct_map
-from nbtrack.cli import main
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.experiments.bench import measure_steps
 from nbtrack.experiments.methods import METHODS, TABLE_1
@@ -22,7 +21,7 @@ from nbtrack.recordings.reading import parse_frames
 from nbtrack.synthetic import REPORTED_ROOMS, build_room
 from nbtrack.synthetic.make import MOTIONS
 from nbtrack.tables import published_table_1
-from nbtrack.tracking import TRACKERS, SdfTracker, StepBudget, TrackerSettings, make_tracker
+from nbtrack.tracking import StepBudget, make_tracker
 from nbtrack.tracking.metrics import still_metrics
 
 KEY = "mapping.neus.iterations"
@@ -179,25 +178,6 @@ def test_changed_settings_are_those_that_were_changed(name: str) -> None:
     assert len(changed) == len(settings)
     assert with_settings(PRESETS[name], *changed) == preset
     assert load_preset(name) == PRESETS[name]
-
-
-def test_one_tree_for_a_command(monkeypatch) -> None:
-    """Catches settings that are made anew wherever one is asked for, once for each --set before."""
-    made = []
-
-    class Unused(SdfTracker):
-        name = "unused"
-
-        @staticmethod
-        def Settings() -> TrackerSettings:
-            made.append(SdfTracker.Settings())
-            return made[-1]
-
-    monkeypatch.setitem(TRACKERS, "unused", Unused)
-    words = tiny_words("tracking.sdf.n_pixels=8", "tracking.sdf.lambda_sdf=2.0")
-    run = ["track", "office", "--tracker", "sdf", "--field", "neus", "--steps", "1"]
-    assert main([*run, *words]) == 0
-    assert len(made) == 1
 
 
 EVERY_KEY = flat(PRESETS["smoke"].settings)
