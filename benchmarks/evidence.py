@@ -46,14 +46,17 @@ KEPT = [
 
 @dataclass(frozen=True)
 class OtherDepth(Scene):
-    """A synthetic room or one of the paper's, read with another of its depth folders."""
+    """One of the paper's rooms, read with another depth folder, or with an error taken out."""
 
-    depth_folder: str = "depth"
+    depth_folder: str | None = None
+    depth_error_per_m: float = 0.0
 
     @cached_property
     def recording(self) -> Recording:
-        """With the depth of that folder."""
-        return open_recording(self.folder, self.format, self.depth_folder)
+        """With that depth."""
+        recording = open_recording(self.folder, self.format, self.depth_folder)
+        declared = replace(recording.declared, depth_error_per_m=self.depth_error_per_m)
+        return replace(recording, declared=declared)
 
 
 @dataclass(frozen=True)
@@ -65,13 +68,11 @@ class Case:
     how: dict[str, Any] = field(default_factory=dict)  # arguments of `track_scenes`
     methods: Sequence[str | Method] | None = None  # by default the experiment's
     tracked: tuple[str, ...] = ()  # settings of the scenes that are tracked, and not mapped
-    # The depth folder of scenes that are "mapped" and "tracked"; by default the format's own.
-    depth: dict[str, str] = field(default_factory=dict)
+    depth: dict[str, Any] = field(default_factory=dict)  # how it is read: fields of `OtherDepth`
 
-    def in_role(self, role: str, scenes: list[Scene]) -> list[Scene]:
-        """Scenes that are "mapped" or "tracked", with the depth that they have there."""
-        folder = self.depth.get(role)
-        return [OtherDepth(s.name, s.folder, depth_folder=folder) if folder else s for s in scenes]
+    def seen(self, scene: Scene) -> Scene:
+        """A scene as it is read."""
+        return OtherDepth(scene.name, scene.folder, **self.depth) if self.depth else scene
 
 
 @dataclass(frozen=True)
@@ -99,10 +100,13 @@ FULL = load_preset("synthetic", settings=[THREE_ROOMS, "scenes.n_frames=240", *_
 # Five of the paper's rooms, at the sizes of the file beside the results.
 PAPER_ROOMS = load_preset("paper", tables_folder() / "paper_rooms" / "settings.toml")
 PAPER_SIZES = load_preset("paper", tables_folder() / "paper_rooms_gpu" / "settings.toml")
-# The paper's rooms with the depth of the dataset's sensor, and with that of one without its bias,
-# which lies in a folder of its own.
-_UNBIASED = dict.fromkeys(("mapped", "tracked"), "depth_unbiased")
-SENSORS = Case({"sensor": "dataset"}), Case({"sensor": "unbiased"}, depth=_UNBIASED)
+# The paper's rooms with the depth of the dataset's sensor, with that of one without its bias, which
+# lies in a folder of its own, and with the first as one of the paper's authors corrects it.
+SENSORS = (
+    Case({"sensor": "dataset"}),
+    Case({"sensor": "unbiased"}, depth={"depth_folder": "depth_unbiased"}),
+)
+CORRECTED = Case({"sensor": "dataset, corrected"}, depth={"depth_error_per_m": 0.00123631})
 _SIZES_PLUS = {"n_rays": 96, "n_stratified": 8, "n_surface": 8, "n_surface_points": 1024}
 _SIZES_PLUS |= {"learning_rate": 0.003}
 _SMALL_PLUS = [f"mapping.neus_plus.{name}={size}" for name, size in _SIZES_PLUS.items()]
@@ -121,6 +125,17 @@ def _at_speed(speed: float) -> Case:
     return Case({"speed": speed}, (motion, f"scenes.n_frames={n_frames}"))
 
 
+TRAINED = 500, 1000, 2000, 4000, 8000  # iterations
+
+
+def _trained(case: Case, units: int, iterations: int, learning_rate: float) -> Case:
+    """A case with other sizes of the map."""
+    sizes = {"iterations": iterations, "learning_rate": learning_rate}
+    settings = [f"mapping.neus.{name}={size}" for name, size in sizes.items()]
+    place = {"units": units, "iterations": iterations, **case.place}
+    return replace(case, place=place, settings=(f"network.neus.width={units}", *settings))
+
+
 def _with_steps(steps: float, n_pixels: int) -> Case:
     settings = f"tracking.vr.n_pixels={n_pixels}", f"tracking.sdf.n_pixels={n_pixels}"
     return Case({"n_pixels": n_pixels, "steps": steps}, settings, {"steps": steps})
@@ -133,21 +148,18 @@ GRIDS = {
     # What the bias of the sensor costs LM, in corrected maps of the sizes of `smoke`, and ICP.
     "sensors": Grid(
         with_settings(PAPER_ROOMS, *_SMALL_PLUS),
-        SENSORS,
+        [*SENSORS, CORRECTED],
         ["corrected", "icp_middle"],
         {"steps": 30},
         "paper_rooms",
     ),
-    # How the error of SDF at 5 Hz follows the training of its map, with both sensors.
+    # How the error of SDF at 5 Hz follows the training of its map, and the sensor.
     "training": Grid(
         with_settings(PAPER_ROOMS, "scenes.names=['breakfast_room']"),
         [
-            replace(
-                sensor,
-                place={"iterations": n, **sensor.place},
-                settings=(f"mapping.neus.iterations={n}",),
-            )
-            for sensor, n in product(SENSORS, (500, 1000, 2000, 4000, 8000))
+            *(_trained(sensor, 96, n, 3e-3) for sensor, n in product(SENSORS, TRAINED)),
+            _trained(CORRECTED, 96, 4000, 3e-3),
+            *(_trained(sensor, 256, 4000, 1e-3) for sensor in SENSORS),
         ],
         ["sdf"],
         {"rates_hz": [5], "frames": ":240"},
@@ -238,8 +250,7 @@ def chunks_of(grid: Grid, seed: int) -> Iterator[Chunk]:
         how = {"seeds": [seed], **grid.how, **case.how}
         if grid.workers:  # all at once; below they are read
             track(scenes, methods, preset, grid.workers, **how)
-        pairs = zip(case.in_role("mapped", scenes), case.in_role("tracked", tracked), strict=True)
-        for mapped, seen in pairs:
+        for mapped, seen in zip(map(case.seen, scenes), map(case.seen, tracked), strict=True):
 
             def make(mapped=mapped, seen=seen, methods=methods, preset=preset, how=how):
                 rows = track([mapped], methods, preset, tracked=[seen], **how)
