@@ -136,7 +136,9 @@ def _wide(cells: pd.DataFrame, keys: list[str], value: str) -> pd.DataFrame:
 
 
 def _refuse_doubles(cells: pd.DataFrame, keys: list[str]) -> None:
-    """Raises DataError where two rows have the same values of these columns."""
+    """Raises DataError where these columns are not all there, or two rows have the same of them."""
+    if not {*keys} <= {*cells}:
+        raise DataError(f"a table has the columns {[*cells]}: it needs {', '.join(keys)}")
     twice = cells[cells.duplicated(keys)]
     if len(twice):
         cell = ", ".join(str(key) for key in twice[keys].iloc[0])

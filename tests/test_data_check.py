@@ -41,6 +41,7 @@ from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.settings import with_settings
 from nbtrack.recordings.formats import WORLD_TO_CAMERA
 from nbtrack.recordings.recording import open_recording
+from nbtrack.synthetic.make import make_room
 
 N_FRAMES = 16
 MOVED_MM = 30 * np.linalg.norm([0.55, -0.4, 0.73])
@@ -379,3 +380,10 @@ def test_black_images(tmp_path: Path) -> None:
     changed = with_settings(load_preset("smoke"), *settings)
     assert changed.tracking_of("lm").lambda_intensity == 0
     assert changed.tracking_of("sdf").lambda_color == 0
+
+
+def test_a_camera_that_turns_fast(tmp_path: Path) -> None:
+    """Catches pairs so far apart that a camera which turns by 5 degrees a frame sees nothing in
+    both, so that nothing is told of a right recording."""
+    make_room("living_room", tmp_path / "room", 40, 48, 36, motion="tour")
+    assert check_recording(open_recording(tmp_path / "room")).verdict == "read rightly"

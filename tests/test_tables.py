@@ -336,6 +336,13 @@ def test_two_values_for_a_cell() -> None:
             make(pd.concat([cells, cells]))
 
 
+def test_no_results() -> None:
+    """Catches a KeyError for a table without rows, which has no columns either."""
+    for make in (table_1, table_2):
+        with pytest.raises(DataError, match="it needs"):
+            make(pd.DataFrame())
+
+
 def latex_is_installed() -> bool:
     files = ["booktabs.sty", "geometry.sty", "multirow.sty", "siunitx.sty", "xcolor.sty"]
     if shutil.which("pdflatex") is None or shutil.which("kpsewhich") is None:

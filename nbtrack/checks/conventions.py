@@ -65,7 +65,8 @@ class Convention(Agreement):
     @property
     def is_far_apart(self) -> bool:
         """Whether surfaces lie farther apart than in any part of a right recording."""
-        return self.apart > min(2 * _USUAL_APART, _USUAL_M / self.depth_m)
+        # Also true for NaN: of nothing that is known it cannot be said that it agrees.
+        return not self.apart <= min(2 * _USUAL_APART, _USUAL_M / self.depth_m)
 
     def is_clearly_better(self, other: "Convention") -> bool:
         """Whether clearly more surfaces coincide than in the other."""

@@ -62,7 +62,7 @@ def doubts_of_poses(conventions: list[Convention], file: str, needs_proof: bool)
     """
     own, *others = conventions
     alike = [c.name for c in others if c.subject == "poses" and not own.is_clearly_better(c)]
-    if own.overlap < MIN_OVERLAP:
+    if own.overlap < MIN_OVERLAP or np.isnan(own.apart):
         seen = f"too little of the same ({own.overlap:.0%} of the points)"
         why = f"two frames see {seen}: check it, and a piece with smaller steps"
     elif needs_proof and alike:
