@@ -30,7 +30,6 @@ _CELL_2 = ["tracker", "n_pixels", "budget_ms"]
 _MISSING = "–"
 _BOLD = "font-weight: bold;"
 _LEGEND = f"bold: best at this rate; † and red: above {LOST_THRESHOLD_M:g} m"
-Marks = pd.DataFrame | bool  # a table of flags, or one for all cells
 _UNITS = {"m": (1, "{:.3f}"), "mm": (1000, "{:.1f}")}  # of an ATE, and how it is printed
 
 
@@ -110,9 +109,8 @@ def beside_published(results: pd.DataFrame) -> pd.DataFrame:
     sides = {"ours": ours, "paper": paper}
     summary = {("median ATE (m)", side): table.median(axis=1) for side, table in sides.items()}
     for side, table in sides.items():
-        summary["lost (share of scenes)", side] = 1 - (table.round(3) <= LOST_THRESHOLD_M).mean(
-            axis=1
-        )
+        is_followed = table.round(3) <= LOST_THRESHOLD_M
+        summary["lost (share of scenes)", side] = 1 - is_followed.mean(axis=1)
     return pd.DataFrame(summary).reindex(ours.index)
 
 
@@ -233,7 +231,7 @@ def _texts(wide: pd.DataFrame, form: str, missing: str = "") -> pd.DataFrame:
     return wide.map(lambda value: missing if pd.isna(value) else form.format(value))
 
 
-def _styled(texts: pd.DataFrame, stds: pd.DataFrame, is_best: Marks, is_lost: Marks) -> TableStyler:
+def _styled(texts: pd.DataFrame, stds: pd.DataFrame, is_best: Any, is_lost: Any) -> TableStyler:
     """A styled table of `Cell`s; marks are tables of the shape of the texts, or a flag for all."""
     cells = np.vectorize(Cell, otypes=[object])(texts, stds, is_best, is_lost)
     styler = TableStyler(pd.DataFrame(cells, texts.index, texts.columns))

@@ -92,9 +92,8 @@ def track_command(options: Namespace) -> None:
     steps = options.steps if has_budget else method.usual_steps
     make_budget(steps, options.rate)  # raises for a wrong one, before a room is made
     scene = _opened(options, preset)
-    job = given
+    job = given or MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
     if not given:
-        job = MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
         scene.select(job.frames)  # raises for a wrong slice
     how = steps, options.rate, options.frames, options.seed, options.start
     run = TrackJob(job, scene, method.tracker, preset.tracking_of(method.tracker), *how)

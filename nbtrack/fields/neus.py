@@ -94,8 +94,7 @@ class NeuSField(LearnedField):
         last layer is linear: the start is a least-squares problem with one answer (our choice).
         """
         single = {"dtype": torch.float32}
-        corners = self.bounds.minimum, self.bounds.maximum
-        low, high = (torch.tensor(corner, **single) for corner in corners)
+        low, high = (torch.tensor(c, **single) for c in (self.bounds.minimum, self.bounds.maximum))
         # m, in the box
         points = low + (high - low) * torch.rand(8192, 3, generator=generator, **single)
         target = torch.minimum(points - low, high - points).amin(dim=-1)  # m, to the nearest face

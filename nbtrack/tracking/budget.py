@@ -59,11 +59,9 @@ class ClockBudget:
 
     def _steps(self, start: float, device: torch.device) -> Generator[int, None, None]:
         """The steps of a frame begun at `start` (s). It is prepared when the first is asked for."""
-        prepared = self._now(device)
-        now = prepared
-        mean = self.memory
+        prepared = now = self._now(device)
+        mean, step = self.memory, 0
         self.memory = None  # it stays so after a frame without any step
-        step = 0
         while mean is None or start + 1 / self.rate_hz - now >= mean:
             try:
                 yield step

@@ -217,8 +217,7 @@ class Tracker(abc.ABC):
         began = time.perf_counter()
         allowed = budget.frame(self.device)  # a clock runs from here
         self.begin(frame.to(self.device), torch.from_numpy(T_starts))
-        steps = 0
-        loss = float("nan")
+        steps, loss = 0, float("nan")
         for step in allowed:
             loss = self.step()
             steps = step + 1
