@@ -24,7 +24,7 @@ class SceneBounds:
         low, high = (tuple(map(float, corner)) for corner in (self.minimum, self.maximum))
         unit = 1.0 if self.declared_unit is None else self.declared_unit
         if len(low) != 3 or not all(0 < x < np.inf for x in (*np.subtract(high, low), unit)):
-            raise ConfigError(f"{self} are no bounds: give (x, y, z) twice, the second larger")
+            raise ConfigError(f"{self} are no bounds: give a minimum and a larger maximum, in m")
         object.__setattr__(self, "minimum", low)
         object.__setattr__(self, "maximum", high)
 

@@ -160,7 +160,8 @@ def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -
     if options.map_frames:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
     if field != made:
-        raise ConfigError(f"{options.map_from} is a map of {made!r}, not {field!r}: leave that out")
+        advice = "leave --method and --field out"
+        raise ConfigError(f"{options.map_from} is a map of field {made!r}, not {field!r}: {advice}")
     known, wanted = flat(given.setting_tree), flat(preset.settings)
     asked = {key for text in options.settings for key in read_setting(text)}
     asked |= {f"correction.{made}"} if options.method else set()  # methods say it, or none

@@ -95,7 +95,8 @@ def cluster(address: str, n_calls: int) -> Iterator[Workplace]:
         client = Client(address, timeout=_SECONDS_TO_CONNECT)
         client.wait_for_workers(1, timeout=_SECONDS_TO_CONNECT)
     except (OSError, ValueError):
-        raise MissingError(f"no Dask scheduler at {address!r} with a worker: start them") from None
+        advice = "start 'dask scheduler', and 'dask worker ADDRESS --nthreads 1'"
+        raise MissingError(f"no Dask scheduler at {address!r} with a worker: {advice}") from None
     with client:
         # Not pure: Dask would answer an equal call with the result of the earlier one.
         executor = client.get_executor(pure=False)
