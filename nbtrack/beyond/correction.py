@@ -75,6 +75,7 @@ class CorrectedField(BakedField):
             self.register_buffer(name, correction[name])
         medians = self.residual_medians.double().numpy()  # of distance (m) and luma
         scales = np.maximum(_SCALES_PER_MEDIAN * medians, _MIN_SCALES)
+        # A point fits within 2.5 cm of the surface.
         self.accuracy = Accuracy(tuple(scales.tolist()), 0.025, float(medians[1]))
         self.volume[4] = _UNMEASURED  # the channel of confidence
         self.volume[:, self.numbers.long()] += self.corrections.float().T
@@ -138,16 +139,16 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     uncorrected = grid.volume[:4].T.double().numpy()[numbers]
     color_before, distance_before = uncorrected[:, :3], uncorrected[:, 3:]
     reliability = (depth.mean() / depth) ** 2
-
     wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ distance_before
     reliabilities = np.tile(reliability, len(_OFFSETS))
+    # Residuals above 1 cm count less; their weights are computed anew four times.
     distance, diagonal = solve(matrix, wanted, reliabilities, regularisation, 0.01, rounds=4)
     # The share of measurements, not regularisation, in a vertex's diagonal.
     confidence = (1 - _UNMEASURED) * (1 - regularisation.diagonal() / diagonal)
 
     at_surface = matrix[:n_points]  # the rows of the first offset, which is 0
     wanted_color = seen_color - at_surface @ color_before
-    # Colours change faster: a tenth of the regularisation.
+    # Colours, in [0, 1], change faster: a tenth of the regularisation.
     color, _ = solve(at_surface, wanted_color, reliability, 0.1 * regularisation, 0.05, rounds=3)
 
     distance_residuals = wanted[:n_points] - at_surface @ distance

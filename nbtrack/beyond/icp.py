@@ -24,8 +24,6 @@ _NARROW = 0.1
 _FAR_APART = 0.06  # m, rad; starts that differ by less are taken for one, as by LM
 _NEIGHBOURS = 20  # points that tell a point's plane
 _MIN_POINTS = 20  # with fewer a frame keeps its start
-_MIN_INLIERS = 0.5  # share of the points; below, a frame is lost
-_LOST = 0.5  # a pose is lost if the probability that it is right is less
 _SEARCH = {"registration_type": "GICP", "num_threads": 1, "max_iterations": 30}
 _SEARCH |= {"rotation_epsilon": 1e-3, "translation_epsilon": 1e-3}  # rad, m; smaller moves end it
 
@@ -160,8 +158,8 @@ class IcpTracker(Tracker):
         # points that count as independent half of the wrong poses before a flat wall would pass.
         position_std_m = std_when_moved(costs_at, T_found, covariance, 2, n_independent=128)
         inlier_ratio = self.found.num_inliers / self.source.size()
-        is_held = p_within(CORRELATED * position_std_m) > _LOST
-        lost = inlier_ratio < _MIN_INLIERS or not is_held
+        is_held = p_within(CORRELATED * position_std_m) > 0.5
+        lost = inlier_ratio < 0.5 or not is_held
         return {"inlier_ratio": inlier_ratio, "position_std_m": position_std_m, "lost": lost}
 
     def _find_planes(self, cloud: Any) -> Any:

@@ -52,17 +52,6 @@ def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
     return np.stack([right, np.cross(viewer, right), viewer])
 
 
-def inward_side(mesh: trimesh.Trimesh) -> float:
-    """1 where the normals of a room's shell point inwards, else -1.
-
-    Marching cubes orients faces by the sign of the field, which differs between densities and
-    distances. The sign is that of the sum over the area, since a room's shell is larger than what
-    stands in it.
-    """
-    inwards = mesh.bounds.mean(axis=0) - mesh.triangles_center
-    return np.sign((inwards * mesh.face_normals).sum(axis=1) @ mesh.area_faces)
-
-
 def draw_mesh(
     axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray, to_screen: np.ndarray | None = None
 ) -> np.ndarray:
@@ -73,7 +62,10 @@ def draw_mesh(
     Returns the `screen_axes` of the view: those given, else those from where most surface shows its
     front. Lengths across the picture are true (m).
     """
-    side = inward_side(mesh)
+    # Marching cubes orients faces by the sign of the field, which differs between densities and
+    # distances: 1 where normals point inwards, else -1, by most of the area, which is the shell's.
+    inwards = mesh.bounds.mean(axis=0) - mesh.triangles_center
+    side = np.sign((inwards * mesh.face_normals).sum(axis=1) @ mesh.area_faces)
     if to_screen is None:
         # None of the azimuths looks along the walls of a room aligned to the axes.
         screens = np.stack([screen_axes(up, azimuth) for azimuth in np.arange(15.0, 360.0, 30.0)])

@@ -32,14 +32,14 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     choice). Raises `NumericalError` as `attempts` does.
     """
     of_short, of_long = room.walk.keys
-    keys = np.array(of_short if n_frames <= 240 else of_long)
+    keys = np.array(of_short if n_frames <= 240 else of_long)  # frames of the shorter path
     base = _calibrated_path(room, keys)
     # How far (m) a camera that stands still has to be off at least: 1 m, or by this share of what
     # it is without a seed's changes.
     least = min(1.0, 0.8 * still_metrics(base)["still_ate_m"])
 
     for rng in attempts(room, seed):
-        moved = keys.copy()
+        moved = keys.copy()  # so little that the paths of two seeds pass the same things
         moved[:, :3] += rng.uniform(-1, 1, (len(keys), 3)) * (0.2, 0.1, 0.2)  # m
         moved[:, 4] += rng.uniform(-0.12, 0.12, len(keys))  # yaw, rad
         poses = _calibrated_path(room, moved)

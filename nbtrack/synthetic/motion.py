@@ -41,7 +41,7 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     Raises `NumericalError` as `attempts` does.
     Source: our choice; the statistics are those of hand-held RGB-D recordings.
     """
-    length = max(n_frames, 120)
+    length = max(n_frames, 120)  # shorter ones are the beginning of one of this length
     for rng in attempts(room, seed):
         poses = _glance_around(room.walk, length, rng)
         is_at_height = poses[:, 1, 3].min() >= HEIGHTS[0] and poses[:, 1, 3].max() <= HEIGHTS[1]
