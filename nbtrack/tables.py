@@ -119,11 +119,9 @@ def beside(ours: pd.DataFrame, paper: pd.DataFrame) -> pd.DataFrame:
     same = paper.reindex(index=ours.index, columns=ours.columns)
     sources = {"ours": ours, "paper": same, "difference": ours - same}
     both = pd.concat(sources, names=["source"]).reorder_levels([1, 2, 0])
-    # Ours stands alone where the paper has no such row.
     rows = []
-    for row in ours.index:
-        shown = sources if row in paper.index else ["ours"]
-        rows += [(*row, source) for source in shown]
+    for row in ours.index:  # ours stands alone where the paper has no such row
+        rows += [(*row, source) for source in (sources if row in paper.index else ["ours"])]
     return both.loc[rows]
 
 
