@@ -24,6 +24,7 @@ from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.fields import NetworkSettings, NeusMapping, make_field
 from nbtrack.fields.base import NEAR, rendered_losses
 from nbtrack.fields.neus import NeuSField, guided_depths
+from nbtrack.mapping.holdout import depth_residual_of, usual_depth_residual
 from nbtrack.recordings.reading import FAR, far_limit
 from nbtrack.tracking import SdfSettings, StepBudget, VrSettings, make_tracker
 
@@ -151,7 +152,8 @@ def test_a_mapping_loss_is_the_sum_by_hand(name: str) -> None:
 @pytest.mark.parametrize("unit", ["map", "metre"])
 def test_the_first_step_of_adam_by_hand(unit: str) -> None:
     """Catches a rate in another unit, one rate for both parts, and a quaternion that is left
-    longer than one: a first step moves every coordinate by its rate, against the gradient."""
+    longer than one: a first step moves every coordinate by its rate, against the gradient; and a
+    search from the worse of two starts."""
     room = BoxRoom()
     sequence = box_sequence([[0.05, -0.04, 0.03]], room)
     settings = SdfSettings(n_pixels=500, position_unit=unit)
@@ -162,6 +164,11 @@ def test_the_first_step_of_adam_by_hand(unit: str) -> None:
     quaternion = Rotation.from_matrix(found[:3, :3]).as_quat(scalar_first=True)
     vector = np.abs(quaternion[1:] / quaternion[0])
     np.testing.assert_allclose(vector, 1e-3, rtol=2e-3)
+    assert tracker.q_wxyz.norm().item() == pytest.approx(1, abs=3e-7)
+    starts = torch.from_numpy(poses_at([[0.1, 0.0, 0.0], [0.05, -0.04, 0.03]]))
+    for T_starts in (starts, starts.flip(0)):  # the better one is taken up
+        tracker.begin(sequence[0], T_starts)
+        assert tracker.T_world_camera[0, 3].item() == pytest.approx(0.05)
 
 
 def test_the_trackers_losses_by_hand() -> None:
@@ -261,7 +268,8 @@ def test_how_many_points_fit_by_hand() -> None:
 
 
 def test_views_that_are_alike() -> None:
-    """Catches brightness or contrast that count, depths that do not, and an order turned round."""
+    """Catches brightness or contrast that count, depths that do not or that count little, and an
+    order turned round."""
     frames = box_sequence([[0.0, 0.0, 0.0], [0.0, 0.0, 0.15], [0.0, 0.0, -0.4]], BoxRoom(), 96)
     views = torch.stack([view_of(frames[i]) for i in range(3)])
     cameras = frames.T_world_camera.copy()
@@ -269,6 +277,11 @@ def test_views_that_are_alike() -> None:
     found = retrieve(darker, Viewpoints(cameras, views), 3)
     assert found[:, 2, 3].tolist() == [0.15, 0.0, -0.4]
     np.testing.assert_allclose(found[0], cameras[1], atol=1e-12)  # not turned
+    deeper, unlike = views[0].clone(), views[0].clone()
+    deeper[1] = (1.5 * deeper[1].float()).clamp(max=255).byte()
+    unlike[0] = unlike[0].flip(0)
+    found = retrieve(views[0], Viewpoints(cameras, torch.stack([deeper, unlike, views[0]])), 3)
+    assert found[:, 2, 3].tolist() == [-0.4, 0.15, 0.0]
 
 
 def test_a_view_shows_what_lies_where() -> None:
@@ -283,3 +296,16 @@ def test_a_view_shows_what_lies_where() -> None:
     asked = (luma > 0) & (expected < 60)
     assert asked.sum() > 100
     assert np.abs(depth - expected)[asked].max() < 1.5
+
+
+def test_how_far_a_map_is_off_by_hand() -> None:
+    """Catches a pose that is inverted, a sign that counts, and frames that were not mapped: walls
+    lie where the frames saw them, or 10 cm before or behind that."""
+    poses = poses_at([[0.1, 0.05, -0.1]] * 3, [0.1, -0.3, 0.2])
+    sequence = box_sequence(poses)
+    assert depth_residual_of(BoxRoom(), sequence[0]) < 0.03  # rendered: as sharp as its samples
+    for off in (-0.1, 0.1):
+        grid = BakedField(BoxRoom(half=(1.0 + off, 0.8 + off, 1.2 + off)), 0.05)
+        assert depth_residual_of(grid, sequence[0]) == pytest.approx(0.1, abs=2e-3)
+    sequence.T_world_camera[0, 0, 3] += 0.5
+    assert usual_depth_residual(BoxRoom(), sequence, np.array([1, 2])) < 0.03

@@ -144,7 +144,7 @@ def test_a_pose_that_still_moves_when_the_budget_ends_is_lost() -> None:
     """Catches a pose on its way along a wall that passes for found: most points fit on the wall."""
     offset, tracker = retract(T_TRUE, np.array([0.0, 0.05, 0.0, 0.1, 0.05, 0.1])), begun()
     assert run(tracker, offset, 1)
-    assert tracker.best.last_step > 0.01
+    assert tracker.report()["last_step"] > 0.01
     assert not run(begun(), offset, 40)
 
 

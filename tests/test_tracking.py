@@ -84,12 +84,17 @@ def test_colour_alone() -> None:
 
 
 def test_where_a_frame_starts() -> None:
-    """Catches a start from the truth: without steps, all estimates are the first pose; and a motion
-    model that is named in the settings and not used, or not reset."""
+    """Catches a start from the truth: without steps, all estimates are the first pose, and errors
+    are those of standing still; and a motion model that is named in the settings and not used, or
+    not reset."""
     sequence = walk(3)
     tracked = track("sdf", sequence, 0.1)
     assert tracked.frames["steps"].sum() == 0
     assert np.allclose(tracked.T_estimated, np.eye(4), atol=1e-7)
+    still, errors = (tracked.frames[f"{name}_error_m"] for name in ("still", "translation"))
+    np.testing.assert_allclose(still, errors, atol=1e-7)
+    np.testing.assert_array_equal(tracked.T_true, sequence.T_world_camera[1:])
+    tracked.T_true[:] = np.nan  # as a user may: the sequence stays
     tracker = tracker_of("sdf", 0.1, SdfSettings(motion_model="constant_velocity"))
     tracker.estimates.append(sequence.T_world_camera[1])
     assert np.allclose(tracker.track(sequence[2]).T_world_camera, sequence.T_world_camera[2])
