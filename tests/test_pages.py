@@ -55,14 +55,3 @@ def test_a_page_loads_nothing_and_tells_what_it_is(pages: dict[Path, bs4.Beautif
     assert page.title.text.startswith("1. Map known rooms")
     assert not page.select("img[alt^='No description'], img[alt='']")
     assert "interactive(" not in page.text
-
-
-def test_each_page_has_contents_and_a_way_back(pages: dict[Path, bs4.BeautifulSoup]) -> None:
-    """Catches a page whose contents lack a heading, and one that does not lead to the index."""
-    (root,) = (path for path in pages if path.parent == min(p.parent for p in pages))
-    for path, page in pages.items():
-        headings = [f"#{heading['id']}" for heading in page.select("h2")]
-        links = [link["href"] for link in page.nav.select("a")]
-        assert links[-len(headings) :] == headings or not headings, path
-        back = [(path.parent / link).resolve() for link in links if "#" not in link]
-        assert back == ([root] if path != root else []), path

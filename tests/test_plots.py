@@ -131,16 +131,6 @@ def test_every_axis_has_a_unit_and_nothing_leaks(name: str, sequence) -> None:
     assert plt.get_fignums() == []
 
 
-def test_curves_along_a_ray_share_their_depths() -> None:
-    """Catches values beside another sample's depth, where a section has none."""
-    *curves, measured = FIGURES["ray"](None).axes[0].lines
-    for line, n in zip(curves, (20, 19), strict=True):
-        assert line.get_xdata() == pytest.approx(np.linspace(0, 2, 20), abs=1e-6)
-        values = np.ma.compressed(line.get_ydata()).astype(float)
-        assert values == pytest.approx(np.linspace(1, -1, 20)[:n], abs=1e-6)
-    assert list(measured.get_xdata()) == [1.2, 1.2]
-
-
 def test_curves_of_methods_and_sweeps() -> None:
     """Catches a group without its own line, colour or mark, text sorted by letters, and spans drawn
     elsewhere."""
@@ -193,17 +183,6 @@ def test_names_that_are_no_formulas(tmp_path: Path) -> None:
             figure = plots.plot_curves(SWEEP, *SWEEP, "a$^$b 録画: 3 frames")
             save_picture(figure, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 1000
-
-
-def test_slices_side_by_side(sequence) -> None:
-    """Catches maps that are compared in two scales, panels without their map's name, and a room
-    with another sign, frame or scale than its map."""
-    left, right, _ = plots.plot_slice([SPHERE, NEAR], sequence, 0.0, title="two").axes
-    assert left.collections[0].norm is right.collections[0].norm
-    assert SPHERE.label in left.get_title("left")
-    panels = plots.plot_slice(SPHERE, sequence, 0.0, ROOM).axes[:2]
-    mapped, exact = (np.asarray(axes.collections[0].get_array()) for axes in panels)
-    assert exact == pytest.approx(mapped, abs=1e-6)
 
 
 def test_what_was_not_seen_is_veiled(sequence) -> None:

@@ -247,19 +247,6 @@ def test_written_files(tmp_path: Path) -> None:
     assert "C, $n = 512$ &" in third.read_text()
 
 
-def test_latex_for_a_paper(tmp_path: Path) -> None:
-    """Catches a caption, a label or a scene's name that is still ours, and one label for both."""
-    own = Wording(r"My \emph{table}.", "tab:mine", {"room_a": "Mine & x"})
-    write_tables(tmp_path, OURS_1, OURS_2, NOTE, own=own)
-    first, second = ((tmp_path / f"table_{n}.tex").read_text() for n in (1, 2))
-    assert "\\caption{My \\emph{table}. \\textcolor{red}{Red}$^\\dagger$: above" in first
-    assert r"\begin{table}" in first  # two columns fit into one of the page's
-    assert "\\label{tab:mine}" in first
-    assert r"\begin{tabular}{@{}r@{}}Mine\\\&\\x\end{tabular}" in first
-    assert "\\label{tab:mine-steps}" in second
-    assert "used for tracking).}\n" in second  # without the note
-
-
 @pytest.mark.parametrize(
     ("given", "written"),
     [
@@ -280,6 +267,7 @@ def test_captions_compile(tmp_path: Path, given: str, written: str | None) -> No
         written = given.replace("R_1", r"R\_1").replace("^", r"\textasciicircum{}")
     assert rf"\caption{{{written} \textcolor{{red}}" in text
     assert r"\label{tab:a_b-c-1}" in text
+    assert r"\label{tab:a_b-c-1-steps}" in (tmp_path / "table_2.tex").read_text()
 
 
 def test_millimetres_where_metres_tie(tmp_path: Path) -> None:
