@@ -210,7 +210,7 @@ def plot_panels(
         y = texts.get_indexer(values.index)
         axes.hlines(y, values.min(axis=1), values.max(axis=1), color="0.85", linewidth=2, zorder=1)
         for (label, color), mark in zip(style.method_colors(values).items(), _MARKS, strict=False):
-            axes.plot(values[label], y, mark, color=color, mec="white", label=label)
+            axes.plot(values[label], y, mark, color=color, mfc="none", mew=1.6, label=label)
         axes.set_yticks(range(len(texts)), texts)
         axes.set(title=name, xlabel=x, ylim=(len(texts) - 0.5, -0.5))
         style.log_axes(axes, "x")
