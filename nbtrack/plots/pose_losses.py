@@ -127,9 +127,10 @@ def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, nea
     paths_cm = {label: _path_cm(tracker, frame, T_start) for label, tracker in trackers.items()}
     errors_mm = {label: 10 * np.linalg.norm(path, axis=1) for label, path in paths_cm.items()}
     within = {label: np.flatnonzero(e < 1000 * near) for label, e in errors_mm.items()}
-    found = [f"{k} after {n[0]} steps" if len(n) else f"{k} never" for k, n in within.items()]
+    steps = {k: n[0] if len(n) else f"not in {len(errors_mm[k]) - 1}" for k, n in within.items()}
+    found = ", ".join(f"{label} {told}" for label, told in steps.items())
     ends = " and ".join(f"{errors[-1]:.0f}" for errors in errors_mm.values())
-    title = f"Within {1000 * near:.0f} mm: {', '.join(found)}; they end {ends} mm off"
+    title = f"Steps to within {1000 * near:.0f} mm: {found}; they end {ends} mm off"
     plane, by_step = new_axes(title, 3.6, 1, 2, width_ratios=[1.2, 1])[0]
     field = next(iter(trackers.values())).field
     _draw_mean_distance(plane, field, frame, np.concatenate([*paths_cm.values(), [[0, 0, 0]]]))
@@ -142,9 +143,8 @@ def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, nea
     plane.plot(0, 0, "*", markersize=10, label="true pose", **marks)
     plane.set(xlabel="camera off along x (cm)", ylabel="off along z (cm)", aspect="equal")
     by_step.axhline(1000 * near, **DASHED)
-    corner = {"ha": "right", "va": "bottom"}
-    by_step.text(by_step.get_xlim()[1], 1000 * near, f"{1000 * near:.0f} mm", **corner)
-    by_step.set(xlabel="step", ylabel="position error (mm)")
+    by_step.set(xlabel="step", ylim=0, ylabel=f"position error (mm; dashed: {1000 * near:.0f})")
+    plane.figure.get_layout_engine().set(wspace=0.1)
     return plane.figure.legend_below()
 
 
