@@ -20,7 +20,7 @@ from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 DEPTH, DEPTH_ERROR, DISTANCE = "depth (m)", "depth error (cm)", "|signed distance| (cm)"
 # Panels keep their own anchor (panchor): else those with a bar stand lower than those without.
-_BAR = {"location": "bottom", "pad": 0.02, "aspect": 40, "extend": "max", "panchor": False}
+_BAR = {"location": "bottom", "pad": 0.02, "extend": "max", "panchor": False}
 _MARKS = "os^Dv"  # matplotlib's markers of up to five methods
 # A title, an image (colours or numbers), and the label of the numbers' colour bar; "" for colours.
 Panel = tuple[str, np.ndarray, str]
@@ -101,7 +101,9 @@ def plot_images(rows: list[list[Panel]], title: str = "", ends: Ends | None = No
         limit = (ends or {}).get(label) or _most(np.ma.stack([i.get_array() for i in images]))
         for drawn in images:
             drawn.set_clim(0, limit)
-        figure.colorbar(images[0], ax=[image.axes for image in images], label=label, **_BAR)
+        # Wide bars are no thicker than narrow ones, whose length is some tens of their thickness.
+        aspect = 90 * min(len(images), len(rows[0])) / len(rows[0])
+        figure.colorbar(images[0], ax=[i.axes for i in images], label=label, aspect=aspect, **_BAR)
     return figure
 
 
@@ -123,33 +125,38 @@ def show_image(axes: Axes, image: np.ndarray, title: str, colors: str = "viridis
 
 @style.styled
 def plot_along_ray(
-    depths: Values, curves: Curves, measured_depth: float, title: str, ylabel: str
+    depths: Values, curves: Curves, marks: Mapping[str, float], title: str, ylabel: str
 ) -> Figure:
-    """Curves of one unit over the z-depths (m) of a ray's samples, every second dashed.
+    """Curves of one unit over the z-depths (m) of a ray's samples; that called "true" is dashed.
 
-    A curve may be shorter than `depths`: weights of sections lack the last sample.
+    A curve may be shorter than `depths`: weights of sections lack the last sample. `marks` are
+    further depths (m) by label.
     """
     index = depths.cpu().numpy()
     columns = {k: pd.Series(c.detach().cpu(), index[: len(c)]) for k, c in curves.items()}
     axes = style.new_axes(title, 2.7)[0, 0]
-    look = {"style": ["-", "--"] * len(curves), "color": style.method_colors(columns)}
+    dashes = ["--" if label == "true" else "-" for label in columns]
+    look = {"style": dashes, "color": style.method_colors(columns)}
     pd.DataFrame(columns).plot(ax=axes, xlabel="depth (m)", ylabel=ylabel, **look)
-    axes.axvline(measured_depth, label="measured depth", **style.DASHED)
+    for label, depth in marks.items():
+        axes.axvline(depth, label=label, **style.DASHED)
     axes.legend()
     return axes.figure
 
 
 @style.styled
-def plot_columns(tables: Sequence[pd.DataFrame], title: str = "") -> Figure:
+def plot_columns(tables: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """The columns of each table below each other, over its index, whose name labels x.
 
-    Tables stand side by side and have the same columns, whose names, with units, label y.
+    Tables stand side by side below their names, and have the same columns, whose names, with units,
+    label y.
     """
-    n = len(tables[0].columns)
-    grid = style.new_axes(title, 0.9 + 1.3 * n, n, len(tables), sharex="col", sharey="row")
-    for column, table in zip(grid.T, tables, strict=True):
+    n = len(next(iter(tables.values())).columns)
+    grid = style.new_axes(title, 0.9 + 1.45 * n, n, len(tables), sharex="col", sharey="row")
+    for column, (heading, table) in zip(grid.T, tables.items(), strict=True):
+        column[0].set_title(heading)
         for axes, (name, color) in zip(column, style.method_colors(table).items(), strict=True):
-            axes.plot(table[name].dropna(), ".-", markersize=4, color=color)
+            axes.plot(table[name].dropna(), color=color)
             axes.set(xlabel=table.index.name, ylabel=name)
             axes.label_outer()
     return grid[0, 0].figure
@@ -161,26 +168,29 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
 
     `frames` has by method the rows of a run's frames.csv, of the same frames. The dashed line is
     the ATE of 0.2 m above which the paper prints a sequence in red; the dotted one is a camera that
-    stands still.
+    stands still. The legend names these two, since curves have their names at their ends.
     """
     above, below = style.new_axes(title, 4.9, 2, sharex=True)[:, 0]
     draw_errors(above, frames)
     for label, color in style.method_colors(frames).items():
         below.plot(_seconds(frames[label]), frames[label]["rotation_error_deg"], color=color)
     above.margins(x=0)  # labels at the ends of curves stand beside the axes
-    above.axhline(100 * LOST_THRESHOLD_M, **style.DASHED)
-    above.text(0, 100 * LOST_THRESHOLD_M, "the paper's 0.2 m", va="bottom")
+    above.axhline(100 * LOST_THRESHOLD_M, label="the paper's 0.2 m", **style.DASHED)
     below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
     return above.figure.legend_below()
 
 
 def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
-    """Errors of the position (cm) over time (s), by label, and those of a camera standing still."""
+    """Errors of the position (cm) over time (s), by label, and those of a camera standing still.
+
+    Of several curves each has its label at its end; one curve alone has it in the legend.
+    """
+    alone = len(frames) == 1
     for label, color in style.method_colors(frames).items():
         error_cm = 100 * frames[label]["translation_error_m"]
-        axes.plot(_seconds(frames[label]), error_cm, color=color, label=label)
+        axes.plot(_seconds(frames[label]), error_cm, color=color, label=label if alone else "")
         last = error_cm.last_valid_index()
-        if last is not None and len(frames) > 1:  # one curve alone needs no label at its end
+        if last is not None and not alone:
             end = _seconds(frames[label])[last], error_cm[last]
             axes.annotate(label, end, (5, 0), textcoords="offset points", color=color, va="center")
     still = list(frames.values())[-1]  # the same in every run of these frames

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -19,6 +20,7 @@ _STEP = 0.01  # m, between the grid points of a slice
 _BEFORE, _BEHIND, _ASIDE = 0.2, 0.45, 0.45  # m, drawn before the camera, behind the measured point
 _N_STRATIFIED, _N_IMPORTANCE = 32, 12  # iMAP's samples along a ray
 _DOT = {"edgecolors": "black", "linewidths": 0.5, "zorder": 4}
+_HALO = withStroke(linewidth=3, foreground="white")
 _COLORS = method_colors(["VR", "SDF", "true"])
 
 
@@ -51,8 +53,9 @@ def plot_idea(
     draw_slice(axes, field, grid_world, places, aspect=25, pad=0.015)
     pose = torch.from_numpy(T_world_camera).float()
     axes.plot([0, distance + _BEHIND], [0, 0], color="0.2", linewidth=0.8)
-    axes.plot([0, 0.2, 0.2, 0], [0, 0.12, -0.12, 0], "k-", linewidth=1.5)
-    axes.text(0.1, -0.15, "camera", ha="center", va="top")
+    # With white, since the slice may be dark here.
+    axes.fill([0, 0.2, 0.2], [0, 0.12, -0.12], facecolor="white", edgecolor="black", linewidth=1.5)
+    axes.text(0.1, -0.17, "camera", ha="center", va="top", path_effects=[_HALO])
     if field.is_distance:
         _draw_queries(axes, field, pose, points_camera, page_camera)
     else:

@@ -15,7 +15,7 @@ _ARROW = {"arrowstyle": "-|>", "color": "0.3", "shrinkA": 0, "shrinkB": 0}
 def plot_network(network: FourierMlp, value: str, title: str = "") -> Figure:
     """From a point to colour and a value: a box is a layer, with its activation and shape.
 
-    `value` names the fourth output with its unit, as "density (1/m)".
+    `value` names the fourth output with its unit, as "density (1/m)". A sigmoid makes the colours.
     """
     hidden = f"{network.activation.__name__}(W h + b)"
     layers = [("sin(x B)", network.frequencies)]
@@ -25,7 +25,7 @@ def plot_network(network: FourierMlp, value: str, title: str = "") -> Figure:
     texts = [f"{name}\n{matrix.shape[0]} × {matrix.shape[1]}" for name, matrix in layers]
     axes = new_axes(title, 1.6)[0, 0]
     boxes = []
-    for place, text in enumerate(["point\n3 (m, world)", *texts, f"colour (3)\n{value}"]):
+    for place, text in enumerate(["point\n3 (m, world)", *texts, f"sigmoid: colour (3)\n{value}"]):
         edge = PALETTE[0] if 0 < place <= len(texts) else "none"  # of layers only
         box = {"boxstyle": "square,pad=0.6", "facecolor": "white", "edgecolor": edge}
         boxes.append(axes.text(place, 0, text, bbox=box, **_CENTRED).get_bbox_patch())

@@ -8,6 +8,7 @@ import torch
 import trimesh
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.ndimage import binary_opening
 
 from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.data.sequence import RgbdSequence
@@ -16,7 +17,7 @@ from nbtrack.plots import scene
 from nbtrack.plots.figures import draw_errors
 from nbtrack.plots.meshes import extract_mesh, seen_by
 from nbtrack.plots.scene import Paths
-from nbtrack.plots.style import WIDTH, method_colors, new_axes, styled
+from nbtrack.plots.style import method_colors, new_axes, styled
 from nbtrack.synthetic import Room
 
 _TRUE_LINE = {"colors": method_colors(["true"])["true"], "linestyles": "--"}
@@ -32,14 +33,15 @@ def plot_slice(
 ) -> Figure:
     """A field's values on the horizontal plane `height` metres up, drawn as `draw_slice` does.
 
-    Fields of one recording stand side by side, in one colour scale. `sequence` are the frames that
-    the maps were made of; `height` is by default the cameras' mean. `room` is the exact scene, if
-    it is a synthetic one: its surface is dashed green, and its distance stands beside those of the
-    fields. The axes end around the path and what the frames have seen, within a known room.
+    Fields of one recording stand side by side, in the colour scale of the first. `sequence` are the
+    frames that the maps were made of; `height` is by default the cameras' mean. `room` is the exact
+    scene, if it is a synthetic one: its surface is dashed green, and its distance stands before
+    those of the fields. The axes end around the path and what the frames have seen, within a known
+    room. What single rays saw between others counts as not seen.
     """
     drawn = [fields] if isinstance(fields, Field) else [*fields]
     if room is not None and drawn[0].is_distance:
-        drawn.append(_ExactDistance(room, drawn[0]))
+        drawn.insert(0, _ExactDistance(room, drawn[0]))
     # Lower with more panels, which are narrower.
     panels = new_axes(title, 5.4 - 0.9 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
     norm = None  # the first field's, for all
@@ -51,12 +53,12 @@ def plot_slice(
         step = (high - low).max() / 240  # m
         points, places = _level_grid(page, low, high + step, step, height * up)
         bar = {"ax": panels, "aspect": 25, "pad": 0.015}
-        shown = seen_by(points, sequence)
+        shown = binary_opening(seen_by(points, sequence), iterations=2)
         norm = scene.draw_slice(axes, field, points, places, shown, norm, **bar)
         axes.plot([], [], "k-", label="surface")  # only names the lines drawn above in the legend
         if room is not None:
             shown = shown & _draw_true_level(axes, room, points, places)
-        axes.plot([], [], "s", color=scene.UNSEEN, label="never seen")
+        axes.plot([], [], "s", color=scene.UNSEEN, label="hardly or never seen")
         axes.set_title(f"{field.label}, {height:.2f} m up")
         _end_around(axes, places[shown], sequence.T_world_camera[:, :3, 3] @ page.T)
     return panels[0].figure.legend_below()
@@ -119,6 +121,7 @@ def plot_mesh(meshes: Mapping[str, trimesh.Trimesh], T_paths: Paths, title: str 
     for axes, (label, mesh) in zip(panels, meshes.items(), strict=True):
         to_screen = scene.draw_mesh(axes, mesh, scene.up_of(*T_paths.values()), to_screen)
         scene.draw_paths(axes, T_paths, to_screen[:2])
+        scene.draw_scale(axes)
         axes.set_title(label)
     return panels[0].figure.legend_below()
 
@@ -129,41 +132,32 @@ def plot_map_and_slice(
 ) -> Figure:
     """A map as in the paper's Figure 1: its surface, a slice through its signed distance, paths.
 
-    The surface is drawn as `plot_mesh` draws it, from a grid of `voxel` metres. Beside it stand, in
-    the same projection, the slice at the cameras' mean height, grey where no frame of `sequence`
-    has seen it, and larger the paths alone, camera-to-world poses (m) by label.
+    The surface is drawn as `plot_mesh` draws it, from a grid of `voxel` metres. Beside it is the
+    slice at the cameras' mean height in the same projection, grey where no frame of `sequence` has
+    seen it. Both have camera-to-world poses (m) by label; the last panel has how far (mm) those
+    after the first are from the first, pose by pose.
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
-    axes = new_axes(title, 4.2)[0, 0]
-    to_page = scene.draw_mesh(axes, mesh, up)[:2]
-    axes.set_axis_off()
-    paths = np.concatenate([path[:, :3, 3] for path in T_paths.values()])
+    room, level, errors = new_axes(title, 3.6, 1, 3, width_ratios=[1.2, 1.4, 1])[0]
+    to_page = scene.draw_mesh(room, mesh, up)[:2]
+    paths = {label: path[:, :3, 3] for label, path in T_paths.items()}
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
-    points = _level_points(np.concatenate([mesh.bounds, paths]), voxel, up, height)
-    parts = {"Mesh: the zero level": mesh.vertices}
-    parts |= {"Slice at the cameras' height; grey: never seen": points, "The path, larger": paths}
-    on_page = mesh.vertices @ to_page.T
-    corner, size = on_page.min(axis=0), np.ptp(on_page, axis=0)
-    gap, top = 0.12 * size[0], corner[1] + 1.08 * size[1]  # top: of all headings
-    for name, part in parts.items():
-        on_page = (part @ to_page.T).reshape(-1, 2)
-        low, extent = on_page.min(axis=0), np.ptp(on_page, axis=0).clip(1e-3)
-        zoom = (size / extent).min() if part is paths else 1.0  # to the height of the mesh
-        aside = to_page.T @ (corner / zoom - low)  # m, world frame
-        if part is points:
-            places = (points + aside) @ to_page.T
-            bar = {"location": "bottom", "shrink": 0.35, "aspect": 30, "pad": 0.02}
-            scene.draw_slice(axes, field, points, places, seen_by(points, sequence), **bar)
-        scene.draw_paths(axes, T_paths, zoom * to_page, 0.7, aside)
-        if not axes.figure.legends:  # of the first part, while each path is drawn once
-            axes.figure.legend_below()
-        middle = corner[0] + zoom * extent[0] / 2
-        axes.text(middle, top, name, ha="center")
-        _draw_scale(axes, middle, corner[1] - 0.5 * gap, gap, zoom, extent.max())
-        corner = corner + np.array([zoom * extent[0] + gap, 0])
-    axes.figure.set_figheight(1.5 + WIDTH * axes.dataLim.height / axes.dataLim.width)
-    return axes.figure
+    points = _level_points(np.concatenate([mesh.bounds, *paths.values()]), voxel, up, height)
+    shown = seen_by(points, sequence)
+    scene.draw_slice(level, field, points, points @ to_page.T, shown, location="bottom", shrink=0.7)
+    level.set_axis_off()
+    level.set_aspect("equal")
+    for axes, name in (room, "surface: the zero level"), (level, "slice at the cameras' height"):
+        scene.draw_paths(axes, T_paths, to_page, 0.7)
+        scene.draw_scale(axes)
+        axes.set_title(name)
+    first, *others = paths
+    for label in others:
+        off_mm = 1000 * np.linalg.norm(paths[label] - paths[first], axis=1)
+        errors.plot(off_mm, color=method_colors(paths)[label])
+    errors.set(xlabel="frame", ylabel=f"off the {first} path (mm)")
+    return room.figure.legend_below()
 
 
 def _level_points(shown: np.ndarray, step: float, up: np.ndarray, height: float) -> np.ndarray:
@@ -175,13 +169,6 @@ def _level_points(shown: np.ndarray, step: float, up: np.ndarray, height: float)
     places = shown @ level.T
     low, high = places.min(axis=0) - step, places.max(axis=0) + 2 * step
     return _level_grid(level, low, high, step, height * up)[0]
-
-
-def _draw_scale(axes: Axes, x: float, y: float, gap: float, zoom: float, extent: float) -> None:
-    """A bar of 1 m, or another power of ten below `extent` (m), in a drawing enlarged by `zoom`."""
-    length = 10.0 ** np.floor(np.log10(extent))
-    axes.plot(x + zoom * length * np.array([-0.5, 0.5]), [y, y], "k-", linewidth=2)
-    axes.text(x, y - 0.1 * gap, f"{length:g} m", ha="center", va="top")
 
 
 @styled

@@ -22,7 +22,7 @@ from nbtrack.plots.style import method_colors
 
 Paths = Mapping[str, Poses]  # camera-to-world poses (m) by label
 _ELEVATION = np.radians(45)  # of the viewer of a mesh
-_AMBIENT = 0.55  # share of the light on a mesh that comes from everywhere
+_AMBIENT = 0.75  # share of the light on a mesh that comes from everywhere
 UNSEEN = "0.82"
 """The grey of what no frame has seen; the scales of values hold no grey."""
 _CUT = 0.01  # share of a recording's points cut off at either end: wild depths hide the room
@@ -82,11 +82,18 @@ def draw_mesh(
     order = corners[..., 2].mean(axis=1).argsort()  # from the farthest to the nearest
     look = {"edgecolors": "face", "linewidths": 0.4, "rasterized": True}
     axes.add_collection(PolyCollection(corners[order, :, :2], facecolors=colors[order], **look))
-    # Only lengths across have numbers: others are shortened.
-    axes.set(aspect="equal", xlabel="left to right (m)", yticks=[])
-    axes.spines["left"].set_visible(False)
-    axes.grid(False)
+    axes.set_aspect("equal")
+    axes.set_axis_off()  # a scale would be that of lengths across alone: others are shortened
     return to_screen
+
+
+def draw_scale(axes: Axes) -> None:
+    """Draw a bar of 1 m, or of another power of ten, below all that is drawn on axes in metres."""
+    (left, low), (right, high) = axes.dataLim.get_points()
+    length = 10.0 ** np.floor(np.log10(right - left))
+    x, y = (left + right) / 2, low - 0.05 * (high - low)
+    axes.plot(x + length * np.array([-0.5, 0.5]), [y, y], "k-", linewidth=2)
+    axes.annotate(f"{length:g} m", (x, y), (0, -12), textcoords="offset points", ha="center")
 
 
 def draw_from_above(axes: Axes, T_paths: Paths) -> tuple[np.ndarray, np.ndarray]:
@@ -104,22 +111,20 @@ def draw_from_above(axes: Axes, T_paths: Paths) -> tuple[np.ndarray, np.ndarray]
     return up, page
 
 
-def draw_paths(
-    axes: Axes, T_paths: Paths, to_page: np.ndarray, width: float = 1, aside: np.ndarray | float = 0
-) -> None:
+def draw_paths(axes: Axes, T_paths: Paths, to_page: np.ndarray, width: float = 1) -> None:
     """Draw trajectories by label, with a dot where the first one starts.
 
     The rows of `to_page`, (2, 3), are the page's axes in the world. `width` multiplies lines and
-    dot. `aside` (m, world frame) moves everything, as to a slice beside the room.
+    dot.
     """
     dashes = cycle(("--", "-.", ":"))
     for label, color in method_colors(T_paths).items():
-        x, y = to_page @ (T_paths[label][:, :3, 3] + aside).T
+        x, y = to_page @ T_paths[label][:, :3, 3].T
         line = "-" if label == "true" else next(dashes)
         # The true path is wide, so that the others do not hide it.
         look = {"linewidth": width * (4.0 if label == "true" else 1.6), "color": color, "zorder": 3}
         axes.plot(x, y, line, label=label, **look)
-    start_x, start_y = to_page @ (next(iter(T_paths.values()))[0, :3, 3] + aside)
+    start_x, start_y = to_page @ next(iter(T_paths.values()))[0, :3, 3]
     dot = {"color": "black", "markersize": 5 * width, "zorder": 4}
     # A legend has four keys at most: beside four paths the start has no label.
     axes.plot(start_x, start_y, "o", label="start" if len(T_paths) < 4 else "", **dot)
@@ -156,16 +161,13 @@ def draw_slice(
     A signed distance is blue in free space and red in matter, with thin lines 0.25 m apart; a
     density or an occupancy has a logarithmic scale. Black is the surface (the field's
     `surface_level`). What no frame has seen is grey: there the field invents. `bar` holds options
-    of `Figure.colorbar`. Returns the scale; with that of another slice as `norm` no bar is drawn,
-    and of distances it is widened for both.
+    of `Figure.colorbar`. Returns the scale; with that of another slice as `norm` no bar is drawn.
     """
     _, values = query_field(field, points)
     level = field.surface_level
     if field.is_distance:
-        limit = max(0.2, np.quantile(np.abs(values), 0.98), norm.vmax if norm else 0)  # m
+        limit = 0.25 * max(1, np.ceil(np.quantile(np.abs(values), 0.98) / 0.25))  # m
         own_norm, colors = Normalize(-limit, limit), "RdBu"
-        if norm:
-            norm.vmin, norm.vmax = -limit, limit
     else:
         own_norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
     look = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points

@@ -25,8 +25,8 @@ _LABELS = (  # those of each colour of the palette
     # Of rates, too: a method's colour would say which method it is.
     ("ICP", "at 5 Hz"),
     ("NeuS+ grid", "at 10 Hz"),
-    ("five rooms of the paper", "at 2 Hz"),
-    ("nine rooms of ours",),
+    ("five rooms of the paper",),
+    ("nine rooms of ours", "at 2 Hz"),
 )
 _FIXED = {label: color for color, labels in zip(PALETTE, _LABELS, strict=True) for label in labels}
 # Green and red as in the paper's first figure, of tones that colour-blind readers tell apart (Okabe
@@ -85,6 +85,7 @@ class NotebookFigure(Figure):
         Image.open(drawn).convert("RGB").save(picture, "PNG", optimize=True)
         return picture.getvalue()
 
+    @styled
     def legend_below(self) -> "NotebookFigure":
         """Draw the first panel's legend below all panels, for which it holds; returns the figure.
 
