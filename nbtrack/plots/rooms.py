@@ -139,13 +139,13 @@ def plot_map_and_slice(
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
-    room, level, errors = new_axes(title, 3.6, 1, 3, width_ratios=[1.2, 1.4, 1])[0]
+    room, level, errors = new_axes(title, 3.3, 1, 3, width_ratios=[1.2, 1.5, 0.9])[0]
     to_page = scene.draw_mesh(room, mesh, up)[:2]
     paths = {label: path[:, :3, 3] for label, path in T_paths.items()}
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
     points = _level_points(np.concatenate([mesh.bounds, *paths.values()]), voxel, up, height)
     shown = seen_by(points, sequence)
-    scene.draw_slice(level, field, points, points @ to_page.T, shown, location="bottom", shrink=0.7)
+    scene.draw_slice(level, field, points, points @ to_page.T, shown, shrink=0.7, aspect=25)
     level.set_axis_off()
     level.set_aspect("equal")
     for axes, name in (room, "surface: the zero level"), (level, "slice at the cameras' height"):
@@ -156,7 +156,7 @@ def plot_map_and_slice(
     for label in others:
         off_mm = 1000 * np.linalg.norm(paths[label] - paths[first], axis=1)
         errors.plot(off_mm, color=method_colors(paths)[label])
-    errors.set(xlabel="frame", ylabel=f"off the {first} path (mm)")
+    errors.set(xlabel="frame", ylabel=f"off the {first} path (mm)", ylim=(0, None))
     return room.figure.legend_below()
 
 
