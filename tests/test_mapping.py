@@ -50,6 +50,7 @@ def test_neus_finds_a_wall() -> None:
     assert sdf[1] == pytest.approx(0.3, abs=0.1)
     assert (color[2] - 128 / 255).abs().max() < 0.1
     assert mapped.record["misfit_m"] < 0.05
+    assert mapped.record["first_and_last_frame"] == [0, 5]
 
 
 def test_imap_renders_a_wall() -> None:
