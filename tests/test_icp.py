@@ -1,6 +1,7 @@
 """The fused point cloud and the classical tracker in it."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,11 +61,12 @@ def test_points_of_a_voxel_are_averaged(monkeypatch) -> None:
 
 def test_only_the_frames_asked_for_and_what_lies_inside_are_fused() -> None:
     """Catches a map of held-out frames, wild depths that stretch the grid, and a distance that is
-    squared, or from another point."""
+    squared, from another point, or not to be had where a pose is optimised."""
     sequence = two_pixels([[2000, 9000], [1000, 1000]], [[10, 10]] * 2)
     cloud = fuse_points(sequence, np.array([0]), BOX, voxel=0.02)
     np.testing.assert_allclose(cloud.points, [[-0.5, 0.0, 2.0]], atol=1e-6)
-    found = cloud(torch.tensor([[-0.5, 0.3, 2.0], [-0.5, 0.0, 1.6]]))[1]
+    asked = torch.tensor([[-0.5, 0.3, 2.0], [-0.5, 0.0, 1.6]]).requires_grad_()
+    found = cloud(asked)[1]
     torch.testing.assert_close(found, torch.tensor([0.3, 0.4]))
 
 
@@ -104,17 +106,22 @@ def test_icp_lands_on_the_true_pose(room: Room) -> None:
 
 
 def test_icp_says_when_it_is_lost(room: Room) -> None:
-    """Catches a crash, or a pose that is no number, where no point has a partner."""
+    """Catches a crash, or a pose that is no number, where no point has a partner: far from the map,
+    and in its midst, with a hand 30 cm before the camera."""
     pytest.importorskip("small_gicp")
-    tracker, T_start = tracker_in(room), torch.eye(4)
-    T_start[:3, 3] = 100.0
-    tracker.begin(room[0][5], T_start[None])
-    tracker.step()
-    assert torch.equal(tracker.T_world_camera, T_start)
-    assert tracker.report() == {"inlier_ratio": 0.0, "lost": True}
+    frame = room[0][5]
+    hand = replace(frame, depth_mm=torch.full_like(frame.depth_mm, 300))
+    far, here = torch.eye(4), torch.from_numpy(frame.T_world_camera).float()
+    far[:3, 3] = 100.0
+    for seen, T_start in ((frame, far), (hand, here)):
+        tracker = tracker_in(room)
+        tracker.begin(seen, T_start[None])
+        tracker.step()
+        assert torch.equal(tracker.T_world_camera, T_start)
+        assert tracker.report() == {"inlier_ratio": 0.0, "lost": True}
 
 
-@pytest.mark.parametrize("voxel", [0.0, 1e-9, 1e9])
+@pytest.mark.parametrize("voxel", [0.0, 2.4e-6, 1e9])
 def test_voxels_that_are_no_cells_of_the_scene_are_one_line(voxel: float) -> None:
     """Catches a division by zero, cells whose numbers overflow, and a cloud of a single point."""
     sequence = two_pixels([[2000, 2000]], [[10, 10]])
@@ -126,8 +133,8 @@ def test_voxels_that_are_no_cells_of_the_scene_are_one_line(voxel: float) -> Non
 def test_maps_and_draws_that_icp_cannot_use_are_one_line(room: Room) -> None:
     """Catches pages of a library's warnings, and a frame that never ends."""
     pytest.importorskip("small_gicp")
-    cloud = fuse_points(two_pixels([[2000, 2000]], [[10, 10]]), np.array([0]), BOX, voxel=1.0)
-    with pytest.raises(ConfigError, match=r"^the map has 2 points of 1 m cells; .*voxel, or map"):
+    cloud = fuse_points(two_pixels([[2000, 2000]], [[10, 10]]), np.array([0]), BOX, voxel=2.5)
+    with pytest.raises(ConfigError, match=r"^the map has 1 points of 2.5 m cells; .*voxel, or map"):
         make_tracker("icp", cloud, np.eye(4), StepBudget(1))
     settings = IcpSettings(n_pixels=999_999_999)
     with pytest.raises(ConfigError, match=r"^n_pixels = 999999999: it must be 1 to"):

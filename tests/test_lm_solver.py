@@ -164,6 +164,13 @@ def test_a_rejected_step_leaves_the_pose_unchanged() -> None:
     assert abs(optimizer.T_world_camera - ORIGIN).max() < 2e-3
 
 
+def test_scales_are_never_below_those_of_the_map() -> None:
+    """Catches a tracker that takes what a worse map leaves for outliers."""
+    accuracy = NARROW.accuracy._replace(residual_sigma=(0.2, 0.5))
+    optimizer = LmOptimizer(NARROW._replace(accuracy=accuracy), SEEN, SEEN, 1.0, ORIGIN)
+    np.testing.assert_allclose(optimizer.scales, [0.2, 0.5])
+
+
 def test_a_coarse_stage_that_leads_astray_is_undone() -> None:
     """Catches a good start that is given up for a worse pose: something stands before two fifths
     of the coarse points, which pull the camera tens of centimetres away."""
