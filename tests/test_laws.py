@@ -307,5 +307,5 @@ def test_how_far_a_map_is_off_by_hand() -> None:
     for off in (-0.1, 0.1):
         grid = BakedField(BoxRoom(half=(1.0 + off, 0.8 + off, 1.2 + off)), 0.05)
         assert depth_residual_of(grid, sequence[0]) == pytest.approx(0.1, abs=2e-3)
-    sequence.T_world_camera[0, 0, 3] += 0.5
+    sequence.T_world_camera[0, 2, 3] += 0.5
     assert usual_depth_residual(BoxRoom(), sequence, np.array([1, 2])) < 0.03
