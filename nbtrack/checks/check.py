@@ -63,29 +63,33 @@ class DataReport:
 
     def __str__(self) -> str:
         recording, cloud = self.recording, self.cloud
-        own, *others = self.conventions
-        rivals = sorted((r for r in others if r.overlap > 0), key=lambda r: -r.agreement)[:3]
-        c = own.reading.camera
-        wide_deg = 2 * np.degrees(np.arctan(c.width / 2 / c.fx))
+        declared, *others = self.conventions
+        overlapping = [other for other in others if other.overlap > 0]
+        best = sorted(overlapping, key=lambda other: -other.agreement)[:3]
+        camera = declared.reading.camera
+        wide_deg = 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx))
         near, far = cloud.depth.quantile([0.01, 0.99])
         x, y, z = np.ptp(cloud[_XYZ].quantile(_CUT), axis=0)
         facts = self.frames[_PRINTED].agg(["mean", "min", "max"]).T
-        row = "{:9.1f} mm {:5.0%}  {}".format
-        used, *tried = [row(1e3 * r.apart * r.depth_m, r.overlap, r.name) for r in (own, *rivals)]
-        told = [f"  warning: {text}" for text in (self.faults + self.doubts)[1:]]  # see `verdict`
-        told += [f"  note: {text}" for text in (*recording.notes, *self.remarks)]
+        used, *tried = [
+            f"{1e3 * each.apart * each.depth_m:9.1f} mm {each.overlap:5.0%}  {each.name}"
+            for each in (declared, *best)
+        ]
+        # The first fault or doubt is in the verdict.
+        texts = [f"  warning: {text}" for text in (self.faults + self.doubts)[1:]]
+        texts += [f"  note: {text}" for text in (*recording.notes, *self.remarks)]
         command = "data check" if self.faults else "track"
         lines = [
             f"{recording.name}: {recording.format.label}, {len(self.frames)} of {len(recording)} "
-            f"frames have a pose, {c.width} x {c.height} px",
-            f"  camera: focal lengths {c.fx:.2f} and {c.fy:.2f} px ({wide_deg:.1f} deg wide), "
-            f"principal point ({c.cx:g}, {c.cy:g})",
+            f"frames have a pose, {camera.width} x {camera.height} px",
+            f"  camera: focal lengths {camera.fx:.2f} and {camera.fy:.2f} px ({wide_deg:.1f} deg "
+            f"wide), principal point ({camera.cx:g}, {camera.cy:g})",
             f"  depth: {near:.2f} to {far:.2f} m (1 to 99%), scene: {x:.2f} x {y:.2f} x {z:.2f} m",
             facts.to_string(float_format="{:10.2f}".format),
             "  surfaces of two frames (mm apart in the mean, share of points), read as",
             f"  > (in use) {used}",
             *(f"             {other}" for other in tried),
-            *map(_LINES.fill, told),
+            *map(_LINES.fill, texts),
             f"  next: python -m nbtrack {command} {shlex.quote(str(recording.folder))}",
             "",
             _LINES.fill(f"verdict: {self.verdict}"),
@@ -103,28 +107,29 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     T_world_camera = recording.T_world_camera[ids]
     T_world_camera[:, :3, 3] -= recording.origin
     pairs = _pairs(T_world_camera, _N_PAIRS if is_whole else _QUICK_PAIRS)
-    kept = ids[np.union1d(pairs, [0])]  # those that are compared; a single one is only shown
+    kept = ids[np.union1d(pairs, [0])]  # those of pairs; the first is shown, also without a pair
     sequence, frames, counts = _read(recording, ids if is_whole else kept, kept)
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     own = Reading(recording.declared, sequence.intrinsics)
     shared = findings.shared_value(counts, frames)
     sequence.depths_mm[sequence.depths_mm == shared] = 0
-    seen = FramePairs(recording, ids, sequence, pairs)
-    conventions, best = fit_all(seen, own)
+    compared = FramePairs(recording, ids, sequence, pairs)
+    conventions, best = fit_all(compared, own)
     cloud = _cloud(own, sequence)
     is_far = cloud.depth > far_limit(cloud.depth)
-    is_own = best is conventions[0]  # else poses and depths mean something else than is judged
+    is_own = best is conventions[0]
     causes = CAUSES if is_own and len(ids) >= _MIN_FRAMES and best.overlap >= MIN_OVERLAP else {}
-    misfits = [fit(seen, own, *cause) for cause in ProgressBar("fitting", causes.items())]
-    faults = list(findings.of_images(frames, shared, counts[0]))
-    main = main_misfits(seen, own, misfits)
-    said, kind = findings.misreading(conventions[0], best, main)
-    faults += [said] if kind == "fault" else findings.of_poses(frames, recording) if is_own else []
-    faults += findings.of_units(cloud.depth[~is_far]) if is_own else []
-    remarks = [said] if kind == "note" else []
-    remarks += findings.of_depths(frames, cloud.depth, own.declared.depth_scale) if is_own else []
-    doubts = [said] if kind == "doubt" else []
+    misfits = [fit(compared, own, *cause) for cause in ProgressBar("fitting", causes.items())]
+    main = main_misfits(compared, own, misfits)
+    text, kind = findings.misreading(conventions[0], best, main)
+    texts = {name: [text] if kind == name else [] for name in ("fault", "doubt", "note")}
+    faults = [*findings.of_images(frames, shared, counts[0]), *texts["fault"]]
+    remarks, doubts = texts["note"], texts["doubt"]
+    if is_own:  # else the numbers of poses and depths are read wrongly, and tell nothing
+        faults += findings.of_poses(frames, recording) if kind != "fault" else []
+        faults += findings.of_units(cloud.depth[~is_far])
+        remarks += findings.of_depths(frames, cloud.depth, own.declared.depth_scale)
     if not (faults or doubts):
         doubts = list(findings.doubts_of_poses(conventions, recording.pose_file.name, is_whole))
     return DataReport(
@@ -167,15 +172,17 @@ def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:
 def _read(
     recording: Recording, looked_at: Frames, kept: Frames
 ) -> tuple[RgbdSequence, pd.DataFrame, np.ndarray]:
-    """The frames to be kept, as a sequence, a table with a row for each frame looked at, and how
-    often each depth value occurs, and in how many frames many pixels share it (2, 65536).
+    """The frames `kept` as a sequence, a table with a row for each of `looked_at`, and counts.
 
-    Images are read in parts, so that memory holds few besides those kept; those of a single part
-    are left for whoever reads next. `depths_mm` are the files' values, for any reading of them.
-    A row holds the share that is measured, the brightness in [0, 1], the greatest number that
-    divides all depth values, whether these are those of the row before, by what the camera moved
-    and turned since the frame before, and how far it is off the middle between the frames before
-    and after; NaN where one of these has no pose.
+    Counts (2, 65536) are how often each depth value occurs, and in how many frames many pixels
+    share it. `depths_mm` of the sequence are the files' values, for any reading of them.
+    Images are read in parts, so that memory holds few besides those kept. Those of a single part
+    stay in memory for whoever reads next.
+
+    A row holds the share of pixels with depth, the brightness in [0, 1], the greatest common
+    divisor of all depth values, and whether these are the same as in the row before. It also holds
+    how far the camera moved and turned since the frame before, and how far it is off the middle
+    between the frames before and after; NaN where one of these has no pose.
     """
     parts = []
     rows = []

@@ -73,11 +73,12 @@ class Convention(Agreement):
         return self.agreement > _CLEARLY_BETTER * other.agreement
 
     def __str__(self) -> str:
-        look = "look" if self.subject.endswith("s") else "looks"
-        # Depth upside down, or turned by 180 degrees, fits like mirrored or turned axes.
-        is_rare = "axes" in self.name and not self.name.startswith(("Open", "robot"))
-        turned = ", or the images, or those of depth alone, are turned or mirrored against them"
-        return f"your {self.subject} {look} like {self.name}{turned if is_rare else ''}"
+        verb = "look" if self.subject.endswith("s") else "looks"
+        text = f"your {self.subject} {verb} like {self.name}"
+        # Images that are turned or mirrored fit as well as axes that nobody uses.
+        if "axes" in self.name and not self.name.startswith(("OpenGL", "OpenCV", "robot")):
+            text += ", or the images, or those of depth alone, are turned or mirrored against them"
+        return text
 
 
 def fit_all(pairs: FramePairs, own: Reading) -> tuple[list[Convention], Convention]:
@@ -129,8 +130,10 @@ def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
         for changed in (scaled, scaled | middle):
             yield "calibration", label, replace(own, camera=replace(camera, **changed))
     for name, metres in _UNITS.items():
-        # A camera that moves in a plane cannot prove what is no doubt: mirrored ones are rare.
-        yield "poses" if min(metres) > 0 else "positions", name, replace(own, metres=metres)
+        # Mirrored positions are rare, and a camera that moves in a plane cannot exclude them: with
+        # another subject than "poses" they raise no doubt.
+        subject = "poses" if min(metres) > 0 else "positions"
+        yield subject, name, replace(own, metres=metres)
     for poses in (CAMERA_TO_WORLD, WORLD_TO_CAMERA):
         mixed = replace(own, declared=replace(own.declared, poses=poses), is_mixed=True)
         yield "poses", f"{poses} ones whose rotations alone are of the other direction", mixed
@@ -160,8 +163,9 @@ def remedy(reading: Reading, own: Reading) -> str:
     if reading.metres != own.metres:
         factors = "x, y and z by {:g}, {:g} and {:g}".format(*reading.metres)
         return f"multiply the positions in the pose file, {factors}"
-    if (c := reading.calibration) != own.calibration:
-        numbers = f"{c.fx:.6g} {c.fy:.6g} {c.cx - 0.5:.6g} {c.cy - 0.5:.6g}"
+    camera = reading.calibration
+    if camera != own.calibration:
+        numbers = f"{camera.fx:.6g} {camera.fy:.6g} {camera.cx - 0.5:.6g} {camera.cy - 0.5:.6g}"
         return f"set fx fy cx cy in the calibration to {numbers} (the first pixel's centre at 0)"
     if reading.late:
         return "shift one of them against the other, and let both have one clock"
@@ -176,8 +180,8 @@ def remedy(reading: Reading, own: Reading) -> str:
     changes = changed_settings(reading.declared, own.declared)  # as `depth_scale=5000.0`
     if not changes:
         return "multiply each camera-to-world pose by this transform from the right"
-    said = " and ".join(text.replace("=", " = ", 1).removesuffix(".0") for text in changes)
-    advice = f"set {said} in sequence.toml"
-    if "quaternion" in said:
+    entries = " and ".join(text.replace("=", " = ", 1).removesuffix(".0") for text in changes)
+    advice = f"set {entries} in sequence.toml"
+    if "quaternion" in entries:
         advice += " if the pose file has quaternions, or make the matrices anew"
     return advice

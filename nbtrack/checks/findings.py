@@ -24,11 +24,11 @@ _BLACK = 0.02  # brightness, in [0, 1]
 
 
 def misreading(own: Convention, best: Convention, main: list[Misfit]) -> tuple[str, str]:
-    """What is off in how the numbers are read, in a sentence, and its kind: fault, doubt or note.
+    """What is wrong in how the numbers are read, in a sentence, and its kind.
 
-    Both are empty where nothing is off. A cause is told if with it surfaces agree as those of right
-    recordings do, and is a note where usual sensors have it. Where nothing explains what lies apart
-    it is a doubt, and a fault if it is far.
+    Both are empty where nothing is wrong. A cause is named if surfaces then agree as well as those
+    of right recordings: the kind is "note" for a usual sensor's error, else "fault". Surfaces that
+    lie apart without a known cause are a "doubt", and a "fault" if they lie far apart.
     """
     usual_mm = 1e3 * own.usual_apart * own.depth_m
     apart = f"lie {1e3 * own.apart * own.depth_m:.0f} mm apart" if own.overlap else "never meet"
@@ -61,16 +61,14 @@ def doubts_of_poses(conventions: list[Convention], file: str, needs_proof: bool)
     tell conventions apart.
     """
     own, *others = conventions
-    alike = [c.name for c in others if c.subject == "poses" and not own.is_clearly_better(c)]
+    of_poses = [other for other in others if other.subject == "poses"]
+    alike = [other.name for other in of_poses if not own.is_clearly_better(other)]
     if own.overlap < MIN_OVERLAP or np.isnan(own.apart):
-        seen = f"too little of the same ({own.overlap:.0%} of the points)"
-        why = f"two frames see {seen}: check it, and a piece with smaller steps"
+        reason = f"two frames see too little of the same ({own.overlap:.0%} of the points)"
+        yield f"{file} is not proved: {reason}: check it, and a piece with smaller steps"
     elif needs_proof and alike:
-        little = f"the camera moves too little to tell {len(alike)} other conventions apart"
-        why = f"{little}, such as {alike[0]}"
-    else:
-        return
-    yield f"{file} is not proved: {why}"
+        reason = f"the camera moves too little to tell {len(alike)} other conventions apart"
+        yield f"{file} is not proved: {reason}, such as {alike[0]}"
 
 
 def shared_value(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> int:
@@ -109,8 +107,10 @@ def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
     """What is wrong with poses that are read rightly: some lie beside their neighbours' path."""
     off = frames.off_mm / 1e3  # m
     is_odd = off > max(_OFF, _OFF_STEPS * frames.moved_mm.median() / 1e3)
-    # Both neighbours of an odd pose are off by half as much: of three in a row the worst counts.
-    odd = off[is_odd & (off == off.rolling(3, 1, center=True).max())]
+    # An odd pose makes both of its neighbours off by half as much. So only the largest of three
+    # frames in a row counts.
+    largest_of_three = off.rolling(3, min_periods=1, center=True).max()
+    odd = off[is_odd & (off == largest_of_three)]
     if len(odd):
         first = recording.color_files[odd.index[0]].name
         found = f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path"

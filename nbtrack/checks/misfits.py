@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbtrack.checks.readings import AREA_SCALE, Apart, FramePairs, Reading, cost_of, mean_apart
+from nbtrack.checks.readings import AREA_SCALE, FramePairs, Gaps, Reading, cost_of, mean_apart
 
 _STEPS = 12  # of Gauss-Newton, at most
 _FACTORS = (4.0, 2.0, 1.0, 0.5, 0.2)  # of a step; the best is taken
@@ -73,14 +73,16 @@ class Misfit:
     reading: Reading  # with the estimate
     numbers: dict[str, tuple[float, float, float]]  # by key: estimate and ends of its interval
     apart: float  # by how much surfaces then lie apart in the mean, as a share of the depth
-    gain: float  # the cost, as a share of that as declared, or that of the opposite if it is less
+    # The cost, as a share of that without the numbers, or of that with the opposite numbers; the
+    # larger share.
+    gain: float
 
     @property
     def is_significant(self) -> bool:
         """Whether an interval is more than negligible, and surfaces agree better, within limits."""
-        told = [(_NUMBERS[key], *ends) for key, ends in self.numbers.items()]
-        is_off = any(max(low, -high) > number.negligible for number, _, low, high in told)
-        is_within = all(abs(value) < number.limit for number, value, _, _ in told)
+        rows = [(_NUMBERS[key], *estimate) for key, estimate in self.numbers.items()]
+        is_off = any(max(low, -high) > number.negligible for number, _, low, high in rows)
+        is_within = all(abs(value) < number.limit for number, value, _, _ in rows)
         return is_off and is_within and self.gain < (_USUAL_GAIN if self.is_usual else _GAIN)
 
     @property
@@ -89,30 +91,31 @@ class Misfit:
         return all(abs(ends[0]) <= _NUMBERS[key].usual for key, ends in self.numbers.items())
 
     def __str__(self) -> str:
-        said = []
-        for key, ends in self.numbers.items():
+        texts = []
+        for key, estimate in self.numbers.items():
             label, form, unit, *_ = _NUMBERS[key]
-            value, low, high = (format(end, form) for end in ends)
-            said.append(f"{label}{value} ({low} to {high}){unit}")
-        return f"{self.name} {', '.join(said)}"
+            value, low, high = (format(number, form) for number in estimate)
+            texts.append(f"{label}{value} ({low} to {high}){unit}")
+        return f"{self.name} {', '.join(texts)}"
 
 
 def main_misfits(pairs: FramePairs, own: Reading, misfits: list[Misfit]) -> list[Misfit]:
-    """Of the significant misfits the one that explains what there is, and what fits as well.
+    """The significant misfits that fit best, about equally well; the one of fewest numbers first.
 
-    Empty where none is, or where all numbers together leave clearly less: then what happens is
-    something else. Of those that fit alike the first stands first, and one whose numbers another
-    has among more is left out.
+    A misfit that only adds numbers to those of the first is left out. The list is empty where none
+    is significant. It is empty too where all numbers together fit clearly better: then the cause is
+    none of those that were tried.
     """
-    found = [misfit for misfit in misfits if misfit.is_significant]
-    lowest = min((misfit.gain for misfit in found), default=0.0)
-    alike = [misfit for misfit in found if _ALIKE * misfit.gain <= lowest]
+    significant = [misfit for misfit in misfits if misfit.is_significant]
+    lowest = min((misfit.gain for misfit in significant), default=0.0)
+    alike = [misfit for misfit in significant if _ALIKE * misfit.gain <= lowest]
     if not alike:
         return []
-    together = fit(pairs, own, "all", list(_NUMBERS), alike[0].reading)
+    first, *others = alike
+    together = fit(pairs, own, "all", list(_NUMBERS), first.reading)
     if together.gain < _WHOLE * lowest:
         return []
-    return [m for m in alike if m is alike[0] or not alike[0].numbers.keys() <= m.numbers.keys()]
+    return [first, *(other for other in others if not first.numbers.keys() <= other.numbers.keys())]
 
 
 def fit(
@@ -124,59 +127,63 @@ def fit(
     def read(values: np.ndarray) -> Reading:
         return replace(own, **dict(zip(keys, values.tolist(), strict=True)))
 
-    def apart_at(values: np.ndarray) -> Apart:
+    def gaps_at(values: np.ndarray) -> Gaps:
         return pairs.compare(read(values)).areas
 
     values = np.array([getattr(start or own, key) for key in keys])
-    apart = apart_at(values)
+    gaps = gaps_at(values)
     for _ in range(_STEPS):
-        scale = _WIDE * float(np.nanmedian(np.abs(apart)))
+        scale = _WIDE * float(np.nanmedian(np.abs(gaps)))
         # Steps are in units of what is negligible, so that all numbers are alike.
-        moved = [apart_at(values + d) for d in np.diag(small)]
-        step = _solution(*(each.sum(axis=0) for each in _normal_equations(apart, moved, scale)))
+        moved = [gaps_at(values + unit) for unit in np.diag(small)]
+        H, g = _normal_equations(gaps, moved, scale)
+        step = _solution(H.sum(axis=0), g.sum(axis=0))
         tried = [(values + factor * small * step).clip(-limit, limit) for factor in _FACTORS]
-        aparts = [apart_at(new) for new in tried]
-        best = int(np.argmin([cost_of(a, scale) for a in aparts]))
-        if cost_of(aparts[best], scale) >= cost_of(apart, scale):
+        tried_gaps = [gaps_at(new) for new in tried]
+        best = int(np.argmin([cost_of(new, scale) for new in tried_gaps]))
+        if cost_of(tried_gaps[best], scale) >= cost_of(gaps, scale):
             break
-        is_near = (np.abs(tried[best] - values) < _ENOUGH * small).all()
-        values, apart = tried[best], aparts[best]
-        if is_near:
+        is_small_step = (np.abs(tried[best] - values) < _ENOUGH * small).all()
+        values, gaps = tried[best], tried_gaps[best]
+        if is_small_step:
             break
-    H, g = _normal_equations(apart, [apart_at(values + d) for d in np.diag(small)], AREA_SCALE)
+    H, g = _normal_equations(gaps, [gaps_at(values + unit) for unit in np.diag(small)], AREA_SCALE)
     # A fixed seed, so that a recording always has the same interval.
     drawn = np.random.default_rng(0).integers(len(H), size=(_RESAMPLED, len(H)))
-    left = _solution(H.sum(axis=0), g.sum(axis=0))
-    steps = _solution(H[drawn].sum(axis=1), g[drawn].sum(axis=1)) - left
-    low, high = values + small * np.quantile(steps, _INTERVAL, axis=0)
-    # Where the opposite does as well, what helps is something else, as an average of poses.
-    others = [apart_at(0 * values), apart_at(-values)]
-    gain = max(_ratio(apart, other) for other in others)
-    ends = np.stack([values, low, high], axis=1)
-    numbers = dict(zip(keys, map(tuple, ends.tolist()), strict=True))
-    return Misfit(name, read(values), numbers, mean_apart(apart), gain)
+    step = _solution(H.sum(axis=0), g.sum(axis=0))  # of all pairs; not quite 0
+    deviations = _solution(H[drawn].sum(axis=1), g[drawn].sum(axis=1)) - step
+    low, high = values + small * np.quantile(deviations, _INTERVAL, axis=0)
+    # Where the opposite numbers fit as well, the cause is another one: a `late` of either sign
+    # interpolates the poses, for example, which may help by itself.
+    gain = max(_ratio(gaps, gaps_at(0 * values)), _ratio(gaps, gaps_at(-values)))
+    estimates = np.stack([values, low, high], axis=1)
+    numbers = dict(zip(keys, map(tuple, estimates.tolist()), strict=True))
+    return Misfit(name, read(values), numbers, mean_apart(gaps), gain)
 
 
 def _solution(
     H: Float[np.ndarray, "... k k"], g: Float[np.ndarray, "... k"]
 ) -> Float[np.ndarray, "... k"]:
-    """The k numbers of normal equations; what nothing tells is 0."""
+    """The k numbers that solve normal equations; those that no equation determines are 0."""
     return -(np.linalg.pinv(H, rcond=1e-6, hermitian=True) @ g[..., None])[..., 0]
 
 
 def _normal_equations(
-    apart: Apart, moved: list[Apart], scale: float
+    gaps: Gaps, moved: list[Gaps], scale: float
 ) -> tuple[Float[np.ndarray, "pairs k k"], Float[np.ndarray, "pairs k"]]:
-    """Those of each pair; `moved` is what lies apart where one of k numbers is a unit more."""
-    J = np.stack(moved) - apart
-    is_known = np.isfinite(J).all(axis=0) & np.isfinite(apart)
-    weights = np.where(is_known, 1 / (1 + (apart / scale) ** 2) ** 2, 0)
-    J, apart = np.nan_to_num(J), np.nan_to_num(apart)
+    """The weighted J J^T and J gaps of each pair of frames.
+
+    `moved` are k gaps: in each, another one of the k numbers is larger by a unit.
+    """
+    J = np.stack(moved) - gaps  # (k, pairs, areas)
+    is_known = np.isfinite(J).all(axis=0) & np.isfinite(gaps)
+    weights = np.where(is_known, 1 / (1 + (gaps / scale) ** 2) ** 2, 0)
+    J, gaps = np.nan_to_num(J), np.nan_to_num(gaps)
     H = np.einsum("ipa,jpa,pa->pij", J, J, weights)
-    return H, np.einsum("ipa,pa,pa->pi", J, apart, weights)
+    return H, np.einsum("ipa,pa,pa->pi", J, gaps, weights)
 
 
-def _ratio(apart: Apart, other: Apart) -> float:
-    """The cost of one as a share of that of another, by areas that both know."""
-    is_known = np.isfinite(apart) & np.isfinite(other)
-    return cost_of(apart[is_known]) / cost_of(other[is_known])
+def _ratio(gaps: Gaps, others: Gaps) -> float:
+    """The cost of some gaps as a share of that of others, over areas that are known in both."""
+    is_known = np.isfinite(gaps) & np.isfinite(others)
+    return cost_of(gaps[is_known]) / cost_of(others[is_known])

@@ -28,7 +28,7 @@ AREA_SCALE = 0.004  # of the depth: areas that lie so far apart cost by half (ou
 _FAR_APART = 0.05  # of the depth: more counts no more
 _MIN_MEASURED = 0.3  # share of an area's points without which nothing is told of it
 Pairs = Int[np.ndarray, "2 pairs"]  # of frames
-Apart = Float[np.ndarray, "pairs areas"]
+Gaps = Float[np.ndarray, "pairs areas"]  # between surfaces, signed, as shares of the depth
 
 
 @dataclass(frozen=True)
@@ -104,25 +104,28 @@ class Agreement:
     """How well pairs of frames agree under a reading."""
 
     reading: Reading
-    areas: Apart  # by how much surfaces lie apart in each area, as a share of the depth
-    apart: float  # the mean of its sizes; NaN of nothing
+    areas: Gaps  # by how much surfaces lie apart in each area, as a share of the depth
+    apart: float  # the mean of their absolute values; NaN where none is known
     depth_m: float  # the median depth of the points that overlap
     overlap: float  # share of all points that fall onto a measured, not nearer, surface
     agreement: float  # the same, where surfaces that coincide count 1 and those far apart 0
 
 
-def cost_of(apart: Apart, scale: float = AREA_SCALE) -> float:
+def cost_of(gaps: Gaps, scale: float = AREA_SCALE) -> float:
     """The mean cost of Geman and McClure: 0 where surfaces coincide, 1 far from that.
 
     It is infinite where nothing is known, so that no fit ends there.
     """
-    known = apart[np.isfinite(apart)]
+    known = gaps[np.isfinite(gaps)]
     return float((known**2 / (known**2 + scale**2)).mean()) if len(known) else np.inf
 
 
-def mean_apart(apart: Apart) -> float:
-    """By how much surfaces lie apart in the mean, as a share of the depth; NaN of nothing."""
-    known = np.abs(apart[np.isfinite(apart)])
+def mean_apart(gaps: Gaps) -> float:
+    """By how much surfaces lie apart in the mean, as a share of the depth.
+
+    It is NaN where nothing is known.
+    """
+    known = np.abs(gaps[np.isfinite(gaps)])
     return float(np.minimum(known, _FAR_APART).mean()) if len(known) else np.nan
 
 
@@ -168,13 +171,14 @@ class FramePairs:
         residual = depth - measured
         is_valid = (self.values > 0) & (depth > 1e-6) & (at.abs() <= 1).all(dim=-1)[:, 0]
         is_valid &= (blended / nearest - 1).abs() < _SAME_SURFACE  # false where there is no depth
-        # A point far in front of the surface stays: it contradicts, while one behind is hidden.
+        # A point far behind the measured surface is hidden by it. One far in front of it is kept,
+        # since there the two frames contradict each other.
         is_valid &= residual < _HIDDEN_BEHIND
-        share = torch.where(is_valid, residual / measured, torch.nan)
+        gap = torch.where(is_valid, residual / measured, torch.nan)
         # The weight of Geman and McClure: 1 where both coincide, 0 where they are far apart.
-        agreement = 1 / (1 + (share / _SCALE) ** 2)
+        agreement = 1 / (1 + (gap / _SCALE) ** 2)
         n_points = float((self.values > 0).sum().clamp(1))
-        areas = self._areas(share)
+        areas = self._areas(gap)
         return Agreement(
             reading, areas, mean_apart(areas), float(measured[is_valid].median()),
             float(is_valid.sum()) / n_points, float(agreement.nansum()) / n_points,
@@ -183,8 +187,8 @@ class FramePairs:
     def _T_second_first(self, reading: Reading) -> Tensor:
         """Poses of the first cameras in the second ones' frames, (pairs, 4, 4; m)."""
         T_world_camera = reading.T_world_camera(self.file_poses, self.order)
-        # Depth that is late by some frames was taken at the pose that is so many frames before,
-        # which lies between two poses; they are so near that it may be blended by parts.
+        # Late depth belongs to an earlier pose, between two frames. The poses of these are so near
+        # to each other that their matrices may be interpolated element by element.
         at = (self.pairs - reading.late).clip(0, len(T_world_camera) - 1)
         before = at.astype(int)
         share = (at - before)[..., None, None]
@@ -192,11 +196,11 @@ class FramePairs:
         T = (1 - share) * T_world_camera[before] + share * T_world_camera[after]
         return torch.from_numpy(np.linalg.solve(T[1], T[0])).float()
 
-    def _areas(self, share: Tensor) -> Apart:
-        """Medians over areas of the image of what lies apart; NaN where few points are valid.
+    def _areas(self, gaps: Float[Tensor, "pairs points"]) -> Gaps:
+        """The median gap in each area of the image; NaN where few of its points are valid.
 
-        Over an area a sensor's noise averages out, while what is read wrongly stays.
+        A median over an area reduces a sensor's noise. An error of the reading stays.
         """
-        of_areas = share[:, self.areas]
-        is_measured = of_areas.isfinite().float().mean(dim=-1) >= _MIN_MEASURED
-        return torch.where(is_measured, of_areas.nanmedian(dim=-1).values, torch.nan).numpy()
+        by_area = gaps[:, self.areas]  # (pairs, areas, points)
+        is_measured = by_area.isfinite().float().mean(dim=-1) >= _MIN_MEASURED
+        return torch.where(is_measured, by_area.nanmedian(dim=-1).values, torch.nan).numpy()

@@ -68,8 +68,10 @@ def _fill_tables(
     clock = options.budget == "clock"
     scenes = open_scenes(preset)
     rates = RATES_3_HZ if options.beyond else None  # those of the preset
-    how = {"clock": clock, "seeds": range(options.seeds), "execution": execution}
-    results = track_scenes(scenes, methods, preset, rates, **how)
+    seeds = range(options.seeds)
+    results = track_scenes(
+        scenes, methods, preset, rates, clock=clock, seeds=seeds, execution=execution
+    )
     shown = results.drop(columns="still_ate_m", errors="ignore") if options.no_still else results
     folder = options.out or runs_folder() / f"tables/{preset.name}{'_clock' if clock else ''}"
     note = f"{camera_motion(preset, results)}; {_note(preset, clock)}"
@@ -84,8 +86,8 @@ def _fill_tables(
         # One scene is enough, the first without a gap: a step costs the same in all. Table II is
         # always by the clock.
         failed = {*results.loc[results["failure"] != "", "scene"]}
-        whole = next((scene for scene in scenes if scene.name not in failed), scenes[0])
-        steps = _table_2(preset, whole, methods)
+        complete = next((scene for scene in scenes if scene.name not in failed), scenes[0])
+        steps = _table_2(preset, complete, methods)
         pixels, by_clock = default_pixels(preset, methods), _note(preset, clock=True)
         paths = tables.write_tables(folder, shown, steps, note, pixels, by_clock, wording)
     cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
@@ -139,34 +141,35 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     firsts = {}
     for method in find_methods(methods):
         firsts.setdefault(method.tracker, method)
-    pixels = preset.tables.pixels
-    plan = [(m, n) for m in firsts.values() for n in pixels.get(m.tracker, pixels["sdf"])]
-    has_pose = np.flatnonzero(scene.recording.has_pose)
-    frame = read_frames(scene.recording, has_pose[:1])[0]
-    columns, rows = ["tracker", "n_pixels", "budget_ms", "steps", "steps_std", "converged"], []
+    pixels, usual = preset.tables.pixels, preset.tables.pixels["sdf"]
+    plan = [(method, n) for method in firsts.values() for n in pixels.get(method.tracker, usual)]
+    posed_ids = np.flatnonzero(scene.recording.has_pose)
+    frame = read_frames(scene.recording, posed_ids[:1])[0]
+    columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_std", "converged"]
+    rows = []
     with ProgressBar("Table II", len(plan)) as bar:
         for done, (method, n_pixels) in enumerate(plan):
             name = method.tracker
             bar.move_to(done, f"{name}={n_pixels}")
-            own = preset.with_method(method.settings)
-            settings = replace(own.tracking_of(name), n_pixels=n_pixels)
+            with_method = preset.with_method(method.settings)
+            settings = replace(with_method.tracking_of(name), n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
-                field = map_scene(scene, method.field, own).field
+                field = map_scene(scene, method.field, with_method).field
                 # The budget is replaced for every cell.
                 tracker = make_tracker(name, field, frame.T_world_camera, StepBudget(1), settings)
                 for budget_ms in preset.tables.budgets_ms:
                     counts, converged = _steps_within(tracker, frame, budget_ms)
-                    found = float(np.mean(counts)), float(np.std(counts)), converged
-                    rows.append((name.upper(), n_pixels, budget_ms, *found))
+                    mean, std = float(np.mean(counts)), float(np.std(counts))
+                    rows.append((name.upper(), n_pixels, budget_ms, mean, std, converged))
         bar.move_to(len(plan))
     return pd.DataFrame(rows, columns=columns)
 
 
 def _steps_within(tracker: Tracker, frame: Frame, budget_ms: float) -> tuple[list[int], bool]:
-    """The steps that a tracker takes within a budget, frame by frame, always from the true pose,
-    and whether it ended each time by itself: while one more would have fitted into the budget.
+    """The steps that a tracker takes for the frame within a budget, each time from the true pose.
 
-    A first frame, in which it allocates and compiles, is not counted.
+    Also returns whether it converged each time: it ended although one more step would have fitted
+    into the budget. A first time, in which it allocates and compiles, is not counted.
     """
     tracker.budget = ClockBudget(1000 / budget_ms)  # Hz
     counts, with_one_more = [], []

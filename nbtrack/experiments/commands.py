@@ -82,8 +82,8 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
 def track_command(options: Namespace) -> None:
     """Track a sequence in its map, made first where none fits, or in a given one."""
     given = MapJob.of_given(options.map_from) if options.map_from else None
-    is_named = options.field or options.method
-    field = given.field if given and not is_named else options.field
+    names_field = options.field or options.method
+    field = given.field if given and not names_field else options.field
     method = method_of(options.method, field, options.tracker)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     if given:
@@ -95,8 +95,10 @@ def track_command(options: Namespace) -> None:
     job = given or MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
     if not given:
         scene.select(job.frames)  # raises for a wrong slice
-    how = steps, options.rate, options.frames, options.seed, options.start
-    run = TrackJob(job, scene, method.tracker, preset.tracking_of(method.tracker), *how)
+    run = TrackJob(
+        job, scene, method.tracker, preset.tracking_of(method.tracker), steps, options.rate,
+        options.frames, options.seed, options.start,
+    )  # fmt: skip
     run.check()
     for warning in reach_warnings([run]):
         tell(f"nbtrack: warning: {warning}")
@@ -119,9 +121,9 @@ def track_command(options: Namespace) -> None:
 def _summary(metrics: dict[str, Any]) -> Iterator[str]:
     """Lines that tell people how a run went."""
     n_frames, n_unknown = metrics["frames"], metrics["frames_without_reference"]
-    mm = {name: f"{1e3 * metrics.get(name, np.nan):.1f} mm" for name in _ERRORS}
+    ate, largest, still = (f"{1e3 * metrics.get(name, np.nan):.1f} mm" for name in _ERRORS)
     if "ate_rmse_m" in metrics:
-        yield "error  {} (ATE), at most {}; of a camera that stands still {}".format(*mm.values())
+        yield f"error  {ate} (ATE), at most {largest}; of a camera that stands still {still}"
         share = metrics["lost_frames"] / (n_frames - n_unknown)
         yield f"lost   {share:.1%} of the frames, off by more than {LOST_THRESHOLD_M:g} m"
     else:
@@ -156,19 +158,19 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
 
 def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -> None:
     """Raises ConfigError where a given map contradicts the options: its frames, field, settings."""
-    made = given.field
     if options.map_frames:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
-    if field != made:
-        advice = "leave --method and --field out"
-        raise ConfigError(f"{options.map_from} is a map of field {made!r}, not {field!r}: {advice}")
-    known, wanted = flat(given.setting_tree), flat(preset.settings)
-    asked = {key for text in options.settings for key in read_setting(text)}
-    asked |= {f"correction.{made}"} if options.method else set()  # methods say it, or none
-    for key in sorted(asked & known.keys()):  # no map has the others, as those of a tracker
-        if known[key] != wanted[key]:
-            what = f"{options.map_from} was made with {key}={known[key]}, not {wanted[key]}"
-            raise ConfigError(f"{what} as asked: leave --set and --method out, or map anew")
+    if field != given.field:
+        found = f"{options.map_from} is a map of field {given.field!r}, not {field!r}"
+        raise ConfigError(f"{found}: leave --method and --field out")
+    of_map, wanted = flat(given.setting_tree), flat(preset.settings)
+    asked_keys = {key for text in options.settings for key in read_setting(text)}
+    if options.method:  # its name says whether the map is corrected
+        asked_keys.add(f"correction.{field}")
+    for key in sorted(asked_keys & of_map.keys()):  # a map has no settings of a tracker
+        if of_map[key] != wanted[key]:
+            found = f"{options.map_from} was made with {key}={of_map[key]}, not {wanted[key]}"
+            raise ConfigError(f"{found} as asked: leave --set and --method out, or map anew")
 
 
 def _make_map(job: MapJob) -> None:
@@ -198,8 +200,8 @@ def check_command(options: Namespace) -> int:
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     report = check_recording(recording)
     if options.out:
-        own = report.conventions[0]
-        apart_mm = 1e3 * own.apart * own.depth_m  # as the recording's files are declared
+        declared = report.conventions[0]
+        apart_mm = 1e3 * declared.apart * declared.depth_m
         title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart in the mean"
         figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)
         runs.save_picture(figure, options.out / runs.CHECK_FILE)

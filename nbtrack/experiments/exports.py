@@ -83,16 +83,18 @@ def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
         finished, source = _map_of(runs.read_trajectory(source))
     else:
         finished = read_map(source)
-    seen = source / MESH_FILE
-    is_seen = seen.is_file() and not isinstance(finished.field, PointCloud)
+    mesh_file = source / MESH_FILE
+    has_mesh = mesh_file.is_file() and not isinstance(finished.field, PointCloud)
     origin = np.array(finished.record["origin"])
-    with naming_damaged(seen, "mesh", "remove it and map again"):
-        mesh = trimesh.load_mesh(seen, process=False) if is_seen else extract_mesh(finished.field)
-        if is_seen:  # its vertices are in the recording's world, and `mesh_bytes` moves them there
-            mesh.vertices -= origin
+    with naming_damaged(mesh_file, "mesh", "remove it and map again"):
+        if has_mesh:
+            mesh = trimesh.load_mesh(mesh_file, process=False)
+            mesh.vertices -= origin  # `mesh_bytes` adds the origin to a mesh in the map's world
+        else:
+            mesh = extract_mesh(finished.field)
         content = mesh_bytes(mesh, format_name, origin, finished.record.get("up"))
-    what = "what was seen" if is_seen else "all"
-    return content, f"{len(mesh.vertices)} coloured vertices of {what}"
+    part = "what was seen" if has_mesh else "all"
+    return content, f"{len(mesh.vertices)} coloured vertices of {part}"
 
 
 def _map_of(tracked: Trajectory) -> tuple[Map, Path]:

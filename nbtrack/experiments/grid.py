@@ -76,13 +76,14 @@ def track_scenes(
     frames = preset.scenes.track_frames if frames is None else str(frames)
     jobs, rows = [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
-        own = preset.with_method(method.settings)
-        settings = own.tracking_of(method.tracker)
+        tracker, with_method = method.tracker, preset.with_method(method.settings)
+        settings = with_method.tracking_of(tracker)
+        # By the clock `steps` is None.
         n_steps = steps if rate_hz is None or clock else method.paper_steps(rate_hz)
-        budget = n_steps, rate_hz if clock else None  # by the clock the number of steps is None
-        make_budget(*budget)  # raises for a wrong number, before anything is made
-        made = MapJob.of(scene, method.field, own, seed=seed)
-        job = TrackJob(made, seen, method.tracker, settings, *budget, frames, made.seed)
+        clock_hz = rate_hz if clock else None
+        make_budget(n_steps, clock_hz)  # raises for a wrong number, before anything is made
+        map_job = MapJob.of(scene, method.field, with_method, seed=seed)
+        job = TrackJob(map_job, seen, tracker, settings, n_steps, clock_hz, frames, map_job.seed)
         jobs.append(job)
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
         rows.append(row | {"seed": seed, "run": job.folder.name, "n_pixels": settings.n_pixels})
@@ -115,15 +116,17 @@ def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[
     metrics the tracked one.
     """
     failed = isinstance(result, NbtrackError)
-    metrics = {} if failed else {k: v for k, v in result.items() if not isinstance(v, dict)}
+    values = {} if failed else result
+    metrics = {name: value for name, value in values.items() if not isinstance(value, dict)}
     ate_m = metrics.get("ate_rmse_m", float("nan"))
     return {**metrics, **row, "failure": str(result) if failed else "", "ate_m": ate_m}
 
 
 def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:
-    """The results of some jobs, run side by side; by the clock only their maps are made so.
+    """The results of some jobs, which run side by side.
 
-    Runs whose frames end by the clock follow each other, since what runs beside them costs steps.
+    By the clock only their maps are made side by side. The runs then follow each other, since what
+    runs beside them would cost steps.
     """
     missing = [job for job in jobs if not job.is_done]
     for job in missing:

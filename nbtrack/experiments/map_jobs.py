@@ -42,8 +42,8 @@ class MapJob(Job):
     frames: str = ":"
     seed: int = 0
     correction_voxel: float = 0.0  # m, of the cells in which the map is corrected; 0: it is not
-    # m, of the cells in which another job will correct this map: so a size that cannot work is told
-    # before this one is made. It changes nothing in this map.
+    # m, of the cells in which the job that needs this map will correct it. The size is only checked
+    # before this map is made, which takes minutes.
     later_voxel: float = field(default=0.0, compare=False)
     given: Path | None = None  # the user's own map: its folder, or file
 
@@ -53,25 +53,26 @@ class MapJob(Job):
     @classmethod
     def of(cls, scene: Scene, field: str, preset: Preset, frames: str = ":", seed: int = 0) -> Self:
         """The map of a scene with the settings of a preset."""
-        made = preset.network_of(field), preset.mapping_of(field)
+        network, settings = preset.network_of(field), preset.mapping_of(field)
         seed, voxel = whole_number("seed", seed), preset.correction.get(field, 0.0)
-        return cls(scene, field, *made, frames, seed, voxel)
+        return cls(scene, field, network, settings, frames, seed, voxel)
 
     @classmethod
     def of_given(cls, path: Path) -> Self:
         """A finished map that the user gave. Raises as `read_map` does."""
         finished = _stored(path)
-        made, voxel = finished.record, finished.record.get("correction", 0.0)
-        how = finished.field.name, made["network"], made["settings"]
-        return cls(None, *how, correction_voxel=voxel, given=path)
+        name, record = finished.field.name, finished.record
+        network, settings = record["network"], record["settings"]
+        voxel = record.get("correction", 0.0)
+        return cls(None, name, network, settings, correction_voxel=voxel, given=path)
 
     @property
     def setting_tree(self) -> dict[str, Any]:
         """Its settings as a tree of the form of `Preset.settings`."""
-        known = default_settings()
-        # Whose network the field has.
-        of_network = self.field if self.field in known["network"] else "neus"
-        is_correctable = self.field in known["correction"]
+        defaults = default_settings()
+        # A field that has no network settings of its own has those of NeuS.
+        of_network = self.field if self.field in defaults["network"] else "neus"
+        is_correctable = self.field in defaults["correction"]
         return {
             "network": {of_network: self.network} if self.network else {},
             "mapping": {self.field: self.settings},
@@ -80,14 +81,16 @@ class MapJob(Job):
 
     @cached_property
     def key(self) -> str:
-        """A digest of code, device, data, settings and seed; of a given map in place of the last
-        three."""
+        """A digest of code, device, data, settings and seed.
+
+        For a given map it is one of code, device and the key that is stored with the map.
+        """
         code = provenance.code_fingerprint(field_class(self.field))
         if self.given:
             return fingerprint(_stored(self.given).key, code, choose_device().type)
-        made = self.field, self.network, self.settings, self.correction_voxel, self.seed
-        machine = code, provenance.versions(), choose_device().type
-        return fingerprint(*made, *machine, self.scene.fingerprint, self.frames)
+        recipe = self.field, self.network, self.settings, self.correction_voxel, self.seed
+        program = code, provenance.versions(), choose_device().type
+        return fingerprint(*recipe, *program, self.scene.fingerprint, self.frames)
 
     @property
     def name(self) -> str:
@@ -104,7 +107,7 @@ class MapJob(Job):
 
     @property
     def folder(self) -> Path:
-        """Where its files are kept, in the cache, or where the user has it: perhaps its file."""
+        """Where its files are in the cache; of a given map the user's folder or file."""
         return self.given or super().folder
 
     @property
@@ -125,20 +128,20 @@ class MapJob(Job):
         """Map and score, or resume from a checkpoint; write the map's files. Returns its record."""
         checkpoint = self.folder / CHECKPOINT_FILE
 
-        def tell(share: float, losses: dict[str, float | int]) -> None:
+        def report_losses(share: float, losses: dict[str, float | int]) -> None:
             report(share, " ".join(f"{name} {loss:.3f}" for name, loss in losses.items()))
 
         sequence = self.scene.read(self.frames)
-        if self.later_voxel:  # what would fail after minutes of mapping is told now
+        if self.later_voxel:  # raises now what would else be raised after minutes of mapping
             setting = f"correction.{self.field}"
             checked_size(observed_bounds(sequence), self.later_voxel, setting)
         if self.needs:
             finished = correct_map(self.needs.map(), sequence, self.correction_voxel)
         else:
-            # `code`: a checkpoint that was written under another key is not resumed.
+            # `code` is the key, so that no checkpoint of another key is resumed.
             finished = map_sequence(
                 self.field, sequence, self.network, self.settings, self.seed, choose_device(),
-                checkpoint=checkpoint, on_iteration=tell, code=self.key,
+                checkpoint=checkpoint, on_iteration=report_losses, code=self.key,
             )  # fmt: skip
         record = {
             "quality": score_map(finished, sequence, self.scene.room),
@@ -154,11 +157,11 @@ class MapJob(Job):
         return finished.record
 
 
-def map_unit(made: MapJob) -> float:
+def map_unit(job: MapJob) -> float:
     """Metres a unit of a map; an estimate for one that is still to be made."""
-    if made.is_done:
-        return made.map().field.bounds.metres_per_unit
-    return _rough_unit(made.scene, made.frames)
+    if job.is_done:
+        return job.map().field.bounds.metres_per_unit
+    return _rough_unit(job.scene, job.frames)
 
 
 @lru_cache
@@ -170,9 +173,9 @@ def _rough_unit(scene: Scene, frames: str) -> float:
 
 
 def _stored(path: Path) -> Map:
-    """The map of a folder or file, from a cache of this process as long as it is unchanged.
+    """The map of a folder or file, read once in this process.
 
-    So are the registered fields: of a class that is written anew the map is read anew.
+    It is read again where its files changed, or where a class was registered since.
     """
     path = absolute(path)
     parts = (path / MAP_FILE, path / HISTORY_FILE) if path.is_dir() else (path,)
@@ -184,7 +187,7 @@ def _stored(path: Path) -> Map:
 def _read(path: Path, modified_ns: tuple[int, ...], fields: tuple) -> Map:
     """The map of a folder or file, kept for all runs in it: reading a corrected one takes seconds.
 
-    `modified_ns` and `fields` are no input: with others the cache has no answer, and the files are
-    read anew.
+    `modified_ns` and `fields` only belong to the cache's key: where one changes, the files are read
+    again.
     """
     return read_map(path)

@@ -66,7 +66,7 @@ _NETWORKS = {
     "occupancy": NetworkSettings(embedding_sigma=4.0),
 }
 # What a preset changes in these holds for all fields or trackers that it does not name.
-_USUAL = {"network": "neus", "mapping": "neus", "tracking": "sdf"}
+_MODELS = {"network": "neus", "mapping": "neus", "tracking": "sdf"}
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,8 @@ class Preset:
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
         """The preset with the `key=value` texts of a method, over which a user's values win."""
-        of_method = dict(self.of_method) | dict(with_settings(PRESETS[self.name], *settings).chosen)
+        checked = with_settings(PRESETS[self.name], *settings).chosen
+        of_method = dict(self.of_method) | dict(checked)
         return replace(self, of_method=tuple(sorted(of_method.items())))
 
     @property
@@ -137,23 +138,23 @@ class Preset:
     def step_counts(self) -> str:
         """For captions: with which sizes the paper measured its step counts, and what ours are."""
         paper = " and ".join(f"{n} ({tracker})" for tracker, n in PAPER_PIXELS.items())
-        own = " and ".join(f"{self.tracking_of(t.lower()).n_pixels} ({t})" for t in PAPER_PIXELS)
-        width, own_width = NetworkSettings().width, self.network_of("neus").width
-        there = f"measured there with n = {paper} and {width} units a layer"
-        return f"the paper's step counts, {there}; here n = {own} and {own_width} units"
+        ours = " and ".join(f"{self.tracking_of(t.lower()).n_pixels} ({t})" for t in PAPER_PIXELS)
+        width, our_width = NetworkSettings().width, self.network_of("neus").width
+        in_paper = f"measured there with n = {paper} and {width} units a layer"
+        return f"the paper's step counts, {in_paper}; here n = {ours} and {our_width} units"
 
 
 _SMALL = flat(read_object(Path(__file__).with_name("smoke.toml")))
 # With the iterations of NeuS that the committed results of nine_rooms were made with.
 _NINE = {"scenes.track_frames": ":", "mapping.neus.iterations": 1200}
 # What presets change in the defaults of the settings classes.
-_OWN: dict[str, dict[str, Any]] = {
+_CHANGES: dict[str, dict[str, Any]] = {
     "smoke": _SMALL,
     "nine_rooms": _SMALL | {"scenes.names": REPORTED_ROOMS} | _NINE,
     "synthetic": {"scenes.names": REPORTED_ROOMS},
     "paper": {"scenes.names": tuple(DATASET_SCENES)},
 }
-PRESETS = {name: Preset(name) for name in _OWN}
+PRESETS = {name: Preset(name) for name in _CHANGES}
 
 
 def default_settings() -> dict[str, Any]:
@@ -184,21 +185,21 @@ def _merged(preset: Preset, fields: Classes, trackers: Classes) -> dict[str, Any
     What the preset does not name has the defaults of its class, with what the preset changes in
     NeuS or in SDF tracking. A user's values change only what they name.
     """
-    tree, own = _defaults(fields, trackers), _OWN[preset.name]
-    usual = _usual(own, tree)
-    return with_values(tree, usual | own | dict(preset.of_method) | dict(preset.chosen))
+    tree, changes = _defaults(fields, trackers), _CHANGES[preset.name]
+    of_unnamed = _changes_of_unnamed(changes, tree)
+    return with_values(tree, of_unnamed | changes | dict(preset.of_method) | dict(preset.chosen))
 
 
-def _usual(own: dict[str, Any], tree: dict[str, Any]) -> dict[str, Any]:
+def _changes_of_unnamed(changes: dict[str, Any], tree: dict[str, Any]) -> dict[str, Any]:
     """By dotted keys, what a preset changes in fields and trackers that it does not name.
 
     That is what it changes in NeuS, or for trackers in SDF, where they have such a setting.
     """
-    named = {tuple(key.split(".")[:2]) for key in own}
+    named = {tuple(key.split(".")[:2]) for key in changes}
     values = {}
-    for key, value in own.items():
+    for key, value in changes.items():
         part, name, *setting = key.split(".")
-        others = tree[part] if name == _USUAL.get(part) else {}
+        others = tree[part] if name == _MODELS.get(part) else {}
         for other in others:
             if (part, other) not in named and hasattr(others[other], setting[0]):
                 values[f"{part}.{other}.{setting[0]}"] = value

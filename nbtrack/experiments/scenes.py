@@ -69,9 +69,12 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     """
     text = str(sequence)
     folder = absolute(sequence)
-    is_other_file = folder.is_file() and text not in _KNOWN  # what opens it tells what is wrong
-    if is_other_file or (folder.is_dir() and not (text in _KNOWN and is_own_output(folder))):
-        if text in _KNOWN:
+    is_known = text in _KNOWN
+    # A plain file is no recording: opening it raises an error that says what to give instead.
+    is_plain_file = folder.is_file() and not is_known
+    is_recording = folder.is_dir() and not (is_known and is_own_output(folder))
+    if is_plain_file or is_recording:
+        if is_known:
             tell(f"{text}: the folder {folder} is read, not the room or scene of that name")
         return Scene(folder.name, folder, format)
     if text in ROOMS:
@@ -80,8 +83,8 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
         downloaded = data_folder() / text
         if downloaded.is_dir():
             return Scene(text, downloaded, format)
-        how = f"`nbtrack data fetch {text}` brings it (data/README.md); rooms need no download"
-        raise MissingError(f"no folder {downloaded} of the Neural RGB-D dataset: {how}")
+        advice = f"`nbtrack data fetch {text}` brings it (data/README.md); rooms need no download"
+        raise MissingError(f"no folder {downloaded} of the Neural RGB-D dataset: {advice}")
     found = f"no sequence {text!r}: it is neither a folder nor a known scene"
     raise ConfigError(f"{found}; {nearest_name(text, _KNOWN)}")
 
@@ -114,9 +117,10 @@ def open_scenes(preset: Preset) -> list[Scene]:
 
 def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
     """Write a synthetic room as a sequence folder, and show a progress bar."""
-    with ProgressBar(f"room {name}", config.n_frames) as bar:
-        size, how = (config.width, config.width * 3 // 4), (config.seed, config.motion)
-        make_room(name, folder, config.n_frames, *size, *how, bar.move_to)
+    n_frames, seed, motion = config.n_frames, config.seed, config.motion
+    width, height = config.width, config.width * 3 // 4
+    with ProgressBar(f"room {name}", n_frames) as bar:
+        make_room(name, folder, n_frames, width, height, seed, motion, bar.move_to)
 
 
 def _room(name: str, config: ScenesConfig) -> Scene:

@@ -62,12 +62,13 @@ class TrackJob(Job):
     @cached_property
     def key(self) -> str:
         """A digest of code, map, tracker, budget, frames, seed; by the clock, machine, threads."""
-        code = provenance.code_fingerprint(tracker_class(self.tracker))  # the field's: in the map's
+        # Of the tracker's class; the map's key has that of the field's.
+        code = provenance.code_fingerprint(tracker_class(self.tracker))
         clock = self.rate_hz, device_name(choose_device()), torch.get_num_threads()
-        how = self.tracker, self.settings, self.start, self.frames, self.seed
         budget = self.steps if self.rate_hz is None else clock
-        made = self.needs.key, self.scene.fingerprint, code, provenance.versions()
-        return files.fingerprint(*how, budget, *made)
+        recipe = self.tracker, self.settings, self.start, self.frames, self.seed, budget
+        inputs = self.needs.key, self.scene.fingerprint, code, provenance.versions()
+        return files.fingerprint(*recipe, *inputs)
 
     @property
     def name(self) -> str:
@@ -94,21 +95,24 @@ class TrackJob(Job):
     def check(self) -> None:
         """Raises ConfigError or DataError, before anything is made, where a run cannot begin."""
         T_first = self._true_path()[0]
-        # With any pose: it raises for an unknown motion model.
+        # The result is not used, and any pose will do: this raises for an unknown motion model.
         expected_poses(self.settings.motion_model, [np.eye(4)])
-        if not self._starts_at(T_first):
+        if not self._starts_at(T_first):  # then the tracker has to find the camera in the map
             tracker_class(self.tracker).check_finds(in_corrected=self.needs.correction_voxel > 0)
 
     def expected_reach(self) -> dict[str, float]:
-        """What `reach_metrics` will say of the run; empty by the clock, where steps are unknown."""
+        """What `reach_metrics` will give for the run.
+
+        It is empty for a run by the clock, whose number of steps is not known in advance.
+        """
         if self.steps is not None:
-            with contextlib.suppress(NbtrackError):  # the run itself will say what is wrong
+            with contextlib.suppress(NbtrackError):  # the run itself will raise it
                 reach = self.settings.reach(self.steps, map_unit(self.needs))
                 return reach_metrics(reach, self._true_path(), self.settings.motion_model)
         return {}
 
     def result(self) -> dict[str, Any]:
-        """What a finished run keeps: errors, speed, device, versions, settings."""
+        """The stored metrics of the finished run: errors, speed, device, versions, settings."""
         path = self.folder / METRICS_FILE
         metrics = read_object(path)
         if metrics.get("key") != self.key:
@@ -125,16 +129,17 @@ class TrackJob(Job):
         sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
         warning = self._map_warning(finished, sequence[0])
 
-        def tell(done: int, error_m: float) -> None:
+        def report_frame(done: int, error_m: float) -> None:
             status = f"frame {done}" if np.isnan(error_m) else f"off by {100 * error_m:.1f} cm"
             report(done / len(sequence), status)
 
         T_first = sequence.T_world_camera[0]
-        is_known = self._starts_at(T_first)
-        T_start = T_first if is_known else np.eye(4)
-        how = make_budget(self.steps, self.rate_hz), self.settings, self.seed
-        tracker = make_tracker(self.tracker, finished.field, T_start, *how)
-        tracked = track_sequence(tracker, sequence, self.folder / RUN_FILE, tell, is_known)
+        is_start_known = self._starts_at(T_first)
+        T_start = T_first if is_start_known else np.eye(4)
+        field, budget = finished.field, make_budget(self.steps, self.rate_hz)
+        tracker = make_tracker(self.tracker, field, T_start, budget, self.settings, self.seed)
+        checkpoint = self.folder / RUN_FILE
+        tracked = track_sequence(tracker, sequence, checkpoint, report_frame, is_start_known)
         notes = self._notes(finished, sequence, tracked, warning)
         notes["device"] = device_name(tracker.device)  # LM and ICP run on the host
         if warning == _OTHER_WORLD:
@@ -142,7 +147,7 @@ class TrackJob(Job):
             notes["map_warning"] = warning if is_explained else None
         metrics = scores_of(tracked) | self._provenance(finished) | notes
         write_run(self.folder, replace(tracked, metrics=metrics))
-        (self.folder / RUN_FILE).unlink(missing_ok=True)
+        checkpoint.unlink(missing_ok=True)
         return metrics
 
     def _starts_at(self, T_first: Pose) -> bool:
@@ -150,10 +155,10 @@ class TrackJob(Job):
         return self.start == "given" and bool(np.isfinite(T_first).all())
 
     def _map_warning(self, finished: Map, first: Frame) -> str | None:
-        """Where it cannot be told whether a given map fits the first frame, a warning.
+        """A warning about how a given map fits the first frame; None where it fits.
 
-        If the map does not fit at the recording's pose, and the run would start there, it is a
-        DataError. Where the run does not use that pose, it is the warning `_OTHER_WORLD`.
+        Without depth the fit cannot be checked, which is a warning. A map that does not fit at the
+        recording's pose is a DataError where the run starts at that pose, else `_OTHER_WORLD`.
         """
         # Only given maps are checked: one made here is of the right room, but another path in the
         # room may begin where it does not reach.
@@ -169,7 +174,7 @@ class TrackJob(Job):
     def _notes(
         self, finished: Map, sequence: RgbdSequence, tracked: Trajectory, warning: str | None
     ) -> dict[str, Any]:
-        """What is to be said of a run beside its errors; `warning` is of `_map_warning`."""
+        """Metrics of a run beside its errors; `warning` is what `_map_warning` returned."""
         T_true, T_estimated = sequence.T_world_camera, tracked.T_estimated
         unit_m = finished.field.bounds.metres_per_unit
         n_given = len(sequence) - len(tracked.frames)  # a first frame whose pose is given: 1, or 0
@@ -207,22 +212,22 @@ class TrackJob(Job):
         }
 
     def _command(self) -> str:
-        """What makes this run anew, and its map where that is not cached.
+        """The command that repeats this run, and makes its map where that is not cached.
 
-        A room of the cache is named by its name, and made again; another recording by its folder.
+        It names a synthetic room, which is made again, and the folder of another recording.
         """
         options = {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
         options |= {"start": self.start, "frames": self.frames, "seed": self.seed}
         options |= {"format": self.scene.format, "device": choose_device().type}
-        options["preset"] = "synthetic"  # whose settings are the classes' own
+        options["preset"] = "synthetic"  # has the defaults that `changed_settings` compares with
         settings: dict[str, Any] = {"tracking": {self.tracker: self.settings}}
         sequence = str(self.scene.folder)
-        made = self.needs
+        map_job = self.needs
         if self.is_elsewhere:
-            options["map-from"] = files.absolute(made.folder)
+            options["map-from"] = files.absolute(map_job.folder)
         else:
-            options |= {"field": made.field, "map-frames": made.frames}
-            settings |= made.setting_tree
+            options |= {"field": map_job.field, "map-frames": map_job.frames}
+            settings |= map_job.setting_tree
             if self.scene.made:
                 sequence = self.scene.name
                 settings["scenes"] = {name: getattr(self.scene.made, name) for name in SIZES}
@@ -237,23 +242,24 @@ class TrackJob(Job):
 def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
     """A line for each kind of run whose search falls behind its camera, whatever the map is.
 
-    A kind is a tracker with its settings and steps. The line tells of the scene in which a greedy
+    A kind is a tracker with its settings and steps. The line is about the run in which a greedy
     search with this reach has the largest ATE.
     """
-    reaches = [(run.scene.name, run.expected_reach(), run) for run in runs]
-    # Those whose true path is known, the worst last: of its kind it stays.
-    known = [reach for reach in reaches if "greedy_ate_m" in reach[1]]
-    known.sort(key=lambda reach: reach[1]["greedy_ate_m"])
-    kinds = {(run.tracker, run.settings, run.steps): (scene, r) for scene, r, run in known}
-    for (tracker, settings, steps), (scene, worst) in kinds.items():
-        if worst["greedy_ate_m"] <= _GREEDY_ATE and worst["beyond_reach_share"] <= _SHARE:
+    pairs = [(run, run.expected_reach()) for run in runs]
+    pairs = [pair for pair in pairs if "greedy_ate_m" in pair[1]]  # true paths are known
+    pairs.sort(key=lambda pair: pair[1]["greedy_ate_m"])
+    # The last one of a kind, which has the largest ATE, replaces those before it.
+    largest = {(run.tracker, run.settings, run.steps): (run, reach) for run, reach in pairs}
+    for run, reach in largest.values():
+        if reach["greedy_ate_m"] <= _GREEDY_ATE and reach["beyond_reach_share"] <= _SHARE:
             continue
         advice = "take more steps, a lower rate, "
-        if settings.motion_model == "previous_pose":
-            advice += f"--set tracking.{tracker}.motion_model=constant_velocity, "
+        if run.settings.motion_model == "previous_pose":
+            advice += f"--set tracking.{run.tracker}.motion_model=constant_velocity, "
         yield (
-            f"{steps:g} steps of {tracker} move the camera by at most {1e3 * worst['reach_m']:.1f} "
-            f"mm along an axis and {worst['reach_deg']:.2f} deg about it; it moves farther in "
-            f"{worst['beyond_reach_share']:.0%} of the frames of {scene}, where a greedy "
-            f"follower has an ATE of {worst['greedy_ate_m']:.3f} m: {advice}or --method corrected"
+            f"{run.steps:g} steps of {run.tracker} move the camera by at most "
+            f"{1e3 * reach['reach_m']:.1f} mm along an axis and {reach['reach_deg']:.2f} deg about "
+            f"it; it moves farther in {reach['beyond_reach_share']:.0%} of the frames of "
+            f"{run.scene.name}, where a greedy follower has an ATE of {reach['greedy_ate_m']:.3f} "
+            f"m: {advice}or --method corrected"
         )

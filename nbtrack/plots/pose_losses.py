@@ -45,15 +45,16 @@ def pose_losses(
     directions_camera = pixel_directions(frame.camera, columns, rows)
     color, depth = frame.at(rows, columns)
     points_camera = directions_camera * depth[:, None]
-    own = frame.T_world_camera, StepBudget(1)
-    sdf, vr = SdfTracker(distance, *own), VrTracker(density, *own)
+    T_true, budget = frame.T_world_camera, StepBudget(1)  # trackers need them, their losses do not
+    sdf, vr = SdfTracker(distance, T_true, budget), VrTracker(density, T_true, budget)
     vr.generator = None  # without it samples along rays lie in fixed places
     losses = []
     for x_cm in _OFFSETS_CM:
         T_world_camera = move_sideways(frame, x_cm, y_deg)
-        seen = T_world_camera, directions_camera, color, depth
+        sdf_loss = sdf.loss(T_world_camera, directions_camera, color, depth)
+        vr_loss = vr.loss(T_world_camera, directions_camera, color, depth)
         _, densities = density(transform_points(T_world_camera, points_camera))
-        losses.append([x.item() for x in (sdf.loss(*seen), vr.loss(*seen), densities.mean())])
+        losses.append([sdf_loss.item(), vr_loss.item(), densities.mean().item()])
     return pd.DataFrame(losses, pd.Index(_OFFSETS_CM, name="x_cm"), [_SDF_LOSS, _VR_LOSS, _DENSITY])
 
 
@@ -69,24 +70,26 @@ def plot_pose_losses(
     """
     straight = pose_losses(density, distance, frame)
     turned = pose_losses(density, distance, frame, y_deg)
-    sdf_cm, vr_cm, _ = turned.idxmin()
+    sdf_cm, vr_cm = turned[[_SDF_LOSS, _VR_LOSS]].idxmin()
     title = f"Turned by {y_deg:g}°, SDF's loss is lowest at {sdf_cm} cm, VR's at {vr_cm} cm"
     title += ": a turn is traded for a shift" if sdf_cm and vr_cm else ""
-    *panels, view = new_axes(title.replace("-", "−"), 2.9, 1, 3)[0]
+    title = title.replace("-", "−")  # the sign of numbers
+    *panels, view = new_axes(title, 2.9, 1, 3)[0]
     T_world_camera = move_sideways(frame, x_cm, y_deg).double().numpy()
     rendered_color, _ = density.render_view(frame.camera, T_world_camera)
     view.imshow(rendered_color)
     view.set_title("the view from this pose")
     view.axis("off")
-    along = np.array([-5, 0, 5])  # cm from the pose, of three points on the tangent
+    tangent_cm = np.array([-5, 0, 5])  # from the pose, of three points on the tangent
     for axes, (name, color) in zip(panels, _COLORS.items(), strict=True):
         axes.plot(straight[name], color=color, alpha=0.4, label="not turned")
         axes.plot(turned[name], color=color, label=f"turned by {y_deg:g}°")
         axes.plot(turned[name].idxmin(), turned[name].min(), "v", color="0.3", label="lowest")
         loss = np.interp(x_cm, turned.index, turned[name])
-        slope = np.interp(x_cm, turned.index, np.gradient(turned[name], turned.index))
+        gradient = np.interp(x_cm, turned.index, np.gradient(turned[name], turned.index))
+        # Only the middle point, the pose itself, has a dot.
         look = {"marker": "o", "markevery": [1], "label": "this pose, its gradient"}
-        axes.plot(x_cm + along, loss + slope * along, color="0.3", **look)
+        axes.plot(x_cm + tangent_cm, loss + gradient * tangent_cm, color="0.3", **look)
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
     figure = view.figure.legend_below()
@@ -101,15 +104,14 @@ def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
 
     That is where the loss is lowest, and where the density is highest.
     """
-    best = {_SDF_LOSS: ("lowest", curves[_SDF_LOSS].idxmin())}
-    best[_DENSITY] = "highest", curves[_DENSITY].idxmax()
+    lowest_cm, highest_cm = curves[_SDF_LOSS].idxmin(), curves[_DENSITY].idxmax()
+    best = {_SDF_LOSS: ("lowest", lowest_cm), _DENSITY: ("highest", highest_cm)}
     panels = new_axes(title, 2.9, 1, 2)[0]
     for axes, name, color in zip(panels, best, _COLORS.values(), strict=True):
-        told, best_cm = best[name]
+        extreme, best_cm = best[name]
+        label = f"{extreme}, at {best_cm} cm"
         axes.plot(curves[name], color=color)
-        axes.plot(
-            best_cm, curves[name][best_cm], "o", color="0.3", label=f"{told}, at {best_cm} cm"
-        )
+        axes.plot(best_cm, curves[name][best_cm], "o", color="0.3", label=label)
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
         axes.legend()
@@ -126,11 +128,13 @@ def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, nea
     """
     paths_cm = {label: _path_cm(tracker, frame, T_start) for label, tracker in trackers.items()}
     errors_mm = {label: 10 * np.linalg.norm(path, axis=1) for label, path in paths_cm.items()}
-    within = {label: np.flatnonzero(e < 1000 * near) for label, e in errors_mm.items()}
-    steps = {k: n[0] if len(n) else f"not in {len(errors_mm[k]) - 1}" for k, n in within.items()}
-    found = ", ".join(f"{label} {told}" for label, told in steps.items())
+    arrivals = []
+    for label, errors in errors_mm.items():
+        steps = np.flatnonzero(errors < 1000 * near)
+        arrival = steps[0] if len(steps) else f"not in {len(errors) - 1}"
+        arrivals.append(f"{label} {arrival}")
     ends = " and ".join(f"{errors[-1]:.0f}" for errors in errors_mm.values())
-    title = f"Steps to within {1000 * near:.0f} mm: {found}; they end {ends} mm off"
+    title = f"Steps to within {1000 * near:.0f} mm: {', '.join(arrivals)}; they end {ends} mm off"
     plane, by_step = new_axes(title, 3.6, 1, 2, width_ratios=[1.2, 1])[0]
     field = next(iter(trackers.values())).field
     _draw_mean_distance(plane, field, frame, np.concatenate([*paths_cm.values(), [[0, 0, 0]]]))
@@ -138,8 +142,9 @@ def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, nea
         look = {"color": color, "marker": ".", "markersize": 4, "label": label}
         plane.plot(paths_cm[label][:, 0], paths_cm[label][:, 2], **look)
         by_step.plot(errors_mm[label], **look)
-    start, marks = paths_cm[label][0], {"color": "black", "linestyle": ""}
-    plane.plot(start[0], start[2], "s", label="start", **marks)
+    x_start, _, z_start = next(iter(paths_cm.values()))[0]  # the same for all
+    marks = {"color": "black", "linestyle": ""}
+    plane.plot(x_start, z_start, "s", label="start", **marks)
     plane.plot(0, 0, "*", markersize=10, label="true pose", **marks)
     plane.set(xlabel="camera off along x (cm)", ylabel="off along z (cm)", aspect="equal")
     by_step.axhline(1000 * near, **DASHED)

@@ -102,9 +102,10 @@ def draw_from_above(axes: Axes, T_paths: Paths) -> tuple[np.ndarray, np.ndarray]
     Returns the world's axis that is up, and those to the right and ahead on the page, (2, 3).
     """
     up = up_of(*T_paths.values())
-    page = np.eye(3)[up == 0]
+    is_level = up == 0  # up is along one of the world's axes; the others span the page
+    page = np.eye(3)[is_level]
     draw_paths(axes, T_paths, page)
-    right, ahead = np.array(list("xyz"))[up == 0]
+    right, ahead = np.array(["x", "y", "z"])[is_level]
     axes.set(xlabel=f"{right} (m)", ylabel=f"{ahead} (m)", aspect="equal")
     # Seen from above, the page's right, its upward direction and up must be right-handed.
     axes.yaxis.set_inverted(np.cross(*page) @ up < 0)
