@@ -45,17 +45,21 @@ def code_fingerprint(kind: type) -> str:
 
 @cache
 def _code_of(kind: type) -> list[str]:
-    """What keys say of a class besides the code of this package."""
+    """What keys hold of a class besides the code of this package.
+
+    These are the installed distributions of the class and its bases, as names with versions. A
+    class of no distribution adds its own name and version.
+    """
     installed = {base.__module__: _installed(base.__module__) for base in kind.__mro__}
-    said = sorted({name for names in installed.values() for name in names})
+    distributions = sorted({name for names in installed.values() for name in names})
     if installed[kind.__module__] or kind.__module__.startswith("nbtrack."):
-        return said
+        return distributions
     name, version = f"{kind.__module__}.{kind.__qualname__}", vars(kind).get("version")
     if version is None:
         version = secrets.token_hex(6)  # for this class object in this process
         advice = f'give {kind.__name__} version = "1", and another text whenever its code changes'
         tell(f"nbtrack: maps and runs with {name} are not kept for another process: {advice}")
-    return [*said, name, str(version)]
+    return [*distributions, name, str(version)]
 
 
 @cache
@@ -71,7 +75,7 @@ def _installed(module: str) -> list[str]:
 
 def versions() -> dict[str, str]:
     """Versions that a result depends on, to be kept beside it and in its key."""
-    there = [name for name in _PACKAGES if importlib.util.find_spec(name)]
-    of_packages = {name: importlib.metadata.version(name) for name in there}
+    installed = [name for name in _PACKAGES if importlib.util.find_spec(name)]
+    of_packages = {name: importlib.metadata.version(name) for name in installed}
     own = {"nbtrack": nbtrack.__version__, "python": platform.python_version()}
     return {**own, "torch": str(torch.__version__), **of_packages}

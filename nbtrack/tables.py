@@ -260,9 +260,9 @@ def write_tables(
     always measured by the clock and may have a note of its own.
     """
     styled = style_table_2(steps, default_pixels=default_pixels)
-    compared = beside(table_2(steps), table_2(published_table_2()))
-    second = folder / "table_2", steps, styled, steps_note or note, own, compared
-    return write_table_1(folder, results, note, own) + _write_table(*second)
+    both = beside(table_2(steps), table_2(published_table_2()))
+    paths = write_table_1(folder, results, note, own)
+    return paths + _write_table(folder / "table_2", steps, styled, steps_note or note, own, both)
 
 
 def write_table_1(

@@ -68,9 +68,8 @@ def _fill_tables(
     clock = options.budget == "clock"
     scenes = open_scenes(preset)
     rates = RATES_3_HZ if options.beyond else None  # those of the preset
-    seeds = range(options.seeds)
     results = track_scenes(
-        scenes, methods, preset, rates, clock=clock, seeds=seeds, execution=execution
+        scenes, methods, preset, rates, clock=clock, seeds=range(options.seeds), execution=execution
     )
     shown = results.drop(columns="still_ate_m", errors="ignore") if options.no_still else results
     folder = options.out or runs_folder() / f"tables/{preset.name}{'_clock' if clock else ''}"

@@ -115,11 +115,11 @@ def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[
     The row's own values win over metrics of the same name: its scene is the mapped one, that of the
     metrics the tracked one.
     """
-    failed = isinstance(result, NbtrackError)
-    values = {} if failed else result
-    metrics = {name: value for name, value in values.items() if not isinstance(value, dict)}
+    if isinstance(result, NbtrackError):
+        return {**row, "failure": str(result), "ate_m": float("nan")}
+    metrics = {name: value for name, value in result.items() if not isinstance(value, dict)}
     ate_m = metrics.get("ate_rmse_m", float("nan"))
-    return {**metrics, **row, "failure": str(result) if failed else "", "ate_m": ate_m}
+    return {**metrics, **row, "failure": "", "ate_m": ate_m}
 
 
 def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:

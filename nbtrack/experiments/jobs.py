@@ -38,9 +38,9 @@ Report = Callable[[float, str], None]
 
 
 class Job:
-    """One piece of work: picklable, its result kept in its own folder, perhaps made from another's.
+    """One piece of work, which can be pickled. Its result is kept in a folder of its own.
 
-    `needs` is the job whose result it is made from.
+    `needs` is the job whose result it is made from, if any.
     """
 
     kind: str  # the part of the cache where it is kept
@@ -66,10 +66,10 @@ class Job:
         return runs_folder() / "locks" / f"{self.folder.name}.lock"
 
     def make(self, report: Report) -> Any:
-        """Its `result`, made where it is missing.
+        """The job's `result`, which is computed where it is missing.
 
-        It waits for another process that makes the same: the system frees the lock when a process
-        ends.
+        If another process is computing it, this one waits for the lock, which the system frees when
+        that process ends.
         """
         report(0.0, "begins, or waits for another process that makes the same")
         check_no_recording(self.lock)
@@ -87,7 +87,8 @@ class Execution:
     # the work: jobs share its memory, and side by side gain less (benchmarks/README.md).
     workers: int | None = None
     dask: str | None = None  # address of a Dask scheduler whose workers run the jobs instead
-    # A user's mistake in one job stands among the results, also of what needs it; others still run.
+    # An NbtrackError of one job stands among the results, also in place of the results of jobs that
+    # need it. The others still run.
     keep_going: bool = False
 
     def __post_init__(self) -> None:
@@ -137,9 +138,9 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
 
 
 def _waves(jobs: Sequence[Job]) -> list[dict[Path, Job]]:
-    """Missing jobs, and those that they need, by folder: plain maps, corrected ones, and then runs.
+    """Missing jobs by folder, in waves that run one after the other: each needs only earlier ones.
 
-    None of a wave needs another one of it.
+    Of tracked runs in corrected maps these are plain maps, corrected maps and runs.
     """
     waves = []
     wave = {job.folder: job for job in jobs if not job.is_done}
@@ -151,7 +152,7 @@ def _waves(jobs: Sequence[Job]) -> list[dict[Path, Job]]:
 
 
 def _workplace(execution: Execution, n_jobs: int) -> AbstractContextManager[Workplace | None]:
-    """Where so many jobs run at a time; None is here, one after the other."""
+    """Where the jobs run side by side; None where they run in this process, one after the other."""
     usual = device.usable_cores() if device.choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, n_jobs)
     if execution.dask is None and workers <= 1:
@@ -171,8 +172,8 @@ def _caught(work: Callable, *arguments: Any) -> Any:
 def _outcomes(wave: Mapping, before: Mapping, show: Callable, place: Workplace | None) -> Pairs:
     """Pairs of folder and outcome, as the jobs of a wave end.
 
-    Those of earlier waves were `before`, and may hold some of this one; `show` is that of
-    `run_jobs`.
+    `before` are the outcomes of earlier waves. A job that is in two waves has its outcome there.
+    `show` is that of `run_jobs`.
     """
     ready = {folder: job for folder, job in wave.items() if folder not in before}
     for folder, job in wave.items():
@@ -183,7 +184,7 @@ def _outcomes(wave: Mapping, before: Mapping, show: Callable, place: Workplace |
         yield from _elsewhere(ready, show, place)
         return
     for folder, job in ready.items():
-
+        # A default argument, since the loop changes `folder`.
         def report(share: float, status: str, folder: Path = folder) -> None:
             show({folder: (share, status)})
 

@@ -70,10 +70,9 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     text = str(sequence)
     folder = absolute(sequence)
     is_known = text in _KNOWN
-    # A plain file is no recording: opening it raises an error that says what to give instead.
-    is_plain_file = folder.is_file() and not is_known
-    is_recording = folder.is_dir() and not (is_known and is_own_output(folder))
-    if is_plain_file or is_recording:
+    is_output = folder.is_dir() and is_own_output(folder)
+    # Opening a plain file, which is no recording, raises an error that says what to give instead.
+    if (folder.is_dir() and not (is_known and is_output)) or (folder.is_file() and not is_known):
         if is_known:
             tell(f"{text}: the folder {folder} is read, not the room or scene of that name")
         return Scene(folder.name, folder, format)

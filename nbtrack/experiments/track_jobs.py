@@ -232,8 +232,7 @@ class TrackJob(Job):
                 sequence = self.scene.name
                 settings["scenes"] = {name: getattr(self.scene.made, name) for name in SIZES}
         words = ["python", "-m", "nbtrack", "track", sequence]
-        changed = changed_settings(settings, default_settings())
-        words += [f"--set={text}" for text in changed]
+        words += [f"--set={text}" for text in changed_settings(settings, default_settings())]
         words += [f"--{name}={value}" for name, value in options.items() if value is not None]
         words += [f"--import={source}" for source in IMPORTED]
         return shlex.join([*words, "--out", f"again_{self.name}"])

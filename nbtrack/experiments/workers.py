@@ -19,7 +19,7 @@ from nbtrack.machinery.errors import MissingError
 _START = "spawn"  # how worker processes begin: forked ones would lack the threads of libraries
 _SECONDS_TO_CONNECT = 10
 DEATHS = ("BrokenProcessPool", "KilledWorker")
-"""Names of the errors by which a process, or Dask, says that the one of a call died."""
+"""Names of the errors that are raised, here or by Dask, where the process of a call has died."""
 
 
 class Workplace(NamedTuple):

@@ -32,8 +32,8 @@ def choose_device() -> torch.device:
         device = torch.device(name)
         torch.zeros(1, device=device).item()  # raises on `meta`, too, whose tensors have no values
     except (RuntimeError, AssertionError, NotImplementedError, ImportError):
-        there = ["cpu", *(f"{accelerator}:{i}" for i in range(torch.accelerator.device_count()))]
-        raise ConfigError(f"no device {name!r}: this machine has {', '.join(there)}") from None
+        devices = ["cpu", *(f"{accelerator}:{i}" for i in range(torch.accelerator.device_count()))]
+        raise ConfigError(f"no device {name!r}: this machine has {', '.join(devices)}") from None
     return device
 
 
@@ -71,10 +71,11 @@ def usable_cores() -> int:
 def usual_modes() -> Iterator[None]:
     """Run a block with gradients, without autocast, on the CPU where no device is named.
 
-    Also in a program that has it otherwise. These modes are the thread's own. The default type is
-    one of the whole process, and stays: types are named where tensors are made.
+    A program that calls this package may have set other modes, which hold again after the block.
+    The default dtype is not among them: it is one of the whole process, not of the thread. Dtypes
+    are named where tensors are made.
     """
-    is_usual = torch.get_default_device().type == "cpu"  # to say so again would slow every call
+    is_usual = torch.get_default_device().type == "cpu"  # then no context, which slows every call
     with (
         contextlib.nullcontext() if is_usual else torch.device("cpu"),
         torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False),
@@ -98,22 +99,22 @@ def threads(number: int) -> contextlib.AbstractContextManager[None]:
 
 
 @contextlib.contextmanager
-def _changed(name: str, within: Any) -> Iterator[None]:
-    """Run a block with a setting of PyTorch's, which has no other way in, at the value `within`.
+def _changed(name: str, value: Any) -> Iterator[None]:
+    """Run a block with a global setting of PyTorch at another value, and restore it afterwards.
 
-    Where it is that already, perhaps by the block of another thread, nothing is set or restored: so
-    of two blocks the first to begin restores what was before both.
+    Where the setting has that value already, perhaps by the block of another thread, nothing is set
+    or restored. So of two such blocks the first to begin restores what was before both.
     """
-    get, put = getattr(torch, f"get_{name}"), getattr(torch, f"set_{name}")
-    before = get()
-    if before == within:
+    getter, setter = getattr(torch, f"get_{name}"), getattr(torch, f"set_{name}")
+    before = getter()
+    if before == value:
         yield
         return
-    put(within)
+    setter(value)
     try:
         yield
     finally:
-        put(before)
+        setter(before)
 
 
 @contextlib.contextmanager
@@ -133,9 +134,9 @@ def has_room_for(device: torch.device, n_bytes: int) -> bool:
     if device.type != "cuda":
         return True  # the CPU's and Apple's memory is the one that the data are in already
     free_bytes, _ = torch.cuda.mem_get_info(device)
-    # What torch keeps for later is free for us as well.
-    kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return 2 * n_bytes < free_bytes + kept
+    # What torch's allocator keeps without using it is free as well.
+    unused_bytes = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return 2 * n_bytes < free_bytes + unused_bytes
 
 
 @contextlib.contextmanager
@@ -147,10 +148,11 @@ def advise_on_memory(setting: str) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, MemoryError) as error:
-        # CUDA, the CPU's allocator and MPS say it in words.
+        # The RuntimeErrors of CUDA, the CPU's allocator and MPS are known by their texts.
         words = ("can't allocate memory", "not enough memory", "out of memory")
-        is_lack = isinstance(error, MemoryError) or any(word in str(error) for word in words)
-        if isinstance(error, OutOfMemory) or not is_lack:  # somebody nearer has named the setting
+        lacks_memory = isinstance(error, MemoryError) or any(word in str(error) for word in words)
+        # An OutOfMemory comes from a block within this one, which has named its own setting.
+        if isinstance(error, OutOfMemory) or not lacks_memory:
             raise
         advice = "lower it with --set, or take fewer frames, as with --frames ::2"
         raise OutOfMemory(f"out of memory with {setting}: {advice}") from None

@@ -93,8 +93,8 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 def loaded_checkpoint(path: Path) -> Iterator[dict[str, Any]]:
     """What `save_checkpoint` wrote, on the CPU, for a `with` block that restores from it.
 
-    Raises DataError if the file is damaged, and also in place of an error that the block itself
-    raises because the content is not what it needs.
+    Raises DataError if the file is damaged. An error of the block becomes a DataError too: then the
+    content is not what the block needs.
     """
     with naming_damaged(path):
         with zipfile.ZipFile(path) as archive:  # torch checks no checksums
@@ -119,7 +119,7 @@ class Checkpoint:
     """
 
     def __init__(self, path: Path | None, recipe: dict[str, Any]) -> None:
-        """`recipe` is what the run depends on, by names for whoever gives another run's file."""
+        """`recipe` is what the run depends on; the error for another run's file has its names."""
         self.path = path
         self.recipe = recipe
         self.last_saved = time.perf_counter()
@@ -139,8 +139,9 @@ class Checkpoint:
         if not (self.path and self.path.exists()):
             return
         with loaded_checkpoint(self.path) as state:
-            written, wanted = state["recipe"], self.recipe
-            if changed := [name for name in wanted if written.get(name) != wanted[name]]:
+            written = state["recipe"]
+            changed = [name for name in self.recipe if written.get(name) != self.recipe[name]]
+            if changed:
                 others = ", ".join(changed).replace("_", " ")
                 raise DataError(f"{self.path} was made with another {others}: remove it")
             take_up(state)
@@ -159,8 +160,8 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> 
 
     A file whose content is None is removed.
 
-    All are written aside before the first is moved, so that a disk that fills up leaves the
-    earlier ones as they were. Whoever is killed between two moves leaves a folder without the last.
+    All new files are first written to another folder, so that a full disk leaves the old ones as
+    they were. A process that is killed between two moves leaves the folder without the last file.
     Missing folders are made. Raises OSError, which names the last file, where that is not possible.
     """
     last = [*contents][-1]
@@ -174,7 +175,7 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> 
                 is_text = isinstance(content, str)
                 encoded = content.encode(errors="surrogateescape") if is_text else content
                 Path(aside, name).write_bytes(encoded)
-            if len(contents) > 1:  # the old sign goes first: it must not stand among new files
+            if len(contents) > 1:  # the old last file must not stand beside new ones
                 (folder / last).unlink(missing_ok=True)
             for name in contents.keys() - kept.keys():
                 (folder / name).unlink(missing_ok=True)

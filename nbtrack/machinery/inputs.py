@@ -51,8 +51,9 @@ def check_array(what: str, array: Any, shape: tuple, kinds: list, asked: str) ->
 
 def tensor_of(array: np.ndarray) -> Tensor:
     """An array's memory as a tensor; a copy where PyTorch cannot share it."""
-    is_fine = array.flags.writeable and array.dtype.isnative and min(array.strides, default=0) >= 0
-    return torch.from_numpy(array if is_fine else array.astype(array.dtype.newbyteorder("=")))
+    has_strides = min(array.strides, default=0) >= 0  # that PyTorch knows: none is negative
+    can_share = array.flags.writeable and array.dtype.isnative and has_strides
+    return torch.from_numpy(array if can_share else array.astype(array.dtype.newbyteorder("=")))
 
 
 def checked_images(color: Any, depth: Any, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -139,7 +140,10 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
 
 
 def read_object(path: Path, kind: str = "") -> dict[str, Any]:
-    """A JSON or TOML file, by its name if not said, of an object. Raises DataError otherwise."""
+    """The object in a JSON or TOML file; without `kind` its name says which of both it is.
+
+    Raises DataError for any other content.
+    """
     kind = kind or ("JSON" if path.suffix.lower() == ".json" else "TOML")
     with naming_damaged(path, f"{kind} file of names and values", "correct it or write it anew"):
         text = read_text(path)
@@ -171,7 +175,7 @@ def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np
     Raises DataError for anything else, or if the number of columns is none of `columns`. The
     message says what every line should hold: the `meaning`.
     """
-    # First: some spellings hold a `#`, which else begins a comment.
+    # Before comments are cut off: some spellings of NaN hold a `#`.
     lines = [_NOT_A_NUMBER.sub("nan", line) for line in read_lines(path)]
     if path.suffix == ".log":  # Open3D's, with a head of three numbers before each matrix
         lines = [line for line in lines if len(line.split()) != 3]

@@ -22,7 +22,7 @@ _WAITS = "called a synchronizing CUDA operation"  # how PyTorch warns of it
 
 
 class Recording:
-    """Calls work; on CUDA a few times, after which it is recorded, and replayed from then on.
+    """Calls work; on CUDA it records the work after a few calls, and replays it from then on.
 
     The work always reads and writes the same tensors, and draws from one generator. A replay runs
     no Python: anything else that the work depends on stays as it was at the recording. Work that
@@ -55,14 +55,14 @@ class Recording:
         The first call may wait, since it loads and allocates.
         """
         # Warnings are caught in the whole process: one thread at a time, or some are lost for good.
-        with _WATCHING, warnings.catch_warnings(record=True) as told:
+        with _WATCHING, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             torch.cuda.set_sync_debug_mode("warn")
             try:
                 result = work()
             finally:
                 torch.cuda.set_sync_debug_mode("default")
-        waits = [warning for warning in told if _WAITS in str(warning.message)]
+        waits = [warning for warning in caught if _WAITS in str(warning.message)]
         if waits and self.n_calls == CALLS_BEFORE_RECORDING:
             self.is_recordable = False
             where = f"{waits[0].filename}:{waits[0].lineno}"

@@ -123,17 +123,17 @@ class _Fit:
 
     def run(self, checkpoint: Path | None, on_iteration: OnIteration) -> None:
         """Fit from the checkpoint, if any, to the last iteration; the field then learns no more."""
-        kept = Checkpoint(checkpoint, self.recipe)
-        kept.resume(self._take_up)
+        file = Checkpoint(checkpoint, self.recipe)
+        file.resume(self._take_up)
         end = self.settings.iterations
         for first in range(len(self.history), end, _PENDING):
             self._advance(range(first, min(end, first + _PENDING)))
             on_iteration(len(self.history) / end, self.history[-1])
-            kept.save(self._state, is_last=len(self.history) == end)
+            file.save(self._state, is_last=len(self.history) == end)
         self.field.eval().requires_grad_(False)
 
     def _advance(self, iterations: range) -> None:
-        """Descend some iterations; only then are their losses looked at, which waits for a GPU."""
+        """Take some steps, then read their losses all at once: each reading waits for the GPU."""
         start = time.perf_counter()
         pending = []
         for iteration in iterations:

@@ -146,13 +146,14 @@ def plot_along_ray(
 
 @style.styled
 def plot_columns(tables: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
-    """The columns of each table below each other, over its index, whose name labels x.
+    """A panel for each column of each table: a row for each column, a panel column for each table.
 
-    Tables stand side by side below their names, and have the same columns, whose names, with units,
-    label y.
+    The name of a table stands above its panels. Tables have the same columns, whose names, with
+    units, label y; the name of the index labels x.
     """
-    n = len(next(iter(tables.values())).columns)
-    grid = style.new_axes(title, 0.9 + 1.45 * n, n, len(tables), sharex="col", sharey="row")
+    n_rows = len(next(iter(tables.values())).columns)
+    height = 0.9 + 1.45 * n_rows  # inches
+    grid = style.new_axes(title, height, n_rows, len(tables), sharex="col", sharey="row")
     for column, (heading, table) in zip(grid.T, tables.items(), strict=True):
         column[0].set_title(heading)
         for axes, (name, color) in zip(column, style.method_colors(table).items(), strict=True):

@@ -38,15 +38,16 @@ def movie_pictures(
 ) -> Iterator[Image.Image]:
     """A picture for each frame of a run, drawn when it is asked for.
 
-    Left the observed image, in the middle the map's surface seen from the estimated pose, right the
-    estimated path so far from above. `run` has the rows of frames.csv of the sequence's frames,
+    On the left is the observed image, in the middle the map's surface as seen from the estimated
+    pose, on the right the estimated path up to there, from above. `run` has the sequence's rows of
+    frames.csv,
     `T_estimated` their camera-to-world poses (m). `progress` is told how many are drawn.
     """
     left, middle, right = new_axes(title, 2.8, 1, 3, width_ratios=[1, 1, 0.9])[0]
     page = draw_cloud(right, cloud_of(surface), {"tracked": T_estimated})
-    path, here = right.lines  # here: the dot at the start, which now moves along the path
-    here.set_color(path.get_color())
-    words = right.text(0, 1.03, "", transform=right.transAxes)
+    path, dot = right.lines  # the dot stood at the start, and now moves along the path
+    dot.set_color(path.get_color())
+    label = right.text(0, 1.03, "", transform=right.transAxes)
     canvas = FigureCanvasAgg(left.figure)
     left.figure.set_dpi(72)
     for index, row in enumerate(run.itertuples()):
@@ -57,10 +58,10 @@ def movie_pictures(
         show_image(middle, view, "the map from the estimated pose")
         places = page @ T_estimated[: index + 1, :3, 3].T
         path.set_data(*places)
-        here.set_data(*places[:, -1:])
+        dot.set_data(*places[:, -1:])
         error_cm = 100 * row.translation_error_m
         error = "" if np.isnan(error_cm) else f", off by {error_cm:.1f} cm"
-        words.set_text(f"frame {row.frame_id}{error}")
+        label.set_text(f"frame {row.frame_id}{error}")
         canvas.draw()
         left.figure.set_layout_engine("none")  # the first picture's layout stays: nothing jumps
         progress(index + 1)
@@ -72,7 +73,7 @@ def movie_pictures(
 def movie_bytes(pictures: Iterator[Image.Image]) -> bytes:
     """A GIF that repeats, of at least one picture.
 
-    A lazy iterator, as that of `movie_pictures`, draws in the house style while this writes.
+    `movie_pictures` draws each picture when this asks for it, and so in the house style.
     """
     content = io.BytesIO()
     options = {"duration": 100, "loop": 0, "optimize": True}  # ms a picture
@@ -97,7 +98,7 @@ def view_of(surface: Mesh, camera: Intrinsics, T_world_camera: Pose) -> np.ndarr
     pixels = scale * (corners[..., :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
     in_view = ((pixels.max(axis=1) > 0) & (pixels.min(axis=1) < [_WIDTH, height])).all(axis=1)
     seen = np.flatnonzero(in_view & (corners[..., 2] > _NEAR).all(axis=1))
-    order = seen[np.argsort(-corners[seen, :, 2].mean(axis=1))]
+    order = seen[np.argsort(-corners[seen, :, 2].mean(axis=1))]  # the farthest first
     colors = surface.visual.vertex_colors[parts[order], :3].mean(axis=1)
     image = np.full((height, _WIDTH, 3), 255, np.uint8)
     for polygon, color in zip(pixels[order].round().astype(np.int32), colors.tolist(), strict=True):

@@ -104,8 +104,9 @@ def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
 
     That is where the loss is lowest, and where the density is highest.
     """
-    lowest_cm, highest_cm = curves[_SDF_LOSS].idxmin(), curves[_DENSITY].idxmax()
-    best = {_SDF_LOSS: ("lowest", lowest_cm), _DENSITY: ("highest", highest_cm)}
+    # By column: which extreme pulls the camera, and where it is (cm).
+    best = {_SDF_LOSS: ("lowest", curves[_SDF_LOSS].idxmin())}
+    best[_DENSITY] = "highest", curves[_DENSITY].idxmax()
     panels = new_axes(title, 2.9, 1, 2)[0]
     for axes, name, color in zip(panels, best, _COLORS.values(), strict=True):
         extreme, best_cm = best[name]

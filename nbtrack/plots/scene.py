@@ -30,7 +30,7 @@ _LINES_M = np.arange(-5.0, 5.01, 0.25).tolist()  # distances with a thin line
 
 
 def up_of(*T_paths: Poses) -> np.ndarray:
-    """The world's axis, with its sign, that is nearest to the mean up of cameras.
+    """The unit vector along an axis of the world, or against it, nearest to the cameras' mean up.
 
     A camera's up is minus its y.
     """
@@ -44,7 +44,7 @@ def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
 
     The viewer stands 45 degrees above the horizon, at `azimuth_deg` about up.
     """
-    side = np.roll(up, 1)  # azimuth 0 is the horizontal axis after up: which one does not matter
+    side = np.roll(up, 1)  # a horizontal axis of the world, for azimuth 0; either one will do
     azimuth = np.radians(azimuth_deg)
     level = np.cos(azimuth) * side + np.sin(azimuth) * np.cross(up, side)
     viewer = np.cos(_ELEVATION) * level + np.sin(_ELEVATION) * up
@@ -134,7 +134,8 @@ def draw_paths(axes: Axes, T_paths: Paths, to_page: np.ndarray, width: float = 1
 def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Paths) -> np.ndarray:
     """Draw paths from above, and coloured points, without those higher than all cameras.
 
-    So no ceiling hides the room. Returns the world's axes to the right and ahead, (2, 3).
+    Without those, no ceiling hides the room. Returns the page's axes in the world, (2, 3): to the
+    right and ahead.
     """
     up, page = draw_from_above(axes, T_paths)
     places = cloud[["x", "y", "z"]]

@@ -128,17 +128,17 @@ def _from_json(path: Path) -> Calibration:
     with naming_damaged(path, "description of a camera", _ADVICE):
         for key in unused:
             _check_unused(key, entries[key])
-        found = {key: _numbers(key, entries[key]) for key in entries.keys() & _COUNTS.keys()}
-        single = {key: numbers[0] for key, numbers in found.items() if len(numbers) == 1}
-        lens = tuple(found.get("distortion", [single.get(key, 0.0) for key in _LENS]))
+        used = {key: _numbers(key, entries[key]) for key in entries.keys() & _COUNTS.keys()}
+        single = {key: numbers[0] for key, numbers in used.items() if len(numbers) == 1}
+        lens = tuple(used.get("distortion", [single.get(key, 0.0) for key in _LENS]))
         stored = single.get("depth_scale")
         scale = 1 / stored if stored and stored < 1 else stored  # below 1 it is metres a value
         has_size = "width" in single or "height" in single
         # One without the other is a KeyError, which `naming_damaged` makes a DataError.
         size = (int(single["width"]), int(single["height"])) if has_size else None
         K = camera_matrix(*[single.get(key, np.nan) for key in ("fx", "fy", "cx", "cy")])
-        if "intrinsic_matrix" in found:
-            K = np.reshape(found["intrinsic_matrix"], (3, 3)).T  # the file has it by columns
+        if "intrinsic_matrix" in used:
+            K = np.reshape(used["intrinsic_matrix"], (3, 3)).T  # the file has it by columns
     return replace(calibration(path, K, size), distortion=lens, depth_scale=scale, unused=unused)
 
 

@@ -34,10 +34,11 @@ def fetch_scene(name: str, folder: Path, source: str = DATASET_ZIP) -> str:
             archive = opened.enter_context(_archive(source, opened))
         files = _files_of(name, archive, source)
         missing = {path: info for path, info in files.items() if _is_missing(folder / path, info)}
-        there = next(path for path in (folder, *folder.parents) if path.is_dir())
-        needed, free = sum(i.file_size for i in missing.values()), shutil.disk_usage(there).free
+        existing = next(path for path in (folder, *folder.parents) if path.is_dir())
+        needed = sum(info.file_size for info in missing.values())
+        free = shutil.disk_usage(existing).free
         if needed > free:
-            found = f"{needed / 1e6:.0f} MB are needed, and {there} has {free / 1e6:.0f} MB free"
+            found = f"{needed / 1e6:.0f} MB are needed, and {existing} has {free / 1e6:.0f} MB free"
             raise DataError(f"{found}: make room, or let NBTRACK_DATA name another disk")
         total, done = sum(info.compress_size for info in missing.values()), 0
         with ProgressBar(f"fetching {name}", max(total, 1)) as bar:
@@ -72,18 +73,21 @@ def _archive(source: str, opened: contextlib.ExitStack) -> zipfile.ZipFile:
 
 
 def _files_of(name: str, archive: zipfile.ZipFile, source: str) -> Files:
-    """What is read of a scene: of the folder of its name, at any depth, that holds most of it."""
-    found: dict[str, Files] = {}
+    """The files of a scene that are read, by their paths in the scene's folder.
+
+    The scene's folder is the one of its name, at any depth of the archive, with most such files.
+    """
+    by_parent: dict[str, Files] = {}
     for info in archive.infolist():
-        above, _, inside = f"/{info.filename}".rpartition(f"/{name}/")
-        if _NAME.fullmatch(inside):
-            found.setdefault(above, {})[inside] = info
-    files = max(found.values(), key=len, default={})
-    kinds = {path: path.rpartition("/")[0] for path in files}  # "" of texts
+        parent, _, path = f"/{info.filename}".rpartition(f"/{name}/")
+        if _NAME.fullmatch(path):
+            by_parent.setdefault(parent, {})[path] = info
+    files = max(by_parent.values(), key=len, default={})
+    kinds = {path: path.rpartition("/")[0] for path in files}  # folders; "" of texts
     wanted = [""]
     for patterns in (FORMATS["neural_rgbd"].color, FORMATS["neural_rgbd"].depth):
         folders = (pattern.rpartition("/")[0] for pattern in patterns)
-        wanted += [folder for folder in folders if folder in kinds.values()][:1]
+        wanted += [folder for folder in folders if folder in kinds.values()][:1]  # the first
     if len(wanted) < 3:
         found = f"{source} has no images and depth in a folder {name!r}"
         raise MissingError(f"{found}: name the dataset's own ZIP file with --url")

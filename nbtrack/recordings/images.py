@@ -54,7 +54,7 @@ class Images:
         self.forget()
 
     def forget(self) -> None:
-        """Keep no frames any more, as where a long recording is gone through once."""
+        """Free the frames that are kept, as in one pass over a long recording."""
         self._ids = np.empty(0, int)  # of the frames that are kept, in order
         self._kept: Decoded | tuple[()] = ()
 
@@ -75,9 +75,9 @@ class Images:
         return images, digest.hexdigest(), recording.declared
 
     def kept(self, ids: Frames) -> Decoded:
-        """Some frames (at least one), which are kept for whoever wants them next.
+        """Colours and depths of some frames (at least one), which are kept for the next call.
 
-        They are views of what is kept where their numbers rise evenly, as those of a slice do.
+        The arrays are views of the kept ones where the frames' numbers rise evenly, as in a slice.
         Raises DataError if a file is damaged, or of another kind or size.
         """
         camera = self.camera_of(ids[0])
@@ -86,6 +86,7 @@ class Images:
             shape = len(all_ids), camera.height, camera.width
             colors, depths = np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint16)
             is_kept = np.isin(all_ids, self._ids)
+            # Not strict: at first nothing is kept, and `_kept` is empty.
             for array, before in zip((colors, depths), self._kept, strict=False):
                 array[is_kept] = before
             missing = np.flatnonzero(~is_kept)
@@ -102,20 +103,23 @@ class Images:
         return colors[places], depths[places]
 
     def camera_of(self, first: int) -> Intrinsics:
-        """The camera, told by the frame of this number where none was decoded before.
+        """The camera of all images. The first call decodes the frame `first` to know their size.
 
         Raises DataError as `kept` does.
         """
         if self._camera:
             return self._camera
         recording = self.recording
-        color, depth = self._first[first] = self._pixels(first)
+        color, depth = self._pixels(first)
+        self._first[first] = color, depth
         self._resize, note = _resizing(color, depth, recording)
         if note and note not in recording.notes:
             recording.notes.append(note)  # of the caller's recording, for reports of what was read
+        # The file whose image has the size that all must have; messages name it.
         self._sized = (recording.depth_files if self._resize else recording.color_files)[first]
         height, width = (depth if self._resize else color).shape[:2]
         self._camera = recording.calibration.for_size(width, height, self._sized)
+        # Where each pixel lies in the distorted image; empty without distortion.
         self._maps = _undistortion(self._camera, recording.calibration.distortion)
         return self._camera
 
@@ -129,16 +133,16 @@ class Images:
         _check(recording.depth_files[index], depth, np.uint16, shape, self._sized)
         if self._maps:
             color = cv2.remap(color, *self._maps, cv2.INTER_LINEAR)
-            # No points between two surfaces.
+            # Not interpolated, which would make points between two surfaces.
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST)
         is_none = (depth == recording.declared.no_depth) | (depth == _MAX_16_BITS)
         return color, np.where(is_none, 0, depth)
 
     def in_millimetres(self, depths: Depths, ids: Frames) -> Depths:
-        """Depths (mm along the optical axis) of frames with these numbers.
+        """Depths (mm along the optical axis) from the stored ones of frames with these numbers.
 
-        They are the given array itself where its values are that already. Raises DataError for
-        more than 65.535 m.
+        Where the stored values are millimetres along the axis, they are returned as they are.
+        Raises DataError for more than 65.535 m.
         """
         declared = self.recording.declared
         meaning = declared.depth_scale, declared.depth_along, declared.depth_error_per_m

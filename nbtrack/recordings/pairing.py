@@ -32,7 +32,7 @@ def check_paired(colors: list[Path], others: list[Path]) -> None:
     color_keys, other_keys = frame_keys(colors), frame_keys(others)
     if color_keys != other_keys or len(set(color_keys)) < len(color_keys):
         keys = color_keys + other_keys
-        count = Counter(keys)
+        count = Counter(keys)  # 2 of a key that each list has once
         odd = [p.name for p, key in zip(colors + others, keys, strict=True) if count[key] != 2]
         raise DataError(
             f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
@@ -46,8 +46,8 @@ def check_paired(colors: list[Path], others: list[Path]) -> None:
 def nearest(times: Times, others: Times, tolerance: float) -> Frames:
     """For every time the index of the nearest other one; -1 if none is within the tolerance (s)."""
     # In one dimension p=1 is the plain difference, which no square and root round.
-    apart, closest = cKDTree(others[:, None]).query(times[:, None], p=1)
-    return np.where(apart <= tolerance, closest, -1)
+    distances, closest = cKDTree(others[:, None]).query(times[:, None], p=1)
+    return np.where(distances <= tolerance, closest, -1)
 
 
 def pair_lists(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Path], Times, str]:
@@ -144,15 +144,16 @@ class Moments:
         )
 
     def _by_number(self, poses: Poses, stamps: Times | None) -> tuple[Poses, str] | None:
-        """A pose a frame by the frames' numbers, and a note; None where these tell nothing.
+        """A pose for each frame by the frames' numbers, and a note; None if no rule applies.
 
-        The number of a pose is its stamp (s) times the rate or, without stamps, its place in the
-        list. Two rules are tried:
-        1. Frames take the poses of their numbers if, over the ways to count of `_counted`, just
-           one pairing is complete: all frames find a pose, or all poses a frame. Without stamps
-           this needs more poses than frames; for equally many there is rule 2.
-        2. Equally many poses and frames are paired in order, unless stamps are times, not a count,
-           and most frames find a pose by them: then the list lacks some frames and has others.
+        The number of a pose is its stamp (s) times the rate. Without stamps it is the pose's place
+        in the list. There are two rules:
+        1. Equal numbers are paired. The frames' numbers may be counted in the ways of `_counted`.
+           Exactly one way must give a complete pairing, in which all frames have a pose or all
+           poses have a frame. Without stamps there must also be more poses than frames.
+        2. Equally many poses and frames are paired in order. The rule does not apply where stamps
+           are times and most frames have a pose at their time: then the list lacks the poses of
+           some frames and has others.
         """
         n_frames, n_poses = len(self.images), len(poses)
         pose_numbers = np.arange(n_poses) if stamps is None else stamps * self.rate_hz
@@ -165,9 +166,9 @@ class Moments:
         if len(complete) == 1 and (n_poses > n_frames or stamps is not None):
             note = f"of {n_poses} poses those of the images' numbers" if n_poses > n_frames else ""
             return _at(poses, complete[0]), note
-        are_times = stamps is not None and not _are_even(stamps)  # even ones may only count
-        finds_most = (n_paired > 0.75 * n_frames).any()  # as on one clock
-        if n_poses != n_frames or (are_times and finds_most):
+        are_times = stamps is not None and not _are_even(stamps)  # even ones may count the poses
+        most_have_pose = (n_paired > 0.75 * n_frames).any()
+        if n_poses != n_frames or (are_times and most_have_pose):
             return None
         counts_up = np.array_equal(self.numbers, np.arange(n_frames))
         return poses, "" if counts_up else "images have the poses one after another"
@@ -182,7 +183,7 @@ class Moments:
             return []
         first = self.numbers[0]
         is_1_to_n = first == 1 and np.ptp(self.numbers) == len(self.numbers) - 1
-        # The second is 1, but 0 where there is a frame 0.
+        # The second entry is 1, or 0 where there is a frame 0.
         of_place_0 = [0] if self.counts_from_0 and not is_1_to_n else [0, min(first, 1), first]
         return [self.numbers - number for number in of_place_0]
 
@@ -197,9 +198,10 @@ def _interpolated(
     """
     found = _at(poses, nearest(times, stamps, _TOLERANCE))
     later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
-    before, after = times - stamps[later - 1], stamps[later] - times  # s, to both stamps beside
+    # s from each time back to the stamp before it, and on to the stamp after it.
+    before, after = times - stamps[later - 1], stamps[later] - times
     to_nearest = np.minimum(before, after)  # s; negative outside of the list
-    # Else the nearest stays, as that of the very time, to the last digit of lists.
+    # Elsewhere the nearest pose stays. A stamp within 1e-6 s is that of the time itself, rounded.
     is_between = (before + after <= _GAP) & (to_nearest > 1e-6)
     if not is_between.any():
         return found, ""

@@ -89,7 +89,7 @@ def frame_keys(files: list[Path]) -> list[tuple[int, ...]]:
 def check_rising(times: Times, source: Path) -> None:
     """Raises DataError where times (s; NaN: none), in the order of their source, fall or repeat.
 
-    Whoever sorted them would shuffle a recording whose clock fell back.
+    They are not sorted instead: that would mix up the frames of a recording whose clock fell back.
     """
     rows = np.flatnonzero(np.isfinite(times))
     steps = np.diff(times[rows])
@@ -104,7 +104,8 @@ def check_rising(times: Times, source: Path) -> None:
 def check_order(files: list[Path]) -> None:
     """Raises DataError where the order of names, by their numbers, may not be that of frames."""
     names = f"{files[0].parent}/{files[0].name}, {files[-1].name} and the others"
-    # Words tell no order: Jan, Feb; neither do 1.5 and 1.25, which may be 1.50 or chapters.
+    # The order of words is not that of frames (Jan, Feb). Neither is that of 1.5 and 1.25: the
+    # first may mean 1.50, or come before 1.25 as a chapter does.
     kinds = {re.sub("[0-9]+", "0", path.stem.lower()) for path in files}
     stamps = [stamp_in(path) for path in files]
     decimals = {tuple(map(len, re.findall(r"\d\.(\d+)", path.stem))) for path in files}
@@ -117,6 +118,8 @@ def check_order(files: list[Path]) -> None:
         if is_counter and (steps < 0).any():
             raise DataError(f"{names} have numbers that order them in two ways: keep one of both")
         usual, last = np.median(steps) if len(steps) else 0, numbers[-1]
+        # A counter that went back to 0 at `end` has a wide gap in sorted numbers, and its last
+        # number is followed by its first one.
         for end in (10 ** len(str(last)), 2**8, 2**16, 2**32):
             if 0 < numbers[0] + end - last <= 2 * usual and steps.max() > 10 * usual:
                 i = steps.argmax()

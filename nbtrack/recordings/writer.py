@@ -58,8 +58,8 @@ def write_sequence(
                 (unfinished / name).write_text(text, encoding="utf-8")
             unfinished.rename(folder)  # fails if another command has finished it meanwhile
     except KeyboardInterrupt:
-        left = "is whole" if folder.exists() else "is not kept: the same command begins anew"
-        raise KeyboardInterrupt(f"{folder} {left}") from None
+        state = "is whole" if folder.exists() else "is not kept: the same command begins anew"
+        raise KeyboardInterrupt(f"{folder} {state}") from None
 
 
 def _write_images(
@@ -80,8 +80,9 @@ def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
     # so that the function that reads the layout's poses also writes them.
     T_file = FORMATS["neural_rgbd"].declared.poses_to_opencv(T_world_camera)
     texts = dict.fromkeys(["poses.txt", "trainval_poses.txt"], number_lines(T_file.reshape(-1, 4)))
-    told_by_focal = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
-    if np.allclose(astuple(camera), astuple(told_by_focal), rtol=0, atol=1e-6):  # rounding
+    # The camera that a reader makes of the focal length alone.
+    by_focal = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
+    if np.allclose(astuple(camera), astuple(by_focal), rtol=0, atol=1e-6):  # rounding
         return texts | {"focal.txt": f"{float(camera.fx)!r}\n"}
     # There is no `focal.txt` then, so that programs that know only this file stop, instead of
     # reading another camera. In `intrinsics.txt` pixel centres are whole numbers, as in OpenCV.

@@ -76,7 +76,7 @@ def _glance_around(walk: Walk, length: int, rng: np.random.Generator) -> Poses:
     heading = walk.start_yaw + rng.uniform(-0.25, 0.25)  # rad
     # Rows: x and z of the directions forward and left.
     axes = np.array([[-np.sin(heading), -np.cos(heading)], [-np.cos(heading), np.sin(heading)]])
-    # Where the adjustment begins, of which each round comes nearer to the wanted mean speeds.
+    # Start values. Each round of the loop below brings the mean speeds nearer to `MEAN_STEP`.
     radius = 0.7  # m
     rate = np.radians(0.5)  # a frame, in the mean
     for _ in range(12):

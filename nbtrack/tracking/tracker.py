@@ -107,9 +107,9 @@ class Tracker(abc.ABC):
         MissingError, if a package that it needs is not installed.
         """
         kind = field if isinstance(field, type) else type(field)
-        # Of the grid of a density only the object itself says that it holds no distance.
         fits = issubclass(kind, Field) and cls.works_in(kind)
-        if not fits or field.is_distance < kind.is_distance:
+        # A grid is of a class with distances, but may be made from a density.
+        if not fits or (kind.is_distance and not field.is_distance):
             named = getattr(kind, "name", kind.__name__)
             known = ", ".join(name for name, other in FIELDS.items() if cls.works_in(other))
             raise ConfigError(f"{cls.name!r} does not work on field {named!r}: take {known}")
@@ -191,14 +191,14 @@ class Tracker(abc.ABC):
             setattr(self, name, state[name])
 
     def __reduce__(self) -> tuple:
-        """Copies and pickles are made as a resumed run is: anew, with what `state` tells."""
-        made = self.field, self.estimates[-1], self.budget, self.settings
-        return _restored, (type(self), made, self.state())
+        """Copies and pickles are made as a resumed run is: by the class, then from the `state`."""
+        arguments = self.field, self.estimates[-1], self.budget, self.settings
+        return _restored, (type(self), arguments, self.state())
 
     def _warm_up(self, frame: Frame, T_starts: Poses) -> None:
-        """Take steps that count nowhere: first calls load, allocate and record for a second.
+        """Take some steps before those that count: the first ones load, allocate and record.
 
-        Estimates, budget and random numbers are as before afterwards.
+        That takes a second. Afterwards estimates, budget and random numbers are as before.
         """
         state = self.state()
         self._is_warm = True
@@ -232,8 +232,8 @@ class Tracker(abc.ABC):
         return Estimate(pose, not frame.has_depth, steps, seconds, float(loss), self.report())
 
 
-def _restored(kind: type[Tracker], made: tuple, state: dict[str, Any]) -> Tracker:
+def _restored(kind: type[Tracker], arguments: tuple, state: dict[str, Any]) -> Tracker:
     """A tracker made with some arguments, that goes on from a state."""
-    tracker = kind(*made)
+    tracker = kind(*arguments)
     tracker.restore(state)
     return tracker

@@ -65,12 +65,13 @@ def track_sequence(
     with advise_on_memory(f"tracking.{tracker.name}.n_pixels={tracker.settings.n_pixels}"):
         kept.resume(take_up)
         for index in range(first + len(rows), len(sequence)):
+            # Until one frame is not lost, the camera is still to be found.
             is_found = is_start_known or not all(row.get("lost", False) for row in rows)
-            budget = None if is_found else StepBudget(STEPS_TO_FIND)
+            budget = None if is_found else StepBudget(STEPS_TO_FIND)  # None: the tracker's own
             rows.append(_row(sequence, index, tracker.track(sequence[index], budget)))
             on_frame(index, rows[-1]["translation_error_m"])
             kept.save(lambda: {"rows": rows, "tracker": tracker.state()})
-    T_estimated = np.stack(tracker.estimates[1:])  # without the start, be it known or not
+    T_estimated = np.stack(tracker.estimates[1:])  # the first is the start, no tracked frame
     return Trajectory(T_estimated, sequence.T_world_camera[first:].copy(), _table_of(rows))
 
 
@@ -86,7 +87,7 @@ def _table_of(rows: list[dict[str, Any]]) -> pd.DataFrame:
 
 
 def _recipe(tracker: Tracker, sequence: RgbdSequence, is_start_known: bool) -> dict[str, Any]:
-    """What a run depends on, by names for whoever gives the checkpoint of another."""
+    """What a run depends on, by the names that the error for another run's checkpoint gives."""
     field, budget, seed = tracker.field, str(tracker.budget), tracker.generator.initial_seed()
     method = [tracker.name, as_dict(tracker.settings), budget, seed, is_start_known]
     weights = dict(chain(field.named_parameters(), field.named_buffers()))
