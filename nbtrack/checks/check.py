@@ -64,17 +64,14 @@ class DataReport:
     def __str__(self) -> str:
         recording, cloud = self.recording, self.cloud
         declared, *others = self.conventions
-        overlapping = [other for other in others if other.overlap > 0]
-        best = sorted(overlapping, key=lambda other: -other.agreement)[:3]
+        rivals = sorted((c for c in others if c.overlap > 0), key=lambda c: -c.agreement)[:3]
+        compared = [declared, *rivals]
         camera = declared.reading.camera
         wide_deg = 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx))
         near, far = cloud.depth.quantile([0.01, 0.99])
         x, y, z = np.ptp(cloud[_XYZ].quantile(_CUT), axis=0)
         facts = self.frames[_PRINTED].agg(["mean", "min", "max"]).T
-        used, *tried = [
-            f"{1e3 * each.apart * each.depth_m:9.1f} mm {each.overlap:5.0%}  {each.name}"
-            for each in (declared, *best)
-        ]
+        rows = [f"{1e3 * c.apart * c.depth_m:9.1f} mm {c.overlap:5.0%}  {c.name}" for c in compared]
         # The first fault or doubt is in the verdict.
         texts = [f"  warning: {text}" for text in (self.faults + self.doubts)[1:]]
         texts += [f"  note: {text}" for text in (*recording.notes, *self.remarks)]
@@ -87,8 +84,8 @@ class DataReport:
             f"  depth: {near:.2f} to {far:.2f} m (1 to 99%), scene: {x:.2f} x {y:.2f} x {z:.2f} m",
             facts.to_string(float_format="{:10.2f}".format),
             "  surfaces of two frames (mm apart in the mean, share of points), read as",
-            f"  > (in use) {used}",
-            *(f"             {other}" for other in tried),
+            f"  > (in use) {rows[0]}",
+            *(f"             {row}" for row in rows[1:]),
             *map(_LINES.fill, texts),
             f"  next: python -m nbtrack {command} {shlex.quote(str(recording.folder))}",
             "",
@@ -121,8 +118,7 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     is_own = best is conventions[0]
     causes = CAUSES if is_own and len(ids) >= _MIN_FRAMES and best.overlap >= MIN_OVERLAP else {}
     misfits = [fit(compared, own, *cause) for cause in ProgressBar("fitting", causes.items())]
-    main = main_misfits(compared, own, misfits)
-    text, kind = findings.misreading(conventions[0], best, main)
+    text, kind = findings.misreading(conventions[0], best, main_misfits(compared, own, misfits))
     texts = {name: [text] if kind == name else [] for name in ("fault", "doubt", "note")}
     faults = [*findings.of_images(frames, shared, counts[0]), *texts["fault"]]
     remarks, doubts = texts["note"], texts["doubt"]

@@ -135,8 +135,7 @@ def fit(
     for _ in range(_STEPS):
         scale = _WIDE * float(np.nanmedian(np.abs(gaps)))
         # Steps are in units of what is negligible, so that all numbers are alike.
-        moved = [gaps_at(values + unit) for unit in np.diag(small)]
-        H, g = _normal_equations(gaps, moved, scale)
+        H, g = _normal_equations(gaps, [gaps_at(values + unit) for unit in np.diag(small)], scale)
         step = _solution(H.sum(axis=0), g.sum(axis=0))
         tried = [(values + factor * small * step).clip(-limit, limit) for factor in _FACTORS]
         tried_gaps = [gaps_at(new) for new in tried]

@@ -142,8 +142,7 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
         firsts.setdefault(method.tracker, method)
     pixels, usual = preset.tables.pixels, preset.tables.pixels["sdf"]
     plan = [(method, n) for method in firsts.values() for n in pixels.get(method.tracker, usual)]
-    posed_ids = np.flatnonzero(scene.recording.has_pose)
-    frame = read_frames(scene.recording, posed_ids[:1])[0]
+    frame = read_frames(scene.recording, np.flatnonzero(scene.recording.has_pose)[:1])[0]
     columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_std", "converged"]
     rows = []
     with ProgressBar("Table II", len(plan)) as bar:

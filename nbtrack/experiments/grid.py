@@ -118,8 +118,7 @@ def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[
     if isinstance(result, NbtrackError):
         return {**row, "failure": str(result), "ate_m": float("nan")}
     metrics = {name: value for name, value in result.items() if not isinstance(value, dict)}
-    ate_m = metrics.get("ate_rmse_m", float("nan"))
-    return {**metrics, **row, "failure": "", "ate_m": ate_m}
+    return {**metrics, **row, "failure": "", "ate_m": metrics.get("ate_rmse_m", float("nan"))}
 
 
 def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:

@@ -133,8 +133,7 @@ class MapJob(Job):
 
         sequence = self.scene.read(self.frames)
         if self.later_voxel:  # raises now what would else be raised after minutes of mapping
-            setting = f"correction.{self.field}"
-            checked_size(observed_bounds(sequence), self.later_voxel, setting)
+            checked_size(observed_bounds(sequence), self.later_voxel, f"correction.{self.field}")
         if self.needs:
             finished = correct_map(self.needs.map(), sequence, self.correction_voxel)
         else:

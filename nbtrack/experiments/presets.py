@@ -101,8 +101,7 @@ class Preset:
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
         """The preset with the `key=value` texts of a method, over which a user's values win."""
-        checked = with_settings(PRESETS[self.name], *settings).chosen
-        of_method = dict(self.of_method) | dict(checked)
+        of_method = dict(self.of_method) | dict(with_settings(PRESETS[self.name], *settings).chosen)
         return replace(self, of_method=tuple(sorted(of_method.items())))
 
     @property

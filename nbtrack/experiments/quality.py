@@ -114,8 +114,7 @@ def _score_surface(
     else:
         points = mesh.sample(POINTS_SCORED, seed=0)
     hits_world = rays.points(_exact_depths(rays, room)[:, None])[rays.depth > 0, 0].numpy()
-    cells = np.floor(hits_world / NEAR).astype(int)
-    _, one_a_cell = np.unique(cells, axis=0, return_index=True)
+    _, one_a_cell = np.unique(np.floor(hits_world / NEAR).astype(int), axis=0, return_index=True)
     to_truth = np.abs(room.sdf(points))
     to_map, _ = cKDTree(points).query(hits_world[one_a_cell])
     precision, recall = float((to_truth < NEAR).mean()), float((to_map < NEAR).mean())

@@ -218,8 +218,9 @@ class TrackJob(Job):
         """
         options = {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
         options |= {"start": self.start, "frames": self.frames, "seed": self.seed}
+        # The preset `synthetic` has the defaults that `changed_settings` compares with.
         options |= {"format": self.scene.format, "device": choose_device().type}
-        options["preset"] = "synthetic"  # has the defaults that `changed_settings` compares with
+        options["preset"] = "synthetic"
         settings: dict[str, Any] = {"tracking": {self.tracker: self.settings}}
         sequence = str(self.scene.folder)
         map_job = self.needs

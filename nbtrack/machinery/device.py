@@ -89,8 +89,7 @@ def matrix_products(tf32: bool) -> contextlib.AbstractContextManager[None]:
 
     TF32 keeps 10 of the mantissa's 23 bits, and is several times as fast.
     """
-    precision = "high" if tf32 else "highest"
-    return _changed("float32_matmul_precision", precision)
+    return _changed("float32_matmul_precision", "high" if tf32 else "highest")
 
 
 def threads(number: int) -> contextlib.AbstractContextManager[None]:

@@ -140,8 +140,7 @@ class Checkpoint:
             return
         with loaded_checkpoint(self.path) as state:
             written = state["recipe"]
-            changed = [name for name in self.recipe if written.get(name) != self.recipe[name]]
-            if changed:
+            if changed := [name for name in self.recipe if written.get(name) != self.recipe[name]]:
                 others = ", ".join(changed).replace("_", " ")
                 raise DataError(f"{self.path} was made with another {others}: remove it")
             take_up(state)

@@ -51,9 +51,9 @@ def check_array(what: str, array: Any, shape: tuple, kinds: list, asked: str) ->
 
 def tensor_of(array: np.ndarray) -> Tensor:
     """An array's memory as a tensor; a copy where PyTorch cannot share it."""
-    has_strides = min(array.strides, default=0) >= 0  # that PyTorch knows: none is negative
-    can_share = array.flags.writeable and array.dtype.isnative and has_strides
-    return torch.from_numpy(array if can_share else array.astype(array.dtype.newbyteorder("=")))
+    # PyTorch shares the memory of no other arrays.
+    shared = array.flags.writeable and array.dtype.isnative and min(array.strides, default=0) >= 0
+    return torch.from_numpy(array if shared else array.astype(array.dtype.newbyteorder("=")))
 
 
 def checked_images(color: Any, depth: Any, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -161,8 +161,7 @@ def read_text(path: Path) -> str:
 
 def read_lines(path: Path) -> list[str]:
     """The lines of a text file that are neither blank nor comments. DataError if there is none."""
-    lines = read_text(path).splitlines()
-    full = [line for line in lines if line.partition("#")[0].strip()]
+    full = [line for line in read_text(path).splitlines() if line.partition("#")[0].strip()]
     if not full:
         raise DataError(f"{path} is empty: write it anew")
     return full

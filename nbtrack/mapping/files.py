@@ -81,8 +81,7 @@ def write_map(path: Path | str, finished: Map) -> None:
         if _map_of(content, path).key != finished.key:
             raise ValueError("it is read as another map")
     history = finished.history.rename_axis("iteration")
-    losses = None if history.empty else history.to_csv().encode()
-    beside = {HISTORY_FILE: losses, MESH_FILE: None}
+    beside = {HISTORY_FILE: None if history.empty else history.to_csv().encode(), MESH_FILE: None}
     write_together(path.parent, {**(beside if path.name == MAP_FILE else {}), path.name: content})
 
 

@@ -58,8 +58,7 @@ def plot_views(
         name = f"frame {sequence.frame_ids[index]}"
         colors = [(name, sequence.color(index), ""), ("rendered colour", color, "")]
         depths = [("observed depth", depth, DEPTH), ("rendered depth", rendered, DEPTH)]
-        error = ("|error|", 100 * np.abs(rendered - depth), DEPTH_ERROR)
-        rows.append([*colors, *depths, error])
+        rows.append([*colors, *depths, ("|error|", 100 * np.abs(rendered - depth), DEPTH_ERROR)])
     return plot_images(rows, title, {DEPTH_ERROR: 10.0})
 
 

@@ -111,5 +111,5 @@ def seen_by(
     """
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32)).view(-1, 3)
     frames = np.arange(len(sequence)) if frames is None else frames
-    behind = min_depth_behind(points, sequence, frames).numpy()
-    return behind.reshape(points_world.shape[:-1]) < 0.1
+    behind = min_depth_behind(points, sequence, frames)
+    return behind.numpy().reshape(points_world.shape[:-1]) < 0.1

@@ -73,8 +73,7 @@ def plot_pose_losses(
     sdf_cm, vr_cm = turned[[_SDF_LOSS, _VR_LOSS]].idxmin()
     title = f"Turned by {y_deg:g}°, SDF's loss is lowest at {sdf_cm} cm, VR's at {vr_cm} cm"
     title += ": a turn is traded for a shift" if sdf_cm and vr_cm else ""
-    title = title.replace("-", "−")  # the sign of numbers
-    *panels, view = new_axes(title, 2.9, 1, 3)[0]
+    *panels, view = new_axes(title.replace("-", "−"), 2.9, 1, 3)[0]  # a minus, no hyphen
     T_world_camera = move_sideways(frame, x_cm, y_deg).double().numpy()
     rendered_color, _ = density.render_view(frame.camera, T_world_camera)
     view.imshow(rendered_color)

@@ -142,8 +142,7 @@ def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Paths) -> np.ndarray:
     inside = (places >= places.quantile(_CUT)) & (places <= places.quantile(1 - _CUT))
     heights = (places @ up)[inside.all(axis=1)].sort_values()  # drawn from the floor up
     highest = max((path[:, :3, 3] @ up).max() for path in T_paths.values())
-    heights_shown = heights[heights <= highest + 0.1]  # 0.1 m above the highest camera
-    shown = cloud.loc[heights_shown.index]
+    shown = cloud.loc[heights[heights <= highest + 0.1].index]  # up to 0.1 m above the cameras
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
     axes.scatter(*page @ shown[["x", "y", "z"]].to_numpy().T, c=colors, s=4, linewidths=0)
     return page

@@ -153,8 +153,7 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     height = rng.uniform(1.3, 1.5) + _wander(n_frames, rng, 0.05)
     pitch = room.walk.pitch + _wander(n_frames, rng, 0.09)
     roll = _wander(n_frames, rng, 0.025)
-    placed = np.stack([x, height, z, pitch, yaw, roll], axis=1)
-    return camera_poses(placed + _tremor(n_frames, rng))
+    return camera_poses(np.stack([x, height, z, pitch, yaw, roll], axis=1) + _tremor(n_frames, rng))
 
 
 def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
