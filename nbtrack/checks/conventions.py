@@ -132,8 +132,7 @@ def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
     for name, metres in _UNITS.items():
         # Mirrored positions are rare, and a camera that moves in a plane cannot exclude them: with
         # another subject than "poses" they raise no doubt.
-        subject = "poses" if min(metres) > 0 else "positions"
-        yield subject, name, replace(own, metres=metres)
+        yield "poses" if min(metres) > 0 else "positions", name, replace(own, metres=metres)
     for poses in (CAMERA_TO_WORLD, WORLD_TO_CAMERA):
         mixed = replace(own, declared=replace(own.declared, poses=poses), is_mixed=True)
         yield "poses", f"{poses} ones whose rotations alone are of the other direction", mixed
@@ -163,8 +162,7 @@ def remedy(reading: Reading, own: Reading) -> str:
     if reading.metres != own.metres:
         factors = "x, y and z by {:g}, {:g} and {:g}".format(*reading.metres)
         return f"multiply the positions in the pose file, {factors}"
-    camera = reading.calibration
-    if camera != own.calibration:
+    if (camera := reading.calibration) != own.calibration:
         numbers = f"{camera.fx:.6g} {camera.fy:.6g} {camera.cx - 0.5:.6g} {camera.cy - 0.5:.6g}"
         return f"set fx fy cx cy in the calibration to {numbers} (the first pixel's centre at 0)"
     if reading.late:

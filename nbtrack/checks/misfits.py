@@ -112,8 +112,7 @@ def main_misfits(pairs: FramePairs, own: Reading, misfits: list[Misfit]) -> list
     if not alike:
         return []
     first, *others = alike
-    together = fit(pairs, own, "all", list(_NUMBERS), first.reading)
-    if together.gain < _WHOLE * lowest:
+    if fit(pairs, own, "all", list(_NUMBERS), first.reading).gain < _WHOLE * lowest:
         return []
     return [first, *(other for other in others if not first.numbers.keys() <= other.numbers.keys())]
 

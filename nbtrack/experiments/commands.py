@@ -82,8 +82,7 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
 def track_command(options: Namespace) -> None:
     """Track a sequence in its map, made first where none fits, or in a given one."""
     given = MapJob.of_given(options.map_from) if options.map_from else None
-    names_field = options.field or options.method
-    field = given.field if given and not names_field else options.field
+    field = given.field if given and not (options.field or options.method) else options.field
     method = method_of(options.method, field, options.tracker)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     if given:

@@ -32,9 +32,8 @@ def method_of(name: str | None, field: str | None, tracker: str | None) -> Metho
     if field is None and tracker is None:
         return find_methods([name or DEFAULT_METHOD])[0]
     if tracker is None:
-        kind = field_class(field)
         in_order = ("lm", "icp", "vr", *TRACKERS)
-        fits = [other for other in in_order if tracker_class(other).works_in(kind)]
+        fits = [other for other in in_order if tracker_class(other).works_in(field_class(field))]
         if not fits:
             raise ConfigError(f"no tracker works on field {field!r}: register one of your own")
         tracker = fits[0]

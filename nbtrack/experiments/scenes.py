@@ -69,11 +69,11 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     """
     text = str(sequence)
     folder = absolute(sequence)
-    is_known = text in _KNOWN
-    is_output = folder.is_dir() and is_own_output(folder)
-    # Opening a plain file, which is no recording, raises an error that says what to give instead.
-    if (folder.is_dir() and not (is_known and is_output)) or (folder.is_file() and not is_known):
-        if is_known:
+    # A room or scene comes before a file of its name, and before a folder with nbtrack's results.
+    is_hidden = text in _KNOWN and (folder.is_file() or is_own_output(folder))
+    # Opening another plain file raises an error that says what to give instead.
+    if (folder.is_dir() or folder.is_file()) and not is_hidden:
+        if text in _KNOWN:
             tell(f"{text}: the folder {folder} is read, not the room or scene of that name")
         return Scene(folder.name, folder, format)
     if text in ROOMS:

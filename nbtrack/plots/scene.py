@@ -175,8 +175,8 @@ def draw_slice(
     page = np.moveaxis(places, -1, 0)
     image = axes.pcolormesh(*page, values, cmap=colors, norm=norm or own_norm, **look)
     if norm is None:
-        usual = {"ax": axes, "label": field.value_label, "extend": "both"}
-        axes.figure.colorbar(image, **(usual | bar))
+        bar = {"ax": axes, "label": field.value_label, "extend": "both", **bar}
+        axes.figure.colorbar(image, **bar)
     if field.is_distance:
         draw_levels(axes, places, values, _LINES_M, colors="0.35", linewidths=0.4, linestyles="-")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)

@@ -55,8 +55,7 @@ def plain(
     points: Points, color: Color, variation: float = 0.08, wavelength: float = 0.45, seed: int = 0
 ) -> Points:
     """One color with a faint, relative, cloudy variation, as of paint, cloth or plaster."""
-    brightness = 1.0 + variation * _smooth_noise(points, wavelength, seed)
-    return np.asarray(color) * brightness[:, None]
+    return np.asarray(color) * (1.0 + variation * _smooth_noise(points, wavelength, seed))[:, None]
 
 
 def checker(
@@ -107,8 +106,7 @@ def patchwork(points: Points, base: Color, period: float, seed: int, spread: flo
     total = np.sin(points[:, :, None] * angular + rng.uniform(0, 2 * np.pi, (3, 4))).sum(axis=1)
     waves = total / np.sqrt(total * total + 0.2)
     # Patches differ in brightness more than in hue.
-    mixed = 0.6 * waves[:, :3] + 0.9 * waves[:, 3:]
-    return np.clip(np.asarray(base) + spread * mixed, 0.05, 1.0)
+    return np.clip(np.asarray(base) + spread * (0.6 * waves[:, :3] + 0.9 * waves[:, 3:]), 0.05, 1.0)
 
 
 def split(points: Points, below: Material, above: Material, axis: int) -> Points:

@@ -41,9 +41,9 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     Raises `NumericalError` as `attempts` does.
     Source: our choice; the statistics are those of hand-held RGB-D recordings.
     """
-    length = max(n_frames, 120)  # shorter ones are the beginning of one of this length
     for rng in attempts(room, seed):
-        poses = _glance_around(room.walk, length, rng)
+        # A shorter path is the beginning of one of 120 frames.
+        poses = _glance_around(room.walk, max(n_frames, 120), rng)
         is_at_height = poses[:, 1, 3].min() >= HEIGHTS[0] and poses[:, 1, 3].max() <= HEIGHTS[1]
         is_steady = has_speed(poses, MEAN_STEP, 3 * MEAN_STEP, tolerance=0.05)
         if is_at_height and is_steady and is_clear(room, poses):
@@ -169,9 +169,8 @@ def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
     # is a cell that no route enters.
     costs = np.where(is_free, 1.0 / np.maximum(clearance - CLEARANCE, 0.01), -1.0)
     cells = [(np.abs(x - at_x).argmin(), np.abs(z - at_z).argmin()) for at_x, at_z in stops]
-    ends = [*cells[1:], cells[0]]
     walk = []
-    for start, end in zip(cells, ends, strict=True):
+    for start, end in zip(cells, [*cells[1:], cells[0]], strict=True):
         route, _ = route_through_array(costs, start, end, geometric=True)
         walk += route[:-1]  # the next one begins where it ends
     rows, columns = np.array(walk).T
