@@ -144,8 +144,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status = getattr(commands, f"{options.command}_command")(options)
         print(end="", flush=True)  # a closed pipe is found here, not after the return
         return status or 0
-    except BrokenPipeError:  # whoever read the output, as `head` does, has enough
-        for descriptor in (1, 2):  # stdout and stderr: what Python flushes at its end goes nowhere
+    except BrokenPipeError:  # the reader of the output, such as `head`, has closed it
+        for descriptor in (1, 2):  # stdout and stderr: what Python flushes at its end is discarded
             os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
         return 1
     except (NbtrackError, OSError, MemoryError, KeyboardInterrupt) as error:
@@ -169,7 +169,7 @@ def _writable(stream: TextIO | None) -> TextIO:
 
 
 def _message_of(error: BaseException) -> str:
-    """What a user is told of what ended a command, in a line."""
+    """The line in which a user is told what ended a command."""
     if isinstance(error, NbtrackError):
         return " ".join(str(error).split())
     if isinstance(error, OSError):  # a disk that is full, a file where a folder should be

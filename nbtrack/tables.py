@@ -202,7 +202,7 @@ def style_table_2(
 ) -> TableStyler:
     """Table II, mean ± std over frames; rows of whole numbers without a std have no decimals.
 
-    Where a column `converged` is true, they are marked. The default pixels of each tracker, the n
+    Steps are marked where the column `converged` is true. The default pixels of each tracker, the n
     used for Table I, are printed bold with an asterisk.
     """
     wide, stds = table_2(steps), table_2(steps, "steps_std")
@@ -285,7 +285,7 @@ def write_table_3(
 def _write_table(
     stem: Path, cells: pd.DataFrame, styler: TableStyler, note: str, own: Wording, *compared: Any
 ) -> list[Path]:
-    """Write a table in long form as CSV, styled as LaTeX, and compared, if it is; their paths."""
+    """Write a table as CSV, as LaTeX and, if given, `compared` with the paper's; their paths."""
     path = stem.with_suffix(".tex")
     write_atomic(path, latex_file(styler, path, note, own))
     beside_it = stem.with_name(f"{stem.name}_vs_paper.csv")

@@ -143,7 +143,7 @@ class IcpTracker(Tracker):
             return {"inlier_ratio": 0.0, "lost": True}
         T_found = self.found.T_target_source
         distances = self._distances(T_found)
-        # m; at least what a voxel's points scatter by
+        # m; at least as far as the points of a voxel scatter.
         scale = max(MAD_FACTOR * np.median(distances[np.isfinite(distances)]), 0.005)
 
         # Geman-McClure's, in a form that is 1 at an infinite distance, not NaN.
@@ -154,8 +154,8 @@ class IcpTracker(Tracker):
         R_twist = np.kron(np.eye(2), T_found[:3, :3])
         H_world = R_twist @ self.found.H @ R_twist.T
         covariance = np.linalg.inv(H_world + PRIOR_WEIGHT * np.eye(6))
-        # Moved along 2 directions, those along a wall, since nothing but planes counts. With 256
-        # points that count as independent half of the wrong poses before a flat wall would pass.
+        # Only planes count here, so that a flat wall leaves two directions free: both are tried.
+        # With 256 independent points half of the wrong poses before such a wall would pass as good.
         position_std_m = std_when_moved(costs_at, T_found, covariance, 2, n_independent=128)
         inlier_ratio = self.found.num_inliers / self.source.size()
         is_held = p_within(CORRELATED * position_std_m) > 0.5

@@ -51,7 +51,7 @@ class LmSettings(TrackerSettings):
 
 
 class LmTracker(Tracker):
-    """Levenberg-Marquardt on SE(3), on points drawn once a frame; knows when it is lost.
+    """Levenberg-Marquardt on SE(3), on points drawn once a frame, with a verdict of being lost.
 
     It works on a grid on the host: one that is given, or any field with a signed distance, sampled
     once in cells of `settings.voxel`. Of the motion model's starts the better one is followed: by
@@ -79,8 +79,8 @@ class LmTracker(Tracker):
         baked = field if isinstance(field, BakedField) else BakedField(field, self.settings.voxel)
         on_host = baked.cpu()
         self.grid = grid_of(on_host)
-        # A search of nothing loads what numba has compiled, the inner functions before those that
-        # call them: else sums would be rounded otherwise in the process that compiles than later.
+        # A search on one point loads the compiled functions, the inner ones before those that call
+        # them. Otherwise the process that compiles would round sums in another way than later ones.
         any_point = Observed(np.zeros((1, 3)), np.zeros(1), np.empty((0, 3)))
         LmOptimizer(self.grid, any_point, any_point, 1.0, T_start=np.eye(4)).certainty()
         return on_host
@@ -104,7 +104,8 @@ class LmTracker(Tracker):
         starts = T_starts.double().numpy().copy()  # a copy: they are changed below
         if self.was_lost and self.last_good is not None:
             starts = np.concatenate([starts, self.last_good.numpy()[None]])
-        # Rounding gathers over thousands of frames: a Newton step towards the nearest rotation.
+        # Rounding errors add up over thousands of frames. A Newton step leads to the nearest
+        # rotation.
         R = starts[:, :3, :3]
         starts[:, :3, :3] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
         expected, last_good = np.split(starts, [len(T_starts)])  # the latter is one pose or none
@@ -122,7 +123,7 @@ class LmTracker(Tracker):
         # A descent begins on a part of the points, and ends on all of them: far from the pose the
         # coarse answer is as good and costs less.
         coarse = with_normals(frame, observed, max(128, n_points // 8))
-        # A picture without contrast is dark, covered or overexposed, and says nothing.
+        # A picture without contrast is dark, covered or overexposed, and is not used.
         has_contrast = observed.intensity.std() > 0.01
         self.intensity_weight = self.settings.lambda_intensity if has_contrast else 0.0
         # A function of a start: the descent of this frame from there.

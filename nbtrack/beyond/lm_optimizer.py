@@ -98,7 +98,7 @@ class LmOptimizer:
         """
         distance, intensity = self.terms.residuals
         reliability = self.terms.reliability
-        # A picture that is darker as a whole says nothing against a pose.
+        # A picture that is darker as a whole is no sign of a wrong pose.
         has_weight = self.fine_problem.lambda_intensity > 0
         off = np.abs(intensity - _median(intensity)) if has_weight else np.zeros_like(intensity)
         is_near = np.abs(distance) < self.problem.grid.accuracy.inlier_distance

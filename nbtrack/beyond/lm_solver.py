@@ -172,9 +172,9 @@ def try_step(
     geometric series: first its limit is tried (Aitken 1926), so far as `_MAX_RATIO` allows, and
     the step alone if that is no better.
 
-    In the fine stage the cost after a step takes usable points by their reliabilities before it:
-    from cell to cell of a grid gradients jump, and reliabilities with them, and a pose is no worse
-    for that. In the coarse one, from afar, reliable gradients tell that a surface is near.
+    In the fine stage the cost after a step has the reliabilities of usable points before it. From
+    cell to cell of a grid gradients jump, and reliabilities with them, which makes a pose no worse.
+    In the coarse stage, far from the pose, reliable gradients are a sign that a surface is near.
     """
     twist = damped_step(problem, T, terms, scales, damping)
     before = robust_cost(terms.residuals, terms.reliability, scales, problem.lambda_intensity)

@@ -123,7 +123,8 @@ class ObservedDistance:
     ) -> None:
         low, high = np.array(bounds.minimum), np.array(bounds.maximum)
         self.voxel = max(_MIN_VOXEL, (high - low).max() / _MAX_CELLS_A_SIDE)
-        # Points are kept in cells half as large: the centre of every second one is a corner.
+        # Points are fused in cells of half the size; the centre of every second one is a corner of
+        # the grid.
         fine = self.voxel / 2
         shape = np.ceil((high - low) / fine).astype(int) + 1
         n_pixels = sequence.intrinsics.width * sequence.intrinsics.height
@@ -208,7 +209,8 @@ class FeatureGrid(nn.Module):
         """Activations of the hidden layer at points (m, world frame)."""
         levels = zip(self.volumes, self.voxels, strict=True)
         inputs = [trilinear(volume, self.low, voxel, points_world).T for volume, voxel in levels]
-        inputs.append((points_world - self.low) / self.metres_per_unit - 1)  # about [-1, 1]
+        # The point itself, from about -1 to 1: a unit is half the longest side of the bounds.
+        inputs.append((points_world - self.low) / self.metres_per_unit - 1)
         return nn.functional.silu(self.layer(torch.cat(inputs, dim=-1)))
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:

@@ -134,9 +134,9 @@ def cells_of(
 def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frames) -> Values:
     """How far (z-depth, m) points (m) lie behind what frames measured in their direction.
 
-    The least of all frames counts: it is negative where any saw what lies behind the point, and
-    infinite where all have it out of view or measured nothing there. Every fifth of the frames is
-    asked: neighbours see the same.
+    The minimum over the frames is returned. It is negative where a frame measured something behind
+    the point, and infinite where no frame has the point in view or measured anything there. Every
+    fifth frame is used, since neighbours see the same.
     """
     behind = points_world.new_full(points_world.shape[:1], torch.inf)
     for index in frames[::5].tolist():

@@ -171,10 +171,8 @@ def _read(
     """The frames `kept` as a sequence, a table with a row for each of `looked_at`, and counts.
 
     Counts (2, 65536) are how often each depth value occurs, and in how many frames many pixels
-    share it. `depths_mm` of the sequence are the files' values, for any reading of them.
-    Images are read in parts, so that memory holds few besides those kept. Those of a single part
-    stay in memory for whoever reads next.
-
+    share it. `depths_mm` are the files' values, for any reading of them. Images are read in parts,
+    to bound the memory; those of a single part are kept for the next read.
     A row holds the share of pixels with depth, the brightness in [0, 1], the greatest common
     divisor of all depth values, and whether these are the same as in the row before. It also holds
     how far the camera moved and turned since the frame before, and how far it is off the middle

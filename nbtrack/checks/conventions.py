@@ -14,13 +14,13 @@ from nbtrack.recordings.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_C
 
 _CLEARLY_BETTER = 1.3  # times as many points agree (our choice)
 _ALIKE = 0.95  # of the highest agreement: the first so good is named
-PLAUSIBLE_DEPTH = (0.2, 20.0)  # m, of a depth camera's median: units in doubt are told by it
+PLAUSIBLE_DEPTH = (0.2, 20.0)  # m, of the median: where units are in doubt, it decides
 # Of the depth, in the mean over areas of images. Of 21 right recordings at hand 5.0 mm a metre at
 # most, a Kinect's with poses of KinectFusion; 2.0 of a HoloLens, and 1.7 of rendered rooms.
 _USUAL_APART = 0.0055
-# Parts of real_room's 36 frames have 9.9, so that up to twice as much nothing is told by it alone.
+# Parts of real_room's 36 frames have 9.9, so that up to twice as much is no evidence by itself.
 _USUAL_M = 0.025  # and m, whatever the depth
-MIN_OVERLAP = 0.15  # share of points below which nothing is told (our choice)
+MIN_OVERLAP = 0.15  # share of points below which nothing is concluded (our choice)
 _NAMES = {
     "opengl": "OpenGL axes", "opencv": "OpenCV axes", "forward left up": "robot axes",
     "left up forward": "PyTorch3D axes",
@@ -141,10 +141,9 @@ def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
 def _best_of(conventions: list[Convention]) -> Convention:
     """The declared convention (the first), unless another is clearly better.
 
-    Of the others those count whose surfaces meet and whose median depth is plausible for a depth
-    camera: surfaces also meet if depths and positions are wrong by the same factor, and only the
-    depth then tells which unit is right. Of these the first is taken whose agreement is about the
-    highest.
+    Only those count whose surfaces meet and whose median depth is plausible for a depth camera.
+    Surfaces also meet where depths and positions are wrong by the same factor, and then only the
+    depth shows which unit is right. The first one with about the highest agreement is the best.
     """
     own = conventions[0]
     near, far = PLAUSIBLE_DEPTH

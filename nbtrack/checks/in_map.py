@@ -47,8 +47,10 @@ def check_belongs(finished: Map, frame: Frame) -> str | None:
 
 
 def in_world_of_map(tracked: Trajectory) -> tuple[Trajectory, bool]:
-    """The trajectory with true poses in the map's world and the errors against these, and whether
-    they were in another world; where they were not, it is returned as it is."""
+    """The trajectory with its true poses moved into the map's world, and errors against these.
+
+    Also returns whether they were in another world. If not, the trajectory is returned as it is.
+    """
     T_map_world = other_world(tracked.T_estimated, tracked.T_true)
     if T_map_world is None:
         return tracked, False
@@ -72,8 +74,8 @@ def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
     if is_known.sum() < 3:
         return None
     T_estimated, T_true = T_estimated[is_known], T_true[is_known]
-    # The rotation from orientations, which tell it also where the camera moves along a line; of the
-    # half of the frames that agree best, since lost frames say nothing of it.
+    # The rotation comes from orientations, which determine it also where the camera moves along a
+    # line. Only the half of the frames that agree best is used, since lost frames are wrong.
     turns = Rotation.from_matrix(T_estimated[:, :3, :3] @ T_true[:, :3, :3].mT)
     off_mean = (turns.mean().inv() * turns).magnitude()
     agrees = off_mean <= np.median(off_mean)

@@ -15,25 +15,25 @@ from nbtrack.checks.readings import AREA_SCALE, FramePairs, Gaps, Reading, cost_
 
 _STEPS = 12  # of Gauss-Newton, at most
 _FACTORS = (4.0, 2.0, 1.0, 0.5, 0.2)  # of a step; the best is taken
-_WIDE = 5.0  # medians of what lies apart; so far away half of the weight is left
+_WIDE = 5.0  # medians of the gaps: the scale of the weights in a step
 _ENOUGH = 0.02  # of what is negligible: a last step
 # Shares of the cost as declared that a cause may leave: a usual sensor's error, and another.
 _USUAL_GAIN, _GAIN = 0.9, 0.75  # our choice
-_ALIKE = 0.95  # of two costs: they tell nothing
+_ALIKE = 0.95  # ratio of two costs from which on they count as equal
 _WHOLE = 0.8  # of the cost of a cause: where all numbers together leave less, it is not the whole
 _RESAMPLED = 200  # draws of a bootstrap
 _INTERVAL = [0.025, 0.975]  # its quantiles
 
 
 class Number(NamedTuple):
-    """How a number of a `Reading` is told, and how large it may be."""
+    """How a number of a `Reading` is printed, and how large it may be."""
 
     label: str
     form: str  # format specification
     unit: str
     limit: float  # beyond which it is not looked for
     negligible: float  # our choice: more than right recordings show
-    usual: float = 0.0  # so much is told, but is no fault: usual sensors have it
+    usual: float = 0.0  # up to this it is a note and no fault: usual sensors have such errors
 
 
 _LENGTH, _ANGLE = ("+.3f", " m", 1.0, 0.02), ("+.1f", " deg", 30.0, 1.0)

@@ -20,13 +20,14 @@ from nbtrack.recordings.formats import Declaration
 from nbtrack.recordings.recording import Recording
 
 _HIDDEN_BEHIND = 0.25  # m behind a surface points are hidden: several times a camera's noise
-_SAME_SURFACE = 0.025  # of the depth: where neighbours blend to more, they lie on two surfaces
+# Of the depth: where the mean of neighbouring pixels is farther off, they lie on two surfaces.
+_SAME_SURFACE = 0.025
 _SCALE = 0.01  # of the depth: surfaces so far apart agree by half, several times a camera's noise
 _POINTS_PER_FRAME = 1000  # 20 pairs of frames have enough for a median
 _AREAS = (4, 6)  # rows and columns of them in an image
 AREA_SCALE = 0.004  # of the depth: areas that lie so far apart cost by half (our choice)
-_FAR_APART = 0.05  # of the depth: more counts no more
-_MIN_MEASURED = 0.3  # share of an area's points without which nothing is told of it
+_FAR_APART = 0.05  # of the depth: larger gaps count as this
+_MIN_MEASURED = 0.3  # share of an area's points that have to be valid
 Pairs = Int[np.ndarray, "2 pairs"]  # of frames
 Gaps = Float[np.ndarray, "pairs areas"]  # between surfaces, signed, as shares of the depth
 
@@ -130,7 +131,7 @@ def mean_apart(gaps: Gaps) -> float:
 
 
 class FramePairs:
-    """Pairs of frames that see much the same, to be read in one way or another."""
+    """Pairs of frames that see much the same, whose agreement is computed for any reading."""
 
     def __init__(self, recording: Recording, ids: Frames, kept: RgbdSequence, pairs: Pairs) -> None:
         """Take the frames of pairs from a sequence whose depth values are as in the files.

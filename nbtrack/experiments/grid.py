@@ -78,9 +78,8 @@ def track_scenes(
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         tracker, with_method = method.tracker, preset.with_method(method.settings)
         settings = with_method.tracking_of(tracker)
-        # By the clock `steps` is None.
         n_steps = steps if rate_hz is None or clock else method.paper_steps(rate_hz)
-        clock_hz = rate_hz if clock else None
+        clock_hz = rate_hz if clock else None  # by the clock the number of steps is None
         make_budget(n_steps, clock_hz)  # raises for a wrong number, before anything is made
         map_job = MapJob.of(scene, method.field, with_method, seed=seed)
         job = TrackJob(map_job, seen, tracker, settings, n_steps, clock_hz, frames, map_job.seed)

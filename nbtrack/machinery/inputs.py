@@ -128,7 +128,7 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
         usual = np.quantile(away[is_known], 0.9, method="lower")
         is_wrong |= is_known & (away > _ALONE * max(1.0, usual))
     if is_wrong.any():
-        i = is_wrong.argmax()  # the first is told
+        i = is_wrong.argmax()  # the message is about the first one
         frame = f" frame {i}" if len(poses) > 1 else ""
         numbers = " ".join(f"{number:.4g}" for number in poses[i].flat)
         raise DataError(

@@ -1,4 +1,4 @@
-"""One progress bar: a line that moves where somebody watches, elsewhere a line now and then."""
+"""One progress bar: a moving line at a terminal or in a notebook, elsewhere a line now and then."""
 
 import os
 import sys
@@ -8,7 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-_DELAY_SECONDS = 1.0  # so that a mistake which ends the work at once is told alone
+_DELAY_SECONDS = 1.0  # so that no bar stands before the message of a mistake that is found at once
 # What matters first: in a narrow terminal the end of a line is cut off.
 _FORMAT = "{percentage:3.0f} % |{bar:12}| {remaining} left, {desc}{postfix}"
 # Where nobody watches: the form of a line, and seconds between two.
@@ -60,7 +60,7 @@ class _Line:
 class ProgressBar(tqdm):
     """Progress with an ETA over a known amount of work, in a `with` block, or over a collection."""
 
-    # Work done in a warm-up, and its seconds: its speed says nothing of the time that is left.
+    # Work done in a warm-up, and its seconds: its speed is not that of the rest.
     warm_up_work: float | int = 0
     warm_up_seconds = 0.0
 
@@ -91,5 +91,5 @@ class ProgressBar(tqdm):
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much is done, and a word on how it goes."""
         self.set_postfix_str(status, refresh=False)
-        # Sums of fractions may end a rounding error above the total, which a bar does not like.
+        # Sums of fractions may end a rounding error above the total, for which tqdm shows no bar.
         self.update(min(done, self.total) - self.n)

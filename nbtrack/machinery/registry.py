@@ -41,7 +41,7 @@ class Registry(UserDict[str, Entry]):
             plugin = _waiting.pop(0)  # before it is loaded: it uses registries itself
             try:
                 plugin.load()
-            except Exception as error:  # in somebody else's package: all others still work
+            except Exception as error:  # of another package; the other plug-ins still work
                 why = f"({type(error).__name__}: {error}): mend or remove it"
                 tell(f"nbtrack: warning: plug-in {plugin.value} is left out {why}")
         return self._entries

@@ -126,8 +126,8 @@ def _replaced(node: Any, path: list[str], key: str, value: Any, allowed: Mapping
 def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
     """A value in the type of the old one; ConfigError for another type, or one not allowed.
 
-    `allowed` is the metadata of its field: limits or choices, if any. One value stands for a list
-    of one, and a whole number for a float; nothing else is converted.
+    `allowed` is the metadata of its field: limits or choices, if any. A single value becomes a
+    tuple of one, and a whole number a float, where the old value is one. Nothing else is converted.
     """
     wanted = type(old)
     value = value.item() if isinstance(value, np.generic) else value
@@ -135,8 +135,10 @@ def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
         values = value if isinstance(value, list | tuple) else [value]
         if not values:
             raise ConfigError(f"{key} = []: give at least one, for example {list(old)}")
+        # An empty tuple does not say of which type its entries are.
         return tuple(_converted(key, old[0], part, allowed) if old else part for part in values)
-    # Integers of TOML may be too large for a float, or to be printed.
+    # An integer of TOML that is too large for a float, or to be printed, becomes infinity, which
+    # the checks below refuse.
     if type(value) is int and (wanted is float or abs(value) > 1e300):
         value = float(value) if abs(value) < 1e300 else math.inf
     if type(value) is not wanted or (wanted is str and "\0" in value):

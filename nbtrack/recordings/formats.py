@@ -97,7 +97,7 @@ class Format:
     known_cameras: tuple[Calibration, ...] = ()
     declared: Declaration = Declaration()  # what its numbers mean
     counts_from_0: bool = False  # a number is the place of the frame's pose in a list
-    stamps_tell: bool = True  # times in a list tell whose a pose is; else only its place does
+    stamps_tell: bool = True  # poses of a list belong to frames by their times, else by place alone
     resize_color: bool = False  # colour has another size than depth and shows the same view
     # Poses and their times (s; NaN: none) of a file, given the order of its quaternions.
     read_poses: Callable[[Path, str], tuple[Poses, Times]] = read_poses

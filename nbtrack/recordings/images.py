@@ -41,7 +41,7 @@ def images_of(recording: Recording) -> "Images":
 
 
 class Images:
-    """What was read of the images of a recording; the first frame tells the size of all."""
+    """What was read of the images of a recording; all have the size of the first frame read."""
 
     def __init__(self, recording: Recording) -> None:
         """Begin with nothing read."""

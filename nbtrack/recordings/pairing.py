@@ -27,8 +27,10 @@ _GAP = 0.0505  # s between poses that are interpolated, 20 Hz: at a hand's 2 m/s
 
 
 def check_paired(colors: list[Path], others: list[Path]) -> None:
-    """Raises DataError unless every image has its depth map or pose, with the same frame number,
-    and the numbers tell the order of frames."""
+    """Raises DataError unless every image has a depth map or pose of the same frame number.
+
+    Also raises it where the numbers may not give the order of the frames.
+    """
     color_keys, other_keys = frame_keys(colors), frame_keys(others)
     if color_keys != other_keys or len(set(color_keys)) < len(color_keys):
         keys = color_keys + other_keys
@@ -51,8 +53,11 @@ def nearest(times: Times, others: Times, tolerance: float) -> Frames:
 
 
 def pair_lists(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Path], Times, str]:
-    """Images and depth maps of two lists that are each other's nearest in time, the images' times
-    (s), and a note, empty unless images are left out. Raises DataError if all are."""
+    """Images and depth maps of two lists that are each other's nearest in time.
+
+    Also returns the images' times (s), and a note, which is empty unless images are left out.
+    Raises DataError if all are left out.
+    """
     color_times, colors = _read_list(color_list)
     depth_times, depths = _read_list(depth_list)
     depth_of_color = nearest(color_times, depth_times, _TOLERANCE)
@@ -90,7 +95,7 @@ def _read_list(path: Path) -> tuple[Times, list[Path]]:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """What files tell of the time of frames."""
+    """What is known of the times of frames from files and their names."""
 
     images: list[Path]
     own: Times | None  # s: of a list, a file of times, or the names of images
@@ -114,18 +119,18 @@ class Moments:
     def poses_of(
         self, path: Path, poses: Poses, stamps: Times, flip: Callable[[Poses], Poses]
     ) -> tuple[Poses, str]:
-        """A pose a frame of those of a list, NaN without one, and a note.
+        """A pose for each frame from those of a list, NaN where a frame has none, and a note.
 
-        The first of these rules that applies tells whose a pose is:
-        1. Each stamp (s; NaN: none) is the very time of a frame, as where nbtrack wrote the list.
-        2. Frames have times of their own, and some stamp is near one: it is the same clock, and
-           poses are interpolated.
-        3. The frames' numbers tell, see `_by_number`. Frames with times of their own, no stamp near
-           one, are on another clock. Then equal counts prove nothing, and the rule applies only if
-           the stamps are even, as where they just count the lines.
+        The first of these rules that applies gives poses to frames:
+        1. Each stamp (s; NaN: none) is exactly the time of a frame, as in lists that nbtrack wrote.
+        2. Frames have times of their own, and some stamp is near one of them. Then both are on the
+           same clock, and poses are interpolated.
+        3. Frames take poses by their numbers, see `_by_number`. Where frames have times of their
+           own and no stamp is near one, the clocks differ, and equal counts prove nothing. The rule
+           then applies only to stamps at even steps, which may just count the lines.
 
-        `flip` makes camera-to-world poses of the list's, and the other way round: rule 2 needs
-        both. `path` names the list in messages. Raises DataError if no rule applies.
+        `flip` converts the list's poses to camera-to-world ones, and back, for rule 2. `path` names
+        the list in messages. Raises DataError if no rule applies.
         """
         has_both = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(stamps)
         known_poses, known_stamps = poses[has_both], stamps[has_both]
@@ -191,10 +196,12 @@ class Moments:
 def _interpolated(
     times: Times, poses: Poses, stamps: Times, flip: Callable[[Poses], Poses]
 ) -> tuple[Poses, str]:
-    """Poses at some times, and a note: between two close in time interpolated, else the nearest.
+    """The pose at each time, and a note on how many are interpolated.
 
-    In between the camera moves along a straight line in the world and turns at an even rate. That
-    is said of camera-to-world poses: `flip` makes these of the list's, and afterwards the reverse.
+    Between two stamps that are close to each other the pose is interpolated. Elsewhere it is that
+    of the nearest stamp, or NaN. An interpolated camera moves along a straight line in the world
+    and turns at a constant rate. Only camera-to-world poses do so: `flip` converts the list's poses
+    to these, and back.
     """
     found = _at(poses, nearest(times, stamps, _TOLERANCE))
     later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)

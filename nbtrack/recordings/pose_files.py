@@ -69,8 +69,9 @@ def _numbers_in(path: Path) -> tuple[int, ...]:
 
 
 def frame_keys(files: list[Path]) -> list[tuple[int, ...]]:
-    """Of each file the numbers in its name that vary over the files; all numbers, where none does,
-    or where names have different counts of them.
+    """The numbers in each file's name that vary over the files.
+
+    These are all numbers where none varies, or where names have different counts of numbers.
 
     >>> frame_keys([Path("0017_cam0.png"), Path("0018_cam0.png")])
     [(17,), (18,)]
@@ -109,6 +110,7 @@ def check_order(files: list[Path]) -> None:
     kinds = {re.sub("[0-9]+", "0", path.stem.lower()) for path in files}
     stamps = [stamp_in(path) for path in files]
     decimals = {tuple(map(len, re.findall(r"\d\.(\d+)", path.stem))) for path in files}
+    # Either all names are times, or none is and all have the same number of decimals.
     if len(kinds) > 1 or (None in stamps and (any(stamps) or len(decimals) > 1)):
         found = f"{names} differ in more than their numbers, or in how these are written"
         raise DataError(f"{found}, which tells no order: number the images as they were recorded")
@@ -161,7 +163,7 @@ def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> 
     norms = np.linalg.norm(q_xyzw, axis=1)
     is_wrong = (np.abs(norms - 1) > RIGID) | (is_known & np.isnan(times))
     if is_wrong.any():
-        i = is_wrong.argmax()  # the first is told
+        i = is_wrong.argmax()  # the message is about the first one
         raise DataError(
             f"{path} pose {i} has the time {rows[i, 0]:.13g} and a quaternion of norm "
             f"{norms[i]:.3g}: columns must be finite timestamps (s), tx ty tz and a unit "

@@ -105,7 +105,7 @@ def open_recording(
 
 
 def _own_times(folder: Path, colors: list[Path]) -> Times | None:
-    """Times (s) of images that stand in a folder, not in a list with times; None if nothing tells.
+    """Times (s) of images that stand in a folder, not in a list with times; None if not known.
 
     They come from `timestamps.txt`, else from the images' names if all hold a time.
     """
@@ -158,8 +158,8 @@ def _poses_and_times(
 ) -> tuple[Poses, Times, str]:
     """A pose and a time (s) for each frame, and a note of how poses were given to frames.
 
-    The note is empty where it goes without saying. `path` is the one file of poses, or the pattern
-    with `*` where each frame has one.
+    The note is empty where that is plain. `path` is the one file of poses, or a pattern with `*`
+    where each frame has a file.
     """
     tables = []
     for file in files:
@@ -167,7 +167,7 @@ def _poses_and_times(
             tables.append(layout.read_poses(file, declared.quaternion))
     listed = checked_poses(np.concatenate([poses for poses, _ in tables]), path)
     stamps = np.concatenate([times for _, times in tables])
-    if len(stamps) > 1 and np.ptp(stamps) == 0:  # as tools that know no times write them
+    if len(stamps) > 1 and np.ptp(stamps) == 0:  # written by a tool that has no times
         stamps = np.full(len(stamps), np.nan)
     check_rising(stamps, path)
     # Frames without times of their own have those of the poses, if there are as many.
@@ -176,7 +176,7 @@ def _poses_and_times(
     if "*" in path.name:
         check_paired(moments.images, files)
         return listed, times, ""
-    # In some formats stamps are times only, as used above, and do not tell whose a pose is.
-    telling = stamps if layout.stamps_tell else np.full(len(stamps), np.nan)
-    poses, note = moments.poses_of(path, listed, telling, declared.inverted_if_world_to_camera)
+    # In some formats stamps are not used to give poses to frames, but only as times, above.
+    used = stamps if layout.stamps_tell else np.full(len(stamps), np.nan)
+    poses, note = moments.poses_of(path, listed, used, declared.inverted_if_world_to_camera)
     return poses, times, f"{path.name}: {note}" if note else ""

@@ -34,8 +34,8 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     of_short, of_long = room.walk.keys
     keys = np.array(of_short if n_frames <= 240 else of_long)  # frames of the shorter path
     base = _calibrated_path(room, keys)
-    # How far (m) a camera that stands still has to be off at least: 1 m, or by this share of what
-    # it is without a seed's changes.
+    # The smallest allowed error (m) of a camera that stands still. A path with a larger one leads
+    # well away from its start.
     least = min(1.0, 0.8 * still_metrics(base)["still_ate_m"])
 
     for rng in attempts(room, seed):
@@ -61,11 +61,15 @@ def _is_like_the_dataset(room: Room, poses: Poses) -> bool:
 
 
 def _calibrated_path(room: Room, keys: Keys) -> Poses:
-    """The path through key poses, whose x, z and yaw are scaled about their means, in four rounds,
-    to give it the mean speeds `MEAN_STEP`; the frames of the keys stay."""
+    """The path through key poses after x, z and yaw were scaled about their means.
+
+    Four rounds of scaling give the path the mean speeds `MEAN_STEP`. The keys keep their frames.
+    """
     keys = keys.copy()
     spread = [0, 2, 4]  # columns: x, z, yaw
-    unit = np.max(room.parts[0].solid.half)  # m; at first of the whole room, by its shell
+    # The unit of the scene (m), in which `MEAN_STEP` is given: at first that of the whole room,
+    # then that of what the camera sees.
+    unit = np.max(room.parts[0].solid.half)
     for _ in range(4):
         poses = _path(keys)
         if room.sdf(poses[:, :3, 3]).min() > 0:  # only a camera in free space sees something
@@ -104,10 +108,10 @@ def _path(keys: Keys) -> Poses:
 
 
 def _view(room: Room, poses: Poses) -> tuple[float, float]:
-    """What every twelfth frame of a path sees: the unit of a map of it, and how near it is (m).
+    """The unit (m) of a map of what every twelfth frame of a path sees, and how near that is (m).
 
-    The unit is that of `SceneBounds`. How near says the lower quartile of the z-depths of a frame,
-    of the frame where it is least.
+    The unit is that of `SceneBounds`. The second number is the smallest lower quartile of z-depths
+    of a frame.
     """
     # A grid of rays with z = 1, which covers most of an image.
     across, down = np.linspace(-0.55, 0.55, 7), np.linspace(-0.4, 0.4, 5)

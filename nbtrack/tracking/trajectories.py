@@ -65,7 +65,6 @@ def track_sequence(
     with advise_on_memory(f"tracking.{tracker.name}.n_pixels={tracker.settings.n_pixels}"):
         kept.resume(take_up)
         for index in range(first + len(rows), len(sequence)):
-            # Until one frame is not lost, the camera is still to be found.
             is_found = is_start_known or not all(row.get("lost", False) for row in rows)
             budget = None if is_found else StepBudget(STEPS_TO_FIND)  # None: the tracker's own
             rows.append(_row(sequence, index, tracker.track(sequence[index], budget)))
