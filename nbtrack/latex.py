@@ -41,8 +41,8 @@ def latex_file(styler: Any, path: Path, note: str, own: Wording = OUR_WORDING) -
     """The text of the `.tex` file for `styler`, a `TableStyler` of `nbtrack.tables`.
 
     The name of `path`, `table_1`, `table_2` or `table_3`, chooses the caption, and its folder's
-    name goes into the label; nothing is written here. `note`, plain text, tells how the numbers
-    came about. An author's own caption is that of Table I or III; Table II then has the usual one
+    name goes into the label; nothing is written here. `note`, plain text, says how the numbers were
+    measured. An author's own caption is that of Table I or III; Table II then has the usual one
     without the note.
     """
     cells = styler.data

@@ -219,7 +219,7 @@ def style_table_2(
     styler.relabel_index(labels, level="n_pixels")
     # Notebooks show every row label in bold, so the others are set to normal weight.
     weights = [_BOLD if default else "font-weight: normal;" for default in is_default]
-    styler.apply_index(lambda _: weights, axis="index", level="n_pixels")
+    styler.apply_index(lambda labels: weights, axis="index", level="n_pixels")
     ended = f"; {CONVERGED}: until it converged, with time left" if has_ended.any(axis=None) else ""
     return _labelled(styler, caption, f"* and bold: the n used for tracking{ended}")
 

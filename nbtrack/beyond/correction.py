@@ -186,7 +186,7 @@ def _measured_planes(
         rays = sampler.draw(round(times * _N_POINTS), generator, asked, tangent_planes=True)
         ends = rays.points(rays.depth[:, None])[:, 0]
         low, high = grid.low, grid.low + grid.voxel * (ends.new_tensor(grid.n_vertices) - 1)
-        # The grid says nothing of points outside: a facade seen through a window.
+        # The grid has no values for points outside, such as a facade seen through a window.
         is_inside = ((ends >= low) & (ends <= high)).all(dim=-1)
         has_plane = rays.normals_world.any(dim=-1) & is_inside
         if not has_plane.any():

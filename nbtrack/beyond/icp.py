@@ -79,7 +79,7 @@ class IcpTracker(Tracker):
         self.T_world_camera = T_starts[0]
         self.source = None
         self.is_converged = False
-        self.found = None
+        self.found = None  # small_gicp's result of the alignment, for `report`
         # Points at depth edges are taken too (docs/tried.md).
         observed = draw_points(frame, self.settings.n_pixels, self.generator, edge_jump=np.inf)
         if len(observed.points):

@@ -56,7 +56,7 @@ class LmOptimizer:
         return step.cost_before
 
     def run_stage(self, max_steps: int = 60) -> None:
-        """Steps of the stage that it is in, until that ends or so many are taken."""
+        """Take steps of the present stage until it ends, at most `max_steps`."""
         for _ in range(max_steps):
             if self.is_ended:
                 return

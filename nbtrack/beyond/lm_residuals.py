@@ -62,7 +62,7 @@ class Stage(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What the points of a frame ask of its pose: the cost and the prior of `lm_solver`."""
+    """What the cost and the prior of `lm_solver` need to be computed at a pose."""
 
     observed: Observed
     grid: Grid
@@ -103,7 +103,7 @@ def residual_terms(problem: Problem, T: Pose) -> Terms:
     residuals = np.empty((2, n_points), np.float32)
     gradients = np.empty((2, 3, n_points), np.float32)
     lever_arms, reliability, cells, in_cell, per_metre = _locate(points, T, grid)
-    # Unsigned numbers of vertices: numba need not ask whether they count from the end.
+    # Unsigned numbers of vertices, so that numba adds no check for negative indices.
     vertices, step_z = grid.vertices, np.uintp(1)
     step_x, step_y = np.uintp(grid.n_vertices[1] * grid.n_vertices[2]), np.uintp(grid.n_vertices[2])
     for i in range(n_points):

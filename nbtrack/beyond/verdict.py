@@ -73,7 +73,7 @@ def std_when_moved(
     covariance (world frame, rad and m, as `lm_solver.retract` takes twists) says; the smallest
     growth counts. Curvature alone is not enough: ripples in the map of a flat wall have gradients,
     too, but the frame fits as well all along the wall. Errors of a map are alike at neighbouring
-    points, so many points tell no more than `n_independent`. Costs are Geman-McClure's, at scales
+    points, so that at most `n_independent` points count. Costs are Geman-McClure's, at scales
     of `MAD_FACTOR` medians.
     """
     variances, directions = np.linalg.eigh(covariance[3:, 3:])  # the least certain come last

@@ -61,7 +61,7 @@ def view_of(frame: Frame) -> View:
 def spread_out(T_world_camera: Poses) -> Int[np.ndarray, "_"]:
     """Numbers of poses for views, spread by place and direction.
 
-    The first, then again and again the one that is farthest from all before it.
+    The first pose is chosen, and then repeatedly the one that is farthest from all chosen ones.
     """
     # Poses whose optical axes differ by 1 are as far apart as if moved by 1 m.
     places = np.concatenate([T_world_camera[:, :3, 3], T_world_camera[:, :3, 2]], axis=1)

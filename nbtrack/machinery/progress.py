@@ -22,8 +22,8 @@ def tell(news: str) -> None:
 
     At a terminal warnings are yellow, unless `NO_COLOR` is set.
     """
-    is_shown = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
-    if news.startswith("nbtrack: warning: ") and is_shown and not _is_notebook():
+    has_colors = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+    if news.startswith("nbtrack: warning: ") and has_colors and not _is_notebook():
         news = f"\33[33m{news}\33[0m"
     print(news, file=sys.stdout if _is_notebook() else sys.stderr)
 

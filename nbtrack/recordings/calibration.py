@@ -58,6 +58,7 @@ class Calibration:
         """
         own_width, own_height = self.size or (width, height)
         factor = width / own_width
+        # In pixels of the calibration; without a principal point it is the middle of the image.
         own_cx, own_cy = self.principal_point or (width / factor / 2, height / factor / 2)
         cx, cy = factor * own_cx, factor * own_cy
         # Resizing rounds sides to whole pixels, so that heights may differ by one.
@@ -159,10 +160,10 @@ def _numbers(key: str, value: Any) -> list[float]:
 
 
 def _check_unused(key: str, value: Any) -> None:
-    """Raises ValueError if an entry that is not used says that the lens or the unit is another.
+    """Raises ValueError if an entry that is not used means another lens or unit.
 
-    Entries with other names than `_TELLING` may hold anything. Those with such a name may hold a
-    word of `_USUAL`, zeros, false, null or an empty list, which say that nothing is unusual.
+    Only entries with names as in `_TELLING` are checked. They may hold a word of `_USUAL`, zeros,
+    false, null or an empty list, which stand for the usual lens and unit.
     """
     is_usual = value.lower() in _USUAL if isinstance(value, str) else not np.any(value)
     if _TELLING.match(key) and not is_usual:
