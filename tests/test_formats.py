@@ -128,7 +128,8 @@ def test_natural_order_with_unpadded_and_padded_numbers(tmp_path: Path) -> None:
 
 
 def test_a_sequence(scene: Path) -> None:
-    """Catches units mixed up, frames selected in file order, and copies of what could be shared."""
+    """Catches units mixed up, frames selected in file order, copies of what could be shared,
+    and one frame that is asked for as several."""
     sequence = read_sequence(scene)
     np.testing.assert_allclose(sequence.depth(1), sequence.depths_mm[1] / 1000.0, rtol=1e-6)
     np.testing.assert_allclose(sequence.color(1) * 255, sequence.colors[1], atol=1e-4)
@@ -136,6 +137,8 @@ def test_a_sequence(scene: Path) -> None:
     assert chosen.frame_ids.tolist() == [2, 0]
     check_equal(chosen, Source(*(a[[2, 0]] for a in source()[:3])))
     assert np.shares_memory(sequence.select(slice(1, 3)).colors, sequence.colors)
+    with pytest.raises(ConfigError, match="`select` takes a slice"):
+        sequence.select(2)
 
 
 def test_frames_without_a_pose_are_left_out_and_counted(scene: Path, tmp_path: Path) -> None:

@@ -111,7 +111,8 @@ def test_a_class_is_its_own_key(tmp_path: Path, monkeypatch, capsys) -> None:
 
 def test_what_a_fingerprint_tells_apart() -> None:
     """Catches a cache that mixes up settings, or makes results twice because a step count was
-    written 30 and 30.0, or settings in another order."""
+    written 30 and 30.0, or settings in another order; large seeds that floats round alike."""
+    assert files.fingerprint(2**53) != files.fingerprint(2**53 + 1)
     whole = files.fingerprint(30, {"a": [1], "b": 2})
     assert whole == files.fingerprint(30.0, {"b": 2.0, "a": [1.0]})
     wide, narrow = NetworkSettings(), NetworkSettings(width=255)

@@ -20,6 +20,7 @@ from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
 from nbtrack.machinery.settings import limited
 from nbtrack.tracking.budget import Budget
+from nbtrack.tracking.starts import rigid
 from nbtrack.tracking.tracker import Estimate, Tracker, TrackerSettings
 
 _MIN_POINTS = 20  # below, a frame says too little for six unknowns
@@ -101,13 +102,10 @@ class LmTracker(Tracker):
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Draw the frame's points; take up the descent from the start that fits them best."""
-        starts = T_starts.double().numpy().copy()  # a copy: they are changed below
+        starts = T_starts.double().numpy()
         if self.was_lost and self.last_good is not None:
             starts = np.concatenate([starts, self.last_good.numpy()[None]])
-        # Rounding errors add up over thousands of frames. A Newton step leads to the nearest
-        # rotation.
-        R = starts[:, :3, :3]
-        starts[:, :3, :3] = R @ (3 * np.eye(3) - R.swapaxes(1, 2) @ R) / 2
+        starts = rigid(starts)
         expected, last_good = np.split(starts, [len(T_starts)])  # the latter is one pose or none
         # Poses near which the camera should be: `innovation` is the distance from them.
         # After a lost frame, which says little of this one, only the last good pose counts, if any.

@@ -28,7 +28,6 @@ _QUICK_PAIRS = 16  # of frames that are compared in a quick look
 _MIN_FRAMES = 30  # without which pairs share too much to tell a small misfit
 _GAPS = (5, 10, 20, 40)  # frames between the two of a pair: they moved, and still see the same
 _TURNED_DEG = 30  # by which the camera may turn in between: half of what most cameras see
-_CUT = [0.002, 0.998]  # quantiles of points that bounds leave out, as in observed_bounds
 _PRINTED = ["measured", "brightness", "moved_mm", "turned_deg"]
 _XYZ = ["x", "y", "z"]
 _LINES = textwrap.TextWrapper(98, "", "    ", break_long_words=False, break_on_hyphens=False)
@@ -69,7 +68,7 @@ class DataReport:
         camera = declared.reading.camera
         wide_deg = 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx))
         near, far = cloud.depth.quantile([0.01, 0.99])
-        x, y, z = np.ptp(cloud[_XYZ].quantile(_CUT), axis=0)
+        x, y, z = np.ptp(cloud[_XYZ].quantile([0.002, 0.998]), axis=0)  # as bounds
         facts = self.frames[_PRINTED].agg(["mean", "min", "max"]).T
         rows = [f"{1e3 * c.apart * c.depth_m:9.1f} mm {c.overlap:5.0%}  {c.name}" for c in compared]
         # The first fault or doubt is in the verdict.

@@ -13,6 +13,7 @@ from nbtrack.machinery.settings import changed_settings
 from nbtrack.recordings.formats import CAMERA_TO_WORLD, SPELLED_AXES, WORLD_TO_CAMERA
 
 _CLEARLY_BETTER = 1.3  # times as many points agree (our choice)
+_NEARER = 3  # times as near lie surfaces (our choice)
 _ALIKE = 0.95  # of the highest agreement: the first so good is named
 PLAUSIBLE_DEPTH = (0.2, 20.0)  # m, of the median: where units are in doubt, it decides
 # Of the depth, in the mean over areas of images. Of 21 right recordings at hand 5.0 mm a metre at
@@ -139,11 +140,13 @@ def _hypotheses(own: Reading) -> Iterator[tuple[str, str, Reading]]:
 
 
 def _best_of(conventions: list[Convention]) -> Convention:
-    """The declared convention (the first), unless another is clearly better.
+    """The declared convention (the first), unless with another surfaces agree clearly better.
 
-    Only those count whose surfaces meet and whose median depth is plausible for a depth camera.
-    Surfaces also meet where depths and positions are wrong by the same factor, and then only the
-    depth shows which unit is right. The first one with about the highest agreement is the best.
+    More points then agree, or surfaces lie three times as near. With positions mirrored along an
+    axis that the camera hardly moved along, most points still agree. Only those count whose
+    surfaces meet and whose median depth is plausible for a depth camera. Surfaces also meet where
+    depths and positions are wrong by the same factor, and then only the depth shows which unit is
+    right. The first one with about the highest agreement is the best.
     """
     own = conventions[0]
     near, far = PLAUSIBLE_DEPTH
@@ -151,7 +154,7 @@ def _best_of(conventions: list[Convention]) -> Convention:
     plausible = [c for c in meet if near <= c.depth_m <= far]
     highest = max((c.agreement for c in plausible), default=0.0)
     best = next((c for c in plausible if c.agreement >= _ALIKE * highest), own)
-    return best if best.is_clearly_better(own) else own
+    return best if best.is_clearly_better(own) or best.apart < own.apart / _NEARER else own
 
 
 def remedy(reading: Reading, own: Reading) -> str:

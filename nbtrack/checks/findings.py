@@ -96,8 +96,7 @@ def of_images(frames: pd.DataFrame, shared: int, often: Int[np.ndarray, "_"]) ->
     repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
     if repeated > _MIN_REPEATED:
         found = f"{repeated:.0%} of the depth images repeat the one before, though the poses move"
-        every = round(1 / (1 - repeated))
-        yield f"{found}: leave them out, as with --frames ::{every} of map and track"
+        yield f"{found}: leave them out: --frames ::{1 / (1 - repeated):.0f} of map and track"
     if frames.brightness.median() < _BLACK:
         options = "--set tracking.lm.lambda_intensity=0, or tracking.sdf.lambda_color=0 for sdf"
         yield f"the colour images are black: check their folder, or track without colour: {options}"

@@ -16,13 +16,12 @@ from nbtrack.checks.readings import AREA_SCALE, FramePairs, Gaps, Reading, cost_
 _STEPS = 12  # of Gauss-Newton, at most
 _FACTORS = (4.0, 2.0, 1.0, 0.5, 0.2)  # of a step; the best is taken
 _WIDE = 5.0  # medians of the gaps: the scale of the weights in a step
-_ENOUGH = 0.02  # of what is negligible: a last step
+_ENOUGH = 0.02  # of what is negligible: such a step is none
 # Shares of the cost as declared that a cause may leave: a usual sensor's error, and another.
 _USUAL_GAIN, _GAIN = 0.9, 0.75  # our choice
 _ALIKE = 0.95  # ratio of two costs from which on they count as equal
 _WHOLE = 0.8  # of the cost of a cause: where all numbers together leave less, it is not the whole
 _RESAMPLED = 200  # draws of a bootstrap
-_INTERVAL = [0.025, 0.975]  # its quantiles
 
 
 class Number(NamedTuple):
@@ -139,18 +138,16 @@ def fit(
         tried = [(values + factor * small * step).clip(-limit, limit) for factor in _FACTORS]
         tried_gaps = [gaps_at(new) for new in tried]
         best = int(np.argmin([cost_of(new, scale) for new in tried_gaps]))
-        if cost_of(tried_gaps[best], scale) >= cost_of(gaps, scale):
-            break
         is_small_step = (np.abs(tried[best] - values) < _ENOUGH * small).all()
-        values, gaps = tried[best], tried_gaps[best]
-        if is_small_step:
+        if is_small_step or cost_of(tried_gaps[best], scale) >= cost_of(gaps, scale):
             break
+        values, gaps = tried[best], tried_gaps[best]
     H, g = _normal_equations(gaps, [gaps_at(values + unit) for unit in np.diag(small)], AREA_SCALE)
     # A fixed seed, so that a recording always has the same interval.
     drawn = np.random.default_rng(0).integers(len(H), size=(_RESAMPLED, len(H)))
     step = _solution(H.sum(axis=0), g.sum(axis=0))  # of all pairs; not quite 0
     deviations = _solution(H[drawn].sum(axis=1), g[drawn].sum(axis=1)) - step
-    low, high = values + small * np.quantile(deviations, _INTERVAL, axis=0)
+    low, high = values + small * np.quantile(deviations, [0.025, 0.975], axis=0)
     # Where the opposite numbers fit as well, the cause is another one: a `late` of either sign
     # interpolates the poses, for example, which may help by itself.
     gain = max(_ratio(gaps, gaps_at(0 * values)), _ratio(gaps, gaps_at(-values)))

@@ -84,6 +84,8 @@ class RgbdSequence:
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
         """The sequence of some of the frames, in the order given; slices copy nothing."""
+        if not isinstance(indices, slice) and np.ndim(indices) != 1:
+            raise ConfigError(f"`select` takes a slice or a list of frames, not {indices!r:.80}")
         return replace(self, **{name: getattr(self, name)[indices] for name in ARRAYS})
 
 

@@ -72,13 +72,18 @@ def tables_folder() -> Path:
     return project_folder() / "paper_tables"
 
 
+def _number(digits: str) -> float | int:
+    """A float where that is exact, so that other whole numbers are not taken for one another."""
+    return float(digits) if float(digits) == int(digits) else int(digits)
+
+
 def fingerprint(*parts: Any) -> str:
     """Twelve hexadecimal digits that change with any of the parts (plain values or configs).
 
     Numbers count by their value: 30 is 30.0.
     """
     as_given = json.dumps([as_dict(p) if dataclasses.is_dataclass(p) else p for p in parts])
-    plain = json.dumps(json.loads(as_given, parse_int=float), sort_keys=True)
+    plain = json.dumps(json.loads(as_given, parse_int=_number), sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()[:12]
 
 

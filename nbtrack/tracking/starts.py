@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nbtrack.core.arrays import Pose
+from nbtrack.core.arrays import Pose, Poses
 from nbtrack.machinery.errors import look_up
 
 
@@ -21,3 +21,13 @@ def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
         starts["constant_velocity"] = [moved_on]
         starts["better_of_both"] = [moved_on, last]
     return look_up("motion model", motion_model, starts)
+
+
+def rigid(T: Pose | Poses) -> Pose | Poses:
+    """Transforms without what rounding gathers in their rotations over thousands of frames.
+
+    A Newton step towards the nearest rotation.
+    """
+    T, R = T.copy(), T[..., :3, :3]
+    T[..., :3, :3] = R @ (3 * np.eye(3) - R.swapaxes(-2, -1) @ R) / 2
+    return T

@@ -20,7 +20,7 @@ from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
 from nbtrack.machinery.settings import checked
 from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.reach import Reach
-from nbtrack.tracking.starts import expected_poses
+from nbtrack.tracking.starts import expected_poses, rigid
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class Tracker(abc.ABC):
         later frames can still be found (our choice).
         """
         T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
-        estimate = Estimate(T_starts[0], without_depth=True)
+        estimate = Estimate(rigid(T_starts[0]), without_depth=True)
         if self.copes_without_depth or frame.has_depth:
             with suited_to(self.field.width, self.settings.tf32):
                 estimate = self._search(frame, T_starts, budget or self.budget)
