@@ -103,6 +103,9 @@ CASES: dict[str, tuple[Change, str, float, float]] = {
     "a quadratic error": (short(0.008), "depths are short by a quadratic", 0.008, 0.002),
     "depth 8 cm long": (depth(lambda d: d + 80 * (d > 0)), "depths are short by", -0.08, 0.015),
     "none is 10000": (fill(10000, 0.3), f"30% {NO_DEPTH} 10000.*no_depth =", 10000, 0),
+    "positions mirrored": (
+        positions(lambda t: t * [-1, 1, 1]), "your positions .* mirrored; .* by -1, 1 and 1 ", 0, 0
+    ),
     "one pose off by 20 cm": (
         positions(lambda t: t + 0.2 * (np.arange(len(t)) == 60)[:, None] * [1, 0, 0]),
         "1 of .* poses lie up to", 20, 2,
