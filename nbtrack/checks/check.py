@@ -83,8 +83,7 @@ class DataReport:
             f"  depth: {near:.2f} to {far:.2f} m (1 to 99%), scene: {x:.2f} x {y:.2f} x {z:.2f} m",
             facts.to_string(float_format="{:10.2f}".format),
             "  surfaces of two frames (mm apart in the mean, share of points), read as",
-            f"  > (in use) {rows[0]}",
-            *(f"             {row}" for row in rows[1:]),
+            "  > (in use) " + "\n             ".join(rows),
             *map(_LINES.fill, texts),
             f"  next: python -m nbtrack {command} {shlex.quote(str(recording.folder))}",
             "",
@@ -180,7 +179,6 @@ def _read(
     parts = []
     rows = []
     counts = np.zeros((2, 65536), int)
-    is_short = len(looked_at) <= _FRAMES_AT_ONCE
     with ProgressBar("reading frames", len(looked_at)) as bar:
         for ids in np.split(looked_at, range(_FRAMES_AT_ONCE, len(looked_at), _FRAMES_AT_ONCE)):
             part = read_frames(recording, ids, as_stored=True)
@@ -190,7 +188,7 @@ def _read(
                 counts += of_frame, of_frame > findings.SHARED * values.size
                 rows.append(((values > 0).mean(), color.mean() / 255, step, zlib.crc32(values)))
             parts.append(part.select(np.isin(ids, kept)))
-            if not is_short:
+            if len(looked_at) > _FRAMES_AT_ONCE:
                 images_of(recording).forget()
             bar.update(len(part))
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}

@@ -32,13 +32,12 @@ def misreading(own: Convention, best: Convention, main: list[Misfit]) -> tuple[s
     """
     usual_mm = 1e3 * own.usual_apart * own.depth_m
     apart = f"lie {1e3 * own.apart * own.depth_m:.0f} mm apart" if own.overlap else "never meet"
-    is_apart = own.overlap >= MIN_OVERLAP and own.apart > own.usual_apart
     if best is not own:
         reading, name, left_mm = best.reading, str(best), 1e3 * best.apart * best.depth_m
     elif main and main[0].apart <= own.usual_apart:
         reading, left_mm = main[0].reading, 1e3 * main[0].apart * own.depth_m
         name = ", or as well that ".join(str(misfit) for misfit in main)
-    elif is_apart:
+    elif own.overlap >= MIN_OVERLAP and own.apart > own.usual_apart:
         return (
             f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), "
             "and nothing that is tried explains it: no other axes, units or directions of poses "
