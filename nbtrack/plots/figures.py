@@ -206,19 +206,25 @@ def _seconds(frames: pd.DataFrame) -> pd.Series:
 
 @style.styled
 def plot_panels(
-    panels: Mapping[str, pd.DataFrame], x: str, title: str = "", same_x: bool = False
+    panels: Mapping[str, pd.DataFrame],
+    x: str,
+    title: str = "",
+    same_x: bool = False,
+    joined: bool = True,
 ) -> Figure:
     """A panel for each table, by its title: a column is a method, whose numbers are points along x.
 
     Tables share the texts of their index, which stand along y from the top; in a table each has one
-    row, whose numbers a pale line joins. x is logarithmic, labelled by `x`, and with `same_x` of
-    one range in all panels.
+    row, whose numbers a pale line joins, if they are to be `joined`. x is logarithmic, labelled by
+    `x`, and with `same_x` of one range in all panels.
     """
     texts = pd.Index(np.concatenate([table.index for table in panels.values()])).unique()
     grid = style.new_axes(title, 3.4, 1, len(panels), sharex=same_x, sharey=True)[0]
     for axes, (name, values) in zip(grid, panels.items(), strict=True):
         y = texts.get_indexer(values.index)
-        axes.hlines(y, values.min(axis=1), values.max(axis=1), color="0.85", linewidth=2, zorder=1)
+        if joined:
+            ends = values.min(axis=1), values.max(axis=1)
+            axes.hlines(y, *ends, color="0.85", linewidth=2, zorder=1)
         for (label, color), mark in zip(style.method_colors(values).items(), _MARKS, strict=False):
             axes.plot(values[label], y, mark, color=color, mfc="none", mew=1.6, label=label)
         axes.set_yticks(range(len(texts)), texts)
