@@ -74,7 +74,7 @@ def plot_distances(frame: Frame, distances: Curves, title: str = "") -> Figure:
         # `masked_all` leaves its memory as it is, of which drawing may warn.
         image_cm = np.ma.array(np.zeros(frame.depth_mm.shape), mask=True)
         image_cm[rows, columns] = 100 * sdf.abs().cpu().numpy()
-        panels.append((f"{label}: mean {image_cm.mean():.1f} cm", image_cm, DISTANCE))
+        panels.append((f"{label}: mean {image_cm.mean():.2f} cm", image_cm, DISTANCE))
     return plot_images([panels], title)
 
 

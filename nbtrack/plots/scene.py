@@ -178,7 +178,9 @@ def draw_slice(
         bar = {"ax": axes, "label": field.value_label, "extend": "both", **bar}
         axes.figure.colorbar(image, **bar)
     if field.is_distance:
-        draw_levels(axes, places, values, _LINES_M, colors="0.35", linewidths=0.4, linestyles="-")
+        # Light where the slice is dark.
+        tones = ["1" if abs(line) > 0.6 * image.norm.vmax else "0.35" for line in _LINES_M]
+        draw_levels(axes, places, values, _LINES_M, colors=tones, linewidths=0.4, linestyles="-")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
     if seen is not None:
         veil = np.full((*seen.shape, 4), float(UNSEEN))

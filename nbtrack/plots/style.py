@@ -93,7 +93,7 @@ class NotebookFigure(Figure):
         """
         handles, labels = self.axes[0].get_legend_handles_labels()
         ncols = 3 if len("".join(labels)) > 100 else len(labels)
-        self.legend(handles, labels, loc="outside lower center", ncols=ncols)
+        self.legend(handles, labels, loc="outside lower center", ncols=ncols, handlelength=3)
         return self
 
 
