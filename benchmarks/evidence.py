@@ -159,7 +159,7 @@ GRIDS = {
         [
             *(_trained(sensor, 96, n, 3e-3) for sensor, n in product(SENSORS, TRAINED)),
             _trained(CORRECTED, 96, 4000, 3e-3),
-            *(_trained(sensor, 256, 2000, 1e-3) for sensor in SENSORS),
+            *(_trained(sensor, 256, 1000, 1e-3) for sensor in SENSORS),
         ],
         ["sdf"],
         {"rates_hz": [5], "frames": ":240"},

@@ -58,7 +58,7 @@ class TablesConfig:
 
 
 # A density gains from finer detail; a distance must start smooth, or ripples satisfy the
-# eikonal term: at 4 rad/m in place of 2.5 it was off by 19 cm in free space, not by 5.
+# eikonal term.
 # Fields without a `Network` class of their own, as NeuS+, have the network of NeuS.
 _NETWORKS = {
     "imap": NetworkSettings(embedding_sigma=4.0),
