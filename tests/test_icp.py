@@ -22,6 +22,7 @@ from nbtrack.mapping.fit import map_sequence
 from nbtrack.synthetic import build_room
 from nbtrack.tracking import StepBudget, Tracker, make_tracker
 from nbtrack.tracking.metrics import pose_errors
+from nbtrack.tracking.trajectories import track_sequence
 
 BOX = SceneBounds((-1.0, -1.0, 0.0), (1.0, 1.0, 3.0))
 Room = tuple[RgbdSequence, Map]
@@ -162,3 +163,19 @@ def test_lost_where_the_points_fit_as_well_elsewhere(scene: str, turn: tuple) ->
     tracker = make_tracker("icp", cloud, T_world_camera, StepBudget(1))
     camera, color = Intrinsics(80, 60, 40.0, 40.0, 40.0, 30.0), np.zeros((60, 80, 3), np.uint8)
     assert tracker.track(Frame.of_images(camera, color, depth)).lost == (not is_held)
+
+
+def test_a_killed_run_goes_on(room: Room, tmp_path, monkeypatch) -> None:
+    """Catches a verdict of numpy's in a checkpoint, which PyTorch does not read: no killed run of
+    such a tracker went on."""
+    monkeypatch.setattr("nbtrack.machinery.files.CHECKPOINT_SECONDS", -1)
+    whole = track_sequence(tracker_in(room), room[0])
+
+    def kill(index: int, error_m: float) -> None:
+        if index == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        track_sequence(tracker_in(room), room[0], tmp_path / "run.pt", kill)
+    resumed = track_sequence(tracker_in(room), room[0], tmp_path / "run.pt")
+    np.testing.assert_array_equal(resumed.T_estimated, whole.T_estimated)
