@@ -113,7 +113,7 @@ def test_images_that_are_none(monkeypatch) -> None:
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     color = np.zeros((12, 16, 3), np.uint8)
     for depth in (None, [[1.0]], torch.ones(12, 16)):
-        with pytest.raises(DataError, match=f"depth is of type {type(depth).__name__}: give a num"):
+        with pytest.raises(DataError, match=f"depth is {type(depth).__name__}: give a num"):
             Frame.of_images(CAMERA_OF_BUFFERS, color, depth)
 
 

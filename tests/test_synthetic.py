@@ -49,7 +49,7 @@ def test_rays_and_distances_find_the_first_surface(body):
     rng = np.random.default_rng(0)
     if isinstance(body, Room):
         shell, hit = body.parts[0].solid, lambda *rays: body.first_hit(*rays)[0]
-        points = rng.uniform(-0.5, 0.5, (200, 3)) * shell.size + shell.center
+        points = rng.uniform(-0.5, 0.5, (200, 3)) * 2 * shell.half + shell.center
         points = points[body.sdf(points) > 1e-3]  # where bodies overlap it is a bound
         nearby = np.minimum(body.sdf(points), 0.3)
         np.testing.assert_allclose(body.sdf(points, 0.3), nearby, atol=1e-12)
