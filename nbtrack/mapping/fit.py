@@ -177,5 +177,4 @@ class _Fit:
         self.optimizer.load_state_dict(state["optimizer"])
         self.optimizer.param_groups[0]["lr"] = self.rate  # the tensor that `_advance` fills
         self.generator.set_state(state["generator"])
-        self.seconds = state["seconds"]
-        self.history = state["history"]
+        self.seconds, self.history = state["seconds"], state["history"]

@@ -18,8 +18,7 @@ def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
     starts = {"previous_pose": [last], "constant_velocity": [last], "better_of_both": [last]}
     if len(estimates) > 1:  # else no velocity is known
         moved_on = last @ np.linalg.inv(estimates[-2]) @ last
-        starts["constant_velocity"] = [moved_on]
-        starts["better_of_both"] = [moved_on, last]
+        starts |= {"constant_velocity": [moved_on], "better_of_both": [moved_on, last]}
     return look_up("motion model", motion_model, starts)
 
 

@@ -107,8 +107,6 @@ def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, An
     error_m, error_deg = np.nan, np.nan
     if np.isfinite(T_true).all():
         (error_m,), (error_deg,) = pose_errors(estimate.T_world_camera[None], T_true[None])
-    # Python's numbers and flags: a checkpoint holds no others.
-    report = {name: np.asarray(value).item() for name, value in estimate.report.items()}
     return {
         "frame_id": int(sequence.frame_ids[index]),
         "time": float(sequence.times[index]),
@@ -119,5 +117,6 @@ def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, An
         "rotation_error_deg": float(error_deg),
         "still_error_m": float(np.linalg.norm((T_true - T_first)[:3, 3])),  # of standing still
         "without_depth": estimate.without_depth,
-        **report,
+        # Python's numbers and flags: a checkpoint holds no others.
+        **{name: np.asarray(value).item() for name, value in estimate.report.items()},
     }
