@@ -32,7 +32,7 @@ from tiny import TINY
 
 from nbtrack import load_preset, read_sequence
 from nbtrack.checks import check as check_module
-from nbtrack.checks.check import DataReport, check_recording, quick_warning
+from nbtrack.checks.check import DataReport, check_recording, quick_look
 from nbtrack.checks.conventions import AXES, axes_name
 from nbtrack.cli import main
 from nbtrack.data.sequence import observed_bounds
@@ -315,7 +315,7 @@ def test_every_mistake_is_named_and_nothing_else(tmp_path: Path, place: int) -> 
         folder = write(tmp_path / str(number), name, case)
         recording = open_recording(folder)
         wanted = f"your ((poses|positions) look|(depth|calibration) looks) like {case.says}"
-        said = quick_warning(recording)
+        said = quick_look(recording).removeprefix("warning: ")
         whole = said if number % 4 else next(iter(check_recording(recording).warnings), "")
         for text in (said, whole):
             if not re.match(wanted if case.says else "$", text):
@@ -323,7 +323,7 @@ def test_every_mistake_is_named_and_nothing_else(tmp_path: Path, place: int) -> 
         advice = re.findall(r'\w+ = (?:"[^"]+"|[\d.]+)', said)
         if advice and "make the matrices anew" not in said:
             (folder / "sequence.toml").write_text("\n".join(advice) + "\n")
-            if said := quick_warning(open_recording(folder)):
+            if said := quick_look(open_recording(folder)):
                 wrong[f"{number}, as advised"] = said
     assert wrong == {}
 
@@ -333,7 +333,7 @@ def test_absurd_numbers_before_mapping(tmp_path: Path) -> None:
     none = Case("no pixel", change=depth(lambda d: 0 * d))
     far = Case("poses.txt is not proved: two", change=positions(lambda t: 1e5 * t))
     for case in (none, far):
-        said = quick_warning(open_recording(write(tmp_path / case.says[:5], "office", case)))
+        said = quick_look(open_recording(write(tmp_path / case.says[:5], "office", case)))
         assert case.says in said
 
 

@@ -20,7 +20,7 @@ from recordings import (
     write_matrices,
 )
 
-from nbtrack.checks.check import DataReport, check_recording
+from nbtrack.checks.check import DataReport, check_recording, quick_look
 from nbtrack.checks.readings import cost_of
 from nbtrack.recordings.recording import open_recording
 
@@ -156,14 +156,15 @@ def test_nothing_is_told_of_right_recordings(tmp_path: Path, name: str) -> None:
 
 def test_a_usual_sensors_error_is_noted_and_is_no_fault(tmp_path: Path) -> None:
     """Catches a dataset that nobody can check, as its depth has a structured light's quadratic
-    error; an estimate of another error than the one that `depth_error_per_m` takes away; and an
-    interval that is too narrow."""
+    error; a warning of that before each run; an estimate of another error than the one that
+    `depth_error_per_m` takes away; and an interval that is too narrow."""
     b, data = 0.0025, source("office", N_FRAMES, 1)
     noise_mm = np.random.default_rng(0).normal(scale=4, size=data.depths_mm.shape)
     noisy = depth(lambda d: np.where(d > 0, d + noise_mm, 0))(short(b)(data))
     folder = write_matrices(tmp_path / "r", noisy)
-    report = check_recording(open_recording(folder))
+    report, quickly = check_recording(open_recording(folder)), quick_look(open_recording(folder))
     assert report.verdict == "read rightly"
+    assert re.match("note: .* depth_error_per_m = 0.00", quickly)
     assert "depth_error_per_m = 0.00" in report.remarks[0]
     low, high = interval(report)
     assert low < b < high < 2 * b

@@ -132,11 +132,16 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     )  # fmt: skip
 
 
-def quick_warning(recording: Recording) -> str:
-    """The first thing that a look at a few pairs of frames finds wrong; empty where nothing is."""
+def quick_look(recording: Recording) -> str:
+    """The gravest that a look at a few pairs of frames finds, as "warning: ..." or "note: ...".
+
+    It is empty where nothing is found.
+    """
     if recording.has_pose.sum() < 2:
         return ""
-    return next(iter(check_recording(recording, is_whole=False).warnings), "")
+    report = check_recording(recording, is_whole=False)
+    kind = "warning" if report.faults or report.doubts else "note"
+    return next((f"{kind}: {text}" for text in report.warnings), "")
 
 
 def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:

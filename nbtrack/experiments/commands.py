@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from nbtrack.checks.check import check_recording, quick_warning
+from nbtrack.checks.check import check_recording, quick_look
 from nbtrack.experiments import runs
 from nbtrack.experiments.exports import draw_overview
 from nbtrack.experiments.jobs import run_jobs
@@ -148,10 +148,10 @@ def _warn(metrics: dict[str, Any]) -> None:
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:
-    """The named scene. Warns where it is likely read wrongly, as a room made here never is."""
+    """The named scene. Tells where it is likely read wrongly, as a room made here never is."""
     scene = open_scene(options.sequence, preset, options.format)
-    if not scene.made and (warning := quick_warning(scene.recording)):
-        tell(f"nbtrack: warning: {warning}; `data check` tells more")
+    if not scene.made and (found := quick_look(scene.recording)):
+        tell(f"nbtrack: {found}; `data check` tells more")
     return scene
 
 
