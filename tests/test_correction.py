@@ -125,10 +125,11 @@ def test_a_file_keeps_it_whole(tmp_path: Path, sequence: RgbdSequence) -> None:
     """Catches corrections lost or rounded on the way to disk and back, and a wrong size."""
     network = NetworkSettings(width=16)
     field = make_field("neus", network, ROOM.bounds, seed=0).eval().requires_grad_(False)
-    made = {"field": "neus", "network": vars(network), "seconds": 0.0, "seed": 0}
+    made = {"field": "neus", "network": vars(network), "seconds": 5.0, "seed": 0}
     made |= {"scene": "box", "n_frames": len(sequence), "origin": [0.0, 0.0, 0.0]}
     made["settings"] = asdict(NeusMapping())
     finished = correct_map(Map(field, sequence.intrinsics, made), sequence, 0.2)
+    assert finished.record["seconds"] == 5 + finished.record["correction_seconds"]
     write_map(tmp_path / "map.safetensors", finished)
     stored, points = read_map(tmp_path), torch.rand(100, 3)
     assert torch.equal(stored.field(points)[1], finished.field(points)[1])

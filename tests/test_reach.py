@@ -16,7 +16,14 @@ from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.synthetic import make_room
 from nbtrack.tracking import SdfSettings, StepBudget, make_tracker
 from nbtrack.tracking.metrics import trajectory_metrics
-from nbtrack.tracking.reach import greedy_ate, greedy_follower, motion_of, reach, reach_metrics
+from nbtrack.tracking.reach import (
+    Reach,
+    greedy_ate,
+    greedy_follower,
+    motion_of,
+    reach,
+    reach_metrics,
+)
 
 
 def straight(speed_m: float) -> np.ndarray:
@@ -82,6 +89,32 @@ def test_motion_and_metrics_by_hand() -> None:
     assert reach_metrics(None, path, "previous_pose") == {}
     path[3] = np.nan
     assert "greedy_ate_m" not in reach_metrics(one, path, "previous_pose")
+
+
+def test_a_mirrored_path_asks_for_as_much() -> None:
+    """Catches a bound in one direction alone, and a follower that begins at the truth."""
+    forth, back = straight(0.003), straight(-0.003)
+    for reach_m in (0.002, 0.0031):
+        metrics = [reach_metrics(Reach(reach_m, 1.0), p, "previous_pose") for p in (forth, back)]
+        assert metrics[0] == pytest.approx(metrics[1])
+    assert metrics[0]["beyond_reach_share"] == 0
+
+
+@pytest.mark.parametrize("way", [-1, 1])
+def test_a_turn_asks_for_reach_too(way: int) -> None:
+    """Catches degrees for radians, a turn that needs a motion besides, and turns one way alone."""
+    path = poses_at(np.zeros((11, 3)), np.outer(np.arange(11), [0.0, way * 0.01, 0.0]))
+    for reach_rad, share in ((0.011, 0.0), (0.009, 1.0)):
+        metrics = reach_metrics(Reach(0.001, reach_rad), path, "previous_pose")
+        assert metrics["beyond_reach_share"] == share
+        assert metrics["greedy_ate_m"] == pytest.approx(0.0)
+
+
+def test_the_nearer_of_two_starts_is_taken() -> None:
+    """Catches the farther one: of a camera that starts and stops, each start fits some frames."""
+    path = poses_at(np.outer([0, 0, 1, 2, 2, 2], [0.01, 0.0, 0.0]))
+    found = [motion_of(path, model)[0][:, 0] for model in ("better_of_both", "previous_pose")]
+    assert_allclose(found, [[0, 0.01, 0, 0, 0], [0, 0.01, 0.01, 0, 0]], atol=1e-12)
 
 
 def test_a_warning_before_the_work(tmp_path: Path) -> None:

@@ -122,6 +122,8 @@ def test_guided_depths(generator: torch.Generator) -> None:
     assert depths.min() >= NEAR
     assert (depths.amax(dim=-1) <= rays.depth + 0.15 + 1e-5).all()
     assert ((depths - rays.depth[:, None]).abs() <= 0.15 + 1e-5).sum(dim=-1).min() >= 8
+    part = ((depths - rays.depth[:, None]) / 0.15 + 1) * 4  # one in each eighth of the band
+    assert all((part.floor() == k).any(dim=-1).all() for k in range(8))
     # One stratified sample falls into each of 16 parts, so none is left unseen.
     gaps = depths.diff(dim=-1).amax(dim=-1)
     assert (gaps <= 2 * (rays.depth + 0.15) / 16).all()
