@@ -11,12 +11,13 @@ from scipy.spatial.transform import Rotation
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.lm_optimizer import NEAR_SCALES, LmOptimizer
 from nbtrack.beyond.lm_residuals import grid_of
-from nbtrack.beyond.observed import draw_points
-from nbtrack.beyond.verdict import p_lost, p_within
-from nbtrack.beyond.views import Viewpoints, retrieve, view_of
+from nbtrack.beyond.observed import draw_points, with_normals
+from nbtrack.beyond.verdict import SIGMAS, p_lost, p_within, std_when_moved
+from nbtrack.beyond.views import Viewpoints, retrieve, spread_out, view_of
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.frame import Frame
+from nbtrack.data.pixels import PixelSampler
 from nbtrack.recordings.reading import FAR, far_limit
 from nbtrack.tracking import SdfSettings, StepBudget, VrSettings, make_tracker
 
@@ -167,3 +168,74 @@ def test_a_view_shows_what_lies_where() -> None:
     asked = (luma > 0) & (expected < 60)
     assert asked.sum() > 100
     assert np.abs(depth - expected)[asked].max() < 1.5
+
+
+def test_how_a_pose_is_moved_by_hand() -> None:
+    """Catches another length or direction of the motion, a turn that does not follow it, and a cost
+    that does not grow with the square: by 10 cm along x, where the pose is least certain, a turn of
+    0.25 rad a metre follows; then along y."""
+    moved, covariance = [], np.diag([1e-6, 1e-6, 1e-4, 4e-4, 1e-4, 1e-6])
+    covariance[2, 3] = covariance[3, 2] = 1e-4
+
+    def costs_at(T: np.ndarray) -> np.ndarray:
+        moved.append(T)
+        return np.full(50, 0.5 + 2 * T[0, 3] ** 2 + T[1, 3] ** 2)
+
+    for n_directions, growth in ((1, 2.0), (2, 1.0)):
+        found = std_when_moved(costs_at, np.eye(4), covariance, n_directions, 20)
+        assert found == pytest.approx(1 / (SIGMAS * (20 * growth + 4) ** 0.5))
+    places = np.stack(moved)[1:3, :3, 3]
+    np.testing.assert_allclose(places, places[0, 0] * np.array([[1, 0, 0], [-1, 0, 0]]), atol=1e-9)
+    assert abs(places[0, 0]) == pytest.approx(0.1)
+    turns = Rotation.from_matrix(np.stack(moved)[1:3, :3, :3]).as_rotvec()
+    np.testing.assert_allclose(turns, 0.25 * places[:, [1, 2, 0]], atol=1e-9)
+
+
+def test_points_know_no_unit_and_have_the_normals_of_mapping() -> None:
+    """Catches edges in millimetres, and normals of a pixel beside: of a wavy surface with edges."""
+    rows, columns = np.indices((72, 96))
+    waves = 2000 + 350 * np.sin(rows / 3) + 99 * np.sin(columns / 2) + 900 * (columns > 50)
+    depths_mm = np.stack([waves.round(), 2 * waves.round()])
+    frames = sequence_of(depths_mm, Intrinsics(96, 72, 70.0, 75.0, 45.0, 38.0))
+    seen, far = (draw_points(frames[i], 900, torch.Generator().manual_seed(0)) for i in (0, 1))
+    np.testing.assert_allclose(far.points, 2 * seen.points)
+    u, v = (seen.points[:, :2] / seen.points[:, 2:] * [70, 75] + [45, 38]).T
+    columns, rows = (torch.from_numpy(x - 0.5).round().long() for x in (u, v))
+    sampler = PixelSampler(frames, torch.device("cpu"))
+    expected = sampler.normals_camera(torch.zeros_like(rows), rows, columns)
+    np.testing.assert_allclose(with_normals(frames[0], seen, 900)[2], expected, atol=1e-3)
+
+
+def test_poses_are_spread_by_place_and_optical_axis() -> None:
+    """Catches the nearest in place of the farthest, and turns about the optical axis that count."""
+    poses = poses_at(np.zeros((4, 3)), [[0.5, 0.0, 0.0]] * 4)
+    poses[1, :3, :3] @= Rotation.from_rotvec([0.0, 0.0, 3.0]).as_matrix()
+    poses[2, :3, :3] @= Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix()
+    poses[3, :3, 3] = [0.2, 0.0, 0.0]
+    assert spread_out(poses).tolist() == [0, 2, 3, 1]
+
+
+@pytest.mark.parametrize("turn", [[0.14, 0.0, 0.0], [-0.14, 0.0, 0.0], [0.0, 0.3, 0.0]])
+def test_a_view_is_found_from_a_turned_camera(turn: list[float]) -> None:
+    """Catches a turn of the wrong sign or axis."""
+    poses = poses_at([[0.0, 0.0, -0.3]] * 2, [[0.0, 0.0, 0.0], turn])
+    frames = box_sequence(poses, BoxRoom(), 96)
+    known = Viewpoints(poses[:1].copy(), view_of(frames[0])[None])
+    (found,) = retrieve(view_of(frames[1]), known, 1)
+    assert Rotation.from_matrix(found[:3, :3].T @ poses[1, :3, :3]).magnitude() < 0.03
+
+
+def test_brightness_and_what_is_not_measured_make_no_view_unlike() -> None:
+    """Catches a mean that is left in, and depths of nothing: the same with noise comes after the
+    same in bright light, and a view that is measured less is as much like."""
+    noise = torch.Generator().manual_seed(0)
+    dark = torch.randint(1, 11, (2, 15, 20), generator=noise).byte()
+    dark[1] = 40
+    bright, noisy, deeper, half = (dark.clone() for _ in range(4))
+    bright[0] += 200
+    noisy[0] += torch.randint(0, 9, (15, 20), generator=noise).byte()
+    deeper[1] += 1
+    half[1, :7] = 0
+    cameras = poses_at(np.outer(range(4), [1.0, 0.0, 0.0]))
+    found = retrieve(dark, Viewpoints(cameras, torch.stack([noisy, deeper, half, bright])), 4)
+    assert found[:, 0, 3].tolist() in ([2, 3, 1, 0], [3, 2, 1, 0])

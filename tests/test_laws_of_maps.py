@@ -32,10 +32,10 @@ def rays_ahead(n: int, depth: float) -> Rays:
 
 
 class Slope(NeuSField):
-    """A value that rises by 3 per metre along x."""
+    """A value that rises by 3 per metre, along no axis."""
 
     def forward(self, points_world: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return torch.sigmoid(points_world), 3 * points_world[:, 0]
+        return torch.sigmoid(points_world), points_world @ torch.tensor([1.0, -2.0, 2.0])
 
 
 @pytest.mark.parametrize("kind", [NeuSField, NeuSPlusField])
@@ -141,10 +141,12 @@ def test_a_mapping_loss_is_the_sum_by_hand(name: str) -> None:
 
 def test_how_far_points_lie_behind_what_was_seen() -> None:
     """Catches a sign, the largest in place of the least, and places that no frame saw."""
-    sequence = sequence_of(np.full((6, 12, 16), 2000.0), Intrinsics.from_focal(16, 12, 14.0))
+    camera, poses = Intrinsics.from_focal(16, 12, 14.0), poses_at([[0.3, -0.2, 0.1]] * 6, [1, 2, 3])
+    sequence = sequence_of(np.full((6, 12, 16), 2000.0), camera, poses=poses)
     sequence.depths_mm[5] = 3000  # every fifth frame is asked: 0 and 5
     points = torch.tensor([[0.0, 0.0, 2.5], [0.1, 0.0, 1.5], [9.0, 0.0, 2.0], [0.0, 0.0, -1.0]])
-    behind = min_depth_behind(points, sequence, np.arange(6))
+    R, t = torch.from_numpy(poses[0, :3]).float().split([3, 1], dim=1)
+    behind = min_depth_behind(points @ R.T + t.T, sequence, np.arange(6))
     torch.testing.assert_close(behind, torch.tensor([-0.5, -1.5, math.inf, math.inf]))
 
 

@@ -112,7 +112,7 @@ def test_images_stay_on_the_host_where_the_device_is_full(name: str, monkeypatch
 
 
 def test_guided_depths(generator: torch.Generator) -> None:
-    """Catches samples behind the surface's band, too few around it, an unsorted ray, a missing
+    """Catches samples behind the surface's band, too few around it or right behind it, an unsorted ray, a missing
     depth taken for a surface at the camera (such rays go to the box, 3 m), and negative ranges when
     a pose has left the box."""
     rays = rays_ahead(40, torch.linspace(0.5, 2.5, 40))
@@ -124,6 +124,7 @@ def test_guided_depths(generator: torch.Generator) -> None:
     assert ((depths - rays.depth[:, None]).abs() <= 0.15 + 1e-5).sum(dim=-1).min() >= 8
     part = ((depths - rays.depth[:, None]) / 0.15 + 1) * 4  # one in each eighth of the band
     assert all((part.floor() == k).any(dim=-1).all() for k in range(8))
+    assert (depths > rays.depth[:, None]).sum(dim=-1).float().mean() > 4.5  # four of them behind it
     # One stratified sample falls into each of 16 parts, so none is left unseen.
     gaps = depths.diff(dim=-1).amax(dim=-1)
     assert (gaps <= 2 * (rays.depth + 0.15) / 16).all()
