@@ -130,7 +130,8 @@ def test_distances_are_learned_sooner_than_by_rendering_alone(tmp_path: Path, mo
 
 def test_features_by_hand() -> None:
     """Catches a level that is left out or read in another's cells: at a vertex of the coarsest one
-    the features are its own, and those of the vertices of the finer ones that lie there."""
+    the features are its own, and those of the vertices of the finer ones that lie there; and first
+    weights of another spread: of 15 inputs."""
     box = SceneBounds((-1.0, -0.5, 0.0), (1.0, 0.5, 3.0))
     grid = FeatureGrid(GridNetwork(finest=0.1, levels=3), box, torch.Generator().manual_seed(0))
     vertex = torch.tensor([[-1.0 + 0.4, -0.5 + 0.8, 1.2]])  # number 1, 2, 3 of the coarsest
@@ -139,6 +140,7 @@ def test_features_by_hand() -> None:
     normalized = (vertex[0] - grid.low) / box.metres_per_unit - 1
     hidden = torch.nn.functional.silu(grid.layer(torch.cat([*expected, normalized])))
     torch.testing.assert_close(grid.features(vertex)[0], hidden)
+    assert grid.layer.weight.std().item() == pytest.approx(15**-0.5, rel=0.15)
 
 
 def test_the_eikonal_term_of_grids_is_refused() -> None:

@@ -112,9 +112,9 @@ def test_images_stay_on_the_host_where_the_device_is_full(name: str, monkeypatch
 
 
 def test_guided_depths(generator: torch.Generator) -> None:
-    """Catches samples behind the surface's band, too few around it or right behind it, an unsorted ray, a missing
-    depth taken for a surface at the camera (such rays go to the box, 3 m), and negative ranges when
-    a pose has left the box."""
+    """Catches samples behind the surface's band, too few in a part of it or right behind the
+    surface, an unsorted ray, a missing depth taken for a surface at the camera (such rays go to the
+    box, 3 m), and negative ranges when a pose has left the box."""
     rays = rays_ahead(40, torch.linspace(0.5, 2.5, 40))
     depths = guided_depths(rays, BOX, CONFIG, generator)
     assert depths.shape == (40, 24)
