@@ -83,7 +83,8 @@ def test_a_traceback_for_who_asks(tmp_path: Path, capsys, monkeypatch) -> None:
 
 def test_a_map_is_taken_with_the_settings_that_made_it(tmp_path: Path, capsys, monkeypatch) -> None:
     """Catches a refusal of the very settings that a map was made with, because a method set others
-    beside them; and settings that the map does not have, which no run could follow."""
+    beside them; and settings that the map does not have, which no run could follow, however they
+    are given."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
     folder, out = write_recording("plain", tmp_path / "r"), str(tmp_path / "m")
     made = ["map", str(folder), "--field", "neus", *TINY, "--set", "correction.neus=0.3"]
@@ -93,6 +94,8 @@ def test_a_map_is_taken_with_the_settings_that_made_it(tmp_path: Path, capsys, m
     says = ", not 77 as asked"
     assert_refused(tmp_path, capsys, [*given, "--set", "mapping.neus.n_rays=77"], says)
     assert main([*given, "--set", "mapping.imap.n_rays=77", "--out", str(tmp_path / "run")]) == 0
+    (tmp_path / "own.toml").write_text("mapping.neus.lambda_depth = 77")
+    assert_refused(tmp_path, capsys, [*given, "--config", str(tmp_path / "own.toml")], ", not 77")
 
 
 def test_times_are_the_recordings_own(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.machinery.files import data_folder, write_atomic
 from nbtrack.machinery.progress import tell
-from nbtrack.machinery.settings import flat, read_setting, with_values
+from nbtrack.machinery.settings import flat, with_values
 from nbtrack.mapping.files import MESH_FILE, Map
 from nbtrack.plots import plot_overview
 from nbtrack.plots.meshes import extract_mesh, mesh_bytes
@@ -156,20 +156,26 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
 
 
 def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -> None:
-    """Raises ConfigError where a given map contradicts the options: its frames, field, settings."""
+    """Check that a given map was made as the command asks, before anything is tracked in it.
+
+    Raises ConfigError for `--map-frames`, for another field, and where the map was made with
+    another value of a setting that the user has chosen, or is corrected where `--method` names a
+    method that is not, or the other way round.
+    """
     if options.map_frames:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
     if field != given.field:
         found = f"{options.map_from} is a map of field {given.field!r}, not {field!r}"
         raise ConfigError(f"{found}: leave --method and --field out")
     of_map, wanted = flat(given.setting_tree), flat(preset.settings)
-    asked_keys = {key for text in options.settings for key in read_setting(text)}
+    asked_keys = {key for key, _ in preset.chosen}  # by --set, --config or NBTRACK_SET
     if options.method:  # its name says whether the map is corrected
         asked_keys.add(f"correction.{field}")
     for key in sorted(asked_keys & of_map.keys()):  # a map has no settings of a tracker
         if of_map[key] != wanted[key]:
             found = f"{options.map_from} was made with {key}={of_map[key]}, not {wanted[key]}"
-            raise ConfigError(f"{found} as asked: leave --set and --method out, or map anew")
+            advice = "leave that setting (--set, --config, NBTRACK_SET) or --method out"
+            raise ConfigError(f"{found} as asked: {advice}, or map anew")
 
 
 def _make_map(job: MapJob) -> None:

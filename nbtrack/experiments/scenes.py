@@ -96,7 +96,7 @@ def open_scenes(preset: Preset) -> list[Scene]:
     whole, what is wrong with the first.
     """
     names = preset.scenes.names
-    if not names or len({absolute(name).name for name in names}) < len(names):
+    if not names or len({Path(name).name for name in names}) < len(names):
         given = ", ".join(names) or "(none)"
         raise ConfigError(f"scenes {given}: give at least one, and of one name only one")
     scenes, missing = [], {}
