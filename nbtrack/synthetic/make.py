@@ -1,4 +1,4 @@
-"""Make a synthetic scene on disk, in the Neural RGB-D layout, and find its exact room again."""
+"""Write synthetic scenes in the layout of the Neural RGB-D dataset, and find their rooms again."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -22,7 +22,7 @@ from nbtrack.synthetic.room import Room, build_room, description
 ROOM_FILE = "room.json"
 ROOM_VERSION = 2  # raise it when a room, the motion or the sensor model changes
 _AGAIN = "remove the folder and make the room again"
-_FRAMES_AT_ONCE = 32  # in flight, so that memory is bounded where writing is slower
+_FRAMES_AT_ONCE = 32  # rendered ahead of writing: bounds memory where writing is slower
 MOTIONS = {"keyframes": keyframe_trajectory, "handheld": handheld_trajectory, "tour": tour}
 
 
@@ -34,11 +34,11 @@ def room_intrinsics(width: int, height: int) -> Intrinsics:
 def room_frames(
     room: Room, n_frames: int, width: int, height: int, seed: int, motion: str = "handheld"
 ) -> Iterator[WrittenFrame]:
-    """Render a room's frames in order; memory does not grow with their number.
+    """Renders a room's frames in order; memory does not grow with their number.
 
-    `seed` is that of the camera's path and of the depth noise. Every frame has its own random
-    numbers, so that the result does not depend on the number of threads.
-    Raises `ConfigError` for an unknown motion.
+    `motion` is a name in `MOTIONS`. `seed` determines the camera's path and the depth noise. Every
+    frame has its own random numbers, so that the result does not depend on the number of threads.
+    Raises ConfigError for an unknown motion.
     """
     camera = room_intrinsics(width, height)
     poses = look_up("motion", motion, MOTIONS)(room, n_frames, seed)
@@ -51,7 +51,7 @@ def room_frames(
         depths_mm = {name: np.rint(1e3 * values).astype(np.uint16) for name, values in maps.items()}
         return color, depths_mm, poses[number]
 
-    # NumPy releases the interpreter lock, so threads suffice.
+    # Threads suffice, since NumPy releases the interpreter lock.
     with ThreadPoolExecutor(usable_cores()) as pool:
         for start in range(0, n_frames, _FRAMES_AT_ONCE):
             yield from pool.map(make_frame, range(start, min(start + _FRAMES_AT_ONCE, n_frames)))
@@ -67,23 +67,24 @@ def make_room(
     motion: str = "handheld",
     progress: Callable[[int], object] = lambda done: None,
 ) -> Path:
-    """Write a synthetic scene as the Neural RGB-D dataset does; returns `folder`.
+    """Writes a synthetic scene in the layout of the Neural RGB-D dataset; returns `folder`.
 
-    Clean depth goes to `depth/`, the sensor's to `depth_with_noise/` and `depth_filtered/`; the
-    poses are exact in both pose files. `room.json` records how the scene was made. The same
-    arguments give the same bytes. Raises as `build_room`, `room_frames` and `write_sequence` do.
+    `depth/` gets the exact depth, `depth_with_noise/` what a sensor measures, and `depth_filtered/`
+    that after a bilateral filter. Both pose files hold the exact poses. `room.json` records the
+    arguments; the same arguments give the same bytes. `progress` is told the number of frames
+    written so far. Raises as `build_room`, `room_frames` and `write_sequence` do.
     """
     made_with = {"room": name, "version": ROOM_VERSION, "motion": motion, "seed": seed}
     size = {"frames": n_frames, "width": width, "height": height}
     notes = {ROOM_FILE: json_text(made_with | size)}
     frames = room_frames(build_room(name), n_frames, width, height, seed, motion)
-    with closing(frames):  # ends the threads that render, also where writing fails
+    with closing(frames):  # ends the rendering threads, even if writing fails
         write_sequence(folder, room_intrinsics(width, height), frames, notes, progress)
     return folder
 
 
 def room_version(name: str) -> str:
-    """Twelve hexadecimal digits that change with the room's description and the generator's code.
+    """Hash of a room's description and the generator's code, as twelve hexadecimal digits.
 
     Raises ConfigError for an unknown room.
     """
@@ -93,7 +94,7 @@ def room_version(name: str) -> str:
 def room_of(folder: Path) -> Room | None:
     """The exact room that a sequence folder shows; None for a recording of the real world.
 
-    Raises `DataError` where `room.json` is damaged or of another version of the generator.
+    Raises DataError if `room.json` is damaged, or another version of the generator wrote it.
     """
     path = folder / ROOM_FILE
     if not path.is_file():

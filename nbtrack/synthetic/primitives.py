@@ -15,11 +15,12 @@ Values = Float[np.ndarray, "n"]
 Indices = Int[np.ndarray, "n"]
 Vectors = Float[np.ndarray, "... k"]
 Origins = Float[np.ndarray, "... 3"]  # one origin for all rays, (3,), or one each, (n, 3)
-Interval = tuple[Values, Values]  # ray parameters between which a ray is inside; none: near > far
+# Ray parameters (near, far) between which a ray is inside; near > far if it never is.
+Interval = tuple[Values, Values]
 
 
 def row_dot(first: Vectors, second: Vectors) -> Float[np.ndarray, "..."]:
-    """Scalar products along the last axis; several times as fast as multiply and sum."""
+    """Dot products along the last axis; several times as fast as multiply and sum."""
     return np.asarray(np.einsum("...i,...i->...", first, second))
 
 
@@ -29,8 +30,11 @@ def _row_max(rows: Vectors) -> Values:
 
 
 def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Interval:
-    """Where a ray, in the box's own coordinates, is inside |coordinates| <= half."""
-    # In a direction parallel to a slab a tiny slope sends both crossings far away, without 0/0.
+    """The interval of ray parameters in which rays have |coordinates| <= half.
+
+    Origins, directions and half the extents are in the box's own coordinates.
+    """
+    # For a ray parallel to a slab a tiny slope puts both crossings far away; 0 could give 0/0.
     direction = np.where(directions == 0.0, 1e-30, directions)
     first, second = (-half - origins) / direction, (half - origins) / direction
     far = reduce(np.minimum, np.maximum(first, second).T)
@@ -38,12 +42,16 @@ def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Inte
 
 
 def _round_interval(offsets: Origins, directions: Points, radius: float) -> Interval:
-    """The t between which |offset + t direction| <= radius (none: near = inf, far = -inf)."""
+    """The interval of t in which |offset + t direction| <= radius.
+
+    It is empty (near = inf, far = -inf) for rays that miss.
+    """
     squared = row_dot(directions, directions)
     b = row_dot(offsets, directions)
     c = row_dot(offsets, offsets) - radius**2
-    # A ray along the axis of a cylinder has no direction across it: it never crosses the side and
-    # is inside for ever or never. There 1 only avoids a division by 0.
+    # A ray parallel to a cylinder's axis has a direction of 0 here, where only components
+    # perpendicular to the axis are given. It is always inside or never; the 1 avoids a division
+    # by 0.
     crosses = squared > 1e-24
     a = np.where(crosses, squared, 1.0)
     discriminant = b * b - a * c
@@ -55,28 +63,29 @@ def _round_interval(offsets: Origins, directions: Points, radius: float) -> Inte
 class Solid:
     """A closed convex body that is a box in its own coordinates.
 
-    A subclass has a `center` (world frame, m). `_coordinates` maps points (m, world) to distances
-    (m) from the center or an axis, in directions perpendicular to each other: a point is inside if
-    none exceeds its entry in `half`. `_crossing` gives the interval of ray parameters in which a
+    A subclass defines three methods. `_coordinates` maps points (m, world) to distances (m) from
+    the center or from an axis, in directions perpendicular to each other; a point is inside if none
+    of them exceeds its entry in `half`. `_crossing` gives the interval of ray parameters in which a
     line is inside. `normals` gives unit outward normals (world frame) at points on the surface.
     """
 
     def __init__(self, center: Array3, half: Vectors) -> None:
-        """Of a center (m, world) and half the extents in its own coordinates (m)."""
+        """Take the center (m, world) and half the extents in the solid's own coordinates (m)."""
         self.center, self.half = center, half
-        self.reach = float(np.linalg.norm(half))  # m; of the sphere that holds the solid
+        self.reach = float(np.linalg.norm(half))  # m; radius of the bounding sphere
 
     def sdf(self, points: Points) -> Values:
-        """Exact signed distance (m) outside and inside."""
+        """Exact signed distance (m) outside (positive) and inside (negative)."""
         excess = self._coordinates(points) - self.half
-        beyond = np.maximum(excess, 0.0)
+        beyond = np.maximum(excess, 0.0)  # 0 in all coordinates of a point inside
         return np.sqrt(row_dot(beyond, beyond)) + np.minimum(_row_max(excess), 0.0)
 
     def hit(self, origins: Origins, directions: Points) -> Values:
         """Ray parameter at which a ray from outside enters the solid; inf for a miss.
 
-        In units of the direction's length: with camera directions of z = 1 it is the z-depth.
-        Rays that start inside count as misses, since cameras are in free space.
+        The point of entry is origin + parameter * direction; where directions have z = 1 in the
+        camera frame, the parameter is the z-depth. Rays that start inside count as misses, since
+        cameras are in free space.
         """
         near, far = self._crossing(origins, directions)
         return np.where((near <= far) & (near > 0.0), near, np.inf)
@@ -86,7 +95,10 @@ class Box(Solid):
     """A cuboid that may be turned about the vertical axis."""
 
     def __init__(self, center: Vector3, size: Vector3, yaw: float = 0.0) -> None:
-        """Of full edge lengths (m) along its own axes; yaw (rad) turns left, seen from above."""
+        """Take full edge lengths (m) along the box's own axes, and a yaw (rad).
+
+        A positive yaw turns it to the left, seen from above.
+        """
         super().__init__(np.asarray(center), np.asarray(size) / 2)
         sine, cosine = np.sin(yaw), np.cos(yaw)
         self._axes = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # world from box
@@ -99,7 +111,7 @@ class Box(Solid):
         return _slab_interval(offsets, directions @ self._axes, self.half)
 
     def normals(self, points: Points) -> Points:
-        """Unit normals of the face that lies nearest."""
+        """Unit normals of the face nearest to each point."""
         local = (points - self.center) @ self._axes
         axis = (np.abs(local) - self.half).argmax(axis=1)
         normals_local = np.eye(3)[axis] * np.where(local < 0, -1.0, 1.0)
@@ -107,12 +119,15 @@ class Box(Solid):
 
 
 class RoomShell(Box):
-    """Walls, floor and ceiling: the solid is everything outside a cuboid, normals point inwards."""
+    """Walls, floor and ceiling: a solid that is everything outside a cuboid.
+
+    Its normals point into the room.
+    """
 
     def __init__(self, center: Vector3, size: Vector3) -> None:
-        """Of full edge lengths (m)."""
+        """Take the center and the full edge lengths (m) of the cuboid."""
         super().__init__(center, size)
-        self.reach = np.inf  # all of space but the room: no bounding sphere holds it
+        self.reach = np.inf  # no bounding sphere holds all of space but the room
 
     def sdf(self, points: Points) -> Values:
         """Exact signed distance (m), positive inside the room."""
@@ -132,7 +147,7 @@ class Sphere(Solid):
     """A ball."""
 
     def __init__(self, center: Vector3, radius: float) -> None:
-        """Of a radius in metres."""
+        """Take the center (m, world) and the radius (m)."""
         super().__init__(np.asarray(center), np.array([radius]))
 
     def _coordinates(self, points: Points) -> Float[np.ndarray, "n 1"]:
@@ -151,7 +166,7 @@ class Cylinder(Solid):
     """A cylinder or rod with flat caps, in any direction."""
 
     def __init__(self, start: Vector3, end: Vector3, radius: float) -> None:
-        """Of the centers of both caps (m, world) and a radius (m)."""
+        """Take the centers of both caps (m, world) and the radius (m)."""
         along = np.asarray(end) - start
         length = float(np.linalg.norm(along))
         super().__init__((np.asarray(start) + end) / 2, np.array([radius, length / 2]))
@@ -175,7 +190,7 @@ class Cylinder(Solid):
         return np.maximum(near, caps[0]), np.minimum(far, caps[1])
 
     def normals(self, points: Points) -> Points:
-        """Unit normals of the side or the cap, whichever lies nearer."""
+        """Unit normals of the side or of a cap, whichever is nearer to each point."""
         along, across = self._split(points - self.center)
         beyond_side, beyond_cap = (self._coordinates(points) - self.half).T
         lengths = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)

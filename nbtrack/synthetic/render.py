@@ -14,12 +14,14 @@ Surfaces = Int[np.ndarray, "h w"]
 # Samples of a refined pixel, as offsets from its center in pixels: a 2x2 grid.
 _SUBPIXELS = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)]
 BASELINE = 0.075  # m between projector and camera (Khoshelham & Elberink 2012, Kinect v1)
-DISPARITY_STEP = 1 / 8  # px at 640 width: the sensor's sub-pixel resolution (the same source)
-DISPARITY_NOISE = 1 / 16  # px at 640 width: half a step of random error (the same source)
-LATERAL_NOISE = 0.5  # px at 640 width; Handa et al. 2014 (ICL-NUIM) shift lookups likewise
-RANGE = (0.4, 8.0)  # m; nearer and farther is invalid (our choice, near the sensor's limits)
-MAX_INCIDENCE = np.radians(82.0)  # dropped beyond; Nguyen et al. 2012: noise explodes there
-EDGE_JUMP = 1.0  # px of disparity at 640 width that make a depth edge (our choice)
+# Pixels (px) are those of an image 640 wide.
+DISPARITY_STEP = 1 / 8  # px; the sensor's sub-pixel resolution (the same source)
+DISPARITY_NOISE = 1 / 16  # px; std of the random error, half a step (the same source)
+LATERAL_NOISE = 0.5  # px; std of the shift of lookups, as in Handa et al. 2014 (ICL-NUIM)
+RANGE = (0.4, 8.0)  # m; other depths are invalid (our choice, near the sensor's limits)
+# Pixels seen at a larger angle from the normal are lost: noise explodes there (Nguyen et al. 2012).
+MAX_INCIDENCE = np.radians(82.0)
+EDGE_JUMP = 1.0  # px of disparity; a sharper bend is a depth edge (our choice)
 
 
 def render_frame(
@@ -27,15 +29,15 @@ def render_frame(
 ) -> tuple[ColorImage, Depth, Surfaces]:
     """Color (RGB), z-depth (m, float64, at pixel centers) and surface index of each pixel.
 
-    Pixels at the outline of a surface or in a steep pattern get four color samples instead of
-    one. Depth is never averaged: a mean over an edge is a point in mid-air. The pose has OpenCV
-    axes; the camera stands in free space.
+    The index is that of `Room.parts`. At the outline of a surface or in a steep pattern a pixel's
+    color is the mean of four samples. Depth is never averaged: a mean over an edge would be a point
+    in mid-air. The pose has OpenCV axes; the camera must be in free space.
     """
     height, width = intrinsics.height, intrinsics.width
     rows, columns = np.indices((height, width)).reshape(2, -1)
 
     def cast(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
-        """z-depth, color and surface at pixel columns u and rows v, which need not be whole."""
+        """z-depth (m), color and surface index at pixel columns u and rows v (real numbers)."""
         # `camera.pixel_directions` is single precision, too coarse for an exact depth.
         x = (u + 0.5 - intrinsics.cx) / intrinsics.fx
         y = (v + 0.5 - intrinsics.cy) / intrinsics.fy
@@ -45,7 +47,7 @@ def render_frame(
     depth, colors, index = cast(columns, rows)
     surfaces = index.reshape(height, width)
     rough = np.flatnonzero(_rough(colors.reshape(height, width, 3), surfaces))
-    # One call for all samples: culling and shading cost per call, not only per ray.
+    # One call casts all samples, since culling and shading have a cost per call.
     dx, dy = np.array(_SUBPIXELS).T[:, :, None]  # (4, 1): four samples of each rough pixel
     _, samples, _ = cast((columns[rough] + dx).ravel(), (rows[rough] + dy).ravel())
     colors[rough] = samples.reshape(4, -1, 3).mean(axis=0)
@@ -54,8 +56,8 @@ def render_frame(
 
 
 def _rough(image: Float[np.ndarray, "h w 3"], surfaces: Surfaces) -> Bool[np.ndarray, "h w"]:
-    """Pixels that differ from a neighbor in surface, or in color by more than 0.06 (our choice)."""
-    looks = np.dstack([image, surfaces])  # another surface differs by one or more
+    """Whether a pixel differs from a neighbor in surface, or in color by over 0.06 (our choice)."""
+    looks = np.dstack([image, surfaces])  # indices of two surfaces differ by 1 or more, also > 0.06
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))  # a pixel and its neighbors
     to_largest = cv2.dilate(looks, cross) - looks
     to_smallest = looks - cv2.erode(looks, cross)
@@ -65,12 +67,12 @@ def _rough(image: Float[np.ndarray, "h w 3"], surfaces: Surfaces) -> Bool[np.nda
 def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> Depth:
     """Depth (m, 0 = invalid) as a Kinect-like sensor would report it.
 
-    Lookups jitter sideways; disparity gets Gaussian noise and is rounded to an eighth of a pixel,
-    which makes depth steps and errors grow with the square of depth (2.7 cm steps at 3 m); pixels
-    at depth edges, at grazing incidence and out of range are lost. All pixel constants hold at a
-    width of 640; other widths are treated as the same camera's image made smaller. Where the exact
-    depth is 0 or not finite nothing is seen. `focal` (pixels) is that of this image; `rng` advances
-    by a fixed number of draws.
+    Each pixel looks up the depth at a place shifted by random noise. Its disparity gets Gaussian
+    noise and is rounded to an eighth of a pixel; this makes depth steps and errors grow with the
+    square of depth (2.7 cm steps at 3 m). Pixels at grazing incidence and out of range are lost,
+    and most of those at depth edges. Where the exact depth is 0 or not finite nothing is seen.
+    Constants in pixels are given for a width of 640, and scaled to that of this image. `focal`
+    (pixels) is that of this image. The number of draws from `rng` depends on the image's size only.
 
     Source: Khoshelham & Elberink, Sensors 2012 (disparity model); Nguyen et al., 3DIMPVT 2012
     (growth with incidence); Handa et al., ICRA 2014 (jitter, rounding). Dropout probability and
@@ -81,29 +83,30 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     seen = np.isfinite(depth) & (depth > 0)
     exact = np.where(seen, scale / np.where(seen, depth, 1.0), 0.0)
     lost = ~seen | _is_grazing(exact, focal)
-    # On planes, however slanted, disparity is affine: where it bends sharply is an edge.
+    # On a plane of any slant disparity is affine in pixel coordinates, and its second difference is
+    # 0. So a large second difference is an edge.
     bends = [np.abs(np.diff(exact, 2, axis=axis)) > EDGE_JUMP for axis in (0, 1)]
     is_edge = np.pad(bends[0], ((1, 1), (0, 0))) | np.pad(bends[1], ((0, 0), (1, 1)))
     lost |= is_edge & (rng.uniform(size=depth.shape) < 0.6)  # (our choice)
     shift = rng.normal(scale=LATERAL_NOISE / per_pixel, size=(2, *depth.shape))
     places = np.indices(depth.shape) + shift
-    # Interpolated: at a width of 96 the jitter is below a tenth of a pixel, and the nearest pixel
-    # would nearly always be the same one.
+    # Lookups interpolate: at a width of 96 the shift is below a tenth of a pixel, and would hardly
+    # ever change which pixel is the nearest.
     looked_up = map_coordinates(exact, places, order=1, mode="nearest")
     share_seen = map_coordinates(seen.astype(float), places, order=1, mode="nearest")
-    noisy = looked_up + rng.normal(scale=DISPARITY_NOISE, size=depth.shape)
-    disparity = np.rint(noisy / DISPARITY_STEP) * DISPARITY_STEP
-    measured = scale / np.maximum(disparity, DISPARITY_STEP)
-    lost |= (measured < RANGE[0]) | (measured > RANGE[1]) | (share_seen < 0.999)
-    return np.where(lost, 0.0, measured)
+    noisy_disparity = looked_up + rng.normal(scale=DISPARITY_NOISE, size=depth.shape)
+    disparity = np.rint(noisy_disparity / DISPARITY_STEP) * DISPARITY_STEP
+    noisy_depth = scale / np.maximum(disparity, DISPARITY_STEP)
+    lost |= (noisy_depth < RANGE[0]) | (noisy_depth > RANGE[1]) | (share_seen < 0.999)
+    return np.where(lost, 0.0, noisy_depth)
 
 
 def _is_grazing(disparity: Depth, focal: float) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose surface is seen at more than `MAX_INCIDENCE` from its normal.
+    """Whether a pixel sees its surface at more than `MAX_INCIDENCE` from the surface's normal.
 
-    On a plane disparity, like inverse depth, is a x + b y + c over normalised coordinates (x, y),
-    and (a, b, c) is parallel to the normal; so its product with the ray (x, y, 1) is disparity.
-    `focal` is in pixels of this image; the principal point is the image's middle.
+    On a plane the disparity at normalised coordinates (x, y) is a x + b y + c, and (a, b, c) is
+    parallel to the plane's normal. So the dot product of (a, b, c) and the ray (x, y, 1) is the
+    disparity. `focal` is in pixels of this image; the principal point is the image's middle.
     """
     height, width = disparity.shape
     gradient_y = focal * _smaller_difference(disparity)
@@ -117,22 +120,27 @@ def _is_grazing(disparity: Depth, focal: float) -> Bool[np.ndarray, "h w"]:
 
 
 def _smaller_difference(values: Depth) -> Depth:
-    """Difference to the next or from the previous row, whichever is less: no slope over an edge."""
+    """The difference to the next row or from the previous one, whichever has the smaller size.
+
+    So the slope of a pixel beside an edge is that of its own surface.
+    """
     steps = np.pad(np.diff(values, axis=0), ((1, 1), (0, 0)), mode="edge")
     return np.where(np.abs(steps[1:]) < np.abs(steps[:-1]), steps[1:], steps[:-1])
 
 
 def filter_depth(depth: Depth, sigma_px: float = 2.0, sigma_range: float = 0.1) -> Depth:
-    """Bilateral filter of depth (m); invalid pixels (0) stay invalid and influence none.
+    """Depth (m) after a bilateral filter; invalid pixels (0) stay invalid and influence no other.
 
-    Standard deviations are in space (pixels at a width of 640) and of depth differences (m). The
-    first shrinks with the image, but not below 0.7 pixels of it: small images are smoothed too.
+    `sigma_px` is the standard deviation in space, in pixels of an image 640 wide; in this image it
+    is at least 0.7 pixels, so that small images are smoothed, too. `sigma_range` (m) is that of
+    depth differences.
 
     Source: Neural RGB-D filters its noisy depth with these values; the lower limit is our choice.
     """
     sigma = max(sigma_px * depth.shape[1] / 640.0, 0.7)
     valid = depth > 0
-    # Far from every real depth an invalid pixel has no weight; zero would pull at 0.4 m.
+    # An invalid pixel has no weight if its value is far from every real depth. A value of 0 would
+    # be near enough to 0.4 m to have some.
     marked = np.where(valid, depth, -10.0 * sigma_range - 1.0).astype(np.float32)
     diameter = 2 * int(np.ceil(2 * sigma)) + 1  # pixels: two standard deviations to either side
     smooth = cv2.bilateralFilter(marked, diameter, sigma_range, sigma)
