@@ -10,9 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from recordings import N_FRAMES, WRITERS, change_camera, write_recording
-from test_faults import assert_refused
 
-from nbtrack.cli import main
 from nbtrack.machinery.errors import NbtrackError
 from nbtrack.recordings.reading import read_sequence
 from nbtrack.recordings.recording import open_recording
@@ -176,19 +174,6 @@ def test_one_line(whole, tmp_path: Path, capfd, format: str, case: str) -> None:
         assert len(message) < 690
         assert ": " in message  # what was found: what is allowed
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("format", WRITERS)
-def test_command(whole, tmp_path: Path, capfd, format: str) -> None:
-    """Catches tracebacks of the command, and Windows line ends or marks taken for numbers."""
-    folder = whole(format, tmp_path / "copy")
-    for path in [*folder.rglob("*.txt"), *folder.parent.rglob("*.json")]:
-        content = path.read_text().replace("\n", "\r\n")
-        path.write_bytes(b"\xef\xbb\xbf" + content.encode())
-    assert main(["data", "check", str(folder)]) == 0
-    assert capfd.readouterr().err == ""
-    toml("depth_scal = 1")(folder)
-    assert_refused(folder, capfd, ["data", "check", str(folder)], "depth_scal")
 
 
 def test_files_of_the_system(tmp_path: Path) -> None:
