@@ -21,13 +21,11 @@ from nbtrack.beyond.lm import LmTracker
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.fields import NetworkSettings, NeusMapping, field_class, make_field
 from nbtrack.machinery import launches
-from nbtrack.machinery.device import choose_device
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import naming_damaged
 from nbtrack.machinery.launches import Recording
 from nbtrack.mapping.fit import _Fit
-from nbtrack.tracking import AdamTracker, SdfTracker, StepBudget, Tracker, VrTracker
-from nbtrack.tracking.paper import AdamSettings
+from nbtrack.tracking import AdamTracker, SdfTracker, StepBudget, Tracker, VrTracker, track_sequence
 
 BOUNDS = SceneBounds((-1.2, -1.0, -1.4), (1.2, 1.0, 1.4))
 WAITS = "_local_scalar_dense", "nonzero", "masked_select", "is_nonzero"
@@ -94,8 +92,7 @@ def as_on_a_gpu(monkeypatch) -> None:
 class Own(AdamTracker):
     """What a user may write: distances alone, in quarters of a metre."""
 
-    name = "own"
-    Settings = AdamSettings
+    name, Settings = "own", SdfTracker.Settings
 
     def loss(self, T_world_camera, directions_camera, color, depth):
         points_camera = directions_camera * depth[:, None]
@@ -118,8 +115,7 @@ def tracked(kind: type[Tracker], field_name: str, device: torch.device = CPU) ->
     field = make_field(field_name, NetworkSettings(width=16), BOUNDS, seed=3).to(device)
     settings = kind.Settings(n_pixels=24)
     tracker = kind(field, SEQUENCE.T_world_camera[0], StepBudget(4), settings)
-    poses = [tracker.track(SEQUENCE[index]).T_world_camera for index in (1, 2, 3, 4)]
-    return np.stack(poses)
+    return track_sequence(tracker, SEQUENCE).T_estimated
 
 
 FIELDS = ("imap", "neus", "neus_plus")
@@ -222,10 +218,3 @@ def test_a_device_that_fails_is_no_damage(kind: type, tmp_path: Path) -> None:
     """Catches the advice to delete a sound file because a GPU was full."""
     with pytest.raises(kind), naming_damaged(tmp_path):
         raise kind("CUDA error: out of memory")
-
-
-def test_the_device_is_the_named_one(monkeypatch) -> None:
-    """Catches tests that run commands on a GPU because there is one."""
-    assert choose_device().type == "cpu"
-    monkeypatch.setenv("NBTRACK_DEVICE", "cpu:1")
-    assert choose_device() == torch.device("cpu:1")

@@ -1,8 +1,6 @@
 """Keys follow the code: what changes a result changes its key, what does not leaves it alone."""
 
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -50,37 +48,35 @@ def test_what_changes_a_key(package: Path, file: str, counts: bool) -> None:
     assert (key() != before) == counts
 
 
-SCRIPT = """
-import sys
-from nbtrack.provenance import code_fingerprint
-from nbtrack.tracking import SdfTracker
-class Mine(SdfTracker):
-    weight = {weight}
-class Promised(SdfTracker):
-    weight, version = {weight}, "1"
-class Later(Promised):
-    pass
-class Next(Promised):
-    version = "2"
-print(*map(code_fingerprint, (Mine, Promised, Later, SdfTracker, Next)))
-"""
+def classes_of_ones_own() -> tuple[type, ...]:
+    """Written anew, as by a cell that runs again."""
+
+    class Mine(SdfTracker):
+        pass
+
+    class Promised(SdfTracker):
+        version = "1"
+
+    class Later(Promised):
+        pass
+
+    class Next(Promised):
+        version = "2"
+
+    return Mine, Promised, Later, SdfTracker, Next
 
 
-def test_classes_of_ones_own_in_other_processes() -> None:
-    """Catches an edited class that is answered from the cache of another process, one that says its
-    version and is made anew, and a class that lives on the promise of its base."""
-    keys, told = [], []
-    for weight in (0.5, 0.6):
-        script = [sys.executable, "-c", SCRIPT.format(weight=weight)]
-        done = subprocess.run(script, capture_output=True, text=True)
-        keys.append(done.stdout.split())
-        told.append(done.stderr.splitlines())
+def test_classes_of_ones_own(capsys) -> None:
+    """Catches an edited class that is answered from the cache, one that says its version and is
+    made anew, and a class that lives on the promise of its base."""
+    keys = [map(provenance.code_fingerprint, classes_of_ones_own()) for _ in range(2)]
     mine, promised, later, ours, newer = map(set, zip(*keys, strict=True))
     assert len(mine | later) == 4
     assert len(promised) == len(ours) == len(newer) == 1
     assert len(mine | later | promised | ours | newer) == 7
-    assert [line.split()[5] for line in told[0]] == ["__main__.Mine", "__main__.Later"]
-    assert 'version = "1"' in told[0][0]
+    told = capsys.readouterr().err.splitlines()
+    assert [line.split()[5].split(".")[-1] for line in told] == 2 * ["Mine"] + 2 * ["Later"]
+    assert 'version = "1"' in told[0]
 
 
 def test_a_class_is_its_own_key(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -8,25 +8,24 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pandas as pd
 import pytest
 from recordings import write_recording
 from tiny import TINY, tiny_words
 
+from nbtrack import METHODS, load_preset, map_scene, map_scenes, open_scenes, read_run, track_scenes
 from nbtrack.beyond.correction import CorrectedField
 from nbtrack.beyond.points import PointCloud
 from nbtrack.cli import main
 from nbtrack.experiments.bench import default_pixels, measure_steps
-from nbtrack.experiments.grid import Execution, map_scene, map_scenes, read_run, track_scenes
+from nbtrack.experiments.jobs import Execution
 from nbtrack.experiments.map_jobs import MapJob
-from nbtrack.experiments.methods import METHODS, RATES_3_HZ, TABLE_1, TABLE_3, Method
-from nbtrack.experiments.presets import Preset, load_preset
-from nbtrack.experiments.scenes import Scene, open_scenes
+from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
+from nbtrack.experiments.presets import Preset
+from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob
-from nbtrack.machinery.errors import ConfigError, DataError, MissingError, NbtrackError
-from nbtrack.machinery.files import runs_folder
+from nbtrack.machinery.errors import ConfigError, DataError, MissingError
 from nbtrack.machinery.settings import with_settings
 from nbtrack.tables import table_1
 from nbtrack.tracking import make_tracker
@@ -49,16 +48,6 @@ def preset(cache: Path) -> Preset:
 @pytest.fixture(scope="module")
 def scenes(preset: Preset) -> list[Scene]:
     """Two rooms of a few pixels."""
-    return open_scenes(preset)
-
-
-@pytest.fixture
-def own_scenes(
-    cache: Path, scenes: list[Scene], preset: Preset, tmp_path: Path, monkeypatch
-) -> list[Scene]:
-    """The rooms in an otherwise empty cache, to be spoilt."""
-    shutil.copytree(cache / "rooms", tmp_path / "rooms")
-    monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path))
     return open_scenes(preset)
 
 
@@ -107,6 +96,8 @@ def test_keys_change_with_what_matters(preset: Preset, scenes: list[Scene], monk
     assert MapJob.of(scenes[0], "points", other).key == MapJob.of(scenes[0], "points", preset).key
     runs = [TrackJob(cells[0], scenes[0], "sdf", preset.tracking_of("sdf"), 2) for _ in range(2)]
     assert runs[0].key == runs[1].key
+    colored = TrackJob(cells[0], scenes[0], "sdf", other.tracking_of("sdf"), 2)
+    assert runs[0].key != colored.key
     monkeypatch.setattr("nbtrack.provenance.versions", lambda: {"torch": "another"})
     assert MapJob.of(scenes[0], "neus", preset).key != cells[0].key
     assert replace(runs[0]).key != runs[1].key
@@ -134,14 +125,6 @@ def test_budgets(preset: Preset, scenes: list[Scene]) -> None:
     clock = track_scenes(scenes[1:], ["sdf"], preset, [10], clock=True)
     assert "wall clock" in clock["budget"][0]
     assert clock["steps"].isna().all()
-
-
-def test_methods_carry_their_settings(preset: Preset, own_scenes: list[Scene]) -> None:
-    """Catches settings of a method that reach neither the run nor the map, or reach both."""
-    more = Method("more colour", "neus", "sdf", ("tracking.sdf.lambda_color=0.6",))
-    runs = track_scenes(own_scenes[1:], ["sdf", more], preset, [10])
-    assert runs["run"].nunique() == 2
-    assert len(list(own_scenes[1].folder.parents[2].glob("maps/*/map.safetensors"))) == 1
 
 
 def test_table_3(tmp_path: Path, coarse_methods: None, monkeypatch) -> None:
@@ -211,11 +194,11 @@ def test_a_recording_without_reference(preset: Preset, scenes: list[Scene], tmp_
     assert table_1(results).isna().sum(axis=None) == 2  # of the method, and of standing still
 
 
-def test_a_cached_run_is_checked(preset: Preset, scenes: list[Scene]) -> None:
+def test_a_cached_run_is_checked(cache: Path, preset: Preset, scenes: list[Scene]) -> None:
     """Catches a table that ends in a traceback, or as a whole, or holds a hole without a word, for
     a spoilt file of the cache."""
     run, _ = track_scenes(scenes, ["sdf"], preset, [10])["run"]
-    path = runs_folder() / "tracks" / run / "metrics.json"
+    path = cache / "tracks" / run / "metrics.json"
     sound = path.read_text()
     for spoilt in ("{}", sound.replace('"key": "', '"key": "0')):
         path.write_text(spoilt)
@@ -262,8 +245,9 @@ def test_table_2_measures_own_settings(tmp_path: Path, scenes: list[Scene], monk
 
 
 def test_wrong_scenes_are_told_first(preset: Preset, tmp_path: Path, monkeypatch) -> None:
-    """Catches a misspelt column that is left out in silence, a column counted as two seeds, and an
-    unhelpful error where the dataset was not downloaded."""
+    """Catches a misspelt column that is left out in silence, a column counted as two seeds, an
+    unhelpful error where the dataset was not downloaded, and minutes of mapping before a recording
+    turns out to be shorter than the part that the preset tracks."""
     for names, message in (
         ("['living_rom']", "no sequence 'living_rom': it is neither a folder nor .*did you mean"),
         ("['office', 'office']", "office, office: give at least one, and of one name only one"),
@@ -271,22 +255,17 @@ def test_wrong_scenes_are_told_first(preset: Preset, tmp_path: Path, monkeypatch
     ):
         with pytest.raises(ConfigError, match=message):
             open_scenes(with_settings(preset, f"scenes.names={names}"))
+    with pytest.raises(DataError, match=r"0 of the 5 .*scenes.track_frames"):
+        track_scenes(open_scenes(preset), ["sdf"], preset, frames="90:140", seeds=[7])
+    assert not MapJob.of(open_scenes(preset)[0], "neus", preset, seed=7).is_done
     monkeypatch.setenv("NBTRACK_DATA", str(tmp_path / "nothing"))
     with pytest.raises(MissingError, match=r"no folder .*breakfast_room.*data/README.md"):
         open_scenes(load_preset("paper"))
 
 
-def test_frames_that_a_scene_lacks_are_told_first(preset: Preset, scenes: list[Scene]) -> None:
-    """Catches minutes of mapping before a recording turns out to be shorter than the part that the
-    preset tracks."""
-    with pytest.raises(DataError, match=r"0 of the 5 .*scenes.track_frames"):
-        track_scenes(scenes, ["sdf"], preset, frames="90:140", seeds=[7])
-    assert not MapJob.of(scenes[0], "neus", preset, seed=7).is_done
-
-
-def test_a_scene_whose_tracked_part_has_no_pose(tmp_path: Path, capsys) -> None:
+def test_a_scene_whose_tracked_part_has_no_pose(cache: Path, tmp_path: Path, capsys) -> None:
     """Catches a whole scene whose results are lost, because the first frame of the one beside it,
-    on which steps are counted, has no pose."""
+    on which steps are counted, has no pose, or its map is damaged."""
     lost, whole = (write_recording("neural_rgbd", tmp_path / name) for name in ("lost", "whole"))
     rows = (lost / "poses.txt").read_text().splitlines()
     (lost / "poses.txt").write_text("\n".join([*(4 * ["nan nan nan nan"]), *rows[4:]]) + "\n")
@@ -298,34 +277,19 @@ def test_a_scene_whose_tracked_part_has_no_pose(tmp_path: Path, capsys) -> None:
     errors = pd.read_csv(tmp_path / "out/table_1.csv").set_index(["method", "scene"])["ate_m"]
     assert errors.notna().loc["NeuS with SDF", "whole"].all()
     assert errors.isna().loc["NeuS with SDF", "lost"].all()
-    (damaged,) = runs_folder().glob("maps/lost-*/map.safetensors")
+    (damaged,) = cache.glob("maps/lost-*/map.safetensors")
     damaged.write_bytes(b"")
     assert main([*command, *words]) == 2
     assert "map.safetensors is not a readable map file" in capsys.readouterr().err
     assert len(pd.read_csv(tmp_path / "out/table_2.csv")) == 1
 
 
-def test_a_damaged_scene_leaves_the_others(preset: Preset, own_scenes: list[Scene], capsys) -> None:
+def test_a_damaged_scene_leaves_the_others(preset: Preset, tmp_path: Path, capsys) -> None:
     """Catches one bad folder, or one scene that was not downloaded, that stops the whole grid."""
-    broken = own_scenes[0].folder.rename(own_scenes[0].folder.with_name("broken"))
-    (broken / "images" / "img2.png").unlink()
+    broken = write_recording("neural_rgbd", tmp_path / "broken")
+    (broken / "images/img2.png").unlink()
     names = f"scenes.names=['{broken}', 'office', 'kitchen']"
     assert [s.name for s in open_scenes(with_settings(preset, names))] == ["office"]
     errors = capsys.readouterr().err
     assert f"missing, and left out: {broken}, kitchen (" in errors
     assert "depth2.png" in errors
-
-
-def test_a_failed_map_tells_why_in_every_cell(preset: Preset, own_scenes: list[Scene]) -> None:
-    """Catches a reason that is lost between the map that failed and the runs that need it."""
-    for depth in (own_scenes[0].folder / "depth_filtered").iterdir():
-        cv2.imwrite(str(depth), 0 * cv2.imread(str(depth), cv2.IMREAD_UNCHANGED))
-    execution = Execution(workers=1, keep_going=True)
-    results = track_scenes(own_scenes, ["sdf"], preset, execution=execution)
-    failed = results[results["scene"] == "living_room"]
-    assert len(failed) == 2
-    assert failed["failure"].str.contains("no pixel of living_room has a depth").all()
-    assert failed["ate_m"].isna().all()
-    assert results.loc[results["scene"] == "office", "ate_m"].notna().all()
-    with pytest.raises(NbtrackError, match="no pixel"):
-        track_scenes(own_scenes, ["sdf"], preset)
