@@ -60,13 +60,6 @@ def test_track_writes_what_it_promises(tmp_path: Path, capsys) -> None:
     assert len(rows) == 6
 
 
-def test_tracking_command_reads_any_format(tmp_path: Path, capsys) -> None:
-    """Catches a --format that the command line drops on its way to map and track."""
-    folder = write_recording("tum", tmp_path / "r")
-    assert main(track(folder, "--format", "tum")) == 0
-    assert_refused(tmp_path, capsys, track(folder, "--format", "plain"), "no colour images ")
-
-
 def test_a_traceback_for_who_asks(tmp_path: Path, capsys, monkeypatch) -> None:
     """Catches a mistake of the program that looks like one of a file, and tracebacks unasked."""
     wrong = ["data", "check", str(tmp_path / "nothing")]
@@ -98,12 +91,14 @@ def test_a_map_is_taken_with_the_settings_that_made_it(tmp_path: Path, capsys, m
     assert_refused(tmp_path, capsys, [*given, "--config", str(tmp_path / "own.toml")], ", not 77")
 
 
-def test_times_are_the_recordings_own(tmp_path: Path) -> None:
+def test_times_are_the_recordings_own(tmp_path: Path, capsys) -> None:
     """Catches frame numbers in place of times, which evaluation tools cannot associate with the
-    recording's own reference; also after a conversion, and with a declared frame rate."""
+    recording's own reference; also after a conversion, and with a declared frame rate; and a
+    --format that the command line drops on its way to map and track."""
     folder, out = write_recording("tum", tmp_path / "r"), tmp_path / "result"
     times = open_recording(folder).times
-    assert main(track(folder, "--out", str(out))) == 0
+    assert_refused(tmp_path, capsys, track(folder, "--format", "plain"), "no colour images ")
+    assert main(track(folder, "--out", str(out), "--format", "tum")) == 0
     found, _ = read_tum(out / "trajectory.txt")
     assert found.tolist() == times[1:].tolist()
     assert found[0] > 1.3e9

@@ -52,7 +52,7 @@ class Square(Job):
             raise DataError(f"depth{self.number}.png is empty")
         if self.how == "deadly":
             os._exit(1)
-        end = time.monotonic() + (2.5 if self.how == "slowly" else 0.0)
+        end = time.monotonic() + (1.5 if self.how == "slowly" else 0.0)
         while time.monotonic() < end:
             report(0.5, "half")
             time.sleep(0.1)
