@@ -5,7 +5,7 @@ import pickle
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -123,13 +123,11 @@ def test_right_in_another_form() -> None:
     assert SceneBounds(*np.array(UNIT)) == SceneBounds(*UNIT)
 
 
-@contextmanager
-def default_dtype() -> Any:
+def default_dtype() -> ExitStack:
     torch.set_default_dtype(torch.float64)
-    try:
-        yield
-    finally:
-        torch.set_default_dtype(torch.float32)
+    stack = ExitStack()
+    stack.callback(torch.set_default_dtype, torch.float32)
+    return stack
 
 
 MODES: dict[str, Callable[[], AbstractContextManager]] = {

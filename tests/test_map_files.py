@@ -1,6 +1,5 @@
 """Maps as one file, what else they are exported to, and tracking in a map made earlier."""
 
-import io
 import json
 import os
 import pickle
@@ -92,7 +91,6 @@ MAP_CONTENT: dict[str, tuple[str, Any, str]] = {
     "a weight less": ("mlp.head.bias", GONE, "Missing key"),
     "other shape": (WEIGHT, lambda w: w[:3].contiguous(), "size mismatch"),
     "changed weights": (WEIGHT, lambda w: w + 1e-6, CHANGED),
-    "other width": ("made/network/width", 17, "size mismatch"),
     "width as text": ("made/network/width", "16", OTHER),
     "unknown setting": ("made/network/depth", 9, "unexpected keyword"),
     "one corner": ("bounds", [[0.0, 0.0, 0.0]], "not enough values"),
@@ -101,7 +99,6 @@ MAP_CONTENT: dict[str, tuple[str, Any, str]] = {
     "no digest": ("digest", GONE, CHANGED),
     # With a digest that is right.
     "origin of two": ("made/origin", [0.0, 0.0], "a number of its header"),
-    "seconds of NaN": ("made/seconds", NAN, "a number of its header"),
     "a scene of control characters": ("made/scene", "a\x1b[2Jb", "can be printed"),
     "a corner of NaN": ("bounds", [[NAN, 0.0, 0.0], [1.0] * 3], "are no bounds"),
     "weights of NaN": (WEIGHT, lambda w: w * NAN, "is not finite"),
@@ -143,22 +140,14 @@ class Bomb:
         return os.system, ("touch exploded",)
 
 
-def _torch_file(content: Any) -> bytes:
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    return buffer.getvalue()
-
-
 MAP_BYTES: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda sound: b"",
-    "half": lambda sound: sound[: len(sound) // 2],
     "a bit flipped": lambda s: s[:-90] + bytes([s[-90] ^ 1]) + s[-89:],
     "an endless header": lambda sound: b"\xff" * 8 + sound[8:],
     "another's header": lambda sound: save({"a": torch.ones(3)}, {"format": "pt"}),
     "a header that is no JSON": lambda sound: save({}, {"nbtrack map": "{"}),
     "a header that is a list": lambda sound: save({}, {"nbtrack map": "[1, 2]"}),
-    "a pickled bomb": lambda sound: pickle.dumps(Bomb()),
-    "a zipped bomb": lambda sound: _torch_file(Bomb()),
+    "a bomb": lambda sound: pickle.dumps(Bomb()),
 }
 
 
@@ -212,7 +201,8 @@ def test_a_frame_without_depth_tells_nothing() -> None:
 
 def test_a_file_gives_the_same_trajectory(work: Path, tmp_path: Path, monkeypatch) -> None:
     """Catches weights that lose a bit on the way, a file that needs what is not in it, a folder of
-    twice the size, and a map's parts that are not written together."""
+    twice the size, and a map's parts that are not written together; of an exported trajectory
+    another order of numbers, lost digits, and inverted poses."""
     monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
     assert main([*GIVEN, "room", "--out", "again"]) == 0
     for name in ("trajectory.txt", "groundtruth.txt"):
@@ -220,14 +210,9 @@ def test_a_file_gives_the_same_trajectory(work: Path, tmp_path: Path, monkeypatc
     metrics = json.loads((work / "again/metrics.json").read_text())
     assert (metrics["map_record"]["scene"], metrics["field"]) == ("living_room", "neus")
     assert metrics["map_record"]["network"]["width"] == 16
-    names = {path.name for path in (work / "map").iterdir()}
-    assert names == {MAP_FILE, "history.csv", "mesh.ply", MARK}
+    assert {*os.listdir("map")} == {MAP_FILE, "history.csv", "mesh.ply", MARK}
     assert (work / "room").read_bytes() == (work / "map" / MAP_FILE).read_bytes()
     assert len(read_map("map").history) == 30
-
-
-def test_trajectories(work: Path) -> None:
-    """Catches another order of numbers, lost digits, and inverted poses."""
     assert main(["export", "run", "--to", "kitti", "kitti"]) == 0
     expected = read_tum(work / "run/trajectory.txt")[1][:, :3]
     np.testing.assert_allclose(np.loadtxt("kitti").reshape(-1, 3, 4), expected, atol=1e-15)

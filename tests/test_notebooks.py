@@ -50,14 +50,6 @@ def test_nothing_of_one_machine(cells: list[dict[str, Any]]) -> None:
         assert not found, cell["source"]
 
 
-def test_no_two_tables_share_an_id(cells: list[dict[str, Any]]) -> None:
-    """Catches tables that colour each other: a page's style sheets go by the id of a table."""
-    outputs = [output for cell in cells for output in cell.get("outputs", [])]
-    pages = ["".join(output.get("data", {}).get("text/html", "")) for output in outputs]
-    ids = re.findall(r'<table id="(.*?)"', " ".join(pages))
-    assert len(set(ids)) == len(ids)
-
-
 # Numbers in the prose of the notebooks that judge, which no cell of theirs shows, and their source.
 FACTS = {*pd.read_csv(Path(__file__).parent / "data/prose_numbers.csv", dtype=str)["number"]}
 NUMBER = r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?![\w.]*\d)"

@@ -28,7 +28,6 @@ from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.machinery import files
 from nbtrack.machinery.device import threads
 from nbtrack.machinery.errors import DataError
-from nbtrack.recordings.images import images_of
 from nbtrack.recordings.pose_files import read_tum
 from nbtrack.recordings.reading import read_frames
 from nbtrack.recordings.recording import open_recording
@@ -144,9 +143,6 @@ def test_an_image_mended_in_place_counts(tmp_path: Path, kind: str) -> None:
     cv2.imwrite(str(image), pixels, uncompressed)
     shutil.copytree(tmp_path / "rec", tmp_path / "copy")
     assert Scene("rec", tmp_path / "copy").fingerprint == before
-    poses = tmp_path / "rec/trajectory.txt"
-    poses.write_text(poses.read_text().replace(" 0.", " 0.1", 1))
-    assert Scene("rec", tmp_path / "rec").fingerprint != before
 
 
 def test_a_room_is_made_anew_where_its_maker_changes(monkeypatch) -> None:
@@ -166,10 +162,7 @@ def test_flagged_and_wrong_frames_are_told_apart(work: Path, capsys) -> None:
     metrics = json.loads((work / "by_lm/metrics.json").read_text())
     flags = pd.read_csv(work / "by_lm/frames.csv")["lost"]
     assert metrics["flagged_frames"] == flags.sum()
-    for name, says in (
-        ("lost", "of the frames, off by"),
-        ("flagged", "of the frames lost, as the"),
-    ):
+    for name, says in (("lost", "of the frames, off by"), ("flagged", "of the frames lost, as")):
         assert f"{metrics[f'{name}_frames'] / metrics['frames']:.1%} {says}" in printed
     assert main([*GIVEN, "map"]) == 0
     assert "tracker itself" not in capsys.readouterr().out
@@ -239,17 +232,14 @@ def test_track_reads_a_file_once(tmp_path: Path, monkeypatch) -> None:
     """Catches a check, an estimate of the unit, a digest, a map, a run or a picture that opens or
     decodes for itself what another part of the command has read."""
     folder = write_recording("neural_rgbd", tmp_path / "room")
-    decoded, load_end = [], PngImageFile.load_end
-    monkeypatch.setattr(
-        PngImageFile, "load_end", lambda image: decoded.append(image.mode) or load_end(image)
-    )
+    decoded, end = [], PngImageFile.load_end
+    monkeypatch.setattr(PngImageFile, "load_end", lambda i: decoded.append(i.mode) or end(i))
     _opened.clear()
-    words = ["--field", "neus", "--tracker", "sdf", "--steps", "2", "--out", str(tmp_path / "run")]
+    words = ["--method", "sdf", "--steps", "2", "--out", str(tmp_path / "run")]
     assert main(["track", str(folder), *words, *tiny_words()]) == 0
-    files = [*folder.glob("images/*.png"), *folder.glob("depth_filtered/*.png")]
-    assert {_opened[str(file)] for file in files} == {1}
-    assert decoded.count("I;16") == N_FRAMES
-    assert len(decoded) == len(files) == 2 * N_FRAMES
+    files = [str(file) for file in folder.glob("*/*.png")]
+    assert {_opened[file] for file in files} == {1}
+    assert len(decoded) == len(files) == 2 * decoded.count("I;16")
 
 
 @pytest.mark.parametrize("format", ["neural_rgbd", "tum"])  # depth in mm, and in another unit
@@ -262,5 +252,5 @@ def test_shared_frames_are_those_read_anew(format: str, tmp_path: Path) -> None:
         some = read_frames(recording, np.array(ids), needs_poses=False)
         assert (some.colors == whole.colors[ids]).all()
         assert (some.depths_mm == whole.depths_mm[ids]).all()
-    kept, _ = images_of(recording).kept(np.arange(N_FRAMES))
-    assert np.shares_memory(read_frames(recording, slice(1, None, 2)).colors, kept)
+    whole, part = (read_frames(recording, slice(first, None, 2)) for first in (1, 3))
+    assert np.shares_memory(whole.colors, part.colors)
