@@ -31,6 +31,7 @@ from nbtrack.machinery.settings import read_setting
 from nbtrack.mapping.files import MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.tracking import StepBudget, make_budget, make_tracker, paper_steps, track_sequence
+from nbtrack.tracking.methods import METHODS, find_methods
 from nbtrack.tracking.paper import SdfSettings, SdfTracker
 
 SEQUENCE, CAMERA = walk(4), walk(1).intrinsics
@@ -63,6 +64,7 @@ def poses_with(pose: Any) -> np.ndarray:
     return poses
 
 
+SDF = METHODS["sdf"]
 DENSITY = make_field("imap", NETWORK, SceneBounds(*UNIT), 0)
 REFUSED: dict[str, Callable[[], object]] = {
     "zero pose": lambda: tracker(pose=np.zeros((4, 4))),
@@ -101,6 +103,9 @@ REFUSED: dict[str, Callable[[], object]] = {
     "steps by the clock": tracked_with(steps=3, clock=True),
     "a rate for rates": tracked_with(rates_hz=10),
     "a name for names": tracked_with(methods="huber"),
+    "a number for a method": lambda: find_methods([3]),
+    "a list for a method": lambda: find_methods([["sdf"]]),
+    "a text for settings": lambda: find_methods([replace(SDF, settings="tracking.sdf.seed=1")]),
     "fewer tracked": lambda: nbtrack.track_scenes(**scenes(), tracked=2 * scenes()["scenes"]),
 }
 
@@ -121,6 +126,8 @@ def test_right_in_another_form() -> None:
     foreign = replace(backwards, depths_mm=backwards.depths_mm.astype(">u2"))
     assert mapped(foreign).key == mapped(backwards.select(np.arange(4))).key
     assert SceneBounds(*np.array(UNIT)) == SceneBounds(*UNIT)
+    listed = replace(SDF, settings=["tracking.sdf.n_pixels=16"])
+    assert find_methods([listed, SDF, "sdf", listed]) == [listed, SDF]
 
 
 def default_dtype() -> ExitStack:

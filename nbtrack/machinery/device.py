@@ -12,17 +12,22 @@ from torch import Tensor
 
 from nbtrack.machinery.errors import ConfigError, OutOfMemory
 
-# Below this width matrix products are too small to share: on two cores, two threads were slower
-# than one. Rooms and methods then run side by side in processes instead.
+# Below this width of a network (units a layer) its matrix products are too small to share among
+# threads: on two cores, two threads were slower than one. The cores are then used by processes,
+# which handle several rooms and methods side by side.
 _WIDTH_FOR_THREADS = 192
-if hasattr(os, "register_at_fork"):  # a child has none of OpenMP's threads, and would wait for them
+# A forked child would wait for ever for the OpenMP threads of its parent, which it does not have.
+# With one thread it waits for none.
+if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def choose_device() -> torch.device:
-    """The device that `NBTRACK_DEVICE` names, else the accelerator there is, else the CPU.
+    """Choose the device that computes.
 
-    Raises ConfigError, saying what there is, if the named device is unknown, or not there.
+    It is the one that the environment variable `NBTRACK_DEVICE` names. Without this variable it is
+    the machine's accelerator, or the CPU of a machine that has none. Raises ConfigError, which
+    lists the devices of this machine, if the named one is unknown or not there.
     """
     accelerator = torch.accelerator.current_accelerator(check_available=True)
     name = os.environ.get("NBTRACK_DEVICE")
@@ -39,16 +44,17 @@ def choose_device() -> torch.device:
 
 @cache
 def constant(numbers: tuple, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Numbers on a device, copied there once: in every step a copy would wait for the device.
+    """A tensor of the numbers on a device; equal calls return the same tensor.
 
-    They are made outside of inference mode, whose tensors would serve no gradient later.
+    A copy to a GPU waits until the GPU has done its work, so steps of a loop must not make one.
+    The tensor is made outside of inference mode, because autograd refuses tensors made inside.
     """
     with torch.inference_mode(False):
         return torch.tensor(numbers, dtype=dtype, device="cpu").to(device)
 
 
 def device_name(device: torch.device) -> str:
-    """What to call the device in results: the GPU's name, or the processor's and its cores."""
+    """The name of a device for results: the GPU's, or the processor's with its usable cores."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     if device.type == "mps":
@@ -56,12 +62,12 @@ def device_name(device: torch.device) -> str:
     name = platform.processor() or platform.machine()
     with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
         models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-        name = next(models, name)  # the first core's
+        name = next(models, name)  # the file has a line for each core; the first is enough
     return f"{name}, {usable_cores()} cores"
 
 
 def usable_cores() -> int:
-    """The CPU cores that this process may use; a scheduler may leave it fewer than there are."""
+    """How many CPU cores this process may use; a scheduler may allow fewer than there are."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -69,14 +75,15 @@ def usable_cores() -> int:
 
 @contextlib.contextmanager
 def usual_modes() -> Iterator[None]:
-    """Run a block with gradients, without autocast, on the CPU where no device is named.
+    """Run a block with gradients, without autocast, and with the CPU as the default device.
 
-    A program that calls this package may have set other modes, which hold again after the block.
-    The default dtype is not among them: it is one of the whole process, not of the thread. Dtypes
-    are named where tensors are made.
+    A program that calls this package may have set other modes; they are restored after the block.
+    The default dtype stays as it is, because it holds for all threads of the process. For this
+    reason the package names the dtype wherever it makes a tensor.
     """
-    is_usual = torch.get_default_device().type == "cpu"  # then no context, which slows every call
+    is_usual = torch.get_default_device().type == "cpu"
     with (
+        # The context of a device slows every call of PyTorch, so it is left out where it can be.
         contextlib.nullcontext() if is_usual else torch.device("cpu"),
         torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False),
         torch.inference_mode(False), torch.enable_grad(),
@@ -85,24 +92,25 @@ def usual_modes() -> Iterator[None]:
 
 
 def matrix_products(tf32: bool) -> contextlib.AbstractContextManager[None]:
-    """Run a block with matrix products in single precision, or on NVIDIA's GPUs in TF32.
+    """Run a block with matrix products in full single precision, or with `tf32` in TF32.
 
-    TF32 keeps 10 of the mantissa's 23 bits, and is several times as fast.
+    Only NVIDIA's GPUs have TF32. It keeps 10 of the mantissa's 23 bits and is several times as
+    fast.
     """
     return _changed("float32_matmul_precision", "high" if tf32 else "highest")
 
 
 def threads(number: int) -> contextlib.AbstractContextManager[None]:
-    """Run a block with so many CPU threads."""
+    """Run a block with this number of CPU threads."""
     return _changed("num_threads", number)
 
 
 @contextlib.contextmanager
 def _changed(name: str, value: Any) -> Iterator[None]:
-    """Run a block with a global setting of PyTorch at another value, and restore it afterwards.
+    """Run a block with the global setting `name` of PyTorch at `value`; restore it afterwards.
 
-    Where the setting has that value already, perhaps by the block of another thread, nothing is set
-    or restored. So of two such blocks the first to begin restores what was before both.
+    If the setting has this value already, the block neither sets nor restores it: the value may
+    come from a block that runs in another thread, and that block will restore the original.
     """
     getter, setter = getattr(torch, f"get_{name}"), getattr(torch, f"set_{name}")
     before = getter()
@@ -118,10 +126,10 @@ def _changed(name: str, value: Any) -> Iterator[None]:
 
 @contextlib.contextmanager
 def suited_to(width: int, tf32: bool) -> Iterator[None]:
-    """Run a block with `matrix_products`, and the number of CPU threads that suits a network.
+    """Run a block with the CPU threads that suit a network, and with `matrix_products(tf32)`.
 
-    Narrow networks get one, since sharing their small matrix products takes longer than it saves;
-    wide ones get as many as the process already has.
+    A network with layers of few units (`width`) gets one thread, since sharing its small matrix
+    products takes longer than it saves. A wide one gets as many as the process already has.
     """
     number = 1 if width < _WIDTH_FOR_THREADS else torch.get_num_threads()
     with threads(number), matrix_products(tf32):
@@ -129,20 +137,24 @@ def suited_to(width: int, tf32: bool) -> Iterator[None]:
 
 
 def has_room_for(device: torch.device, n_bytes: int) -> bool:
-    """Whether a GPU can hold `n_bytes` more and then still has as much free for the work itself."""
+    """Whether a GPU has room for `n_bytes` of data and as much again for the work on them.
+
+    Always true for the CPU and for Apple's GPUs, which use the memory that the data are in already.
+    """
     if device.type != "cuda":
-        return True  # the CPU's and Apple's memory is the one that the data are in already
+        return True
     free_bytes, _ = torch.cuda.mem_get_info(device)
-    # What torch's allocator keeps without using it is free as well.
+    # PyTorch's allocator holds memory in reserve, which the driver does not count as free.
     unused_bytes = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return 2 * n_bytes < free_bytes + unused_bytes
 
 
 @contextlib.contextmanager
 def advise_on_memory(setting: str) -> Iterator[None]:
-    """Turn running out of memory, the device's or the host's, into an OutOfMemory in one line.
+    """Run a block; where the device or the host runs out of memory, raise OutOfMemory in one line.
 
-    It names the setting to lower: what decides on the memory, with its present value.
+    `setting` tells in the message what to lower, with its present value, as
+    "tables.pixels.vr=1024".
     """
     try:
         yield
@@ -150,7 +162,7 @@ def advise_on_memory(setting: str) -> Iterator[None]:
         # The RuntimeErrors of CUDA, the CPU's allocator and MPS are known by their texts.
         words = ("can't allocate memory", "not enough memory", "out of memory")
         lacks_memory = isinstance(error, MemoryError) or any(word in str(error) for word in words)
-        # An OutOfMemory comes from a block within this one, which has named its own setting.
+        # An OutOfMemory comes from an inner `advise_on_memory`, which has named its own setting.
         if isinstance(error, OutOfMemory) or not lacks_memory:
             raise
         advice = "lower it with --set, or take fewer frames, as with --frames ::2"

@@ -32,16 +32,21 @@ class OutOfMemory(NbtrackError, MemoryError):
 
 
 def look_up(what: str, name: str, known: Mapping[str, Entry]) -> Entry:
-    """The entry of a name. Raises ConfigError, naming the nearest, for an unknown one."""
+    """The entry of `known` that has this name.
+
+    Raises ConfigError, which suggests the nearest name, for an unknown one. `what` says in the
+    message what kind of name it is.
+    """
     if not isinstance(name, str) or name not in known:
         raise ConfigError(f"unknown {what} {str(name)[:40]!r}: {nearest_name(str(name), [*known])}")
     return known[name]
 
 
 def check_lists(at_least: int = 0, **arguments: object) -> None:
-    """Raises ConfigError for an argument that is no list of at least so many entries.
+    """Raises ConfigError for an argument that is no list of at least `at_least` entries.
 
-    A text, a single thing or a dictionary is none, nor what can be gone through only once.
+    Tuples and arrays are lists here. Texts, dictionaries, single objects and iterators are not.
+    The keyword of each argument is its name in the message.
     """
     for name, value in arguments.items():
         is_list = hasattr(value, "__getitem__") and hasattr(value, "__len__")
@@ -52,32 +57,35 @@ def check_lists(at_least: int = 0, **arguments: object) -> None:
 
 
 def look_up_kind(what: str, name: str, known: Mapping[str, type], needed: Sequence[str]) -> type:
-    """The class that is known by a name, checked.
+    """The class that is registered in `known` by a name, after a check that it can be used.
 
-    Raises ConfigError for an unknown name, for a class whose own `name` is another, and for one
-    that lacks a `needed` attribute or an abstract method.
+    Raises ConfigError for an unknown name; for a class that lacks an attribute in `needed`, or
+    leaves a method abstract; and for a class whose attribute `name` differs from the given name.
     """
     kind = look_up(what, name, known)
-    lacks = [word for word in needed if not hasattr(kind, word)]
+    lacks = [attribute for attribute in needed if not hasattr(kind, attribute)]
     lacks += sorted(getattr(kind, "__abstractmethods__", ()))
     if lacks:
         raise ConfigError(f"{what} {name!r} lacks {', '.join(lacks)}: give them to {kind.__name__}")
-    own = getattr(kind, "name", None)
-    if own != name:
-        raise ConfigError(f"{what} {name!r} calls itself {own!r}: give the class this name")
+    class_name = getattr(kind, "name", None)
+    if class_name != name:
+        raise ConfigError(f"{what} {name!r} calls itself {class_name!r}: give the class this name")
     return kind
 
 
 def nearest_name(text: str, allowed: list[str]) -> str:
-    """A hint for a misspelt name: the nearest one, then all that are allowed, or of many a few.
+    """A hint for a misspelt name: the nearest allowed name, then all allowed names.
+
+    Of more than 40 allowed names it lists the nearest ones, or a few if none is near.
 
     >>> nearest_name("imapp", ["imap", "neus"])
     "did you mean 'imap'? Allowed: imap, neus"
     """
-    small = {name.lower(): name for name in allowed}  # SDF is near sdf
-    near = difflib.get_close_matches(text.lower(), small, n=5, cutoff=0.5)
-    close = [small[name] for name in near]
+    # Compared in lower case, so that `SDF` is near `sdf`.
+    allowed_of = {name.lower(): name for name in allowed}
+    matches = difflib.get_close_matches(text.lower(), allowed_of, n=5, cutoff=0.5)
+    close = [allowed_of[match] for match in matches]
     hint = f"did you mean '{close[0]}'? " if close else ""
-    if len(allowed) > 40:  # a message lists no more
+    if len(allowed) > 40:
         return f"{hint}Allowed are {len(allowed)} names, such as {', '.join(close or allowed[:5])}"
     return f"{hint}Allowed: {', '.join(allowed)}"

@@ -27,8 +27,9 @@ from nbtrack.machinery.settings import as_dict
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
 PACKAGE = Path(nbtrack.__file__).resolve().parent
-# Errors in reading a file that do not come from its content: they are a program's mistakes, or a
-# device's, or say already what is wrong. All others count as a damaged file.
+# An error of one of these types, raised while a file is read, does not mean that the file is
+# damaged: it is a mistake in the program, a failure of memory or device, or an NbtrackError, whose
+# message says already what is wrong. Errors of all other types mean that the file is damaged.
 _NOT_BY_CONTENT = (
     NbtrackError, MemoryError, torch.OutOfMemoryError, torch.AcceleratorError, NameError,
     AttributeError, AssertionError,
@@ -37,50 +38,57 @@ _NO_LOCKS = errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP  # of file systems with
 
 
 def project_folder() -> Path:
-    """The checkout that the package lies in; the current folder where it is installed elsewhere."""
+    """The checkout of nbtrack; the current folder if the package is installed without one."""
     return PACKAGE.parent if (PACKAGE.parent / "pyproject.toml").is_file() else Path.cwd()
 
 
 def absolute(path: Path | str) -> Path:
-    """An absolute path without `~` and `..`. Raises MissingError for `~` and no user's name.
+    """An absolute path without `~` and `..`.
 
-    Links are not followed: a recording has the name by which it is given, also that of a link.
+    Links are not followed, so that a recording that is given by a link has the name of the link.
+    Raises MissingError for `~` with a name that no user has.
     """
     expanded = os.path.expanduser(path)
-    if expanded.startswith("~"):
+    if expanded.startswith("~"):  # Python leaves the `~` of an unknown user as it is
         raise MissingError(f"{path}: there is no such user; a folder of this name is ./{path}")
     return Path(os.path.abspath(expanded))
 
 
 def resolved(path: Path | str) -> Path:
-    """An absolute path without links or `~`. A loop of links fails only where it is opened."""
+    """An absolute path without links or `~`.
+
+    Links that lead in a circle raise no error here, but when the path is opened.
+    """
     return Path(os.path.realpath(absolute(path)))
 
 
 def runs_folder() -> Path:
-    """Cache of rooms, maps and trajectories: `NBTRACK_RUNS`, else `runs/` of the project."""
+    """The cache of rooms, maps and trajectories: `NBTRACK_RUNS`, else `runs/` of the project."""
     return resolved(os.environ.get("NBTRACK_RUNS") or project_folder() / "runs")
 
 
 def data_folder() -> Path:
-    """Folder with downloaded scenes: `NBTRACK_DATA`, else `data/` of the project."""
+    """The folder with downloaded scenes: `NBTRACK_DATA`, else `data/` of the project."""
     return resolved(os.environ.get("NBTRACK_DATA") or project_folder() / "data")
 
 
 def tables_folder() -> Path:
-    """The committed evidence: `paper_tables/` of the project. No command writes there by itself."""
+    """The folder of the committed results, `paper_tables/`; commands write there only if told."""
     return project_folder() / "paper_tables"
 
 
 def _number(digits: str) -> float | int:
-    """A float where that is exact, so that other whole numbers are not taken for one another."""
+    """A whole number of a JSON text as a float, so that 30 and 30.0 get one fingerprint.
+
+    It stays an int where the float would be rounded: two numbers must not become the same one.
+    """
     return float(digits) if float(digits) == int(digits) else int(digits)
 
 
 def fingerprint(*parts: Any) -> str:
     """Twelve hexadecimal digits that change with any of the parts (plain values or configs).
 
-    Numbers count by their value: 30 is 30.0.
+    Equal numbers of different types, as 30 and 30.0, give the same digits.
     """
     as_given = json.dumps([as_dict(p) if dataclasses.is_dataclass(p) else p for p in parts])
     plain = json.dumps(json.loads(as_given, parse_int=_number), sort_keys=True)
@@ -96,20 +104,20 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def loaded_checkpoint(path: Path) -> Iterator[dict[str, Any]]:
-    """What `save_checkpoint` wrote, on the CPU, for a `with` block that restores from it.
+    """Give a `with` block the state that `save_checkpoint` wrote, its tensors on the CPU.
 
-    Raises DataError if the file is damaged. An error of the block becomes a DataError too: then the
-    content is not what the block needs.
+    Raises DataError if the file is damaged. An error within the block becomes a DataError too: it
+    means that the file does not hold what the block restores from it.
     """
     with naming_damaged(path):
-        with zipfile.ZipFile(path) as archive:  # torch checks no checksums
-            if damaged := archive.testzip():
+        with zipfile.ZipFile(path) as archive:
+            if damaged := archive.testzip():  # compares the checksums, which `torch.load` does not
                 raise ValueError(f"{damaged} is not what was written")
         yield torch.load(path, map_location="cpu", weights_only=True)
 
 
 def digest_of(plain: Any, tensors: Mapping[str, torch.Tensor]) -> str:
-    """SHA-256 over plain values and tensors, whatever the order of names."""
+    """SHA-256 (hexadecimal) over plain values and named tensors, whatever the order of names."""
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
     for name, tensor in sorted(tensors.items()):
         content = tensor.detach().cpu().contiguous().numpy().tobytes()
@@ -120,26 +128,29 @@ def digest_of(plain: Any, tensors: Mapping[str, torch.Tensor]) -> str:
 class Checkpoint:
     """The file from which a killed run goes on; it is written every few seconds.
 
-    Where there is no path, nothing is written or taken up.
+    With the path None nothing is written, and every run begins anew.
     """
 
     def __init__(self, path: Path | None, recipe: dict[str, Any]) -> None:
-        """`recipe` is what the run depends on; the error for another run's file has its names."""
+        """`recipe` holds by name what the run depends on.
+
+        It is stored in the file. `resume` compares it, and names in its error what differs.
+        """
         self.path = path
         self.recipe = recipe
         self.last_saved = time.perf_counter()
 
     def save(self, state_of: Callable[[], dict[str, Any]], is_last: bool = False) -> None:
-        """Write the state if it is time to, or if it is the last one."""
+        """Write the state that `state_of` returns if a write is due, or if it is the last state."""
         is_due = is_last or time.perf_counter() - self.last_saved > CHECKPOINT_SECONDS
         if self.path and is_due:
             save_checkpoint(self.path, {"recipe": self.recipe, **state_of()})
             self.last_saved = time.perf_counter()
 
     def resume(self, take_up: Callable[[dict[str, Any]], None]) -> None:
-        """Hand over the written state, if there is one.
+        """Call `take_up` with the written state, if there is one.
 
-        Raises DataError if it is damaged, or of a run with another recipe.
+        Raises DataError if the file is damaged, or if a run with another recipe wrote it.
         """
         if not (self.path and self.path.exists()):
             return
@@ -152,47 +163,50 @@ class Checkpoint:
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Replaces the file at `path` by `content` in one move, as `write_together` does.
+    """Replaces the file at `path` by `content` in one move, so that no reader sees half of it.
 
-    Text is UTF-8 with the given line ends on every system.
+    Text is written as UTF-8, and its line ends stay as they are on every system. Folders are made,
+    and errors are raised, as by `write_together`.
     """
     write_together(path.parent, {path.name: content})
 
 
 def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:
-    """Replaces several files of a folder, the last one as the sign that all of them are there.
+    """Replaces several files of a folder; the last file is the sign that all of them are there.
 
-    A file whose content is None is removed.
+    `contents` maps each file's name to its new content; with None the file is removed. Missing
+    folders are made.
 
-    All new files are first written to another folder, so that a full disk leaves the old ones as
-    they were. A process that is killed between two moves leaves the folder without the last file.
-    Missing folders are made. Raises OSError, which names the last file, where that is not possible.
+    All new files are first written to a temporary folder, so that a full disk leaves the old ones
+    as they were, and are then moved. A process that is killed between two moves leaves the folder
+    without the last file. Raises OSError, which names the last file, if a file cannot be written.
     """
     last = [*contents][-1]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # A new folder of a random name: nobody else writes there, or has put a link in its place.
-        with tempfile.TemporaryDirectory(suffix=".tmp", prefix=".", dir=folder) as aside:
-            kept = {name: content for name, content in contents.items() if content is not None}
-            for name, content in kept.items():
-                # Paths whose letters the system's encoding lacks come as surrogates.
+        # The folder's name is random, so nobody else writes there or has put a link in its place.
+        with tempfile.TemporaryDirectory(suffix=".tmp", prefix=".", dir=folder) as temporary:
+            written = {name: content for name, content in contents.items() if content is not None}
+            for name, content in written.items():
+                # A text may hold a path; bytes of a path that are no UTF-8 come as surrogates.
                 is_text = isinstance(content, str)
                 encoded = content.encode(errors="surrogateescape") if is_text else content
-                Path(aside, name).write_bytes(encoded)
+                Path(temporary, name).write_bytes(encoded)
             if len(contents) > 1:  # the old last file must not stand beside new ones
                 (folder / last).unlink(missing_ok=True)
-            for name in contents.keys() - kept.keys():
+            for name in contents.keys() - written.keys():
                 (folder / name).unlink(missing_ok=True)
-            for name in kept:
-                os.replace(Path(aside, name), folder / name)
-    except OSError as error:  # a write that finds the disk full has no name of its own
+            for name in written:
+                os.replace(Path(temporary, name), folder / name)
+    except OSError as error:  # the error of a full disk names no file
         raise OSError(error.errno, error.strerror or str(error), str(folder / last)) from None
 
 
 def json_text(content: Any) -> str:
-    """JSON, indented. Raises ValueError for NaN and infinity, which it cannot say: pass None.
+    """Indented JSON. Raises ValueError for NaN and infinity, which JSON lacks: pass None instead.
 
-    It is UTF-8 whatever a path is called: bytes that are none are escaped.
+    The text can be encoded as UTF-8 even if a path in it holds bytes that are no UTF-8: Python
+    keeps such bytes as surrogates, and they are escaped here.
     """
     text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
     return text.encode(errors="backslashreplace").decode() + "\n"
@@ -202,10 +216,11 @@ def json_text(content: Any) -> str:
 def naming_damaged(
     path: Path, kind: str = "checkpoint", advice: str = "remove it and run the same command again"
 ) -> Iterator[None]:
-    """Turn an error in a block that reads a file and uses its content into a DataError in a line.
+    """Turn an error in a block that reads a file and uses its content into a DataError.
 
-    The line names the file and what `kind` of file it should be, and ends with the `advice`. Errors
-    that say nothing about the file pass: see `_NOT_BY_CONTENT`.
+    Its message is one line. It names the file and what `kind` of file that should be, and ends with
+    the `advice`. Errors of the types in `_NOT_BY_CONTENT`, which say nothing about the file, are
+    raised unchanged.
     """
     try:
         yield
@@ -218,13 +233,13 @@ def naming_damaged(
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Keep other processes out of a block by a lock file.
+    """Run a block while this process holds the lock on a file; wait first until it is free.
 
-    The system frees the lock when this process ends, however it ends. Where the file system knows
-    no locks, the block runs without one: two processes may then do the same work, and the files of
-    either stay whole.
+    The system frees the lock when this process ends, however it ends. On a file system without
+    locks the block runs without one. Two processes may then do the same work twice; their files
+    stay whole, since each is written in one move.
     """
-    # The presence of a file is no lock: a killed process leaves that file behind.
+    # A soft lock would be the mere presence of the file, which a killed process leaves behind.
     lock = FileLock(path, fallback_to_soft=False)
     try:
         lock.acquire()

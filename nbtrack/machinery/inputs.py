@@ -18,8 +18,8 @@ from nbtrack.machinery.files import naming_damaged
 
 Poses = Float[np.ndarray, "_ 4 4"]
 _FARTHEST = 1e7  # m from the origin: beyond geographic coordinates; floats can square it
-# No camera went so many times as far from the middle of its path as nine in ten of the poses lie,
-# or than 1 m, whichever is more.
+# A pose is wrong if its distance from the median position is more than so many times the distance
+# within which nine in ten poses lie, or more than so many metres, whichever is larger.
 _ALONE = 1000.0
 _MILLIMETRE = 1e-3
 _MAX_MILLIMETRES = np.iinfo(np.uint16).max
@@ -27,7 +27,8 @@ _MAX_METRES = 100.0  # a median depth beyond it is in another unit (our choice)
 _DEPTH_UNITS = "uint16 in mm, or floating point in metres"
 RIGID = 1e-2  # deviation of R Rᵀ from the identity: files rounded to a few decimals stay below
 
-# By the byte-order mark; that of UTF-32 begins with that of UTF-16.
+# Encodings by their byte-order marks. UTF-32 comes first, since its little-endian mark begins with
+# the mark of UTF-16.
 _ENCODINGS = {
     codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",
     codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
@@ -38,9 +39,10 @@ _DECIMAL_COMMA = re.compile(r"(?<!\S)[-+]?\d+,\d+(e[-+]?\d+)?(?!\S)")
 
 
 def check_array(what: str, array: Any, shape: tuple, kinds: list, asked: str) -> None:
-    """Raises DataError for another shape, or a type that is none of the kinds (jaxtyping's).
+    """Raises DataError unless `array` is a numpy array of this shape and of one of these types.
 
-    The message calls the array `what`, and the types that it may have `asked`.
+    `kinds` are the types as jaxtyping has them, as `UInt8`. The message calls the array `what`, and
+    describes its allowed types by the words in `asked`.
     """
     wanted = " ".join(map(str, shape))
     if not any(isinstance(array, kind[np.ndarray, wanted]) for kind in kinds):
@@ -50,29 +52,37 @@ def check_array(what: str, array: Any, shape: tuple, kinds: list, asked: str) ->
 
 
 def tensor_of(array: np.ndarray) -> Tensor:
-    """An array's memory as a tensor; a copy where PyTorch cannot share it."""
-    # PyTorch shares the memory of no other arrays.
-    shared = array.flags.writeable and array.dtype.isnative and min(array.strides, default=0) >= 0
-    return torch.from_numpy(array if shared else array.astype(array.dtype.newbyteorder("=")))
+    """A tensor with an array's values; it shares the array's memory where PyTorch can do so."""
+    # PyTorch refuses foreign byte orders and negative strides, and warns of read-only memory.
+    is_plain = array.flags.writeable and array.dtype.isnative and min(array.strides, default=0) >= 0
+    return torch.from_numpy(array if is_plain else array.astype(array.dtype.newbyteorder("=")))
 
 
 def checked_images(color: Any, depth: Any, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """A camera's images, copied: RGB, and depth in whole millimetres, 0 where none is measured.
+    """A camera's colour and depth image, checked and copied.
 
-    Raises DataError as `Frame.of_images` says. The size is that of both: rows and columns.
+    Args:
+        color: RGB, (rows, columns, 3), uint8.
+        depth: z-depth, (rows, columns): uint16 in millimetres, or floating point in metres.
+        size: the rows and columns that both must have.
+
+    Returns the colour as it is, and the depth in whole millimetres as int32. A depth is 0, which
+    means "not measured", where it was 0, negative, not finite, masked, or at least 65535 mm. Raises
+    DataError for another size or type, for masked colour, and for a depth in another unit.
     """
     check_array("color", color, (*size, 3), [UInt8], "uint8")
     check_array("depth", depth, size, [UInt16, Float], _DEPTH_UNITS)
     if np.ma.is_masked(color):
         raise DataError("color has masked pixels: fill them; only depth may lack some")
-    measured = np.ma.filled(depth, 0)
-    if measured.dtype.type != np.uint16:  # of any byte order
-        metres = np.where(np.isfinite(measured) & (measured > 0), measured, 0).astype(np.float64)
+    filled = np.ma.filled(depth, 0)
+    if filled.dtype.type != np.uint16:  # then in metres; `type` is the same for both byte orders
+        metres = np.where(np.isfinite(filled) & (filled > 0), filled, 0).astype(np.float64)
         median = np.median(metres[metres > 0]) if metres.any() else 0
         if median > _MAX_METRES:
             raise DataError(f"depth is {median:.4g} m in the median: give {_DEPTH_UNITS}")
-        measured = (metres / _MILLIMETRE).round().clip(0, _MAX_MILLIMETRES)
-    depth_mm = measured.astype(np.int32)
+        filled = (metres / _MILLIMETRE).round().clip(0, _MAX_MILLIMETRES)
+    depth_mm = filled.astype(np.int32)
+    # This largest value means "farther than 16 bits can say", so it is no measurement.
     depth_mm[depth_mm >= _MAX_MILLIMETRES] = 0
     return np.array(np.ma.getdata(color), order="C"), depth_mm
 
@@ -86,7 +96,10 @@ def check_points(points: Any) -> None:
 
 
 def number(name: str, value: Any, minimum: float, maximum: float, kind: type = Real) -> Any:
-    """A real number within limits, or an `Integral`, as Python's. ConfigError for another value."""
+    """A number from `minimum` to `maximum`, as a float; with the kind `Integral`, as an int.
+
+    Raises ConfigError, whose message calls the number `name`, for any other value.
+    """
     if not isinstance(value, kind) or isinstance(value, bool) or not minimum <= value <= maximum:
         what = "a whole number" if kind is Integral else "a number"
         raise ConfigError(f"{name} is {value!r:.80}: give {what} from {minimum:g} to {maximum:g}")
@@ -94,29 +107,37 @@ def number(name: str, value: Any, minimum: float, maximum: float, kind: type = R
 
 
 def whole_number(name: str, value: Any, minimum: int = 0) -> int:
-    """A whole number of Python's. Raises ConfigError, by its name, for any other value."""
+    """A whole number of 64 bits from `minimum` on, as an int.
+
+    Raises ConfigError, whose message calls the number `name`, for any other value.
+    """
     return number(name, value, minimum, 2**63 - 1, Integral)
 
 
 def checked_pose(T_world_camera: Any) -> Float[np.ndarray, "4 4"]:
-    """One known pose (m), copied in double precision; DataError if it is no rigid transform."""
+    """One pose (m), 4 x 4, copied in double precision.
+
+    Raises DataError if it is no rigid transform, or is not known: not finite, or all 0.
+    """
     try:
         pose = np.array(T_world_camera, dtype=np.float64)
-    except (TypeError, ValueError, RuntimeError):  # the last is of a tensor with gradients
-        pose = np.empty(0)
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor that requires gradients
+        pose = np.empty(0)  # of a shape that is refused
     if pose.shape != (4, 4) or not np.isfinite(pose).all() or not pose[:3].any():
         raise DataError("T_world_camera is no rigid transform: give 4 x 4 finite numbers")
     return checked_poses(pose[None], Path("T_world_camera"))[0]
 
 
 def checked_poses(poses: Poses, path: Path) -> Poses:
-    """The poses, all NaN where a number is not finite or all are 0: those frames have no pose.
+    """Check the poses (m) of a file's frames; returns them with NaN for frames that have none.
 
-    Raises DataError if a pose is no rigid transform, or absurdly far from the origin or from the
-    other poses.
+    A frame has no pose if a number of its matrix is not finite, or if the first three rows are 0.
+    Raises DataError if a pose is no rigid transform, or is absurdly far from the origin or from the
+    other poses. The message names `path`.
     """
     is_known = np.isfinite(poses).all(axis=(1, 2)) & (poses[:, :3] != 0).any(axis=(1, 2))
-    # Clipped, so that absurd numbers are refused and overflow nothing.
+    # The identity stands for unknown poses, and passes all checks. Clipped numbers are still far
+    # enough off to be refused, and overflow nothing.
     T = np.where(is_known[:, None, None], poses, np.eye(4)).clip(-1e8, 1e8)
     R = T[:, :3, :3]
     is_wrong = (np.abs(R @ R.mT - np.eye(3)) > RIGID).any(axis=(1, 2))
@@ -124,11 +145,12 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
     is_wrong |= (np.abs(T[:, 3] - [0, 0, 0, 1]) > RIGID).any(axis=1)
     is_wrong |= (np.abs(T[:, :3, 3]) > _FARTHEST).any(axis=1)
     if is_known.any():
-        away = np.linalg.norm(T[:, :3, 3] - np.median(T[is_known, :3, 3], axis=0), axis=1)
-        usual = np.quantile(away[is_known], 0.9, method="lower")
-        is_wrong |= is_known & (away > _ALONE * max(1.0, usual))
+        center = np.median(T[is_known, :3, 3], axis=0)
+        distances = np.linalg.norm(T[:, :3, 3] - center, axis=1)
+        usual = np.quantile(distances[is_known], 0.9, method="lower")
+        is_wrong |= is_known & (distances > _ALONE * max(1.0, usual))
     if is_wrong.any():
-        i = is_wrong.argmax()  # the message is about the first one
+        i = is_wrong.argmax()  # the first wrong pose
         frame = f" frame {i}" if len(poses) > 1 else ""
         numbers = " ".join(f"{number:.4g}" for number in poses[i].flat)
         raise DataError(
@@ -140,27 +162,35 @@ def checked_poses(poses: Poses, path: Path) -> Poses:
 
 
 def read_object(path: Path, kind: str = "") -> dict[str, Any]:
-    """The object in a JSON or TOML file; without `kind` its name says which of both it is.
+    """The names and values in a file with a JSON object or a TOML document.
 
-    Raises DataError for any other content.
+    `kind` is "JSON" or "TOML". Without it, a file whose name ends in `.json` is read as JSON, and
+    any other as TOML. Raises DataError for any other content.
     """
     kind = kind or ("JSON" if path.suffix.lower() == ".json" else "TOML")
     with naming_damaged(path, f"{kind} file of names and values", "correct it or write it anew"):
         text = read_text(path)
-        # Braces, since they raise TypeError for a list or a number.
+        # Unpacking raises TypeError where the JSON is no object but a list, text or number.
         return {**(tomllib.loads(text) if kind == "TOML" else json.loads(text))}
 
 
 def read_text(path: Path) -> str:
-    """The text of a file, decoded by its byte-order mark, else as UTF-8, whatever its bytes are."""
+    """The text of a file, decoded by its byte-order mark, or as UTF-8 if it has none.
+
+    Bytes that cannot be decoded are replaced.
+    """
     with path.open("rb") as file:
         start = file.read(4)
-    of_mark = (encoding for mark, encoding in _ENCODINGS.items() if start.startswith(mark))
-    return path.read_text(encoding=next(of_mark, "utf-8-sig"), errors="replace")
+    marked = [encoding for mark, encoding in _ENCODINGS.items() if start.startswith(mark)]
+    encoding = marked[0] if marked else "utf-8-sig"  # this one skips the mark of UTF-8
+    return path.read_text(encoding=encoding, errors="replace")
 
 
 def read_lines(path: Path) -> list[str]:
-    """The lines of a text file that are neither blank nor comments. DataError if there is none."""
+    """The lines of a text file that hold more than blanks and a comment after `#`.
+
+    Raises DataError if there is none.
+    """
     full = [line for line in read_text(path).splitlines() if line.partition("#")[0].strip()]
     if not full:
         raise DataError(f"{path} is empty: write it anew")
@@ -168,15 +198,15 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np.ndarray, "n m"]:
-    """A table of numbers, separated by blanks or commas; NaN, however it is spelled, and infinity
-    are kept.
+    """Read a table of numbers that are separated by blanks or commas.
 
-    Raises DataError for anything else, or if the number of columns is none of `columns`. The
-    message says what every line should hold: the `meaning`.
+    NaN, in the spelling of any language, and infinity are kept. Raises DataError for anything else,
+    and if the number of columns is not one of `columns`. The message says what a line should hold
+    by the words in `meaning`.
     """
-    # Before comments are cut off: some spellings of NaN hold a `#`.
+    # Some spellings of NaN hold a `#`, with which comments begin for `np.loadtxt`.
     lines = [_NOT_A_NUMBER.sub("nan", line) for line in read_lines(path)]
-    if path.suffix == ".log":  # Open3D's, with a head of three numbers before each matrix
+    if path.suffix == ".log":  # a trajectory of Open3D: a line of three numbers before each matrix
         lines = [line for line in lines if len(line.split()) != 3]
     with naming_damaged(path, "table", f"every line holds {meaning}"):
         if any(_DECIMAL_COMMA.search(line) for line in lines):

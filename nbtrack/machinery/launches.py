@@ -1,7 +1,9 @@
-"""Work that is repeated on tensors which keep their place: launched on a GPU in one go.
+"""CUDA graphs: a GPU gets all kernels of a repeated step in one launch.
 
 A step of tracking or mapping consists of a hundred kernels and more, each of some microseconds.
-Launched from Python one by one they keep a GPU waiting. CUDA records them once, as a graph.
+When Python launches them one by one, the GPU waits for Python. So CUDA records the kernels of a
+step once, as a graph, and replays the graph in every later step. All steps must read and write the
+same tensors.
 """
 
 import threading
@@ -15,19 +17,19 @@ from torch import Tensor
 from nbtrack.machinery.progress import tell
 
 CALLS_BEFORE_RECORDING = 2
-"""The first call loads and allocates; the second one is watched for what cannot be recorded."""
+"""The first call loads and allocates; the last one tells whether the work can be recorded."""
 
 _WATCHING = threading.Lock()
-_WAITS = "called a synchronizing CUDA operation"  # how PyTorch warns of it
+_WAITS = "called a synchronizing CUDA operation"  # in PyTorch's warning of a wait for the GPU
 
 
 class Recording:
-    """Calls work; on CUDA it records the work after a few calls, and replays it from then on.
+    """Does work by calling it; on CUDA, after a few calls, by replaying a recorded graph of it.
 
-    The work always reads and writes the same tensors, and draws from one generator. A replay runs
-    no Python: anything else that the work depends on stays as it was at the recording. Work that
-    waits for a value of the device, as shapes that depend on values do, cannot be recorded; it is
-    called each time, and a message says so once.
+    The work must always read and write the same tensors, and draw random numbers from `generator`
+    alone. A replay runs no Python, so anything else that the work depends on stays as it was when
+    the graph was recorded. Work that waits for a value from the GPU, as for a shape that depends on
+    values, cannot be recorded. It is called each time, and a message says so once.
     """
 
     def __init__(self, name: str, generator: torch.Generator) -> None:
@@ -38,23 +40,25 @@ class Recording:
         self.replay: Callable[[], None] | None = None
 
     def run(self, work: Callable[[], Tensor]) -> Tensor:
-        """Do the work once, by a call or a replay; returns its result."""
+        """Do the work once, by a call or a replay, and return its result."""
         if not self.is_recordable:
             return work()
         self.n_calls += 1
         if self.n_calls <= CALLS_BEFORE_RECORDING:
             return self._watch(work)
         if self.replay is None:
-            self.replay, self.result = record(work, self.generator)  # which runs nothing yet
+            self.replay, self.result = record(work, self.generator)  # does not run the work yet
         self.replay()
-        return self.result.clone()  # the next replay writes over it
+        return self.result.clone()  # a copy, because the next replay overwrites the result
 
     def _watch(self, work: Callable[[], Tensor]) -> Tensor:
-        """Call the work; if it waits for the device in the last of these calls, it is not recorded.
+        """Call the work and return its result; mark it as not recordable if it waits for the GPU.
 
-        The first call may wait, since it loads and allocates.
+        Only the last call before the recording counts: the first one may wait, since it loads and
+        allocates.
         """
-        # Warnings are caught in the whole process: one thread at a time, or some are lost for good.
+        # `catch_warnings` changes a list of the whole process. Two threads in it at a time could
+        # restore each other's lists, and warnings would stay caught for good.
         with _WATCHING, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             torch.cuda.set_sync_debug_mode("warn")
@@ -71,12 +75,15 @@ class Recording:
 
 
 def can_record(device: torch.device) -> bool:
-    """Whether launches on a device can be recorded."""
+    """Whether work on a device can be recorded as a graph."""
     return device.type == "cuda"
 
 
 def record(work: Callable[[], Tensor], generator: torch.Generator) -> tuple[Callable, Tensor]:
-    """Record the work without running it: what replays it, and where its result will then lie."""
+    """Record the work as a CUDA graph, without running it.
+
+    Returns the function that replays it, and the tensor into which each replay writes the result.
+    """
     graph = torch.cuda.CUDAGraph()
     graph.register_generator_state(generator)
     with torch.cuda.graph(graph):
@@ -85,10 +92,10 @@ def record(work: Callable[[], Tensor], generator: torch.Generator) -> tuple[Call
 
 
 def make_adam(groups: list[dict[str, Any]], device: torch.device) -> torch.optim.Adam:
-    """Adam whose state and learning rates are tensors that keep their place.
+    """Adam for groups of parameters, with learning rates as tensors so that a graph can read them.
 
-    Learning rates are in double precision on a CPU, as Python's numbers would be; CUDA's fused
-    kernel takes single precision.
+    `groups` are PyTorch's dictionaries with "params" and a number "lr". On a CPU the rates are in
+    double precision, as Python's numbers are; CUDA's fused kernel takes single precision.
     """
     is_recorded = can_record(device)
     like = {"dtype": torch.float32 if is_recorded else torch.float64, "device": device}

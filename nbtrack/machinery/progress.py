@@ -8,19 +8,22 @@ from typing import Any
 
 from tqdm import tqdm
 
-_DELAY_SECONDS = 1.0  # so that no bar stands before the message of a mistake that is found at once
-# What matters first: in a narrow terminal the end of a line is cut off.
+_DELAY_SECONDS = 1.0  # so that no bar is shown before the error of a command that fails at once
+# The share comes first: in a narrow terminal the end of the line is cut off.
 _FORMAT = "{percentage:3.0f} % |{bar:12}| {remaining} left, {desc}{postfix}"
-# Where nobody watches: the form of a line, and seconds between two.
+# In a log file: the form of its lines, and the seconds between two of them.
 _LINE_FORMAT = "{desc}: {percentage:.0f} %, {elapsed} gone, {remaining} left{postfix}"
 _LINE_SECONDS = 30.0
-tqdm.set_lock(threading.RLock())  # its own is one between processes, which killed ones leave behind
+# tqdm's own lock is shared between processes, and a killed process would leave it behind.
+tqdm.set_lock(threading.RLock())
 
 
 def tell(news: str) -> None:
-    """Print news: to standard error, since it is no result; notebooks would show that in red.
+    """Print news for the user.
 
-    At a terminal warnings are yellow, unless `NO_COLOR` is set.
+    It goes to standard error, since it is no result of a command. In a notebook it goes to standard
+    output, because notebooks show standard error in red. At a terminal, texts that begin with
+    `nbtrack: warning: ` are yellow, unless `NO_COLOR` is set.
     """
     has_colors = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
     if news.startswith("nbtrack: warning: ") and has_colors and not _is_notebook():
@@ -35,12 +38,14 @@ def _is_notebook() -> bool:
 
 
 class _Line:
-    """A file that shows each text written to it: as a line, or as the output of a notebook's cell.
+    """A file for tqdm outside of terminals, which shows each text that is written to it.
 
-    The latter needs no widget, so that stored notebooks and exported pages end with the last text.
+    In a notebook each text replaces the one before as the output of the cell. Without a widget,
+    stored notebooks and exported pages show the last text. Elsewhere each text is a line of
+    standard error.
     """
 
-    handle: Any = None  # of the cell's output, once there is one
+    handle: Any = None  # of the cell's output, once a text was shown
 
     def write(self, text: str) -> None:
         """Show a text without tqdm's carriage return and line end; blanks show nothing."""
@@ -58,38 +63,48 @@ class _Line:
 
 
 class ProgressBar(tqdm):
-    """Progress with an ETA over a known amount of work, in a `with` block, or over a collection."""
+    """A progress bar with the time that is left.
 
-    # Work done in a warm-up, and its seconds: its speed is not that of the rest.
+    It is used in a `with` block with `move_to`, or as an iterator over a collection.
+    """
+
+    # Work done and seconds gone in a warm-up, whose speed says nothing of the rest.
     warm_up_work: float | int = 0
     warm_up_seconds = 0.0
 
     def __init__(self, title: str, work: float | Collection, is_shown: bool = True) -> None:
-        """Begin; nothing is shown before a second has gone."""
+        """Begin a bar over a collection, or over an amount of work in any unit.
+
+        Nothing is shown in the first second.
+        """
         options = {"file": sys.stderr, "bar_format": _FORMAT}
-        if _is_notebook():  # its kernel drops messages once a thousand wait to be read
+        if _is_notebook():  # an update a second: a kernel drops messages once a thousand wait
             options |= {"file": _Line(), "mininterval": 1.0}
         elif not sys.stderr.isatty():
             options |= {"file": _Line(), "mininterval": _LINE_SECONDS, "bar_format": _LINE_FORMAT}
-        # "miniters" 0: only the time decides when to show; "ascii" False: bars of block characters.
+        # With "miniters" 0 only the time decides when to show; without "ascii" bars are of blocks.
         options |= {"disable": not is_shown, "delay": _DELAY_SECONDS, "miniters": 0, "ascii": False}
         work_of = "iterable" if isinstance(work, Collection) else "total"
         super().__init__(desc=title, **{work_of: work}, **options)
 
     @property
     def format_dict(self) -> dict[str, Any]:
-        """What is shown; the time that is left comes from the mean speed after the warm-up."""
+        """tqdm's values to show, with the mean speed after the warm-up as its rate.
+
+        tqdm computes the time that is left from this rate.
+        """
         values = super().format_dict
         seconds = values["elapsed"] - self.warm_up_seconds
         return values | {"rate": (self.n - self.warm_up_work) / max(seconds, 1e-3)}
 
     def end_warm_up(self, done: float | int) -> None:
-        """Leave the work that is done by now, and the time so far, out of the mean speed."""
+        """Leave the work that is done by now, and the time until now, out of the mean speed."""
         self.warm_up_work = done
         self.warm_up_seconds = self.format_dict["elapsed"]
 
     def move_to(self, done: float | int, status: str = "") -> None:
-        """Show how much is done, and a word on how it goes."""
+        """Show how much of the work is done, and a word on how it goes."""
         self.set_postfix_str(status, refresh=False)
-        # Sums of fractions may end a rounding error above the total, for which tqdm shows no bar.
+        # A sum of fractions may be larger than the total by a rounding error; tqdm then shows no
+        # bar.
         self.update(min(done, self.total) - self.n)

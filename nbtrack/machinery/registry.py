@@ -1,8 +1,8 @@
-"""Registries of what is known by name, and who adds to them.
+"""Registries of fields, trackers, methods and formats by name, and the plug-ins that add to them.
 
-Packages add when they are imported: `nbtrack.beyond`, and installed ones that have an entry point
-of the group `nbtrack`. A user's own file does so by `import_own`, which `--import` of every command
-calls.
+A plug-in is a package that adds entries when it is imported: `nbtrack.beyond`, and every installed
+package with an entry point of the group `nbtrack`. A user's own file adds entries too: `import_own`
+imports it, for the option `--import` of every command.
 """
 
 import importlib
@@ -19,16 +19,18 @@ from nbtrack.machinery.files import resolved
 from nbtrack.machinery.progress import tell
 
 Entry = TypeVar("Entry")
-# Plug-ins that are still to be imported; ours joins as any other does.
+# Plug-ins that are still to be imported. The package's own one is loaded in the same way.
 _waiting = [EntryPoint("beyond", "nbtrack.beyond", "nbtrack"), *entry_points(group="nbtrack")]
 IMPORTED: list[str] = []
-"""What `import_own` has imported, for the command that makes a run again."""
+"""Files and modules that `import_own` has imported; a run's command for its repetition names them.
+"""
 
 
 class Registry(UserDict[str, Entry]):
-    """Entries by name, those of plug-ins included, which are imported when it is first used.
+    """A dictionary of entries by name, with the entries of plug-ins.
 
-    An entry may be a text "module:Name", as of entry points: it is loaded when it is asked for.
+    The first use of any registry imports all plug-ins. An entry may be given as a text
+    "module:Name", as entry points have it; it is then loaded when it is first asked for.
     """
 
     def __init__(self, entries: dict[str, Entry | str]) -> None:
@@ -36,12 +38,13 @@ class Registry(UserDict[str, Entry]):
 
     @property
     def data(self) -> dict[str, Entry | str]:
-        """What `UserDict` works on: the entries as given, once all plug-ins have added theirs."""
+        """The dictionary that all methods of `UserDict` use, after all plug-ins added to it."""
         while _waiting:
-            plugin = _waiting.pop(0)  # before it is loaded: it uses registries itself
+            # Taken from the list before it is loaded: it uses registries, which come here again.
+            plugin = _waiting.pop(0)
             try:
                 plugin.load()
-            except Exception as error:  # of another package; the other plug-ins still work
+            except Exception as error:  # a fault of another package must not stop the program
                 why = f"({type(error).__name__}: {error}): mend or remove it"
                 tell(f"nbtrack: warning: plug-in {plugin.value} is left out {why}")
         return self._entries
@@ -54,9 +57,10 @@ class Registry(UserDict[str, Entry]):
         return Registry({**self.data})
 
     def __getitem__(self, name: str) -> Entry:
-        """The entry of a name. Raises ConfigError where its text names nothing that is there.
+        """The entry of a name.
 
-        That the name is not known is a KeyError, as in every mapping.
+        Raises ConfigError if the entry is a text "module:Name" that cannot be loaded, and KeyError,
+        as every mapping, for an unknown name.
         """
         entry = self.data[name]
         if isinstance(entry, str):
@@ -69,11 +73,11 @@ class Registry(UserDict[str, Entry]):
 
 
 def import_own(source: str) -> None:
-    """Import a user's file, or a module by its name, that adds fields, trackers or methods.
+    """Import a user's Python file, or a module by its name, that adds fields, trackers or methods.
 
-    The file's folder is searched for modules from then on. Raises MissingError where there is no
-    such file, and ConfigError for whatever the import raises, and where another module has the
-    file's name.
+    `source` is a file if it ends in `.py`. The folder of a file is added to the search path for
+    modules. Raises MissingError if there is no such file, and ConfigError if the import fails, or
+    if another module of the file's name was imported instead.
     """
     file = resolved(source)
     is_file = file.suffix == ".py"
@@ -86,7 +90,7 @@ def import_own(source: str) -> None:
         module = importlib.import_module(name)
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
-        # Python's own import system, as for a module that is not there: no place to mend.
+        # An error in Python's import system, as for a missing module, has no line to mend.
         is_in_python = place.filename.startswith("<frozen")
         where = "" if is_in_python else f" at {place.filename}, line {place.lineno}"
         reason = f"{type(error).__name__}: {error}"

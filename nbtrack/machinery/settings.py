@@ -1,8 +1,9 @@
-"""Settings: trees of frozen dataclasses and dictionaries of them, changed by checked `key=value`.
+"""Settings: trees of frozen dataclasses and dictionaries, changed by checked `key=value` texts.
 
-Keys are dotted paths such as `mapping.neus.iterations`; an unknown one is an error. Counts are 1 to
-a million, other numbers 0 to a million, unless their field says otherwise: what is beyond any use
-would overflow, fill the memory or never end. No list is empty.
+A key is a dotted path such as `mapping.neus.iterations`; an unknown key is an error. Whole numbers
+must lie between 1 and a million, other numbers between 0 and a million, unless the dataclass field
+has limits of its own: useless sizes would overflow, fill the memory or never end. No list may be
+empty.
 """
 
 import dataclasses
@@ -18,17 +19,17 @@ from nbtrack.machinery.errors import ConfigError, look_up
 
 Config = TypeVar("Config")
 MANY = 1_000_000
-_DEEPEST = 10  # dots of a key, more than any has: what lies deeper is not taken apart
+_DEEPEST = 10  # dots in a key, more than any key has; `flat` takes nothing apart below this depth
 _USUAL_LIMITS = {int: (1, MANY), float: (0.0, MANY)}
 
 
 def limited(default: float | tuple, minimum: float, maximum: float) -> Any:
-    """A dataclass field with a number, or some, that a user may set within limits."""
+    """A dataclass field for a number, or a tuple of numbers, from `minimum` to `maximum`."""
     return dataclasses.field(default=default, metadata={"limits": (minimum, maximum)})
 
 
 def one_of(*choices: str) -> Any:
-    """A dataclass field with one of some words, by default the first."""
+    """A dataclass field for one of the words in `choices`, by default the first."""
     return dataclasses.field(default=choices[0], metadata={"choices": choices})
 
 
@@ -38,9 +39,10 @@ def as_dict(config: Any) -> dict[str, Any]:
 
 
 def with_settings(preset: Any, *settings: str) -> Any:
-    """A preset, or anything with its method `with_values`, after some `key=value` texts in order.
+    """The preset, changed by `key=value` texts, of which a later one wins over an earlier one.
 
-    Raises ConfigError as `with_values` and `read_setting` do.
+    The preset may be any object with a method `with_values`. Raises ConfigError for a text that is
+    no `key=value`, an unknown key, or a value of the wrong type or range.
     """
     for setting in settings:
         preset = preset.with_values(read_setting(setting))
@@ -48,29 +50,32 @@ def with_settings(preset: Any, *settings: str) -> Any:
 
 
 def read_setting(setting: str) -> dict[str, Any]:
-    """The value of a `key=value` text, or the values where it is a table, by dotted keys.
+    """The values that a text `key=value` sets, by dotted keys.
 
-    Raises ConfigError for a text that is none.
+    The value is TOML. A table in it sets several keys, and a bare word is a string. Raises
+    ConfigError for a text without `=`, for a list, table or quoted string that is not TOML, and for
+    more than one setting in the text.
     """
     key, equals, text = [part.strip() for part in setting.partition("=")]
     if not equals:
         raise ConfigError(f"setting {setting!r} has no value: write key=value")
     try:
         parsed = tomllib.loads(f"value = {text}")
-    # Nesting thousands deep ends the parser's recursion, as do thousands of digits.
+    # RecursionError: lists that are nested thousands deep.
     except (ValueError, RecursionError):
         if text.startswith(("[", "{", '"', "'")):
             raise ConfigError(f"{text!r:.40} is no TOML: write \"{key}=['a', 'b']\"") from None
         parsed = {"value": text}  # a bare word is a string
-    if len(parsed) > 1:
+    if len(parsed) > 1:  # the text has line ends, after which TOML may set other names
         raise ConfigError(f"setting {setting!r} holds more than one: give each by itself")
     return flat({key: parsed["value"]})
 
 
 def checked(config: Config, kind: type) -> Config:
-    """Settings of a kind whose values all are of their defaults' types and within their limits.
+    """Settings that a program passes as an object, after a check of every value.
 
-    Raises ConfigError for any other. Numbers of numpy become Python's.
+    Raises ConfigError if they are no object of the class `kind` or of a subclass, or if a value has
+    another type than its default or lies beyond its limits. Numbers of numpy become Python's.
     """
     if not isinstance(config, kind):
         raise ConfigError(f"settings are {config!r:.60}: give {kind.__name__}(...), or a child's")
@@ -78,9 +83,10 @@ def checked(config: Config, kind: type) -> Config:
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
-    """The dataclass, or tree of them, with some values of dotted keys, or trees as TOML has them.
+    """The config, a dataclass or a tree of them, with other values for some keys.
 
-    Raises ConfigError for an unknown key, or a value of the wrong type or range.
+    `values` has dotted keys, or is a tree of dictionaries, as a TOML file gives it. Raises
+    ConfigError for an unknown key, or a value of the wrong type or range.
     """
     valid = flat(config)
     for key, value in flat(dict(values)).items():
@@ -90,15 +96,15 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
 
 
 def changed_settings(config: Config, original: Config) -> list[str]:
-    """The `key=value` texts that turn the original into this config."""
+    """The `key=value` texts that turn the config `original` into `config`."""
     before = flat(original)
     return [f"{k}={json.dumps(v)}" for k, v in flat(config).items() if before.get(k) != v]
 
 
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:
-    """The values of a config, or of a tree as TOML gives it, by their dotted keys.
+    """The values of a config, or of a tree of dictionaries, by dotted keys.
 
-    `prefix` is the dotted key of the config itself, where it is a part of another.
+    A recursive call passes as `prefix` the dotted key of the part that it flattens.
     """
     if dataclasses.is_dataclass(config):
         config = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
@@ -109,25 +115,32 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def _replaced(node: Any, path: list[str], key: str, value: Any, allowed: Mapping) -> Any:
-    """A part of a tree with the value of one key, which lies at a path of names below that part.
+    """A copy of a part of a config in which one value is replaced.
 
-    Nested parts are rebuilt, never changed in place. `allowed` is the metadata of the part's field.
+    Args:
+        node: the part: a dataclass, a dictionary, or the old value itself.
+        path: the names that lead from the part to the value; empty for the value itself.
+        key: the whole dotted key, for messages.
+        value: the new value, which is checked by `_converted`.
+        allowed: metadata of the dataclass field that holds the part; empty without one.
     """
     if not path:
         return _converted(key, node, value, allowed)
     name, *rest = path
     if isinstance(node, dict):
         return {**node, name: _replaced(node[name], rest, key, value, {})}
-    of_field = next(f.metadata for f in dataclasses.fields(node) if f.name == name)
-    new = _replaced(getattr(node, name), rest, key, value, of_field)
+    metadata = {field.name: field.metadata for field in dataclasses.fields(node)}[name]
+    new = _replaced(getattr(node, name), rest, key, value, metadata)
     return dataclasses.replace(node, **{name: new})
 
 
 def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
-    """A value in the type of the old one; ConfigError for another type, or one not allowed.
+    """The new value of a key, in the type of its old value.
 
-    `allowed` is the metadata of its field: limits or choices, if any. A single value becomes a
-    tuple of one, and a whole number a float, where the old value is one. Nothing else is converted.
+    A single value becomes a tuple of one entry if the old value is a tuple, and a whole number
+    becomes a float if the old value is a float. Nothing else is converted. `allowed` is the
+    metadata of the dataclass field, which may hold "limits" or "choices". Raises ConfigError for
+    another type, and for a value that is not allowed.
     """
     wanted = type(old)
     value = value.item() if isinstance(value, np.generic) else value
@@ -135,10 +148,10 @@ def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
         values = value if isinstance(value, list | tuple) else [value]
         if not values:
             raise ConfigError(f"{key} = []: give at least one, for example {list(old)}")
-        # An empty tuple does not say of which type its entries are.
+        # Entries have the type of the old first one. An empty tuple tells no type.
         return tuple(_converted(key, old[0], part, allowed) if old else part for part in values)
-    # An integer of TOML that is too large for a float, or to be printed, becomes infinity, which
-    # the checks below refuse.
+    # A whole number may be too large to become a float, or to be printed in a message. It becomes
+    # infinity here, which the checks below refuse.
     if type(value) is int and (wanted is float or abs(value) > 1e300):
         value = float(value) if abs(value) < 1e300 else math.inf
     if type(value) is not wanted or (wanted is str and "\0" in value):

@@ -56,15 +56,17 @@ A method of your own joins by `METHODS["mine"] = Method(...)`."""
 
 
 def find_methods(methods: Methods) -> list[Method]:
-    """The methods of these names; a `Method` stands for itself.
+    """The methods of a list of names and `Method` objects, in order, each once.
 
-    Raises ConfigError if they are no list, a name is unknown, or a field and a tracker do not go
-    together.
+    Raises ConfigError if `methods` is no list or is empty, if an entry is neither a known name nor
+    a `Method`, if a method's settings are no list, or if its tracker does not work in its field.
     """
     chosen = []
     check_lists(at_least=1, methods=methods)
-    for named in dict.fromkeys(methods):  # each once
-        method = look_up("method", named, METHODS) if isinstance(named, str) else named
+    for entry in methods:
+        method = entry if isinstance(entry, Method) else look_up("method", entry, METHODS)
+        check_lists(settings=method.settings)
         tracker_class(method.tracker).check_field(field_class(method.field))
-        chosen.append(method)
+        if method not in chosen:
+            chosen.append(method)
     return chosen
