@@ -61,14 +61,16 @@ def test_points_of_a_voxel_are_averaged(monkeypatch) -> None:
 
 
 def test_only_the_frames_asked_for_and_what_lies_inside_are_fused() -> None:
-    """Catches a map of held-out frames, wild depths that stretch the grid, and a distance that is
-    squared, from another point, or not to be had where a pose is optimised."""
-    sequence = two_pixels([[2000, 9000], [1000, 1000]], [[10, 10]] * 2)
-    cloud = fuse_points(sequence, np.array([0]), BOX, voxel=0.02)
+    """Catches a map of held-out frames, wild depths that stretch the grid or lie in the next cell,
+    and a distance that is squared, from another point, of a point that is no number, or not to be
+    had where a pose is optimised."""
+    sequence = two_pixels([[2000, 9000], [1000, 1000], [3025, 0]], [[10, 10]] * 3)
+    cloud = fuse_points(sequence, np.array([0, 2]), BOX, voxel=0.02)
     np.testing.assert_allclose(cloud.points, [[-0.5, 0.0, 2.0]], atol=1e-6)
     asked = torch.tensor([[-0.5, 0.3, 2.0], [-0.5, 0.0, 1.6]]).requires_grad_()
     found = cloud(asked)[1]
     torch.testing.assert_close(found, torch.tensor([0.3, 0.4]))
+    assert cloud(asked * torch.nan)[1].isnan().all()
 
 
 def test_scores_of_points(room: Room, monkeypatch) -> None:

@@ -132,12 +132,14 @@ def test_images_without_an_inside_are_lost_frames(size: tuple[int, int]) -> None
 
 def test_a_fast_camera_that_stops_is_found() -> None:
     """Catches a start that is chosen by its cost alone, where the motion model is half a metre
-    ahead of a camera that has stopped: coarse stages from both starts tell them apart."""
+    ahead of a camera that has stopped: coarse stages from both starts tell them apart; and a pose
+    that counts as unexpected because of the other start."""
     tracker = begun(n_restarts=0)
     ahead = retract(T_TRUE, np.array([0.0, 0.5, 0.0, 0.3, 0.0, 0.5]))
     tracker.begin(FRAME, torch.from_numpy(np.stack([ahead, T_TRUE])))
     np.testing.assert_allclose(tracker.best.problem.T_start, T_TRUE, atol=1e-12)
     assert errors(tracker)[0] < 0.01
+    assert tracker.report()["innovation"] < 0.01
 
 
 def test_a_pose_that_still_moves_when_the_budget_ends_is_lost() -> None:

@@ -83,7 +83,8 @@ def map_wall(field_name: str, checkpoint: Path | None, *on_iteration) -> Map:
 
 @pytest.mark.parametrize("field_name", ["imap", "neus", "neus_plus"])
 def test_resume_equals_uninterrupted(field_name: str, tmp_path: Path) -> None:
-    """Catches a checkpoint that forgets anything: batches, Adam's moments, the learning rate."""
+    """Catches a checkpoint that forgets anything: batches, Adam's moments, the learning rate; and a
+    seed or a sum of losses that is recorded wrongly."""
     checkpoint, seen = tmp_path / "mapping.pt", []
 
     def kill(share: float, losses: dict[str, float]) -> None:
@@ -98,6 +99,9 @@ def test_resume_equals_uninterrupted(field_name: str, tmp_path: Path) -> None:
     assert seen == [20 / 24, 1]
     assert np.array_equal(resumed.history.to_numpy(), whole.history.to_numpy())
     assert resumed.key == whole.key
+    assert whole.record["seed"] == 3
+    terms = whole.history.drop(columns=["total", "std_m"], errors="ignore")
+    np.testing.assert_allclose(whole.history["total"], terms.sum(axis=1))
 
 
 def test_diverged_loss_names_the_iteration() -> None:
