@@ -187,8 +187,8 @@ def _measured_planes(
         ends = rays.points(rays.depth[:, None])[:, 0]
         low, high = grid.low, grid.low + grid.voxel * (ends.new_tensor(grid.n_vertices) - 1)
         # The grid has no values for points outside, such as a facade seen through a window.
-        is_inside = ((ends >= low) & (ends <= high)).all(dim=-1)
-        has_plane = rays.normals_world.any(dim=-1) & is_inside
+        is_inside = ((ends >= low) & (ends <= high)).all(dim=1)
+        has_plane = rays.normals_world.any(dim=1) & is_inside
         if not has_plane.any():
             found = f"{sequence.name} shows no surface to correct a map by"
             raise DataError(f"{found}: check its depth")

@@ -88,7 +88,7 @@ class BakedField(Field):
         volume = self.volume.view(5, *self.n_vertices)
         values = trilinear(volume, self.low, self.voxel, points_world)
         # `trilinear` moves NaN to the border, too.
-        return torch.where(points_world.isnan().any(dim=-1), torch.nan, values)
+        return torch.where(points_world.isnan().any(dim=1), torch.nan, values)
 
 
 def trilinear(

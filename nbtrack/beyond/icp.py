@@ -106,7 +106,7 @@ class IcpTracker(Tracker):
         found = self._align(coarse.T_target_source, _NARROW) if coarse.num_inliers else coarse
         if not found.num_inliers or not np.isfinite(found.T_target_source).all():
             return float("nan")
-        self.T_world_camera = torch.from_numpy(found.T_target_source.copy())
+        self.T_world_camera = torch.from_numpy(found.T_target_source)
         self.found = found
         return found.error / found.num_inliers
 

@@ -100,6 +100,6 @@ def solve(
         preconditioner = dia_array((1 / diagonal[None], 0), shape=regularisation.shape)
         right_sides = matrix.T @ (weights[:, None] * wanted)
         for k in range(wanted.shape[1]):
-            start = solution[:, k].copy()
+            start = solution[:, k]
             solution[:, k], _ = cg(hessian, right_sides[:, k], start, rtol=1e-3, M=preconditioner)
     return solution, diagonal

@@ -84,7 +84,7 @@ def grid_of(field: BakedField) -> Grid:
     """The grid of a field on the host."""
     intensity = field.volume[:3].T @ torch.tensor(LUMA, dtype=torch.float32)
     value, confidence = field.volume[3:]
-    vertices = torch.stack([value, intensity, confidence], dim=-1).numpy()
+    vertices = torch.stack([value, intensity, confidence], dim=1).numpy()
     low, high = np.array([field.bounds.minimum, field.bounds.maximum])
     shape, first = np.array(field.n_vertices), field.low.double().numpy()
     usable = low - MARGIN, high + MARGIN

@@ -70,7 +70,7 @@ class NeuSPlusField(NeuSField):
         # At measured points the distance is zero, and the colour is that of the pixel.
         surface_color, surface_sdf = self(surface.points(surface.depth[:, None])[:, 0])
         measured = (surface.depth > 0).float()
-        color_error = (surface_color - surface.color).abs().mean(dim=-1)
+        color_error = (surface_color - surface.color).abs().mean(dim=1)
         losses = {
             **rendered_losses(rendering, rays, lambda_color, lambda_depth),
             "sdf": settings.lambda_sdf * measured_mean((sdf - target).abs(), known),
@@ -100,7 +100,7 @@ def distance_targets(
     """
     before = rays.depth[:, None] - depths  # z-depth from a sample to the surface; negative behind
     # Distance from the plane for one metre of z-depth; 0 where the normal is not known.
-    per_depth = (rays.normals_world * rays.directions_world).sum(dim=-1).abs()[:, None]
+    per_depth = (rays.normals_world * rays.directions_world).sum(dim=1).abs()[:, None]
     plane = before * per_depth
     is_plane_nearest = (per_depth > 0) & ((plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
     target = torch.where(is_plane_nearest, plane, nearest)
@@ -211,7 +211,7 @@ class FeatureGrid(nn.Module):
         inputs = [trilinear(volume, self.low, voxel, points_world).T for volume, voxel in levels]
         # The point itself, from about -1 to 1: a unit is half the longest side of the bounds.
         inputs.append((points_world - self.low) / self.metres_per_unit - 1)
-        return nn.functional.silu(self.layer(torch.cat(inputs, dim=-1)))
+        return nn.functional.silu(self.layer(torch.cat(inputs, dim=1)))
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Raw colour and the raw fourth output, before a field gives them a meaning."""

@@ -45,7 +45,7 @@ class VolSdfField(NeuSField):
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
         """Weights of samples, from the density that belongs to the signed distance."""
         density = density_from_sdf(values, self.inverse_std)
-        return weights_from_density(density, depths, rays.directions_world.norm(dim=-1))
+        return weights_from_density(density, depths, rays.directions_world.norm(dim=1))
 
 
 def density_from_sdf(sdf: RaySamples, inverse_scale: Scalar) -> RaySamples:
@@ -66,5 +66,5 @@ def weights_from_occupancy(occupancy: RaySamples) -> RaySamples:
     place the ray passes a quarter, however near they are.
     Source: Oechsle et al. 2021 (UNISURF), Sec. 3; Zhu et al. 2022 (NICE-SLAM), Sec. 3.2.
     """
-    passed = torch.cat([torch.ones_like(occupancy[:, :1]), 1 - occupancy[:, :-1]], dim=-1)
-    return occupancy * passed.cumprod(dim=-1)
+    passed = torch.cat([torch.ones_like(occupancy[:, :1]), 1 - occupancy[:, :-1]], dim=1)
+    return occupancy * passed.cumprod(dim=1)

@@ -163,7 +163,7 @@ class LearnedField(Field):
         Without a generator nothing is random. Source: iMAP, Sec. 3.2 (32 and 12 samples).
         """
         coarse, _, _, fine = self._two_passes(rays, n_stratified, n_importance, generator)
-        return torch.cat([coarse, fine], dim=-1).sort(dim=-1).values
+        return torch.cat([coarse, fine], dim=1).sort(dim=1).values
 
     def render_hierarchically(
         self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None = None
@@ -171,7 +171,7 @@ class LearnedField(Field):
         """What `render` gives at `hierarchical_depths`, with every sample asked for once."""
         coarse, colors, values, fine = self._two_passes(rays, n_stratified, n_importance, generator)
         fine_colors, fine_values = self.query_along(rays, fine)
-        depths, order = torch.cat([coarse, fine], dim=-1).sort(dim=-1)
+        depths, order = torch.cat([coarse, fine], dim=1).sort(dim=1)
         all_colors = torch.cat([colors, fine_colors], dim=1)
         all_colors = all_colors.gather(1, order[..., None].expand_as(all_colors))
         all_values = torch.cat([values, fine_values], dim=1).gather(1, order)
@@ -242,7 +242,7 @@ def rendered_losses(
     depth_error = (seen.depth - rays.depth).abs()
     if over_std:
         depth_error = depth_error / seen.depth_variance.detach().sqrt().clamp_min(MIN_STD)
-    color_error = (seen.color - rays.color).abs().mean(dim=-1)
+    color_error = (seen.color - rays.color).abs().mean(dim=1)
     return {
         "depth": lambda_depth * measured_mean(depth_error, measured),
         "color": lambda_color * measured_mean(color_error, measured),

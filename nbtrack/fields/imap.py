@@ -36,7 +36,7 @@ class IMapField(LearnedField):
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
         """Weights of samples, from their densities. Source: iMAP, Sec. 3.2."""
-        return weights_from_density(values, depths, rays.directions_world.norm(dim=-1))
+        return weights_from_density(values, depths, rays.directions_world.norm(dim=1))
 
     def mapping_losses(self, draw: Draw, settings: MappingSettings, generator: Generator) -> Losses:
         """iMAP's geometric and photometric losses."""

@@ -62,7 +62,7 @@ class FourierMlp(nn.Module):
         embedding = torch.sin(normalized @ self.frequencies)
         hidden = self.activation(self.layer_1(embedding))
         hidden = self.activation(self.layer_2(hidden))
-        hidden = self.activation(self.layer_3(torch.cat([hidden, embedding], dim=-1)))
+        hidden = self.activation(self.layer_3(torch.cat([hidden, embedding], dim=1)))
         return self.activation(self.layer_4(hidden))
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:

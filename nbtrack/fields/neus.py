@@ -77,10 +77,10 @@ class NeuSField(LearnedField):
         flat = points_world.flatten(0, 1)
         n_points = max(1, round(settings.eikonal_share * len(flat)))
         chosen = torch.randint(len(flat), (n_points,), generator=generator, device=flat.device)
-        points = flat[chosen].detach().requires_grad_()
+        points = flat[chosen].requires_grad_()
         _, sdf = self(points)
         (gradient,) = torch.autograd.grad(sdf.sum(), points, create_graph=True)
-        return settings.lambda_eikonal * (gradient.norm(dim=-1) - 1).square().mean()
+        return settings.lambda_eikonal * (gradient.norm(dim=1) - 1).square().mean()
 
     def diagnostics(self) -> dict[str, float]:
         """The s-density's standard deviation 1/s, in metres."""
@@ -97,9 +97,9 @@ class NeuSField(LearnedField):
         low, high = (torch.tensor(c, **single) for c in (self.bounds.minimum, self.bounds.maximum))
         # m, in the box
         points = low + (high - low) * torch.rand(8192, 3, generator=generator, **single)
-        target = torch.minimum(points - low, high - points).amin(dim=-1)  # m, to the nearest face
+        target = torch.minimum(points - low, high - points).amin(dim=1)  # m, to the nearest face
         features = self.mlp.features(points)
-        design = torch.cat([features, torch.ones_like(features[:, :1])], dim=-1).double()
+        design = torch.cat([features, torch.ones_like(features[:, :1])], dim=1).double()
         # A little ridge keeps the weights small where features repeat each other.
         normal_matrix = design.T @ design
         normal_matrix.diagonal().add_(1e-3 * normal_matrix.diagonal().mean())
@@ -126,4 +126,4 @@ def guided_depths(
     offsets = rendering.stratified_depths(-1.0, torch.ones_like(far), settings.n_surface, generator)
     center = torch.where(measured, rays.depth, far_bound)
     around = (center[:, None] + settings.surface_band * offsets).clamp_min(base.NEAR)
-    return torch.cat([coarse, around], dim=-1).sort(dim=-1).values
+    return torch.cat([coarse, around], dim=1).sort(dim=1).values

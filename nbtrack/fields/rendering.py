@@ -35,12 +35,12 @@ def weights_from_density(
     Source: Sucar et al. 2021 (iMAP), Sec. 3.2. The last sample has no successor; it gets the
     section length of the one before it (our choice: a wall stays opaque, and free space free).
     """
-    z_steps = depths.diff(dim=-1)
-    sections = torch.cat([z_steps, z_steps[:, -1:]], dim=-1) * ray_lengths[:, None]
+    z_steps = depths.diff(dim=1)
+    sections = torch.cat([z_steps, z_steps[:, -1:]], dim=1) * ray_lengths[:, None]
     optical_depth = density * sections
     opacity = -torch.expm1(-optical_depth)
     # Transmittance in front of a sample: everything that lies before it, itself left out.
-    transmittance = torch.exp(-(optical_depth.cumsum(dim=-1) - optical_depth))
+    transmittance = torch.exp(-(optical_depth.cumsum(dim=1) - optical_depth))
     return opacity * transmittance
 
 
@@ -61,9 +61,9 @@ def weights_from_sdf(sdf: RaySamples, inverse_std: Scalar) -> Float[Tensor, "ray
     # 1 - alpha_i, which is Phi(f_{i+1}) / Phi(f_i) and at most 1, in logarithms: a plain quotient
     # is 0/0 deep inside objects.
     log_phi = torch.nn.functional.logsigmoid(inverse_std * sdf)
-    log_ratio = log_phi.diff(dim=-1).clamp_max(0)
+    log_ratio = log_phi.diff(dim=1).clamp_max(0)
     # Phi(f_0) times all (1 - alpha_j) before a section; its own is taken out of the sum again.
-    log_passed = log_phi[:, :1] + log_ratio.cumsum(dim=-1) - log_ratio
+    log_passed = log_phi[:, :1] + log_ratio.cumsum(dim=1) - log_ratio
     return -torch.expm1(log_ratio) * torch.exp(log_passed)
 
 
@@ -72,9 +72,9 @@ def composite(weights: RaySamples, colors: RayColors, depths: RaySamples) -> Ren
 
     Source: Sucar et al. 2021 (iMAP), Sec. 3.2. Light that passes the last sample adds nothing.
     """
-    depth = (weights * depths).sum(dim=-1)
-    color = (weights[..., None] * colors).sum(dim=-2)
-    depth_variance = (weights * (depth[:, None] - depths).square()).sum(dim=-1)
+    depth = (weights * depths).sum(dim=1)
+    color = (weights[..., None] * colors).sum(dim=1)
+    depth_variance = (weights * (depth[:, None] - depths).square()).sum(dim=1)
     return Rendering(color, depth, depth_variance, weights)
 
 
@@ -102,10 +102,10 @@ def importance_depths(
     without any weight, which see free space only, sampled evenly.
     """
     borders = (depths[:, 1:] + depths[:, :-1]) / 2
-    borders = torch.cat([depths[:, :1], borders, depths[:, -1:]], dim=-1)
+    borders = torch.cat([depths[:, :1], borders, depths[:, -1:]], dim=1)
     share = weights + 1e-4
-    cdf = (share / share.sum(dim=-1, keepdim=True)).cumsum(dim=-1)
-    cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], dim=-1)
+    cdf = (share / share.sum(dim=1, keepdim=True)).cumsum(dim=1)
+    cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], dim=1)
     # Stratified in probability: fewer clumps than independent draws.
     levels = stratified_depths(0.0, depths.new_ones(len(depths)), n_samples, generator)
     cell = torch.searchsorted(cdf, levels, right=True).clamp(1, cdf.shape[-1] - 1)

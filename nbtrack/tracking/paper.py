@@ -148,7 +148,7 @@ class VrTracker(AdamTracker):
         self, T_world_camera: Transform, directions_camera: Points, color: Colors, depth: Values
     ) -> Scalar:
         """iMAP's loss of rendered pixels; gradients reach the pose through every sample."""
-        rotation, position = T_world_camera[:3].split([3, 1], dim=-1)
+        rotation, position = T_world_camera[:3].split([3, 1], dim=1)
         directions_world = directions_camera @ rotation.T
         rays = Rays(position.T.expand_as(directions_world), directions_world, color, depth)
         n_first, n_second = self.settings.n_stratified, self.settings.n_importance
