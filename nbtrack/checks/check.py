@@ -21,14 +21,14 @@ from nbtrack.recordings.images import images_of
 from nbtrack.recordings.reading import far_limit, read_frames, select_frames
 from nbtrack.recordings.recording import Recording
 
-_FRAMES_AT_ONCE = 32  # 50 MB at 640x480
-_POINTS_PER_FRAME = 3000
-_N_PAIRS = 32  # of frames that are compared
-_QUICK_PAIRS = 16  # of frames that are compared in a quick look
-_MIN_FRAMES = 30  # without which pairs share too much to tell a small misfit
-_GAPS = (5, 10, 20, 40)  # frames between the two of a pair: they moved, and still see the same
-_TURNED_DEG = 30  # by which the camera may turn in between: half of what most cameras see
-_PRINTED = ["measured", "brightness", "moved_mm", "turned_deg"]
+_FRAMES_AT_ONCE = 32  # frames that are read at once; 50 MB at 640x480
+_POINTS_PER_FRAME = 3000  # about, in the cloud
+_N_PAIRS = 32  # pairs of frames that are compared
+_QUICK_PAIRS = 16  # pairs of frames that are compared in a quick look
+_MIN_FRAMES = 30  # with fewer, pairs share too many frames to tell a small misfit
+_STRIDES = (5, 10, 20, 40)  # frames from one to the other of a pair, which still see the same
+_TURNED_DEG = 30  # a camera may turn so far within a pair: half of what most cameras see
+_PRINTED = ["measured", "brightness", "moved_mm", "turned_deg"]  # columns of `DataReport.frames`
 _XYZ = ["x", "y", "z"]
 _LINES = textwrap.TextWrapper(98, "", "    ", break_long_words=False, break_on_hyphens=False)
 
@@ -38,24 +38,24 @@ class DataReport:
     """What a recording holds, and how well its frames agree with each other."""
 
     recording: Recording
-    frames: pd.DataFrame  # what `_read` tells of each
-    T_world_camera: Poses  # of the frames that have one, as declared
+    frames: pd.DataFrame  # a row for each frame that was read: see `_read`
+    T_world_camera: Poses  # poses of all frames that have one, read as declared
     cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m); no outliers
-    conventions: list[Convention]  # the declared one first
+    conventions: list[Convention]  # all that were compared, the declared one first
     best: Convention  # the declared one unless another is clearly better
-    misfits: list[Misfit]  # what may be a little off; where there are frames enough to tell
-    faults: list[str]  # what is wrong, each in a sentence; how numbers are read comes first
-    doubts: list[str]  # why it cannot be told whether numbers are read rightly
-    remarks: list[str]  # what is worth knowing of a recording that is right
+    misfits: list[Misfit]  # fits of all causes; empty if there are too few frames to tell
+    faults: list[str]  # sentences that say what is wrong
+    doubts: list[str]  # sentences that say why it is unknown whether numbers are read rightly
+    remarks: list[str]  # sentences about what is worth knowing of a right recording
 
     @property
     def warnings(self) -> list[str]:
-        """All that is said of the recording, the gravest first."""
+        """All sentences about the recording, the gravest first."""
         return self.faults + self.doubts + self.remarks
 
     @property
     def verdict(self) -> str:
-        """Whether the recording is read rightly."""
+        """Whether the recording is read rightly, with the gravest reason against it."""
         if self.faults:
             return f"wrong, because {self.faults[0]}"
         return f"cannot be told: {self.doubts[0]}" if self.doubts else "read rightly"
@@ -68,7 +68,7 @@ class DataReport:
         camera = declared.reading.camera
         wide_deg = 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx))
         near, far = cloud.depth.quantile([0.01, 0.99])
-        x, y, z = np.ptp(cloud[_XYZ].quantile([0.002, 0.998]), axis=0)  # as bounds
+        x, y, z = np.ptp(cloud[_XYZ].quantile([0.002, 0.998]), axis=0)  # as a map's bounds
         facts = self.frames[_PRINTED].agg(["mean", "min", "max"]).T
         rows = [f"{1e3 * c.apart * c.depth_m:9.1f} mm {c.overlap:5.0%}  {c.name}" for c in compared]
         # The first fault or doubt is in the verdict.
@@ -96,34 +96,36 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     """Read every frame of a recording and report what is there and whether it fits together.
 
     Unless `is_whole`, only some pairs of frames are read, in a second or two. Raises what
-    `read_frames` does, and DataError where the whole has no depth.
+    `read_frames` does, and DataError if `is_whole` and no pixel has a depth.
     """
     ids = select_frames(recording, slice(None))
     T_world_camera = recording.T_world_camera[ids]
     T_world_camera[:, :3, 3] -= recording.origin
     pairs = _pairs(T_world_camera, _N_PAIRS if is_whole else _QUICK_PAIRS)
-    kept = ids[np.union1d(pairs, [0])]  # those of pairs; the first is shown, also without a pair
-    sequence, frames, counts = _read(recording, ids if is_whole else kept, kept)
+    paired_ids = ids[np.union1d(pairs, [0])]  # the first frame, too: the cloud needs at least one
+    sequence, frames, counts = _read(recording, ids if is_whole else paired_ids, paired_ids)
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
-    own = Reading(recording.declared, sequence.intrinsics)
-    shared = findings.shared_value(counts, frames)
-    sequence.depths_mm[sequence.depths_mm == shared] = 0
-    compared = FramePairs(recording, ids, sequence, pairs)
-    conventions, best = fit_all(compared, own)
-    cloud = _cloud(own, sequence)
+    as_declared = Reading(recording.declared, sequence.intrinsics)
+    no_depth = findings.no_depth_value(counts, frames)
+    sequence.depths_mm[sequence.depths_mm == no_depth] = 0
+    frame_pairs = FramePairs(recording, ids, sequence, pairs)
+    conventions, best = fit_all(frame_pairs, as_declared)
+    cloud = _cloud(as_declared, sequence)
     is_far = cloud.depth > far_limit(cloud.depth)
-    is_own = best is conventions[0]
-    causes = CAUSES if is_own and len(ids) >= _MIN_FRAMES and best.overlap >= MIN_OVERLAP else {}
-    misfits = [fit(compared, own, *cause) for cause in ProgressBar("fitting", causes.items())]
-    text, kind = findings.misreading(conventions[0], best, main_misfits(compared, own, misfits))
-    texts = {name: [text] if kind == name else [] for name in ("fault", "doubt", "note")}
-    faults = [*findings.of_images(frames, shared, counts[0]), *texts["fault"]]
-    remarks, doubts = texts["note"], texts["doubt"]
-    if is_own:  # else the numbers of poses and depths are read wrongly, and tell nothing
-        faults += findings.of_poses(frames, recording) if kind != "fault" else []
+    # A small misfit can only be told if poses and depths are read rightly otherwise.
+    declared_is_best = best is conventions[0]
+    has_enough = len(ids) >= _MIN_FRAMES and best.overlap >= MIN_OVERLAP
+    causes = ProgressBar("fitting", CAUSES.items() if declared_is_best and has_enough else [])
+    misfits = [fit(frame_pairs, as_declared, as_declared, name, keys) for name, keys in causes]
+    main = main_misfits(frame_pairs, as_declared, misfits)
+    misread = findings.misreading(conventions[0], best, main)  # at most one sentence, by its kind
+    faults = [*findings.of_images(frames, no_depth, counts[0]), *misread.get("fault", [])]
+    doubts, remarks = misread.get("doubt", []), misread.get("note", [])
+    if declared_is_best:  # otherwise the numbers of poses and depths mean nothing
+        faults += findings.of_poses(frames, recording) if "fault" not in misread else []
         faults += findings.of_units(cloud.depth[~is_far])
-        remarks += findings.of_depths(frames, cloud.depth, own.declared.depth_scale)
+        remarks += findings.of_depths(frames, cloud.depth, as_declared.declared.depth_scale)
     if not (faults or doubts):
         doubts = list(findings.doubts_of_poses(conventions, recording.pose_file.name, is_whole))
     return DataReport(
@@ -145,7 +147,7 @@ def quick_look(recording: Recording) -> str:
 
 
 def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:
-    """How far the camera turns from frame to frame, by the trace of the rotation in between."""
+    """The angle by which the camera turns from each frame to the next."""
     R = T_world_camera[:, :3, :3]
     cosine = ((R[:-1] * R[1:]).sum(axis=(1, 2)) - 1) / 2  # the sum is the trace of R_a^T R_b
     return np.degrees(np.arccos(cosine.clip(-1, 1)))
@@ -154,68 +156,77 @@ def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:
 def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:
     """At most `maximum` pairs of frames that see much the same, as indices of their poses.
 
-    They are spread over the sequence, and every gap of `_GAPS` occurs about equally often. How far
-    the camera turns, which limits the gaps, is the same in all conventions.
+    The pairs are spread over the sequence, and each of `_STRIDES` occurs about equally often, but
+    none in which the camera turns too far. The poses may be of any convention, since all have the
+    same angles between frames.
     """
     n_frames = len(T_world_camera)
     if n_frames < 2:
         return np.empty((2, 0), int)
-    # At least 1, so that nothing is divided by 0; up to there no gap of `_GAPS` is limited.
+    # At least 1, so that nothing is divided by 0: then strides are limited to `_TURNED_DEG` frames.
     step_deg = max(1.0, np.median(_turned_deg(T_world_camera)))
-    largest_gap = max(1, min(n_frames - 1, int(_TURNED_DEG / step_deg)))
-    gaps = np.minimum(np.resize(_GAPS, maximum), largest_gap)
-    first = np.rint(np.linspace(0, 1, maximum) * (n_frames - 1 - gaps)).astype(int)
-    return np.unique([first, first + gaps], axis=1)
+    largest = max(1, min(n_frames - 1, int(_TURNED_DEG / step_deg)))
+    strides = np.minimum(np.resize(_STRIDES, maximum), largest)
+    first = np.rint(np.linspace(0, 1, maximum) * (n_frames - 1 - strides)).astype(int)
+    return np.unique([first, first + strides], axis=1)
 
 
 def _read(
-    recording: Recording, looked_at: Frames, kept: Frames
+    recording: Recording, ids: Frames, ids_kept: Frames
 ) -> tuple[RgbdSequence, pd.DataFrame, np.ndarray]:
-    """The frames `kept` as a sequence, a table with a row for each of `looked_at`, and counts.
+    """Read the frames `ids`. Returns those of `ids_kept` as a sequence, a table, and counts.
 
-    Counts (2, 65536) are how often each depth value occurs, and in how many frames many pixels
-    share it. `depths_mm` are the files' values, for any reading of them. Images are read in parts,
-    to bound the memory; those of a single part are kept for the next read.
-    A row holds the share of pixels with depth, the brightness in [0, 1], the greatest common
-    divisor of all depth values, and whether these are the same as in the row before. It also holds
-    how far the camera moved and turned since the frame before, and how far it is off the middle
-    between the frames before and after; NaN where one of these has no pose.
+    The sequence's `depths_mm` are the files' values, which any reading can take. The table has a
+    row for each of `ids`:
+
+    - `measured`: the share of pixels with depth; `brightness`: the mean colour, in [0, 1];
+    - `depth_step`: the greatest common divisor of all depth values;
+    - `is_repeated`: whether the depth image is that of the row before;
+    - `moved_mm`, `turned_deg`: how far the camera moved and turned since the recording's frame
+      before, and `off_mm`, how far it is off the middle between the frames before and after; NaN if
+      one of these has no pose.
+
+    Counts (2, 65536) are how often each depth value occurs, and in how many frames many pixels have
+    it. Images are read in parts, to bound the memory.
     """
-    parts = []
-    rows = []
+    parts, rows = [], []
     counts = np.zeros((2, 65536), int)
-    with ProgressBar("reading frames", len(looked_at)) as bar:
-        for ids in np.split(looked_at, range(_FRAMES_AT_ONCE, len(looked_at), _FRAMES_AT_ONCE)):
-            part = read_frames(recording, ids, as_stored=True)
+    with ProgressBar("reading frames", len(ids)) as bar:
+        for part_ids in np.split(ids, range(_FRAMES_AT_ONCE, len(ids), _FRAMES_AT_ONCE)):
+            part = read_frames(recording, part_ids, as_stored=True)
             for values, color in zip(part.depths_mm, part.colors, strict=True):
                 step = np.gcd.reduce(values, axis=None)
                 of_frame = np.bincount(values.ravel(), minlength=65536)
                 counts += of_frame, of_frame > findings.SHARED * values.size
                 rows.append(((values > 0).mean(), color.mean() / 255, step, zlib.crc32(values)))
-            parts.append(part.select(np.isin(ids, kept)))
-            if len(looked_at) > _FRAMES_AT_ONCE:
+            parts.append(part.select(np.isin(part_ids, ids_kept)))
+            if len(ids) > _FRAMES_AT_ONCE:  # a single part is left for whoever reads next
                 images_of(recording).forget()
             bar.update(len(part))
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
-    frames = pd.DataFrame(rows, looked_at, ["measured", "brightness", "depth_step", "checksum"])
+    frames = pd.DataFrame(rows, ids, ["measured", "brightness", "depth_step", "checksum"])
     frames["is_repeated"] = frames.pop("checksum").diff() == 0
-    T_world_camera = recording.T_world_camera
-    moves_mm = 1e3 * np.diff(T_world_camera[:, :3, 3], axis=0, prepend=np.nan)
-    off_mm = np.diff(moves_mm, axis=0, append=np.nan) / 2  # from the middle of both neighbours
-    frames["moved_mm"] = np.linalg.norm(moves_mm, axis=1)[looked_at]
-    frames["turned_deg"] = np.array([np.nan, *_turned_deg(T_world_camera)])[looked_at]
-    frames["off_mm"] = np.linalg.norm(off_mm, axis=1)[looked_at]
+    _add_motion(frames, recording.T_world_camera)
     counts[:, 0] = 0  # no depth
     return replace(parts[0], **arrays), frames, counts
 
 
-def _cloud(own: Reading, stored: RgbdSequence) -> pd.DataFrame:
-    """Coloured points (m, world) of some frames, as `own` reads them, with the columns of `cloud`.
+def _add_motion(frames: pd.DataFrame, T_world_camera: Poses) -> None:
+    """Add `moved_mm`, `turned_deg` and `off_mm`, as `_read` explains them, to its table."""
+    moves_mm = 1e3 * np.diff(T_world_camera[:, :3, 3], axis=0, prepend=np.nan)
+    off_mm = np.diff(moves_mm, axis=0, append=np.nan) / 2  # from the middle of both neighbours
+    frames["moved_mm"] = np.linalg.norm(moves_mm, axis=1)[frames.index]
+    frames["turned_deg"] = np.array([np.nan, *_turned_deg(T_world_camera)])[frames.index]
+    frames["off_mm"] = np.linalg.norm(off_mm, axis=1)[frames.index]
 
-    `stored` has the files' own values as `depths_mm`.
+
+def _cloud(reading: Reading, stored: RgbdSequence) -> pd.DataFrame:
+    """Coloured points (m, world) of a sequence under a reading: see `DataReport.cloud`.
+
+    `stored.depths_mm` are the files' own values. Points without depth are left out, outliers not.
     """
     stride = max(1, round((stored.depths_mm[0].size / _POINTS_PER_FRAME) ** 0.5))
-    points_camera = own.points(*on_grid(stored.depths_mm, stride)).numpy()
+    points_camera = reading.points(*on_grid(stored.depths_mm, stride)).numpy()
     T = stored.T_world_camera
     points_world = points_camera @ T[:, :3, :3].mT + T[:, None, :3, 3]
     colors = stored.colors[:, ::stride, ::stride].reshape(points_camera.shape)

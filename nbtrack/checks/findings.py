@@ -1,4 +1,7 @@
-"""What a recording and its fits say, each in a sentence: faults, doubts and remarks."""
+"""Sentences about a recording: faults, doubts and remarks, from what `check` measured.
+
+Each function looks at one kind of mistake, and yields or returns a sentence for each one it finds.
+"""
 
 from collections.abc import Iterator
 
@@ -11,86 +14,100 @@ from nbtrack.checks.misfits import Misfit
 from nbtrack.recordings.reading import FAR, far_limit
 from nbtrack.recordings.recording import Recording
 
-# A pose is odd if it is off the middle of its neighbours by more than both: metres, and medians of
-# a step. Real recordings, and rooms thinned to every twentieth frame, have up to 1.1 medians.
-_OFF = 0.05
-_OFF_STEPS = 2.5
-_MIN_REPEATED = 0.05  # share of frames whose depth is that of the frame before, though they moved
-_MAX_STEP = 0.01  # share of the depth between depths that a camera can tell (our choice)
-# A value is shared if it is so much of all depths, in so many frames, and so many times as often
-# as any other (our choice).
+# A pose is odd if it lies farther from the middle of its neighbours than both of these. Real
+# recordings, and rooms thinned to every twentieth frame, have up to 1.1 median steps.
+_OFF = 0.05  # m
+_OFF_STEPS = 2.5  # medians of the distance between frames
+_MIN_REPEATED = 0.05  # a larger share of frames that repeat the depth of the one before is a fault
+_MAX_STEP = 0.01  # share of the depth: coarser steps of a camera's depth are remarked (our choice)
+# A depth value is no measurement if it is a larger share of all depths than SHARED, if it is that
+# in a larger share of the frames than _SHARING, and if it is more than _SPIKE times as frequent as
+# any other value (our choice).
 SHARED, _SHARING, _SPIKE = 0.01, 0.25, 10
-_BLACK = 0.02  # brightness, in [0, 1]
+_BLACK = 0.02  # the median brightness, in [0, 1], below which images are black
 
 
-def misreading(own: Convention, best: Convention, main: list[Misfit]) -> tuple[str, str]:
-    """What is wrong in how the numbers are read, in a sentence, and its kind.
+def misreading(declared: Convention, best: Convention, main: list[Misfit]) -> dict[str, list[str]]:
+    """A sentence about how the numbers are misread, by its kind: "fault", "doubt" or "note".
 
-    Both are empty where nothing is wrong. A cause is named if surfaces then agree as well as those
-    of right recordings: the kind is "note" for a usual sensor's error, else "fault". Surfaces that
-    lie apart without a known cause are a "doubt", and a "fault" if they lie far apart.
+    `best` is the result of `fit_all`, and `main` that of `main_misfits`. The dictionary is empty if
+    nothing is wrong. There are two kinds of mistakes:
+
+    - Another convention than the declared one is the best, or a cause explains the gaps, which then
+      are those of right recordings. It is a "note" if usual sensors have such an error, and a
+      "fault" otherwise.
+    - Surfaces lie apart without a known cause: a "doubt", or a "fault" if they lie far apart.
     """
-    usual_mm = 1e3 * own.usual_apart * own.depth_m
-    apart = f"lie {1e3 * own.apart * own.depth_m:.0f} mm apart" if own.overlap else "never meet"
-    if best is not own:
+    depth_mm = 1e3 * declared.depth_m
+    usual_mm = declared.usual_apart * depth_mm
+    apart = f"lie {declared.apart * depth_mm:.0f} mm apart" if declared.overlap else "never meet"
+    if best is not declared:
         reading, name, left_mm = best.reading, str(best), 1e3 * best.apart * best.depth_m
-    elif main and main[0].apart <= own.usual_apart:
-        reading, left_mm = main[0].reading, 1e3 * main[0].apart * own.depth_m
+        kind = "fault"
+    elif main and main[0].apart <= declared.usual_apart:
+        reading, left_mm = main[0].reading, main[0].apart * depth_mm
         name = ", or as well that ".join(str(misfit) for misfit in main)
-    elif own.overlap >= MIN_OVERLAP and own.apart > own.usual_apart:
-        return (
+        kind = "note" if main[0].is_usual else "fault"
+    elif declared.overlap >= MIN_OVERLAP and declared.apart > declared.usual_apart:
+        text = (
             f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), "
             "and nothing that is tried explains it: no other axes, units or directions of poses "
             "and depth, no late depth, no focal lengths or principal point, no error of depth (a "
             "factor, a length, a square), no offset of the camera. What cannot be told: poses that "
             "drift or jump, a lens's distortion, and depth images that hold no depth (disparity, "
             "half floats, each frame scaled by itself)"
-        ), "fault" if own.is_far_apart else "doubt"
+        )
+        return {"fault" if declared.is_far_apart else "doubt": [text]}
     else:
-        return "", ""
+        return {}
     tail = f"surfaces that two frames see then lie {left_mm:.0f} mm apart; as declared they {apart}"
-    kind = "note" if best is own and main[0].is_usual else "fault"
-    return f"{name}; {remedy(reading, own.reading)} ({tail})", kind
+    return {kind: [f"{name}; {remedy(reading, declared.reading)} ({tail})"]}
 
 
 def doubts_of_poses(conventions: list[Convention], file: str, needs_proof: bool) -> Iterator[str]:
-    """Why it cannot be told whether poses are read rightly, in a sentence; none where it can.
+    """A sentence that says why it is unknown whether poses are read rightly; none if it is known.
 
-    Two frames see too little of the same; or, where proof is needed, the camera moves too little to
-    tell conventions apart.
+    The reason is that two frames see too little of the same, or, if `needs_proof`, that the camera
+    moves too little to tell conventions apart. The declared one must come first in `conventions`.
     """
-    own, *others = conventions
+    declared, *others = conventions
     of_poses = [other for other in others if other.subject == "poses"]
-    alike = [other.name for other in of_poses if not own.is_clearly_better(other)]
-    if own.overlap < MIN_OVERLAP or np.isnan(own.apart):
-        reason = f"two frames see too little of the same ({own.overlap:.0%} of the points)"
+    alike = [other.name for other in of_poses if not declared.is_clearly_better(other)]
+    if declared.overlap < MIN_OVERLAP or np.isnan(declared.apart):
+        reason = f"two frames see too little of the same ({declared.overlap:.0%} of the points)"
         yield f"{file} is not proved: {reason}: check it, and a piece with smaller steps"
     elif needs_proof and alike:
         reason = f"the camera moves too little to tell {len(alike)} other conventions apart"
         yield f"{file} is not proved: {reason}, such as {alike[0]}"
 
 
-def shared_value(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> int:
-    """The depth value that many pixels share though the camera moves; 0 where there is none.
+def no_depth_value(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> int:
+    """The depth value that many pixels share although the camera moves; 0 if there is none.
 
-    `counts` are how often each value occurs, and in how many frames many share it.
+    Such a value is no measurement, but what the camera gives for none. `counts` and `frames` are
+    those of `check`: `counts[0]` is how often each depth value occurs, and `counts[1]` in how many
+    frames it is more than the share `SHARED` of the pixels.
     """
-    next_most, most = np.argsort(counts[0])[-2:]
-    is_often = counts[0, most] > SHARED * counts[0].sum() and np.count_nonzero(counts[0]) > _SPIKE
+    n_pixels, n_frames = counts
+    second, most = np.argsort(n_pixels)[-2:]
+    is_frequent = n_pixels[most] > SHARED * n_pixels.sum() and np.count_nonzero(n_pixels) > _SPIKE
     # A camera's rounding makes many values frequent, but none so much more than all others.
-    is_spike = counts[0, most] > _SPIKE * counts[0, next_most]
-    is_shared = counts[1, most] > _SHARING * len(frames) and frames.moved_mm.median() > 0
-    return int(most) if is_often and is_spike and is_shared else 0
+    is_spike = n_pixels[most] > _SPIKE * n_pixels[second]
+    is_shared = n_frames[most] > _SHARING * len(frames) and frames.moved_mm.median() > 0
+    return int(most) if is_frequent and is_spike and is_shared else 0
 
 
-def of_images(frames: pd.DataFrame, shared: int, often: Int[np.ndarray, "_"]) -> Iterator[str]:
-    """What is wrong with images, whatever their numbers mean; `often` each depth value occurs."""
+def of_images(frames: pd.DataFrame, no_depth: int, often: Int[np.ndarray, "_"]) -> Iterator[str]:
+    """What is wrong with images, whatever their numbers mean.
+
+    `no_depth` is the result of `no_depth_value`, and `often[v]` how often the depth value v occurs.
+    """
     if not frames.measured.any():
         advice = "check the depth folder, and no_depth in sequence.toml"
         yield f"no pixel that was looked at has a depth: all are 0, or saturated (65535); {advice}"
-    if shared:
-        found = f"{often[shared] / often.sum():.0%} of the depths are {shared}"
-        yield f"{found}, which is no measurement; set no_depth = {shared} in sequence.toml"
+    if no_depth:
+        found = f"{often[no_depth] / often.sum():.0%} of the depths are {no_depth}"
+        yield f"{found}, which is no measurement; set no_depth = {no_depth} in sequence.toml"
     # The first frame repeats none, so that the share is below 1 and 1 / (1 - repeated) is finite.
     repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
     if repeated > _MIN_REPEATED:
@@ -102,11 +119,11 @@ def of_images(frames: pd.DataFrame, shared: int, often: Int[np.ndarray, "_"]) ->
 
 
 def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
-    """What is wrong with poses that are read rightly: some lie beside their neighbours' path."""
+    """Poses that are read rightly, but lie beside the path of their neighbours."""
     off = frames.off_mm / 1e3  # m
     is_odd = off > max(_OFF, _OFF_STEPS * frames.moved_mm.median() / 1e3)
-    # An odd pose makes both of its neighbours off by half as much. So only the largest of three
-    # frames in a row counts.
+    # An odd pose also moves the middles that its neighbours are compared with, by half as much. So
+    # of three frames in a row only the one that is farthest off counts.
     largest_of_three = off.rolling(3, min_periods=1, center=True).max()
     odd = off[is_odd & (off == largest_of_three)]
     if len(odd):
@@ -117,7 +134,7 @@ def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
 
 
 def of_units(depth: pd.Series) -> Iterator[str]:
-    """What is wrong with depths that fit the poses: no camera measures them."""
+    """A median depth (m) that no camera measures, though depths and poses fit each other."""
     near, far = PLAUSIBLE_DEPTH
     median = depth.median()
     if median < near or median > far:
@@ -126,9 +143,10 @@ def of_units(depth: pd.Series) -> Iterator[str]:
 
 
 def of_depths(frames: pd.DataFrame, depth: pd.Series, depth_scale: float) -> Iterator[str]:
-    """What is worth knowing of depths that are read rightly.
+    """Remarks about depths (m) that are read rightly: outliers, and coarse steps.
 
-    Depths and their steps are both as declared: only the ratio of the two decides.
+    Depths and their steps are both in the declared unit. Only their ratios decide, which no unit
+    changes.
     """
     is_far = depth > far_limit(depth)
     if is_far.any():
@@ -138,7 +156,7 @@ def of_depths(frames: pd.DataFrame, depth: pd.Series, depth_scale: float) -> Ite
         advice = "check the camera, or set no_depth in sequence.toml to what it gives for none"
         yield f"{found}, {rule}; {advice}"
     step_m = np.gcd.reduce(frames.depth_step) / depth_scale
-    # With fewer than eight steps up to the farthest point, they may be chance.
+    # The steps may be chance if the farthest point is fewer than eight of them away.
     if _MAX_STEP * depth.median() < step_m < depth.max() / 8:
         advice = "look for those that the camera gave, or expect no better poses"
         yield f"depths come in steps of {100 * step_m:.1f} cm: {advice}"

@@ -1,8 +1,9 @@
-"""What may be a little off in how a recording is read, fitted to its own surfaces.
+"""Small errors in how a recording is read, estimated from its own depth maps.
 
-Each cause is what happens: depth that comes after the poses, a camera beside what its poses are
-of. Its few numbers are those under which surfaces of pairs of frames lie least apart (Gauss-Newton
-with the weights of Geman and McClure). Their interval comes from drawing pairs anew (bootstrap).
+A cause is something that may be off, such as depth that comes after its poses, or a camera that
+lies beside the body whose poses are given. It has one to six numbers. They are fitted so that the
+surfaces of pairs of frames have the smallest gaps, by Gauss-Newton with the weights of Geman and
+McClure. A bootstrap over the pairs gives an interval of each number.
 """
 
 from dataclasses import dataclass, replace
@@ -14,14 +15,19 @@ from jaxtyping import Float
 from nbtrack.checks.readings import AREA_SCALE, FramePairs, Gaps, Reading, cost_of, mean_apart
 
 _STEPS = 12  # of Gauss-Newton, at most
-_FACTORS = (4.0, 2.0, 1.0, 0.5, 0.2)  # of a step; the best is taken
-_WIDE = 5.0  # medians of the gaps: the scale of the weights in a step
-_ENOUGH = 0.02  # of what is negligible: such a step is none
-# Shares of the cost as declared that a cause may leave: a usual sensor's error, and another.
-_USUAL_GAIN, _GAIN = 0.9, 0.75  # our choice
-_ALIKE = 0.95  # ratio of two costs from which on they count as equal
-_WHOLE = 0.8  # of the cost of a cause: where all numbers together leave less, it is not the whole
-_RESAMPLED = 200  # draws of a bootstrap
+_FACTORS = (4.0, 2.0, 1.0, 0.5, 0.2)  # a step is tried at these lengths, and the best is taken
+_WIDE = 5.0  # in a step the weights' scale is so many medians of the absolute gaps
+_ENOUGH = 0.02  # a step ends the fit if it changes each number by less than this x negligible
+# A cause is significant if the cost that it leaves is below this share of the declared reading's.
+_MAX_COST_LEFT = 0.75  # our choice
+_MAX_COST_LEFT_USUAL = 0.9  # our choice, for errors that usual sensors have
+_ALIKE = 0.95  # two costs count as equal if their ratio is at least this
+# No single cause is the whole explanation if all numbers together leave less than this share of the
+# cost that the best cause leaves.
+_WHOLE = 0.8
+_RESAMPLED = 200  # draws of the bootstrap
+Hessians = Float[np.ndarray, "... k k"]
+Gradients = Float[np.ndarray, "... k"]
 
 
 class Number(NamedTuple):
@@ -30,9 +36,9 @@ class Number(NamedTuple):
     label: str
     form: str  # format specification
     unit: str
-    limit: float  # beyond which it is not looked for
-    negligible: float  # our choice: more than right recordings show
-    usual: float = 0.0  # up to this it is a note and no fault: usual sensors have such errors
+    limit: float  # the fit clips it to -limit and limit; an estimate there says nothing
+    negligible: float  # more than right recordings show (our choice)
+    usual: float = 0.0  # usual sensors have errors up to this: they are a note, not a fault
 
 
 _LENGTH, _ANGLE = ("+.3f", " m", 1.0, 0.02), ("+.1f", " deg", 30.0, 1.0)
@@ -40,7 +46,8 @@ _NUMBERS = {
     "late": Number("by ", "+.1f", " frames", 10.0, 0.3),
     "focal_share": Number("by ", "+.1%", "", 0.5, 0.01),
     "depth_share": Number("by ", "+.1%", "", 0.5, 0.01),
-    # Structured light's; that of the paper's dataset is 0.0012, and is estimated as up to 0.0035.
+    # Sensors with structured light have this error. In the paper's dataset it is 0.0012, and the
+    # estimates are up to 0.0035.
     "depth_error_per_m": Number("of ", "+.5f", " per metre", 0.05, 5e-4, usual=4e-3),
     "depth_offset": Number("", "+.3f", " m", 0.5, 0.02),
     "right": Number("right by ", "+.1%", " of the width", 0.25, 0.005),
@@ -49,8 +56,8 @@ _NUMBERS = {
     **{axis: Number(f"{axis} ", *_LENGTH) for axis in "xyz"},
     **{f"turn_{axis}": Number(f"turned {axis} ", *_ANGLE) for axis in "xyz"},
 }
-# What may be off, and the numbers that say by how much. Those of fewer numbers first: of several
-# that fit alike the first is named.
+# What may be off, and the numbers of a `Reading` that say by how much. Causes with fewer numbers
+# come first: `main_misfits` relies on this order, since it names the first of those that fit alike.
 CAUSES = {
     "depth comes after the poses": ["late"],
     "focal lengths should change": ["focal_share"],
@@ -66,28 +73,32 @@ CAUSES = {
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """The estimate of a cause's numbers, with its interval of 95 %, and how surfaces then agree."""
+    """A fitted cause: its numbers with intervals of 95 %, and how surfaces then agree."""
 
     name: str
-    reading: Reading  # with the estimate
-    numbers: dict[str, tuple[float, float, float]]  # by key: estimate and ends of its interval
-    apart: float  # by how much surfaces then lie apart in the mean, as a share of the depth
-    # The cost, as a share of that without the numbers, or of that with the opposite numbers; the
-    # larger share.
-    gain: float
+    reading: Reading  # with the estimated numbers
+    numbers: dict[str, tuple[float, float, float]]  # by key: estimate, low and high end of interval
+    apart: float  # the mean absolute gap under `reading`, as a share of the depth
+    # The cost under `reading` as a share of the cost without the numbers, or of that with the
+    # opposite numbers, whichever share is larger. Smaller is better.
+    cost_left: float
 
     @property
     def is_significant(self) -> bool:
-        """Whether an interval is more than negligible, and surfaces agree better, within limits."""
+        """Whether the cause is off, and explains much of the cost, by numbers within their limits.
+
+        It is off if the interval of any number has only values beyond what is negligible.
+        """
         rows = [(_NUMBERS[key], *estimate) for key, estimate in self.numbers.items()]
         is_off = any(max(low, -high) > number.negligible for number, _, low, high in rows)
         is_within = all(abs(value) < number.limit for number, value, _, _ in rows)
-        return is_off and is_within and self.gain < (_USUAL_GAIN if self.is_usual else _GAIN)
+        max_cost_left = _MAX_COST_LEFT_USUAL if self.is_usual else _MAX_COST_LEFT
+        return is_off and is_within and self.cost_left < max_cost_left
 
     @property
     def is_usual(self) -> bool:
-        """Whether usual sensors have errors so large."""
-        return all(abs(ends[0]) <= _NUMBERS[key].usual for key, ends in self.numbers.items())
+        """Whether usual sensors have errors as large as the estimates."""
+        return all(abs(value) <= _NUMBERS[key].usual for key, (value, _, _) in self.numbers.items())
 
     def __str__(self) -> str:
         texts = []
@@ -98,77 +109,88 @@ class Misfit:
         return f"{self.name} {', '.join(texts)}"
 
 
-def main_misfits(pairs: FramePairs, own: Reading, misfits: list[Misfit]) -> list[Misfit]:
-    """The significant misfits that fit best, about equally well; the one of fewest numbers first.
+def main_misfits(pairs: FramePairs, as_declared: Reading, misfits: list[Misfit]) -> list[Misfit]:
+    """The significant misfits that leave about the least cost, in the order of `misfits`.
 
-    A misfit that only adds numbers to those of the first is left out. The list is empty where none
-    is significant. It is empty too where all numbers together fit clearly better: then the cause is
-    none of those that were tried.
+    `misfits` must be in the order of `CAUSES`, so that the first one returned has the fewest
+    numbers. Others that only add numbers to those of the first are left out.
+
+    The list is empty if no misfit is significant. It is also empty if all numbers, fitted at once,
+    leave clearly less cost: then none of the causes explains the recording.
     """
     significant = [misfit for misfit in misfits if misfit.is_significant]
-    lowest = min((misfit.gain for misfit in significant), default=0.0)
-    alike = [misfit for misfit in significant if _ALIKE * misfit.gain <= lowest]
-    if not alike:
+    if not significant:
         return []
-    first, *others = alike
-    if fit(pairs, own, "all", list(_NUMBERS), first.reading).gain < _WHOLE * lowest:
+    lowest = min(misfit.cost_left for misfit in significant)
+    first, *others = (m for m in significant if _ALIKE * m.cost_left <= lowest)
+    all_numbers = fit(pairs, as_declared, first.reading, "all", list(_NUMBERS))
+    if all_numbers.cost_left < _WHOLE * lowest:
         return []
     return [first, *(other for other in others if not first.numbers.keys() <= other.numbers.keys())]
 
 
 def fit(
-    pairs: FramePairs, own: Reading, name: str, keys: list[str], start: Reading | None = None
+    pairs: FramePairs, as_declared: Reading, start: Reading, name: str, keys: list[str]
 ) -> Misfit:
-    """Fit numbers of a reading, from those of `start`, by default from what is declared."""
-    limit, small = np.array([(_NUMBERS[key].limit, _NUMBERS[key].negligible) for key in keys]).T
+    """Fit the numbers `keys` of the cause `name`, while all others stay as declared.
+
+    The fit begins at the numbers that the reading `start` has.
+    """
+    # The unit of a step is what is negligible of each number, so that all are of similar size.
+    limit, unit = np.array([(_NUMBERS[key].limit, _NUMBERS[key].negligible) for key in keys]).T
 
     def read(values: np.ndarray) -> Reading:
-        return replace(own, **dict(zip(keys, values.tolist(), strict=True)))
+        return replace(as_declared, **dict(zip(keys, values.tolist(), strict=True)))
 
     def gaps_at(values: np.ndarray) -> Gaps:
-        return pairs.compare(read(values)).areas
+        return pairs.compare(read(values)).area_gaps
 
-    values = np.array([getattr(start or own, key) for key in keys])
+    values = np.array([getattr(start, key) for key in keys])
     gaps = gaps_at(values)
     for _ in range(_STEPS):
         scale = _WIDE * float(np.nanmedian(np.abs(gaps)))
-        # Steps are in units of what is negligible, so that all numbers are alike.
-        H, g = _normal_equations(gaps, [gaps_at(values + unit) for unit in np.diag(small)], scale)
+        H, g = _normal_equations(gaps, [gaps_at(values + move) for move in np.diag(unit)], scale)
         step = _solution(H.sum(axis=0), g.sum(axis=0))
-        tried = [(values + factor * small * step).clip(-limit, limit) for factor in _FACTORS]
+        tried = [(values + factor * unit * step).clip(-limit, limit) for factor in _FACTORS]
         tried_gaps = [gaps_at(new) for new in tried]
         best = int(np.argmin([cost_of(new, scale) for new in tried_gaps]))
-        is_small_step = (np.abs(tried[best] - values) < _ENOUGH * small).all()
+        is_small_step = (np.abs(tried[best] - values) < _ENOUGH * unit).all()
         if is_small_step or cost_of(tried_gaps[best], scale) >= cost_of(gaps, scale):
             break
         values, gaps = tried[best], tried_gaps[best]
-    H, g = _normal_equations(gaps, [gaps_at(values + unit) for unit in np.diag(small)], AREA_SCALE)
-    # A fixed seed, so that a recording always has the same interval.
+    H, g = _normal_equations(gaps, [gaps_at(values + move) for move in np.diag(unit)], AREA_SCALE)
+    low, high = values + unit * _interval(H, g)
+    # If the opposite numbers fit as well, the cause is another one. For example a `late` of either
+    # sign interpolates poses, which may help by itself.
+    without, opposite = gaps_at(0 * values), gaps_at(-values)
+    cost_left = max(_cost_ratio(gaps, without), _cost_ratio(gaps, opposite))
+    intervals = zip(values.tolist(), low.tolist(), high.tolist(), strict=True)
+    numbers = dict(zip(keys, intervals, strict=True))
+    return Misfit(name, read(values), numbers, mean_apart(gaps), cost_left)
+
+
+def _interval(H: Hessians, g: Gradients) -> Float[np.ndarray, "2 k"]:
+    """Ends of the interval of 95 % around the estimate, by a bootstrap over pairs of frames.
+
+    `H` and `g` are the normal equations of each pair at the estimate.
+    """
+    # The seed is fixed, so that a recording always has the same interval.
     drawn = np.random.default_rng(0).integers(len(H), size=(_RESAMPLED, len(H)))
-    step = _solution(H.sum(axis=0), g.sum(axis=0))  # of all pairs; not quite 0
-    deviations = _solution(H[drawn].sum(axis=1), g[drawn].sum(axis=1)) - step
-    low, high = values + small * np.quantile(deviations, [0.025, 0.975], axis=0)
-    # Where the opposite numbers fit as well, the cause is another one: a `late` of either sign
-    # interpolates the poses, for example, which may help by itself.
-    gain = max(_ratio(gaps, gaps_at(0 * values)), _ratio(gaps, gaps_at(-values)))
-    estimates = np.stack([values, low, high], axis=1)
-    numbers = dict(zip(keys, map(tuple, estimates.tolist()), strict=True))
-    return Misfit(name, read(values), numbers, mean_apart(gaps), gain)
+    deviations = _solution(H[drawn].sum(axis=1), g[drawn].sum(axis=1))
+    deviations -= _solution(H.sum(axis=0), g.sum(axis=0))  # the step of all pairs is not quite 0
+    return np.quantile(deviations, [0.025, 0.975], axis=0)
 
 
-def _solution(
-    H: Float[np.ndarray, "... k k"], g: Float[np.ndarray, "... k"]
-) -> Float[np.ndarray, "... k"]:
-    """The k numbers that solve normal equations; those that no equation determines are 0."""
+def _solution(H: Hessians, g: Gradients) -> Gradients:
+    """The step of k numbers that solves H step = -g, and is 0 along undetermined directions."""
     return -(np.linalg.pinv(H, rcond=1e-6, hermitian=True) @ g[..., None])[..., 0]
 
 
-def _normal_equations(
-    gaps: Gaps, moved: list[Gaps], scale: float
-) -> tuple[Float[np.ndarray, "pairs k k"], Float[np.ndarray, "pairs k"]]:
-    """The weighted J J^T and J gaps of each pair of frames.
+def _normal_equations(gaps: Gaps, moved: list[Gaps], scale: float) -> tuple[Hessians, Gradients]:
+    """J W J' and J W gaps of each pair of frames, with Geman-McClure weights W at `scale`.
 
-    `moved` are k gaps: in each, another one of the k numbers is larger by a unit.
+    The Jacobian J is by finite differences: `moved` holds the gaps after each of the k numbers, one
+    at a time, has grown by its unit.
     """
     J = np.stack(moved) - gaps  # (k, pairs, areas)
     is_known = np.isfinite(J).all(axis=0) & np.isfinite(gaps)
@@ -178,7 +200,7 @@ def _normal_equations(
     return H, np.einsum("ipa,pa,pa->pi", J, gaps, weights)
 
 
-def _ratio(gaps: Gaps, others: Gaps) -> float:
-    """The cost of some gaps as a share of that of others, over areas that are known in both."""
+def _cost_ratio(gaps: Gaps, others: Gaps) -> float:
+    """The cost of `gaps` divided by that of `others`, over the areas that are known in both."""
     is_known = np.isfinite(gaps) & np.isfinite(others)
     return cost_of(gaps[is_known]) / cost_of(others[is_known])
