@@ -1,4 +1,4 @@
-"""Bring one scene of the Neural RGB-D dataset out of its ZIP file, without the other eight."""
+"""Download one scene of the Neural RGB-D dataset from its ZIP file, without the other eight."""
 
 import contextlib
 import re
@@ -13,20 +13,20 @@ from nbtrack.machinery.files import absolute, naming_damaged, write_atomic
 from nbtrack.machinery.progress import ProgressBar
 from nbtrack.recordings.formats import FORMATS
 
-# What may be written below a scene's folder. No other name is: it could lead out of there.
+# The paths that are written below a scene's folder. Any other path, as with `..`, could lead out.
 _NAME = re.compile(r"(?a)[\w-]+/[\w-][\w.-]*\.(?:png|jpe?g)|[\w-][\w.-]*\.txt")
 _AGAIN = "run the same command again to go on, or name a mirror or a local ZIP file with --url"
-Files = dict[str, zipfile.ZipInfo]  # by their paths below the scene's folder
+Files = dict[str, zipfile.ZipInfo]  # entries of the ZIP file, by paths below the scene's folder
 
 
 def fetch_scene(name: str, folder: Path, source: str = DATASET_ZIP) -> str:
-    """Write the images, the depth that is read, and the texts of a scene; say what was written.
+    """Download the images, depth maps and texts of a scene; returns a line on what was written.
 
-    `source` is the ZIP file: an address, of which only the scene's parts are asked for, or a local
-    path. Files that are there whole stay, so that a fetch that was killed goes on.
-    Raises ConfigError for an unknown name, MissingError where the ZIP file, or the scene in it, is
-    not there, DataError where it cannot be read, or where other files are in the way, and OSError
-    where the disk is full.
+    `source` is the address of the ZIP file, from which only the scene's parts are asked for, or a
+    local path. Files that are complete stay as they are, so that a killed fetch can go on.
+    Raises ConfigError for an unknown name; MissingError if the ZIP file is not there, or the scene
+    is not in it; DataError if the ZIP file cannot be read, the disk has too little room, or a file
+    of other content is in the way; OSError if the disk fills up.
     """
     look_up("scene of the dataset", name, DATASET_SCENES)
     with contextlib.ExitStack() as opened:
@@ -34,13 +34,14 @@ def fetch_scene(name: str, folder: Path, source: str = DATASET_ZIP) -> str:
             archive = opened.enter_context(_archive(source, opened))
         files = _files_of(name, archive, source)
         missing = {path: info for path, info in files.items() if _is_missing(folder / path, info)}
+        # The folder may not exist yet: its nearest parent is on the same disk.
         existing = next(path for path in (folder, *folder.parents) if path.is_dir())
         needed = sum(info.file_size for info in missing.values())
         free = shutil.disk_usage(existing).free
         if needed > free:
             found = f"{needed / 1e6:.0f} MB are needed, and {existing} has {free / 1e6:.0f} MB free"
             raise DataError(f"{found}: make room, or let NBTRACK_DATA name another disk")
-        total, done = sum(info.compress_size for info in missing.values()), 0
+        total, done = sum(info.compress_size for info in missing.values()), 0  # bytes
         with ProgressBar(f"fetching {name}", max(total, 1)) as bar:
             for path, info in missing.items():
                 with naming_damaged(source, "ZIP file", _AGAIN):
@@ -48,12 +49,12 @@ def fetch_scene(name: str, folder: Path, source: str = DATASET_ZIP) -> str:
                 write_atomic(folder / path, content)
                 done += info.compress_size
                 bar.move_to(done, f"{done / 1e6:.0f} of {total / 1e6:.0f} MB")
-    kept = len(files) - len(missing)
-    return f"{folder}: {len(missing)} files fetched, {total / 1e6:.1f} MB; {kept} were there"
+    present = len(files) - len(missing)
+    return f"{folder}: {len(missing)} files fetched, {total / 1e6:.1f} MB; {present} were there"
 
 
 def _archive(source: str, opened: contextlib.ExitStack) -> zipfile.ZipFile:
-    """The ZIP file at an address or a path; `opened` ends what it needs."""
+    """Open the ZIP file at an address or a path; `opened` will close the connection it needs."""
     if not re.match("https?://", source):
         path = absolute(source.removeprefix("file://"))
         if not path.is_file():
@@ -66,16 +67,18 @@ def _archive(source: str, opened: contextlib.ExitStack) -> zipfile.ZipFile:
         raise MissingError("data fetch needs remotezip: pip install 'nbtrack[fetch]'") from None
     session = opened.enter_context(requests.Session())  # one connection for all files
     try:
-        return remotezip.RemoteZip(source, session=session, timeout=60)  # s of silence
+        return remotezip.RemoteZip(source, session=session, timeout=60)  # s without an answer
     except remotezip.RangeNotSupported:
         advice = "take another mirror, or download the whole file and give its path to --url"
         raise DataError(f"{source}: the server gives no ranges of a file: {advice}") from None
 
 
 def _files_of(name: str, archive: zipfile.ZipFile, source: str) -> Files:
-    """The files of a scene that are read, by their paths in the scene's folder.
+    """The files of a scene that nbtrack reads, by their paths in the scene's folder.
 
-    The scene's folder is the one of its name, at any depth of the archive, with most such files.
+    The scene's folder may lie at any depth of the archive. Of several folders with the scene's
+    name, the one with the most files of allowed paths is taken. Raises MissingError if it has no
+    images or no depth.
     """
     by_parent: dict[str, Files] = {}
     for info in archive.infolist():
@@ -83,19 +86,23 @@ def _files_of(name: str, archive: zipfile.ZipFile, source: str) -> Files:
         if _NAME.fullmatch(path):
             by_parent.setdefault(parent, {})[path] = info
     files = max(by_parent.values(), key=len, default={})
-    kinds = {path: path.rpartition("/")[0] for path in files}  # folders; "" of texts
-    wanted = [""]
+    folder_of = {path: path.rpartition("/")[0] for path in files}  # "" for texts
+    wanted = [""]  # the texts, one folder of colour and one of depth
     for patterns in (FORMATS["neural_rgbd"].color, FORMATS["neural_rgbd"].depth):
-        folders = (pattern.rpartition("/")[0] for pattern in patterns)
-        wanted += [folder for folder in folders if folder in kinds.values()][:1]  # the first
+        folders = [pattern.rpartition("/")[0] for pattern in patterns]
+        # The format reads the first of these folders that is there.
+        wanted += [folder for folder in folders if folder in folder_of.values()][:1]
     if len(wanted) < 3:
         found = f"{source} has no images and depth in a folder {name!r}"
         raise MissingError(f"{found}: name the dataset's own ZIP file with --url")
-    return {path: info for path, info in files.items() if kinds[path] in wanted}
+    return {path: info for path, info in files.items() if folder_of[path] in wanted}
 
 
 def _is_missing(file: Path, info: zipfile.ZipInfo) -> bool:
-    """Whether a file is not there, or only in part. Raises DataError where it is another one."""
+    """Whether a file is not there, or is cut short, as by a killed download.
+
+    Raises DataError if the file has other content than the ZIP file's.
+    """
     content = file.read_bytes() if file.is_file() else b""
     if (len(content), zlib.crc32(content)) == (info.file_size, info.CRC):
         return False

@@ -1,6 +1,6 @@
-"""Images of a recording, from files to arrays: each file is read once and decoded once.
+"""The images of a recording, from files to arrays. Each file is read once and decoded once.
 
-Images have one size, and a lens's distortion is taken out.
+All arrays have one size, and the distortion of the lens is taken out of them.
 """
 
 import hashlib
@@ -23,25 +23,30 @@ from nbtrack.recordings.calibration import camera_matrix
 from nbtrack.recordings.formats import IMAGE_SUFFIXES, Declaration
 from nbtrack.recordings.recording import Recording
 
-_MAX_16_BITS = 65535  # also what cameras write for "farther than I can measure"
-_MAX_BYTES = 1_000_000_000  # of files that were read for a digest and are not decoded yet
+_MAX_16_BITS = 65535  # as a depth value, cameras mean by it "farther than I can measure"
+# At most so many bytes are held of files that were read for a digest and are not decoded yet.
+_MAX_BYTES = 1_000_000_000
 Pixels = Shaped[np.ndarray, "height width *channels"]
 Depths = UInt16[np.ndarray, "n height width"]
 Decoded = tuple[UInt8[np.ndarray, "n height width 3"], Depths]
-"""RGB colours, and depth values as they are in the files; 0: not measured."""
+"""RGB colours, and depth values in the unit of the files, 0 where none is measured."""
 
 
 @lru_cache(maxsize=1)
 def images_of(recording: Recording) -> "Images":
-    """The images of a recording, shared by all that read it until another one is read.
+    """The images of a recording; a second call for the same recording returns the same object.
 
-    1,600 frames of 640x480 take 2.5 GB: those of several recordings need not fit into memory.
+    Only those of the last recording are held: 1,600 frames of 640x480 take 2.5 GB, and those of
+    several recordings may not fit into memory.
     """
     return Images(recording)
 
 
 class Images:
-    """What was read of the images of a recording; all have the size of the first frame read."""
+    """The images of a recording, read when they are asked for and held in memory until `forget`.
+
+    All must have the size of the frame that is read first.
+    """
 
     def __init__(self, recording: Recording) -> None:
         """Begin with nothing read."""
@@ -54,13 +59,16 @@ class Images:
         self.forget()
 
     def forget(self) -> None:
-        """Free the frames that are kept, as in one pass over a long recording."""
-        self._ids = np.empty(0, int)  # of the frames that are kept, in order
-        self._kept: Decoded | tuple[()] = ()
+        """Free the arrays of all frames, as after each part of a long recording."""
+        self._ids = np.empty(0, int)  # numbers of the frames in `_arrays`, in rising order
+        self._arrays: Decoded | tuple[()] = ()
 
     def contents(self) -> tuple[list[tuple[str, str, str]], str, Declaration]:
-        """What changes when a recording does: the folder, name and digest of every image, a digest
-        of times, poses and camera, and the declaration. Where the recording lies does not count."""
+        """Values that change when a recording does, for the keys of the cache.
+
+        Returns the folder, name and digest of every image; a digest of times, poses and camera; and
+        the declaration. They do not depend on where the recording lies.
+        """
         recording = self.recording
         files = recording.color_files + recording.depth_files
         for file in files:
@@ -74,38 +82,39 @@ class Images:
         digest.update(recording.times.tobytes() + recording.file_poses.tobytes())
         return images, digest.hexdigest(), recording.declared
 
-    def kept(self, ids: Frames) -> Decoded:
-        """Colours and depths of some frames (at least one), which are kept for the next call.
+    def arrays_of(self, ids: Frames) -> Decoded:
+        """Colours and depths of the frames with these numbers, of which there is at least one.
 
-        The arrays are views of the kept ones where the frames' numbers rise evenly, as in a slice.
-        Raises DataError if a file is damaged, or of another kind or size.
+        They stay in memory for the next call. If the numbers rise in even steps, as those of a
+        slice do, the arrays are views of the memory, else copies. Raises DataError if a file is
+        damaged, or is of another kind or size.
         """
         camera = self.camera_of(ids[0])
         all_ids = np.union1d(self._ids, ids)
         if len(all_ids) > len(self._ids):
             shape = len(all_ids), camera.height, camera.width
             colors, depths = np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint16)
-            is_kept = np.isin(all_ids, self._ids)
-            # Not strict: at first nothing is kept, and `_kept` is empty.
-            for array, before in zip((colors, depths), self._kept, strict=False):
-                array[is_kept] = before
-            missing = np.flatnonzero(~is_kept)
+            is_held = np.isin(all_ids, self._ids)
+            if self._arrays:
+                colors[is_held], depths[is_held] = self._arrays
+            missing = np.flatnonzero(~is_held)
             with ThreadPoolExecutor(4) as pool:  # decoding frees the GIL: a few suffice
                 decoded = pool.map(self._decoded, all_ids[missing].tolist())
                 for place, frame in zip(missing, decoded, strict=True):
                     colors[place], depths[place] = frame
-            self._ids, self._kept = all_ids, (colors, depths)
+            self._ids, self._arrays = all_ids, (colors, depths)
         places = np.searchsorted(self._ids, ids)
         steps = np.unique(np.diff(places)) if len(places) > 1 else [1]
         if len(steps) == 1 and steps[0] > 0:
             places = slice(places[0], places[-1] + 1, steps[0])
-        colors, depths = self._kept
+        colors, depths = self._arrays
         return colors[places], depths[places]
 
     def camera_of(self, first: int) -> Intrinsics:
-        """The camera of all images. The first call decodes the frame `first` to know their size.
+        """The camera of all images, without its lens.
 
-        Raises DataError as `kept` does.
+        The first call decodes the frame with the number `first` to know the size of the images.
+        Raises DataError if one of its files is damaged or does not fit the calibration.
         """
         if self._camera:
             return self._camera
@@ -114,17 +123,20 @@ class Images:
         self._first[first] = color, depth
         self._resize, note = _resizing(color, depth, recording)
         if note and note not in recording.notes:
-            recording.notes.append(note)  # of the caller's recording, for reports of what was read
+            recording.notes.append(note)  # reports on the recording print its notes
         # The file whose image has the size that all must have; messages name it.
         self._sized = (recording.depth_files if self._resize else recording.color_files)[first]
         height, width = (depth if self._resize else color).shape[:2]
         self._camera = recording.calibration.for_size(width, height, self._sized)
-        # Where each pixel lies in the distorted image; empty without distortion.
+        # The place of each pixel in the distorted image; empty without distortion.
         self._maps = _undistortion(self._camera, recording.calibration.distortion)
         return self._camera
 
     def _decoded(self, index: int) -> tuple[Pixels, Pixels]:
-        """A frame of the camera's size, without its lens; depth is 0 where it is not measured."""
+        """Colour and depth of a frame in the camera's size, without the lens's distortion.
+
+        Depth is in the unit of the files, and 0 where none is measured.
+        """
         recording, shape = self.recording, (self._camera.height, self._camera.width)
         color, depth = self._first.pop(index, None) or self._pixels(index)
         if self._resize:
@@ -133,16 +145,16 @@ class Images:
         _check(recording.depth_files[index], depth, np.uint16, shape, self._sized)
         if self._maps:
             color = cv2.remap(color, *self._maps, cv2.INTER_LINEAR)
-            # Not interpolated, which would make points between two surfaces.
+            # An interpolated depth would be a point between two surfaces.
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST)
-        is_none = (depth == recording.declared.no_depth) | (depth == _MAX_16_BITS)
-        return color, np.where(is_none, 0, depth)
+        is_unmeasured = (depth == recording.declared.no_depth) | (depth == _MAX_16_BITS)
+        return color, np.where(is_unmeasured, 0, depth)
 
     def in_millimetres(self, depths: Depths, ids: Frames) -> Depths:
-        """Depths (mm along the optical axis) from the stored ones of frames with these numbers.
+        """Depths (mm along the optical axis) of the frames `ids`, from the values in their files.
 
-        Where the stored values are millimetres along the axis, they are returned as they are.
-        Raises DataError for more than 65.535 m.
+        Values that are millimetres along the axis are returned as they are. Raises DataError for a
+        depth of more than 65.535 m.
         """
         declared = self.recording.declared
         meaning = declared.depth_scale, declared.depth_along, declared.depth_error_per_m
@@ -151,6 +163,7 @@ class Images:
         camera = self.camera_of(ids[0])
         y, x = np.indices(depths.shape[1:]) + 0.5  # pixel centres
         squares = ((x - camera.cx) / camera.fx) ** 2 + ((y - camera.cy) / camera.fy) ** 2
+        # The length of a pixel's ray up to a z-depth of 1.
         slant = np.sqrt(1 + squares) if declared.depth_along == "ray" else 1.0
         depths_mm = np.empty_like(depths)
         for place, index in enumerate(ids):
@@ -176,9 +189,10 @@ class Images:
         return color, self._read_image(file, is_color=False)
 
     def _read_image(self, path: Path, is_color: bool) -> Pixels:
-        """A PNG or JPEG file's pixels as they are stored, colour as RGB of 8 bits.
+        """The pixels of a PNG or JPEG file as they are stored, colour as RGB of 8 bits.
 
-        The orientation that a file gives to viewers does not count: depth images know none.
+        A photograph may ask viewers to turn it. It is not turned here, because its depth image
+        cannot ask for that.
         """
         advice = "copy it again, or remove the frame's image, depth and pose"
         with naming_damaged(path, "PNG or JPEG", advice):
@@ -186,11 +200,14 @@ class Images:
             with Image.open(content, formats=("PNG", "JPEG")) as image:
                 image.verify()  # checksums, which decoding does not look at
             with Image.open(content) as image:
-                is_8_bit = not image.mode.startswith("I")  # others are left for `_check` to refuse
+                is_8_bit = not image.mode.startswith("I")  # `_check` refuses colour of other types
                 return np.array(image.convert("RGB") if is_color and is_8_bit else image)
 
     def _content(self, path: Path) -> bytes:
-        """What is in a file, which is opened here and nowhere else."""
+        """The bytes of a file, which is opened nowhere else; its digest is stored on the way.
+
+        Bytes that `contents` left in memory are used once and freed.
+        """
         content = self._contents.pop(path, None)
         if content is None:
             content = path.read_bytes()
@@ -199,18 +216,18 @@ class Images:
 
 
 def _resizing(color: np.ndarray, depth: np.ndarray, recording: Recording) -> tuple[bool, str]:
-    """Whether colour is to be given the size of depth, and a note.
+    """Whether colour images are resized to the size of depth images, and a note for the user.
 
-    It is if its format says so, or if it is larger in the same proportions, as phones with LiDAR
-    give it. The note tells of the second case and is empty otherwise. Raises DataError if the
-    calibration then does not say which of both sizes it is for.
+    They are resized if the format says so, or if they are larger in the same proportions, as phones
+    with LiDAR write them. In the second case the note says so; otherwise it is empty. Raises
+    DataError in the second case if the calibration does not say for which of the sizes it is.
     """
     if recording.format.resize_color:
         return True, ""
     height, width = color.shape[:2]
     depth_height, depth_width = depth.shape[:2]
     factor = width / depth_width
-    if factor <= 1 or abs(factor * depth_height - height) > 1:  # a pixel is rounding
+    if factor <= 1 or abs(factor * depth_height - height) > 1:  # sides are rounded to whole pixels
         return False, ""
     sizes = f"{width}x{height} and {depth_width}x{depth_height}"
     camera = recording.calibration
@@ -221,7 +238,10 @@ def _resizing(color: np.ndarray, depth: np.ndarray, recording: Recording) -> tup
 
 
 def _check(path: Path, image: np.ndarray, dtype: type, shape: tuple[int, ...], sized: Path) -> None:
-    """Raises DataError unless an image has this type and shape; `sized` is a file of that size."""
+    """Raises DataError unless the image of the file `path` has this type and shape.
+
+    The message also names the file `sized`, whose image has the size that is wanted.
+    """
     if image.dtype != dtype or image.shape != shape:
         wanted = f"{dtype.__name__} of shape {shape}, for the size of {sized}"
         found = f"{path} is {image.dtype} of shape {image.shape}"
@@ -229,13 +249,14 @@ def _check(path: Path, image: np.ndarray, dtype: type, shape: tuple[int, ...], s
 
 
 def _undistortion(camera: Intrinsics, distortion: tuple[float, ...]) -> tuple[np.ndarray, ...]:
-    """For cv2.remap: where pixels of the camera without its lens lie in the image.
+    """Maps for `cv2.remap` that take a lens's distortion (OpenCV's coefficients) out of an image.
 
-    Empty if the lens distorts nothing.
+    They hold the column and the row in the distorted image of each pixel of the undistorted one.
+    Empty if all coefficients are 0.
     """
     if not any(distortion):
         return ()
-    # OpenCV counts pixel centres as whole numbers.
+    # For OpenCV the centres of pixels have whole coordinates.
     K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
     size = (camera.width, camera.height)
     # None: no rotation. The second K: the undistorted image keeps the camera matrix.

@@ -1,6 +1,7 @@
-"""Which image, depth map and pose belong together: by numbers in their names, or by time.
+"""Which image, depth map and pose belong together: by the numbers in file names, or by time.
 
-The name of a file says which frame it belongs to, or when it was taken; lists say times.
+A file's name tells the number of its frame or the time when it was taken. A list, a text file with
+a line for each image or pose, tells times.
 """
 
 import os
@@ -21,20 +22,23 @@ from nbtrack.machinery.files import naming_damaged
 from nbtrack.machinery.inputs import read_lines
 from nbtrack.recordings.pose_files import Times, check_order, check_rising, frame_keys, in_seconds
 
-TIMES_FILE = "timestamps.txt"  # one a line (s); ours, in folders of numbered images
-_TOLERANCE = 0.02  # s between what belongs together: that of the TUM benchmark's associate.py
-_GAP = 0.0505  # s between poses that are interpolated, 20 Hz: at a hand's 2 m/s² 0.6 mm off
+TIMES_FILE = "timestamps.txt"  # a time (s) in each line, for a folder of numbered images (ours)
+_TOLERANCE = 0.02  # s at most between images and poses of a frame, as in TUM's associate.py
+# Poses are interpolated over at most so many seconds (20 Hz, and 1 % more). A hand that accelerates
+# by 2 m/s² is then off by 0.6 mm.
+_GAP = 0.0505
 
 
 def check_paired(colors: list[Path], others: list[Path]) -> None:
-    """Raises DataError unless every image has a depth map or pose of the same frame number.
+    """Check the files of images and of their depth maps or poses, which are sorted by number.
 
-    Also raises it where the numbers may not give the order of the frames.
+    Raises DataError unless every image has one other file of the same number, and if the numbers
+    may not give the order in which the frames were recorded.
     """
     color_keys, other_keys = frame_keys(colors), frame_keys(others)
     if color_keys != other_keys or len(set(color_keys)) < len(color_keys):
         keys = color_keys + other_keys
-        count = Counter(keys)  # 2 of a key that each list has once
+        count = Counter(keys)  # a key that each list has once occurs twice
         odd = [p.name for p, key in zip(colors + others, keys, strict=True) if count[key] != 2]
         raise DataError(
             f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
@@ -46,38 +50,46 @@ def check_paired(colors: list[Path], others: list[Path]) -> None:
 
 
 def nearest(times: Times, others: Times, tolerance: float) -> Frames:
-    """For every time the index of the nearest other one; -1 if none is within the tolerance (s)."""
-    # In one dimension p=1 is the plain difference, which no square and root round.
+    """For each of the times (s) the index of the nearest of the others.
+
+    The index is -1 if that one is farther away than the tolerance (s), or if there are no others.
+    """
+    # In one dimension p=1 is the absolute difference, without the rounding of a square and a root.
     distances, closest = cKDTree(others[:, None]).query(times[:, None], p=1)
     return np.where(distances <= tolerance, closest, -1)
 
 
 def pair_lists(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Path], Times, str]:
-    """Images and depth maps of two lists that are each other's nearest in time.
+    """Pair the images of one list with the depth maps of another by their times.
 
-    Also returns the images' times (s), and a note, which is empty unless images are left out.
-    Raises DataError if all are left out.
+    An image and a depth map are a pair if each is the nearest of the other, within `_TOLERANCE`.
+    Returns the paired images, their depth maps, the images' times (s), and a note that says how
+    many images are left out; it is empty if none is. Raises DataError if all are left out.
     """
     color_times, colors = _read_list(color_list)
     depth_times, depths = _read_list(depth_list)
     depth_of_color = nearest(color_times, depth_times, _TOLERANCE)
     color_of_depth = nearest(depth_times, color_times, _TOLERANCE)
-    # An image without a depth map has -1, which indexes the last one: the next line leaves it out.
+    # Where `depth_of_color` is -1, it takes the last depth map here; the next line leaves it out.
     is_mutual = color_of_depth[depth_of_color] == np.arange(len(colors))
-    kept = np.flatnonzero((depth_of_color >= 0) & is_mutual)
-    of_all = f"{len(colors) - len(kept)} of the {len(colors)} images in {color_list.name}"
+    paired = np.flatnonzero((depth_of_color >= 0) & is_mutual)  # indices of images
+    of_all = f"{len(colors) - len(paired)} of the {len(colors)} images in {color_list.name}"
     why = f"no depth map of {depth_list.name} has them nearest within {_TOLERANCE} s"
     left_out = f"{of_all} are left out: {why}"
-    if not len(kept):
+    if not len(paired):
         raise DataError(f"{color_list.parent}: {left_out}; both lists need the same clock")
-    note = left_out if len(kept) < len(colors) else ""
-    paired_depths = [depths[i] for i in depth_of_color[kept]]
-    return [colors[i] for i in kept], paired_depths, color_times[kept], note
+    note = left_out if len(paired) < len(colors) else ""
+    paired_depths = [depths[i] for i in depth_of_color[paired]]
+    return [colors[i] for i in paired], paired_depths, color_times[paired], note
 
 
 def _read_list(path: Path) -> tuple[Times, list[Path]]:
-    """Times (s), which rise, and files of a list with `timestamp file` a line."""
-    # Windows separates folders by a backslash.
+    """Read a list with `timestamp file` in each line; returns the times (s) and the files.
+
+    Raises DataError for other lines and for times that do not rise, and MissingError if a file is
+    not there.
+    """
+    # A list that was written on Windows may separate folders by a backslash.
     words = [line.replace("\\", "/").strip().split(maxsplit=1) for line in read_lines(path)]
     advice = "every line holds 'timestamp file', such as '1305031102.175 rgb/1305031102.175.png'"
     with naming_damaged(path, "list", advice):
@@ -87,7 +99,7 @@ def _read_list(path: Path) -> tuple[Times, list[Path]]:
     check_rising(times, path)
     files = [path.parent / name for _, name in words]
     for file in files:
-        if not os.path.isfile(file):  # unlike pathlib's, it takes names that no file can have
+        if not os.path.isfile(file):  # pathlib's raises an error for names that no file can have
             found = f"{path} names {str(file)[:200]!r}, which is not there"
             raise MissingError(f"{found}: add it, or take it out")
     return times, files
@@ -95,39 +107,45 @@ def _read_list(path: Path) -> tuple[Times, list[Path]]:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """What is known of the times of frames from files and their names."""
+    """The times and numbers of a recording's frames, and the poses that belong to them."""
 
-    images: list[Path]
-    own: Times | None  # s: of a list, a file of times, or the names of images
-    rate_hz: float  # of the numbers in names
-    counts_from_0: bool  # a number is the place of the frame's pose in a list
+    images: list[Path]  # one for each frame, in order
+    # Times (s) from a list, from a file of times, or from the names of the images; None without.
+    recorded_times: Times | None
+    rate_hz: float  # frames a second: two frames whose numbers differ by 1 are 1/rate apart
+    counts_from_0: bool  # the format's: a frame's number is the place of its pose in a list
 
     @cached_property
     def numbers(self) -> Frames | None:
-        """The frames' numbers, where just one in the names varies."""
+        """The frames' numbers, from the names of their images.
+
+        None unless exactly one number in the names varies: then it is not clear which is meant.
+        """
         keys = frame_keys(self.images)
         return np.array(keys).ravel() if set(map(len, keys)) == {1} else None
 
     @cached_property
     def times(self) -> Times:
-        """Times (s) of frames: their own, else by their numbers and the rate."""
-        if self.own is not None:
-            return self.own
+        """Times (s) of the frames: the recorded ones, or without them number / rate from 0 on."""
+        if self.recorded_times is not None:
+            return self.recorded_times
         numbers = np.arange(len(self.images)) if self.numbers is None else self.numbers
         return (numbers - numbers[0]) / self.rate_hz
 
     def poses_of(
         self, path: Path, poses: Poses, stamps: Times, flip: Callable[[Poses], Poses]
     ) -> tuple[Poses, str]:
-        """A pose for each frame from those of a list, NaN where a frame has none, and a note.
+        """Find the pose of each frame in a list of poses; returns them and a note for the user.
 
-        The first of these rules that applies gives poses to frames:
-        1. Each stamp (s; NaN: none) is exactly the time of a frame, as in lists that nbtrack wrote.
-        2. Frames have times of their own, and some stamp is near one of them. Then both are on the
-           same clock, and poses are interpolated.
-        3. Frames take poses by their numbers, see `_by_number`. Where frames have times of their
-           own and no stamp is near one, the clocks differ, and equal counts prove nothing. The rule
-           then applies only to stamps at even steps, which may just count the lines.
+        `stamps` are the times (s) of the list's poses, NaN without. A frame that has no pose gets
+        NaN. The first of these rules that applies gives poses to frames:
+        1. Each stamp is exactly the time of a frame, as in lists that nbtrack wrote.
+        2. Frames have recorded times, and some stamp is near one of them. Then stamps and times are
+           of the same clock, and poses are interpolated.
+        3. Frames and poses have the same numbers, or are equally many: see `_by_number`. If frames
+           have recorded times and no stamp is near one, this rule applies only to stamps at even
+           steps, which may just count the lines. Other stamps are of another clock than the times,
+           and equal counts prove nothing.
 
         `flip` converts the list's poses to camera-to-world ones, and back, for rule 2. `path` names
         the list in messages. Raises DataError if no rule applies.
@@ -135,11 +153,12 @@ class Moments:
         has_both = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(stamps)
         known_poses, known_stamps = poses[has_both], stamps[has_both]
         same_time = nearest(self.times, known_stamps, tolerance=0.0)
-        if len(known_stamps) > 0 and (same_time >= 0).sum() == len(known_stamps):
+        if len(known_stamps) > 0 and (same_time >= 0).sum() == len(known_stamps):  # rule 1
             return _at(known_poses, same_time), ""
-        if self.own is not None and (nearest(self.times, known_stamps, _TOLERANCE) >= 0).any():
+        is_near = nearest(self.times, known_stamps, _TOLERANCE) >= 0
+        if self.recorded_times is not None and is_near.any():  # rule 2
             return _interpolated(self.times, known_poses, known_stamps, flip)
-        if self.own is None or _are_even(known_stamps):
+        if self.recorded_times is None or _are_even(known_stamps):  # rule 3
             all_stamped = has_both.any() and np.isfinite(stamps).all()
             if found := self._by_number(poses, stamps if all_stamped else None):
                 return found
@@ -149,66 +168,70 @@ class Moments:
         )
 
     def _by_number(self, poses: Poses, stamps: Times | None) -> tuple[Poses, str] | None:
-        """A pose for each frame by the frames' numbers, and a note; None if no rule applies.
+        """The pose of each frame by the frames' numbers, and a note; None if neither rule applies.
 
-        The number of a pose is its stamp (s) times the rate. Without stamps it is the pose's place
-        in the list. There are two rules:
-        1. Equal numbers are paired. The frames' numbers may be counted in the ways of `_counted`.
-           Exactly one way must give a complete pairing, in which all frames have a pose or all
-           poses have a frame. Without stamps there must also be more poses than frames.
-        2. Equally many poses and frames are paired in order. The rule does not apply where stamps
-           are times and most frames have a pose at their time: then the list lacks the poses of
-           some frames and has others.
+        Rule 1: equal numbers are paired. The number of a pose is its stamp (s) times the rate, or
+        its place in the list if it has no stamp. The numbers of the frames may be counted in
+        several ways, see `_counted`; exactly one way must pair all frames or all poses. Without
+        stamps there must also be more poses than frames.
+
+        Rule 2: equally many poses and frames are paired in order. This rule does not apply if the
+        stamps are times at which more than three quarters of the frames have a pose: such a list
+        lacks the poses of some frames, and has poses of no frame.
         """
         n_frames, n_poses = len(self.images), len(poses)
+        has_more_poses = n_poses > n_frames
+        # Rule 1.
         pose_numbers = np.arange(n_poses) if stamps is None else stamps * self.rate_hz
         tolerance = min(1e-3 * self.rate_hz, 0.25)  # 1 ms, in numbers, which are 1 apart
-        # A row for each way to count: the place of every frame's pose, -1 without one.
+        # A row for each way to count: the place of each frame's pose in the list, -1 without one.
         ways = [nearest(numbers, pose_numbers, tolerance) for numbers in self._counted()]
-        places = np.unique(np.reshape(ways, (-1, n_frames)), axis=0)
+        places = np.unique(np.reshape(ways, (-1, n_frames)), axis=0)  # equal rows are one way
         n_paired = (places >= 0).sum(axis=1)
         complete = places[n_paired == min(n_frames, n_poses)]
-        if len(complete) == 1 and (n_poses > n_frames or stamps is not None):
-            note = f"of {n_poses} poses those of the images' numbers" if n_poses > n_frames else ""
+        if len(complete) == 1 and (has_more_poses or stamps is not None):
+            note = f"of {n_poses} poses those of the images' numbers" if has_more_poses else ""
             return _at(poses, complete[0]), note
-        are_times = stamps is not None and not _are_even(stamps)  # even ones may count the poses
-        most_have_pose = (n_paired > 0.75 * n_frames).any()
-        if n_poses != n_frames or (are_times and most_have_pose):
+        # Rule 2. Stamps at even steps are not taken for times: they may just count the poses.
+        are_times = stamps is not None and not _are_even(stamps)
+        lacks_some = are_times and (n_paired > 0.75 * n_frames).any()
+        if n_poses != n_frames or lacks_some:
             return None
         counts_up = np.array_equal(self.numbers, np.arange(n_frames))
         return poses, "" if counts_up else "images have the poses one after another"
 
     def _counted(self) -> list[Frames]:
-        """Places in the list that the frames' numbers may mean, an array for each way to count.
+        """The places in a list of poses that the frames' numbers may mean; an array for each way.
 
-        The list may begin with number 0 (the numbers as they stand), with 1, or with the first
-        frame's. In a format that counts from 0 it begins with 0, unless the numbers are 1 to n.
+        The list's first pose may have the number 0, the number 1 (unless there is a frame 0), or
+        the number of the first frame. In a format that counts from 0 it has the number 0, unless
+        the frames' numbers are 1 to n.
         """
         if self.numbers is None:
             return []
         first = self.numbers[0]
         is_1_to_n = first == 1 and np.ptp(self.numbers) == len(self.numbers) - 1
-        # The second entry is 1, or 0 where there is a frame 0.
-        of_place_0 = [0] if self.counts_from_0 and not is_1_to_n else [0, min(first, 1), first]
-        return [self.numbers - number for number in of_place_0]
+        # With a frame 0, the minimum is 0, which repeats the first way.
+        first_of_list = [0] if self.counts_from_0 and not is_1_to_n else [0, min(first, 1), first]
+        return [self.numbers - number for number in first_of_list]
 
 
 def _interpolated(
     times: Times, poses: Poses, stamps: Times, flip: Callable[[Poses], Poses]
 ) -> tuple[Poses, str]:
-    """The pose at each time, and a note on how many are interpolated.
+    """The pose at each time (s), from poses at stamps (s), and a note on how many are interpolated.
 
-    Between two stamps that are close to each other the pose is interpolated. Elsewhere it is that
-    of the nearest stamp, or NaN. An interpolated camera moves along a straight line in the world
-    and turns at a constant rate. Only camera-to-world poses do so: `flip` converts the list's poses
-    to these, and back.
+    A pose is interpolated between two stamps that are at most `_GAP` apart. At other times it is
+    that of the nearest stamp, or NaN if no stamp is within `_TOLERANCE`. An interpolated camera
+    moves along a straight line in the world and turns at a constant rate. This holds only for
+    camera-to-world poses, so `flip` converts the list's poses to these, and back.
     """
     found = _at(poses, nearest(times, stamps, _TOLERANCE))
-    later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
+    later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)  # index of the stamp after
     # s from each time back to the stamp before it, and on to the stamp after it.
     before, after = times - stamps[later - 1], stamps[later] - times
-    to_nearest = np.minimum(before, after)  # s; negative outside of the list
-    # Elsewhere the nearest pose stays. A stamp within 1e-6 s is that of the time itself, rounded.
+    to_nearest = np.minimum(before, after)  # s; negative for times outside of the list
+    # A stamp within 1e-6 s is the time itself, rounded: its pose is taken as it is.
     is_between = (before + after <= _GAP) & (to_nearest > 1e-6)
     if not is_between.any():
         return found, ""
@@ -223,11 +246,11 @@ def _interpolated(
 
 
 def _are_even(stamps: Times) -> bool:
-    """Whether steps between stamps differ by no more than a tenth of the median step."""
+    """Whether the steps between stamps (s) differ by no more than a tenth of the median step."""
     steps = np.diff(stamps)
     return len(steps) == 0 or np.ptp(steps) <= 0.1 * np.median(np.abs(steps))
 
 
 def _at(poses: Poses, places: Frames) -> Poses:
-    """The poses at places in a list; NaN at -1."""
+    """The poses at some places of a list; NaN for the place -1."""
     return np.where(places[:, None, None] >= 0, poses[places], np.nan)

@@ -1,19 +1,20 @@
-"""Recordings of phones with LiDAR, by two apps, whose cameras have ARKit's axes and units.
+"""Recordings of phones with LiDAR by two apps, Record3D and Polycam.
 
-Poses are camera-to-world in metres with OpenGL's axes (x right, y up, z towards the viewer).
-Principal points count from the frame's upper left corner, as those of Apple's
-`ARCamera.intrinsics` do.
+In both, poses are camera-to-world in metres with ARKit's camera axes, which are OpenGL's (x right,
+y up, z towards the viewer). Principal points count from the image's upper left corner, as those of
+Apple's `ARCamera.intrinsics` do.
 
-Record3D: an .r3d file, unpacked as the ZIP file that it is. `metadata` is JSON: K, the colour
-images' camera matrix column by column, their size w and h, and a pose qx qy qz qw tx ty tz a
-frame. `rgbd/N.depth` holds metres as float32, row by row in colour's proportions, compressed by
-LZFSE. Sources: the app's author, github.com/marek-simonik/record3d, issues 18, 33, 36 and 93; K's
-order as viser's `Record3dLoader` reads it.
+Record3D writes an .r3d file; this is a ZIP file, which the user has unpacked. `metadata` is JSON
+with the camera matrix K of the colour images column by column, their size w and h, and for each
+frame a pose qx qy qz qw tx ty tz. `rgbd/N.depth` holds metres as float32, row by row, in the
+proportions of colour, compressed by LZFSE. Sources: the app's author,
+github.com/marek-simonik/record3d, issues 18, 33, 36 and 93; for the order of K viser's
+`Record3dLoader`.
 
-Polycam's raw data, the export of its developer mode: files are named after their time in
-microseconds. `cameras/*.json` hold fx, fy, cx, cy of images of width and height, and t_00 to t_23,
-the rows of a pose; `corrected_cameras` the same after the app's optimisation, which comes with
-`corrected_images`, whose lens is taken out. Depth is 16-bit PNG in millimetres. Sources:
+Polycam writes raw data in its developer mode. Files are named after their time in microseconds.
+`cameras/*.json` hold fx, fy, cx, cy, the width and height of the images, and the rows of a pose as
+t_00 to t_23. `corrected_cameras` hold the same after the app's optimisation; `corrected_images`
+come with them and have no distortion. Depth is 16-bit PNG in millimetres. Sources:
 github.com/PolyCam/polyform, README and `core/capture_folder.py`.
 """
 
@@ -33,14 +34,17 @@ _ADVICE_ON_DEPTH = "run `pip install pyliblzfse`, or put 16-bit PNG files (mm) i
 
 
 def _camera(path: Path, numbers: Sequence[float]) -> Calibration:
-    """The camera of fx, fy, cx, cy, width and height as the apps write them."""
+    """The camera of fx, fy, cx, cy, width and height (pixels) as the apps write them."""
     fx, fy, cx, cy, width, height = numbers
-    # The apps count from the first pixel's corner, a camera matrix of OpenCV's from its centre.
+    # The apps count from the corner of the first pixel, OpenCV's camera matrix from its centre.
     return calibration(path, camera_matrix(fx, fy, cx - 0.5, cy - 0.5), (int(width), int(height)))
 
 
 def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times]:
-    """The poses and their frames' times (s); `order` is not used: the app always writes xyzw."""
+    """The poses and times (s) of all frames.
+
+    `order`, which every reader of poses takes, is not used: the app always writes xyzw.
+    """
     content = read_object(path, "JSON")
     rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)  # qx qy qz qw tx ty tz
     times = np.array(content.get("frameTimestamps", ()), dtype=np.float64)
@@ -50,41 +54,47 @@ def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times]:
 
 
 def _record3d_camera(path: Path) -> Calibration:
-    """The camera of the first frame, which the app writes; later ones move by a pixel or two."""
+    """The camera of the first frame, the only one that the app writes.
+
+    The principal points of later frames differ by a pixel or two.
+    """
     content = read_object(path, "JSON")
-    # The matrix, column by column.
+    # The matrix is stored column by column.
     fx, _, _, _, fy, _, cx, cy, _ = np.array(content["K"], dtype=np.float64)
     return _camera(path, [fx, fy, cx, cy, content["w"], content["h"]])
 
 
 def _record3d_depth(content: bytes, path: Path, camera: Calibration) -> DepthImage:
-    """Depth in millimetres; 0 where there is none, 65535 where it is farther than 16 bits can say.
+    """Depth in millimetres from the content of a file.
 
-    LZFSE is no part of Python: `liblzfse` reads it, where that is installed.
+    It is 0 where none is measured, and 65535 where it is farther than 16 bits can say. Raises
+    DataError for other content, and if the package `liblzfse`, which decompresses LZFSE, is not
+    installed.
     """
     kind = "file of float32 depth, plain or by LZFSE, in the proportions of colour"
     with naming_damaged(path, kind, _ADVICE_ON_DEPTH):
-        if content[:3] == b"bvx":  # how LZFSE's blocks begin
+        if content[:3] == b"bvx":  # every block of LZFSE begins so
             import liblzfse
 
             content = liblzfse.decompress(content)
         metres = np.frombuffer(content, "<f4")
         width, height = camera.size
-        # The file does not say its size: its rows follow from the proportions of colour.
-        depth_mm = 1000 * metres.reshape(round(np.sqrt(metres.size * height / width)), -1)
+        # The file does not say its size. The number of its rows follows from colour's proportions.
+        n_rows = round(np.sqrt(metres.size * height / width))
+        depth_mm = 1000 * metres.reshape(n_rows, -1)
         return np.rint(np.nan_to_num(depth_mm).clip(0, 65535)).astype(np.uint16)
 
 
 def _corrected(path: Path) -> Path:
-    """Polycam's optimised camera file of a frame; `path` itself where the app has made none."""
+    """The file of a frame's optimised camera beside `path`; `path` itself if there is none."""
     corrected = path.parent.parent / "corrected_cameras" / path.name
     return corrected if corrected.is_file() else path
 
 
 def _polycam_pose(path: Path, order: str) -> tuple[Poses, Times]:
-    """A frame's pose and its time (s), which names the file in microseconds.
+    """The pose of a frame and its time (s); the file is named after this time in microseconds.
 
-    `order` is not used: the poses are matrices.
+    `order`, which every reader of poses takes, is not used: the poses are matrices.
     """
     content = read_object(_corrected(path), "JSON")
     pose = np.eye(4)
@@ -93,7 +103,10 @@ def _polycam_pose(path: Path, order: str) -> tuple[Poses, Times]:
 
 
 def _polycam_camera(path: Path) -> Calibration:
-    """The median of all frames' cameras, which differ by a pixel or two; `path` is any of them."""
+    """The median of the cameras of all frames, which differ by a pixel or two.
+
+    `path` is the file of any frame; the others lie beside it.
+    """
     rows = []
     for file in map(_corrected, sorted(path.parent.glob("*.json"))):
         with naming_damaged(file, "camera of Polycam", "export the recording again"):
@@ -113,7 +126,7 @@ _RECORD3D_FILES = ("metadata", "metadata.json")
 RECORD3D = Format(
     "Record3D", color=("rgbd/*", "rgb/*"), depth=("rgbd/*.depth", "depth/*"),
     poses=_RECORD3D_FILES, cameras=_RECORD3D_FILES,
-    # Pose N of the list is that of image N, whatever its time.
+    # Pose N of the list belongs to image N, whatever its time is.
     declared=Declaration(camera_axes="opengl"), counts_from_0=True, stamps_tell=False,
     read_poses=_record3d_poses, read_camera=_record3d_camera, read_depth=_record3d_depth,
 )  # fmt: skip

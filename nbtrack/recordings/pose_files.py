@@ -1,7 +1,7 @@
-"""Poses, times and numbers, as texts and names of files tell them, checked.
+"""Poses and times from text files, and times and frame numbers from the names of files.
 
-Times and names are looked at in the order of recording before anything is sorted or matched by
-them.
+They are checked here in the order in which files have them. So a clock that fell back is found
+before anything is sorted or matched by time.
 """
 
 import re
@@ -18,17 +18,19 @@ from nbtrack.machinery.inputs import RIGID, checked_poses, read_numbers
 
 Times = Float[np.ndarray, "_"]  # s
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
+# What a line of a pose file may hold, for messages.
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
 _LATEST = 1e11  # s: no timestamp in seconds is later; one in milliseconds since 1970 is larger
-# Seconds since 1970 with decimals, or as many milli-, micro- or nanoseconds, in 13 to 19 digits.
+# A time since 1970 in a name: seconds with decimals (9 or 10 digits before the point), or milli-,
+# micro- or nanoseconds (13, 16 or 19 digits).
 _STAMP = re.compile(r"(?a)(?<!\d)(?<!\d\.)([1-9]\d{8,9}\.\d+|1\d{12}(?:\d{3}){0,2})(?!\.?\d)")
 
 
 def in_seconds(times: Times) -> Times:
-    """Times in seconds, also where a file has them in milli-, micro- or nanoseconds since 1970.
+    """Convert times in seconds, or in milli-, micro- or nanoseconds since 1970, to seconds.
 
-    The unit is the largest of these in which the median lies below `_LATEST`. A single time that
-    does not is NaN.
+    The unit is the largest of these in which the median of all times is below `_LATEST`. A time
+    that is not below it in this unit becomes NaN.
 
     >>> in_seconds(np.array([1403636579763555584.0, 1403636579796888917.0])).round(2).tolist()
     [1403636579.76, 1403636579.8]
@@ -41,7 +43,9 @@ def in_seconds(times: Times) -> Times:
 
 
 def stamp_in(path: Path) -> float | None:
-    """The time (s) that a file is named after, as 1305031102.175304.png or in nanoseconds.
+    """The time (s since 1970) in a file's name, as 1305031102.175304.png; None if there is none.
+
+    Milli-, micro- and nanoseconds are read, too.
 
     >>> [stamp_in(Path(name)) for name in ("1305031102.5.png", "rgb_1305031102500000000.png")]
     [1305031102.5, 1305031102.5]
@@ -53,25 +57,25 @@ def stamp_in(path: Path) -> float | None:
 
 
 def _seconds(stamp: str) -> float:
-    """The time (s) of a stamp: decimals, or an integer whose first ten digits are seconds."""
+    """The time (s) of a text that matches `_STAMP`; an integer's first ten digits are seconds."""
     return float(stamp) if "." in stamp else int(stamp) / 10 ** (len(stamp) - 10)
 
 
 def _numbers_in(path: Path) -> tuple[int, ...]:
-    """The numbers in a file's name, a time as microseconds.
+    """The numbers in a file's name; a time in it gives one number, in microseconds.
 
     >>> _numbers_in(Path("cam0_1305031102.5.png"))
     (0, 1305031102500000)
     """
     stem = _STAMP.sub(lambda match: str(round(1e6 * _seconds(match[0]))), path.stem)
-    # Numbers of 18 digits fit into 64 bits.
+    # Of longer numbers the last 18 digits, which fit into 64 bits.
     return tuple(int(digits[-18:]) for digits in re.findall(r"[0-9]+", stem))
 
 
 def frame_keys(files: list[Path]) -> list[tuple[int, ...]]:
-    """The numbers in each file's name that vary over the files.
+    """For each file, the numbers in its name that vary from file to file.
 
-    These are all numbers where none varies, or where names have different counts of numbers.
+    If no number varies, or if names hold different counts of numbers, these are all numbers.
 
     >>> frame_keys([Path("0017_cam0.png"), Path("0018_cam0.png")])
     [(17,), (18,)]
@@ -88,9 +92,9 @@ def frame_keys(files: list[Path]) -> list[tuple[int, ...]]:
 
 
 def check_rising(times: Times, source: Path) -> None:
-    """Raises DataError where times (s; NaN: none), in the order of their source, fall or repeat.
+    """Raises DataError if times (s; NaN: none), in the order of their source, fall or repeat.
 
-    They are not sorted instead: that would mix up the frames of a recording whose clock fell back.
+    Sorting them instead would mix up the frames of a recording whose clock fell back.
     """
     rows = np.flatnonzero(np.isfinite(times))
     steps = np.diff(times[rows])
@@ -103,25 +107,26 @@ def check_rising(times: Times, source: Path) -> None:
 
 
 def check_order(files: list[Path]) -> None:
-    """Raises DataError where the order of names, by their numbers, may not be that of frames."""
+    """Raises DataError if the frames may have another order than the files, sorted by numbers."""
     names = f"{files[0].parent}/{files[0].name}, {files[-1].name} and the others"
-    # The order of words is not that of frames (Jan, Feb). Neither is that of 1.5 and 1.25: the
-    # first may mean 1.50, or come before 1.25 as a chapter does.
+    # Words must be equal: sorted words, as Feb and Jan, need not be in the order of frames.
     kinds = {re.sub("[0-9]+", "0", path.stem.lower()) for path in files}
     stamps = [stamp_in(path) for path in files]
+    # Decimals must be equally many, unless all names are times: 1.5 may be 1.50, which comes after
+    # 1.25, or chapter 1.5, which comes before chapter 1.25.
     decimals = {tuple(map(len, re.findall(r"\d\.(\d+)", path.stem))) for path in files}
-    # Either all names are times, or none is and all have the same number of decimals.
     if len(kinds) > 1 or (None in stamps and (any(stamps) or len(decimals) > 1)):
         found = f"{names} differ in more than their numbers, or in how these are written"
         raise DataError(f"{found}, which tells no order: number the images as they were recorded")
+    # All names now have equally many numbers: a column for each place of a number in the names.
     for numbers in np.array([_numbers_in(path) for path in files]).T:
         steps = np.diff(numbers)
         is_counter = len(set(numbers.tolist())) == len(files) and np.ptp(numbers) < 2 * len(files)
         if is_counter and (steps < 0).any():
             raise DataError(f"{names} have numbers that order them in two ways: keep one of both")
         usual, last = np.median(steps) if len(steps) else 0, numbers[-1]
-        # A counter that went back to 0 at `end` has a wide gap in sorted numbers, and its last
-        # number is followed by its first one.
+        # If a counter went back to 0 at `end`, its sorted numbers have a wide gap, and from the
+        # last number it is a usual step over `end` to the first one.
         for end in (10 ** len(str(last)), 2**8, 2**16, 2**32):
             if 0 < numbers[0] + end - last <= 2 * usual and steps.max() > 10 * usual:
                 i = steps.argmax()
@@ -131,10 +136,12 @@ def check_order(files: list[Path]) -> None:
 
 
 def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times]:
-    """Poses as they stand in a file, checked, and their timestamps (s), NaN beside matrices.
+    """Read the poses (m) and their timestamps (s) from a text file.
 
-    Lines hold `timestamp tx ty tz` and a quaternion in the order that is given, a 4x4 or 3x4
-    matrix, or one of the rows of a matrix; else DataError is raised. NaN gives NaN poses.
+    A line holds `timestamp tx ty tz` and a quaternion in the order `quaternion`, a 4x4 or 3x4
+    matrix, or a row of a matrix. Poses are returned as they stand in the file, in its direction and
+    axes. They are NaN where a number is, and timestamps are NaN if the file has matrices. Raises
+    DataError for other lines, and for poses that are no rigid transforms.
     """
     numbers = read_numbers(path, (4, 8, 12, 16), _POSE_LINE)
     if numbers.shape[1] == 8:
@@ -150,20 +157,22 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times]:
 
 
 def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> tuple[Poses, Times]:
-    """Poses and times (s) of rows with a timestamp, a position and a quaternion.
+    """Poses (m) and times (s) of rows with a timestamp, a position and a quaternion.
 
-    `order` is that of the quaternion's four columns, as "xyzw". A pose is NaN if a number of it is
-    not finite or its quaternion is zero, as tools write a lost frame.
+    `order` names the quaternion's four columns, as "xyzw". A pose is NaN if a number of its row is
+    not finite or its quaternion is zero: so tools write a frame in which tracking was lost. Raises
+    DataError, which names `path`, for a time that is not finite and for other quaternions that have
+    no unit norm.
     """
     times = in_seconds(rows[:, 0])
-    # Clipped, so that absurd numbers are refused and overflow nothing here.
+    # Clipped numbers are still so large that they are refused below, and overflow nothing.
     q_xyzw = rows[:, [4 + order.index(axis) for axis in "xyzw"]].clip(-1e6, 1e6)
     is_known = np.isfinite(rows[:, 1:]).all(axis=1) & (q_xyzw != 0).any(axis=1)
     q_xyzw[~is_known] = 0.5  # any unit quaternion; these poses become NaN
     norms = np.linalg.norm(q_xyzw, axis=1)
     is_wrong = (np.abs(norms - 1) > RIGID) | (is_known & np.isnan(times))
     if is_wrong.any():
-        i = is_wrong.argmax()  # the message is about the first one
+        i = is_wrong.argmax()  # the first wrong row
         raise DataError(
             f"{path} pose {i} has the time {rows[i, 0]:.13g} and a quaternion of norm "
             f"{norms[i]:.3g}: columns must be finite timestamps (s), tx ty tz and a unit "
@@ -177,17 +186,20 @@ def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> 
 
 
 def shifted(T_world_camera: Poses, by: Position) -> Poses:
-    """Poses (m) whose positions are moved by an offset (m), as in a world with another origin."""
+    """Poses (m) whose positions are moved by an offset (m), as in a world with another origin.
+
+    The given poses stay as they are.
+    """
     T_world_camera = T_world_camera.copy()
     T_world_camera[:, :3, 3] += by
     return T_world_camera
 
 
 def tum_text(times: Float[np.ndarray, "n"], T_world_camera: Poses) -> str:
-    """Times (s) and camera-to-world poses (m, OpenCV camera axes) in TUM format, qw >= 0.
+    """The text of a TUM file from times (s) and camera-to-world poses (m, OpenCV camera axes).
 
-    A line a frame whose pose is known. Numbers have the digits that restore the same double.
-    Source: TUM RGB-D benchmark.
+    It has a line for each frame whose pose is not NaN, with qw >= 0. Numbers have the digits that
+    restore the same double. Source: TUM RGB-D benchmark.
     """
     known = np.isfinite(T_world_camera).all(axis=(1, 2))
     times, T_world_camera = np.asarray(times)[known], T_world_camera[known]
@@ -203,9 +215,10 @@ def number_lines(rows: Float[np.ndarray, "n numbers"]) -> str:
 
 
 def read_tum(path: Path) -> tuple[Float[np.ndarray, "n"], Poses]:
-    """Timestamps (s) and camera-to-world poses (m) of a TUM file; `#` lines are skipped.
+    """Read a TUM file: timestamps (s) and camera-to-world poses (m). Lines with `#` are skipped.
 
-    Raises MissingError if it is not there, DataError, naming file and place, for any other content.
+    Raises MissingError if the file is not there, and DataError if any line holds something else or
+    a number that is not finite.
     """
     path = absolute(path)
     if not path.is_file():

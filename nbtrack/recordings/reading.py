@@ -1,6 +1,7 @@
-"""From files to arrays: recordings on disk as sequences in memory, whatever their format is.
+"""Read recordings of any format from disk into sequences in memory.
 
-Images have one size, depth is in mm along the optical axis, and a lens's distortion is taken out.
+In a sequence all images have one size, depth is in mm along the optical axis, and the distortion of
+the lens is taken out.
 """
 
 import re
@@ -15,13 +16,15 @@ from nbtrack.machinery.errors import DataError
 from nbtrack.recordings.images import images_of
 from nbtrack.recordings.recording import Recording, open_recording
 
-# Beyond so many times the distance that nine in ten depths lie within, they are no measurement: of
-# eleven rooms and two real recordings the farthest was 2.1 times as far (our choice).
+# A depth is an outlier if it is more than so many times the distance within which nine in ten
+# depths lie (our choice). In eleven rooms and two real recordings the largest was 2.1 times as far.
 FAR = 5.0
 
 
 def parse_frames(text: str) -> slice:
-    """A Python slice written `A:B:S` with S > 0; every part may be missing. Or raises DataError.
+    """The slice that a text `A:B:S` writes, with S > 0; every part may be missing.
+
+    Raises DataError for another text.
 
     >>> parse_frames("10:50:2"), parse_frames(":100")
     (slice(10, 50, 2), slice(None, 100, None))
@@ -36,11 +39,12 @@ def parse_frames(text: str) -> slice:
 def read_sequence(
     folder: Path | str, frames: slice = slice(None), **options: str | None
 ) -> RgbdSequence:
-    """Read a recording; `options` are those of `open_recording`: format, depth folder, pose file.
+    """Read the frames of a recording that have a pose, all or those of a slice.
 
-    A Neural RGB-D scene also has depth in `depth` and `depth_with_noise`, and poses in
-    `trainval_poses.txt` (BundleFusion's, in another world frame). Raises as `open_recording` and
-    `read_frames` do.
+    `options` are `format`, `depth_folder` and `pose_file`, as `open_recording` takes them. For
+    example, a Neural RGB-D scene also has depth in the folders `depth` and `depth_with_noise`, and
+    poses in `trainval_poses.txt` (BundleFusion's, in another world frame). Raises MissingError,
+    DataError or ConfigError if something is not there, wrong or unknown.
     """
     return read_frames(open_recording(folder, **options), frames)
 
@@ -52,16 +56,21 @@ def read_frames(
     origin: Position | None = None,
     as_stored: bool = False,
 ) -> RgbdSequence:
-    """Frames of an opened recording: those of given numbers, or those of a slice.
+    """Read frames of an opened recording into a sequence.
 
-    Of a slice frames without a pose are left out if `needs_poses`. Positions are relative to
-    `origin` (m, the recording's world), by default the recording's own. With `as_stored` the
-    `depths_mm` are the files' values, in any unit. Images stay in memory for whoever wants them
-    next. Raises DataError if an image cannot be read, or no frame is left.
+    Args:
+        frames: a slice, or the numbers of the frames.
+        needs_poses: leave out those frames of a slice that have no pose.
+        origin: a point (m) in the recording's world, from which positions in the sequence count; by
+            default `recording.origin`.
+        as_stored: let `depths_mm` hold the values of the files, in any unit.
+
+    Images stay in memory for the next call. Raises DataError if an image cannot be read, or if no
+    frame is left.
     """
     ids = select_frames(recording, frames, needs_poses) if isinstance(frames, slice) else frames
     images = images_of(recording)
-    colors, depths = images.kept(ids)
+    colors, depths = images.arrays_of(ids)
     depths_mm = depths if as_stored else images.in_millimetres(depths, ids)
     origin = recording.origin if origin is None else origin
     T_world_camera = recording.T_world_camera[ids]
@@ -74,9 +83,9 @@ def read_frames(
 
 
 def select_frames(recording: Recording, frames: slice, needs_poses: bool = True) -> Frames:
-    """Numbers of the frames of a slice; if `needs_poses`, only of those that have a pose.
+    """The numbers of the frames in a slice; with `needs_poses` only of those that have a pose.
 
-    Raises DataError if there is none.
+    Raises DataError if there is no such frame.
     """
     frame_ids = np.arange(len(recording))[frames]
     found = f"{len(frame_ids)} of the {len(recording)} frames in {recording.folder} are selected"
@@ -92,7 +101,7 @@ def select_frames(recording: Recording, frames: slice, needs_poses: bool = True)
 
 
 def without_outliers(sequence: RgbdSequence) -> RgbdSequence:
-    """The sequence without depths farther than `far_limit`; as it is, where there are none."""
+    """The sequence with depths beyond `far_limit` set to 0; the same object if there are none."""
     sample = sequence.depths_mm[:, ::4, ::4]  # every sixteenth pixel suffices for a quantile
     is_far = sequence.depths_mm > far_limit(sample[sample > 0])
     if not is_far.any():
@@ -101,5 +110,5 @@ def without_outliers(sequence: RgbdSequence) -> RgbdSequence:
 
 
 def far_limit(depths: np.ndarray) -> float:
-    """The distance beyond which measured depths are outliers, in their unit."""
+    """The depth beyond which measured depths are outliers, in the unit of `depths`."""
     return FAR * float(np.quantile(depths, 0.9)) if len(depths) else np.inf

@@ -1,4 +1,4 @@
-"""A recording: its files found and paired, its texts read, before any pixel is decoded."""
+"""Open a recording: find and pair its files, and read its poses and calibration, but no image."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,26 +21,27 @@ _AGAIN = "export the recording again, or name another format with --format"
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What is found in a folder: paired image files, poses as the file has them, their meaning."""
+    """The frames of a recording: their files, times, poses and camera, and what numbers mean."""
 
     folder: Path
-    name: str  # the folder's own
+    name: str  # of the folder
     format: Format
-    declared: Declaration
-    color_files: list[Path]  # in the order of the recording, frame by frame
-    depth_files: list[Path]
-    times: Times  # of the frames, as recorded, or by their numbers and the rate declared
-    calibration: Calibration  # of the depth images, and of the colour that lies on them
-    notes: list[str]  # what was assumed, and left out
-    file_poses: Poses  # as `declared` says; NaN without a pose
-    pose_file: Path | None = None  # named in messages; with `*` where every frame has a file
+    declared: Declaration  # what the numbers in the files mean
+    color_files: list[Path]  # one for each frame, in the order of the recording
+    depth_files: list[Path]  # one for each frame
+    times: Times  # s, of each frame; without recorded times frame number / declared rate
+    calibration: Calibration  # of the depth images, to which colour is registered
+    notes: list[str]  # for the user: what was assumed, and what was left out
+    # One for each frame, with the numbers of the file, whose meaning is `declared`; NaN without.
+    file_poses: Poses
+    pose_file: Path | None = None  # for messages; with `*` if every frame has a file of its own
 
     def __len__(self) -> int:
         return len(self.color_files)
 
     @cached_property
     def T_world_camera(self) -> Poses:
-        """Camera-to-world poses with OpenCV's camera axes; NaN where there is none."""
+        """Camera-to-world poses (m) with OpenCV's camera axes; NaN for frames without a pose."""
         return self.declared.poses_to_opencv(self.file_poses)
 
     @cached_property
@@ -50,11 +51,12 @@ class Recording:
 
     @cached_property
     def origin(self) -> Position:
-        """The point (m, world) that is subtracted from positions in sequences.
+        """The point (m, world) that is subtracted from all positions in sequences.
 
-        It is 0 unless the cameras are more than 1 km from 0, as in map coordinates: there single
-        precision would soon lose millimetres. Then it is near them, in whole kilometres, so that
-        recordings of one place have one origin, which is that of its map.
+        It is 0 if the cameras are within 1 km of 0. Farther away, as in map coordinates, single
+        precision would lose millimetres, so the origin is the point nearest to the median camera
+        whose coordinates are whole kilometres. Recordings of one place, and the map of the place,
+        then share their origin.
         """
         if not self.has_pose.any():
             return np.zeros(3)
@@ -68,10 +70,10 @@ def open_recording(
     depth_folder: str | None = None,
     pose_file: str | None = None,
 ) -> Recording:
-    """Find the files of a recording and read its poses and calibration; pixels come later.
+    """Find the files of a recording, and read its poses and calibration. Images are read later.
 
-    Without `format` the files tell it; `depth_folder` and `pose_file` replace the format's own.
-    Raises MissingError, DataError or ConfigError if something is not there, wrong or unknown.
+    Without `format` the files tell the format. `depth_folder` and `pose_file` replace those of the
+    format. Raises MissingError, DataError or ConfigError if something is not there or is wrong.
     """
     folder = absolute(folder)
     declared = declaration(folder, format)
@@ -80,15 +82,15 @@ def open_recording(
     colors = layout.files(folder, layout.color, "colour images (PNG or JPEG)")
     depths = layout.files(folder, patterns, "depth maps (PNG of 16 bits)")
     list_note = ""
-    if colors[0].suffix == ".txt":  # lists of images
-        colors, depths, own_times, list_note = pair_lists(colors[0], depths[0])
+    if colors[0].suffix == ".txt":  # a list of images, as `depths` is one of depth maps
+        colors, depths, recorded_times, list_note = pair_lists(colors[0], depths[0])
     else:
         check_paired(colors, depths)
-        own_times = _own_times(folder, colors)
+        recorded_times = _recorded_times(folder, colors)
     camera, camera_note = _calibration(folder, layout)
     if camera.depth_scale:
         declared = declaration(folder, declared.format, camera.depth_scale)
-    moments = Moments(colors, own_times, declared.frame_rate, layout.counts_from_0)
+    moments = Moments(colors, recorded_times, declared.frame_rate, layout.counts_from_0)
     pattern = pose_file or _pose_pattern(folder, layout)
     pose_path = folder / pattern if pattern else None
     if pose_path:
@@ -104,10 +106,11 @@ def open_recording(
     )  # fmt: skip
 
 
-def _own_times(folder: Path, colors: list[Path]) -> Times | None:
-    """Times (s) of images that stand in a folder, not in a list with times; None if not known.
+def _recorded_times(folder: Path, colors: list[Path]) -> Times | None:
+    """The times (s) of the images in a folder; None if they are not known.
 
-    They come from `timestamps.txt`, else from the images' names if all hold a time.
+    They come from `timestamps.txt`, or without this file from the images' names if all hold a time.
+    Raises DataError if they do not rise, or are not one finite time for each image.
     """
     path = folder / TIMES_FILE
     if path.is_file():
@@ -117,7 +120,8 @@ def _own_times(folder: Path, colors: list[Path]) -> Times | None:
             raise DataError(f"{found}: write one each, rising, in seconds, ms, us or ns")
     else:
         stamps = [stamp_in(file) for file in colors]
-        if None in stamps or len(set(stamps)) == 1:  # one of all: when the recording began
+        # The same time in all names is the one when the recording began.
+        if None in stamps or len(set(stamps)) == 1:
             return None
         path, times = colors[0].parent, np.array(stamps)
     check_rising(times, path)
@@ -125,9 +129,11 @@ def _own_times(folder: Path, colors: list[Path]) -> Times | None:
 
 
 def _calibration(folder: Path, layout: Format) -> tuple[Calibration, str]:
-    """The folder's own calibration, else one that is assumed by the folder's name; and a note.
+    """The calibration of a recording, and a note for the user.
 
-    The note tells what is assumed, or what the file says that is not used; else it is empty.
+    It is read from the folder. If the folder has no file of it, and the format knows a camera for
+    the folder's name, that camera is assumed. The note says what is assumed, or which entries of
+    the file are not used; else it is empty. Raises MissingError if there is no calibration.
     """
     known = [c for c in layout.known_cameras if c.source.name in folder.name]
     if known and not any((folder / name).is_file() for name in layout.cameras):
@@ -137,14 +143,15 @@ def _calibration(folder: Path, layout: Format) -> tuple[Calibration, str]:
     file = layout.files(folder, layout.cameras, "calibration")[0]
     with naming_damaged(file, f"camera of {layout.label}", _AGAIN):
         camera = layout.read_camera(file)
-    unused = ", ".join(camera.unused)
-    return camera, f"not used of {camera.source.name}: {unused}" if camera.unused else ""
+    note = f"not used of {camera.source.name}: {', '.join(camera.unused)}" if camera.unused else ""
+    return camera, note
 
 
 def _pose_pattern(folder: Path, layout: Format) -> str | None:
-    """The format's pattern whose files of poses are there, with `*` where every frame has a file.
+    """The format's pattern of pose files that matches files in the folder.
 
-    None if the folder has no poses. Raises DataError if it has those of two patterns.
+    It holds a `*` if every frame has a file of its own. None if the folder has no poses. Raises
+    DataError if files of several patterns are there.
     """
     there = [pattern for pattern in layout.poses if files_of(folder, pattern)]
     if len(there) > 1:
@@ -156,10 +163,10 @@ def _pose_pattern(folder: Path, layout: Format) -> str | None:
 def _poses_and_times(
     files: list[Path], path: Path, layout: Format, declared: Declaration, moments: Moments
 ) -> tuple[Poses, Times, str]:
-    """A pose and a time (s) for each frame, and a note of how poses were given to frames.
+    """The pose (as in the file) and the time (s) of each frame, and a note for the user.
 
-    The note is empty where that is plain. `path` is the one file of poses, or a pattern with `*`
-    where each frame has a file.
+    `path` is the one file of poses, or a pattern with `*` if each frame has a file of its own. The
+    note says how poses were given to frames; it is empty if poses and frames are plainly pairs.
     """
     tables = []
     for file in files:
@@ -167,16 +174,17 @@ def _poses_and_times(
             tables.append(layout.read_poses(file, declared.quaternion))
     listed = checked_poses(np.concatenate([poses for poses, _ in tables]), path)
     stamps = np.concatenate([times for _, times in tables])
-    if len(stamps) > 1 and np.ptp(stamps) == 0:  # written by a tool that has no times
-        stamps = np.full(len(stamps), np.nan)
+    no_stamps = np.full(len(stamps), np.nan)
+    if len(stamps) > 1 and np.ptp(stamps) == 0:  # a tool that has no times wrote the same one
+        stamps = no_stamps
     check_rising(stamps, path)
-    # Frames without times of their own have those of the poses, if there are as many.
+    # Frames without recorded times get those of the poses if these are equally many.
     is_one_each = len(stamps) == len(moments.times) and (np.diff(stamps) > 0).all()
-    times = stamps if moments.own is None and is_one_each else moments.times
+    times = stamps if moments.recorded_times is None and is_one_each else moments.times
     if "*" in path.name:
         check_paired(moments.images, files)
         return listed, times, ""
-    # In some formats stamps are not used to give poses to frames, but only as times, above.
-    used = stamps if layout.stamps_tell else np.full(len(stamps), np.nan)
-    poses, note = moments.poses_of(path, listed, used, declared.inverted_if_world_to_camera)
+    # In formats without `stamps_tell` the stamps are times, but do not say whose a pose is.
+    stamps = stamps if layout.stamps_tell else no_stamps
+    poses, note = moments.poses_of(path, listed, stamps, declared.inverted_if_world_to_camera)
     return poses, times, f"{path.name}: {note}" if note else ""

@@ -21,9 +21,9 @@ from nbtrack.recordings.pose_files import number_lines
 from nbtrack.recordings.reading import read_frames, select_frames
 from nbtrack.recordings.recording import Recording
 
-# RGB colour, depth maps (mm) by depth folder, and pose with OpenCV camera axes.
+# RGB colour; depth maps (mm) by the name of their folder; camera-to-world pose, OpenCV camera axes.
 WrittenFrame = tuple[ColorImage, dict[str, DepthImage], Pose]
-_FRAMES_AT_ONCE = 32  # converted: 50 MB at 640x480
+_FRAMES_AT_ONCE = 32  # held in memory by a conversion: 50 MB at 640x480
 
 
 def write_sequence(
@@ -33,18 +33,24 @@ def write_sequence(
     notes: Mapping[str, str] | None = None,
     progress: Callable[[int], object] = lambda done: None,
 ) -> None:
-    """Write frames, and notes (texts of further files, by name), as a scene in the layout.
+    """Write frames as a scene in the Neural RGB-D layout.
 
-    It is put in place when it is complete, so that a run that is killed leaves no half-written
-    scene; only if the system ends it at once, a hidden folder `.NAME.….unfinished` stays beside.
-    `progress` is called after each frame with how many are written. At least one frame is needed.
+    Args:
+        folder: the scene's folder, which must not exist.
+        frames: at least one.
+        notes: texts of further files, by file name.
+        progress: called after each frame with the number of frames that are written.
+
+    The folder is put in place when it is complete, so a killed run leaves no half of a scene. If
+    the system ends the process at once, a hidden folder `.NAME.….unfinished` stays beside it.
     Raises DataError if the folder exists.
     """
     if folder.exists():
         raise DataError(f"{folder} exists: choose another folder or remove it first")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    # A sibling, so that the final rename stays within one file system. Its name, which messages
-    # hold, begins with the folder's, which may be as long as a file system allows.
+    # The temporary folder is a sibling, so that the final rename stays within one file system. Its
+    # name begins with that of the folder, so that errors tell which one is meant; not with all of
+    # it, since a name may be as long as a file system allows.
     try:
         with TemporaryDirectory(".unfinished", f".{folder.name[:40]}.", folder.parent) as hidden:
             unfinished = Path(hidden) / "scene"
@@ -65,39 +71,40 @@ def write_sequence(
 def _write_images(
     folder: Path, number: int, color: ColorImage, depths_mm: dict[str, DepthImage]
 ) -> None:
-    """Write the images of a frame."""
+    """Write the images of the frame with this number."""
     images = {f"{name}/depth": image for name, image in depths_mm.items()}
     images["images/img"] = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
     for prefix, image in images.items():
-        # The fastest compression: rooms are made often and read from a local disk.
+        # 1 is the fastest compression: rooms are made often, and read from a local disk.
         _, content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
         write_atomic(folder / f"{prefix}{number}.png", content.tobytes())
 
 
 def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
-    """Texts of the files of poses and of the camera, by file name."""
+    """The texts of the pose files and of the camera file, by file name."""
     # The layout's y and z axes point the other way than OpenCV's. Turning them is its own inverse,
-    # so that the function that reads the layout's poses also writes them.
+    # so the function that reads the layout's poses also writes them.
     T_file = FORMATS["neural_rgbd"].declared.poses_to_opencv(T_world_camera)
     texts = dict.fromkeys(["poses.txt", "trainval_poses.txt"], number_lines(T_file.reshape(-1, 4)))
-    # The camera that a reader makes of the focal length alone.
+    # The camera that a reader of the focal length alone assumes.
     by_focal = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
-    if np.allclose(astuple(camera), astuple(by_focal), rtol=0, atol=1e-6):  # rounding
+    if np.allclose(astuple(camera), astuple(by_focal), rtol=0, atol=1e-6):  # equal but for rounding
         return texts | {"focal.txt": f"{float(camera.fx)!r}\n"}
-    # There is no `focal.txt` then, so that programs that know only this file stop, instead of
-    # reading another camera. In `intrinsics.txt` pixel centres are whole numbers, as in OpenCV.
+    # Another camera gets no `focal.txt`: programs that know only this file then stop instead of
+    # assuming a wrong camera. In `intrinsics.txt` pixel centres have whole coordinates.
     K = camera_matrix(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
     return texts | {"intrinsics.txt": number_lines(K)}
 
 
 def convert_sequence(recording: Recording, out: Path, frames: slice = slice(None)) -> str:
-    """Write a recording in the Neural RGB-D layout, and say what a user should know of it.
+    """Write a recording in the Neural RGB-D layout; returns a text that tells the user about it.
 
-    Only a lens's distortion is removed from images; a camera that the layout cannot say goes to
-    `intrinsics.txt`. Frames without a pose keep their number, with a NaN pose.
-    Raises as `read_frames` does, and DataError if `out` exists; it appears when it is complete.
+    Images stay as they are, except that the distortion of a lens is taken out. Frames without a
+    pose keep their number and get a NaN pose. A camera that the layout cannot describe is written
+    to `intrinsics.txt`. The folder `out` appears when it is complete. Raises DataError if `out`
+    exists, if an image cannot be read, or if no selected frame has a pose.
     """
-    select_frames(recording, frames)  # raises where none has a pose
+    select_frames(recording, frames)  # raises if no frame has a pose
     numbers = select_frames(recording, frames, needs_poses=False)
     camera = images_of(recording).camera_of(numbers[0])
     with ProgressBar("converting", len(numbers)) as bar:
@@ -116,7 +123,7 @@ def convert_sequence(recording: Recording, out: Path, frames: slice = slice(None
 
 
 def _frames(recording: Recording, numbers: Frames) -> Iterator[WrittenFrame]:
-    """The frames of some numbers one by one; only `_FRAMES_AT_ONCE` are in memory at a time."""
+    """The frames with these numbers one by one; at most `_FRAMES_AT_ONCE` are held in memory."""
     for part in np.split(numbers, range(_FRAMES_AT_ONCE, len(numbers), _FRAMES_AT_ONCE)):
         read = read_frames(recording, part, origin=np.zeros(3))
         for color, depth, T in zip(read.colors, read.depths_mm, read.T_world_camera, strict=True):
