@@ -1,4 +1,4 @@
-"""Tables as LaTeX, marked up as in the paper, by the template `table.tex.jinja`."""
+"""Writes tables as LaTeX, marked up as in the paper, with the template `table.tex.jinja`."""
 
 import re
 from dataclasses import dataclass, field
@@ -10,13 +10,13 @@ import pandas as pd
 
 _SPECIAL = {character: rf"\{character}" for character in "_&%$#{}"}
 _SPECIAL |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-# In an author's LaTeX: what stays as it is (formulas, references, commands and escaped
-# characters), or a character that is meant as text, since bare it would not compile.
+# What stays as it is in an author's LaTeX: formulas, references, commands, escaped characters.
 _AS_IS = r"\$[^$]+\$|\\(?:\w*ref|cite\w*)\*?\{[^}]*\}|\\[a-zA-Z]+|\\[^a-zA-Z\s]"
+# Group 1 is what stays. Without it, the match is a special character, to be escaped.
 _AUTHORS = re.compile(rf"({_AS_IS})|[%&#_^$\\]")
-_COLUMN_PT = 235  # width of a column of a paper on letter paper or A4
-_CHARACTER_PT, _GAP_PT = 4, 12  # of \scriptsize, and between two columns of a table
-_KINDS = {"table_1": "ate", "table_2": "runtime", "table_3": "beyond"}  # by a file's name
+_COLUMN_PT = 235  # width of a text column of a paper on letter paper or A4
+_CHARACTER_PT, _GAP_PT = 4, 12  # width of a \scriptsize character, and between two table columns
+_KINDS = {"table_1": "ate", "table_2": "runtime", "table_3": "beyond"}  # by a file's stem
 _LATEX = jinja2.Environment(
     loader=jinja2.PackageLoader("nbtrack", ""), keep_trailing_newline=True, trim_blocks=True,
     block_start_string="<%", block_end_string="%>", variable_start_string="<<",
@@ -26,36 +26,38 @@ _LATEX = jinja2.Environment(
 
 @dataclass(frozen=True)
 class Wording:
-    """What an author's LaTeX says in place of ours."""
+    """An author's caption, label and scene names, which replace those of this package."""
 
-    # LaTeX, in which a bare %, &, #, _, ^ or single $ is text; empty: the usual, without the note.
+    # LaTeX, in which a bare %, &, #, _, ^ or single $ means the character itself. None: the usual
+    # caption with the note; empty: the usual caption without the note.
     caption: str | None = None
-    label: str | None = None  # Table II beside Table I has it too, ending in `-steps`
-    scenes: dict[str, str] = field(default_factory=dict)  # labels by the names in the table
+    label: str | None = None  # Table II written with Table I has this label and `-steps`
+    scenes: dict[str, str] = field(default_factory=dict)  # an author's names by those in the table
 
 
 OUR_WORDING = Wording()
 
 
-def latex_file(styler: Any, path: Path, note: str, own: Wording = OUR_WORDING) -> str:
+def latex_file(styler: Any, path: Path, note: str, wording: Wording = OUR_WORDING) -> str:
     """The text of the `.tex` file for `styler`, a `TableStyler` of `nbtrack.tables`.
 
-    The name of `path`, `table_1`, `table_2` or `table_3`, chooses the caption, and its folder's
-    name goes into the label; nothing is written here. `note`, plain text, says how the numbers were
-    measured. An author's own caption is that of Table I or III; Table II then has the usual one
-    without the note.
+    Nothing is written here. The stem of `path` (`table_1`, `table_2` or `table_3`) chooses the
+    caption, and its folder's name becomes part of the label. `note`, plain text, says how the
+    numbers were measured. An author's caption replaces that of Table I or III; Table II then has
+    the usual caption without the note.
     """
     cells = styler.data
-    columns = [own.scenes.get(scene, scene) for scene in cells]
-    groups = {}  # the rows of a rate by method, or of a tracker by n
+    columns = [wording.scenes.get(scene, scene) for scene in cells]
+    # Rows by rate, each with its method; in Table II by tracker, each with its n.
+    groups = {}
     for (first, second), row in zip(cells.index, cells.to_numpy(), strict=True):
         groups.setdefault(first, []).append((second, row))
     return _LATEX.get_template("table.tex.jinja").render(
         styler=styler,
-        own=own,
+        wording=wording,
         kind=_KINDS[path.stem],
         name=path.stem,
-        folder=re.sub(r"[^\w.-]", "_", path.resolve().parent.name),  # without special characters
+        folder=re.sub(r"[^\w.-]", "_", path.resolve().parent.name),  # for a label
         note=" ".join(note.split()),
         has_steps="n_pixels" in cells.index.names,
         has_std=any(cell.std for cell in cells.to_numpy().flat),
@@ -67,32 +69,35 @@ def latex_file(styler: Any, path: Path, note: str, own: Wording = OUR_WORDING) -
 
 
 def _width_pt(cells: pd.DataFrame, columns: list[Any]) -> float:
-    """About the width of a printed table: that of its rates and methods, and of its columns."""
+    """About the width (pt) of a printed table: of its rates, its methods and its other columns."""
     n_characters = 8 + max(len(str(second)) for _, second in cells.index)
     for name, column in zip(columns, cells, strict=True):
-        words = str(name).replace("_", " ").split()  # one below another
+        words = str(name).replace("_", " ").split()  # printed one below the other
         n_characters += max(map(len, [*words, *map(str, cells[column])]))
     return _CHARACTER_PT * n_characters + _GAP_PT * (len(columns) + 1)
 
 
 def _plain(text: object) -> str:
-    """Text with LaTeX's special characters escaped, and what reads `n = 64` set as a formula."""
+    """Plain text as LaTeX: special characters are escaped, and `n = 64` becomes a formula."""
     return re.sub(r"\bn = \d+", r"$\g<0>$", str(text).translate(str.maketrans(_SPECIAL)))
 
 
 def _authors(text: str) -> str:
-    """An author's LaTeX in which what is meant as text is escaped, so that it compiles."""
-    text = " ".join(text.split())  # an empty line ends a caption
+    """An author's LaTeX with special characters escaped that would not compile as they are.
+
+    Text whose braces do not match is taken as plain text.
+    """
+    text = " ".join(text.split())  # an empty line would end the caption
     braces = re.sub(r"\\.", "", text)
     if braces.count("{") != braces.count("}"):
         return _plain(text)
     escaped = _AUTHORS.sub(lambda found: found[1] or _SPECIAL[found[0]], text)
-    return re.sub(r"(?<!\\)[%&#]", r"\\\g<0>", escaped)  # those of formulas
+    return re.sub(r"(?<!\\)[%&#]", r"\\\g<0>", escaped)  # in formulas and references, too
 
 
 def label_of(text: str) -> str:
-    """An author's label, with a hyphen in place of what no label can hold."""
-    return re.sub(r"[^\w:./+ -]", "-", text)  # other characters end a label, or TeX
+    """An author's label, with a hyphen in place of each character that a label cannot hold."""
+    return re.sub(r"[^\w:./+ -]", "-", text)
 
 
 _LATEX.filters |= {"plain": _plain, "authors": _authors, "label": label_of}

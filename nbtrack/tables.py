@@ -1,7 +1,7 @@
 """The paper's tables: long DataFrames in; wide DataFrames, styled HTML, LaTeX and CSV out.
 
-Long form has a row a result and is what experiments and CSV files hold; wide form is the printed
-table. Rows follow the data: a new tracker is a new row and nothing here names a method.
+Experiments and CSV files use the long form, in which each row is one result. The wide form is the
+printed table. Its rows follow the data: a new tracker is a new row, and no code here names one.
 """
 
 import html
@@ -21,16 +21,16 @@ from nbtrack.machinery.files import fingerprint, write_atomic
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 PAPER_PIXELS = {"VR": 512, "SDF": 4096}
-"""The n that the paper's Table II prints in bold: the one used for Table I."""
+"""The n (points or pixels) that the paper uses for Table I, and prints in bold in Table II."""
 STANDING_STILL = "standing still"
-"""The row of a camera that stays at its first pose, the dullest alternative to any tracker."""
-CONVERGED = "‡"  # in Table II: a tracker needed no more steps
+"""The method name of a camera that stays at its first pose: the baseline of every tracker."""
+CONVERGED = "‡"  # marks steps in Table II after which the tracker had converged
 _CELL_1 = ["rate_hz", "method", "scene"]
 _CELL_2 = ["tracker", "n_pixels", "budget_ms"]
 _MISSING = "–"
 _BOLD = "font-weight: bold;"
 _LEGEND = f"bold: best at this rate; † and red: above {LOST_THRESHOLD_M:g} m"
-_UNITS = {"m": (1, "{:.3f}"), "mm": (1000, "{:.1f}")}  # of an ATE, and how it is printed
+_UNITS = {"m": (1, "{:.3f}"), "mm": (1000, "{:.1f}")}  # units per metre, and format of an ATE
 
 
 def published_table_1() -> pd.DataFrame:
@@ -44,21 +44,21 @@ def published_table_2() -> pd.DataFrame:
 
 
 def naming_points(results: pd.DataFrame) -> pd.DataFrame:
-    """The results with n (points or pixels) in their methods' names, as "LM, n = 4096"."""
-    both = zip(results["method"], results["n_pixels"], strict=True)
-    return results.assign(method=[f"{m.removesuffix(f', {n}')}, n = {n}" for m, n in both])
+    """Adds n (points or pixels) to the methods' names: "LM" and "LM, 4096" give "LM, n = 4096"."""
+    names_and_n = zip(results["method"], results["n_pixels"], strict=True)
+    return results.assign(method=[f"{m.removesuffix(f', {n}')}, n = {n}" for m, n in names_and_n])
 
 
 def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
-    """Table I in long form, from results with a row for each cell and seed: means over the seeds.
+    """Table I in long form: means over seeds of results that have a row for each cell and seed.
 
-    Columns are rate_hz (falling), method, scene (the dataset's by their printed names), ate_m, and
-    with several seeds ate_std_m, their sample std (m). A cell with a failed seed is NaN: a mean of
-    the others would hide the failure. A column still_ate_m in the results adds the method
-    `STANDING_STILL`. Raises DataError where two rows are of one cell and seed.
+    Columns are rate_hz (descending), method, scene (as the paper prints it), ate_m and, if there
+    are several seeds, ate_std_m, the sample std (m). A cell with a failed seed is NaN: the mean of
+    the other seeds would hide the failure. If the results have a column still_ate_m, it becomes the
+    method `STANDING_STILL`. Raises DataError for two rows of the same cell and seed.
     """
     keys = [*_CELL_1, "seed"] if "seed" in results else _CELL_1
-    _refuse_doubles(results, keys)
+    _check_keys(results, keys)
     if "still_ate_m" in results:
         still = results.dropna(subset="still_ate_m").assign(method=STANDING_STILL)
         still = still.assign(ate_m=still["still_ate_m"]).drop_duplicates(keys)
@@ -67,17 +67,17 @@ def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
     groups = results.groupby(_CELL_1, sort=False)["ate_m"]
     averaged = groups.mean(skipna=False).reset_index()
     if groups.size().max() > 1:
-        spread = groups.std(skipna=False).to_numpy()  # standing still does not depend on a seed
-        averaged["ate_std_m"] = np.where(averaged["method"] == STANDING_STILL, np.nan, spread)
+        stds = groups.std(skipna=False).to_numpy()  # standing still depends on no seed
+        averaged["ate_std_m"] = np.where(averaged["method"] == STANDING_STILL, np.nan, stds)
     return averaged.sort_values("rate_hz", ascending=False, kind="stable", ignore_index=True)
 
 
 def table_1(results: pd.DataFrame, value: str = "ate_m") -> pd.DataFrame:
-    """Table I as printed: ATE (m), a row per rate and method, a column per scene.
+    """Table I in wide form: ATE (m), a row per rate and method, a column per scene.
 
-    Results and errors are those of `average_over_seeds`. With the value "ate_std_m" the table holds
-    the std over seeds. Methods and scenes keep the order of their first appearance. Every method
-    gets a row at every rate; what has no result is NaN.
+    Takes results and raises errors as `average_over_seeds` does. With the value "ate_std_m" cells
+    hold the std over seeds. Methods and scenes keep the order of their first appearance. Every
+    method has a row at every rate; cells without a result are NaN.
     """
     cells = average_over_seeds(results)
     rates, methods = cells["rate_hz"].unique(), cells["method"].unique()
@@ -86,21 +86,21 @@ def table_1(results: pd.DataFrame, value: str = "ate_m") -> pd.DataFrame:
 
 
 def table_2(steps: pd.DataFrame, value: str = "steps") -> pd.DataFrame:
-    """Table II as printed: mean steps, a row per tracker and n (pixels), a column per budget (ms).
+    """Table II in wide form: mean steps, a row per tracker and n, a column per budget (ms).
 
     `steps` has a row for each cell, with columns tracker, n_pixels, budget_ms, steps. With the
-    value "steps_std" the table holds the std over frames. Raises DataError for two rows of a cell.
+    value "steps_std" cells hold the std over frames. Raises DataError for two rows of a cell.
     """
-    _refuse_doubles(steps, _CELL_2)
+    _check_keys(steps, _CELL_2)
     return _wide(steps, _CELL_2, value).reindex(steps["tracker"].unique(), level="tracker")
 
 
 def beside_published(results: pd.DataFrame) -> pd.DataFrame:
-    """Our Table I beside the paper's: scene by scene where ours has scenes of the paper.
+    """Our Table I compared with the paper's: cell by cell, if the two have scenes in common.
 
-    Errors in different rooms say nothing about each other. Of our own rooms a summary is compared:
-    the median ATE (m), and the share of scenes where it is above 0.2 m, or there is no result. That
-    follows the digits printed, as the marks of `style_table_1` do.
+    Otherwise cells cannot be compared, since they are errors in different rooms. The result then
+    has for each row the median ATE (m) and the share of lost scenes. A scene is lost if its ATE, as
+    printed with three digits, is above 0.2 m, or if it has no result.
     """
     ours, paper = table_1(results), table_1(published_table_1())
     common = [scene for scene in ours if scene in paper]
@@ -115,24 +115,24 @@ def beside_published(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def beside(ours: pd.DataFrame, paper: pd.DataFrame) -> pd.DataFrame:
-    """Two wide tables in one: below each row of ours the paper's, and ours less the paper's."""
-    same = paper.reindex(index=ours.index, columns=ours.columns)
-    sources = {"ours": ours, "paper": same, "difference": ours - same}
-    both = pd.concat(sources, names=["source"]).reorder_levels([1, 2, 0])
+    """Our wide table, with each row followed by the paper's row and by the difference of both."""
+    published = paper.reindex(index=ours.index, columns=ours.columns)
+    sources = {"ours": ours, "paper": published, "difference": ours - published}
+    stacked = pd.concat(sources, names=["source"]).reorder_levels([1, 2, 0])
     rows = []
-    for row in ours.index:  # ours stands alone where the paper has no such row
+    for row in ours.index:  # a row that the paper does not have stands alone
         rows += [(*row, source) for source in (sources if row in paper.index else ["ours"])]
-    return both.loc[rows]
+    return stacked.loc[rows]
 
 
 def _wide(cells: pd.DataFrame, keys: list[str], value: str) -> pd.DataFrame:
-    """Long to wide form: columns by the third key, rows by the first two, gaps NaN."""
-    cells = cells.reindex(columns=[*keys, value])  # a value such as ate_std_m may be missing
+    """Long to wide form: the first two keys give rows, the third columns; missing cells are NaN."""
+    cells = cells.reindex(columns=[*keys, value])  # a column such as ate_std_m may be missing
     return cells.pivot(index=keys[:2], columns=keys[2], values=value).astype(float)
 
 
-def _refuse_doubles(cells: pd.DataFrame, keys: list[str]) -> None:
-    """Raises DataError where these columns are not all there, or two rows have the same of them."""
+def _check_keys(cells: pd.DataFrame, keys: list[str]) -> None:
+    """Raises DataError if a key column is missing, or two rows have the same keys."""
     if not {*keys} <= {*cells}:
         raise DataError(f"a table has the columns {[*cells]}: it needs {', '.join(keys)}")
     twice = cells[cells.duplicated(keys)]
@@ -145,7 +145,7 @@ def _refuse_doubles(cells: pd.DataFrame, keys: list[str]) -> None:
 class Cell:
     """A number as it is printed, perhaps with a std, and its marks.
 
-    The marks are in its text too: pages that do not trust a notebook drop its style sheets.
+    Marks are both CSS and HTML text, since pages that do not trust a notebook drop style sheets.
     """
 
     value: str
@@ -157,20 +157,20 @@ class Cell:
         return f"{self.value} ± {self.std}" if self.std else self.value
 
     def css(self) -> str:
-        """Its declarations in a style sheet."""
+        """The marks as CSS declarations."""
         return ("color: red;" if self.is_lost else "") + (_BOLD if self.is_best else "")
 
     def html(self) -> str:
-        """Its content as HTML, with a dagger and bold type as marks."""
+        """The text as HTML, with a dagger if lost and in bold if best."""
         text = f"{self} †" if self.is_lost else str(self)
         return f"<b>{text}</b>" if self.is_best else text
 
 
 class TableStyler(Styler):
-    """A styled table of cells; its plain-text form is the table itself, equal in every run."""
+    """A styled table of `Cell`s. As plain text it is the table, which is the same in every run."""
 
-    unit = "m"  # of an ATE
-    default_pixels = PAPER_PIXELS  # of Table II
+    unit = "m"  # of the ATEs in Table I or III
+    default_pixels = PAPER_PIXELS  # the n of each tracker that Table II prints in bold
 
     def __repr__(self) -> str:
         return self.data.map(str).to_string()
@@ -181,9 +181,9 @@ def style_table_1(
 ) -> TableStyler:
     """Table I, mean ± std over seeds: best bold, above 0.2 m red with a dagger, missing "–".
 
-    Both marks follow the digits printed, three in m and one in mm: values equal to the last digit
-    are equally good. A value without a rival at its rate is not bold. Raises ConfigError for
-    another unit. Source: caption of the paper's Table I.
+    Marks depend on the digits printed, three in m and one in mm, so that values printed alike are
+    marked alike. A value without a rival in its scene at its rate is not bold. Raises ConfigError
+    for another unit than "m" or "mm". Source: caption of the paper's Table I.
     """
     scale, form = look_up("unit", unit, _UNITS)
     shown = (scale * table_1(results)).map(lambda value: float(form.format(value)))
@@ -202,8 +202,8 @@ def style_table_2(
 ) -> TableStyler:
     """Table II, mean ± std over frames; rows of whole numbers without a std have no decimals.
 
-    Steps are marked where the column `converged` is true. The default pixels of each tracker, the n
-    used for Table I, are printed bold with an asterisk.
+    Cells whose `converged` is true in `steps` are marked with `CONVERGED`. Each tracker's default
+    pixels, the n used for Table I, are printed in bold with an asterisk.
     """
     wide, stds = table_2(steps), table_2(steps, "steps_std")
     is_whole = (wide.isna() | (wide % 1 == 0)).all(axis=1) & stds.isna().all(axis=1)
@@ -225,21 +225,21 @@ def style_table_2(
 
 
 def _texts(wide: pd.DataFrame, form: str, missing: str = "") -> pd.DataFrame:
-    """Numbers as texts by a format such as `{:.3f}`; NaN as the text `missing`."""
+    """The numbers as texts: formatted by `form`, such as `{:.3f}`, and `missing` for NaN."""
     return wide.map(lambda value: missing if pd.isna(value) else form.format(value))
 
 
 def _styled(texts: pd.DataFrame, stds: pd.DataFrame, is_best: Any, is_lost: Any) -> TableStyler:
-    """A styled table of `Cell`s; marks are tables of the shape of the texts, or a flag for all."""
+    """A styled table of `Cell`s; marks are tables of flags shaped as `texts`, or one flag each."""
     cells = np.vectorize(Cell, otypes=[object])(texts, stds, is_best, is_lost)
     styler = TableStyler(pd.DataFrame(cells, texts.index, texts.columns))
     return styler.format(Cell.html).map(Cell.css)
 
 
 def _labelled(styler: TableStyler, caption: str | None, legend: str) -> TableStyler:
-    """The styler, given a caption that explains the marks, and an id from all that it shows.
+    """The styler, given a caption that explains its marks, and an id hashed from its content.
 
-    A page's style sheets go by ids: tables that share one would colour each other.
+    Style sheets refer to ids: two tables in a page with the same id would colour each other.
     """
     styler.set_caption(html.escape(f"{caption}; {legend}" if caption else legend))
     return styler.set_uuid(fingerprint(styler.set_uuid("table").to_html()))
@@ -252,45 +252,45 @@ def write_tables(
     note: str,
     default_pixels: dict[str, int] = PAPER_PIXELS,
     steps_note: str | None = None,
-    own: Wording = OUR_WORDING,
+    wording: Wording = OUR_WORDING,
 ) -> list[Path]:
-    """Writes Tables I and II as CSV (long form), LaTeX, and beside the paper's; returns the paths.
+    """Writes Tables I and II as CSV (long form), LaTeX, and CSV beside the paper's numbers.
 
-    The arguments are those of `table_1`, `table_2`, `latex_file` and `style_table_2`. Table II is
-    always measured by the clock and may have a note of its own.
+    Takes the arguments of `table_1`, `table_2`, `latex_file` and `style_table_2`; returns the
+    paths. Table II, which is always measured by the clock, may have its own note, `steps_note`.
     """
     styled = style_table_2(steps, default_pixels=default_pixels)
     both = beside(table_2(steps), table_2(published_table_2()))
-    paths = write_table_1(folder, results, note, own)
-    return paths + _write_table(folder / "table_2", steps, styled, steps_note or note, own, both)
+    paths = write_table_1(folder, results, note, wording)
+    paths += _write_table(folder / "table_2", steps, styled, steps_note or note, wording)
+    return [*paths, write_csv(folder / "table_2_vs_paper.csv", both, index=True)]
 
 
 def write_table_1(
-    folder: Path, results: pd.DataFrame, note: str, own: Wording = OUR_WORDING
+    folder: Path, results: pd.DataFrame, note: str, wording: Wording = OUR_WORDING
 ) -> list[Path]:
-    """Writes Table I alone as CSV, LaTeX, and beside the paper's; see `write_tables`."""
-    cells, styled = average_over_seeds(results), style_table_1(results)
-    return _write_table(folder / "table_1", cells, styled, note, own, beside_published(results))
+    """Writes Table I alone as CSV, LaTeX, and CSV beside the paper's numbers; returns the paths."""
+    styled, both = style_table_1(results), beside_published(results)
+    paths = _write_table(folder / "table_1", average_over_seeds(results), styled, note, wording)
+    return [*paths, write_csv(folder / "table_1_vs_paper.csv", both, index=True)]
 
 
 def write_table_3(
-    folder: Path, results: pd.DataFrame, note: str, own: Wording = OUR_WORDING
+    folder: Path, results: pd.DataFrame, note: str, wording: Wording = OUR_WORDING
 ) -> list[Path]:
-    """Writes Table III, Table I with other rows and in mm, as CSV and LaTeX; see `write_tables`."""
-    results = naming_points(results)  # with more points a frame it is another method
+    """Writes Table III, the methods beyond the paper in mm, as CSV and LaTeX; returns the paths."""
+    results = naming_points(results)  # results with different n must not be averaged
     cells, styled = average_over_seeds(results), style_table_1(results, unit="mm")
-    return _write_table(folder / "table_3", cells, styled, note, own)
+    return _write_table(folder / "table_3", cells, styled, note, wording)
 
 
 def _write_table(
-    stem: Path, cells: pd.DataFrame, styler: TableStyler, note: str, own: Wording, *compared: Any
+    stem: Path, cells: pd.DataFrame, styler: TableStyler, note: str, wording: Wording
 ) -> list[Path]:
-    """Write a table as CSV, as LaTeX and, if given, `compared` with the paper's; their paths."""
+    """Writes a table as CSV (long form) and as LaTeX; returns the paths."""
     path = stem.with_suffix(".tex")
-    write_atomic(path, latex_file(styler, path, note, own))
-    beside_it = stem.with_name(f"{stem.name}_vs_paper.csv")
-    paths = [write_csv(beside_it, table, index=True) for table in compared]
-    return [write_csv(stem.with_suffix(".csv"), cells), path, *paths]
+    write_atomic(path, latex_file(styler, path, note, wording))
+    return [write_csv(stem.with_suffix(".csv"), cells), path]
 
 
 def write_csv(path: Path, table: pd.DataFrame, **options: Any) -> Path:

@@ -253,7 +253,7 @@ def test_written_files(tmp_path: Path) -> None:
 def test_captions_compile(tmp_path: Path, given: str, written: str | None) -> None:
     """Catches a caption or label that ends a line, a cell or TeX, and LaTeX that is spoiled."""
     own = Wording(given, "tab:a_b%c#1")
-    first, *_ = write_tables(tmp_path, OURS_1, OURS_2, NOTE, own=own)
+    first, *_ = write_tables(tmp_path, OURS_1, OURS_2, NOTE, wording=own)
     text = first.with_suffix(".tex").read_text()
     if written is None:
         written = given.replace("R_1", r"R\_1").replace("^", r"\textasciicircum{}")
