@@ -101,6 +101,7 @@ MAP_CONTENT: dict[str, tuple[str, Any, str]] = {
     "origin of two": ("made/origin", [0.0, 0.0], "a number of its header"),
     "a scene of control characters": ("made/scene", "a\x1b[2Jb", "can be printed"),
     "a corner of NaN": ("bounds", [[NAN, 0.0, 0.0], [1.0] * 3], "are no bounds"),
+    "a corner of two numbers": ("bounds", [[0.0] * 3, [1.0] * 2], "are no bounds"),
     "weights of NaN": (WEIGHT, lambda w: w * NAN, "is not finite"),
 }
 

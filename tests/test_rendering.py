@@ -10,7 +10,7 @@ from nbtrack.beyond.other_fields import density_from_sdf, weights_from_occupancy
 from nbtrack.fields.rendering import (
     composite,
     importance_depths,
-    stratified_depths,
+    stratified_samples,
     weights_from_density,
     weights_from_sdf,
 )
@@ -129,13 +129,13 @@ def test_extreme_values_stay_finite(scale: float, generator: torch.Generator) ->
         assert torch.isfinite(tensor).all()
 
 
-def test_stratified_depths(generator: torch.Generator) -> None:
+def test_stratified_samples(generator: torch.Generator) -> None:
     """Catches parts counted from zero instead of `near` (halves of [1, 3] and [1, 9]), independent
     draws, and the same offset for all rays or parts."""
-    found = stratified_depths(1.0, torch.tensor([3.0, 9.0]), 2)
+    found = stratified_samples(1.0, torch.tensor([3.0, 9.0]), 2)
     torch.testing.assert_close(found, torch.tensor([[1.5, 2.5], [3.0, 7.0]]))
     far = 1 + 4 * torch.rand(50, generator=generator)
-    parts = (stratified_depths(0.5, far, 16, generator) - 0.5) / (far[:, None] - 0.5) * 16
+    parts = (stratified_samples(0.5, far, 16, generator) - 0.5) / (far[:, None] - 0.5) * 16
     offsets = parts - torch.arange(16)
     assert -1e-5 < offsets.min() < offsets.max() < 1 + 1e-5
     assert offsets.mean().item() == pytest.approx(0.5, abs=0.05)

@@ -1,4 +1,4 @@
-"""The axis-aligned box of a scene: where fields are defined and where rays end."""
+"""The axis-aligned box of a scene, in which fields are defined and at which rays end."""
 
 from dataclasses import dataclass
 
@@ -17,13 +17,14 @@ class SceneBounds:
 
     minimum: tuple[float, float, float]
     maximum: tuple[float, float, float]
-    declared_unit: float | None = None  # m, where the authors of a recording give it
+    declared_unit: float | None = None  # m, if the authors of a recording give it
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for corners that are not finite, or no box, or no positive unit."""
+        """Raises ConfigError for corners that are not finite or span no box, or a unit <= 0."""
         low, high = (tuple(map(float, corner)) for corner in (self.minimum, self.maximum))
         unit = 1.0 if self.declared_unit is None else self.declared_unit
-        if len(low) != 3 or not all(0 < x < np.inf for x in (*np.subtract(high, low), unit)):
+        has_3_axes = len(low) == len(high) == 3
+        if not has_3_axes or not all(0 < x < np.inf for x in (*np.subtract(high, low), unit)):
             raise ConfigError(f"{self} are no bounds: give a minimum and a larger maximum, in m")
         object.__setattr__(self, "minimum", low)
         object.__setattr__(self, "maximum", high)
@@ -35,20 +36,20 @@ class SceneBounds:
 
     @property
     def metres_per_unit(self) -> float:
-        """The unit of the map (m): that of networks' inputs, and of Adam's rate of the position.
+        """Metres in a unit of the map; networks take positions in this unit, and so does Adam.
 
-        It is the declared one, else half of the longest side, as NeuS and the Neural RGB-D dataset
-        normalise their scenes to about [-1, 1]^3.
+        This is the declared unit or, without one, half of the longest side: NeuS and the Neural
+        RGB-D dataset also normalise their scenes to about [-1, 1]^3.
         """
         return self.declared_unit or float(np.subtract(self.maximum, self.minimum).max() / 2)
 
     def far_bound(self, origins_world: Points, directions_world: Points) -> Values:
-        """The t at which points origin + t * direction, which start inside, leave the box.
+        """The t at which each ray origin + t * direction, which starts in the box, leaves it.
 
-        It is a z-depth (m) where directions have z = 1 in the camera frame. Rays that start
-        outside, as a lost camera's do, may give small or negative values.
+        If directions have z = 1 in the camera frame, t is a z-depth (m). For rays that start
+        outside, as those of a lost camera do, t may be small or negative.
         """
-        # Along an axis in which a ray does not move its t becomes huge; 0 could give 0/0.
+        # A ray parallel to two faces gets a huge t there; with a direction of 0 it could be 0/0.
         safe = torch.where(directions_world.abs() < 1e-9, 1e-9, directions_world)
         device, dtype = origins_world.device, origins_world.dtype
         to_minimum = (constant(self.minimum, device, dtype) - origins_world) / safe

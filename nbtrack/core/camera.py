@@ -27,7 +27,7 @@ class Intrinsics:
     cy: float  # principal point, row; H/2 is the image's middle
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a size or a focal length that no camera has."""
+        """Raises ConfigError for a size or focal length <= 0, or a value that is not finite."""
         for name in ("width", "height"):
             whole_number(f"a camera's {name}", getattr(self, name), minimum=1)
         lengths = self.fx, self.fy, self.cx, self.cy
@@ -36,7 +36,7 @@ class Intrinsics:
 
     @classmethod
     def from_focal(cls, width: int, height: int, focal: float) -> "Intrinsics":
-        """Square pixels and a centred principal point, as in the Neural RGB-D layout."""
+        """A camera with square pixels and a centred principal point, as Neural RGB-D has it."""
         return cls(width, height, focal, focal, width / 2, height / 2)
 
 
@@ -45,9 +45,9 @@ def pixel_directions(
 ) -> Float[Tensor, "*n 3"]:
     """Ray directions (camera frame) through pixel centres, with z = 1.
 
-    A z-depth times this direction is the observed point. The length is not one: at the corner of
-    a 640x480 image with a 60 degree field of view it is about 1.23. Pixel indices are integers, or
-    real ones (0 addresses the centre at 0.5).
+    A z-depth times this direction is the observed point. So the directions are no unit vectors: at
+    the corner of a 640x480 image with a 60 degree field of view the length is about 1.23. Pixel
+    indices are integers or real numbers; index 0 is the centre of the first pixel, at 0.5.
     """
     x = (columns.float() + 0.5 - intrinsics.cx) / intrinsics.fx
     y = (rows.float() + 0.5 - intrinsics.cy) / intrinsics.fy
@@ -67,9 +67,10 @@ def backproject(
 def project(
     intrinsics: Intrinsics, points_camera: Float[Tensor, "*n 3"]
 ) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"], Float[Tensor, "*n"]]:
-    """Columns, rows (real-valued pixel indices, as `pixel_directions` takes them) and z-depth (m).
+    """Columns and rows (real-valued pixel indices) at which points (m) are seen, and z-depths (m).
 
-    Points behind the camera give a depth <= 0 and meaningless pixels; callers mask them.
+    An index of 0 is the centre of the first pixel, as for `pixel_directions`. Points behind the
+    camera give a depth <= 0 and meaningless pixels, which callers must mask.
     """
     x, y, depth = points_camera.unbind(-1)
     columns = intrinsics.fx * x / depth + intrinsics.cx - 0.5

@@ -6,7 +6,8 @@ from torch import Tensor
 
 from nbtrack.machinery.device import constant
 
-# Rows: the entries of the matrix K with K x = v × x, for each component of v.
+# The matrix [v]×, for which [v]× x = v × x, is linear in v. Each row holds the nine entries
+# (row-major) that one component of v is multiplied by.
 _CROSS = (
     (0, 0, 0, 0, 0, -1, 0, 1, 0),
     (0, 0, 1, 0, 0, 0, -1, 0, 0),
@@ -16,7 +17,7 @@ _IDENTITY = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
 def normalize_quaternion(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternion of the same rotation axis and angle.
+    """The quaternion divided by its norm, which describes the same rotation.
 
     Source: paper, implementation details ("we renormalize after every optimization step").
     """
@@ -26,8 +27,8 @@ def normalize_quaternion(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
 def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a quaternion (order w, x, y, z): R = I + 2 [v]× (w I + [v]×).
 
-    The norm is divided out here, so that the gradient is tangential: a radial part would dominate
-    Adam's coordinate-wise step and be lost again in the renormalisation after it.
+    The quaternion is normalised here, so that its gradient is tangential to the unit sphere. A
+    radial part could dominate Adam's step, and the renormalisation after the step would undo it.
 
     >>> quaternion_to_matrix(torch.tensor([0.0, 0.0, 0.0, 2.0])).diagonal().tolist()
     [-1.0, -1.0, 1.0]
@@ -43,10 +44,10 @@ def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
 def matrix_to_quaternion(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternion (w, x, y, z) of a rotation matrix; w >= 0.
 
-    Every row of 4 q qᵀ is a multiple of q. The row with the largest entry on the diagonal is taken,
-    so that no rotation angle divides by a small number.
+    Every row of 4 q qᵀ is a multiple of q. The row with the largest diagonal entry is normalised,
+    so that no rotation leads to a division by a small number.
     """
-    # Off the diagonal, names tell the entries of 4 q qᵀ: `wx` is 4 w x.
+    # The diagonal entries of the rotation matrix, and the other entries of 4 q qᵀ: `wx` is 4 w x.
     difference = rotation - rotation.mT
     total = rotation + rotation.mT
     xx, yy, zz = rotation.diagonal(dim1=-2, dim2=-1).unbind(-1)

@@ -1,7 +1,7 @@
 """The Neural RGB-D dataset of the paper's experiments (Azinović et al. 2022)."""
 
 DATASET_ZIP = "https://kaldir.vc.in.tum.de/neural_rgbd/neural_rgbd_data.zip"
-"""Its one file, 7.25 GB."""
+"""The dataset's only file, 7.25 GB."""
 DATASET_SCENES = {
     "breakfast_room": "Breakfast", "complete_kitchen": "Compl. Kitchen",
     "green_room": "Green Room", "grey_white_room": "Grey-white", "kitchen": "Kitchen",
@@ -13,5 +13,5 @@ DATASET_UNITS = {
     "breakfast_room": 2.5, "complete_kitchen": 5.0, "green_room": 4.0, "grey_white_room": 4.0,
     "kitchen": 4.0, "morning_apartment": 2.0, "staircase": 4.0, "whiteroom": 4.0,
 }  # fmt: skip
-"""Metres a unit of its scenes: 1 / `sc_factor` in the `configs/` of the dataset's own code, which
-scales each scene to about [-1, 1]^3 (Azinović et al. 2022). It has none for `thin_geometry`."""
+"""Metres in a unit of each scene. The dataset's own code scales scenes to about [-1, 1]^3; this is
+1 / `sc_factor` of its `configs/` (Azinović et al. 2022), which lack `thin_geometry`."""

@@ -1,4 +1,4 @@
-"""Random pixels of a sequence as rays."""
+"""Draws random pixels of a sequence, as rays with what the camera measured."""
 
 from dataclasses import dataclass, replace
 
@@ -8,13 +8,14 @@ from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Indices, Points, RaySamples, Values
 from nbtrack.core.camera import backproject, pixel_directions
-from nbtrack.data.frame import measured
+from nbtrack.data.frame import as_floats
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery.device import has_room_for
 from nbtrack.machinery.inputs import tensor_of
 
-# Tangent planes: how far away neighbours are, as a share of the image's width, and by how much of
-# the depth they may differ, which cuts off edges and incidences above some 75 degrees (our choice).
+# The neighbours that a pixel's tangent plane is computed from (our choice): how far away they are,
+# as a share of the image's width, and by what share of the pixel's depth they may differ from it.
+# This leaves out pixels at edges, and surfaces seen at more than some 75 degrees from their normal.
 PLANE_REACH = 1 / 64
 PLANE_JUMP = 0.1
 
@@ -24,11 +25,11 @@ class Rays:
     """Rays through pixels, with what the camera measured there."""
 
     origins_world: Float[Tensor, "rays 3"]
-    directions_world: Float[Tensor, "rays 3"]  # z = 1 in the camera frame: steps are z-depths
+    directions_world: Float[Tensor, "rays 3"]  # with z = 1 in the camera frame
     color: Float[Tensor, "rays 3"]  # measured, in [0, 1]
     depth: Float[Tensor, "rays"]  # measured z-depth (m), 0 = no measurement
-    # Unit normal of the measured surface, towards the camera; 0 where not known, None where not
-    # asked for. One metre of z-depth leads |normal . direction| metres away from the plane.
+    # Unit normals of the measured surface, towards the camera; 0 where unknown. None if they were
+    # not asked for.
     normals_world: Float[Tensor, "rays 3"] | None = None
 
     def points(self, depths: RaySamples) -> Float[Tensor, "rays samples 3"]:
@@ -37,25 +38,26 @@ class Rays:
 
 
 class PixelSampler:
-    """Draws random pixels of a sequence, measured or not, for a network on some device.
+    """Draws random pixels of a sequence as rays on a device, measured or not.
 
-    Only drawn pixels become floating point. The images lie on the device too if it has room to
-    spare, else on the host, from where drawn pixels travel; what is drawn is the same.
+    The images stay integers; only drawn pixels become floating point. Images are kept on the device
+    if it has enough memory, else on the host. This does not change what is drawn.
     """
 
     def __init__(self, sequence: RgbdSequence, device: torch.device) -> None:
+        """Take the sequence and the device on which rays are needed."""
         n_bytes = sequence.colors.nbytes + sequence.depths_mm.nbytes
         self.device = device
         self.intrinsics = sequence.intrinsics
         images_device = device if has_room_for(device, n_bytes) else torch.device("cpu")
         self.colors = tensor_of(sequence.colors).to(images_device)
-        # Few torch kernels know unsigned 16 bit: the same bits travel as signed.
+        # Few torch kernels take unsigned 16-bit integers, so the bits are kept as signed ones.
         self.depths_mm = tensor_of(sequence.depths_mm).view(torch.int16).to(images_device)
         self.T_world_camera = tensor_of(sequence.T_world_camera).float().to(device)
 
     def rays(self, frames: Indices, rows: Indices, columns: Indices) -> Rays:
-        """Rays through given pixels, with their measurements."""
-        color, depth = self.measured(frames, rows, columns)
+        """Rays through given pixels, with what was measured there and without normals."""
+        color, depth = self.at(frames, rows, columns)
         T_world_camera = self.T_world_camera[frames]
         directions_camera = pixel_directions(self.intrinsics, columns, rows)
         directions_world = (T_world_camera[:, :3, :3] @ directions_camera[..., None]).squeeze(-1)
@@ -64,39 +66,39 @@ class PixelSampler:
     def normals_camera(self, frames: Indices, rows: Indices, columns: Indices) -> Points:
         """Unit normals of the surface at pixels, in the camera frame and towards the camera.
 
-        The tangent plane goes through neighbours to all sides, some pixels away, so that noise
-        tilts it little. 0 where the pixel or one of these is not measured, or where one lies on
-        another surface.
+        The tangent plane is computed from the neighbours to the left, right, top and bottom. These
+        are some pixels away, so that noise tilts the plane little. The normal is 0 if the pixel or
+        a neighbour has no measured depth, or if a neighbour lies on another surface.
         """
         _, height, width = self.depths_mm.shape
         reach = max(1, round(width * PLANE_REACH))  # pixels
-        _, depth = self.measured(frames, rows, columns)
-        points = {}  # m, camera frame
-        is_whole = depth > 0
+        _, depth = self.at(frames, rows, columns)
+        points = {}  # of the neighbours, by side (m, camera frame)
+        is_known = depth > 0
         steps = {"left": (0, -reach), "right": (0, reach), "up": (-reach, 0), "down": (reach, 0)}
         for side, (row_step, column_step) in steps.items():
             row, column = rows + row_step, columns + column_step
-            is_whole &= (row >= 0) & (row < height) & (column >= 0) & (column < width)
+            is_known &= (row >= 0) & (row < height) & (column >= 0) & (column < width)
             row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
-            _, side_depth = self.measured(frames, row, column)
-            is_whole &= (side_depth > 0) & ((side_depth - depth).abs() < PLANE_JUMP * depth)
+            _, side_depth = self.at(frames, row, column)
+            is_known &= (side_depth > 0) & ((side_depth - depth).abs() < PLANE_JUMP * depth)
             points[side] = backproject(self.intrinsics, column, row, side_depth)
-        # Rightwards cross upwards: x cross -y is -z, towards the camera.
+        # Right (x) cross up (-y) is -z, which points towards the camera.
         normal = torch.linalg.cross(points["right"] - points["left"], points["up"] - points["down"])
-        return torch.nn.functional.normalize(normal, dim=-1) * is_whole[:, None]
+        return torch.nn.functional.normalize(normal, dim=-1) * is_known[:, None]
 
-    def measured(self, frames: Indices, rows: Indices, columns: Indices) -> tuple[Colors, Values]:
-        """Colour in [0, 1] and z-depth (m, 0 = none) of pixels."""
-        where = tuple(indices.to(self.colors.device) for indices in (frames, rows, columns))
-        depth_mm = self.depths_mm[where].to(self.device).int() & 0xFFFF  # unsigned again
-        return measured(self.colors[where].to(self.device), depth_mm)
+    def at(self, frames: Indices, rows: Indices, columns: Indices) -> tuple[Colors, Values]:
+        """Colour in [0, 1] and z-depth (m, 0 = no measurement) of pixels."""
+        pixels = tuple(indices.to(self.colors.device) for indices in (frames, rows, columns))
+        depth_mm = self.depths_mm[pixels].to(self.device).int() & 0xFFFF  # unsigned again
+        return as_floats(self.colors[pixels].to(self.device), depth_mm)
 
     def draw(
         self, n_rays: int, generator: torch.Generator, frames: Indices, tangent_planes: bool = False
     ) -> Rays:
-        """Rays through random pixels of the given frames, measured or not (depth 0).
+        """Rays through random pixels of the given frames. A pixel without measurement has depth 0.
 
-        With `tangent_planes` they have normals, which are 0 where not known.
+        With `tangent_planes` the rays have normals, which are 0 where unknown.
         """
 
         def below(limit: int) -> Indices:

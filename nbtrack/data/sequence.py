@@ -15,33 +15,35 @@ from nbtrack.data.frame import MILLIMETRE, Frame
 from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.machinery.inputs import check_array, checked_poses
 
-# Of bounds (our choice): pixels looked at in each frame, on a regular grid, and the share of points
-# cut off at either end of each axis, so that a few wild depths do not stretch the box.
+# `observed_bounds` uses about so many pixels of each frame, on a regular grid (our choice).
 _POINTS_PER_FRAME = 2000
+# The share of points that it leaves out at either end of each axis, so that a few wrong depths do
+# not stretch the box (our choice).
 _CUT_OFF = 0.002
-ARRAYS = "colors", "depths_mm", "T_world_camera", "frame_ids", "times"  # a row a frame
+# The fields of a sequence that have one row for each frame.
+ARRAYS = "colors", "depths_mm", "T_world_camera", "frame_ids", "times"
 
 
 @dataclass(frozen=True)
 class RgbdSequence:
-    """Posed RGB-D frames, kept as compactly as on disk (5 bytes a pixel).
+    """RGB-D frames with camera poses, kept as integers (5 bytes a pixel).
 
-    1,600 frames of 640x480 take 2.5 GB. Pixels become floating point only when sampled.
+    1,600 frames of 640x480 take 2.5 GB. Pixels become floating point only when they are used.
     """
 
     name: str
     intrinsics: Intrinsics
     colors: UInt8[np.ndarray, "frames height width 3"]  # RGB
     depths_mm: UInt16[np.ndarray, "frames height width"]  # z-depth, 0 = no measurement
-    T_world_camera: Poses  # OpenCV camera axes; NaN where not known
-    frame_ids: Int[np.ndarray, "frames"]  # position in the folder's natural order
-    times: Float[np.ndarray, "frames"]  # s, the recording's own, or by its numbers and rate
-    # m, where the origin of these poses lies in the recording's own world.
+    T_world_camera: Poses  # OpenCV camera axes; NaN if unknown
+    frame_ids: Int[np.ndarray, "frames"]  # index in the recording's folder, in natural order
+    times: Float[np.ndarray, "frames"]  # s, as recorded, or from frame numbers and a frame rate
+    # The position (m) of this sequence's world origin in the recording's own world frame.
     origin: Position = field(default_factory=lambda: np.zeros(3))
     declared_unit: float | None = None  # m, see `SceneBounds`
 
     def __post_init__(self) -> None:
-        """Raises DataError for an array whose type or shape is not that of its fellows."""
+        """Raises DataError for an image or pose array of another type or shape."""
         n, size = len(self.colors), (self.intrinsics.height, self.intrinsics.width)
         check_array("colors", self.colors, (n, *size, 3), [UInt8], "uint8")
         check_array("depths_mm", self.depths_mm, (n, *size), [UInt16], "uint16")
@@ -55,7 +57,7 @@ class RgbdSequence:
         return f"RgbdSequence({self.name!r}, {len(self)} frames of {size})"
 
     def __getitem__(self, index: int) -> Frame:
-        """One frame, copied, with the pose that it was recorded with."""
+        """A copy of one frame, with its true pose if that is known."""
         if not isinstance(index, int | np.integer):
             raise ConfigError(f"{self!r}[{index}]: give one frame's number; `select` takes several")
         color = torch.from_numpy(self.colors[index].copy())
@@ -66,16 +68,16 @@ class RgbdSequence:
         return Frame(self.intrinsics, color, depth_mm, known, name)
 
     def color(self, index: int) -> Float[np.ndarray, "height width 3"]:
-        """Colour image in [0, 1]."""
+        """The colour image of a frame, in [0, 1]."""
         return self.colors[index].astype(np.float32) / 255
 
     def depth(self, index: int) -> Float[np.ndarray, "height width"]:
-        """Z-depth image in metres, 0 where there is no measurement."""
+        """The z-depth image of a frame (m), 0 where there is no measurement."""
         return self.depths_mm[index].astype(np.float32) * np.float32(MILLIMETRE)
 
     @property
     def digest(self) -> str:
-        """A hash over pixels, poses, frame numbers, camera and unit: sixteen hexadecimal digits."""
+        """A hash of pixels, poses, frame numbers, camera and unit: sixteen hexadecimal digits."""
         digest = hashlib.blake2b(digest_size=8)
         digest.update(repr((self.intrinsics, self.declared_unit)).encode())
         for array in (self.frame_ids, self.T_world_camera, self.colors, self.depths_mm):
@@ -83,16 +85,16 @@ class RgbdSequence:
         return digest.hexdigest()
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
-        """The sequence of some of the frames, in the order given; slices copy nothing."""
+        """A sequence of some of the frames, in the order given. A slice copies no images."""
         if not isinstance(indices, slice) and np.ndim(indices) != 1:
             raise ConfigError(f"`select` takes a slice or a list of frames, not {indices!r:.80}")
         return replace(self, **{name: getattr(self, name)[indices] for name in ARRAYS})
 
 
 def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
-    """Box around everything a sequence sees, and its cameras, with `margin` metres to spare.
+    """The box around all that a sequence sees and around its cameras, enlarged by `margin` (m).
 
-    Raises DataError if no pixel of the sequence has a depth, or a frame no pose.
+    Raises DataError if a frame has no known pose, or if no pixel that is used has a depth.
     """
     poses = checked_poses(sequence.T_world_camera, Path(sequence.name))
     is_posed = np.isfinite(poses).all(axis=(1, 2))
@@ -102,10 +104,10 @@ def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
     height, width = sequence.depths_mm.shape[1:]
     stride = max(1, round((width * height / _POINTS_PER_FRAME) ** 0.5))
     clouds = []
-    for index, T in enumerate(sequence.T_world_camera):
-        frame = sequence[index]
+    for frame in sequence:
         points_camera, _ = frame.points(*frame.measured_pixels(stride, stride // 2))
-        clouds.append(points_camera.numpy() @ T[:3, :3].T + T[:3, 3])
+        rotation, position = frame.T_world_camera[:3, :3], frame.T_world_camera[:3, 3]
+        clouds.append(points_camera.numpy() @ rotation.T + position)
     points_world = np.concatenate(clouds)
     if not len(points_world):
         raise DataError(f"no pixel of {sequence.name} has a depth, of one in {stride**2}: check it")

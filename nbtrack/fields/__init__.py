@@ -13,16 +13,16 @@ from nbtrack.machinery.inputs import whole_number
 from nbtrack.machinery.registry import Registry
 
 FIELDS: Registry[type[Field]] = Registry({"imap": IMapField, "neus": NeuSField})
-"""What can be mapped, by name. A field of your own joins by `FIELDS["mine"] = MyField`."""
+"""The classes of fields that can be mapped, by name. `FIELDS["mine"] = MyField` adds your own."""
 
 
 def field_class(name: str) -> type[Field]:
-    """The field of a name. Raises ConfigError, naming the nearest, for any other."""
+    """The field class of a name. ConfigError, with the most similar name, for an unknown one."""
     return look_up_kind("field", name, FIELDS, ("name", "label"))
 
 
 @usual_modes()
 def make_field(name: str, network: NetworkSettings, bounds: SceneBounds, seed: int) -> Field:
-    """A fresh, seeded field inside `bounds`."""
+    """A new, seeded field inside `bounds`. ConfigError for an unknown name or a seed below 0."""
     generator = torch.Generator().manual_seed(whole_number("seed", seed))
     return field_class(name)(network, bounds, generator)

@@ -10,7 +10,7 @@ from nbtrack.fields.base import Draw, LearnedField, Losses, MappingSettings, ren
 from nbtrack.fields.mlp import FourierMlp, NetworkSettings
 from nbtrack.fields.rendering import Weights, weights_from_density
 
-DENSITY_PER_UNIT = 10.0  # 1/m of one unit of network output (vMAP's re-implementation of iMAP)
+DENSITY_PER_UNIT = 10.0  # density (1/m) for one unit of network output, as in vMAP's iMAP
 
 
 class IMapField(LearnedField):
@@ -20,7 +20,8 @@ class IMapField(LearnedField):
     label = "iMAP"
     is_distance = False
     value_label = "density (1/m)"
-    # Density (1/m): it has no surface, but light is halved over ln 2 / 20 = 3.5 cm (our choice).
+    # 1/m. A density has no exact surface; at this one half of the light is absorbed within
+    # ln 2 / 20 = 3.5 cm (our choice).
     surface_level = 20.0
 
     def __init__(self, network: NetworkSettings, bounds: SceneBounds, generator: Generator) -> None:
@@ -30,18 +31,19 @@ class IMapField(LearnedField):
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour in [0, 1] and density (1/m, positive)."""
         raw_color, raw_density = self.mlp(points_world)
-        # Softplus, not a rectifier: a density that starts below zero could never recover.
+        # Softplus instead of a rectifier, whose gradient is 0 where the raw density is negative.
         density = DENSITY_PER_UNIT * torch.nn.functional.softplus(raw_density)
         return torch.sigmoid(raw_color), density
 
     def weights(self, values: RaySamples, rays: Rays, depths: RaySamples) -> Weights:
-        """Weights of samples, from their densities. Source: iMAP, Sec. 3.2."""
+        """Probabilities that rays end at their samples. Source: iMAP, Sec. 3.2."""
         return weights_from_density(values, depths, rays.directions_world.norm(dim=1))
 
     def mapping_losses(self, draw: Draw, settings: MappingSettings, generator: Generator) -> Losses:
-        """iMAP's geometric and photometric losses."""
+        """iMAP's losses of rendered depth and colour."""
         rays = draw(settings.n_rays)
-        # Not guided by measured depths, since VR cannot be (docs/choices.md).
+        # Samples are not guided by the measured depth, since those of tracking cannot be: at a
+        # wrong pose the map's surface lies elsewhere (docs/choices.md).
         n_first, n_second = settings.n_stratified, settings.n_surface
         rendered = self.render_hierarchically(rays, n_first, n_second, generator)
         return rendered_losses(rendered, rays, settings.lambda_color, lambda_depth=1, over_std=True)

@@ -12,36 +12,38 @@ from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.machinery.settings import limited
 
-_LAYER_SIZE = 2**18  # numbers that are worked on at once: 1 MB, which a core's cache holds
+_LAYER_SIZE = 2**18  # numbers in a layer's output that a core's cache can hold: 1 MB
 
 Activation = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
 class NetworkSettings:
-    """The network that all fields share."""
+    """Sizes of the network that all fields share."""
 
-    width: int = limited(256, 1, 4096)  # hidden units a layer (iMAP)
+    width: int = limited(256, 1, 4096)  # units of each hidden layer (iMAP)
     n_frequencies: int = limited(93, 1, 4096)  # learnable sines of the embedding (iMAP)
-    # Standard deviation of the sines' first frequencies, rad/m. 2.5 is iMAP's own: 25 on
-    # coordinates scaled by 1/10.
+    # Standard deviation (rad/m) from which the sines' initial frequencies are drawn. iMAP has the
+    # same 2.5: it uses 25 on coordinates scaled by 1/10.
     embedding_sigma: float = 2.5
 
 
 class FourierMlp(nn.Module):
-    """Four hidden layers on 93 learnable sines; position in, colour logits and one value out.
+    """Maps positions to colour logits and one value: learnable sines, then four hidden layers.
 
-    The embedding is sin(B x) with B learnable, drawn from a Gaussian; it enters once more beside
-    the input of the third layer. At full size (256 wide) it has 246,555 parameters.
-    Source: Sucar et al. 2021 (iMAP); paper, implementation details. iMAP scales coordinates by
-    1/10; here the scene's own size normalises them, while the frequencies are drawn per metre, so
-    that detail has one size in rooms of any size (our choice).
+    The embedding is sin(B x), where the learnable B is drawn from a Gaussian. It is concatenated
+    once more to the input of the third layer. With the default settings the network has 246,555
+    parameters. Source: Sucar et al. 2021 (iMAP); paper, implementation details.
+
+    iMAP scales coordinates by 1/10. Here they are divided by the unit of the scene, while
+    frequencies are drawn per metre, so that details have the same size in rooms of any size (our
+    choice).
     """
 
     def __init__(
         self, settings: NetworkSettings, bounds: SceneBounds, act: Activation, generator: Generator
     ) -> None:
-        """Draw the weights by a generator; `act` is the activation of all hidden layers."""
+        """Draw the weights with `generator`; `act` is the activation of all hidden layers."""
         super().__init__()
         width, n_frequencies = settings.width, settings.n_frequencies
         self.activation = act
@@ -66,9 +68,9 @@ class FourierMlp(nn.Module):
         return self.activation(self.layer_4(hidden))
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
-        """Raw colour and the raw fourth output, before a field gives them a meaning."""
-        # Parts of a layer that fit the cache: value and gradient of 16,384 points, asked of a
-        # finished network, cost 273 ms instead of 369 (256 wide, one busy core).
+        """Colour logits and raw values at points (m, world frame); fields give them a meaning."""
+        # On the CPU a finished network is asked in parts whose layers fit the cache: value and
+        # gradient of 16,384 points cost 273 ms instead of 369 (256 wide, one busy core).
         n_at_once = max(1, len(points_world))
         if not (self.head.weight.requires_grad or points_world.is_cuda):
             n_at_once = max(1, _LAYER_SIZE // self.head.in_features)
@@ -79,7 +81,7 @@ class FourierMlp(nn.Module):
 
 
 def _linear(n_in: int, n_out: int, generator: Generator) -> nn.Linear:
-    """Kaiming-uniform weights for a rectifier and zero bias, drawn from a generator of our own."""
+    """A layer with zero bias and random weights: Kaiming-uniform, as for a rectifier."""
     layer = empty_linear(n_in, n_out)
     bound = math.sqrt(6.0 / n_in)
     with torch.no_grad():
@@ -90,5 +92,5 @@ def _linear(n_in: int, n_out: int, generator: Generator) -> nn.Linear:
 
 
 def empty_linear(n_in: int, n_out: int) -> nn.Linear:
-    """A layer to be filled: PyTorch's own start would draw from the program's random numbers."""
+    """A layer with uninitialised weights: PyTorch would draw them from its global generator."""
     return nn.utils.skip_init(nn.Linear, n_in, n_out, dtype=torch.float32)

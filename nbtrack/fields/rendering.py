@@ -1,7 +1,7 @@
-"""Volume rendering as pure tensor functions that know nothing about networks.
+"""Volume rendering as pure functions of tensors, without networks.
 
-Rays are z-depth rays: a direction has z = 1 in the camera frame and length `ray_lengths` >= 1, so
-sample positions are z-depths and metric distances along the ray are z-depths times that length.
+Ray directions have z = 1 in the camera frame. So positions of samples on a ray are z-depths, and a
+distance along the ray is a z-depth times the length of the direction, which is at least 1.
 """
 
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ from torch import Generator, Tensor
 from nbtrack.core.arrays import RayColors, RaySamples, Scalar
 
 Weights = Float[Tensor, "rays parts"]
-"""Probabilities that rays end at their samples, or in the sections between them."""
+"""Probabilities that rays end at their samples, or in the sections between two samples."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """What a ray sees: expectations under its weights."""
+    """What rays see: expected values under their weights."""
 
     color: Float[Tensor, "rays 3"]  # in [0, 1]
     depth: Float[Tensor, "rays"]  # z-depth, m
     depth_variance: Float[Tensor, "rays"]  # m^2
-    weights: RaySamples  # their sum is at most 1
+    weights: RaySamples  # the sum over a ray is at most 1
 
 
 def weights_from_density(
@@ -31,15 +31,16 @@ def weights_from_density(
 ) -> RaySamples:
     """Termination probabilities w_i = o_i prod_{j<i} (1 - o_j), o_i = 1 - exp(-density_i delta_i).
 
-    Densities in 1/m, ascending z-depths in m, and the metres along a ray for one metre of z-depth.
-    Source: Sucar et al. 2021 (iMAP), Sec. 3.2. The last sample has no successor; it gets the
-    section length of the one before it (our choice: a wall stays opaque, and free space free).
+    Densities are in 1/m, z-depths (ascending) in m. `ray_lengths` are the lengths of the ray
+    directions, and delta_i is the distance (m) from sample i to the next one along the ray. The
+    last sample has no next one and takes the delta of the sample before it (our choice: so a wall
+    stays opaque, and free space free). Source: Sucar et al. 2021 (iMAP), Sec. 3.2.
     """
     z_steps = depths.diff(dim=1)
     sections = torch.cat([z_steps, z_steps[:, -1:]], dim=1) * ray_lengths[:, None]
     optical_depth = density * sections
     opacity = -torch.expm1(-optical_depth)
-    # Transmittance in front of a sample: everything that lies before it, itself left out.
+    # The transmittance from the camera to a sample, whose own section does not count.
     transmittance = torch.exp(-(optical_depth.cumsum(dim=1) - optical_depth))
     return opacity * transmittance
 
@@ -47,30 +48,31 @@ def weights_from_density(
 def weights_from_sdf(sdf: RaySamples, inverse_std: Scalar) -> Float[Tensor, "rays sections"]:
     """NeuS's unbiased, occlusion-aware weights of the sections between neighbouring samples.
 
-    alpha_i = max((Phi(f_i) - Phi(f_{i+1})) / Phi(f_i), 0) with Phi(f) = sigmoid(s f) and weights
-    w_i = Phi(f_0) alpha_i prod_{j<i} (1 - alpha_j).
+    The weights are w_i = Phi(f_0) alpha_i prod_{j<i} (1 - alpha_j), with
+    alpha_i = max((Phi(f_i) - Phi(f_{i+1})) / Phi(f_i), 0) and Phi(f) = sigmoid(s f). The signed
+    distance f is in m and positive in free space; s, `inverse_std`, is in 1/m.
 
-    The factor Phi(f_0) is ours: a camera stands in free space, so a ray whose first sample lies
-    inside something is dark. NeuS lets such rays leave the solid unharmed, for it looks at
-    objects from outside; in rooms seen from inside the camera's own surroundings then filled up.
+    The factor Phi(f_0) is our choice. NeuS lets a ray that starts inside a solid leave it, since it
+    looks at objects from outside. In a room seen from inside, the space around the cameras then
+    filled up. With the factor a ray whose first sample lies inside a solid sees nothing.
 
-    The signed distance f is in m, positive in free space, `inverse_std` s in 1/m. Source:
-    Wang et al. 2021 (NeuS), Eq. 13; the published code extrapolates f from mid-points, where the
-    paper's own formula spares second derivatives.
+    Source: Wang et al. 2021 (NeuS), Eq. 13. NeuS's published code instead extrapolates f from the
+    middles of sections; the formula of the paper, used here, needs no second derivatives.
     """
-    # 1 - alpha_i, which is Phi(f_{i+1}) / Phi(f_i) and at most 1, in logarithms: a plain quotient
-    # is 0/0 deep inside objects.
+    # log_ratio is the logarithm of 1 - alpha_i = Phi(f_{i+1}) / Phi(f_i), which is at most 1. The
+    # quotient itself would be 0/0 deep inside objects.
     log_phi = torch.nn.functional.logsigmoid(inverse_std * sdf)
     log_ratio = log_phi.diff(dim=1).clamp_max(0)
-    # Phi(f_0) times all (1 - alpha_j) before a section; its own is taken out of the sum again.
+    # The logarithm of Phi(f_0) times all (1 - alpha_j) before a section. The sum includes the
+    # section's own term, which is subtracted again.
     log_passed = log_phi[:, :1] + log_ratio.cumsum(dim=1) - log_ratio
     return -torch.expm1(log_ratio) * torch.exp(log_passed)
 
 
 def composite(weights: RaySamples, colors: RayColors, depths: RaySamples) -> Rendering:
-    """Expected colour, z-depth and depth variance: sum w c, sum w d and sum w (D - d)^2.
+    """Expected colour C = sum w c, z-depth D = sum w d and depth variance sum w (D - d)^2 of rays.
 
-    Source: Sucar et al. 2021 (iMAP), Sec. 3.2. Light that passes the last sample adds nothing.
+    Light that passes the last sample adds nothing. Source: Sucar et al. 2021 (iMAP), Sec. 3.2.
     """
     depth = (weights * depths).sum(dim=1)
     color = (weights[..., None] * colors).sum(dim=1)
@@ -78,12 +80,13 @@ def composite(weights: RaySamples, colors: RayColors, depths: RaySamples) -> Ren
     return Rendering(color, depth, depth_variance, weights)
 
 
-def stratified_depths(
+def stratified_samples(
     near: float, far: Float[Tensor, "rays"], n_samples: int, generator: Generator | None = None
 ) -> RaySamples:
-    """One uniformly random z-depth (m) in each of `n_samples` equal parts of [near, far].
+    """One uniformly random value in each of `n_samples` equal parts of [near, far], for each ray.
 
-    Without a generator the samples lie in the middle of their parts.
+    The values are z-depths (m), or whatever else `near` and `far` are. Without a generator each
+    value is the middle of its part.
     """
     offsets = far.new_full((len(far), n_samples), 0.5)
     if generator is not None:
@@ -95,19 +98,22 @@ def stratified_depths(
 def importance_depths(
     depths: RaySamples, weights: RaySamples, n_samples: int, generator: Generator | None = None
 ) -> Float[Tensor, "rays new_samples"]:
-    """Z-depths (m) drawn from the piecewise-constant density that `weights` describe.
+    """Z-depths (m) drawn from the piecewise-constant density that the weights of samples describe.
 
-    Inverse transform sampling over the cells whose borders are the mid-points between samples.
-    Source: Mildenhall et al. 2020 (NeRF), Sec. 5.2, as used by iMAP. A small floor keeps rays
-    without any weight, which see free space only, sampled evenly.
+    Each sample of the first pass has a cell, whose borders are the mid-points to its neighbours;
+    the first and the last cell end at their samples. A cell is drawn with a probability that is
+    proportional to its weight plus a small constant. So on a ray without any weight, which sees
+    free space only, all cells are equally likely. Source: inverse transform sampling, Mildenhall et
+    al. 2020 (NeRF), Sec. 5.2, as used by iMAP.
     """
     borders = (depths[:, 1:] + depths[:, :-1]) / 2
     borders = torch.cat([depths[:, :1], borders, depths[:, -1:]], dim=1)
     share = weights + 1e-4
     cdf = (share / share.sum(dim=1, keepdim=True)).cumsum(dim=1)
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], dim=1)
-    # Stratified in probability: fewer clumps than independent draws.
-    levels = stratified_depths(0.0, depths.new_ones(len(depths)), n_samples, generator)
+    # Values of the cumulative distribution, stratified in [0, 1]: they form fewer clusters than
+    # independent draws.
+    levels = stratified_samples(0.0, depths.new_ones(len(depths)), n_samples, generator)
     cell = torch.searchsorted(cdf, levels, right=True).clamp(1, cdf.shape[-1] - 1)
     cdf_low, cdf_high = cdf.gather(-1, cell - 1), cdf.gather(-1, cell)
     low, high = borders.gather(-1, cell - 1), borders.gather(-1, cell)
