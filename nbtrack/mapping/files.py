@@ -1,4 +1,4 @@
-"""A finished map, and the one file that holds it: safetensors, which run no code; all checked."""
+"""Finished maps, and their files: safetensors, which run no code and are checked when read."""
 
 import json
 import math
@@ -22,30 +22,30 @@ from nbtrack.machinery.registry import Registry
 
 MAP_FILE = "map.safetensors"
 HISTORY_FILE = "history.csv"  # losses over iterations
-MESH_FILE = "mesh.ply"  # what a map's frames have seen
-CHECKPOINT_FILE = "mapping.pt"  # of a map in the making
+MESH_FILE = "mesh.ply"  # the part of a map's surface that its frames have seen
+CHECKPOINT_FILE = "mapping.pt"  # of an unfinished map
 _FORMAT = "nbtrack map"
 _VERSION = 4
 FORMS: Registry[type[Field]] = Registry({})
-"""What may be made of a finished map's field, as a corrected one, by its name in map files."""
+"""Classes of fields that are made from finished maps, such as corrected ones, by name."""
 _AGAIN = "map again, and give the folder or its map.safetensors; an earlier nbtrack's are none"
 
 
 @dataclass(frozen=True)
 class Map:
-    """A mapped scene, ready for tracking, with what is known of how it was made."""
+    """A mapped scene, ready for tracking, and the record of how it was made."""
 
     field: Field
-    camera: Intrinsics  # of the frames it was made from
-    # Plain values: scene, n_frames, seed, network, settings, misfit_m, device, versions, seconds
-    # spent in iterations; and whatever its maker adds, as `quality`, scores by name.
+    camera: Intrinsics  # of the mapped frames
+    # Plain values: what `map_sequence` records (the scene, seed, network, settings, misfit_m, the
+    # seconds spent in iterations, ...), and what callers add, such as scores.
     record: dict[str, Any]
-    # One row an iteration: weighted loss terms and diagnostics. Empty where it was not kept.
+    # One row for each iteration: weighted loss terms and diagnostics. Empty if it was not kept.
     history: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     @property
     def key(self) -> str:
-        """Twelve hexadecimal digits that change with the field, its bounds and its weights."""
+        """A hash of the field, its bounds and its weights, as twelve hexadecimal digits."""
         field, network = self.field, self.record["network"]
         plain = [field.name, field.form, network, asdict(field.bounds)]
         return digest_of(plain, _tensors(field))[:12]
@@ -53,16 +53,17 @@ class Map:
 
 @usual_modes()
 def write_map(path: Path | str, finished: Map) -> None:
-    """Writes a map as one file, about 1 MB for the paper's network.
+    """Writes a map to a file, of about 1 MB for the paper's network.
 
-    Weights keep every bit, so that tracking in the file gives the trajectory of the map itself.
-    In a folder the file is `MAP_FILE`, with the map's history beside it; another's history and mesh
-    are removed. Raises ConfigError or DataError, and writes nothing, where `read_map` could not
-    read it.
+    If the path is a folder, the file is its `MAP_FILE`. The map's history is then written beside
+    it, and the history and mesh of an earlier map are removed. Weights keep every bit, so that the
+    file gives the same trajectories as the map. If `read_map` could not read the file, nothing is
+    written and ConfigError or DataError is raised.
     """
     path = absolute(path)
     path = path / MAP_FILE if path.is_dir() else path
     field, bounds = finished.field, finished.field.bounds
+    # A file names its field's class, or form: only what is registered can be read again.
     if type(field) is not (FORMS.get(field.form) if field.form else FIELDS.get(field.name)):
         raise ConfigError(f"no map file holds a {type(field).__name__}: write what it comes from")
     header = {
@@ -81,17 +82,18 @@ def write_map(path: Path | str, finished: Map) -> None:
         if _map_of(content, path).key != finished.key:
             raise ValueError("it is read as another map")
     history = finished.history.rename_axis("iteration")
+    # A folder's other files belong to its map; None removes that of an earlier map.
     beside = {HISTORY_FILE: None if history.empty else history.to_csv().encode(), MESH_FILE: None}
     write_together(path.parent, {**(beside if path.name == MAP_FILE else {}), path.name: content})
 
 
 @usual_modes()
 def read_map(path: Path | str) -> Map:
-    """A map from the folder that `map` has written, or from a single file, on the CPU.
+    """The map, on the CPU, of a folder that the command `map` has written, or of a single file.
 
-    A single file comes without a history. Raises MissingError where there is no finished map, and
-    DataError where a file is damaged, of another format version, or no map at all; ConfigError
-    where its field is not registered.
+    A single file has no history. Raises MissingError if there is no finished map; DataError if a
+    file is damaged, of another format version, or no map at all; ConfigError if the map's field is
+    not registered.
     """
     path = absolute(path)
     file = path / MAP_FILE if path.is_dir() else path
@@ -99,7 +101,7 @@ def read_map(path: Path | str) -> Map:
     if not file.is_file():
         raise MissingError(f"{path} holds no finished map of this nbtrack: map again, or give one")
     with naming_damaged(file, "map file", _AGAIN):
-        # safetensors itself opens no path whose letters are not UTF-8
+        # The bytes are read here, since safetensors opens no path that is not UTF-8.
         stored = _map_of(file.read_bytes(), file)
     if not history.is_file():
         return stored
@@ -108,7 +110,7 @@ def read_map(path: Path | str) -> Map:
 
 
 def _map_of(content: bytes, file: Path) -> Map:
-    """The map of a file's content. Raises ValueError, KeyError and others if it is not sound."""
+    """The map of a file's content. Raises ValueError, KeyError or others if it is damaged."""
     tensors = safetensors.torch.load(content)
     # A safetensors file begins with the size of its JSON header, in 8 bytes, and that header.
     size = int.from_bytes(content[:8], "little")
@@ -116,7 +118,7 @@ def _map_of(content: bytes, file: Path) -> Map:
     header = dict(json.loads(metadata[_FORMAT]))
     if header.get("format_version") != _VERSION:
         raise ValueError(f"format {header.get('format_version')!r}; this nbtrack reads {_VERSION}")
-    # A bit that flipped on a disk, or a number edited by hand, shows nowhere else.
+    # Nothing else notices a bit that flipped on a disk, or a number edited by hand.
     if header.pop("digest", None) != digest_of(header, tensors):
         raise ValueError("its content is not what was written")
     name, record = header["field"], header["made"]
@@ -126,7 +128,7 @@ def _map_of(content: bytes, file: Path) -> Map:
         bounds = SceneBounds(low, high, header.get("declared_unit"))
         camera = Intrinsics(**header["camera"])
     except ConfigError as error:
-        raise ValueError(error) from None  # so that the file is named
+        raise ValueError(error) from None  # `read_map` adds the file's name to a ValueError
     if name not in FIELDS:
         found = f"{file} is a map of field {name!r}, which is not registered"
         raise ConfigError(f"{found}: import the file of its class first (--import FILE.py)")
@@ -136,9 +138,10 @@ def _map_of(content: bytes, file: Path) -> Map:
 
 
 def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
-    """Raises ValueError or KeyError for content that is not sound, even if its digest fits.
+    """Raises ValueError or KeyError for content that is wrong although its digest fits.
 
-    Names may hold what moves a terminal's cursor, and one NaN among weights spreads to every pose.
+    A file may come from anybody: a scene's name may hold control characters that act on a
+    terminal, and a NaN among the weights would spread to every pose.
     """
     made = header["made"]
     numbers = [made["seconds"], made["misfit_m"], made["seed"], made["n_frames"], *made["origin"]]
@@ -153,5 +156,5 @@ def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
 
 
 def _tensors(mapped: Field) -> dict[str, Tensor]:
-    """All that was learnt, by name, on the CPU."""
+    """The tensors of a field's state by name, contiguous and on the CPU."""
     return {name: part.detach().cpu().contiguous() for name, part in mapped.state().items()}

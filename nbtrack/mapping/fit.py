@@ -24,15 +24,15 @@ from nbtrack.machinery.settings import checked
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
 
-_PENDING = 10  # iterations between two looks at the losses, which wait for the device
+_PENDING = 10  # iterations whose losses are read together, since each reading waits for a GPU
 _FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
 
 OnIteration = Callable[[float, dict[str, float]], object]
-"""Called every few iterations with the share of them that is done and the last losses."""
+"""Called every few iterations with the share of iterations done (0 to 1) and the latest losses."""
 
 
 def learning_rate(settings: MappingSettings, iteration: int) -> float:
-    """Adam's learning rate: a cosine from its start down to a twentieth. Source: NeuS."""
+    """Adam's learning rate at an iteration: it falls along a cosine to 1/20 (Source: NeuS)."""
     progress = iteration / settings.iterations
     share = _FINAL_RATE + (1 - _FINAL_RATE) * (1 + math.cos(math.pi * progress)) / 2
     return settings.learning_rate * share
@@ -50,12 +50,16 @@ def map_sequence(
     on_iteration: OnIteration = lambda done, losses: None,
     code: str = "",
 ) -> Map:
-    """Fit a field to a sequence with known poses; one that learns nothing is made from its frames.
+    """Fit a field to a sequence with known poses; a field that learns nothing is computed from it.
 
-    Settings are of the field's classes `Network`, None where it has none, and `Settings`. From a
-    `checkpoint`, written every few seconds, it goes on with the batches of an uninterrupted run;
-    the caller removes it. `code`, any text, tells versions of the program apart. Raises DataError
-    for frames without depth or pose, or another map's checkpoint; ConfigError; NumericalError.
+    `network` and `settings` are of the field's classes `Network` (None if it has none) and
+    `Settings`. The file `checkpoint` is written every few seconds. A killed run goes on from it
+    with the batches of an uninterrupted run; the caller removes it in the end. `code`, any text,
+    identifies the version of the program: another version refuses the checkpoint.
+
+    Raises DataError for frames without depth or pose and for the checkpoint of another map,
+    ConfigError for an unknown field or a wrong setting, NumericalError for losses that are not
+    finite.
     """
     bounds = observed_bounds(sequence)
     kind = field_class(field_name)
@@ -66,7 +70,7 @@ def map_sequence(
     mapped, _ = split_holdout(len(sequence), settings.holdout_every)
     if issubclass(kind, LearnedField):
         with advise_on_memory(f"mapping.{field_name}.n_rays={settings.n_rays}"):
-            with threads(1):  # sums, and so the start, depend on their number
+            with threads(1):  # the rounding of sums, and so the start, depends on their number
                 field = make_field(field_name, network, bounds, seed).to(device or "cpu")
             with suited_to(field.width, settings.tf32):
                 fit = _Fit(recipe | {"code": code}, settings, field, sequence, mapped)
@@ -84,7 +88,7 @@ def map_sequence(
 def recipe_of(
     field_name: str, sequence: RgbdSequence, network: Any, settings: Any, seed: int
 ) -> dict[str, Any]:
-    """What a map is made of, as plain values: two maps of one recipe are the same map."""
+    """All that determines a map, as plain values: maps with the same recipe are the same."""
     ids = sequence.frame_ids
     return {
         "field": field_name,
@@ -100,13 +104,14 @@ def recipe_of(
 
 
 class _Fit:
-    """All that changes while a field is fitted, and what its batches are drawn from."""
+    """A fit in progress: field, optimiser, the frames that batches are drawn from, and losses."""
 
     def __init__(
         self, recipe: dict, settings: Any, field: LearnedField, seen: RgbdSequence, mapped: Frames
     ) -> None:
-        """Make ready to fit a field to the frames `mapped` of the sequence `seen`."""
-        self.recipe = {**recipe, "device": field.device.type}  # each kind draws other numbers
+        """Prepare to fit a field to the frames `mapped` of the sequence `seen`."""
+        # Another type of device draws other random numbers, and so is part of the recipe.
+        self.recipe = {**recipe, "device": field.device.type}
         self.settings = settings
         self.field = field
         parameters = {"params": [*field.parameters()], "lr": settings.learning_rate}
@@ -119,10 +124,10 @@ class _Fit:
         field.prepare(seen, mapped)
         self.seconds = 0.0
         self.history = []
-        self.terms: list[str] = []  # names of the losses, told by the first batch
+        self.terms: list[str] = []  # names of the loss terms, known from the first batch on
 
     def run(self, checkpoint: Path | None, on_iteration: OnIteration) -> None:
-        """Fit from the checkpoint, if any, to the last iteration; the field then learns no more."""
+        """Fit from the checkpoint, if any, to the last iteration; then make the field constant."""
         file = Checkpoint(checkpoint, self.recipe)
         file.resume(self._take_up)
         end = self.settings.iterations
@@ -133,7 +138,7 @@ class _Fit:
         self.field.eval().requires_grad_(False)
 
     def _advance(self, iterations: range) -> None:
-        """Take some steps, then read their losses all at once: each reading waits for the GPU."""
+        """Take some steps, then read all their losses together, since reading waits for a GPU."""
         start = time.perf_counter()
         pending = []
         for iteration in iterations:
@@ -149,7 +154,7 @@ class _Fit:
         self.seconds += time.perf_counter() - start
 
     def _descend(self) -> torch.Tensor:
-        """One step of Adam on a batch; its losses, in the order of `terms`, before the step."""
+        """Take one step of Adam on a batch; returns the losses before it, ordered as `terms`."""
         draw = partial(self.sampler.draw, generator=self.generator, frames=self.frames)
         terms = self.field.mapping_losses(draw, self.settings, self.generator)
         found = f"mapping_losses of {self.field.name} gave"
@@ -166,13 +171,13 @@ class _Fit:
         return losses.detach()
 
     def _state(self) -> dict[str, Any]:
-        """All that the next iteration depends on."""
+        """All that the next iteration depends on, for a checkpoint."""
         state = {"field": self.field.state_dict(), "optimizer": self.optimizer.state_dict()}
         state |= {"seconds": self.seconds, "history": self.history}
         return {**state, "generator": self.generator.get_state()}
 
     def _take_up(self, state: dict[str, Any]) -> None:
-        """Go on from what `_state` gave."""
+        """Restore what `_state` returned."""
         self.field.load_state_dict(state["field"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.optimizer.param_groups[0]["lr"] = self.rate  # the tensor that `_advance` fills

@@ -1,4 +1,4 @@
-"""Which frames are kept back from mapping, and how far a map is from what a frame measured."""
+"""Which frames are held out from mapping, and how far a map is from what a frame measured."""
 
 import numpy as np
 import torch
@@ -11,15 +11,15 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField
 from nbtrack.machinery.inputs import checked_pose
 
-_MISFIT_PIXELS = 500  # of a frame, at random
-_MISFIT_FRAMES = 10
+_MISFIT_PIXELS = 500  # random pixels of a frame that a residual is computed from
+_MISFIT_FRAMES = 10  # frames of a map that its usual residual is computed from
 
 
 def split_holdout(n_frames: int, every: int) -> tuple[Frames, Frames]:
-    """Indices of the frames to map and of those kept back for scoring.
+    """Indices of the frames to map, and of the frames held out for scoring.
 
-    Every `every`-th frame is kept back, beginning in the middle of the first stretch; with
-    `every` below 2, or fewer frames than `every`, none is.
+    Every `every`-th frame is held out, beginning with frame `every // 2`. None is held out if
+    `every` is below 2 or larger than the number of frames.
 
     >>> split_holdout(6, 3)
     (array([0, 2, 3, 5]), array([1, 4]))
@@ -32,10 +32,11 @@ def split_holdout(n_frames: int, every: int) -> tuple[Frames, Frames]:
 
 
 def depth_residual_of(field: Field, frame: Frame) -> float:
-    """How far (m) a map is from what a frame measured, at the frame's given pose.
+    """The median distance (m) between a map and what a frame measured, at the frame's true pose.
 
-    The median over random pixels of |rendered depth - measured depth|; of points and grids, which
-    cannot be rendered, the distance at what was measured. NaN where nothing was.
+    For a field that can be rendered, this is the median over random pixels of
+    |rendered depth - measured depth|. For points and grids it is the median of the field's absolute
+    distance at measured points. It is NaN for a frame without measured depth.
     """
     if not frame.has_depth:
         return float("nan")
@@ -56,7 +57,7 @@ def depth_residual_of(field: Field, frame: Frame) -> float:
 
 
 def usual_depth_residual(field: Field, sequence: RgbdSequence, mapped: Frames) -> float:
-    """The median misfit (m) of some of the mapped frames, evenly spread; 0 if none has a depth."""
+    """The median `depth_residual_of` (m) over ten mapped frames, evenly spread; 0 without depth."""
     spread = np.linspace(0, len(mapped) - 1, min(_MISFIT_FRAMES, len(mapped))).round().astype(int)
     frames = [sequence[index] for index in mapped[spread].tolist()]
     residuals = [depth_residual_of(field, frame) for frame in frames if frame.has_depth]

@@ -1,4 +1,4 @@
-"""Tracking: a camera's pose, frame by frame, in a field that is known."""
+"""Tracking: finds a camera's pose, frame by frame, in a field that stays fixed."""
 
 from nbtrack.core.arrays import Pose
 from nbtrack.fields import Field
@@ -10,11 +10,11 @@ from nbtrack.tracking.tracker import Tracker, TrackerSettings
 from nbtrack.tracking.trajectories import Trajectory, track_sequence
 
 TRACKERS: Registry[type[Tracker]] = Registry({"vr": VrTracker, "sdf": SdfTracker})
-"""What can track, by name. A tracker of your own joins by `TRACKERS["mine"] = MyTracker`."""
+"""The classes of trackers, by name. `TRACKERS["mine"] = MyTracker` adds your own."""
 
 
 def tracker_class(name: str) -> type[Tracker]:
-    """The tracker of a name. Raises ConfigError, naming the nearest, for any other."""
+    """The tracker class of a name. ConfigError, with the most similar name, for an unknown one."""
     return look_up_kind("tracker", name, TRACKERS, ["name"])
 
 
@@ -26,8 +26,8 @@ def make_tracker(
     settings: TrackerSettings | None = None,
     seed: int = 0,
 ) -> Tracker:
-    """A tracker by name, for one trajectory; `tracker.track(frame)` then gives pose after pose.
+    """A tracker by name, for one trajectory. Then `tracker.track(frame)` estimates each pose.
 
-    The arguments are those of `Tracker`. Raises ConfigError for an unknown name, and as it does.
+    Takes the arguments of `Tracker` and raises its errors; ConfigError for an unknown name.
     """
     return tracker_class(name)(field, T_world_camera, budget, settings, seed)

@@ -1,7 +1,7 @@
-"""How many optimization steps a frame may take: by the clock, or by a fixed count.
+"""Budgets: how many optimization steps a frame may take, by the clock or by a fixed count.
 
-`for step in budget.frame(): ...` lasts as long as the frame may. `memory` is what the frames so far
-leave to the next one, so every trajectory needs a budget of its own.
+The loop `for step in budget.frame(): ...` ends when the frame's budget is spent. A budget remembers
+earlier frames in `memory`, so that every trajectory needs its own budget.
 """
 
 import time
@@ -16,27 +16,27 @@ from nbtrack.machinery.errors import ConfigError, look_up
 from nbtrack.machinery.inputs import number
 
 _HOST = torch.device("cpu")
-# Steps, or Hz: beyond, no step is taken, or all without end.
+# Limits of steps per frame and of rates (Hz): beyond them a frame would take none, or far too many.
 _FEWEST, _MOST = 1e-3, 1e6
 Number = float | int
 
 
 class ClockBudget:
-    """1/rate seconds per frame; a frame ends when the mean step no longer fits in what is left.
+    """A budget of 1/rate seconds per frame.
 
-    The mean is over the current frame's own steps. Before its first step the previous frame's mean
-    stands in, and a frame may then take no step at all. After such a frame, as at the very first,
-    the next one starts with a step whatever it costs; else one slow step (a first call that
-    compiles or allocates) would stop tracking for good.
+    A frame ends when the time left is shorter than its mean step. Before the first step the mean of
+    the previous frame is used instead, so that a frame may take no step at all. After such a frame,
+    and in the very first frame, the first step is always allowed. Otherwise a single slow step,
+    such as a first call that compiles, would end tracking for good.
 
-    Time runs from the call of `frame`: a tracker that prepares its frame before the first step pays
-    for it, though not as part of a step. Before every reading of the clock the tracker's device is
-    waited for: steps that are only queued would look free. Unused time is lost. Source: paper,
-    evaluation protocol; for the first step of a frame, our choice.
+    Time runs from the call of `frame`. What a tracker does before its first step takes from the
+    budget, but does not count as a step. The clock is read only when all work queued on the
+    tracker's device is done. Unused time is lost. Source: paper, evaluation protocol; the rule for
+    the first step is our choice.
     """
 
     def __init__(self, rate_hz: Number, clock: Callable[[], float] = time.perf_counter) -> None:
-        """Take frames a second and a clock (s); ConfigError if the rate is not 0.001 to 1e6."""
+        """Take a rate (Hz) and a clock (s). Raises ConfigError for a rate beyond 0.001 to 1e6."""
         self.rate_hz = number("rate_hz", rate_hz, _FEWEST, _MOST)
         self._clock = clock
         self.memory: float | None = None  # mean seconds of a step in the last frame
@@ -45,27 +45,27 @@ class ClockBudget:
         return f"wall clock, {1000 / self.rate_hz:g} ms per frame"
 
     def frame(self, device: torch.device = _HOST) -> Generator[int, None, None]:
-        """Starts the clock of the next frame, of a tracker on a device.
+        """Starts the clock for the next frame; yields 0, 1, 2, ... while another step is allowed.
 
-        Yields 0, 1, 2, ... as long as another step is allowed. A caller that stops earlier calls
-        `close`, so that its last step is counted.
+        `device` is that of the tracker. A caller that stops earlier must call `close`, so that its
+        last step is counted.
         """
         return self._steps(self._now(device), device)
 
     def _now(self, device: torch.device) -> float:
-        """The clock (s) when all that is queued on the device is done."""
+        """The time (s) when all work queued on the device is done."""
         synchronize(device)
         return self._clock()
 
     def _steps(self, start: float, device: torch.device) -> Generator[int, None, None]:
-        """The steps of a frame begun at `start` (s). It is prepared when the first is asked for."""
+        """The steps of a frame that began at `start` (s). Asking for the first ends preparation."""
         prepared = now = self._now(device)
         mean, step = self.memory, 0
-        self.memory = None  # it stays so after a frame without any step
+        self.memory = None  # stays None if the frame takes no step
         while mean is None or start + 1 / self.rate_hz - now >= mean:
             try:
                 yield step
-            finally:  # also where the caller closes the frame, as a search does that has converged
+            finally:  # also when the caller closes the frame, since its search has converged
                 step += 1
                 now = self._now(device)
                 mean = (now - prepared) / step
@@ -73,16 +73,18 @@ class ClockBudget:
 
 
 class StepBudget:
-    """A fixed, possibly fractional number of steps per frame; the same on every machine.
+    """A budget with a fixed number of steps per frame, which is the same on every machine.
 
-    After k frames exactly floor(k * steps_per_frame) steps were allowed: with 6.8 the frames take
-    6, 7, 7, 7, 7, 6, ... Our choice, to repeat the paper's tables at its hardware's speed.
+    The number may be fractional: after k frames exactly floor(k * steps_per_frame) steps were
+    allowed. With 6.8 frames take 6, 7, 7, 7, 7, 6, ... steps. Our choice, to reproduce the paper's
+    tables at the speed of its hardware.
     """
 
     def __init__(self, steps_per_frame: Number) -> None:
-        """Raises ConfigError if the count is not 0.001 to 1e6."""
+        """Take the number of steps. Raises ConfigError if it is not 0.001 to 1e6."""
         self.steps_per_frame = number("steps_per_frame", steps_per_frame, _FEWEST, _MOST)
-        # The nearest short fraction: 6.8 becomes 34/5, so that ten frames take 68 steps, not 67.
+        # The nearest fraction with a small denominator: 6.8, which floating point cannot hold
+        # exactly, becomes 34/5, so that ten frames take 68 steps and not 67.
         self._exact = Fraction(self.steps_per_frame).limit_denominator(1_000_000)
         self.memory = 0  # frames so far
 
@@ -92,7 +94,7 @@ class StepBudget:
     def frame(self, device: torch.device = _HOST) -> Generator[int, None, None]:
         """Yields 0, 1, ... while another step is allowed in the next frame, on any device.
 
-        A frame counts once its first step is asked for, whether it may take one or not.
+        A frame counts as soon as its first step is requested, even if it may take none.
         """
         steps_before = floor(self.memory * self._exact)
         self.memory += 1
@@ -104,9 +106,9 @@ Budget = ClockBudget | StepBudget
 
 
 def make_budget(steps: Number | None, rate_hz: Number | None) -> Budget:
-    """A budget by the clock if there is a rate (Hz), else of so many steps a frame.
+    """A `StepBudget` of some steps per frame, or a `ClockBudget` for a rate (Hz).
 
-    Raises ConfigError if there are both or neither, or the number is far out.
+    Raises ConfigError unless exactly one of them is given, between 0.001 and 1e6.
     """
     if (steps is None) == (rate_hz is None):
         raise ConfigError(f"steps={steps} and rate_hz={rate_hz}: a frame has one budget, give one")
@@ -114,16 +116,17 @@ def make_budget(steps: Number | None, rate_hz: Number | None) -> Budget:
 
 
 _MEASURED_STEPS = {"vr": (6.8, 36.1), "sdf": (15.3, 79.3)}
-"""Steps within 100 and 500 ms for the default n (VR 512, SDF 4096). Source: paper, Table II."""
+"""Steps within 100 ms and within 500 ms, with VR's n of 512 and SDF's of 4096 (paper, Table II)."""
 
 
 def paper_steps(tracker: str, rate_hz: Number) -> float:
-    """Steps a frame of "vr" or "sdf" on the paper's hardware, with its n.
+    """Steps per frame that "vr" or "sdf" takes on the paper's hardware at a rate (Hz).
 
-    Raises ConfigError for a rate that is not 0.001 to 1e6, or at which no step is left.
+    The steps are linear in the time per frame, through the paper's numbers at 100 and 500 ms: a
+    step and the rest of a frame then cost the same at every rate. Table I has 5 Hz, for which Table
+    II has no column (our choice).
 
-    On the line through its 100 and 500 ms figures: time per step and fixed cost of a frame are then
-    the same at every rate. Table II has no 200 ms column although Table I has 5 Hz (our choice).
+    Raises ConfigError for another tracker, a rate beyond 0.001 to 1e6, or one without any step.
     """
     budget_ms = 1000 / number("rate_hz", rate_hz, _FEWEST, _MOST)
     at_100, at_500 = look_up("tracker of the paper", tracker, _MEASURED_STEPS)

@@ -1,4 +1,4 @@
-"""Methods: a tracker in a field, with settings of its own, and the registry of their names."""
+"""Methods, which are trackers in fields with certain settings, and the registry of their names."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,28 +11,30 @@ from nbtrack.tracking import paper_steps, tracker_class
 
 @dataclass(frozen=True)
 class Method:
-    """A row of Table I or III."""
+    """A field, a tracker and their settings: a row of Table I or III."""
 
     label: str
     field: str
     tracker: str
-    settings: tuple[str, ...] = ()  # key=value, over the preset's and under the user's own
+    # `key=value` texts: they replace settings of the preset, and the user's settings replace them.
+    settings: tuple[str, ...] = ()
 
     def paper_steps(self, rate_hz: float | int) -> float:
-        """Steps a frame on the paper's hardware: of VR for what renders, else of SDF."""
+        """Steps per frame on the paper's hardware: VR's for a tracker that renders, else SDF's."""
         return paper_steps("vr" if tracker_class(self.tracker).renders else "sdf", rate_hz)
 
     @property
     def usual_steps(self) -> float:
-        """Steps a frame where nobody says how many: up to 30 of a tracker that ends by itself.
+        """The default number of steps per frame.
 
-        The paper's trackers do not; they take the steps of its slowest rate, 2 Hz.
+        It is 30 for a tracker that ends a frame when it has converged. The paper's trackers do not;
+        they take the steps of the paper's slowest rate, 2 Hz.
         """
         return 30 if tracker_class(self.tracker).converges else self.paper_steps(rate_hz=2)
 
 
 Methods = Sequence[str | Method]
-"""By name, or as they are."""
+"""Methods, or their names."""
 
 _COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
 _VR_VELOCITY = ("tracking.vr.motion_model=constant_velocity",)
@@ -51,8 +53,8 @@ _OF_PAPER: dict[str, Method | str] = {
     "color_neus": Method("NeuS with VR, colour only", "neus", "vr", _COLOR_ONLY),
 }
 METHODS: Registry[Method] = Registry(_OF_PAPER)
-"""The paper's, and variants of them, by name; those of the room `beyond` join as a plug-in's do.
-A method of your own joins by `METHODS["mine"] = Method(...)`."""
+"""The paper's methods and variants of them, by name; `beyond` adds its methods as a plug-in does.
+`METHODS["mine"] = Method(...)` adds your own."""
 
 
 def find_methods(methods: Methods) -> list[Method]:

@@ -1,4 +1,4 @@
-"""How far a tracked trajectory is from the true one: the paper's error and its companions."""
+"""How far a tracked trajectory is from the true one: the paper's error, and other errors."""
 
 import numpy as np
 from jaxtyping import Float
@@ -11,19 +11,19 @@ Errors = Float[np.ndarray, "frames"]
 Positions = Float[np.ndarray, "frames 3"]
 
 LOST_THRESHOLD_M = 0.2
-"""Above this translation error (m) a frame counts as lost. Source: the paper's Table I, in red."""
+"""A frame with a larger translation error (m) is lost. Source: the paper's Table I, in red."""
 FOLLOWED_SHARE = 1 / 3
-"""A camera is followed if its ATE is below this share of what standing still scores. Our choice: on
-a short path an error below `LOST_THRESHOLD_M` says nothing, since a camera that never moves has it.
+"""A camera counts as followed if its ATE is below this share of the ATE of a camera that stands
+still. Our choice: on a short path a camera that never moves also stays below `LOST_THRESHOLD_M`.
 """
 
 
 def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | int]:
-    """All errors of one trajectory, from camera-to-world poses (m) of the tracked frames.
+    """All errors of one trajectory, by name, from camera-to-world poses (m) of the tracked frames.
 
-    Frames whose true pose is not known (NaN) are in none of them. Without any known true pose only
-    the number of frames is returned. Source: paper, evaluation protocol (`ate_rmse_m`). The others
-    distinguish a map that is offset from a tracker that drifts (our choice).
+    Frames whose true pose is unknown (NaN) are left out. If all are unknown, only the numbers of
+    frames are returned. `ate_rmse_m` is the error of the paper's evaluation protocol. The other
+    errors distinguish a map that is offset from a tracker that drifts (our choice).
     """
     is_known = np.isfinite(T_true).all(axis=(1, 2))
     counts = {"frames": len(T_true), "frames_without_reference": int((~is_known).sum())}
@@ -34,8 +34,8 @@ def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | i
     aligned = align_rigidly(positions, true_positions)
     aligned_errors = np.linalg.norm(aligned - true_positions, axis=1)
     return {
-        "ate_rmse_m": _root_mean_square(errors),  # unaligned: the paper's equation
-        "ate_rmse_aligned_m": _root_mean_square(aligned_errors),  # after the best rigid motion
+        "ate_rmse_m": _root_mean_square(errors),  # not aligned, as in the paper
+        "ate_rmse_aligned_m": _root_mean_square(aligned_errors),
         "rotation_rmse_deg": _root_mean_square(angles_deg),
         "median_error_m": float(np.median(errors)),
         "max_error_m": float(errors.max()),
@@ -45,10 +45,10 @@ def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | i
 
 
 def still_metrics(T_true: Poses) -> dict[str, float]:
-    """What a camera that stays at the first of some poses (m) scores, and how long their path is.
+    """The ATE (m) of a camera that stays at the first true pose, and the length (m) of the path.
 
-    These are `still_ate_m` and `path_m`; nothing of fewer than two known poses. Whether a tracker
-    is better than nothing is judged by `still_ate_m` and `FOLLOWED_SHARE`.
+    They are called `still_ate_m` and `path_m`, and are missing for fewer than two known poses. A
+    tracker is useful only if its ATE is well below `still_ate_m` (see `FOLLOWED_SHARE`).
     """
     positions = T_true[np.isfinite(T_true).all(axis=(1, 2)), :3, 3]
     if len(positions) < 2:
@@ -59,10 +59,10 @@ def still_metrics(T_true: Poses) -> dict[str, float]:
 
 
 def pose_errors(T_estimated: Poses, T_true: Poses) -> tuple[Errors, Errors]:
-    """Distance (m) and angle (degrees, 0 to 180) between both cameras of every frame, row 0 too.
+    """Distance (m) and angle (degrees, 0 to 180) between estimated and true camera, for each frame.
 
-    Source: paper, evaluation protocol: the norm inside the sum. Raises DataError for different
-    numbers of poses, or none, and for one that is not finite.
+    Source: paper, evaluation protocol. Raises DataError for no poses, different numbers of them, or
+    a pose that is not finite.
     """
     n_frames = len(T_true)
     is_paired = n_frames > 0 and len(T_estimated) == n_frames
@@ -75,14 +75,16 @@ def pose_errors(T_estimated: Poses, T_true: Poses) -> tuple[Errors, Errors]:
 
 
 def align_rigidly(points: Positions, targets: Positions) -> Positions:
-    """Points (m) after the rotation and translation that bring them closest to their targets.
+    """Points (m), moved by the rotation and translation that bring them closest to their targets.
 
-    Least squares, without scale. Where points lie on a line the best rotation is not unique, but
-    the distances that remain are. Source: Horn 1987 and Umeyama 1991, by SVD.
+    The sum of squared distances is minimised, without scale. If all points lie on a line, the best
+    rotation is not unique, but the remaining distances are. Source: Horn 1987 and Umeyama 1991, by
+    singular value decomposition.
     """
     center, target_center = points.mean(axis=0), targets.mean(axis=0)
     u, _, vt = np.linalg.svd((targets - target_center).T @ (points - center))
-    # The best orthogonal matrix may be a mirror; flipping the weakest axis makes it a rotation.
+    # The best orthogonal matrix u @ vt may be a reflection (determinant -1). Flipping the axis of
+    # the smallest singular value gives the best rotation.
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     return points @ rotation.T + (target_center - rotation @ center)
 

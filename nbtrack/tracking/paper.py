@@ -1,4 +1,4 @@
-"""The paper's two trackers on one optimiser; a tracker of one's own needs a `loss` only."""
+"""The paper's two trackers, and the class of trackers that minimise a loss with Adam."""
 
 import abc
 from dataclasses import dataclass, replace
@@ -21,51 +21,57 @@ from nbtrack.tracking.tracker import Tracker, TrackerSettings
 class AdamSettings(TrackerSettings):
     """Adam's learning rates (paper, implementation details).
 
-    The paper does not say what its position is measured in. In metres two cells of its Table I
-    could not be reached (see `reach`), so that it is the unit of the map (notebook A1).
+    The paper does not say in which unit its positions are. With metres a camera could not move far
+    enough in two cells of its Table I (`tracking.reach`), so the default is the unit of the map
+    (notebook A1).
     """
 
-    position_rate: float = 5e-4  # of the position, in units of the map, or in metres
+    position_rate: float = 5e-4  # of the position, in `position_unit`
     position_unit: str = one_of("map", "metre")
     orientation_rate: float = 1e-3  # of the unit quaternion
 
     def position_rate_m(self, metres_per_unit: float) -> float:
-        """The learning rate of the position in metres, in a map of some unit."""
+        """The learning rate of the position in metres, in a map with this unit."""
         return self.position_rate * (metres_per_unit if self.position_unit == "map" else 1.0)
 
     def reach(self, steps: float, metres_per_unit: float) -> Reach:
-        """How far a frame's search comes; a turn by an angle moves the quaternion by half of it."""
+        """How far a frame's search can move and turn the camera.
+
+        A turn by a small angle changes the unit quaternion by half of this angle.
+        """
         position = reach(steps, self.position_rate_m(metres_per_unit))
         return Reach(position, 2 * reach(steps, self.orientation_rate))
 
 
 class AdamTracker(Tracker):
-    """Adam on a position and a unit quaternion, new pixels every step.
+    """Minimises a loss over position and unit quaternion with Adam, on new pixels in every step.
 
-    Source: paper, implementation details. Each frame starts with a fresh Adam: momentum of the
-    frame before would carry the pose on where the camera stands still (our choice).
+    A subclass defines the `loss`. Source: paper, implementation details. Adam's state is reset for
+    each frame: momentum of the frame before would move the pose on although the camera stands still
+    (our choice).
     """
 
     Settings = AdamSettings
-    frame: Frame | None = None  # a copy, whose tensors are kept and overwritten by the next frame
+    frame: Frame | None = None  # a copy; its tensors are overwritten by the next frame
 
     @abc.abstractmethod
     def loss(
         self, T_world_camera: Transform, directions_camera: Points, color: Colors, depth: Values
     ) -> Scalar:
-        """The loss of some pixels at a pose: rays (z = 1), colours in [0, 1] and z-depths (m).
+        """The loss at a pose of pixels with directions (z = 1), colours in [0, 1], z-depths (m).
 
-        On CUDA it is recorded at the third step: what it depends on besides must be tensors.
+        On CUDA the third call is recorded and then replayed. So whatever else the loss depends on,
+        and changes between steps, must be in tensors.
         """
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
-        """Take up a frame; of several starts, that with the lowest loss on the same pixels."""
+        """Start a frame's search at the pose with the lowest loss, computed on the same pixels."""
         if self.frame is None or self.frame.camera != frame.camera:
             self._allocate(frame)
-        # All that steps read is written in place: on CUDA recorded steps read these very tensors.
+        # All that steps read is written in place, since on CUDA recorded steps read these tensors.
         self.frame.color.copy_(frame.color)
         self.frame.depth_mm.copy_(frame.depth_mm)
-        self.measured = frame.measured_pixels()
+        self.measured_pixels = frame.measured_pixels()
         T_starts = T_starts.to(self.device, torch.float32)
         T_start = T_starts[0]
         with torch.no_grad():
@@ -75,17 +81,17 @@ class AdamTracker(Tracker):
                 T_start = T_starts[losses.argmin()]
             self.position.copy_(T_start[:3, 3])
             self.q_wxyz.copy_(geometry.matrix_to_quaternion(T_start[:3, :3]))
-            for moments in self.optimizer.state.values():  # Adam's, and its number of steps
+            for moments in self.optimizer.state.values():  # Adam's moments and number of steps
                 for value in moments.values():
                     value.zero_()
 
     def step(self) -> Scalar:
-        """Draw pixels, lower their loss by one step of Adam, renormalise the quaternion."""
+        """Draw pixels and take one step of Adam on their loss; returns the loss before the step."""
         self._choose_pixels()
         return self.recording.run(self._descend)
 
     def _allocate(self, frame: Frame) -> None:
-        """Make room for all that a step reads and changes, for frames of one size."""
+        """Allocate all tensors that steps read and change, for frames of one camera."""
         self.frame = replace(frame, color=frame.color.clone(), depth_mm=frame.depth_mm.clone())
         self.pixels = torch.empty(2, self.settings.n_pixels, dtype=torch.int64, device=self.device)
         searched = {"dtype": torch.float32, "device": self.device, "requires_grad": True}
@@ -97,7 +103,7 @@ class AdamTracker(Tracker):
         self.recording = Recording(f"tracker {self.name}", self.generator)
 
     def _descend(self) -> Scalar:
-        """One step of Adam on the chosen pixels; returns the loss before it."""
+        """Take one step of Adam on the chosen pixels; returns the loss before it."""
         self.optimizer.zero_grad()
         loss = self._loss_at(self.T_world_camera)
         loss.backward()
@@ -107,10 +113,13 @@ class AdamTracker(Tracker):
         return loss.detach()
 
     def _choose_pixels(self) -> None:
-        """Choose random measured pixels; how many there are changes, so it is not recorded."""
-        n_measured, size = self.measured.shape[1], (self.settings.n_pixels,)
+        """Choose random measured pixels.
+
+        Their number differs from frame to frame, so this is no part of what is recorded.
+        """
+        n_measured, size = self.measured_pixels.shape[1], (self.settings.n_pixels,)
         chosen = torch.randint(n_measured, size, generator=self.generator, device=self.device)
-        torch.index_select(self.measured, 1, chosen, out=self.pixels)
+        torch.index_select(self.measured_pixels, 1, chosen, out=self.pixels)
 
     def _loss_at(self, T_world_camera: Transform) -> Scalar:
         """The loss of the chosen pixels at a pose."""
@@ -121,24 +130,24 @@ class AdamTracker(Tracker):
 
     @property
     def T_world_camera(self) -> Transform:
-        """The present estimate; gradients flow to position and quaternion."""
+        """The current estimate, through which gradients flow to position and quaternion."""
         return geometry.make_transform(geometry.quaternion_to_matrix(self.q_wxyz), self.position)
 
 
 @dataclass(frozen=True)
 class VrSettings(AdamSettings):
-    """Tracking by volume rendering."""
+    """Settings of tracking by volume rendering."""
 
     n_pixels: int = limited(512, 1, 65536)  # (paper)
     lambda_color: float = 5.0  # (iMAP)
-    lambda_depth: float = 1.0  # 0: by colour alone, of the same pixels (iNeRF)
-    # Samples of the first pass (iMAP); the rendered depth of a single one has no gradient.
+    lambda_depth: float = 1.0  # with 0 colour alone counts, at the same pixels (iNeRF)
+    # Samples of the first pass (iMAP). The rendered depth of a single one has no gradient.
     n_stratified: int = limited(32, 2, 1024)
-    n_importance: int = limited(12, 0, 1024)  # of the second pass (iMAP)
+    n_importance: int = limited(12, 0, 1024)  # samples of the second pass (iMAP)
 
 
 class VrTracker(AdamTracker):
-    """Matches rendered to observed colour and depth. Paper, Sec. II-B.1; iMAP, Sec. 3.3."""
+    """Matches rendered with measured colour and depth. Paper, Sec. II-B.1; iMAP, Sec. 3.3."""
 
     name = "vr"
     Settings = VrSettings
@@ -147,7 +156,7 @@ class VrTracker(AdamTracker):
     def loss(
         self, T_world_camera: Transform, directions_camera: Points, color: Colors, depth: Values
     ) -> Scalar:
-        """iMAP's loss of rendered pixels; gradients reach the pose through every sample."""
+        """iMAP's loss of rendered pixels; gradients flow to the pose through all samples."""
         rotation, position = T_world_camera[:3].split([3, 1], dim=1)
         directions_world = directions_camera @ rotation.T
         rays = Rays(position.T.expand_as(directions_world), directions_world, color, depth)
@@ -160,14 +169,14 @@ class VrTracker(AdamTracker):
 
 @dataclass(frozen=True)
 class SdfSettings(AdamSettings):
-    """Tracking by signed distances; the paper gives no weights."""
+    """Settings of tracking by signed distances. The paper gives no weights."""
 
     lambda_sdf: float = 1.0  # per metre
     lambda_color: float = 0.3
 
 
 class SdfTracker(AdamTracker):
-    """Pulls observed points onto the zero level of the signed distance. Paper, Sec. II-B.2."""
+    """Moves measured points onto the zero level of the signed distance. Paper, Sec. II-B.2."""
 
     name = "sdf"
     Settings = SdfSettings
@@ -175,7 +184,7 @@ class SdfTracker(AdamTracker):
     def loss(
         self, T_world_camera: Transform, directions_camera: Points, color: Colors, depth: Values
     ) -> Scalar:
-        """Paper, Eq. 2, for the pixels' back-projected points."""
+        """The loss of the pixels' back-projected points. Source: paper, Eq. 2."""
         points_camera = directions_camera * depth[:, None]
         points_world = geometry.transform_points(T_world_camera, points_camera)
         field_color, field_sdf = self.field(points_world)
@@ -186,10 +195,11 @@ class SdfTracker(AdamTracker):
 def sdf_loss(
     field_sdf: Values, field_color: Colors, color: Colors, lambda_sdf: float, lambda_color: float
 ) -> Scalar:
-    """lambda_sdf mean|d| + lambda_color mean|c - c_observed|, the latter over the 3n channels.
+    """The loss lambda_sdf mean|d| + lambda_color mean|c - c_observed| of measured points.
 
-    Of the signed distances (m) and colours (in [0, 1]) that the field gives at the observed points,
-    and the observed colours. Source: paper, Eq. 2.
+    d (`field_sdf`, m) and c (`field_color`, in [0, 1]) are the field's distances and colours at the
+    points; c_observed (`color`) are the measured colours. The second mean is over points and
+    channels. Source: paper, Eq. 2.
 
     >>> import torch
     >>> zeros = torch.zeros(2, 3)

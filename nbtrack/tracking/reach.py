@@ -1,10 +1,10 @@
-"""How far a frame's steps can move a camera, and what a greedy search with that reach scores.
+"""The reach of a frame's search, and the error that remains if nothing but the reach limits it.
 
-Adam with a fresh state moves a coordinate by about its learning rate a step, whatever the loss is:
-its steps are those of the gradient's sign as long as the gradient keeps it. So N steps from a start
-end within N times the rate along each axis. A camera that moves farther in a frame is left behind,
-whatever the map, the pixels and the loss are. Source: paper, implementation details (rates), and
-Kingma & Ba 2015, Sec. 2.1 (the bound of a step).
+The reach is how far a frame's steps can move the camera. Adam with a fresh state moves a coordinate
+by about its learning rate in each step, whatever the size of the gradient, as long as the gradient
+keeps its sign. So N steps end within N times the rate of their start, along each axis. A camera
+that moves farther in a frame is left behind, whatever the map, the pixels and the loss are. Source:
+paper, implementation details (rates), and Kingma & Ba 2015, Sec. 2.1 (the bound of a step).
 """
 
 from dataclasses import dataclass
@@ -29,10 +29,10 @@ class Reach:
 
 
 def reach(steps: float, rate: float) -> float:
-    """How far that many steps of Adam move a coordinate: by about its learning rate in each.
+    """How far some steps of Adam move a coordinate: by about its learning rate in each step.
 
-    This is nearly a bound: a coordinate moves at most 1.01 times as far in 7 steps and 1.04 times
-    in 15 (by Cauchy and Schwarz), and so far only if its gradients grow in one certain way.
+    This is nearly an upper bound. By the Cauchy-Schwarz inequality a coordinate moves at most 1.01
+    times as far in 7 steps, and 1.04 times in 15; this needs gradients that grow in a certain way.
     """
     return steps * rate
 
@@ -40,10 +40,10 @@ def reach(steps: float, rate: float) -> float:
 def motion_of(
     T_world_camera: Poses, motion_model: str = "previous_pose"
 ) -> tuple[Motions, Motions]:
-    """By how much the search of every frame but the first has to move the camera along a path.
+    """The motion from the start of each frame's search to its true pose, without the first frame.
 
-    Offsets are in m along the world's axes, turns are rotation vectors (rad) in the axes of the
-    start. The search starts as the motion model says, the frames before being found exactly.
+    Offsets are in m along the world's axes; turns are rotation vectors (rad) in the start's camera
+    frame. The motion model gives the start from the true poses of the frames before.
     """
     offsets = np.zeros((len(T_world_camera) - 1, 3))
     turns = np.zeros_like(offsets)
@@ -57,10 +57,11 @@ def motion_of(
 def greedy_follower(
     T_world_camera: Poses, reach_m: float, motion_model: str = "previous_pose"
 ) -> Poses:
-    """The path of a greedy search with a reach (m): it ends each frame as near as it can.
+    """The path of a search that knows the true poses, and only its reach (m) limits it.
 
-    It knows the true pose, moves towards it by at most the reach along each axis, and turns at
-    will. It begins at the first pose. A search that ends a frame farther off may be nearer later.
+    It begins at the first pose. In each frame it moves to the nearest position within the reach
+    along each axis, and takes the true orientation. Being greedy, it is no lower bound: a search
+    that ends one frame farther away may be nearer in later frames.
     """
     followed = [T_world_camera[0]]
     for T_true in T_world_camera[1:]:
@@ -72,7 +73,7 @@ def greedy_follower(
 
 
 def greedy_ate(T_world_camera: Poses, reach_m: float, motion_model: str = "previous_pose") -> float:
-    """The ATE (m) of the greedy follower on a path of known poses, given the first."""
+    """The ATE (m) of `greedy_follower` on a path of known poses, without the first."""
     followed = greedy_follower(T_world_camera, reach_m, motion_model)
     return trajectory_metrics(followed[1:], T_world_camera[1:])["ate_rmse_m"]
 
@@ -80,10 +81,11 @@ def greedy_ate(T_world_camera: Poses, reach_m: float, motion_model: str = "previ
 def reach_metrics(
     reach: Reach | None, T_world_camera: Poses, motion_model: str
 ) -> dict[str, float]:
-    """The reach of a run, the share of its frames that ask for more, and the greedy ATE (m).
+    """The reach of a run, the share of its frames that need a larger one, and the greedy ATE (m).
 
-    Empty where a search has no bound (`reach` is None). The reach alone where a pose (m) of the
-    path, whose first one is the given start, is not known.
+    `T_world_camera` are the true poses of the path, of which the first is the given start. The
+    result is empty if the reach is None, for a search without bound, and has only the reach if a
+    pose is unknown or there are fewer than two.
     """
     if reach is None:
         return {}
@@ -99,6 +101,6 @@ def reach_metrics(
 
 
 def _nearest_start(motion_model: str, found: list[np.ndarray], T_true: np.ndarray) -> np.ndarray:
-    """The start nearest to the truth, of those after the poses `found` so far (the last two)."""
+    """The start that is nearest to the true pose, given the last (up to two) poses found."""
     starts = expected_poses(motion_model, found)
     return min(starts, key=lambda T_start: np.linalg.norm(T_start[:3, 3] - T_true[:3, 3]))

@@ -1,4 +1,4 @@
-"""Where the search of a frame starts, by what was found before it."""
+"""The poses at which a frame's search starts, from the poses found before it."""
 
 import numpy as np
 
@@ -7,12 +7,14 @@ from nbtrack.machinery.errors import look_up
 
 
 def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
-    """Where a frame's search may start, given the poses found so far.
+    """The poses at which a frame's search may start, given the poses found so far.
 
-    At the previous pose (most likely the paper's: Sec. II-B.1 renders "at the previous estimate",
-    Sec. II-B.2 uses "the previous pose estimate"); at constant velocity as the camera sees it,
-    T_k-1 (T_k-2^-1 T_k-1) (ORB-SLAM); or at both, for the tracker to choose: hands start and stop
-    within a frame. Raises ConfigError, naming the nearest, for any other model.
+    There are three motion models. "previous_pose" starts at the previous pose. This is most likely
+    the paper's: Sec. II-B.1 renders "at the previous estimate", and Sec. II-B.2 uses "the previous
+    pose estimate". "constant_velocity" repeats the last motion in the camera frame, as in ORB-SLAM:
+    T_k-1 (T_k-2^-1 T_k-1). "better_of_both" gives both poses, among which the tracker chooses,
+    since hands start and stop within a frame. Raises ConfigError, with the most similar name, for
+    any other model.
     """
     last = estimates[-1]
     starts = {"previous_pose": [last], "constant_velocity": [last], "better_of_both": [last]}
@@ -23,9 +25,10 @@ def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
 
 
 def rigid(T: Pose | Poses) -> Pose | Poses:
-    """Transforms without what rounding gathers in their rotations over thousands of frames.
+    """Transforms whose rotation matrices are made orthogonal again.
 
-    A Newton step towards the nearest rotation.
+    Over thousands of frames rounding errors accumulate in rotations. One Newton step towards the
+    nearest orthogonal matrix removes them.
     """
     T, R = T.copy(), T[..., :3, :3]
     T[..., :3, :3] = R @ (3 * np.eye(3) - R.swapaxes(-2, -1) @ R) / 2

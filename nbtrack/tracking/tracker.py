@@ -1,4 +1,4 @@
-"""What every tracker is: it takes frame after frame and says where the camera was."""
+"""The base class of trackers, which take frame after frame and estimate the camera's poses."""
 
 import abc
 import importlib.util
@@ -25,27 +25,27 @@ from nbtrack.tracking.starts import expected_poses, rigid
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """What all trackers share."""
+    """Settings that all trackers share."""
 
-    n_pixels: int = 4096  # random pixels a step, or a frame where they are drawn once
-    motion_model: str = "previous_pose"  # see `expected_poses`
+    n_pixels: int = 4096  # random pixels for each step, or for each frame if they are drawn once
+    motion_model: str = "previous_pose"  # where a search starts, by a name in `expected_poses`
     tf32: bool = False  # matrix products in TF32, on NVIDIA's GPUs
 
     def reach(self, steps: float, metres_per_unit: float) -> Reach | None:
-        """How far so many steps can move the camera; None where no step is bounded."""
+        """How far some steps can move the camera; None if steps have no bound."""
         return None
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the search for one frame's pose came to."""
+    """The result of the search for one frame's pose."""
 
     T_world_camera: Pose  # camera to world, m, OpenCV axes; never NaN
-    without_depth: bool  # nothing was measured; without a verdict the pose is the expected one
+    without_depth: bool  # whether no pixel of the frame has a measured depth
     steps: int = 0
     seconds: float = 0.0
-    loss: float = float("nan")  # before the last step; NaN without any
-    # What the tracker itself says, by column name; `lost` where it has a verdict.
+    loss: float = float("nan")  # before the last step; NaN without any step
+    # What the tracker reports, by column name. It holds `lost` if the tracker judges its estimate.
     report: dict[str, float | bool] = field(default_factory=dict)
 
     @property
@@ -55,20 +55,22 @@ class Estimate:
 
 
 class Tracker(abc.ABC):
-    """Follows a camera through a fixed field, one frame a call: `tracker.track(frame)`.
+    """Follows a camera through a fixed field: `tracker.track(frame)` is called for each frame.
 
-    A subclass searches one frame by `begin` and `step`, which keep the estimate `T_world_camera`.
+    A subclass defines `begin`, which starts the search of a frame, and `step`. Both update the
+    current estimate `T_world_camera`.
     """
 
     name: str  # on the command line and in file names
     Settings: type[TrackerSettings] = TrackerSettings
-    renders: bool = False  # whether it renders the field, rather than asking it for distances
-    package: str | None = None  # what it needs beside this project's own requirements
-    converges: bool = False  # whether it ends a frame by itself, before its budget is spent
-    copes_without_depth: bool = False  # whether it is shown frames without any measured depth
-    # Attributes that one frame leaves to the next; their class has their values before the first.
+    renders: bool = False  # whether it renders the field; else it asks the field for distances
+    package: str | None = None  # an optional package that it needs
+    converges: bool = False  # whether it can end a frame before its budget is spent
+    copes_without_depth: bool = False  # whether it searches frames without any measured depth
+    # Names of attributes that are kept from one frame to the next. Their values before the first
+    # frame are those of the class.
     remembers: tuple[str, ...] = ()
-    is_converged: bool = False  # whether further steps would change nothing: the rest is spared
+    is_converged: bool = False  # whether further steps in this frame would change nothing
     T_world_camera: Transform
 
     @usual_modes()
@@ -80,11 +82,12 @@ class Tracker(abc.ABC):
         settings: TrackerSettings | None = None,
         seed: int = 0,
     ) -> None:
-        """Begin in a map, from a pose before the first frame (m), with a budget of its own.
+        """Take a field, and the camera's pose (m) before the first frame that will be tracked.
 
-        Field and budget are copied: they stay as they are, whatever becomes of the user's. Raises
-        as `check_field` does, ConfigError for a setting that is not allowed or an unknown motion
-        model, DataError for a pose that is not rigid.
+        Field and budget are copied, so that later changes of the originals have no effect. Raises
+        ConfigError for a field in which the tracker does not work, a setting that is not allowed or
+        an unknown motion model; MissingError for a package that is not installed; DataError for a
+        pose that is not rigid.
         """
         self.check_field(field)
         self.settings = checked(settings or self.Settings(), self.Settings)
@@ -97,18 +100,18 @@ class Tracker(abc.ABC):
 
     @classmethod
     def works_in(cls, field: type) -> bool:
-        """Whether it can track in maps of this kind: rendering needs rays, others distances."""
+        """Whether it works in fields of a class: learned ones if it renders, else distances."""
         return issubclass(field, LearnedField) if cls.renders else field.is_distance
 
     @classmethod
     def check_field(cls, field: Field | type[Field]) -> None:
-        """Raises ConfigError for a field, or a class of fields, in which it does not work.
+        """Raises ConfigError for a field, or a class of fields, in which the tracker does not work.
 
-        MissingError, if a package that it needs is not installed.
+        Raises MissingError if a package that it needs is not installed.
         """
         kind = field if isinstance(field, type) else type(field)
         fits = issubclass(kind, Field) and cls.works_in(kind)
-        # A grid is of a class with distances, but may be made from a density.
+        # A grid's class has distances, but one that is made from a density has none.
         if not fits or (kind.is_distance and not field.is_distance):
             named = getattr(kind, "name", kind.__name__)
             known = ", ".join(name for name, other in FIELDS.items() if cls.works_in(other))
@@ -117,28 +120,28 @@ class Tracker(abc.ABC):
             raise MissingError(f"tracker {cls.name} needs more: pip install 'nbtrack[{cls.name}]'")
 
     def prepare(self, field: Field) -> Field:
-        """A map in the form, and on the device, in which this tracker asks it."""
+        """The field in the form, and on the device, in which this tracker uses it."""
         return field
 
     @abc.abstractmethod
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
-        """Take up a frame; its search starts at the best of some poses (double, on the host)."""
+        """Start the search of a frame at the best of some poses (double precision, on the CPU)."""
 
     @abc.abstractmethod
     def step(self) -> Scalar | float:
-        """One optimisation step; returns the loss before it, still on the device if on one."""
+        """Take one optimisation step; returns the loss before it, which may stay on a GPU."""
 
     def report(self) -> dict[str, float | bool]:
-        """What it says about its estimate, by column name; `lost`, where given, is its verdict."""
+        """What to record about the estimate, by column name; `lost`, if given, is a judgement."""
         return {}
 
     @usual_modes()
     def track(self, frame: Frame, budget: Budget | None = None) -> Estimate:
-        """The camera's pose at the next frame; NumericalError if it is not finite.
+        """Estimate the camera's pose at the next frame. Raises NumericalError if it is not finite.
 
-        A budget given here takes the place of the tracker's own for this frame. A tracker that
-        needs depth returns the pose that the motion model predicts where none is measured, so that
-        later frames can still be found (our choice).
+        A budget given here replaces the tracker's own for this frame. If no depth is measured, a
+        tracker that needs depth returns the pose that the motion model predicts, so that later
+        frames can still be found (our choice).
         """
         T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
         estimate = Estimate(rigid(T_starts[0]), without_depth=True)
@@ -151,23 +154,23 @@ class Tracker(abc.ABC):
     def restart(self, T_world_camera: Pose) -> None:
         """Go on from another pose (m), as after an interruption.
 
-        What the frames before left is forgotten: velocities, and whatever a subclass remembers.
-        Random numbers and the budget go on.
+        Earlier poses, and so the velocity, and what a subclass remembers are forgotten. The random
+        generator and the budget are not reset.
         """
         self.estimates = [checked_pose(T_world_camera)]
-        expected_poses(self.settings.motion_model, self.estimates)  # a wrong name is told now
+        expected_poses(self.settings.motion_model, self.estimates)  # checks the motion model's name
         for name in self.remembers:
             setattr(self, name, getattr(type(self), name))
 
     def restart_anywhere(self) -> None:
-        """Track from an unknown pose. ConfigError if this tracker cannot find the camera."""
+        """Go on from an unknown pose. Raises ConfigError if this tracker cannot find the camera."""
         self.check_finds(in_corrected=False)  # raises: classes that can find it override this
 
     @classmethod
     def check_finds(cls, in_corrected: bool) -> None:
-        """Raises ConfigError if it cannot find a camera, in a corrected map or in another.
+        """Raises ConfigError if the tracker cannot find a camera whose pose is unknown.
 
-        Only a class that has a `restart_anywhere` of its own can, and in a corrected map only.
+        Only a class that overrides `restart_anywhere` can find it, and only in a corrected map.
         """
         if cls.restart_anywhere is Tracker.restart_anywhere or not in_corrected:
             lacks = f"tracker {cls.name!r} cannot find a camera whose first pose is not known"
@@ -183,7 +186,7 @@ class Tracker(abc.ABC):
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take up what `state` returned, so that a resumed run goes on as if uninterrupted."""
+        """Restore what `state` returned, so that a resumed run goes on as if uninterrupted."""
         self.estimates = [*state["estimates"].numpy()]
         self.budget.memory = state["budget"]
         self.generator.set_state(state["generator"])
@@ -191,14 +194,14 @@ class Tracker(abc.ABC):
             setattr(self, name, state[name])
 
     def __reduce__(self) -> tuple:
-        """Copies and pickles are made as a resumed run is: by the class, then from the `state`."""
+        """Copies and pickles are constructed anew and then take the `state`, like a resumed run."""
         arguments = self.field, self.estimates[-1], self.budget, self.settings
         return _restored, (type(self), arguments, self.state())
 
     def _warm_up(self, frame: Frame, T_starts: Poses) -> None:
-        """Take some steps before those that count: the first ones load, allocate and record.
+        """Take some steps that do not count, since the first ones load, allocate and record.
 
-        That takes a second. Afterwards estimates, budget and random numbers are as before.
+        Afterwards estimates, budget and random numbers are as before.
         """
         state = self.state()
         self._is_warm = True
@@ -211,11 +214,11 @@ class Tracker(abc.ABC):
         synchronize(self.device)
 
     def _search(self, frame: Frame, T_starts: Poses, budget: Budget) -> Estimate:
-        """Search a frame's pose from some poses, as long as the budget lets it."""
+        """Search a frame's pose, starting at the best of some poses, until the budget is spent."""
         if not self._is_warm and frame.has_depth:
             self._warm_up(frame, T_starts)
         began = time.perf_counter()
-        allowed = budget.frame(self.device)  # a clock runs from here
+        allowed = budget.frame(self.device)  # a clock budget starts its clock here
         self.begin(frame.to(self.device), torch.from_numpy(T_starts))
         steps, loss = 0, float("nan")
         for step in allowed:
@@ -224,7 +227,7 @@ class Tracker(abc.ABC):
             if self.is_converged:
                 break
         synchronize(self.device)
-        allowed.close()  # a clock counts the last step here where `break` ended the search
+        allowed.close()  # after `break`, a clock budget counts the last step here
         seconds = time.perf_counter() - began
         pose = self.T_world_camera.detach().cpu().double().numpy().copy()
         if not np.isfinite(pose).all():
@@ -233,7 +236,7 @@ class Tracker(abc.ABC):
 
 
 def _restored(kind: type[Tracker], arguments: tuple, state: dict[str, Any]) -> Tracker:
-    """A tracker made with some arguments, that goes on from a state."""
+    """A new tracker of a class, after it took a state."""
     tracker = kind(*arguments)
     tracker.restore(state)
     return tracker

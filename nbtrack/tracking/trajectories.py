@@ -1,4 +1,4 @@
-"""Trajectories, tracked through a recorded sequence."""
+"""Tracks a camera through a recorded sequence; the result is a trajectory."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,17 +19,17 @@ from nbtrack.tracking.budget import StepBudget
 from nbtrack.tracking.metrics import pose_errors
 from nbtrack.tracking.tracker import Estimate, Tracker
 
-STEPS_TO_FIND = 1000  # a few dozen descents
+STEPS_TO_FIND = 1000  # steps per frame to find an unknown pose: some dozen descents
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The tracked frames of a sequence. A first frame whose pose was given is none of them."""
+    """The poses of all tracked frames. A first frame whose pose was given is not among them."""
 
     T_estimated: Poses  # camera to world, OpenCV axes
-    T_true: Poses  # NaN where not known
-    frames: pd.DataFrame  # a row each: id, time, steps, seconds, loss, errors, report
-    metrics: dict[str, Any] = field(default_factory=dict)  # of a run that is finished and kept
+    T_true: Poses  # NaN if unknown
+    frames: pd.DataFrame  # a row for each frame: id, time, steps, seconds, loss, errors, report
+    metrics: dict[str, Any] = field(default_factory=dict)  # of a finished run that was written
 
 
 def track_sequence(
@@ -39,15 +39,16 @@ def track_sequence(
     on_frame: Callable[[int, float], object] = lambda index, error_m: None,
     is_start_known: bool = True,
 ) -> Trajectory:
-    """Estimate every frame's pose from the first frame's true one, wherever the tracker was.
+    """Track all frames of a sequence, beginning with the first frame's true pose.
 
-    Source: paper, Sec. I-A and the evaluation protocol: every frame is processed, none is dropped.
-    Where the start is not known, the first frame is tracked too, and until one frame is not lost
-    each has `STEPS_TO_FIND` steps, whatever the budget (our choice).
-    A checkpoint of this run is written every few seconds and resumed from; `on_frame` is told the
-    index in the sequence and the translation error (m; NaN where no true pose is known). Raises
-    DataError if there are fewer than two frames, or none of them has a measured depth, or the
-    checkpoint is of another run.
+    If the start is not known, the first frame is tracked, too, and every frame has `STEPS_TO_FIND`
+    steps, whatever the budget, until the tracker has found the camera (our choice). The file
+    `checkpoint` is written every few seconds; a killed run goes on from it. `on_frame` is told the
+    index of each frame and its translation error (m; NaN if the true pose is unknown).
+
+    Raises DataError for fewer than two frames, for a sequence without any measured depth, and for
+    the checkpoint of another run. Source: paper, Sec. I-A and evaluation protocol (every frame is
+    processed, none is dropped).
     """
     _check_trackable(sequence)
     recipe = _recipe(tracker, sequence, is_start_known) if checkpoint else {}
@@ -75,9 +76,9 @@ def track_sequence(
 
 
 def _table_of(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    """The rows of frames; where the tracker has a verdict, it is that of `Estimate.lost`.
+    """The rows of frames as a table. If the tracker judges its estimates, `lost` is in all rows.
 
-    A frame that was not searched has no report, and is lost all the same.
+    A frame that was not searched, since it has no depth, has no judgement and counts as lost.
     """
     frames = pd.DataFrame(rows)
     if "lost" in frames:
@@ -86,7 +87,7 @@ def _table_of(rows: list[dict[str, Any]]) -> pd.DataFrame:
 
 
 def _recipe(tracker: Tracker, sequence: RgbdSequence, is_start_known: bool) -> dict[str, Any]:
-    """What a run depends on, by the names that the error for another run's checkpoint gives."""
+    """What a run depends on, by the names that are in the error for another run's checkpoint."""
     field, budget, seed = tracker.field, str(tracker.budget), tracker.generator.initial_seed()
     method = [tracker.name, as_dict(tracker.settings), budget, seed, is_start_known]
     weights = dict(chain(field.named_parameters(), field.named_buffers()))
@@ -94,7 +95,7 @@ def _recipe(tracker: Tracker, sequence: RgbdSequence, is_start_known: bool) -> d
 
 
 def _check_trackable(sequence: RgbdSequence) -> None:
-    """Raises DataError for fewer than two frames, or where no frame has a measured depth."""
+    """Raises DataError for fewer than two frames, or if no frame has a measured depth."""
     if len(sequence) < 2:
         raise DataError(f"{sequence!r} is too short to track: give at least two frames")
     if not sequence.depths_mm.any():
@@ -102,7 +103,7 @@ def _check_trackable(sequence: RgbdSequence) -> None:
 
 
 def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, Any]:
-    """The row of one frame in `Trajectory.frames`; errors are NaN where no true pose is known."""
+    """The row of one frame in `Trajectory.frames`; errors are NaN if the true pose is unknown."""
     T_true, T_first = sequence.T_world_camera[index], sequence.T_world_camera[0]
     error_m, error_deg = np.nan, np.nan
     if np.isfinite(T_true).all():
@@ -117,6 +118,6 @@ def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, An
         "rotation_error_deg": float(error_deg),
         "still_error_m": float(np.linalg.norm((T_true - T_first)[:3, 3])),  # of standing still
         "without_depth": estimate.without_depth,
-        # Python's numbers and flags: a checkpoint holds no others.
+        # As Python's numbers and flags, since a checkpoint cannot hold those of numpy or torch.
         **{name: np.asarray(value).item() for name, value in estimate.report.items()},
     }
