@@ -52,14 +52,10 @@ def map_sequence(
 ) -> Map:
     """Fit a field to a sequence with known poses; a field that learns nothing is computed from it.
 
-    `network` and `settings` are of the field's classes `Network` (None if it has none) and
-    `Settings`. The file `checkpoint` is written every few seconds. A killed run goes on from it
-    with the batches of an uninterrupted run; the caller removes it in the end. `code`, any text,
-    identifies the version of the program: another version refuses the checkpoint.
-
-    Raises DataError for frames without depth or pose and for the checkpoint of another map,
-    ConfigError for an unknown field or a wrong setting, NumericalError for losses that are not
-    finite.
+    Settings are of the field's classes `Network`, or None if it has none, and `Settings`. A killed
+    run goes on from the file `checkpoint`, which the caller removes; it has the same batches as an
+    uninterrupted run. `code`, any text, tells versions of the program apart. Raises DataError for
+    frames without depth or pose, or another map's checkpoint; ConfigError; NumericalError.
     """
     bounds = observed_bounds(sequence)
     kind = field_class(field_name)
