@@ -46,9 +46,8 @@ def track_sequence(
     `checkpoint` is written every few seconds; a killed run goes on from it. `on_frame` is told the
     index of each frame and its translation error (m; NaN if the true pose is unknown).
 
-    Raises DataError for fewer than two frames, for a sequence without any measured depth, and for
-    the checkpoint of another run. Source: paper, Sec. I-A and evaluation protocol (every frame is
-    processed, none is dropped).
+    Raises DataError for fewer than two frames, no measured depth in any frame, or the checkpoint of
+    another run. Source: paper, Sec. I-A and evaluation protocol (no frame is dropped).
     """
     _check_trackable(sequence)
     recipe = _recipe(tracker, sequence, is_start_known) if checkpoint else {}
