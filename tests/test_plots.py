@@ -97,11 +97,11 @@ FIGURES = {
     "overview": lambda s: plots.plot_overview(CLOUD, {"SDF": s.T_world_camera}, FRAMES, "near"),
     "errors": lambda s: plots.plot_errors({"VR": FRAMES, "SDF": FRAMES}, "lost"),
     "curves": lambda s: plots.plot_curves(SWEEP, *SWEEP, "fast"),
-    "samples": lambda s: plot_idea(IMAP_FIELD, s[0], s.T_world_camera[0], 6, 8, "44 samples"),
+    "samples": lambda s: plot_idea(IMAP_FIELD, s[0], {"": s.T_world_camera[0]}, (6, 8), "many"),
     "both losses": lambda s: plot_pose_losses(IMAP_FIELD, NEAR, s[0], 8.0, 4.0),
     "no density": lambda s: plot_density(pose_losses(IMAP_FIELD, NEAR, s[0]), "elsewhere"),
     "steps": lambda s: plots.plot_steps({"SDF": steps_of(s)}, s[0], s.T_world_camera[5], 0.02),
-    "queries": lambda s: plot_idea(SPHERE, s[0], s.T_world_camera[0], 6, 8, "one query"),
+    "queries": lambda s: plot_idea(SPHERE, s[0], {"off": s.T_world_camera[0]}, (6, 8), "one query"),
 }  # fmt: skip
 
 
@@ -263,10 +263,10 @@ def test_a_method_keeps_its_color() -> None:
     assert len(set(colors.values())) == 4
 
 
-def test_errors_run_in_seconds() -> None:
-    """Catches frame numbers taken for seconds, and metres for centimetres."""
+def test_errors_are_those_of_their_frames() -> None:
+    """Catches errors over the number of a row, and metres for centimetres."""
     line, _, still, _ = FIGURES["errors"](None).axes[0].lines
-    assert line.get_xdata() == pytest.approx([0.0, 0.1])
+    assert line.get_xdata() == pytest.approx([33, 36])
     assert line.get_ydata() == pytest.approx([1.0, 30.0])
     assert still.get_label() == "standing still"
     assert still.get_ydata() == pytest.approx([2.0, 4.0])

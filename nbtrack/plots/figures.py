@@ -37,7 +37,7 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     """
     # One scale for all frames, from a sixteenth of the pixels of at most 20 of them.
     some_mm = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]
-    far = MILLIMETRE * _most(np.ma.masked_equal(some_mm, 0))
+    far = MILLIMETRE * _most(np.ma.masked_equal(some_mm, 0), DEPTH)
     depth = np.ma.masked_equal(sequence.depth(index), 0)  # 0 is an unmeasured pixel
     color = (f"frame {sequence.frame_ids[index]}: colour", sequence.color(index), "")
     return plot_images([[color, ("depth", depth, DEPTH)]], title, {DEPTH: far})
@@ -83,7 +83,7 @@ def plot_images(rows: list[list[Panel]], title: str = "", ends: Ends | None = No
     """Images in rows, each with a title and the label of its colour bar, "" for colours.
 
     Images of one label share a bar, and a scale from 0 to its end in `ends`, by default to the 98 %
-    quantile of their values.
+    quantile of their values, of depths to the 99.9 % quantile.
     """
     _, first, _ = rows[0][0]
     height, width = first.shape[:2]
@@ -97,7 +97,8 @@ def plot_images(rows: list[list[Panel]], title: str = "", ends: Ends | None = No
             with_bar.setdefault(label, []).append(drawn)
     figure = grid[0, 0].figure
     for label, images in with_bar.items():
-        limit = (ends or {}).get(label) or _most(np.ma.stack([i.get_array() for i in images]))
+        values = np.ma.stack([drawn.get_array() for drawn in images])
+        limit = (ends or {}).get(label) or _most(values, label)
         for drawn in images:
             drawn.set_clim(0, limit)
         # Wide bars are no thicker than narrow ones, whose length is some tens of their thickness.
@@ -106,13 +107,14 @@ def plot_images(rows: list[list[Panel]], title: str = "", ends: Ends | None = No
     return figure
 
 
-def _most(images: np.ndarray) -> float:
-    """The 98 % quantile of known values, so that a few wild pixels do not hide the rest.
+def _most(images: np.ndarray, label: str) -> float:
+    """A quantile of known values, so that a few wild pixels do not hide the rest.
 
+    Of errors it is that of 98 %; the farthest depths are walls, and that of 99.9 % shows them, too.
     It is 1 where nothing is known: a scale needs an end.
     """
     values = np.ma.compressed(images)
-    return float(np.quantile(values, 0.98)) if len(values) else 1.0
+    return float(np.quantile(values, 0.999 if label == DEPTH else 0.98)) if len(values) else 1.0
 
 
 def show_image(axes: Axes, image: np.ndarray, title: str, colors: str = "viridis") -> AxesImage:
@@ -164,7 +166,7 @@ def plot_columns(tables: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
 
 @style.styled
 def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
-    """Errors of every frame over time: position (cm, logarithmic) and orientation (degrees).
+    """Errors of every frame: position (cm, logarithmic) and orientation (degrees).
 
     `frames` has by method the rows of a run's frames.csv, of the same frames. The dashed line is
     the ATE of 0.2 m above which the paper prints a sequence in red; the dotted one is a camera that
@@ -173,35 +175,32 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     above, below = style.new_axes(title, 4.9, 2, sharex=True)[:, 0]
     draw_errors(above, frames)
     for label, color in style.method_colors(frames).items():
-        below.plot(_seconds(frames[label]), frames[label]["rotation_error_deg"], color=color)
+        below.plot(frames[label]["frame_id"], frames[label]["rotation_error_deg"], color=color)
     above.margins(x=0)  # labels at the ends of curves stand beside the axes
     above.axhline(100 * LOST_THRESHOLD_M, label="the paper's 0.2 m", **style.DASHED)
-    below.set(ylabel="rotation error (degrees)", xlabel="time (s)")
+    below.set(ylabel="rotation error (degrees)", xlabel="frame")
     return above.figure.legend_below()
 
 
 def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
-    """Errors of the position (cm) over time (s), by label, and those of a camera standing still.
+    """Errors of the position (cm) by frame and label, and those of a camera standing still.
 
     Of several curves each has its label at its end; one curve alone has it in the legend.
     """
     alone = len(frames) == 1
     for label, color in style.method_colors(frames).items():
         error_cm = 100 * frames[label]["translation_error_m"]
-        axes.plot(_seconds(frames[label]), error_cm, color=color, label=label if alone else "")
+        index = frames[label]["frame_id"]
+        axes.plot(index, error_cm, color=color, label=label if alone else "")
         last = error_cm.last_valid_index()
         if last is not None and not alone:
-            end = _seconds(frames[label])[last], error_cm[last]
+            end = index[last], error_cm[last]
             axes.annotate(label, end, (5, 0), textcoords="offset points", color=color, va="center")
     still = list(frames.values())[-1]  # the same in every run of these frames
-    axes.plot(_seconds(still), 100 * still["still_error_m"], label=STANDING_STILL, **style.DOTTED)
+    error_cm = 100 * still["still_error_m"]
+    axes.plot(still["frame_id"], error_cm, label=STANDING_STILL, **style.DOTTED)
     axes.set_ylabel("translation error (cm)")
     style.log_axes(axes, "y")
-
-
-def _seconds(frames: pd.DataFrame) -> pd.Series:
-    """Times of a run's frames (s) since its first."""
-    return frames["time"] - frames["time"].iloc[0]
 
 
 @style.styled
@@ -242,17 +241,19 @@ def plot_curves(
     Groups of one row are points beside their labels. Axes are labelled by the names of the columns,
     as "time a frame (ms)". If x is text, it keeps the order of its first appearance, and points of
     the groups stand side by side, without lines. A method has its own colour; marks tell groups
-    apart, too. Columns `from` and `to` are drawn as intervals of y. `log` names the logarithmic
-    axes; `line` is matplotlib's style of all lines, and "none" leaves points.
+    apart, too, and a variant, named after a comma, is dashed. Columns `from` and `to` are drawn as
+    intervals of y. `log` names the logarithmic axes; `line` is matplotlib's style of all lines, and
+    "none" leaves points.
     """
     axes = style.new_axes(title, 3.6)[0, 0]
     is_text = not pd.api.types.is_numeric_dtype(table[x])
     places = _side_by_side(axes, table[x], table[by]) if is_text else table[x]
     colors = style.method_colors(table[by])
-    look = {"linestyle": "none" if is_text else line}
     groups = table.assign(**{x: places}).groupby(by, sort=False)
     for (label, rows), mark in zip(groups, cycle(_MARKS), strict=False):
-        axes.plot(rows[x], rows[y], mark, color=colors[label], label=label, **look)
+        dash = "--" if ", " in label and line == "-" else line
+        look = {"linestyle": "none" if is_text else dash, "color": colors[label], "label": label}
+        axes.plot(rows[x], rows[y], mark, **look)
         if "from" in table:
             axes.vlines(rows[x], rows["from"], rows["to"], colors[label], linewidth=0.8)
     axes.set(xlabel=x, ylabel=y)

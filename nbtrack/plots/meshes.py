@@ -7,10 +7,11 @@ from jaxtyping import Bool, Float
 from skimage.measure import marching_cubes
 
 from nbtrack.beyond.points import PointCloud, min_depth_behind
-from nbtrack.core.arrays import Frames, Position
+from nbtrack.core.arrays import Colors, Frames, Points, Position, Values
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.machinery.errors import DataError
+from nbtrack.synthetic import Room
 
 _POINTS_AT_ONCE = 65_536
 GridPoints = Float[np.ndarray, "*shape 3"]  # m
@@ -52,6 +53,36 @@ def extract_mesh(
         mesh.remove_unreferenced_vertices()
     if not len(mesh.faces):
         raise DataError(f"no frame saw the surface of the {field.label} map: map for longer")
+    return mesh
+
+
+class ExactDistance(Field):
+    """The exact distance (m) of a room as a field: its colour is grey, its bounds are the map's."""
+
+    name, label, surface_level = "exact", "Exact distance", 0.0
+
+    def __init__(self, room: Room, mapped: Field) -> None:
+        super().__init__(mapped.bounds)
+        self.room = room
+
+    def forward(self, points_world: Points) -> tuple[Colors, Values]:
+        """Grey, and the room's signed distance (m), at points (n, 3; m, world frame)."""
+        sdf = self.room.sdf(points_world.cpu().numpy().astype(float))
+        return torch.full_like(points_world, 0.5), torch.from_numpy(sdf).float()
+
+
+def exact_mesh(
+    room: Room, mapped: Field, sequence: RgbdSequence, voxel: float = 0.05
+) -> trimesh.Trimesh:
+    """The mesh (m, world frame) of a room within a map's bounds, in the colours that cameras see.
+
+    As that of the map by `extract_mesh`, it has what the frames of the sequence have seen.
+    """
+    mesh = extract_mesh(ExactDistance(room, mapped), sequence, voxel=voxel)
+    step = 0.5 * voxel * mesh.vertex_normals
+    outwards = np.sign(room.sdf(mesh.vertices + step) - room.sdf(mesh.vertices - step))[:, None]
+    _, colors, _ = room.cast(mesh.vertices + outwards * step, -outwards * step)
+    mesh.visual.vertex_colors = (255 * colors).round().astype(np.uint8)
     return mesh
 
 

@@ -2,11 +2,13 @@
 
 from itertools import pairwise
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from nbtrack.fields.mlp import FourierMlp
 from nbtrack.plots.style import PALETTE, new_axes, styled
 
+_GAP = 6  # letters, between the texts of boxes
 _CENTRED = {"ha": "center", "va": "center", "fontsize": "small"}
 _ARROW = {"arrowstyle": "-|>", "color": "0.3", "shrinkA": 0, "shrinkB": 0}
 
@@ -23,19 +25,23 @@ def plot_network(network: FourierMlp, value: str, title: str = "") -> Figure:
         layers.append((hidden, layer.weight.T))
     layers.append(("W h + b", network.head.weight.T))
     texts = [f"{name}\n{matrix.shape[0]} × {matrix.shape[1]}" for name, matrix in layers]
-    axes = new_axes(title, 1.6)[0, 0]
+    texts = ["point\n3 (m, world)", *texts, f"sigmoid: colour (3)\n{value}"]
+    widths = np.array([max(map(len, text.split("\n"))) for text in texts])  # letters
+    places = np.cumsum(widths + _GAP) - widths / 2
+    axes = new_axes(title, 1.5)[0, 0]
     boxes = []
-    for place, text in enumerate(["point\n3 (m, world)", *texts, f"sigmoid: colour (3)\n{value}"]):
-        edge = PALETTE[0] if 0 < place <= len(texts) else "none"  # of layers only
+    for place, text in zip(places, texts, strict=True):
+        edge = "none" if text in (texts[0], texts[-1]) else PALETTE[0]  # of layers only
         box = {"boxstyle": "square,pad=0.6", "facecolor": "white", "edgecolor": edge}
         boxes.append(axes.text(place, 0, text, bbox=box, **_CENTRED).get_bbox_patch())
-    for place, (start, end) in enumerate(pairwise(boxes)):
+    for (start, end), (here, there) in zip(pairwise(boxes), pairwise(places), strict=True):
         arrow = _ARROW | {"patchA": start, "patchB": end}
-        axes.annotate("", (place + 1, 0), (place, 0), arrowprops=arrow)
+        axes.annotate("", (there, 0), (here, 0), arrowprops=arrow)
     # From the sines, box 1, to the third layer, box 4: box 0 is the point.
     skip = {"connectionstyle": "bar,fraction=-0.12", "patchA": boxes[1], "patchB": boxes[4]}
-    axes.annotate("", (4, 0), (1, 0), arrowprops=_ARROW | skip)
-    axes.text(2.5, 0.8, "sin(x B) once more, beside the output of the second layer", **_CENTRED)
-    axes.set(xlim=(-0.5, len(boxes) - 0.5), ylim=(-0.6, 1))
+    axes.annotate("", (places[4], 0), (places[1], 0), arrowprops=_ARROW | skip)
+    again = "sin(x B) once more, beside the output of the second layer"
+    axes.text(places[[1, 4]].mean(), 0.75, again, **_CENTRED)
+    axes.set(xlim=(0, places[-1] + widths[-1] / 2 + _GAP), ylim=(-0.4, 0.9))
     axes.set_axis_off()
     return axes.figure

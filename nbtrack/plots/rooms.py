@@ -4,18 +4,16 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-import torch
 import trimesh
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.ndimage import binary_opening
 
-from nbtrack.core.arrays import Colors, Points, Values
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.plots import scene
 from nbtrack.plots.figures import draw_errors
-from nbtrack.plots.meshes import extract_mesh, seen_by
+from nbtrack.plots.meshes import ExactDistance, extract_mesh, seen_by
 from nbtrack.plots.scene import Paths
 from nbtrack.plots.style import method_colors, new_axes, styled
 from nbtrack.synthetic import Room
@@ -41,21 +39,23 @@ def plot_slice(
     """
     drawn = [fields] if isinstance(fields, Field) else [*fields]
     if room is not None and drawn[0].is_distance:
-        drawn.insert(0, _ExactDistance(room, drawn[0]))
+        drawn.insert(0, ExactDistance(room, drawn[0]))
     # Lower with more panels, which are narrower.
     panels = new_axes(title, 5.4 - 0.9 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
-    norm = None  # the first field's, for all
+    norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # the first field's, for all
+    of_cameras = (sequence.T_world_camera[:, :3, 3] @ scene.up_of(sequence.T_world_camera)).mean()
+    height = of_cameras if height is None else height
+    above = f", {of_cameras - height:.1f} m higher up" if abs(of_cameras - height) > 0.05 else ""
     for axes, field in zip(panels, drawn, strict=True):
-        up, page = scene.draw_from_above(axes, {"camera path": sequence.T_world_camera})
-        if height is None:
-            height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
+        up, page = scene.draw_from_above(axes, {f"cameras{above}": sequence.T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / 240  # m
         points, places = _level_grid(page, low, high + step, step, height * up)
-        bar = {"ax": panels, "aspect": 25, "pad": 0.015}
         shown = binary_opening(seen_by(points, sequence), iterations=2)
         norm = scene.draw_slice(axes, field, points, places, shown, norm, **bar)
-        axes.plot([], [], "k-", label="surface")  # only names the lines drawn above in the legend
+        what = f": {field.value_label.partition(' ')[0]} of {field.surface_level:g}"
+        # Without points: it only names the lines drawn above in the legend.
+        axes.plot([], [], "k-", label="surface" if field.is_distance else f"surface{what}")
         if room is not None:
             shown = shown & _draw_true_level(axes, room, points, places)
         axes.plot([], [], "s", color=scene.UNSEEN, label="hardly or never seen")
@@ -78,21 +78,6 @@ def _end_around(axes: Axes, *places: np.ndarray) -> None:
     axes.set_xbound(x.min() - 0.1, x.max() + 0.1)
     axes.set_ybound(y.min() - 0.1, y.max() + 0.1)  # an axis that is turned around stays so
     axes.label_outer()
-
-
-class _ExactDistance(Field):
-    """The exact distance (m) of a room as a field: its colour is grey, its bounds are the map's."""
-
-    name, label, surface_level = "exact", "Exact distance", 0.0
-
-    def __init__(self, room: Room, mapped: Field) -> None:
-        super().__init__(mapped.bounds)
-        self.room = room
-
-    def forward(self, points_world: Points) -> tuple[Colors, Values]:
-        """Grey, and the room's signed distance (m), at points (n, 3; m, world frame)."""
-        sdf = self.room.sdf(points_world.cpu().numpy().astype(float))
-        return torch.full_like(points_world, 0.5), torch.from_numpy(sdf).float()
 
 
 def _level_grid(
@@ -121,8 +106,8 @@ def plot_mesh(meshes: Mapping[str, trimesh.Trimesh], T_paths: Paths, title: str 
     for axes, (label, mesh) in zip(panels, meshes.items(), strict=True):
         to_screen = scene.draw_mesh(axes, mesh, scene.up_of(*T_paths.values()), to_screen)
         scene.draw_paths(axes, T_paths, to_screen[:2])
-        scene.draw_scale(axes)
         axes.set_title(label)
+    scene.draw_scale(*panels)
     return panels[0].figure.legend_below()
 
 
@@ -139,7 +124,9 @@ def plot_map_and_slice(
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
-    room, level, errors = new_axes(title, 3.3, 1, 3, width_ratios=[1.2, 1.5, 0.9])[0]
+    room, level, errors = new_axes(title, 3.3, 1, 3, width_ratios=[1.3, 1.5, 0.9])[0]
+    level.sharex(room)
+    level.sharey(room)
     to_page = scene.draw_mesh(room, mesh, up)[:2]
     paths = {label: path[:, :3, 3] for label, path in T_paths.items()}
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
@@ -150,13 +137,13 @@ def plot_map_and_slice(
     level.set_aspect("equal")
     for axes, name in (room, "surface: the zero level"), (level, "slice at the cameras' height"):
         scene.draw_paths(axes, T_paths, to_page, 0.7)
-        scene.draw_scale(axes)
         axes.set_title(name)
+    scene.draw_scale(room, level)
     first, *others = paths
     for label in others:
         off_mm = 1000 * np.linalg.norm(paths[label] - paths[first], axis=1)
         errors.plot(off_mm, color=method_colors(paths)[label])
-    errors.set(xlabel="frame", ylabel=f"off the {first} path (mm)", ylim=(0, None))
+    errors.set(title="error", xlabel="frame", ylabel=f"off the {first} path (mm)", ylim=(0, None))
     return room.figure.legend_below()
 
 
@@ -175,7 +162,7 @@ def _level_points(shown: np.ndarray, step: float, up: np.ndarray, height: float)
 def plot_overview(
     cloud: pd.DataFrame, T_paths: Paths, frames: pd.DataFrame | None, title: str
 ) -> Figure:
-    """Coloured points (m) and paths from above, and the errors of a tracked run over time.
+    """Coloured points (m) and paths from above, and the errors of a tracked run by frame.
 
     The cloud's columns are x, y, z (m, world frame), red, green, blue (0 to 255); what is higher
     than all cameras is left out. Walls should be thin and straight: doubled or fanned ones mean
@@ -187,6 +174,6 @@ def plot_overview(
     scene.draw_cloud(panels[0], cloud, T_paths)
     if has_errors:
         draw_errors(panels[1], {"tracked": frames})
-        panels[1].set_xlabel("time (s)")
+        panels[1].set_xlabel("frame")
         panels[1].legend(loc="best")
     return panels[0].figure.legend_below()

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm, Normalize
+from matplotlib.transforms import Bbox
 
 from nbtrack.core.arrays import Poses
 from nbtrack.fields import Field
@@ -87,13 +88,17 @@ def draw_mesh(
     return to_screen
 
 
-def draw_scale(axes: Axes) -> None:
-    """Draw a bar of 1 m, or of another power of ten, below all that is drawn on axes in metres."""
-    (left, low), (right, high) = axes.dataLim.get_points()
-    length = 10.0 ** np.floor(np.log10(right - left))
-    x, y = (left + right) / 2, low - 0.05 * (high - low)
-    axes.plot(x + length * np.array([-0.5, 0.5]), [y, y], "k-", linewidth=2)
-    axes.annotate(f"{length:g} m", (x, y), (0, -12), textcoords="offset points", ha="center")
+def draw_scale(*panels: Axes) -> None:
+    """Draw a bar of 1 m, or of another power of ten, below all that is drawn on panels in metres.
+
+    Panels share their scale, and bars are level.
+    """
+    low, high = Bbox.union([axes.dataLim for axes in panels]).get_points()
+    length = 10.0 ** np.floor(np.log10(high[0] - low[0]))
+    x, y = (low[0] + high[0]) / 2, low[1] - 0.05 * (high[1] - low[1])
+    for axes in panels:
+        axes.plot(x + length * np.array([-0.5, 0.5]), [y, y], "k-", linewidth=2)
+        axes.annotate(f"{length:g} m", (x, y), (0, -12), textcoords="offset points", ha="center")
 
 
 def draw_from_above(axes: Axes, T_paths: Paths) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 from PIL import Image
 
@@ -151,10 +151,11 @@ def log_axes(axes: Axes, names: str) -> None:
     """Make the axes that `names` has as letters, "x", "y" or "xy", logarithmic.
 
     Ticks have plain numbers at 1, 2 and 5; an axis that spans less than a factor of ten has more.
+    There are no others, also where a caller sets its own.
     """
     for name in names:
         axes.set(**{f"{name}scale": "log"})
         axis = getattr(axes, f"{name}axis")
         low, high = axis.get_view_interval()
         ticks = LogLocator(subs=(1, 2, 5) if high > 10 * low else (1, 1.5, 2, 3, 4, 5, 6, 8))
-        axis.set(major_locator=ticks, major_formatter="{x:g}", minor_formatter="")
+        axis.set(major_locator=ticks, major_formatter="{x:g}", minor_locator=NullLocator())
