@@ -88,7 +88,7 @@ def plot_images(rows: list[list[Panel]], title: str = "", ends: Ends | None = No
     _, first, _ = rows[0][0]
     height, width = first.shape[:2]
     # The figure's title and bars, and in each row the panels' titles and images.
-    inches = 0.9 + len(rows) * (0.2 + style.WIDTH / len(rows[0]) * height / width)
+    inches = 0.75 + len(rows) * (0.2 + style.WIDTH / len(rows[0]) * height / width)
     grid = style.new_axes(title, inches, len(rows), len(rows[0]))
     with_bar: dict[str, list[AxesImage]] = {}
     for axes, (name, image, label) in zip(grid.flat, chain(*rows), strict=True):

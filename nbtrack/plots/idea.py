@@ -47,9 +47,9 @@ def plot_idea(
     points_camera, point_camera = _points_of_row(frame, *pixel)
     distance = point_camera.norm().item()
     x = np.arange(max(-_BEFORE, distance - before), distance + _BEHIND, _STEP)
-    # Lengths have one scale along both axes; above and below are title, labels and legend.
-    height = 1.15 + 0.82 * WIDTH / len(T_world_camera) * 2 * _ASIDE / (x[-1] - x[0])
-    panels = new_axes(title, height, 1, len(T_world_camera), sharey=True)[0]
+    n, texts = len(T_world_camera), 1.15 if any(T_world_camera) else 1.1  # inches of height
+    height = texts + 0.82 * WIDTH / n * 2 * _ASIDE / (x[-1] - x[0])  # both axes have one scale
+    panels = new_axes(title, height, 1, n, sharey=True)[0]
     page_camera = _page_camera(point_camera / distance)
     places = np.stack(np.meshgrid(x, np.arange(-_ASIDE, _ASIDE + _STEP, _STEP)), axis=-1)
     norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # the first's scale, for all

@@ -41,7 +41,7 @@ def plot_slice(
     if room is not None and drawn[0].is_distance:
         drawn.insert(0, ExactDistance(room, drawn[0]))
     # Lower with more panels, which are narrower.
-    panels = new_axes(title, 5.4 - 0.9 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
+    panels = new_axes(title, 5.4 - 0.8 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
     norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # the first field's, for all
     of_cameras = (sequence.T_world_camera[:, :3, 3] @ scene.up_of(sequence.T_world_camera)).mean()
     height = of_cameras if height is None else height
@@ -124,7 +124,7 @@ def plot_map_and_slice(
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
-    room, level, errors = new_axes(title, 3.3, 1, 3, width_ratios=[1.3, 1.5, 0.9])[0]
+    room, level, errors = new_axes(title, 3.3, 1, 3, width_ratios=[1.3, 1.3, 0.9])[0]
     level.sharex(room)
     level.sharey(room)
     to_page = scene.draw_mesh(room, mesh, up)[:2]
@@ -132,7 +132,8 @@ def plot_map_and_slice(
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
     points = _level_points(np.concatenate([mesh.bounds, *paths.values()]), voxel, up, height)
     shown = seen_by(points, sequence)
-    scene.draw_slice(level, field, points, points @ to_page.T, shown, shrink=0.7, aspect=25)
+    bar = {"ax": [room, level], "shrink": 0.7, "aspect": 25}  # beside both: they share a size
+    scene.draw_slice(level, field, points, points @ to_page.T, shown, **bar)
     level.set_axis_off()
     level.set_aspect("equal")
     for axes, name in (room, "surface: the zero level"), (level, "slice at the cameras' height"):
