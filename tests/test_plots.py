@@ -100,7 +100,9 @@ FIGURES = {
     "both losses": lambda s: plot_pose_losses(IMAP_FIELD, NEAR, s[0], 8.0, 4.0),
     "no density": lambda s: plot_density(pose_losses(IMAP_FIELD, NEAR, s[0]), "elsewhere"),
     "steps": lambda s: plots.plot_steps({"SDF": steps_of(s)}, s[0], s.T_world_camera[5], 0.02),
-    "queries": lambda s: plot_idea(SPHERE, s[0], {"off": s.T_world_camera[0]}, (6, 8), "one query"),
+    "queries": lambda s: plot_idea(
+        SPHERE, s[0], {str(k): s.T_world_camera[k] for k in (0, 3, 5)}, (6, 8), "one query", before=0.4
+    ),
 }  # fmt: skip
 
 

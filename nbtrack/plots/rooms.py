@@ -33,9 +33,9 @@ def plot_slice(
 
     Fields of one recording stand side by side, in the colour scale of the first. `sequence` are the
     frames that the maps were made of; `height` is by default the cameras' mean. `room` is the exact
-    scene, if it is a synthetic one: its surface is dashed green, and its distance stands before
-    those of the fields. The axes end around the path and what the frames have seen, within a known
-    room. What single rays saw between others counts as not seen.
+    scene, if it is known: its surface is dashed green, and its distance stands before those of the
+    fields. The axes end around the path and what the frames have seen, within the room. What single
+    rays saw between others counts as not seen.
     """
     drawn = [fields] if isinstance(fields, Field) else [*fields]
     if room is not None and drawn[0].is_distance:
