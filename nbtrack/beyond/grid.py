@@ -1,7 +1,7 @@
-"""A field on a regular grid: sampled once, then answered by trilinear interpolation.
+"""A field that is sampled once on a regular grid, and then interpolated trilinearly.
 
-A network costs 250,000 products a point, the grid eight vertices. The interpolant is continuous;
-its gradient is exact, and jumps from cell to cell.
+A query of a network costs 250,000 products a point, and one of the grid reads eight vertices. The
+interpolant is continuous. Its gradient is exact, and jumps from cell to cell.
 """
 
 import math
@@ -20,41 +20,42 @@ from nbtrack.fields.base import Field
 from nbtrack.machinery.device import constant, usual_modes
 from nbtrack.machinery.errors import ConfigError
 
-_POINTS_AT_ONCE = 65_536
-_MAX_BYTES = 500_000_000  # 25 million vertices, sampled in some minutes (our choice)
+_POINTS_AT_ONCE = 65_536  # batch size when a field is sampled
+_MAX_BYTES = 500_000_000  # of a grid: 25 million vertices, sampled in some minutes (our choice)
 _BYTES_PER_VERTEX = 4 * (3 + 1 + 1)  # colour, value and confidence
 
 
 class Accuracy(NamedTuple):
-    """How far off a map is at surfaces, together with depth cameras: the scales of LM's residuals.
+    """The usual residuals of a map at surfaces: errors of the map and of depth cameras together.
 
-    The defaults are for small networks, where nothing was measured (our choice).
+    The defaults are for small networks whose residuals were not measured (our choice).
     """
 
-    residual_sigma: tuple[float, float] = (0.02, 0.05)  # of distance (m), luma: larger count less
-    inlier_distance: float = 0.05  # m from its surface within which a point fits
-    intensity_mad: float = 0.02  # median residual of luma at what was mapped
+    # LM's smallest robust scales of distance (m) and luma: larger residuals are down-weighted.
+    residual_sigma: tuple[float, float] = (0.02, 0.05)
+    inlier_distance: float = 0.05  # m; a point nearer to the surface is an inlier
+    intensity_mad: float = 0.02  # the median absolute residual of luma
 
 
 class BakedField(Field):
     """A frozen copy of another field on a regular grid over its bounds. Our choice.
 
-    Points outside are moved to its border: along such an axis the gradient is 0.
+    Points outside are moved to the grid's border, so that the gradient across the border is 0.
     """
 
     name = "baked"
     width = 0  # one thread serves a grid, even one that keeps the network it was made from
     accuracy = Accuracy()
-    viewpoints: Viewpoints | None = None  # from where a lost camera is looked for
+    viewpoints: Viewpoints | None = None  # for relocalisation; None: not known
 
     @usual_modes()
     @torch.no_grad()
     def __init__(self, source: Field, voxel: float | int) -> None:
-        """Sample a field, on its device, in cells of `voxel` (m), one to spare on each side.
+        """Sample a field, on its device, at the vertices of cells of `voxel` (m).
 
-        The interpolation's error falls with the voxel's square; the memory (20 bytes a vertex) and
-        the time grow with its inverse's cube. Raises ConfigError where it is no positive number,
-        or the grid would exceed 0.5 GB.
+        The grid extends one cell beyond the bounds at each side. A voxel of half the size divides
+        the interpolation's error by four, and multiplies the memory (20 bytes a vertex) and the
+        time by eight. Raises ConfigError unless the voxel is positive and the grid fits in 0.5 GB.
         """
         super().__init__(source.bounds)
         self.label = f"{source.label} baked"
@@ -62,7 +63,8 @@ class BakedField(Field):
         self.surface_level = float(source.surface_level)
         self.voxel = float(voxel)
         self.n_vertices = checked_size(source.bounds, voxel)
-        # The first vertex lies one cell below the bounds; z is fastest.
+        # The first vertex lies one cell below the bounds. Vertices are in row-major order: z is
+        # fastest.
         first = [x - voxel for x in self.bounds.minimum]
         low = torch.tensor(first, dtype=torch.float32).to(source.device)
         axes = [torch.arange(n, dtype=torch.int32, device=low.device) for n in self.n_vertices]
@@ -75,49 +77,53 @@ class BakedField(Field):
         self.register_buffer("volume", volume, persistent=False)
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
-        """Colour in [0, 1] and value (m for a signed distance) at points (m); differentiable."""
+        """Colour in [0, 1] and value at points (m, world frame), differentiable.
+
+        The value is that of the sampled field: a signed distance in m, for example.
+        """
         values = self._at(points_world)
         return values[:3].T, values[3]
 
     def confidence(self, points_world: Points) -> Values:
-        """How well the surface is known at points (m), in [0, 1]."""
+        """How well the surface is known at points (m, world frame), in [0, 1]."""
         return self._at(points_world)[4]
 
     def _at(self, points_world: Points) -> Float[Tensor, "5 points"]:
-        """Red, green, blue, value and confidence at points (m)."""
+        """Red, green, blue, value and confidence at points (m, world frame); NaN at NaN."""
         volume = self.volume.view(5, *self.n_vertices)
         values = trilinear(volume, self.low, self.voxel, points_world)
-        # `trilinear` moves NaN to the border, too.
+        # `trilinear` gives NaN the values of the border.
         return torch.where(points_world.isnan().any(dim=1), torch.nan, values)
 
 
 def trilinear(
     volume: Float[Tensor, "channels x y z"], low: Float[Tensor, "3"], voxel: float, points: Points
 ) -> Float[Tensor, "channels n"]:
-    """Interpolation at points (m) between vertices, the first at `low`, in cells of `voxel` (m).
+    """Interpolate a volume at points (m), differentiably.
 
-    Differentiable; points outside are moved to the border.
+    The volume's first vertex is at `low` (m), and neighbouring vertices are `voxel` (m) apart.
+    Points outside are moved to the border.
     """
     extent = voxel * (constant(tuple(volume.shape[1:]), low.device, low.dtype) - 1)
-    # grid_sample takes positions from -1 to 1, along the volume's axes in reverse order.
+    # `grid_sample` takes positions from -1 to 1, in the reverse order of the volume's axes.
     normalized = (2 * (points - low) / extent - 1).flip(-1)[None, None, None]
     values = grid_sample(volume[None], normalized, padding_mode="border", align_corners=True)
     return values[0, :, 0, 0]
 
 
 def checked_size(bounds: SceneBounds, voxel: float | int, key: str = "voxel") -> tuple[int, ...]:
-    """The number of vertices along x, y and z of a grid with cells of `voxel` (m).
+    """The numbers of vertices along x, y and z of a grid with cells of `voxel` (m).
 
-    Raises ConfigError, which names the setting's key, unless the voxel is positive and the grid
-    fits in 0.5 GB.
+    Raises ConfigError unless the voxel is positive and the grid fits in 0.5 GB. The message calls
+    the setting by its `key`.
     """
     extent = np.subtract(bounds.maximum, bounds.minimum)
-    # In floating point, where the number of vertices may overflow: 1e-300 m is positive, too.
+    # A tiny positive voxel, such as 1e-300 m, makes infinitely many vertices, without a warning.
     with np.errstate(all="ignore"):
-        n_vertices = np.ceil(extent / voxel) + 3  # two cells to spare, and a vertex at the end
+        n_vertices = np.ceil(extent / voxel) + 3  # one cell more at each side, and the last vertex
         n_bytes = float(np.prod(n_vertices)) * _BYTES_PER_VERTEX
     if not (0 < voxel < math.inf and n_bytes <= _MAX_BYTES):
-        # The smallest that fits, with 5 % for the cells to spare and for rounding.
+        # The smallest voxel that fits, enlarged by 5 % for the cells at the sides and for rounding.
         enough = 1.05 * (float(np.prod(extent)) * _BYTES_PER_VERTEX / _MAX_BYTES) ** (1 / 3)
         raise ConfigError(
             f"{key} is {voxel} m, of a scene of {' x '.join(f'{x:.3g}' for x in extent)} m: a "

@@ -1,7 +1,8 @@
-"""Least squares of what a grid's vertices shall be, by what its interpolation shall give at points.
+"""Linear least squares for the values of a grid's vertices, given the wanted values at points.
 
-Points touch few of a grid's vertices: only those near points are solved for, as the columns of a
-sparse matrix.
+A value at a point is a weighted mean of the eight vertices of its cell. The unknowns are
+corrections of the vertices near points, which are few of a grid's. They are the columns of a sparse
+matrix, and the points are its rows.
 """
 
 import numpy as np
@@ -14,27 +15,28 @@ from skimage.graph import pixel_graph
 from nbtrack.beyond.grid import BakedField
 from nbtrack.core.arrays import WorldPoints
 
-# Weights of the squared difference between neighbouring corrections, and of a correction's square;
-# the squared residual of a point that was seen from the mean depth has the weight 1.
-_SMOOTHNESS = 0.1
-_PULL = 0.1
+# Weights in the loss, in which the squared residual of a point at the mean depth has the weight 1.
+_SMOOTHNESS = 0.1  # of the squared difference between neighbouring corrections
+_PULL = 0.1  # of a squared correction: it is pulled to zero
 Columns = Float[np.ndarray, "rows columns"]
 Vertices = Int[np.ndarray, "points 8"]
 Corners = Float[np.ndarray, "points 8"]
 Mask = Bool[np.ndarray, "x y z"]
-_CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T  # of a cell, 8 x 3: z is fastest
+_CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T  # offsets of a cell's corners, 8 x 3; z is fastest
 
 
 def interpolation(points_world: WorldPoints, grid: BakedField) -> tuple[Vertices, Corners]:
-    """Numbers of the eight vertices around points (m), and their weights in the interpolation.
+    """The eight vertices of the cells that contain points (m), and their trilinear weights.
 
-    Points outside are moved to the border, as the grid itself does.
+    Vertices are given by their row-major numbers, the lowest corner first. Points outside of the
+    grid are moved to its border, as the grid itself does.
     """
     shape = np.array(grid.n_vertices)
     scaled = (points_world - grid.low.double().numpy()) / grid.voxel
     scaled = scaled.clip(0, shape - 1)
     cells = np.clip(np.floor(scaled).astype(np.int64), 0, shape - 2)
-    # Of the two vertices along each axis: n x 3 x 2. A corner's weight is the product of three.
+    # The weights of the lower and the upper vertex along each axis, n x 3 x 2. A corner's weight is
+    # the product of one weight of each axis.
     along = np.stack([1 - (scaled - cells), scaled - cells], axis=-1)
     xy = along[:, 0, :, None, None] * along[:, 1, None, :, None]
     weights = xy * along[:, 2, None, None, :]
@@ -45,29 +47,31 @@ def interpolation(points_world: WorldPoints, grid: BakedField) -> tuple[Vertices
 def corrected_vertices(
     vertices: Vertices, weights: Corners, shape: tuple[int, ...]
 ) -> tuple[Mask, csr_array]:
-    """Which of a grid's vertices to correct, those near points; and the interpolation from them.
+    """A mask of the grid's vertices to correct, and the interpolation matrix A from them to points.
 
-    The latter is a matrix A (points x n): A x is at the points what x is at these vertices.
+    `vertices` and `weights` are those of `interpolation`, and `shape` is the grid's. Corrected are
+    the vertices of cells with points, and their neighbours. If x holds a value for each of these n
+    vertices, A x (A is points x n) holds the interpolated values at the points.
     """
-    is_touched = np.zeros(shape, dtype=bool)
-    is_touched.flat[vertices] = True
-    is_corrected = binary_dilation(is_touched)  # by a vertex, over which corrections fade out
-    column_of = is_corrected.cumsum() - 1
-    # Every row has eight entries: weights, columns, and where rows begin.
+    has_points = np.zeros(shape, dtype=bool)
+    has_points.flat[vertices] = True
+    is_corrected = binary_dilation(has_points)  # by one vertex, over which corrections fade out
+    column_of = is_corrected.cumsum() - 1  # by a vertex's number, if it is corrected
+    # Data, column indices, and row pointers of eight entries a row.
     entries = (weights.ravel(), column_of[vertices].ravel(), np.arange(0, weights.size + 1, 8))
     return is_corrected, csr_array(entries, shape=(len(weights), column_of[-1] + 1))
 
 
 def regularisation_of(is_corrected: Mask) -> tuple[Int[np.ndarray, "n"], csr_array]:
-    """Numbers of the vertices to correct, and the regularisation of corrections as a matrix R.
+    """Row-major numbers of the n vertices to correct, and a matrix R (n x n) that regularises them.
 
-    x' R x is its cost of corrections x. It has springs between the six neighbours, of
-    `_SMOOTHNESS`, and to zero, of `_PULL`. Neighbours that are not corrected stand at zero, so that
-    corrections fade out.
+    x' R x is the regularisation loss of corrections x: `_PULL` times the sum of their squares, plus
+    `_SMOOTHNESS` times the sum of the squared differences between neighbours. A vertex has six, and
+    those that are not corrected count as zero, so that corrections fade out.
     """
-    springs, numbers = pixel_graph(is_corrected, connectivity=1)  # 1 between neighbours
-    own = eye_array(len(numbers)) * (_PULL + 6 * _SMOOTHNESS)
-    return numbers, (own - _SMOOTHNESS * springs).tocsr()
+    adjacency, numbers = pixel_graph(is_corrected, connectivity=1)  # 1 between neighbours
+    diagonal = eye_array(len(numbers)) * (_PULL + 6 * _SMOOTHNESS)
+    return numbers, (diagonal - _SMOOTHNESS * adjacency).tocsr()
 
 
 def solve(
@@ -80,11 +84,14 @@ def solve(
 ) -> tuple[Columns, Float[np.ndarray, "n"]]:
     """The x that minimises |W^(1/2) (A x - wanted)|^2 + x' R x, and the Hessian's diagonal.
 
-    A is the matrix, R the regularisation, W the reliability times Huber's weight. A row has one
-    weight for all its columns, by their largest residual: 1 up to `huber`, else huber / |residual|.
-    Each of the `rounds` solves by conjugate gradients, from the solution before and with its
-    weights. The Hessian A'WA + R is applied to vectors, and never formed: its entries would take
-    several times as long to sum up. Its diagonal is that of the last round.
+    A is `matrix`, R `regularisation`, and W the diagonal matrix of reliability times Huber's
+    weight. A row has the same weight for all its columns. It comes from the largest of their
+    absolute residuals: 1 up to `huber`, and huber / |residual| above.
+
+    Iteratively reweighted least squares: each of the `rounds` computes the weights at the solution
+    so far, and solves by conjugate gradients from there. The Hessian A'WA + R is applied to
+    vectors, and never formed: to sum up its entries would take several times as long. Its diagonal
+    is returned for the weights of the last round.
     """
     solution = np.zeros((matrix.shape[1], wanted.shape[1]))
     squares = matrix.power(2)

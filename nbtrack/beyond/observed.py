@@ -1,4 +1,4 @@
-"""Points that a frame observed, as LM and ICP take them: evenly spread, and away from edges."""
+"""Observed points of a frame for LM and ICP: from evenly spread pixels, away from depth edges."""
 
 from collections.abc import Callable
 from typing import NamedTuple, no_type_check
@@ -10,22 +10,22 @@ from numba import njit
 from nbtrack.data.frame import MILLIMETRE, Frame
 from nbtrack.data.pixels import PLANE_JUMP, PLANE_REACH
 
-_EDGE_JUMP = 0.05  # a neighbouring depth that differs by a larger share marks an edge
-_DRAWN_PER_POINT = 4  # pixels that are looked at for every point that is wanted
-# Pixels follow the sequence R2 (Roberts 2018): the n-th lies at the fractional parts of n g and
-# n g^2, with g^3 + g^2 = 1, down and across, in units of 1 / _MODULUS. However many are taken, they
-# are spread evenly.
+_EDGE_JUMP = 0.05  # a pixel is at an edge if a neighbour's depth differs by a larger share
+_DRAWN_PER_POINT = 4  # at most so many pixels are looked at for every point that is wanted
+# Pixels follow the low-discrepancy sequence R2 (Roberts 2018), whose first n members are spread
+# evenly for any n. The n-th pixel lies at the fractional parts of n g (down) and n g^2 (across);
+# g solves g^3 + g^2 = 1. The steps g and g^2 are integers here, in units of 1 / _MODULUS.
 _EVEN_STEPS = (0xC13FA9A9, 0x91E10DA5)
 _MODULUS = 2**32
 LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in the intensity that trackers compare (ITU-R BT.601)."""
 _RED, _GREEN, _BLUE = np.float32(LUMA).tolist()
-# Sums may be reordered, so that they fill vector registers; NaN stays NaN.
+# Sums may be reordered, which fills vector registers. NaN stays NaN.
 _JIT = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 
 
 Array = np.ndarray
-"""As compiled functions take it, whose docstrings tell its shape."""
+"""The type of arrays in compiled functions. Their docstrings give the shapes."""
 
 
 class Observed(NamedTuple):
@@ -33,26 +33,29 @@ class Observed(NamedTuple):
 
     points: np.ndarray  # n x 3, m, camera frame
     intensity: np.ndarray  # n, luma in [0, 1]
-    normals: np.ndarray  # n x 3, camera frame, towards the camera; 0: not known. Or none (0 x 3)
+    # n x 3, unit vectors towards the camera, camera frame; 0 where unknown. 0 x 3: no normals.
+    normals: np.ndarray
 
 
 def compiled(function: Callable) -> Callable:
-    """A function compiled by numba, and kept on disk where numba finds a place to write."""
+    """Compile a function by numba; the machine code is cached on disk if numba can write there."""
     try:
         return njit(cache=True, **_JIT)(function)
-    except RuntimeError:  # a read-only package, and no home that can be written
+    except RuntimeError:  # neither the package's folder nor the home can be written
         return njit(**_JIT)(function)
 
 
 def draw_points(
     frame: Frame, n_points: int, generator: torch.Generator, edge_jump: float = _EDGE_JUMP
 ) -> Observed:
-    """Observed points (m, camera frame) of evenly spread pixels, and intensities; no normals.
+    """Draw `n_points` observed points and intensities from evenly spread pixels, without normals.
 
-    Not those at depth edges, which may belong to either side, nor at the border: a neighbouring
-    depth that differs by a larger share than `edge_jump` marks an edge; infinity takes all. Only a
-    few times as many pixels as wanted are looked at, from a random one on: where little is
-    measured, fewer points come back.
+    Pixels at the image's border and at depth edges are left out, since those at edges may belong to
+    either side. A pixel is at an edge if a neighbour's depth differs by a larger share than
+    `edge_jump`; none is if that is infinite.
+
+    The first pixel is random. At most `_DRAWN_PER_POINT` x `n_points` pixels are looked at, so that
+    fewer points are returned if few pixels are measured.
     """
     starts = torch.randint(_MODULUS, (2,), generator=generator).numpy()
     depth_mm, color = frame.depth_mm.numpy(), frame.color.numpy()
@@ -61,13 +64,13 @@ def draw_points(
 
 
 def with_normals(frame: Frame, observed: Observed, n_points: int) -> Observed:
-    """The first `n_points` points with unit normals, towards the camera; 0 where not known."""
+    """Keep the first `n_points` observed points, and compute their normals in the frame."""
     points, intensity = observed.points[:n_points], observed.intensity[:n_points]
     return Observed(points, intensity, _normals(frame.depth_mm.numpy(), _pinhole(frame), points))
 
 
 def _pinhole(frame: Frame) -> tuple[float, float, float, float]:
-    """fx, fy, cx and cy (pixels): a tuple, as compiled functions take it."""
+    """fx, fy, cx and cy (pixels) as a tuple, which compiled functions can take."""
     return frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy
 
 
@@ -76,7 +79,10 @@ def _pinhole(frame: Frame) -> tuple[float, float, float, float]:
 def _drawn_points(
     depth_mm: Array, color: Array, pinhole: tuple, n_points: int, starts: Array, edge_jump: float
 ) -> tuple[Array, Array]:
-    """Points (m, camera frame) and luma of `draw_points`; `starts` is where R2 begins."""
+    """Points (n x 3, m, camera frame) and luma (n) of `draw_points`.
+
+    `starts` are the random offsets of the sequence R2, down and across, below `_MODULUS`.
+    """
     height, width = depth_mm.shape
     fx, fy, cx, cy = pinhole
     points, luma, n_drawn = np.empty((n_points, 3)), np.empty(n_points), 0
@@ -90,7 +96,8 @@ def _drawn_points(
         jump = edge_jump * z
         is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
         is_smooth &= abs(depth_mm[v, u + 1] - z) < jump and abs(depth_mm[v, u - 1] - z) < jump
-        if is_smooth:  # never without a depth: no difference is below a jump of zero
+        # A pixel without depth is never smooth: its jump is 0, and no difference is below 0.
+        if is_smooth:
             depth = z * MILLIMETRE
             points[n_drawn, 0] = (u + 0.5 - cx) / fx * depth
             points[n_drawn, 1] = (v + 0.5 - cy) / fy * depth
@@ -104,7 +111,11 @@ def _drawn_points(
 @no_type_check
 @compiled
 def _normals(depth_mm: Array, pinhole: tuple, points: Array) -> Array:
-    """`PixelSampler.normals_camera` at observed points (m, camera frame); 0 where not known."""
+    """Unit normals (n x 3, camera frame) of points (n x 3, m, camera frame); 0 where unknown.
+
+    They are those of `PixelSampler.normals_camera`: of the plane through four pixels at a distance
+    of `PLANE_REACH` of the image's width, if none of their depths differs too much.
+    """
     height, width = depth_mm.shape
     fx, fy, cx, cy = pinhole
     reach, normals = max(1, round(width * PLANE_REACH)), np.zeros((len(points), 3))
@@ -116,8 +127,8 @@ def _normals(depth_mm: Array, pinhole: tuple, points: Array) -> Array:
             above, below = depth_mm[v - reach, u], depth_mm[v + reach, u]
             jump = max(abs(left - z), abs(right - z), abs(above - z), abs(below - z))
             if jump < PLANE_JUMP * z:
-                # How fast the logarithm of the depth grows along x / z and y / z: a normal of the
-                # plane is (a, b, c).
+                # a and b are how fast the logarithm of the depth grows along x / z and y / z. Then
+                # (a, b, c) is normal to the plane.
                 a = fx / reach * (right - left) / (right + left)
                 b = fy / reach * (below - above) / (below + above)
                 c = -1 - x * a - y * b

@@ -1,4 +1,4 @@
-"""Points: the measured pixels of posed frames, averaged by voxel, for classical registration."""
+"""A map of points: measured pixels of posed frames, averaged by voxel, for ICP."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,20 +18,20 @@ from nbtrack.fields.base import Field, State
 from nbtrack.machinery.errors import ConfigError
 from nbtrack.machinery.settings import MANY, limited
 
-_MAX_CELLS_A_SIDE = 2**20  # so that a cell's number fits into 64 bits
-_FRAMES_AT_ONCE = 8  # frames whose voxels wait to be merged: it bounds the memory
+_MAX_CELLS_A_SIDE = 2**20  # with more, a cell's number would not fit into 64 bits
+_FRAMES_AT_ONCE = 8  # the sums of so many frames are merged at once, which bounds the memory
 
 
 @dataclass(frozen=True)
 class PointMapping:
-    """Fusing points."""
+    """Settings of a map of points."""
 
-    voxel: float = 0.02  # edge of the cells whose measured points are averaged, m
+    voxel: float = 0.02  # m; edge of the cells in which measured points are averaged
     holdout_every: int = limited(10, 0, MANY)  # every n-th frame is left out
 
 
 class PointCloud(Field):
-    """Measured points with their colours, one a voxel. Made by `fuse_points`."""
+    """A map of measured points with colours, one point a voxel. `fuse_points` makes it."""
 
     name = "points"
     label = "Points"
@@ -49,30 +49,30 @@ class PointCloud(Field):
     def from_frames(
         cls, sequence: RgbdSequence, frames: Frames, bounds: SceneBounds, settings: PointMapping
     ) -> "PointCloud":
-        """Fused points; see `fuse_points`."""
+        """Map a sequence by `fuse_points`, with the voxel of the settings."""
         return fuse_points(sequence, frames, bounds, settings.voxel)
 
     @classmethod
     def from_state(cls, state: State, made: dict[str, Any], bounds: SceneBounds) -> "PointCloud":
-        """The cloud of a map file. Raises ValueError unless points and colours are equally many."""
+        """Read the cloud of a map file; ValueError unless points and colours are equally many."""
         if len(state["points"]) != len(state["colors"]):
             raise ValueError("points and colours are not equally many")
         return cls(**state, voxel=float(made["settings"]["voxel"]), bounds=bounds)
 
     def diagnostics(self) -> dict[str, float]:
-        """How many points there are, and what memory (bytes) they take."""
-        return {"points": len(self.points), "bytes": 2 * self.points.nbytes}  # colours are as many
+        """The number of points, and the memory (bytes) of points and colours."""
+        return {"points": len(self.points), "bytes": 2 * self.points.nbytes}  # colours take as much
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
-        """Colour of the nearest point, and distance (m, without sign) from it."""
-        asked = points_world.detach().cpu().numpy()
-        distance, nearest = self.tree.query(np.nan_to_num(asked))
-        distance[np.isnan(asked).any(axis=1)] = np.nan
+        """Colour of the nearest map point, and the unsigned distance (m) from it."""
+        queries = points_world.detach().cpu().numpy()
+        distance, nearest = self.tree.query(np.nan_to_num(queries))  # the tree takes no NaN
+        distance[np.isnan(queries).any(axis=1)] = np.nan
         return self.colors[nearest], torch.from_numpy(distance).to(points_world)
 
     @cached_property
     def tree(self) -> cKDTree:
-        """The points' search tree."""
+        """A search tree of the points."""
         return cKDTree(self.points.cpu().numpy())
 
 
@@ -84,12 +84,13 @@ def fuse_points(
     stride: int = 1,
     min_count: int = 1,
 ) -> PointCloud:
-    """One point a voxel (m): mean position (m, world frame) and mean colour (in [0, 1]).
+    """Average the frames' measured pixels in each voxel to one point of a map.
 
-    The frames' measured pixels inside the bounds count, `stride` apart, in voxels that have
-    `min_count` of them or more (or as many as any has). The mean takes noise off, and leaves planes
-    where they are. Memory grows with the surface that was seen, not with the frames.
-    Raises ConfigError for a voxel that is not positive, far too fine, or longer than the scene.
+    A point is the mean position (m, world frame) and colour (in [0, 1]) of a voxel's pixels, which
+    reduces noise. Every `stride`-th pixel along both axes is used, if it lies inside the bounds.
+    Voxels with fewer than `min_count` pixels have no point, unless all have fewer. Memory grows
+    with the surface that was seen, not with the number of frames.
+    Raises ConfigError for a voxel (m) that is not positive, far too fine, or longer than the scene.
     """
     extent = np.subtract(bounds.maximum, bounds.minimum)
     if not extent.max() / _MAX_CELLS_A_SIDE <= voxel <= extent.max():
@@ -98,7 +99,7 @@ def fuse_points(
             f"{extent.max() / _MAX_CELLS_A_SIDE:.2g} to {extent.max():.2g} m; set for instance 0.02"
         )
     shape = np.floor(extent / voxel).astype(np.int64) + 1
-    # Rows of x, y, z (m), red, green, blue and 1, by the voxel's number; merged, sums and a count.
+    # Rows of x y z (m), red green blue and 1 by the voxel's number; merged, sums and a count.
     tables = []
     for count, index in enumerate(frames.tolist(), start=1):
         frame = sequence[index]
@@ -113,18 +114,19 @@ def fuse_points(
         if count % _FRAMES_AT_ONCE == 0 or count == len(frames):
             tables = [pd.concat(tables).groupby(level=0).sum()]
     sums = tables[0].to_numpy()
-    kept = sums[sums[:, 6] >= min(min_count, sums[:, 6].max(initial=0))]
-    means = torch.from_numpy((kept[:, :6] / kept[:, 6:]).astype(np.float32))
+    sums = sums[sums[:, 6] >= min(min_count, sums[:, 6].max(initial=0))]
+    means = torch.from_numpy((sums[:, :6] / sums[:, 6:]).astype(np.float32))
     return PointCloud(means[:, :3].contiguous(), means[:, 3:].contiguous(), voxel, bounds)
 
 
 def cells_of(
     points: WorldPoints, low: Float[np.ndarray, "3"], shape: Int[np.ndarray, "3"], voxel: float
 ) -> tuple[Int[np.ndarray, "_"], np.ndarray]:
-    """Numbers of the cells that points lie in, z fastest, and a mask of the points they are for.
+    """Numbers of the cells that contain points, and a mask (n) of the points inside the grid.
 
-    The grid begins at `low` (m) and has `shape` cells of `voxel` (m). Points outside get no number:
-    the mask leaves them out.
+    The grid has its lowest corner at `low` (m), and `shape` cells of `voxel` (m) along x, y and z.
+    Its cells are numbered in row-major order: z is fastest. The numbers are those of the points
+    inside, in order; points outside have none.
     """
     cells = np.floor((points - low) / voxel).astype(np.int64)
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
@@ -132,11 +134,12 @@ def cells_of(
 
 
 def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frames) -> Values:
-    """How far (z-depth, m) points (m) lie behind what frames measured in their direction.
+    """How far (z-depth, m) points (m) lie at least behind the surface that frames measured.
 
-    The minimum over the frames is returned. It is negative where a frame measured something behind
-    the point, and infinite where no frame has the point in view or measured anything there. Every
-    fifth frame is used, since neighbours see the same.
+    In each frame a point is projected into the image, and the depth measured there is subtracted
+    from the point's depth. The minimum over the frames is returned. It is negative if a frame saw
+    through the point to something behind it, and infinite if no frame has the point in view or
+    measured a depth there. Every fifth frame is used, since neighbours see the same.
     """
     behind = points_world.new_full(points_world.shape[:1], torch.inf)
     for index in frames[::5].tolist():
@@ -147,7 +150,7 @@ def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frame
         columns, rows = columns.round(), rows.round()
         inside = (depth > 0) & (columns >= 0) & (rows >= 0)
         inside &= (columns < frame.camera.width) & (rows < frame.camera.height)
-        _, measured = frame.at(rows[inside].long(), columns[inside].long())
-        found = torch.where(measured > 0, depth[inside] - measured, torch.inf)
+        _, measured_depth = frame.at(rows[inside].long(), columns[inside].long())
+        found = torch.where(measured_depth > 0, depth[inside] - measured_depth, torch.inf)
         behind[inside] = torch.minimum(behind[inside], found)
     return behind

@@ -1,10 +1,13 @@
-"""How likely a pose is wrong, by what a descent says of it.
+"""The probability that a tracked pose is wrong: off by more than 5 cm or 3 degrees.
 
-Off by more than 5 cm or 3 degrees it may be for two reasons. It may be another pose altogether:
-logistic regression, whose coefficients `benchmarks/verdict.py` fits, in the two rooms for tuning
-and on a real recording. Or it is near the right one, but nothing holds it along some direction, or
-the budget ended while it still moved: that error is taken to be normal, with the standard deviation
-that the curvature of the cost tells, and the last step's length.
+Two reasons are modelled, and taken to be independent:
+
+- The pose is another local minimum of the cost. Logistic regression on four features of the result
+  gives the probability. `benchmarks/verdict.py` fits its coefficients, in the two rooms for tuning
+  and on a real recording.
+- The pose is near the right one, but the cost hardly grows along some direction, or the budget
+  ended while the pose still moved. This error is taken to be normal. Its variance is the sum of the
+  position's, from the growth of the cost, and of the last step's square.
 """
 
 import math
@@ -19,39 +22,40 @@ from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 WRONG_M = 0.05
 WRONG_DEG = 3.0
-# Of the log odds of a wrong pose; the coefficients are those of the four `features`.
+# The log odds of a wrong pose are the intercept plus the coefficients times the four `features`.
 _INTERCEPT = 2.01
 _COEFFICIENTS = np.array([-2.06, -0.28, 2.8, 1.39])
-# Scales of robust costs are 3 medians of |r|: two standard deviations, were residuals normal.
-MAD_FACTOR = 3.0
-SIGMAS = 0.6745 * MAD_FACTOR
-CORRELATED = 2.0  # by how much stds that take errors for independent are too small
-# Where a pose is held, its cost grows both ways, but within 5 cm often one way alone.
+MAD_FACTOR = 3.0  # a robust scale is so many median absolute residuals (MAD)
+SIGMAS = 0.6745 * MAD_FACTOR  # the same scale in standard deviations, if residuals are normal
+CORRELATED = 2.0  # factor of standard deviations that take correlated errors for independent ones
+# A pose is moved so far to see whether its cost grows. The cost at a right pose grows in both
+# directions at this distance, but within 5 cm often in one direction alone.
 _MOVED_M = 2 * WRONG_M
 
 
-def features(said: Mapping[str, float]) -> Float[np.ndarray, "4"]:
-    """Numbers that grow about linearly with the log odds of a wrong pose.
+def features(report: Mapping[str, float]) -> Float[np.ndarray, "4"]:
+    """Logarithms with which the log odds of a wrong pose grow about linearly.
 
-    Of what a tracker says: `fitting_ratio`, `known_ratio` (see `LmOptimizer.certainty`),
-    `intensity_ratio` (median difference over the usual one) and `innovation` (how far from where
-    the frames before led to, rad or m).
+    They are computed from four numbers of a tracker's report: `fitting_ratio` and `known_ratio`
+    (see `LmOptimizer.certainty`), `intensity_ratio` (the median intensity difference divided by the
+    usual one), and `innovation` (the distance from where the frames before led to, in rad or m).
     """
-    # Shares of 0 and 1 would have infinite log odds.
-    fitting, known = np.clip([said["fitting_ratio"], said["known_ratio"]], 0.01, 0.99)
-    intensity = np.clip(said["intensity_ratio"], 0.5, 10)
-    innovation = np.clip(said["innovation"], 0.02, 1)
+    # Ratios of 0 and 1 would have infinite log odds.
+    fitting, known = np.clip([report["fitting_ratio"], report["known_ratio"]], 0.01, 0.99)
+    intensity = np.clip(report["intensity_ratio"], 0.5, 10)
+    innovation = np.clip(report["innovation"], 0.02, 1)
     numbers = fitting / (1 - fitting), known / (1 - known), intensity, innovation
     return np.array([math.log(number) for number in numbers])
 
 
-def p_lost(said: Mapping[str, float]) -> float:
-    """The probability that the pose is wrong, by its features, `position_std_m` and `last_step`.
+def p_lost(report: Mapping[str, float]) -> float:
+    """The probability that the pose of a tracker's report is wrong.
 
-    The last step is in rad or m, 0 where the pose has settled.
+    Besides its `features` two numbers of the report count: `position_std_m`, and `last_step`, the
+    length (rad or m) of the last step, 0 if the pose has converged.
     """
-    p_right = 1 / (1 + math.exp(_INTERCEPT + _COEFFICIENTS @ features(said)))
-    spread = math.hypot(CORRELATED * said["position_std_m"], said["last_step"])
+    p_right = 1 / (1 + math.exp(_INTERCEPT + _COEFFICIENTS @ features(report)))
+    spread = math.hypot(CORRELATED * report["position_std_m"], report["last_step"])
     return 1 - p_right * p_within(spread)
 
 
@@ -67,34 +71,38 @@ def std_when_moved(
     n_directions: int,
     n_independent: int,
 ) -> float:
-    """The position's standard deviation (m), by how the points' costs grow `_MOVED_M` away.
+    """The position's standard deviation (m), from how much the cost grows `_MOVED_M` away.
 
-    The pose moves both ways along the position's least certain directions, and turns as the
-    covariance (world frame, rad and m, as `lm_solver.retract` takes twists) says; the smallest
-    growth counts. Curvature alone is not enough: ripples in the map of a flat wall have gradients,
-    too, but the frame fits as well all along the wall. Errors of a map are alike at neighbouring
-    points, so that at most `n_independent` points count. Costs are Geman-McClure's, at scales
-    of `MAD_FACTOR` medians.
+    `costs_at` gives the cost of each of the frame's n points at a pose. Costs must be those of
+    Geman and McClure, at scales of `MAD_FACTOR` medians. The pose is moved both ways along the
+    `n_directions` least certain directions of the position, by the likeliest twist under
+    `covariance` (rad and m, world axes, as `lm_solver.retract` takes twists). The smallest growth
+    of the mean cost counts.
+
+    The curvature of the cost alone is not enough: ripples in the map of a flat wall have gradients,
+    too, but the frame fits as well all along the wall. A map's errors at neighbouring points are
+    correlated, so that at most `n_independent` points count.
     """
-    variances, directions = np.linalg.eigh(covariance[3:, 3:])  # the least certain come last
+    variances, directions = np.linalg.eigh(covariance[3:, 3:])  # ascending: the last is the largest
     here = costs_at(T_world_camera)
     growths = []
     for k in range(1, n_directions + 1):
-        # Of all twists that move the position so far along the direction, the likeliest.
+        # The mean of all twists with this offset along the direction, and so the likeliest of them.
         twist = _MOVED_M * covariance[:, 3:] @ directions[:, -k] / variances[-k]
         for way in (1, -1):
             growths.append((costs_at(retract(T_world_camera, way * twist)) - here).mean())
     growth = max(min(growths), 0.0) * min(len(here), n_independent)
-    # Of a cost that grows with the square of the offset, and of the pose prior.
+    # The cost is taken to grow with the square of the offset. The pose prior adds to it.
     return 1 / (SIGMAS * (growth / _MOVED_M**2 + PRIOR_WEIGHT) ** 0.5)
 
 
 def score_detection(
     called_lost: Bool[np.ndarray, "n"], errors_m: Float[np.ndarray, "n"]
 ) -> dict[str, float | None]:
-    """Precision and recall of verdicts: lost are frames with errors above `LOST_THRESHOLD_M`.
+    """Precision and recall of the verdict "lost" on n frames.
 
-    The precision is None where none was called lost, the recall None where none was.
+    A frame is lost if its error is above `LOST_THRESHOLD_M`. The precision is None if no frame was
+    called lost, and the recall is None if no frame was lost.
 
     >>> score_detection(np.array([True, True, False]), np.array([0.3, 0.1, 0.5]))
     {'lost_precision': 0.5, 'lost_recall': 0.5}

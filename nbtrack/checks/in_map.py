@@ -16,20 +16,21 @@ from nbtrack.mapping.holdout import depth_residual_of
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M, pose_errors
 from nbtrack.tracking.trajectories import Trajectory
 
-# A map is refused where its misfit exceeds both. Measured on nine maps of three rooms (one a real
-# recording): frames of the same room 0.024 m at most, of other rooms 0.095 m at least.
-_MISFIT_FACTOR = 3.0  # times what is usual in the map's own frames
+# A map is refused if the misfit of a frame exceeds both limits. In nine maps of three rooms (one a
+# real recording) frames of the same room had at most 0.024 m, and of other rooms at least 0.095 m.
+_MISFIT_FACTOR = 3.0  # times the usual misfit of the map's own frames
 _MISFIT_ALLOWED = 0.05  # m
-_N_FRAMES = 40  # looked at
-_N_POINTS = 500  # of each frame, looked at
-_MOSTLY = 0.5  # share of a frame's points outside of the map's bounds, where the frame lies outside
+_N_FRAMES = 40  # of a run, at most, are looked at
+_N_POINTS = 500  # of each frame, at most, are looked at
+_MOSTLY = 0.5  # a frame lies outside if a larger share of its points is outside of the map's bounds
 
 
 def check_belongs(finished: Map, frame: Frame) -> str | None:
-    """A warning if the frame has no depth to tell by; None if the map belongs to the frame.
+    """Check that a frame was seen in a map's room, in the same world frame; DataError if not.
 
-    It does if the frame's misfit is at most 5 cm, or at most three times what is usual in the map's
-    own frames. Raises DataError if the misfit is larger.
+    The misfit is the frame's depth residual at its given pose. It may be at most 5 cm, or three
+    times what is usual in the map's own frames. Returns a warning if the frame has no depth, so
+    that nothing can be told, and otherwise None.
     """
     name = f"the map of {finished.record['scene']}"
     usual = finished.record["misfit_m"]
@@ -47,9 +48,9 @@ def check_belongs(finished: Map, frame: Frame) -> str | None:
 
 
 def in_world_of_map(tracked: Trajectory) -> tuple[Trajectory, bool]:
-    """The trajectory with its true poses moved into the map's world, and errors against these.
+    """Move a trajectory's true poses into the map's world, if they are in another one.
 
-    Also returns whether they were in another world. If not, the trajectory is returned as it is.
+    Returns the trajectory, with errors against the moved poses, and whether it was changed.
     """
     T_map_world = other_world(tracked.T_estimated, tracked.T_true)
     if T_map_world is None:
@@ -64,18 +65,19 @@ def in_world_of_map(tracked: Trajectory) -> tuple[Trajectory, bool]:
 
 
 def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
-    """The one rigid motion (m) from true to estimated poses that explains the errors of a run.
+    """The rigid motion T_map_world (m) that explains a run's errors, or None if there is none.
 
-    It explains them if their median was above `LOST_THRESHOLD_M` and after the motion is below it
-    and below a tenth of what it was (our choice). None where no motion does that, or fewer than
-    three frames have a true pose.
+    True poses are then given in another world frame than the map's. A motion explains the errors if
+    their median was above `LOST_THRESHOLD_M`, and after the motion of the true poses is below it
+    and below a tenth of what it was (our choice). The result is also None if fewer than three
+    frames have a true pose.
     """
     is_known = np.isfinite(T_true).all(axis=(1, 2))
     if is_known.sum() < 3:
         return None
     T_estimated, T_true = T_estimated[is_known], T_true[is_known]
-    # The rotation comes from orientations, which determine it also where the camera moves along a
-    # line. Only the half of the frames that agree best is used, since lost frames are wrong.
+    # The rotation is computed from orientations, since positions do not determine it if the camera
+    # moves along a line. Only the half of the frames that agree best is used: others may be lost.
     turns = Rotation.from_matrix(T_estimated[:, :3, :3] @ T_true[:, :3, :3].mT)
     off_mean = (turns.mean().inv() * turns).magnitude()
     agrees = off_mean <= np.median(off_mean)
@@ -91,10 +93,11 @@ def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
 
 
 def outside_map_share(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> float:
-    """The share of frames with depth, of some spread evenly, that saw little of what was mapped.
+    """The share of a run's frames of which most points lie outside of the map's bounds.
 
-    Most of such a frame's points lie outside of the map's bounds, at its true pose if that is
-    known, else at the estimated one.
+    Some evenly spread frames are looked at, and those without depth do not count; 0 if none is
+    left. Points are placed by the true pose of their frame if it is known, else by the estimated
+    one.
     """
     outside = []
     stride = math.ceil((sequence.depths_mm[0].size / _N_POINTS) ** 0.5)
