@@ -1,7 +1,7 @@
 """NeuS+: NeuS whose signed distance is also supervised directly by the measured depths.
 
-Its distance is that of the large network, or of a small one that reads features in grids, which is
-mapped in a fraction of the time.
+`NeuSPlusField` has the large network of NeuS. `GridPlusField` has a small one that reads features
+in grids, and is mapped in a fraction of the time.
 """
 
 from dataclasses import dataclass
@@ -23,26 +23,26 @@ from nbtrack.fields.mlp import empty_linear
 from nbtrack.fields.neus import NeuSField, NeusMapping, guided_depths
 from nbtrack.machinery.settings import limited
 
-_MIN_VOXEL = 0.05  # m between the corners at which distances are kept
-_MAX_CELLS_A_SIDE = 128  # larger scenes have larger voxels
+_MIN_VOXEL = 0.05  # m; smallest voxel of the grid of observed distances
+_MAX_CELLS_A_SIDE = 128  # of that grid: larger scenes have larger voxels
 _POINTS_PER_FRAME = 10_000  # about, on a regular grid of its pixels
-# The tangent plane gives a sample's distance if that differs by less (m) from the distance to the
-# nearest point: half a voxel of the points, and the rounding of distances near the surface.
+# m. The tangent plane is the nearest surface to a sample if the distance from it differs by less
+# from the distance to the nearest point. It is half a voxel of the points, and their rounding.
 _PLANE_TOLERANCE = 0.015
 Flags = Bool[Tensor, "rays samples"]
 
 
 @dataclass(frozen=True)
 class NeusPlusMapping(NeusMapping):
-    """Mapping of NeuS+: half the rays, and measured points besides."""
+    """Mapping of NeuS+: half as many rays as NeuS, and measured points besides."""
 
     iterations: int = 10_000
     n_rays: int = limited(512, 1, 65536)
     lambda_color: float = 6.0
     eikonal_share: float = limited(0.125, 0.0, 1.0)
-    lambda_sdf: float = 10.0  # per metre
-    n_surface_points: int = limited(4096, 1, 65536)  # measured ones, besides the rays
-    lambda_rendering: float = 1.0  # factor of rendered depth and colour; 0: none
+    lambda_sdf: float = 10.0  # 1/m; weight of the errors of the signed distance
+    n_surface_points: int = limited(4096, 1, 65536)  # measured points an iteration
+    lambda_rendering: float = 1.0  # factor of both rendering losses; 0: no rendering losses
 
 
 class NeuSPlusField(NeuSField):
@@ -53,11 +53,11 @@ class NeuSPlusField(NeuSField):
     Settings = NeusPlusMapping
 
     def prepare(self, sequence: RgbdSequence, frames: Frames) -> None:
-        """Collect the surface that the frames saw: distances in free space are measured from it."""
+        """Compute distances from the surface that the frames saw, for the losses in free space."""
         self.observed = ObservedDistance(sequence, frames, self.bounds, self.device)
 
     def mapping_losses(self, draw: Draw, settings: NeusPlusMapping, generator: Generator) -> Losses:
-        """The terms of NeuS, and L1 errors of the signed distance and of the surface's colour."""
+        """The losses of NeuS, and L1 errors of the signed distance and of the surface's colour."""
         rays = draw(settings.n_rays, tangent_planes=True)
         depths = guided_depths(rays, self.bounds, settings, generator)
         surface = draw(settings.n_surface_points)
@@ -85,21 +85,27 @@ class NeuSPlusField(NeuSField):
 def distance_targets(
     rays: Rays, depths: RaySamples, nearest: RaySamples, is_free: Flags, settings: NeusPlusMapping
 ) -> tuple[RaySamples, RaySamples]:
-    """Signed distances (m) to aim at, and a mask of 0 and 1: where one is known.
+    """Target signed distances (m) of samples, and a mask: 1 if the target is known, else 0.
 
-    A measured pixel gives the distance from its tangent plane, (D - d) times the ray's length
-    times the cosine of incidence: exact where the surface is flat, with noise that averages out.
-    In front of the surface it only holds where no other surface is nearer; there, and where the
-    plane is not known, the distance `nearest` from any observed point (m) takes its place, but only
-    farther than `surface_band` from the surface, where it is right to millimetres (see
-    `ObservedDistance`). Just behind the surface the plane is continued, unless a camera saw through
-    the place (`is_free`): thin things end there. Farther behind nothing is known.
+    `nearest` is the distance (m) of samples from the nearest observed point, and `is_free` says
+    whether a camera saw through them. There are two sources of a target:
+
+    - The tangent plane of the ray's pixel: the distance is (D - d) times the length of the ray's
+      direction times the cosine of incidence. It is exact if the surface is flat, and its noise
+      averages out. It is used if no other surface is nearer, in front of the surface and up to
+      10 cm behind it. Behind the surface it is not used where a camera saw through the sample,
+      since thin things end there.
+    - The distance `nearest`. It is used in front of the surface if another surface is nearer or the
+      plane is unknown, but only farther than `surface_band` from the surface: there it is right to
+      millimetres (see `ObservedDistance`).
+
+    Farther behind the surface nothing is known.
 
     Source: distances along the ray as iSDF (Ortiz et al. 2022), nearest points as its "pc" bounds,
-    but over all frames rather than one batch; the choice between them is ours.
+    but over all frames and not one batch; the choice between them is ours.
     """
     before = rays.depth[:, None] - depths  # z-depth from a sample to the surface; negative behind
-    # Distance from the plane for one metre of z-depth; 0 where the normal is not known.
+    # Distance from the plane for each metre of z-depth; 0 if the normal is unknown.
     per_depth = (rays.normals_world * rays.directions_world).sum(dim=1).abs()[:, None]
     plane = before * per_depth
     is_plane_nearest = (per_depth > 0) & ((plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
@@ -111,11 +117,12 @@ def distance_targets(
 
 
 class ObservedDistance:
-    """Unsigned distance from the observed surface, and where cameras saw through, on a grid.
+    """A grid of unsigned distances from the observed surface, and of free space.
 
-    The grid covers the scene's bounds; at its corners distances are those from a mean of measured
-    points, the nearest by an exact Euclidean distance transform. Between corners they are right to
-    millimetres but for the last `voxel` before a surface, where tangent planes serve.
+    The grid covers the scene's bounds. A distance at its vertices is that from the nearest of the
+    fused points (means of measured points), by an exact Euclidean distance transform. Interpolated
+    distances are right to millimetres, except within a `voxel` of a surface. There
+    `distance_targets` uses tangent planes. A vertex is free if a camera saw through it.
     """
 
     def __init__(
@@ -123,8 +130,8 @@ class ObservedDistance:
     ) -> None:
         low, high = np.array(bounds.minimum), np.array(bounds.maximum)
         self.voxel = max(_MIN_VOXEL, (high - low).max() / _MAX_CELLS_A_SIDE)
-        # Points are fused in cells of half the size; the centre of every second one is a corner of
-        # the grid.
+        # Points are fused in fine cells of half the voxel. The grid's vertices are the centres of
+        # every second fine cell.
         fine = self.voxel / 2
         shape = np.ceil((high - low) / fine).astype(int) + 1
         n_pixels = sequence.intrinsics.width * sequence.intrinsics.height
@@ -132,14 +139,14 @@ class ObservedDistance:
         # Fewer than three points of a cell are noise.
         cloud = fuse_points(sequence, frames, bounds, fine, stride, min_count=3)
         points = cloud.points.double().numpy()
-        point_in = np.full(shape, -1)  # each cell's point, by number; -1 where there is none
+        point_in = np.full(shape, -1)  # the index of each cell's point; -1 if it has none
         cells, inside = cells_of(points, low, shape, fine)
         point_in.flat[cells] = np.flatnonzero(inside)
-        # Of each cell the nearest one that has a point, as three indices.
+        # The nearest cell with a point, of each cell: its indices along x, y and z.
         place = distance_transform_edt(point_in < 0, return_distances=False, return_indices=True)
         x, y, z = place[:, ::2, ::2, ::2]
         nearest = points[point_in[x, y, z]]
-        # The corners of the grid, m: the centres of every second cell.
+        # The vertices of the grid, m, world frame.
         corners = np.stack(np.indices(shape)[:, ::2, ::2, ::2], -1) * fine + low + fine / 2
         distance = torch.from_numpy(np.linalg.norm(corners - nearest, axis=-1)).float()
         corners_world = torch.from_numpy(corners.reshape(-1, 3)).float()
@@ -148,9 +155,9 @@ class ObservedDistance:
         self.low = corners_world[0].to(device)
 
     def __call__(self, points_world: Float[Tensor, "rays samples 3"]) -> tuple[RaySamples, Flags]:
-        """Distance (m), and whether a camera saw through, at points (m).
+        """Distances (m) of points (m) from the observed surface, and whether a camera saw through.
 
-        Points outside of the grid get the values at its border.
+        Points outside of the grid get the values of its border.
         """
         values = trilinear(self.values, self.low, self.voxel, points_world.flatten(0, 1))
         distance, free = values.view(2, *points_world.shape[:2])
@@ -161,9 +168,9 @@ class ObservedDistance:
 class GridNetwork:
     """Features at the vertices of some grids, and the small network that reads them."""
 
-    finest: float = limited(0.12, 0.04, 10.0)  # m, edge of the finest cells
-    levels: int = limited(3, 1, 16)  # grids, each twice as coarse as the one before
-    features: int = limited(4, 1, 16)  # a vertex
+    finest: float = limited(0.12, 0.04, 10.0)  # m; cell size of the finest grid
+    levels: int = limited(3, 1, 16)  # number of grids, each twice as coarse as the one before
+    features: int = limited(4, 1, 16)  # numbers a vertex
     hidden: int = limited(32, 1, 4096)  # units of the one hidden layer
 
 
@@ -181,10 +188,10 @@ class GridPlusMapping(NeusPlusMapping):
 
 
 class FeatureGrid(nn.Module):
-    """Colour logits and one value at points, of features that are interpolated in some grids.
+    """Colour logits and one value at points, from features that are interpolated in several grids.
 
-    Source: the dense levels of Instant-NGP (Müller et al. 2022), without its hash table: a room has
-    few vertices.
+    Source: the dense levels of Instant-NGP (Müller et al. 2022). Its hash table is left out, since
+    a room has few vertices.
     """
 
     def __init__(self, settings: GridNetwork, bounds: SceneBounds, generator: Generator) -> None:
@@ -209,12 +216,12 @@ class FeatureGrid(nn.Module):
         """Activations of the hidden layer at points (m, world frame)."""
         levels = zip(self.volumes, self.voxels, strict=True)
         inputs = [trilinear(volume, self.low, voxel, points_world).T for volume, voxel in levels]
-        # The point itself, from about -1 to 1: a unit is half the longest side of the bounds.
+        # The point itself, about in [-1, 1]: `metres_per_unit` is half the bounds' longest side.
         inputs.append((points_world - self.low) / self.metres_per_unit - 1)
         return nn.functional.silu(self.layer(torch.cat(inputs, dim=1)))
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
-        """Raw colour and the raw fourth output, before a field gives them a meaning."""
+        """Colour logits and the value at points (m), before a field applies its activations."""
         color, value = self.head(self.features(points_world)).split([3, 1], dim=1)
         return color, value.squeeze(1)
 
@@ -228,5 +235,5 @@ class GridPlusField(NeuSPlusField):
     Settings = GridPlusMapping
 
     def make_network(self, settings: GridNetwork, generator: Generator) -> FeatureGrid:
-        """The grids, and the small network that reads them."""
+        """The feature grids and their small network, which replace the large network of NeuS."""
         return FeatureGrid(settings, self.bounds, generator)
