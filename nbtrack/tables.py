@@ -52,10 +52,10 @@ def naming_points(results: pd.DataFrame) -> pd.DataFrame:
 def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
     """Table I in long form: means over seeds of results that have a row for each cell and seed.
 
-    Columns are rate_hz (descending), method, scene (as the paper prints it), ate_m and, if there
-    are several seeds, ate_std_m, the sample std (m). A cell with a failed seed is NaN: the mean of
-    the other seeds would hide the failure. If the results have a column still_ate_m, it becomes the
-    method `STANDING_STILL`. Raises DataError for two rows of the same cell and seed.
+    Columns are rate_hz (descending), method, scene (those of the dataset as the paper prints them),
+    ate_m and, for several seeds, ate_std_m, the sample std (m). A cell with a failed seed is NaN:
+    the mean of the others would hide the failure. If the results have a column still_ate_m, it
+    becomes the method `STANDING_STILL`. Raises DataError for two rows of the same cell and seed.
     """
     keys = [*_CELL_1, "seed"] if "seed" in results else _CELL_1
     _check_keys(results, keys)

@@ -36,7 +36,7 @@ class SceneBounds:
 
     @property
     def metres_per_unit(self) -> float:
-        """Metres in a unit of the map; networks take positions in this unit, and so does Adam.
+        """Metres in a unit of the map, for positions in networks and for Adam's position rate.
 
         This is the declared unit or, without one, half of the longest side: NeuS and the Neural
         RGB-D dataset also normalise their scenes to about [-1, 1]^3.

@@ -19,7 +19,7 @@ from nbtrack.machinery.settings import limited
 class NeusMapping(base.MappingSettings):
     """Settings of mapping with NeuS, whose samples are guided by the measured depth."""
 
-    lambda_color: float = 2.0  # lower than iMAP's, since depth errors here are in metres
+    lambda_color: float = 2.0  # beside depth errors in metres, which are not divided by a std
     surface_band: float = 0.15  # m, half width of the region around the measured depth
     lambda_depth: float = 1.0  # per metre
     lambda_eikonal: float = 0.5  # five times that of NeuS: rooms are mostly empty

@@ -114,6 +114,7 @@ def importance_depths(
     # Values of the cumulative distribution, stratified in [0, 1]: they form fewer clusters than
     # independent draws.
     levels = stratified_samples(0.0, depths.new_ones(len(depths)), n_samples, generator)
+    # For each level, the index of the upper border of its cell.
     cell = torch.searchsorted(cdf, levels, right=True).clamp(1, cdf.shape[-1] - 1)
     cdf_low, cdf_high = cdf.gather(-1, cell - 1), cdf.gather(-1, cell)
     low, high = borders.gather(-1, cell - 1), borders.gather(-1, cell)

@@ -60,8 +60,8 @@ class AdamTracker(Tracker):
     ) -> Scalar:
         """The loss at a pose of pixels with directions (z = 1), colours in [0, 1], z-depths (m).
 
-        On CUDA the third call is recorded and then replayed. So whatever else the loss depends on,
-        and changes between steps, must be in tensors.
+        On CUDA the loss is recorded in the third step and then replayed. So what else it depends
+        on, and changes between steps, must be in tensors.
         """
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
