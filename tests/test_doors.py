@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -23,6 +24,7 @@ from nbtrack.beyond.least_squares import interpolation
 from nbtrack.beyond.neus_plus import GridNetwork, GridPlusMapping
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
+from nbtrack.data.frame import Frame
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, NeusMapping, make_field
 from nbtrack.machinery.device import constant, matrix_products, threads
 from nbtrack.machinery.errors import NbtrackError
@@ -89,6 +91,30 @@ REFUSED: dict[str, Callable[[], object]] = {
     "a frame for frames": lambda: SEQUENCE.select(3),
     "points of two": lambda: BoxRoom()(torch.zeros(5, 2)),
     "points of numpy": lambda: BoxRoom()(np.zeros((5, 3))),
+    "a float depth": lambda: replace(SEQUENCE[1], depth_mm=SEQUENCE[1].depth_mm / 1000),
+    "images of numpy": lambda: Frame(CAMERA, SEQUENCE.colors[0], SEQUENCE.depths_mm[0]),
+    "camera last": lambda: Frame.of_images(SEQUENCE.colors[0], SEQUENCE.depths_mm[0], CAMERA),
+    "images for a frame": lambda: tracker().track(SEQUENCE.colors[0]),
+    "a number for a budget": lambda: SdfTracker(BoxRoom(), np.eye(4), 20),
+    "a number for one frame": lambda: tracker().track(SEQUENCE[1], 5),
+    "a class for a field": lambda: tracker(BoxRoom),
+    "no settings": lambda: make_tracker("sdf", BoxRoom(), np.eye(4), StepBudget(1), {}),
+    "fewer times": lambda: replace(SEQUENCE, times=SEQUENCE.times[:2]),
+    "fewer numbers": lambda: replace(SEQUENCE, frame_ids=SEQUENCE.frame_ids[:2]),
+    "a text for a length": lambda: replace(CAMERA, fx="24"),
+    "one number for a corner": lambda: SceneBounds(0, 1),
+    "arguments swapped": lambda: track_sequence(SEQUENCE, tracker()),
+    "mapped when swapped": lambda: map_sequence(SEQUENCE, "neus", NETWORK, NeusMapping(**SMALL)),
+    "no network": lambda: mapped(network=None),
+    "written when swapped": lambda: write_map(mapped(), "here"),
+    "a field for a map": lambda: write_map("here", mapped().field),
+    "no path": lambda: read_map(None),
+    "an empty name": lambda: nbtrack.open_scene("", nbtrack.load_preset()),
+    "a preset's name": lambda: nbtrack.open_scene("office", "smoke"),
+    "its name for maps": lambda: nbtrack.map_scenes(scenes()["scenes"], ["neus"], "smoke"),
+    "no frame of this number": lambda: nbtrack.read_sequence(scenes()["scenes"][0].folder, [99]),
+    "frames as a text": lambda: nbtrack.read_sequence(scenes()["scenes"][0].folder, "0:3"),
+    "a slice for a text": lambda: scenes()["scenes"][0].read(slice(0, 3)),
     "true steps": lambda: make_budget(True, None),
     "200 Hz": lambda: paper_steps("vr", 200),
     "a tracker without a row": lambda: paper_steps("lm", 10),
@@ -111,8 +137,10 @@ REFUSED: dict[str, Callable[[], object]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_wrong_is_refused(case: str) -> None:
-    """Catches arguments that are taken in silence, or end in somebody else's error later on."""
+def test_what_is_wrong_is_refused(case: str, monkeypatch) -> None:
+    """Catches arguments that are taken in silence, or end in somebody else's error later on, where
+    types are not checked at each call."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     with pytest.raises(NbtrackError):
         REFUSED[case]()
 
@@ -126,6 +154,8 @@ def test_right_in_another_form() -> None:
     foreign = replace(backwards, depths_mm=backwards.depths_mm.astype(">u2"))
     assert mapped(foreign).key == mapped(backwards.select(np.arange(4))).key
     assert SceneBounds(*np.array(UNIT)) == SceneBounds(*UNIT)
+    of_numpy = [np.int64(32), np.int64(24), *map(np.float32, (24, 24, 16, 12))]
+    assert repr(Intrinsics(*of_numpy)) == repr(Intrinsics(32, 24, 24.0, 24.0, 16.0, 12.0))
     listed = replace(SDF, settings=["tracking.sdf.n_pixels=16"])
     assert find_methods([listed, SDF, "sdf", listed]) == [listed, SDF]
 
@@ -220,6 +250,8 @@ def test_a_map_of_the_cache_stays_as_it_was_read() -> None:
     key = one.key
     one.field.mlp.head.bias += 1.0
     one.record["quality"].clear()
+    with pytest.raises(ValueError, match="read-only"):  # what the next map would be made of
+        scene.read().depths_mm[:] = 0
     assert one.key != key
     other = nbtrack.map_scene(scene, "neus", preset)
     assert other.key == key

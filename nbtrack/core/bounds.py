@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from nbtrack.core.arrays import Points, Values
 from nbtrack.machinery.device import constant
-from nbtrack.machinery.errors import ConfigError
+from nbtrack.machinery.errors import ConfigError, check_lists
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,9 @@ class SceneBounds:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for corners that are not finite or span no box, or a unit <= 0."""
-        low, high = (tuple(map(float, corner)) for corner in (self.minimum, self.maximum))
-        unit = 1.0 if self.declared_unit is None else self.declared_unit
+        check_lists(at_least=3, minimum=self.minimum, maximum=self.maximum)
+        low, high = (tuple(float(x) for x in corner) for corner in (self.minimum, self.maximum))
+        unit = 1.0 if self.declared_unit is None else float(self.declared_unit)
         has_3_axes = len(low) == len(high) == 3
         if not has_3_axes or not all(0 < x < np.inf for x in (*np.subtract(high, low), unit)):
             raise ConfigError(f"{self} are no bounds: give a minimum and a larger maximum, in m")

@@ -4,15 +4,14 @@ Inside the package every camera frame has OpenCV's axes: x right, y down, z forw
 lie at integer + 0.5, so an image of width W spans [0, W].
 """
 
+import numbers
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float, Real
 from torch import Tensor
 
-from nbtrack.machinery.errors import ConfigError
-from nbtrack.machinery.inputs import whole_number
+from nbtrack.machinery.inputs import number
 
 
 @dataclass(frozen=True)
@@ -27,12 +26,13 @@ class Intrinsics:
     cy: float  # principal point, row; H/2 is the image's middle
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a size or focal length <= 0, or a value that is not finite."""
-        for name in ("width", "height"):
-            whole_number(f"a camera's {name}", getattr(self, name), minimum=1)
-        lengths = self.fx, self.fy, self.cx, self.cy
-        if not (min(lengths[:2]) > 0 and np.isfinite(lengths).all()):
-            raise ConfigError(f"{self} is no camera: give finite pixels, fx and fy above 0")
+        """Raises ConfigError for a number that no camera has. Those of numpy become Python's."""
+        for name, given in vars(self).copy().items():
+            is_size = name in ("width", "height")
+            low = 1 if is_size else 1e-3 if name in ("fx", "fy") else -1e7
+            kind = numbers.Integral if is_size else numbers.Real
+            value = number(f"a camera's {name}", given, low, 1e7, kind)
+            object.__setattr__(self, name, value)
 
     @classmethod
     def from_focal(cls, width: int, height: int, focal: float) -> "Intrinsics":

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values
 from nbtrack.core.camera import Intrinsics, backproject
-from nbtrack.machinery.inputs import checked_images
+from nbtrack.machinery.errors import check_kind
+from nbtrack.machinery.inputs import check_array, checked_images
 
 MILLIMETRE = 1e-3
 
@@ -25,7 +26,13 @@ class Frame:
     name: str = "the frame"  # for error messages
 
     def __post_init__(self) -> None:
-        """Makes the images contiguous: another memory layout would make torch compile again."""
+        """Makes the images contiguous: another memory layout would make torch compile again.
+
+        Raises DataError for images of another size or type.
+        """
+        size = self.camera.height, self.camera.width
+        check_array("color", self.color, (*size, 3), [UInt8], "uint8", Tensor)
+        check_array("depth_mm", self.depth_mm, size, [Int], "whole numbers of mm", Tensor)
         object.__setattr__(self, "color", self.color.contiguous())
         object.__setattr__(self, "depth_mm", self.depth_mm.contiguous())
 
@@ -42,6 +49,7 @@ class Frame:
                 measured if it is 0, NaN, infinite, negative, masked, or at least 65535 mm (the
                 largest number of 16 bits).
         """
+        check_kind(Intrinsics, camera=camera)
         rgb, depth_mm = checked_images(color, depth, (camera.height, camera.width))
         return cls(camera, torch.from_numpy(rgb), torch.from_numpy(depth_mm))
 

@@ -12,7 +12,7 @@ from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.frame import MILLIMETRE, Frame
-from nbtrack.machinery.errors import ConfigError, DataError
+from nbtrack.machinery.errors import ConfigError, DataError, check_kind
 from nbtrack.machinery.inputs import check_array, checked_poses
 
 # `observed_bounds` uses about so many pixels of each frame, on a regular grid (our choice).
@@ -48,6 +48,9 @@ class RgbdSequence:
         check_array("colors", self.colors, (n, *size, 3), [UInt8], "uint8")
         check_array("depths_mm", self.depths_mm, (n, *size), [UInt16], "uint16")
         check_array("T_world_camera", self.T_world_camera, (n, 4, 4), [Float], "floating point")
+        check_array("frame_ids", self.frame_ids, (n,), [Int], "whole numbers")
+        check_array("times", self.times, (n,), [Float], "floating point")
+        check_array("origin", self.origin, (3,), [Float], "floating point")
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -96,6 +99,7 @@ def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
 
     Raises DataError if a frame has no known pose, or if no pixel that is used has a depth.
     """
+    check_kind(RgbdSequence, sequence=sequence)
     poses = checked_poses(sequence.T_world_camera, Path(sequence.name))
     is_posed = np.isfinite(poses).all(axis=(1, 2))
     if not (len(sequence) and is_posed.all()):

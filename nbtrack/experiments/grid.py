@@ -15,7 +15,7 @@ from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.runs import read_trajectory
 from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
-from nbtrack.machinery.errors import ConfigError, NbtrackError, check_lists
+from nbtrack.machinery.errors import ConfigError, NbtrackError, check_kind, check_lists
 from nbtrack.machinery.files import absolute, runs_folder
 from nbtrack.machinery.progress import tell
 from nbtrack.mapping.files import Map
@@ -26,7 +26,7 @@ from nbtrack.tracking.trajectories import Trajectory
 
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
     """The map of a scene, from the cache or made now."""
-    _pairs([scene], [scene])
+    _pairs([scene], [scene], preset)
     job = MapJob.of(scene, field, preset, seed=seed)
     run_jobs([job])
     return job.map()
@@ -37,7 +37,7 @@ def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -
 
     Maps that are not cached are made. Raises ConfigError where scenes or fields are no lists.
     """
-    _pairs(scenes, scenes)
+    _pairs(scenes, scenes, preset)
     check_lists(at_least=1, fields=fields)
     jobs = [MapJob.of(scene, field, preset) for field, scene in product(fields, scenes)]
     rows = []
@@ -71,8 +71,8 @@ def track_scenes(
     Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), the metrics,
     ate_m (NaN if unknown), failure (why). Raises ConfigError first; as jobs do.
     """
-    pairs = _pairs(scenes, scenes if tracked is None else tracked, seeds)
-    rates = _rates(preset.tables.rates_hz, rates_hz, steps, clock)
+    pairs = _pairs(scenes, scenes if tracked is None else tracked, preset, seeds)
+    rates, steps = _rates(preset.tables.rates_hz, rates_hz, steps, clock)
     frames = preset.scenes.track_frames if frames is None else str(frames)
     jobs, rows = [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
@@ -89,23 +89,27 @@ def track_scenes(
     return pd.DataFrame(map(_row_of, rows, _run(jobs, clock, execution or Execution())))
 
 
-def _pairs(scenes: Sequence, tracked: Sequence, seeds: Sequence = (0,)) -> list[tuple]:
+def _pairs(scenes: Sequence, tracked: Sequence, preset: Preset, seeds: Any = (0,)) -> list[tuple]:
     """Each mapped scene and the tracked one. Raises ConfigError for what are no such lists."""
+    check_kind(Preset, preset=preset)
     check_lists(at_least=1, scenes=scenes, tracked=tracked, seeds=seeds)
-    if not all(isinstance(scene, Scene) for scene in (*scenes, *tracked)):
-        raise ConfigError(f"scenes = {[*scenes]!r:.80}: give what open_scenes has returned")
+    for scene in (*scenes, *tracked):
+        check_kind(Scene, scene=scene)
     if len(tracked) != len(scenes):
         raise ConfigError(f"{len(tracked)} tracked for {len(scenes)} scenes: give one for each")
     return [*zip(scenes, tracked, strict=True)]
 
 
-def _rates(usual_hz: Sequence, rates_hz: Sequence | None, steps: Any, clock: bool) -> list:
-    """The rates (Hz) of the cells, None where steps are given. Raises ConfigError for both."""
+def _rates(usual_hz: Sequence, rates_hz: Sequence | None, steps: Any, clock: bool) -> tuple:
+    """The rates (Hz) of the cells, None where steps are given, and steps, as Python's numbers.
+
+    Raises ConfigError for both.
+    """
     rates = usual_hz if rates_hz is None else rates_hz
     check_lists(at_least=1, rates_hz=rates)
     if steps is not None and (rates_hz is not None or clock):
         raise ConfigError(f"steps={steps} beside rates_hz={rates_hz}, clock={clock}: leave one out")
-    return np.asarray(rates).tolist() if steps is None else [None]  # Python's numbers, not numpy's
+    return np.asarray(rates).tolist() if steps is None else [None], np.asarray(steps).tolist()
 
 
 def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[str, Any]:

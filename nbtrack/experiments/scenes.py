@@ -10,7 +10,7 @@ from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.presets import Preset, ScenesConfig
 from nbtrack.experiments.runs import check_no_recording, is_own_output
-from nbtrack.machinery.errors import ConfigError, DataError, MissingError, nearest_name
+from nbtrack.machinery.errors import ConfigError, DataError, MissingError, check_kind, nearest_name
 from nbtrack.machinery.files import absolute, data_folder, fingerprint, locked, runs_folder
 from nbtrack.machinery.progress import ProgressBar, tell
 from nbtrack.recordings import reading
@@ -48,10 +48,13 @@ class Scene:
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
         """The frames of a slice such as `10:50:2`, without depths that are outliers.
 
-        More options, and what is raised, are those of `read_frames`.
+        More options, and what is raised, are those of `read_frames`. Images are read-only: they are
+        shared by all that read this scene, also by what maps it.
         """
         frame_ids = reading.parse_frames(frames)
-        return reading.without_outliers(reading.read_frames(self.recording, frame_ids, **options))
+        read = reading.without_outliers(reading.read_frames(self.recording, frame_ids, **options))
+        read.colors.flags.writeable = read.depths_mm.flags.writeable = False
+        return read
 
     def select(self, frames: str, needs_poses: bool = True) -> Frames:
         """Numbers of the frames of a slice; raises as `select_frames` does."""
@@ -67,6 +70,7 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     format of a folder is by default told by its files. Raises ConfigError where there is no such
     folder, room or scene; MissingError where the scene of the dataset was not downloaded.
     """
+    check_kind(Preset, preset=preset)
     text = str(sequence)
     folder = absolute(sequence)
     # A room or scene comes before a file of its name, and before a folder with nbtrack's results.
@@ -95,6 +99,7 @@ def open_scenes(preset: Preset) -> list[Scene]:
     Raises ConfigError where no name is given, or one twice, or an unknown one; where no scene is
     whole, what is wrong with the first.
     """
+    check_kind(Preset, preset=preset)
     names = preset.scenes.names
     if not names or len({Path(name).name for name in names}) < len(names):
         given = ", ".join(names) or "(none)"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Generator, Tensor, nn
 
 from nbtrack.core.arrays import Colors, Frames, Points, Pose, RayColors, RaySamples, Scalar, Values
@@ -20,7 +20,7 @@ from nbtrack.fields import rendering
 from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.rendering import Rendering, Weights
 from nbtrack.machinery.device import usual_modes
-from nbtrack.machinery.inputs import check_points, checked_pose
+from nbtrack.machinery.inputs import check_array, checked_pose
 from nbtrack.machinery.settings import MANY, limited
 
 # The smallest standard deviation (m) that a depth error is divided by. Without a limit a ray with a
@@ -80,7 +80,7 @@ class Field(nn.Module, abc.ABC):
 
         Raises DataError for anything but a tensor of shape (n, 3).
         """
-        check_points(points_world)
+        check_array("points", points_world, ("n", 3), [Shaped], "in m", Tensor)
         return super().__call__(points_world.float())
 
     @abc.abstractmethod

@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Entry = TypeVar("Entry")
 
@@ -54,6 +54,14 @@ def check_lists(at_least: int = 0, **arguments: object) -> None:
             raise ConfigError(f"{name} = {value!r:.80} is no list: write {name}=[...] around it")
         if len(value) < at_least:
             raise ConfigError(f"{name} = {value!r:.80}: give at least {at_least}")
+
+
+def check_kind(kind: Any, **arguments: object) -> None:
+    """Raises ConfigError for an argument of another class than `kind`, or than all of a union."""
+    for name, value in arguments.items():
+        if not isinstance(value, kind):
+            wanted = getattr(kind, "__name__", kind)
+            raise ConfigError(f"{name} is {value!r:.60}: give what is of class {wanted}")
 
 
 def look_up_kind(what: str, name: str, known: Mapping[str, type], needed: Sequence[str]) -> type:

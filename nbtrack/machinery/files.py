@@ -22,7 +22,7 @@ import torch
 from filelock import FileLock
 
 import nbtrack
-from nbtrack.machinery.errors import DataError, MissingError, NbtrackError
+from nbtrack.machinery.errors import ConfigError, DataError, MissingError, NbtrackError
 from nbtrack.machinery.settings import as_dict
 
 CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
@@ -46,8 +46,11 @@ def absolute(path: Path | str) -> Path:
     """An absolute path without `~` and `..`.
 
     Links are not followed, so that a recording that is given by a link has the name of the link.
-    Raises MissingError for `~` with a name that no user has.
+    Raises MissingError for `~` with a name that no user has, ConfigError for what is no path, and
+    for an empty text, which would mean the working folder.
     """
+    if not isinstance(path, Path | str) or path == "":
+        raise ConfigError(f"{path!r:.80} is no path: give one, or . for the working folder")
     expanded = os.path.expanduser(path)
     if expanded.startswith("~"):  # Python leaves the `~` of an unknown user as it is
         raise MissingError(f"{path}: there is no such user; a folder of this name is ./{path}")

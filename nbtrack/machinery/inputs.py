@@ -38,24 +38,28 @@ _NOT_A_NUMBER = re.compile(r"(?i)(?<![^\s,])[-+]?(?:s?nan\d*(?:\(\w*\))?|\d\.#\w
 _DECIMAL_COMMA = re.compile(r"(?<!\S)[-+]?\d+,\d+(e[-+]?\d+)?(?!\S)")
 
 
-def check_array(what: str, array: Any, shape: tuple, kinds: list, asked: str) -> None:
-    """Raises DataError unless `array` is a numpy array of this shape and of one of these types.
+def check_array(
+    what: str, array: Any, shape: tuple, kinds: list, asked: str, of: type = np.ndarray
+) -> None:
+    """Raises DataError unless `array` is of this class, this shape and one of these types.
 
     `kinds` are the types as jaxtyping has them, as `UInt8`. The message calls the array `what`, and
     describes its allowed types by the words in `asked`.
     """
     wanted = " ".join(map(str, shape))
-    if not any(isinstance(array, kind[np.ndarray, wanted]) for kind in kinds):
-        is_array = isinstance(array, np.ndarray)
-        found = f"{array.dtype} of shape {array.shape}" if is_array else type(array).__name__
-        raise DataError(f"{what} is {found}: give a numpy array, {asked}, of shape {shape}")
+    if not any(isinstance(array, kind[of, wanted]) for kind in kinds):
+        is_of = isinstance(array, of)
+        found = f"{array.dtype} of shape {tuple(array.shape)}" if is_of else type(array).__name__
+        wanted = "numpy array" if of is np.ndarray else "tensor"
+        raise DataError(f"{what} is {found}: give a {wanted}, {asked}, of shape {shape}")
 
 
 def tensor_of(array: np.ndarray) -> Tensor:
     """A tensor with an array's values; it shares the array's memory where PyTorch can do so."""
-    # PyTorch refuses foreign byte orders and negative strides, and warns of read-only memory.
-    is_plain = array.flags.writeable and array.dtype.isnative and min(array.strides, default=0) >= 0
-    return torch.from_numpy(array if is_plain else array.astype(array.dtype.newbyteorder("=")))
+    # PyTorch refuses foreign byte orders and negative strides. `from_numpy` would warn of memory
+    # that is read-only.
+    is_plain = array.dtype.isnative and min(array.strides, default=0) >= 0
+    return torch.from_dlpack(array if is_plain else array.astype(array.dtype.newbyteorder("=")))
 
 
 def checked_images(color: Any, depth: Any, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -87,14 +91,6 @@ def checked_images(color: Any, depth: Any, size: tuple[int, int]) -> tuple[np.nd
     return np.array(np.ma.getdata(color), order="C"), depth_mm
 
 
-def check_points(points: Any) -> None:
-    """Raises DataError for anything but a tensor of points, (n, 3)."""
-    shape = tuple(getattr(points, "shape", ()))
-    if not isinstance(points, Tensor) or len(shape) != 2 or shape[1] != 3:
-        found = f"{type(points).__name__} of shape {shape}"
-        raise DataError(f"points are a {found}: give a tensor of shape (n, 3), in m")
-
-
 def number(name: str, value: Any, minimum: float, maximum: float, kind: type = Real) -> Any:
     """A number from `minimum` to `maximum`, as a float; with the kind `Integral`, as an int.
 
@@ -119,9 +115,11 @@ def checked_pose(T_world_camera: Any) -> Float[np.ndarray, "4 4"]:
 
     Raises DataError if it is no rigid transform, or is not known: not finite, or all 0.
     """
+    if isinstance(T_world_camera, Tensor):  # perhaps on a GPU, or with gradients
+        T_world_camera = T_world_camera.detach().cpu().numpy()
     try:
         pose = np.array(T_world_camera, dtype=np.float64)
-    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor that requires gradients
+    except (TypeError, ValueError):
         pose = np.empty(0)  # of a shape that is refused
     if pose.shape != (4, 4) or not np.isfinite(pose).all() or not pose[:3].any():
         raise DataError("T_world_camera is no rigid transform: give 4 x 4 finite numbers")

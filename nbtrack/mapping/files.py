@@ -16,7 +16,7 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.fields import FIELDS, Field
 from nbtrack.machinery.device import usual_modes
-from nbtrack.machinery.errors import ConfigError, MissingError, look_up
+from nbtrack.machinery.errors import ConfigError, MissingError, check_kind, look_up
 from nbtrack.machinery.files import absolute, digest_of, naming_damaged, write_together
 from nbtrack.machinery.registry import Registry
 
@@ -60,6 +60,7 @@ def write_map(path: Path | str, finished: Map) -> None:
     file gives the same trajectories as the map. If `read_map` could not read the file, nothing is
     written and ConfigError or DataError is raised.
     """
+    check_kind(Map, finished=finished)
     path = absolute(path)
     path = path / MAP_FILE if path.is_dir() else path
     field, bounds = finished.field, finished.field.bounds

@@ -60,7 +60,7 @@ def map_sequence(
     bounds = observed_bounds(sequence)
     kind = field_class(field_name)
     settings = checked(settings, kind.Settings)
-    network = network and checked(network, getattr(kind, "Network", object))
+    network = checked(network, kind.Network) if issubclass(kind, LearnedField) else None
     recipe = recipe_of(field_name, sequence, network, settings, seed)
     start = time.perf_counter()
     mapped, _ = split_holdout(len(sequence), settings.holdout_every)

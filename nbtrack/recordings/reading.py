@@ -7,6 +7,7 @@ the lens is taken out.
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ def parse_frames(text: str) -> slice:
     (slice(10, 50, 2), slice(None, 100, None))
     """
     parts = r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?"
-    match = re.fullmatch(parts, text.replace(" ", ""))
+    match = re.fullmatch(parts, str(text).replace(" ", ""))
     if not match:
         raise DataError(f"frames {text!r} is no slice: write A:B, or A:B:S with S above 0")
     return slice(*(int(part) if part else None for part in match.groups()))
@@ -68,7 +69,7 @@ def read_frames(
     Images stay in memory for the next call. Raises DataError if an image cannot be read, or if no
     frame is left.
     """
-    ids = select_frames(recording, frames, needs_poses) if isinstance(frames, slice) else frames
+    ids = select_frames(recording, frames, needs_poses and isinstance(frames, slice))
     images = images_of(recording)
     colors, depths = images.arrays_of(ids)
     depths_mm = depths if as_stored else images.in_millimetres(depths, ids)
@@ -82,12 +83,18 @@ def read_frames(
     )  # fmt: skip
 
 
-def select_frames(recording: Recording, frames: slice, needs_poses: bool = True) -> Frames:
-    """The numbers of the frames in a slice; with `needs_poses` only of those that have a pose.
+def select_frames(recording: Recording, frames: Any, needs_poses: bool = True) -> Frames:
+    """The numbers of the frames in a slice or list; with `needs_poses` only of those with a pose.
 
-    Raises DataError if there is no such frame.
+    Raises DataError if there is no such frame, or a number that no frame has.
     """
-    frame_ids = np.arange(len(recording))[frames]
+    try:
+        frame_ids = np.atleast_1d(np.arange(len(recording))[frames])
+    except (IndexError, TypeError, ValueError):
+        found = f"frames {frames!r:.80} of {recording.folder}"
+        raise DataError(
+            f"{found}: give a slice or a list of numbers below {len(recording)}"
+        ) from None
     found = f"{len(frame_ids)} of the {len(recording)} frames in {recording.folder} are selected"
     if needs_poses:
         frame_ids = frame_ids[recording.has_pose[frame_ids]]

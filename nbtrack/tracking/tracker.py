@@ -14,7 +14,7 @@ from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
 from nbtrack.data.frame import Frame
 from nbtrack.fields import FIELDS, Field, LearnedField
 from nbtrack.machinery.device import suited_to, synchronize, usual_modes
-from nbtrack.machinery.errors import ConfigError, MissingError, NumericalError
+from nbtrack.machinery.errors import ConfigError, MissingError, NumericalError, check_kind
 from nbtrack.machinery.inputs import checked_pose, whole_number
 from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
 from nbtrack.machinery.settings import checked
@@ -89,8 +89,10 @@ class Tracker(abc.ABC):
         an unknown motion model; MissingError for a package that is not installed; DataError for a
         pose that is not rigid.
         """
+        check_kind(Field, field=field)
         self.check_field(field)
-        self.settings = checked(settings or self.Settings(), self.Settings)
+        check_kind(Budget, budget=budget)
+        self.settings = checked(self.Settings() if settings is None else settings, self.Settings)
         self.field = self.prepare(deepcopy(field)).eval().requires_grad_(False)
         self.device = self.field.device
         self.budget = copy(budget)
@@ -143,6 +145,8 @@ class Tracker(abc.ABC):
         tracker that needs depth returns the pose that the motion model predicts, so that later
         frames can still be found (our choice).
         """
+        check_kind(Frame, frame=frame)
+        check_kind(Budget | None, budget=budget)
         T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
         estimate = Estimate(rigid(T_starts[0]), without_depth=True)
         if self.copes_without_depth or frame.has_depth:

@@ -13,7 +13,7 @@ from nbtrack.core.arrays import Poses
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery import files
 from nbtrack.machinery.device import advise_on_memory
-from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.errors import DataError, check_kind
 from nbtrack.machinery.settings import as_dict
 from nbtrack.tracking.budget import StepBudget
 from nbtrack.tracking.metrics import pose_errors
@@ -95,6 +95,7 @@ def _recipe(tracker: Tracker, sequence: RgbdSequence, is_start_known: bool) -> d
 
 def _check_trackable(sequence: RgbdSequence) -> None:
     """Raises DataError for fewer than two frames, or if no frame has a measured depth."""
+    check_kind(RgbdSequence, sequence=sequence)
     if len(sequence) < 2:
         raise DataError(f"{sequence!r} is too short to track: give at least two frames")
     if not sequence.depths_mm.any():
