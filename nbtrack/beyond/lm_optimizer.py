@@ -1,4 +1,4 @@
-"""The search for a frame's pose from one start: steps of Levenberg-Marquardt in two stages."""
+"""A descent for a frame's pose from one start: steps of Levenberg-Marquardt in two stages."""
 
 import numpy as np
 from jaxtyping import Float
@@ -9,37 +9,38 @@ from nbtrack.beyond.observed import Observed
 from nbtrack.beyond.verdict import MAD_FACTOR, SIGMAS, std_when_moved
 from nbtrack.core.arrays import Pose
 
-_MAX_DAMPING = 1e3  # ends a stage
-# Robust scales (m, luma) at which the ends of descents are compared, also that of a coarse stage
-# with its start, which it may have left for a worse pose.
+_MAX_DAMPING = 1e3  # a larger damping ends a stage
+# Robust scales (m, luma) at which the poses of finished descents are compared, and the pose after a
+# coarse stage with its start, since that stage may end at a worse pose.
 NEAR_SCALES = np.array([0.02, 0.05])
-# From afar distances say where the camera is; intensities mislead: their basin is as wide as the
-# texture.
+# Far from the pose only distances are used: the basin of intensities is as narrow as the texture.
 COARSE = Stage(is_fine=False, mad_factor=10.0, min_step=1e-2)
 FINE = Stage(is_fine=True, mad_factor=MAD_FACTOR, min_step=3e-4)
 
 
 class LmOptimizer:
-    """A search from a start, on some of a frame's points, then on all, in double precision.
+    """A descent from a start: a coarse stage on some points of a frame, then a fine stage on all.
 
-    The caller takes steps until `is_ended`, refines, and takes steps until `is_ended` again.
+    The caller takes steps until `is_ended`, refines, and takes steps until `is_ended` again. The
+    pose is in double precision.
 
-    A step is taken only if it lowers the robust cost; else the damping grows. Robust scales follow
-    the residuals down, so that far-off starts converge and outliers are down-weighted in the end.
+    A step is taken only if it lowers the robust cost. Otherwise the damping grows. Robust scales
+    shrink with the residuals, so that descents from far-off starts converge, and outliers are
+    down-weighted in the end.
     """
 
     def __init__(
         self, grid: Grid, coarse: Observed, fine: Observed, lambda_intensity: float, T_start: Pose
     ) -> None:
-        """Begin the coarse stage, on its points; `fine` are those of the fine stage: all."""
+        """Begin the coarse stage on the points `coarse`; the fine stage takes the points `fine`."""
         self.T_world_camera = T_start
-        self.last_step = np.inf  # rad or m, whichever is more
+        self.last_step = np.inf  # the last twist's largest component (rad or m)
         self.fine_problem = Problem(fine, grid, FINE, lambda_intensity, T_start)
         self._begin_stage(Problem(coarse, grid, COARSE, lambda_intensity=0.0, T_start=T_start))
-        self._start_cost = self.cost(NEAR_SCALES)  # at the start, of the coarse points
+        self._start_cost = self.cost(NEAR_SCALES)  # of the coarse points, at the start
 
     def step(self) -> float:
-        """One step, taken or refused; returns the robust cost before it."""
+        """Try one step, which is taken or refused; returns the robust cost before it."""
         step = lm_solver.try_step(
             self.problem, self.T_world_camera, self.terms, self.scales, self.damping, self.twist
         )
@@ -56,20 +57,20 @@ class LmOptimizer:
         return step.cost_before
 
     def run_stage(self, max_steps: int = 60) -> None:
-        """Take steps of the present stage until it ends, at most `max_steps`."""
+        """Take at most `max_steps` steps of the current stage, until it ends."""
         for _ in range(max_steps):
             if self.is_ended:
                 return
             self.step()
 
     def refine(self) -> None:
-        """Go on with all points from where the coarse stage ended, or from the start if better."""
+        """Begin the fine stage, where the coarse one ended, or at the start if that costs less."""
         if self.cost(NEAR_SCALES) > self._start_cost:
             self.T_world_camera = self.problem.T_start
         self._begin_stage(self.fine_problem)
 
     def run(self) -> None:
-        """Take the search to its end: the rest of its stage, and the fine one if that is left."""
+        """Finish the descent: the rest of the current stage, and the fine stage if it is left."""
         self.run_stage()
         if not self.problem.stage.is_fine:
             self.refine()
@@ -81,28 +82,32 @@ class LmOptimizer:
         return self.is_ended and self.problem.stage.is_fine
 
     def cost(self, scales: Float[np.ndarray, "2"]) -> float:
-        """The robust cost of both residuals at given scales, by which searches are compared.
+        """The robust cost at given scales (m, luma), by which descents are compared.
 
-        Intensities have the weight of the fine stage, in the coarse one too.
+        Intensities have the fine stage's weight in both stages, so that costs are comparable.
         """
         weight = self.fine_problem.lambda_intensity
         return lm_solver.robust_cost(self.terms.residuals, self.terms.reliability, scales, weight)
 
     def certainty(self) -> dict[str, float]:
-        """The share of points that fit, and how well the curvature of their cost holds the pose.
+        """Numbers that tell how well the points fit, and how well the cost holds the pose.
 
-        `known_ratio` is the mean reliability of the points, `fitting_ratio` the share of those that
-        fit, each counted by its reliability: where little was mapped, few can fit at any pose.
-        Intensities count by their differences from the median of all; `intensity_mad` is the median
-        of those (MAD), 0 where they have no weight.
+        - `inlier_ratio`: the share of points that are inliers in distance and intensity;
+        - `known_ratio`: the mean reliability of the points;
+        - `fitting_ratio`: the share of inliers if points count by their reliability, since points
+          of what was not mapped fit at no pose;
+        - `intensity_mad`: the median absolute deviation of the intensity residuals from their
+          median; 0 if intensities have no weight;
+        - `position_std_m`: the position's standard deviation.
         """
         distance, intensity = self.terms.residuals
         reliability = self.terms.reliability
-        # A picture that is darker as a whole is no sign of a wrong pose.
+        # The median is subtracted, since a picture that is darker as a whole is no sign of a wrong
+        # pose.
         has_weight = self.fine_problem.lambda_intensity > 0
         off = np.abs(intensity - _median(intensity)) if has_weight else np.zeros_like(intensity)
         is_near = np.abs(distance) < self.problem.grid.accuracy.inlier_distance
-        is_inlier = is_near & (reliability > 0) & (off < 0.25)  # of luma in [0, 1]
+        is_inlier = is_near & (reliability > 0) & (off < 0.25)  # luma is in [0, 1]
         known_ratio = float(reliability.mean())
         return {
             "inlier_ratio": float(is_inlier.mean()),
@@ -113,42 +118,43 @@ class LmOptimizer:
         }
 
     def _position_std_m(self) -> float:
-        """The position's standard deviation along its least certain direction.
+        """The position's standard deviation (m) along its least certain direction.
 
-        The larger of those by curvature and by `std_when_moved`. Residuals are taken to be
-        independent, which a map's errors are not: it is a lower bound.
+        It is the larger one of two estimates: by the curvature of the cost, and by
+        `std_when_moved`. It is a lower bound, since residuals are taken to be independent, and a
+        map's errors are not.
         """
         H, _ = lm_solver.normal_equations(self.terms, self.scales, self.problem.lambda_intensity)
-        # In rad and m. H is in units of the scales, which are `SIGMAS` standard deviations.
+        # In rad and m. H is in units of the robust scales, which are `SIGMAS` standard deviations.
         covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2
         by_curvature = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:]).max())
-        # If more points counted as independent, as 384, some wrong poses before a flat wall would
-        # pass (docs/tried.md).
+        # With more independent points, such as 384, some wrong poses before a flat wall would pass
+        # (docs/tried.md).
         pose = self.T_world_camera
         moved_std_m = std_when_moved(self._costs_at, pose, covariance, 1, n_independent=256)
         return float(max(by_curvature, moved_std_m))
 
     def _costs_at(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
-        """The points' costs at another pose, at the scales of this one."""
+        """The points' costs at another pose, at the robust scales of the current one."""
         terms = residual_terms(self.problem, T_world_camera)
         return lm_solver.point_costs(terms, self.scales, self.problem.lambda_intensity)
 
     def _begin_stage(self, problem: Problem) -> None:
-        """Begin a stage at the pose so far, with scales and damping anew."""
+        """Begin a stage at the current pose, and reset damping and robust scales."""
         self.problem = problem
         self.damping = 1e-4
         self.is_ended = False
-        self.twist = np.zeros(6)  # of the step before
+        self.twist = np.zeros(6)  # of the last step
         self.terms = residual_terms(problem, self.T_world_camera)
-        self.scales = np.full(2, np.inf)  # they only fall, here to those of the residuals
+        self.scales = np.full(2, np.inf)  # `_narrow_scales` can only reduce them
         self._narrow_scales()
 
     def _narrow_scales(self) -> None:
-        """Let the robust scales follow the residuals down; they never grow in a stage."""
+        """Reduce the robust scales as the residuals allow; they never grow in a stage."""
         sigma, factor = self.problem.grid.accuracy.residual_sigma, self.problem.stage.mad_factor
         self.scales = lm_solver.robust_scales(self.terms.residuals, self.scales, sigma, factor)
 
 
 def _median(values: Float[np.ndarray, "n"]) -> float:
-    """One of the values: of an even number the upper one of the two in the middle."""
+    """The median; of an even number of values it is the upper one of the two in the middle."""
     return np.partition(values, len(values) // 2)[len(values) // 2]

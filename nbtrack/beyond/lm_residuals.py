@@ -2,26 +2,26 @@
 
 A point p of the frame (m, camera frame) has an intensity c (luma, in [0, 1]) and perhaps a unit
 normal n. At the pose (R, t) it lies at x = R p + t, with the lever arm a = x - t. The grid
-interpolates the signed distance f(x) (m), the intensity I(x) and the confidence k(x). With the
-gradient norm g = |grad f(x)|, never below G_MIN where it divides, a point has two residuals and
-their derivatives with respect to a twist (omega, v):
+interpolates the signed distance f(x) (m), the intensity I(x) and the confidence k(x). The gradient
+norm is g = |grad f(x)|, and at least G_MIN in divisions. A point has two residuals and their
+derivatives with respect to a twist (omega, v):
 
     r_d = f / g,   q_d = grad f / g,   J_d = [(a x q_d)', q_d']
     r_i = I - c,   q_i = grad I,       J_i = [(a x q_i)', q_i']
 
-g is held fixed in J_d. Dividing by it corrects distances that grow too fast or too slowly to first
-order. Source: paper, Eq. 2; f / |grad f| is an option in PIN-SLAM (Pan et al. 2024).
+J_d takes g as constant. The division by g corrects, to first order, distances that grow too fast or
+too slowly. Source: paper, Eq. 2; f / |grad f| is an option in PIN-SLAM (Pan et al. 2024).
 
 A twist changes the pose about the camera's centre, with world axes: x -> t + v + exp(omega) a.
 
-The reliability w of a point, in [0, 1], is 0 outside of the bounds and their margin, and where
-g <= G_MIN or g >= G_MAX (PIN-SLAM: 0.5 to 2); elsewhere
+The reliability w of a point lies in [0, 1]. It is 0 farther than a margin outside of the bounds,
+and if g <= G_MIN or g >= G_MAX (PIN-SLAM: 0.5 to 2). Otherwise
 
     w = (1 + ((g - 1) / G_SCALE)^2)^-2 * max(0, (R n)' grad f / g)^2 * k
 
-The factor of the normal counts where one is given (coarse stage): the nearest surface is not the
-observed one if it faces elsewhere. That of k counts in the fine stage: from afar, where no point
-lies at its surface, none would count.
+The second factor is used if the points have normals, as in the coarse stage: a surface that faces
+another way is not the observed one. The factor k is used in the fine stage alone. In the coarse
+stage no point may lie at its surface yet, and none would count.
 """
 
 from typing import NamedTuple, no_type_check
@@ -36,43 +36,48 @@ from nbtrack.core.arrays import Pose
 G_MIN = 0.3
 G_MAX = 2.0
 G_SCALE = 0.5
-MARGIN = 0.3  # m beyond a field's bounds, where walls lie if the pose is off
+MARGIN = 0.3  # m; points so far outside of the bounds are used: walls lie there if the pose is off
 ONE = np.float32(1)
 ZERO = np.float32(0)
 
 
 class Grid(NamedTuple):
-    """A baked field as the compiled functions take it. Lengths in m."""
+    """A baked field in a form that compiled functions can take. Lengths in m."""
 
-    vertices: np.ndarray  # n x 3: distance, intensity, confidence; z is fastest
+    vertices: np.ndarray  # n x 3: distance, intensity, confidence; row-major, z is fastest
     n_vertices: np.ndarray  # 3, along x, y and z
-    low: np.ndarray  # 3, the first vertex
+    low: np.ndarray  # 3, position of the first vertex
     voxel: float
-    usable_low: np.ndarray  # 3, corners of the box whose points are usable
+    usable_low: np.ndarray  # 3, lowest and highest corner of the box in which points are used
     usable_high: np.ndarray
     accuracy: Accuracy
 
 
 class Stage(NamedTuple):
-    """Which residuals count in a part of a search, and when it ends."""
+    """Settings of the coarse or the fine stage of a descent."""
 
-    is_fine: bool  # all points, both residuals and confidence; else some points' distances, normals
-    mad_factor: float  # medians of |r| in a robust scale
+    # True: all points, with both residuals and the confidence. False: some points, with distances
+    # and normals.
+    is_fine: bool
+    mad_factor: float  # a robust scale is so many medians of |r|
     min_step: float  # rad and m: a shorter twist ends the stage
 
 
 class Problem(NamedTuple):
-    """What the cost and the prior of `lm_solver` need to be computed at a pose."""
+    """All that stays the same in a stage: what `lm_solver` needs besides the pose."""
 
     observed: Observed
     grid: Grid
     stage: Stage
     lambda_intensity: float
-    T_start: Pose
+    T_start: Pose  # the pose prior's mean
 
 
 class Terms(NamedTuple):
-    """What the cost needs of n points at a pose, in single precision. Distances come first."""
+    """Residuals, reliabilities and derivatives of n points at a pose, in single precision.
+
+    Of two rows the first is for the distance, the second for the intensity.
+    """
 
     residuals: np.ndarray  # 2 x n: r_d (m) and r_i
     reliability: np.ndarray  # n: w
@@ -81,7 +86,7 @@ class Terms(NamedTuple):
 
 
 def grid_of(field: BakedField) -> Grid:
-    """The grid of a field on the host."""
+    """Convert a baked field on the host."""
     intensity = field.volume[:3].T @ torch.tensor(LUMA, dtype=torch.float32)
     value, confidence = field.volume[3:]
     vertices = torch.stack([value, intensity, confidence], dim=1).numpy()
@@ -94,23 +99,23 @@ def grid_of(field: BakedField) -> Grid:
 @no_type_check
 @compiled
 def residual_terms(problem: Problem, T: Pose) -> Terms:
-    """The terms of all points at a pose.
+    """The terms of a problem's points at the pose `T`.
 
-    Loops are plain, which numba compiles soonest; no result depends on the number of threads.
+    Plain loops compile fastest in numba, and no result depends on the number of threads.
     """
     points, grid = problem.observed.points, problem.grid
     n_points = len(points)
     residuals = np.empty((2, n_points), np.float32)
     gradients = np.empty((2, 3, n_points), np.float32)
     lever_arms, reliability, cells, in_cell, per_metre = _locate(points, T, grid)
-    # Unsigned numbers of vertices, so that numba adds no check for negative indices.
+    # Indices of vertices are unsigned, so that numba adds no check for negative ones.
     vertices, step_z = grid.vertices, np.uintp(1)
     step_x, step_y = np.uintp(grid.n_vertices[1] * grid.n_vertices[2]), np.uintp(grid.n_vertices[2])
     for i in range(n_points):
         v, x, y, z = np.uintp(cells[i]), in_cell[0, i], in_cell[1, i], in_cell[2, i]
         for k in range(3 if problem.stage.is_fine else 2):  # distance, intensity, confidence
-            # Trilinear interpolation: c011 is the value at the cell's corner that is low in x, high
-            # in y and z; c01 is interpolated along z, c0 along y as well.
+            # Trilinear interpolation. c011 is the value at the corner of the cell that is low in x
+            # and high in y and z. c01 is interpolated along z, and c0 along y as well.
             c000, c001 = vertices[v, k], vertices[v + step_z, k]
             c010, c011 = vertices[v + step_y, k], vertices[v + step_y + step_z, k]
             c100, c101 = vertices[v + step_x, k], vertices[v + step_x + step_z, k]
@@ -121,7 +126,7 @@ def residual_terms(problem: Problem, T: Pose) -> Terms:
             if k == 2:
                 reliability[i] *= c0 + x * (c1 - c0)
                 break
-            # The derivative along z, at low and at high x.
+            # Derivatives along z at low x and at high x, interpolated along y.
             low_z = c001 - c000 + y * (c011 - c010 - c001 + c000)
             high_z = c101 - c100 + y * (c111 - c110 - c101 + c100)
             residuals[k, i] = c0 + x * (c1 - c0)
@@ -137,11 +142,16 @@ def residual_terms(problem: Problem, T: Pose) -> Terms:
 @no_type_check
 @compiled
 def _locate(points: Array, T: Pose, grid: Grid) -> tuple[Array, ...]:
-    """Where points (m, camera frame) lie in the grid at a pose.
+    """Locate points (n x 3, m, camera frame) in the grid at the pose `T`.
 
-    Returns lever arms (3 x n, m); reliabilities (n), 1 or, out of the usable box, 0; cells (n), as
-    numbers of their first vertices; positions in them (3 x n, from 0 to 1); and 1 / voxel (3 x n,
-    1/m), by which derivatives along a cell are multiplied, or 0 outside of the grid.
+    Returns five arrays:
+
+    - lever arms (3 x n, m);
+    - reliabilities (n): 1, or 0 outside of the usable box;
+    - cells (n): the row-major numbers of their lowest vertices;
+    - positions in the cells (3 x n, from 0 to 1);
+    - factors (3 x n, 1/m) that make derivatives per cell derivatives per metre: 1 / voxel, or 0 for
+      points outside of the grid along that axis.
     """
     n_points, inverse = len(points), 1 / grid.voxel
     reliability, cells = np.ones(n_points, np.float32), np.zeros(n_points, np.int64)
@@ -156,20 +166,22 @@ def _locate(points: Array, T: Pose, grid: Grid) -> tuple[Array, ...]:
             if not grid.usable_low[k] <= world <= grid.usable_high[k]:
                 reliability[i] = 0
             scaled = (world - grid.low[k]) * inverse
-            # Points outside of the grid, and NaN, are moved to its border; the gradient is 0 there.
+            # Points outside of the grid, and NaN, are moved to its border. Their gradient is 0.
             per_metre[k, i] = inverse if (scaled >= 0) & (scaled <= last) else 0.0
             scaled = min(scaled, last) if scaled > 0 else 0.0
             cell = min(int(scaled), grid.n_vertices[k] - 2)
             in_cell[k, i] = scaled - cell
-            cells[i] = cells[i] * grid.n_vertices[k] + cell  # after all axes: z is fastest
+            cells[i] = cells[i] * grid.n_vertices[k] + cell  # row-major after all axes
     return lever_arms, reliability, cells, in_cell, per_metre
 
 
 @no_type_check
 @compiled
 def _weigh(terms: Terms, normals: Array, T: Pose) -> None:
-    """Complete the terms in place: weigh points by their gradient's norm and, if given, by normals;
-    divide distances and their gradients by that norm.
+    """Complete the terms in place.
+
+    Reliabilities are multiplied by the factors of the gradient norm g and, if there are normals, of
+    these. Distances and their gradients are divided by g.
     """
     gradient = terms.gradients[0]
     for i in range(len(terms.reliability)):

@@ -1,20 +1,24 @@
 """Levenberg-Marquardt on a pose: the cost of residuals, normal equations, and a step; compiled.
 
-Residuals r, their derivatives J and reliabilities w are those of `lm_residuals`. With scales s, the
-weight l of intensity, u = r / s, and Geman-McClure's rho(u) = u^2 / (1 + u^2), the cost of n points
-and the normal equations are
+Residuals r, their derivatives J and reliabilities w are those of `lm_residuals`. The index d is for
+the distance, i for the intensity. s are the robust scales, u = r / s, l is the weight of intensity,
+and rho(u) = u^2 / (1 + u^2) is the loss of Geman and McClure. The cost of n points and the normal
+equations are
 
     cost = 1/n sum [w (rho(u_d) + l rho(u_i)) + (1 - w) (1 + l)]
     H = sum w [J_d' J_d / (s_d (1 + u_d^2))^2 + l J_i' J_i / (s_i (1 + u_i^2))^2]
     b = sum w [J_d' r_d / (s_d (1 + u_d^2))^2 + l J_i' r_i / (s_i (1 + u_i^2))^2]
 
-so that an unusable point costs the most: no pose gets cheaper by moving points out of the map. A
-step solves, with the damping m and the prior weight P,
+An unreliable point has the largest cost, so that no pose gets cheaper by moving points out of the
+map.
+
+The pose prior P (1 - cos(angle) + offset^2 / 2) has the weight P, for the rotation (angle, axis)
+and the offset since the start. With the damping m a step solves
 
     (H + P + m diag H) twist = -(b + P [sin(angle) axis, offset])
 
-of the turn and the offset since the start: the pose prior P (1 - cos(angle) + offset^2 / 2).
-Scales are a factor times the median of |r|, never below the field's residual sigma, and never grow.
+A robust scale is a factor times the median of |r|. It is at least the field's residual sigma, and
+never grows.
 """
 
 from typing import NamedTuple, no_type_check
@@ -25,31 +29,33 @@ from nbtrack.beyond.lm_residuals import ONE, ZERO, Problem, Terms, residual_term
 from nbtrack.beyond.observed import Array, compiled
 from nbtrack.core.arrays import Pose
 
-# So weak that it decides only where the frame says nothing, as along a corridor: one point's worth
-# at a twist of 0.5 rad or 0.5 m (our choice).
+# The prior is as strong as one point at a twist of 0.5 rad or 0.5 m. It is so weak that it decides
+# only along directions in which the frame does not hold the pose, as along a corridor (our choice).
 PRIOR_WEIGHT = 1 / 0.5**2
-_MIN_RATIO = 0.5  # steps creep if each is longer than this share of the last one
-_MAX_RATIO = 0.9  # larger ratios are taken for this one, so that no limit is too far
+# Steps creep if the ratio of a step's length, along the last step, to that of the last one is above
+# _MIN_RATIO. Ratios above _MAX_RATIO count as _MAX_RATIO, which bounds the extrapolation.
+_MIN_RATIO = 0.5
+_MAX_RATIO = 0.9
 
 
 class Step(NamedTuple):
-    """What came of a step: if it was not better, pose, terms and twist are those before it."""
+    """The result of a step. If it was refused, pose, terms and twist are those before it."""
 
-    is_better: bool
+    is_better: bool  # whether the step lowered the cost; otherwise it is refused
     T_world_camera: Pose
     terms: Terms
     twist: np.ndarray  # 6: omega (rad) and v (m)
-    length: float  # of what was tried: rad or m, whichever is more
+    length: float  # of the tried twist: its largest component (rad or m)
     cost_before: float
 
 
 def robust_scales(residuals: Array, before: Array, sigma: Array | tuple, factor: float) -> Array:
-    """Robust scales of both residuals (2), given those before: as the module states them.
+    """Robust scales of distance (m) and intensity: `factor` times the median of each |residual|.
 
-    `sigma` is the least scale of each, `factor` what medians are multiplied by. Not compiled, since
-    that would take seconds for numpy's `partition`.
+    `residuals` are 2 x n. A scale is at least its `sigma`, and at most the one `before`. The
+    function is not compiled, since numpy's `partition` would take seconds to compile.
     """
-    # In most steps scales cannot fall any more: no median then, which takes as long as many sums.
+    # In most steps the scales cannot fall any more. Then the slow median is not computed.
     if (before <= sigma).all():
         return before
     middle = (residuals.shape[1] - 1) // 2
@@ -62,7 +68,10 @@ def robust_scales(residuals: Array, before: Array, sigma: Array | tuple, factor:
 def robust_cost(
     residuals: Array, reliability: Array, scales: Array, lambda_intensity: float
 ) -> float:
-    """The mean cost of the points, as the module states it."""
+    """The mean cost of the points: the module's docstring has the equation.
+
+    `residuals` are 2 x n, `reliability` is n, and `scales` are 2.
+    """
     total, weight = 0.0, np.float32(lambda_intensity)
     per_scale_d, per_scale_i = np.float32(1 / scales[0]), np.float32(1 / scales[1])
     for i in range(len(reliability)):
@@ -74,7 +83,7 @@ def robust_cost(
 
 
 def point_costs(terms: Terms, scales: Array, lambda_intensity: float) -> Array:
-    """The cost of each point (n,), of which `robust_cost` is the mean."""
+    """The cost of each point (n,). Their mean is `robust_cost`."""
     squares = (terms.residuals / scales[:, None]) ** 2
     distance, intensity = squares / (1 + squares)
     cost = distance + lambda_intensity * intensity
@@ -84,7 +93,7 @@ def point_costs(terms: Terms, scales: Array, lambda_intensity: float) -> Array:
 @no_type_check
 @compiled
 def normal_equations(terms: Terms, scales: Array, lambda_intensity: float) -> tuple[Array, Array]:
-    """H (6 x 6) and b (6), in double precision, as the module states them."""
+    """H (6 x 6) and b (6), in double precision: the module's docstring has the equations."""
     n_points = len(terms.reliability)
     jacobian, weights = np.empty((6, n_points), np.float32), np.empty(n_points, np.float32)
     matrix, vector = np.zeros((6, 6)), np.zeros(6)
@@ -94,7 +103,7 @@ def normal_equations(terms: Terms, scales: Array, lambda_intensity: float) -> tu
         for i in range(n_points):
             gx, gy, gz = gradients[0, i], gradients[1, i], gradients[2, i]
             ax, ay, az = terms.lever_arms[0, i], terms.lever_arms[1, i], terms.lever_arms[2, i]
-            # A column of the Jacobian: the lever arm a cross the gradient g, then g itself.
+            # A column of the Jacobian: the cross product a x g of lever arm and gradient, then g.
             jacobian[0, i], jacobian[1, i] = ay * gz - az * gy, az * gx - ax * gz
             jacobian[2, i], jacobian[3, i] = ax * gy - ay * gx, gx
             jacobian[4, i], jacobian[5, i] = gy, gz
@@ -115,13 +124,14 @@ def normal_equations(terms: Terms, scales: Array, lambda_intensity: float) -> tu
 @no_type_check
 @compiled
 def retract(T: Pose, twist: Array) -> Pose:
-    """The pose after a twist (omega in rad, v in m), by Rodrigues' formula; finite at zero."""
+    """The pose after a twist (omega in rad, v in m; world axes), by Rodrigues' formula."""
     x, y, z = twist[0], twist[1], twist[2]
     angle = np.sqrt(x * x + y * y + z * z)
     sine = np.sin(angle) / angle if angle > 1e-9 else 1.0
     versine = 2 * (np.sin(angle / 2) / angle) ** 2 if angle > 1e-9 else 0.5
     after = T.copy()
-    for k in range(3):  # an axis a of the camera turns into a + sine w x a + versine w x (w x a)
+    # With w = omega an axis a of the camera turns into a + sine w x a + versine w x (w x a).
+    for k in range(3):
         a, b, c = T[0, k], T[1, k], T[2, k]
         p, q, r = y * c - z * b, z * a - x * c, x * b - y * a
         after[0, k] += sine * p + versine * (y * r - z * q)
@@ -146,8 +156,8 @@ def damped_step(problem: Problem, T: Pose, terms: Terms, scales: Array, damping:
         vector[3 + k] += PRIOR_WEIGHT * (T[k, 3] - problem.T_start[k, 3])
     for k in range(6):
         matrix[k, k] += PRIOR_WEIGHT + damping * matrix[k, k]
-    # Gaussian elimination without pivots, which positive definite matrices do not need; then back
-    # substitution, with the sign of the twist.
+    # Gaussian elimination: a positive definite matrix needs no pivots. The back substitution after
+    # it also changes the sign.
     for k in range(6):
         for i in range(k + 1, 6):
             share = matrix[i, k] / matrix[k, k]
@@ -166,20 +176,23 @@ def damped_step(problem: Problem, T: Pose, terms: Terms, scales: Array, damping:
 def try_step(
     problem: Problem, T: Pose, terms: Terms, scales: Array, damping: float, last_twist: Array
 ) -> Step:
-    """A step from a pose with its terms, after a step of `last_twist` (0 at first).
+    """Try a step from the pose `T`, whose terms are `terms`, and take it if it lowers the cost.
 
-    Steps that creep, each hardly shorter than the last one and in nearly its direction, are a
-    geometric series: first its limit is tried (Aitken 1926), so far as `_MAX_RATIO` allows, and
-    the step alone if that is no better.
+    `last_twist` is the step before (0 at first). If steps creep, each hardly shorter than the last
+    one and in nearly the same direction, they are taken for a geometric series. Then its limit is
+    tried first (Aitken 1926), as far as `_MAX_RATIO` allows, and the step alone if the limit is no
+    better.
 
-    In the fine stage the cost after a step has the reliabilities of usable points before it. From
-    cell to cell of a grid gradients jump, and reliabilities with them, which makes a pose no worse.
-    In the coarse stage, far from the pose, reliable gradients are a sign that a surface is near.
+    In the fine stage, usable points keep the reliabilities from before the step in the cost after
+    it. Gradients of a grid jump from cell to cell, and reliabilities with them, although the pose
+    is no worse. In the coarse stage the new reliabilities count: far from the pose, a reliable
+    gradient is a sign that a surface is near.
     """
     twist = damped_step(problem, T, terms, scales, damping)
     before = robust_cost(terms.residuals, terms.reliability, scales, problem.lambda_intensity)
     along, square = (twist * last_twist).sum(), (last_twist * last_twist).sum()
-    # Along the last twist longer than a share of it, and less than 45 degrees off it: cos^2 > 0.5.
+    # The ratio along / square is above _MIN_RATIO, and the angle between the twists is below 45
+    # degrees: cos^2 > 0.5.
     does_creep = along > _MIN_RATIO * square and along**2 > 0.5 * square * (twist * twist).sum()
     stride = 1 / (1 - min(along / square, _MAX_RATIO)) if does_creep else 1.0
     for factor in (stride, 1.0):
