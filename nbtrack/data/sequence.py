@@ -17,8 +17,7 @@ from nbtrack.machinery.inputs import check_array, checked_poses
 
 # `observed_bounds` uses about so many pixels of each frame, on a regular grid (our choice).
 _POINTS_PER_FRAME = 2000
-# The share of points that it leaves out at either end of each axis, so that a few wrong depths do
-# not stretch the box (our choice).
+# The share of points that it leaves out at either end of each axis (our choice).
 _CUT_OFF = 0.002
 # The fields of a sequence that have one row for each frame.
 ARRAYS = "colors", "depths_mm", "T_world_camera", "frame_ids", "times"
@@ -95,8 +94,9 @@ class RgbdSequence:
 
 
 def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
-    """The box around all that a sequence sees and around its cameras, enlarged by `margin` (m).
+    """The box around what a sequence sees and around its cameras, enlarged by `margin` (m).
 
+    A few points at either end of each axis are left out, so that wrong depths do not stretch it.
     Raises DataError if a frame has no known pose, or if no pixel that is used has a depth.
     """
     check_kind(RgbdSequence, sequence=sequence)

@@ -112,7 +112,7 @@ class _Fit:
         self.field = field
         parameters = {"params": [*field.parameters()], "lr": settings.learning_rate}
         self.optimizer = make_adam([parameters], field.device)
-        self.rate = self.optimizer.param_groups[0]["lr"]
+        self.rate = self.optimizer.param_groups[0]["lr"]  # a tensor, since recorded steps read it
         self.generator = torch.Generator(field.device).manual_seed(recipe["seed"])
         self.sampler = PixelSampler(seen, field.device)
         self.frames = torch.from_numpy(mapped).to(field.device)

@@ -232,6 +232,7 @@ def camera_poses(parameters: PoseParameters) -> Poses:
     down = np.cross(forward, right)
     rolled_right = np.cos(roll) * right + np.sin(roll) * down
     rolled_down = np.cos(roll) * down - np.sin(roll) * right
+    # The columns of a pose: the camera's axes x (right), y (down), z (forward), and its position.
     poses = np.tile(np.eye(4), (len(parameters), 1, 1))
     poses[:, :3] = np.stack([rolled_right, rolled_down, forward, parameters[:, :3]], axis=-1)
     return poses
