@@ -113,7 +113,7 @@ class Tracker(abc.ABC):
         """
         kind = field if isinstance(field, type) else type(field)
         fits = issubclass(kind, Field) and cls.works_in(kind)
-        # A class may have distances although one of its fields has none: a grid made from a density.
+        # A grid that is made from a density has no distances, although its class has.
         if not fits or (kind.is_distance and not field.is_distance):
             named = getattr(kind, "name", kind.__name__)
             known = ", ".join(name for name, other in FIELDS.items() if cls.works_in(other))
