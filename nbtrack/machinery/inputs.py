@@ -4,6 +4,7 @@ import codecs
 import json
 import re
 import tomllib
+from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -46,12 +47,17 @@ def check_array(
     `kinds` are the types as jaxtyping has them, as `UInt8`. The message calls the array `what`, and
     describes its allowed types by the words in `asked`.
     """
-    wanted = " ".join(map(str, shape))
-    if not any(isinstance(array, kind[of, wanted]) for kind in kinds):
+    if not any(isinstance(array, _type_of(kind, of, shape)) for kind in kinds):
         is_of = isinstance(array, of)
         found = f"{array.dtype} of shape {tuple(array.shape)}" if is_of else type(array).__name__
         wanted = "numpy array" if of is np.ndarray else "tensor"
         raise DataError(f"{what} is {found}: give a {wanted}, {asked}, of shape {shape}")
+
+
+@cache  # frames and queries are checked thousands of times, and a type takes 50 us to make
+def _type_of(kind: Any, of: type, shape: tuple) -> type:
+    """Arrays of a class, a kind as jaxtyping has them, and a shape, for `isinstance`."""
+    return kind[of, " ".join(map(str, shape))]
 
 
 def tensor_of(array: np.ndarray) -> Tensor:
