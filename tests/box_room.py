@@ -1,7 +1,5 @@
 """Fields whose answers are known exactly, among them a box seen from inside; and exact images."""
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
@@ -9,7 +7,6 @@ from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
-from nbtrack.data.pixels import Rays
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import LearnedField
 from nbtrack.fields.rendering import weights_from_density, weights_from_sdf
@@ -30,9 +27,9 @@ class Formula(LearnedField):
 
     def __init__(
         self,
-        value: Callable[[Tensor], Tensor],
+        value,
         bounds: SceneBounds,
-        color: Callable[[Tensor], Tensor] = grey,
+        color=grey,
         as_density: bool = False,
     ) -> None:
         super().__init__(bounds)
@@ -41,7 +38,7 @@ class Formula(LearnedField):
     def forward(self, points_world: Tensor) -> tuple[Tensor, Tensor]:
         return self.color(points_world), self.value(points_world)
 
-    def weights(self, values: Tensor, rays: Rays, depths: Tensor) -> Tensor:
+    def weights(self, values: Tensor, rays, depths: Tensor) -> Tensor:
         if self.as_density:
             return weights_from_density(values, depths, rays.directions_world.norm(dim=-1))
         return weights_from_sdf(values, torch.tensor(50.0))

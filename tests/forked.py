@@ -1,9 +1,7 @@
 """Processes that start at once, forked from one that has imported everything."""
 
 import multiprocessing
-from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 from unittest import mock
 
 import dask
@@ -12,7 +10,7 @@ IMPORTED = ["torch._dynamo", "trimesh", "pytest", "distributed", "nbtrack.experi
 
 
 @contextmanager
-def forking() -> Iterator[Any]:
+def forking():
     """The context of `multiprocessing` that starts them; workers, also Dask's, are such ones."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(IMPORTED)

@@ -11,22 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import recordings
 from box_room import BoxRoom, box_sequence, poses_at
-from recordings import (
-    Change,
-    Source,
-    along_rays,
-    camera,
-    depth,
-    matrix_text,
-    positions,
-    real,
-    source,
-    with_noise,
-    write_matrices,
-    write_neural_rgbd,
-    write_recording,
-)
+from recordings import along_rays, camera, depth, positions, real, source, with_noise
 from scipy.spatial.transform import Rotation
 from tiny import tiny_words
 
@@ -63,7 +50,8 @@ def write_box(folder: Path, poses: np.ndarray, depth_scale: float = 1.0) -> Path
     """Bare walls with exact depth: rays end where they leave the box."""
     sequence = box_sequence(poses, BoxRoom(half=(1.5, 1.2, 1.5), contrast=0.0), 48)
     depths = np.rint(depth_scale * sequence.depths_mm).astype(np.uint16)
-    write_neural_rgbd(folder, Source(sequence.colors, depths, poses, sequence.intrinsics))
+    data = recordings.Source(sequence.colors, depths, poses, sequence.intrinsics)
+    recordings.write_neural_rgbd(folder, data)
     return folder
 
 
@@ -80,7 +68,7 @@ def as_written(T: np.ndarray, camera_axes: str, poses: str = "camera-to-world") 
 
 
 def rewrite_poses(folder: Path, poses: np.ndarray) -> None:
-    (folder / "poses.txt").write_text(matrix_text(poses.reshape(-1, 4)))
+    (folder / "poses.txt").write_text(recordings.matrix_text(poses.reshape(-1, 4)))
 
 
 @pytest.fixture
@@ -199,8 +187,8 @@ def test_far_outliers(tmp_path: Path) -> None:
     depths = data.depths_mm.copy()
     is_far = rng.random(depths.shape) < share
     depths[is_far] = rng.integers(40_000, 65_000, is_far.sum())
-    right = write_recording("plain", tmp_path / "right")
-    far = write_recording("plain", tmp_path / "far", data._replace(depths_mm=depths))
+    right = recordings.write_recording("plain", tmp_path / "right")
+    far = recordings.write_recording("plain", tmp_path / "far", data._replace(depths_mm=depths))
     sequences = [Scene(path.name, path).read() for path in (right, far)]
     assert np.array_equal(sequences[0].depths_mm, read_sequence(right).depths_mm)
     sizes = [np.array([b.minimum, b.maximum]) for b in map(observed_bounds, sequences)]
@@ -210,7 +198,7 @@ def test_far_outliers(tmp_path: Path) -> None:
 
 
 @cache
-def seen(name: str) -> Source:
+def seen(name: str) -> recordings.Source:
     """A room with a Kinect's noise, or the real recording at a quarter of its size."""
     if name == "real_room":
         return real(name, slice(60, 96, 2), 4)  # before, its poses are off by twice as much
@@ -222,17 +210,17 @@ class Case(NamedTuple):
 
     says: str  # as a regular expression, after "your ... look like"
     settings: str = ""
-    change: Change = lambda data: data
+    change: recordings.Change = lambda data: data
 
 
-def poses(axes: str, direction: str = "camera-to-world") -> Change:
+def poses(axes: str, direction: str = "camera-to-world"):
     return lambda data: data._replace(poses=as_written(data.poses, axes, direction))
 
 
-def rolled(places: int) -> Change:
+def rolled(places: int):
     """Matrices made from quaternions whose order was mistaken."""
 
-    def change(data: Source) -> Source:
+    def change(data):
         q = np.roll(Rotation.from_matrix(data.poses[:, :3, :3]).as_quat(), places, axis=1)
         wrong = data.poses.copy()
         wrong[:, :3, :3] = Rotation.from_quat(q).as_matrix()
@@ -241,12 +229,12 @@ def rolled(places: int) -> Change:
     return change
 
 
-def turned(*axes: int) -> Change:
+def turned(*axes: int):
     """Rows or columns of depth images in reverse order."""
     return depth(lambda d: np.flip(d, axes).copy())
 
 
-def mixed(data: Source) -> Source:
+def mixed(data):
     """Rotations world-to-camera beside the camera's own place."""
     wrong = data.poses.copy()
     wrong[:, :3, :3] = data.poses[:, :3, :3].mT
@@ -296,7 +284,7 @@ RIGHT += [Case("", "depth_scale = 5000", depth(lambda d: 5 * d))]
 
 def write(folder: Path, name: str, case: Case) -> Path:
     """A plain recording."""
-    return write_matrices(folder, case.change(seen(name)), case.settings)
+    return recordings.write_matrices(folder, case.change(seen(name)), case.settings)
 
 
 @pytest.mark.parametrize("place", range(3))
@@ -355,7 +343,7 @@ def test_other_ways_to_move(tmp_path: Path) -> None:
     seen twice, about steps that are all long, about light that differs with the view; and pairs so
     far apart that a camera which turns by 5 degrees a frame sees nothing in both, so that nothing
     is told of a right recording."""
-    apart = write_recording("plain", tmp_path / "apart", source("living_room", 12, 80))
+    apart = recordings.write_recording("plain", tmp_path / "apart", source("living_room", 12, 80))
     turning = make_room("living_room", tmp_path / "turning", 40, 48, 36, motion="tour")
     assert check(apart).warnings == []
     assert check(turning).verdict == "read rightly"

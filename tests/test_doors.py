@@ -3,9 +3,8 @@
 import copy
 import pickle
 import warnings
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,7 +55,7 @@ def scenes() -> dict[str, Any]:
     return {"scenes": nbtrack.open_scenes(preset), "methods": ["sdf"], "preset": preset}
 
 
-def tracked_with(**options: Any) -> Callable[[], object]:
+def tracked_with(**options: Any):
     return lambda: nbtrack.track_scenes(**scenes() | options)
 
 
@@ -68,7 +67,7 @@ def poses_with(pose: Any) -> np.ndarray:
 
 SDF = METHODS["sdf"]
 DENSITY = make_field("imap", NETWORK, SceneBounds(*UNIT), 0)
-REFUSED: dict[str, Callable[[], object]] = {
+REFUSED = {
     "zero pose": lambda: tracker(pose=np.zeros((4, 4))),
     "zero pose for a picture": lambda: DENSITY.render_view(CAMERA, np.zeros((4, 4))),
     "a map for a field": lambda: tracker(mapped()),
@@ -167,7 +166,7 @@ def default_dtype() -> ExitStack:
     return stack
 
 
-MODES: dict[str, Callable[[], AbstractContextManager]] = {
+MODES = {
     "inference": torch.inference_mode, "no gradients": torch.no_grad, "double": default_dtype,
     "autocast": lambda: torch.autocast("cpu", torch.bfloat16),
     "another device": lambda: torch.device("meta"),
@@ -226,7 +225,7 @@ def test_threads_leave_the_process_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "copied", [copy.copy, copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))]
 )
-def test_trackers_are_copied_and_fields_are_theirs(copied: Callable, name: str) -> None:
+def test_trackers_are_copied_and_fields_are_theirs(copied, name: str) -> None:
     """Catches a copy that goes elsewhere or moves the original, and a field that the tracker
     freezes, or that moves the tracker when its owner changes it."""
     field = make_field("neus", NETWORK, SceneBounds((-1.2,) * 3, (1.2,) * 3), 0)
@@ -286,7 +285,7 @@ class Kept(FIELDS["neus"]):
         raise NotImplementedError
 
 
-UNREADABLE: dict[str, Callable[[Map], Map]] = {
+UNREADABLE = {
     "grid": lambda made: replace(made, field=BakedField(made.field, 0.3)),
     "class": lambda made: replace(made, field=Kept(NETWORK, made.field.bounds, torch.Generator())),
     "record": lambda made: replace(made, record={**made.record, "network": {"width": 9}}),

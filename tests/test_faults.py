@@ -5,14 +5,15 @@ import io
 import json
 import os
 import resource
+import shlex
 import signal
 import sys
 import zipfile
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
+import pandas as pd
 import pytest
 from finished import GIVEN, MAP, OWN
 
@@ -51,8 +52,8 @@ def _gone(path: str) -> Callable[[], None]:
     return lambda: Path(path).unlink()
 
 
-def _environment(name: str, value: str) -> Callable[[], None]:
-    return lambda: os.environ.update({f"NBTRACK_{name}": value})
+def _environment(variable: str) -> Callable[[], None]:
+    return lambda: os.environ.update([f"NBTRACK_{variable}".split("=", 1)])
 
 
 def _cut(path: str) -> Callable[[], None]:
@@ -63,7 +64,7 @@ def _cut(path: str) -> Callable[[], None]:
     return cut
 
 
-def _killed(kind: str, finished: str, checkpoint: str, content: Any) -> Callable[[], None]:
+def _killed(kind: str, finished: str, checkpoint: str, content) -> Callable[[], None]:
     """What a killed command leaves in the cache, but with another content of its checkpoint."""
 
     def leave() -> None:
@@ -80,7 +81,7 @@ def _cache_in_a_loop_of_links() -> None:
     os.environ["NBTRACK_RUNS"] = "one"
 
 
-# Settings in files, on the command line and in the environment; more kinds in test_settings.py.
+# Settings in files; more kinds in test_settings.py.
 TOML = {
     "binary": (b"\x00\xff\xfe", "readable TOML"),
     "no TOML": (b"width: 3", "readable TOML"),
@@ -89,22 +90,10 @@ TOML = {
     "deep list": (b"tables.rates_hz = " + b"[" * 5000, "readable TOML"),
     "deep table": (b".".join(5000 * [b"a"]) + b" = 1", "unknown config key 'a.a.a.a"),
 }
-ENVIRONMENT = {
-    "unclosed quote": ("SET", "'a=3", "cannot be split"),
-    "no value": ("SET", "mapping.neus.iterations", "has no value"),
-    "preset": ("PRESET", "smok", "did you mean 'smoke'"),
-    "no config": ("CONFIG", "none.toml", "none.toml: give a TOML file"),
-    "config folder": ("CONFIG", "map", "map: give a TOML file"),
-    "no memory": ("DEVICE", "meta", "no device 'meta': this machine"),
-    "no module": ("DEVICE", "hpu", "no device 'hpu': this machine"),
-    "runs in a file": ("RUNS", "room", "room"),
-}
 KITTI = ["export", "run", "--to", "kitti", "poses.txt"]
 MESH = ["export", "map", "--to", "glb", "m.glb"]
 MAKE = ["data", "make", "office", "--out", "new"]
-OTHER = [*OWN, "--seed", "9"]  # whose map is not made: what is refused must not make it first
-NO_STEPS = [*OWN[:4], "--field", "neus"]
-PLAIN = [*GIVEN[:2], "--method", "neus_corrected"]
+COMMANDS = {"OWN": OWN, "GIVEN": GIVEN, "MAP": MAP}
 CUT = "not a readable checkpoint"
 TRAJECTORY, MAP_FILE, RUN = "run/trajectory.txt", "map/map.safetensors", "run/metrics.json"
 ROW = "0.1 1 2 3 0 0 0 1"
@@ -131,43 +120,15 @@ FILES = {
     "unfinished run": (_gone(RUN), KITTI, "no finished run in run"),
     "mesh cut": (_cut("map/mesh.ply"), MESH, "not a readable mesh"),
 }
-ARGUMENTS = {
-    "nothing": ([], "COMMAND"),
-    "no folder to make": (["data", "make", "office"], "--out"),
-    "onto itself": (["export", "room", "--to", "ply", "room"], "room exists: choose another"),
-    "into the kernel": ([*KITTI[:-1], "/proc/nbtrack/poses.txt"], "/proc/nbtrack"),
-    "a method and a field": ([*OWN, "--method", "sdf"], "leave --field and --tracker out"),
-    "a phone's archive": (["track", "scan.r3d"], "unpack it by `unzip scan.r3d -d scan`"),
-    "a movie to check": (["data", "check", "map/map.safetensors"], "is a file: give the rec"),
-    "nobody's home": (["data", "check", "~no_such_user/rec"], "no such user; a folder of"),
-    "unknown method": (["track", "living_room", "--method", "corected"], "mean 'corrected'"),
-    "a method in another map": ([*GIVEN[:2], "--method", "vr", "--map-from", "map"], "not 'imap'"),
-    "a plain map": ([*PLAIN, "--map-from", "map"], "was made with correction.neus=0.0, not "),
-    "tracker not the map's": ([*GIVEN, "map", "--tracker", "icp"], "does not work on field 'neus'"),
-    "two maps": ([*GIVEN, "map", "--map-frames", ":3"], "leave --map-frames out"),
-    "an unknown option": ([*OWN, "--bake", "nan"], "unknown argument '--bake': "),
-    "no frames to map": ([*OWN, "--map-frames", "10:20"], "0 of the"),
-    "no slice": ([*OWN, "--frames", "3"], "is no slice"),
-    "one frame": ([*OWN, "--frames", "2:3"], "too short to track"),
-    "unknown motion": ([*OTHER, "--set", "tracking.sdf.motion_model=leap"], "unknown motion model"),
-    "unknown start": ([*OTHER, "--start", "unknown"], "whose first pose is not known"),
-    "frames without end": ([*NO_STEPS, "--rate", "1e-308"], "rate_hz is 1e-308"),
-    "too many frames": ([*MAKE, "--n-frames", "1000000000"], "must be 2 to"),
-    "too many seeds": (["tables", "--seeds", "1000000000"], "from 1 to 1000"),
-    "unknown room": (["track", "living_rom", *OWN[2:]], "did you mean 'living_room'"),
-    "both budgets": ([*OWN, "--rate", "2"], "steps=2.0 and rate_hz=2.0: a frame has one budget"),
-    "room onto a folder": ([*MAKE[:-1], "run"], "exists"),
-    "motion as a path": ([*MAP, "--set", "scenes.motion=tour/../x"], "write 'keyframes' or "),
-}
-
-
 Fault = tuple[Callable[[], object], list[str], str]  # what is spoilt, the command, what it says
-FAULTS: dict[str, Fault] = FILES | {case: (_nothing, *fault) for case, fault in ARGUMENTS.items()}
+FAULTS: dict[str, Fault] = {**FILES}
 for case, (content, says) in TOML.items():
     command = [*MAP, "--config", "settings.toml"]
     FAULTS[f"config file: {case}"] = (_write("settings.toml", content), command, says)
-for case, (name, value, says) in ENVIRONMENT.items():
-    FAULTS[f"environment: {case}"] = (_environment(name, value), OWN, says)
+REFUSED = pd.read_csv(Path(__file__).parent / "data/refused_commands.csv", keep_default_na=False)
+for case, variable, command, says in REFUSED.itertuples(index=False):
+    words = [w for word in shlex.split(command) for w in COMMANDS.get(word, [word])]
+    FAULTS[case] = (_environment(variable) if variable else _nothing, words, says)
 
 
 @pytest.mark.parametrize("case", FAULTS)
@@ -183,7 +144,7 @@ def test_faults(case: str, work: Path, capsys) -> None:
 
 
 @contextmanager
-def files_limited_to(n_bytes: int) -> Any:
+def files_limited_to(n_bytes: int):
     """No file may grow beyond a size: a disk that is full in the middle of a write."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

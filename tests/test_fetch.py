@@ -4,7 +4,6 @@ import shutil
 import sys
 import threading
 import zipfile
-from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -45,7 +44,7 @@ class Server(BaseHTTPRequestHandler):
 
 
 @pytest.fixture
-def serve() -> Iterator[Callable[..., tuple[str, list[int]]]]:
+def serve():
     """Begins to serve a file; returns its address, and the sizes of what will be sent."""
     servers = []
 

@@ -32,7 +32,6 @@ from recordings import (
 
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
-from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError
 from nbtrack.recordings.formats import FORMATS
 from nbtrack.recordings.images import images_of
@@ -44,7 +43,7 @@ LOSSY = ("replica", "scannet", "record3d", "polycam")  # colour is JPEG
 STEPS = {"tum": 0.1, "record3d": 1 / 60, "polycam": 0.033333}  # s between frames, else 1/30
 
 
-def check_equal(sequence: RgbdSequence, data: Source, lossy: bool = False) -> None:
+def check_equal(sequence, data: Source, lossy: bool = False) -> None:
     """The sequence is the source, to rounding; JPEG colours to a few levels on average."""
     np.testing.assert_allclose(sequence.T_world_camera, data.poses, rtol=0, atol=1e-9)
     assert np.array_equal(sequence.depths_mm, data.depths_mm)

@@ -1,7 +1,5 @@
 """One frame: a camera's images, sound or not, and a tracker that is fed them."""
 
-from collections.abc import Callable
-
 import jaxtyping
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from box_room import BoxRoom, box_sequence, narrow_room, walk
 from nbtrack.beyond.lm import LmSettings
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.frame import Frame
-from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery.errors import DataError
 from nbtrack.tracking import StepBudget, make_tracker
 
@@ -20,7 +17,7 @@ CAMERA_OF_BUFFERS = Intrinsics.from_focal(16, 12, 14.0)
 Images = tuple[np.ndarray, np.ndarray]
 
 
-def error_m(found: np.ndarray, sequence: RgbdSequence, index: int) -> float:
+def error_m(found: np.ndarray, sequence, index: int) -> float:
     return float(np.linalg.norm(found[:3, 3] - sequence.T_world_camera[index, :3, 3]))
 
 
@@ -41,7 +38,7 @@ def test_units_and_types_are_what_they_say() -> None:
     assert not Frame.of_images(sequence.intrinsics, color, depth_mm).depth_mm[:, 5:].any()
 
 
-WRONG_IMAGES: dict[str, tuple[Callable, str]] = {
+WRONG_IMAGES = {
     "millimetres as float": (lambda c, d: (c, d.astype(float)), "or floating point in metres"),
     "colour as integers": (lambda c, d: (c.astype(np.int64), d), "color is int64 of shape"),
     "grey": (lambda c, d: (c[..., 0], d), "color is uint8 of shape (24, 32"),
@@ -77,7 +74,7 @@ def _random(low: int, high: int, shape: tuple[int, ...]) -> np.ndarray:
 
 LOST = 0.2  # m: the paper's rule of what counts as lost, and must not pass for good
 # How the frame is spoilt, and whether it must be flagged; None: either verdict may be honest.
-SPOILT: dict[str, tuple[Callable[..., Images], bool | None]] = {
+SPOILT = {
     "black": (lambda c, d: (np.zeros_like(c), d), False),
     "white": (lambda c, d: (np.full_like(c, 255), d), False),
     "no depth": (lambda c, d: (c, np.zeros_like(d)), True),

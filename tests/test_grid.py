@@ -9,11 +9,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
-from typing import Any
 
 import dask
 import psutil
@@ -60,7 +58,7 @@ class Square(Job):
 
 
 @pytest.fixture(scope="module")
-def address() -> Iterator[str]:
+def address():
     """Of a scheduler with two workers in processes of their own."""
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),
@@ -73,7 +71,7 @@ def address() -> Iterator[str]:
 
 
 @pytest.fixture(params=["here", "in processes", "on a cluster"])
-def execution(request, address: str) -> Iterator[dict[str, Any]]:
+def execution(request, address: str):
     """All ways of running jobs."""
     ways = {"here": {"workers": 1}, "in processes": {"workers": 2}}
     with forking():

@@ -4,11 +4,9 @@ import json
 import os
 import pickle
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, reduce
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,13 +14,13 @@ import pytest
 import safetensors
 import torch
 import trimesh
-from box_room import poses_at
+from box_room import BoxRoom, box_sequence, narrow_room, poses_at
 from finished import GIVEN
 from safetensors.torch import save
 from test_mapping import NETWORK, finished_wall, map_wall, wall_sequence
 
 from nbtrack.beyond.points import PointMapping
-from nbtrack.checks.in_map import check_belongs
+from nbtrack.checks.in_map import check_belongs, outside_map_share
 from nbtrack.cli import main
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.experiments.runs import MARK
@@ -83,7 +81,7 @@ WEIGHT = "mlp.layer_2.weight"
 OTHER, CHANGED = "is not a readable map file", "is not what was written"
 # What a file may hold in place of a map: a part of its header or a tensor, and what it is instead.
 # Where something else than the digest must tell, the file has one that is right.
-MAP_CONTENT: dict[str, tuple[str, Any, str]] = {
+MAP_CONTENT = {
     "a later version": ("format_version", 5, "format 5; this nbtrack reads 4"),
     "unknown field": ("field", "nerf", "field 'nerf', which is not registered: import the file"),
     "field of another kind": ("field", [3], OTHER),
@@ -137,11 +135,11 @@ def assert_refused(path: Path, says: str) -> None:
 class Bomb:
     """Runs a command where it is unpickled."""
 
-    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str]]:
+    def __reduce__(self):
         return os.system, ("touch exploded",)
 
 
-MAP_BYTES: dict[str, Callable[[bytes], bytes]] = {
+MAP_BYTES = {
     "empty": lambda sound: b"",
     "a bit flipped": lambda s: s[:-90] + bytes([s[-90] ^ 1]) + s[-89:],
     "an endless header": lambda sound: b"\xff" * 8 + sound[8:],
@@ -198,6 +196,29 @@ def test_a_frame_without_depth_tells_nothing() -> None:
     sequence.depths_mm[:] = 0
     assert np.isnan(depth_residual_of(finished_wall().field, sequence[0]))
     assert "frame 0 of wall has no depth" in check_belongs(finished_wall(), sequence[0])
+
+
+ROOM = BoxRoom(half=(1.5, 1.2, 2.0))
+
+
+def seen(n_frames: int = 12):
+    """From before the middle, turned to all sides a little: most see four or five walls."""
+    random = np.random.default_rng(0)
+    turns = random.normal(scale=0.2, size=(n_frames, 3))
+    poses = poses_at(random.uniform(-0.2, 0.2, (n_frames, 3)) - [0, 0, 0.4], turns)
+    return box_sequence(poses, narrow_room(), 24)  # with three walls a motion does the same
+
+
+def test_frames_outside_of_what_was_mapped() -> None:
+    """Catches a camera in a part that no map holds, without a word: the map ends at x = 0, and half
+    of the frames look to where it is not, known by their true poses alone."""
+    towards_x = np.outer([1] * 5 + [-1] * 5, [0, np.pi / 2, 0])
+    poses = poses_at(np.zeros((10, 3)), towards_x)
+    half = BoxRoom(half=(1.5, 1.2, 2.0))
+    half.bounds = SceneBounds((-1.6, -1.3, -2.1), (0.0, 1.3, 2.1))
+    astray = np.tile(poses[9], (10, 1, 1))
+    assert outside_map_share(half, box_sequence(poses, ROOM, 48), astray) == 0.5
+    assert outside_map_share(ROOM, seen(), seen().T_world_camera) == 0
 
 
 def test_a_file_gives_the_same_trajectory(work: Path, tmp_path: Path, monkeypatch) -> None:

@@ -11,10 +11,8 @@ from box_room import poses_at, sequence_of
 
 from nbtrack.beyond.points import PointMapping
 from nbtrack.core.camera import Intrinsics
-from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import MappingSettings, NetworkSettings, field_class
 from nbtrack.machinery.errors import NumericalError
-from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import learning_rate, map_sequence
 from nbtrack.mapping.holdout import split_holdout
 
@@ -27,7 +25,7 @@ def settings_of(field_name: str, **changes: float) -> MappingSettings:
     return field_class(field_name).Settings(**{**small, "learning_rate": 3e-3, **changes})
 
 
-def wall_sequence(n_frames: int = 6, distance: float = 2.0) -> RgbdSequence:
+def wall_sequence(n_frames: int = 6, distance: float = 2.0):
     """Cameras side by side that look straight at a grey wall, `distance` metres ahead."""
     poses = poses_at(np.outer(np.linspace(-0.5, 0.5, n_frames), [1, 0, 0]))
     depths_mm = np.full((n_frames, 12, 16), 1000 * distance)
@@ -35,7 +33,7 @@ def wall_sequence(n_frames: int = 6, distance: float = 2.0) -> RgbdSequence:
 
 
 @cache
-def finished_wall() -> Map:
+def finished_wall():
     """A NeuS map of the wall."""
     settings = settings_of("neus", iterations=150, holdout_every=0)
     return map_sequence("neus", wall_sequence(), NETWORK, settings)
@@ -76,7 +74,7 @@ def test_points_are_fused_at_once() -> None:
     assert mapped.record["misfit_m"] < 0.05
 
 
-def map_wall(field_name: str, checkpoint: Path | None, *on_iteration) -> Map:
+def map_wall(field_name: str, checkpoint: Path | None, *on_iteration):
     more = settings_of(field_name), 3, None, checkpoint, *on_iteration
     return map_sequence(field_name, wall_sequence(), NETWORK, *more)
 

@@ -7,18 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import (
-    Change,
-    Source,
-    camera,
-    depth,
-    positions,
-    real,
-    short,
-    source,
-    with_noise,
-    write_matrices,
-)
+from recordings import camera, depth, positions, real, short, source, with_noise, write_matrices
 
 from nbtrack.checks.check import DataReport, check_recording, quick_look
 from nbtrack.checks.readings import cost_of
@@ -29,17 +18,17 @@ ROOMS = ["living_room", "office"]
 N_FRAMES = 120
 
 
-def warnings_of(folder: Path, data: Source) -> list[str]:
+def warnings_of(folder: Path, data) -> list[str]:
     return check_recording(open_recording(write_matrices(folder, data))).warnings
 
 
 @cache
-def room(name: str) -> Source:
+def room(name: str):
     return with_noise(source(name, N_FRAMES, 1))
 
 
 @cache
-def recorded(name: str) -> Source:
+def recorded(name: str):
     """A room, or a real recording at half its size, without which the test is skipped."""
     return real(name, slice(N_FRAMES), 2) if name in REAL else room(name)
 
@@ -59,22 +48,22 @@ def saturated(depths: np.ndarray) -> np.ndarray:
     return depths
 
 
-def cropped(data: Source) -> Source:
+def cropped(data):
     """Columns and rows off the left and the top, the camera as it was for the whole image."""
     left, top = data.camera.width // 12, data.camera.height // 16
-    kept = (slice(None), slice(top, None), slice(left, None))
     size = {"width": data.camera.width - left, "height": data.camera.height - top}
-    return Source(data.colors[kept], data.depths_mm[kept], data.poses, replace(data.camera, **size))
+    images = {"colors": data.colors[:, top:, left:], "depths_mm": data.depths_mm[:, top:, left:]}
+    return data._replace(**images, camera=replace(data.camera, **size))
 
 
-def beside(*metres: float) -> Change:
+def beside(*metres: float):
     """Poses of a marker from where the camera is so far to the right, below and before."""
     T_marker_camera = np.eye(4)
     T_marker_camera[:3, 3] = metres
     return lambda data: data._replace(poses=data.poses @ np.linalg.inv(T_marker_camera))
 
 
-def fill(value: int, share: float) -> Change:
+def fill(value: int, share: float):
     """The farthest so many of the depths as a value that means none."""
     return depth(lambda d: np.where(d > np.quantile(d[d > 0], 1 - share), value, d))
 
@@ -85,7 +74,7 @@ def of_disparity(depths: np.ndarray) -> np.ndarray:
 
 UNTOLD = "surfaces that two frames see lie .* nothing that is tried explains it"
 # What is said begins so; of numbers in braces the first must be as near as the second says.
-CASES: dict[str, tuple[Change, str, float, float]] = {
+CASES = {
     "depth one frame late": (depth(lambda d: late(d, 1)), "depth comes after", 1, 0.2),
     "focal length 5 % short": (camera(0.95), ".*focal lengths should change", 5.26, 0.7),
     "camera of another": (camera(1.15, 1.06), "the calibration is another camera's", -13, 1),

@@ -3,7 +3,6 @@
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 import pytest
@@ -12,13 +11,13 @@ NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/*.ipynb"))
 
 
 @pytest.fixture(params=NOTEBOOKS, ids=lambda path: path.stem)
-def cells(request) -> list[dict[str, Any]]:
+def cells(request):
     """Each committed notebook in turn; a cell's source is one text."""
     found = json.loads(request.param.read_text(encoding="utf-8"))["cells"]
     return [cell | {"source": "".join(cell["source"])} for cell in found]
 
 
-def test_complete_and_small(request, cells: list[dict[str, Any]]) -> None:
+def test_complete_and_small(request, cells) -> None:
     """Catches cells without a stored run, which strict checking would execute but not compare, and
     code that belongs in the package: long cells, functions, shell and magics. A4 is about code of
     one's own, and has classes."""
@@ -31,7 +30,7 @@ def test_complete_and_small(request, cells: list[dict[str, Any]]) -> None:
         assert not re.search(r"^\s*(def |class |[%!])", source, re.M), source
 
 
-def test_progress_is_not_compared(cells: list[dict[str, Any]]) -> None:
+def test_progress_is_not_compared(cells) -> None:
     """Catches a stored progress bar in a cell whose output is compared: where an earlier notebook
     made the map already, no bar appears."""
     for cell in cells:
@@ -40,7 +39,7 @@ def test_progress_is_not_compared(cells: list[dict[str, Any]]) -> None:
             assert "nbval-ignore-output" in cell["metadata"].get("tags", []), cell["source"]
 
 
-def test_nothing_of_one_machine(cells: list[dict[str, Any]]) -> None:
+def test_nothing_of_one_machine(cells) -> None:
     """Catches absolute paths that readers would take for their own, and an end without text."""
     assert cells[0]["cell_type"] == cells[-1]["cell_type"] == "markdown"
     for cell in cells:
@@ -55,7 +54,7 @@ FACTS = {*pd.read_csv(Path(__file__).parent / "data/prose_numbers.csv", dtype=st
 NUMBER = r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?![\w.]*\d)"
 
 
-def test_numbers_in_prose_are_computed(request, cells: list[dict[str, Any]]) -> None:
+def test_numbers_in_prose_are_computed(request, cells) -> None:
     """Catches a sentence whose number is no longer what the cells of its notebook hold or print:
     each with a decimal, or of two digits and more, is that of a cell, rounded, or one in m that
     the sentence has in cm or mm."""

@@ -4,7 +4,6 @@ import contextlib
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -25,7 +24,6 @@ from nbtrack.fields import FIELDS, NeusMapping, field_class
 from nbtrack.machinery import registry
 from nbtrack.machinery.errors import ConfigError
 from nbtrack.machinery.files import runs_folder
-from nbtrack.machinery.registry import Registry
 from nbtrack.machinery.settings import with_settings
 from nbtrack.mapping.files import MAP_FILE, write_map
 from nbtrack.mapping.fit import map_sequence
@@ -72,7 +70,7 @@ nbtrack.METHODS |= {"fine": nbtrack.Method("Mine corrected", "fading", "lm", cel
 
 
 @contextlib.contextmanager
-def importing() -> Iterator[None]:
+def importing():
     """What a command imports is known in the block alone, as in a process of its own."""
     with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         for known in (FIELDS, TRACKERS, METHODS):
@@ -220,7 +218,7 @@ OF_NO_KIND = {**NAME, "label": "Blank", "surface_level": 0.0, "is_distance": Fal
         (FIELDS, type("Mine", (nbtrack.Field,), OF_NO_KIND), "no tracker works on field 'mine'"),
     ],
 )
-def test_classes_that_lack_something(known: Registry, kind: type, says: str, monkeypatch) -> None:
+def test_classes_that_lack_something(known, kind: type, says: str, monkeypatch) -> None:
     """Catches an AttributeError in the middle of a command, and a StopIteration where no tracker of
     the package's works in an own field."""
     monkeypatch.setitem(known, "mine", kind)
@@ -243,7 +241,7 @@ def test_a_place_too_large_for_a_correction() -> None:
         (lambda terms: {"color": terms["color"]}, "gave color after depth, color, eikonal: give"),
     ],
 )
-def test_losses_that_are_no_terms(last: Callable, says: str, monkeypatch) -> None:
+def test_losses_that_are_no_terms(last, says: str, monkeypatch) -> None:
     """Catches torch's words about sizes or sparse tensors where a field returns the sum of its
     terms, or a term only now and then."""
     spoilt = iter([dict, dict, last])

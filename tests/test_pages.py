@@ -6,27 +6,27 @@ from types import SimpleNamespace
 from unittest import mock
 
 import bs4
-import nbformat
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = SimpleNamespace(**runpy.run_path(str(ROOT / "environment/pages.py")))
 FIRST = ROOT / "notebooks/01_map_imap.ipynb"
 
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory) -> dict[Path, bs4.BeautifulSoup]:
     """The pages of the first notebook, with stored outputs, and of the texts that it names."""
+    # Here, since it takes seconds to import.
+    made = SimpleNamespace(**runpy.run_path(str(ROOT / "environment/pages.py")))
 
-    def read_source(path: Path, execute: bool) -> nbformat.NotebookNode:
-        notebook = PAGES.read_source(path, execute)
+    def read_source(path: Path, execute: bool):
+        notebook = made.read_source(path, execute)
         if path != FIRST:
             notebook.cells = [cell for cell in notebook.cells if cell.cell_type == "markdown"]
         return notebook
 
     folder = tmp_path_factory.mktemp("pages")
-    with mock.patch.dict(PAGES.write_pages.__globals__, read_source=read_source):
-        PAGES.write_pages(folder, [FIRST], execute=False)
+    with mock.patch.dict(made.write_pages.__globals__, read_source=read_source):
+        made.write_pages(folder, [FIRST], execute=False)
     texts = {path: path.read_text(encoding="utf-8") for path in folder.rglob("*.html")}
     return {path: bs4.BeautifulSoup(text, "html.parser") for path, text in texts.items()}
 

@@ -1,6 +1,5 @@
 """Which image, depth map and pose belong together: never a neighbour's, and never by a guess."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from nbtrack.recordings.recording import Recording, open_recording
 RUN = tuple(range(N_FRAMES))
 
 
-def rename(recording: Path, colors: Sequence[str], depths: Sequence[str] | None = None) -> None:
+def rename(recording: Path, colors, depths=None) -> None:
     """Give images and depth maps other names, and take away those for which there is none."""
     is_plain = (recording / "color").is_dir()
     kinds = ("color", "depth") if is_plain else ("images", "depth_filtered")

@@ -14,14 +14,12 @@ import torch
 import trimesh
 from box_room import Formula, sequence_of
 from IPython.core.formatters import DisplayFormatter
-from matplotlib.axis import Axis
 from matplotlib.contour import ContourSet
 from PIL import Image, ImageSequence
 
 from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.runs import save_picture
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.plots.idea import plot_idea
@@ -52,7 +50,7 @@ CLOUD.columns = ["x", "y", "z", "red", "green", "blue"]
 
 
 @pytest.fixture(scope="module")
-def sequence() -> RgbdSequence:
+def sequence():
     """Six frames from the origin along +z, everything at 1 m but one pixel without depth."""
     colors = np.random.default_rng(0).integers(0, 256, (6, 12, 16, 3), dtype=np.uint8)
     depths_mm = np.full((6, 12, 16), 1000)
@@ -70,7 +68,7 @@ def room_mesh() -> trimesh.Trimesh:
     return mesh
 
 
-def steps_of(sequence: RgbdSequence) -> Tracker:
+def steps_of(sequence) -> Tracker:
     """A tracker that starts 5 cm beside the first frame."""
     own = sequence.T_world_camera[5], StepBudget(3), SdfSettings(n_pixels=8)
     return make_tracker("sdf", NEAR, *own)
@@ -106,7 +104,7 @@ FIGURES = {
 }  # fmt: skip
 
 
-def is_labelled(axis: Axis) -> bool:
+def is_labelled(axis) -> bool:
     """Whether an axis without numbers, or with a label that names a unit or what it counts."""
     shows_numbers = any(t.get_text() and t.get_visible() for t in axis.get_ticklabels())
     return not shows_numbers or axis.label.get_text().endswith((")", "iteration", "step", "frame"))
@@ -144,7 +142,7 @@ def test_curves_of_methods_and_sweeps() -> None:
     assert axes.get_yscale() == "log"
 
 
-def held(sequence: RgbdSequence, up: tuple[float, float, float]) -> RgbdSequence:
+def held(sequence, up: tuple[float, float, float]):
     """The same frames, with the cameras held upright in a world whose up is another."""
     T_world_camera, right = sequence.T_world_camera.copy(), np.roll(up, 1)
     T_world_camera[:, :3, :3] = np.stack([right, -np.array(up), -np.cross(right, up)], axis=1)

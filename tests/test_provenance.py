@@ -1,7 +1,6 @@
 """Keys follow the code: what changes a result changes its key, what does not leaves it alone."""
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,13 +11,12 @@ from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.fields import FIELDS, NetworkSettings, NeuSField
 from nbtrack.machinery import files
-from nbtrack.machinery.registry import Registry
 from nbtrack.synthetic import make_room
 from nbtrack.tracking import TRACKERS, SdfTracker, TrackerSettings
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch) -> Iterator[Path]:
+def package(tmp_path: Path, monkeypatch):
     """A copy of the package's sources, to be edited."""
     copy = tmp_path / "nbtrack"
     shutil.copytree(provenance.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
@@ -87,7 +85,7 @@ def test_a_class_is_its_own_key(tmp_path: Path, monkeypatch, capsys) -> None:
         made = MapJob(scene, "mine", None, settings)
         return made.key, TrackJob(made, scene, "mine", settings, steps=1).key
 
-    def write_anew(registry: Registry, base: type) -> None:
+    def write_anew(registry, base: type) -> None:
         monkeypatch.setitem(registry, "mine", type("Mine", (base,), {"name": "mine"}))
 
     scene = Scene("office", make_room("office", tmp_path / "office", 2, 16, 12))

@@ -12,7 +12,6 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, backproject
 from nbtrack.core.geometry import transform_points
 from nbtrack.data.pixels import PixelSampler, Rays
-from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NeusMapping
 from nbtrack.fields.base import NEAR, rays_end
 from nbtrack.fields.neus import guided_depths
@@ -29,7 +28,7 @@ def wall(signed: bool) -> Formula:
     return Formula(signed_distance if signed else density, BOX, as_density=not signed)
 
 
-def random_sequence(n_frames: int) -> RgbdSequence:
+def random_sequence(n_frames: int):
     rng = np.random.default_rng(0)
     shape = (n_frames, CAMERA.height, CAMERA.width)
     poses = poses_at(*rng.normal(size=(2, n_frames, 3)))

@@ -3,11 +3,11 @@
 import contextlib
 import copy
 import re
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from box_room import BoxRoom, walk
 from tiny import TINY
@@ -132,28 +132,9 @@ def test_values_take_the_type_of_the_preset(monkeypatch) -> None:
     assert (scenes.n_frames, scenes.names) == (7, ("office", "bedroom"))
 
 
-REFUSED = {  # by key and value; how files and the environment are read: test_faults.py
-    # A misspelt or unused key that would be silently added, a whole branch, an attribute.
-    "tracking.sdf.npixels=5": "did you mean 'tracking.sdf.n_pixels'?",
-    "scene.names=5": "did you mean 'scenes.names'?",
-    "tracking.lm.lambda_color=5": "did you mean 'tracking.vr.lambda_color'?",  # LM has none
-    "mapping.neus=3": "unknown config key 'mapping.neus'",
-    "mapping.neus .iterations=5": "unknown config key",
-    "__class__=5": "unknown config key '__class__'",
-    "=3": "unknown config key",
-    # Values that would fail, or worse would not, somewhere in a run of hours.
-    "mapping.neus.iterations=": "it must be int",
-    "mapping.neus.learning_rate=false": "it must be float, for example",
-    "scenes.track_frames=10": "it must be str, for example",
-    "scenes.names=[1, 2]": "it must be str, for example",
-    "tables.pixels.vr=[1.5]": "it must be int, for example",
-    # A sign that turns a loss into a reward, and lists whose quotes or ends the shell ate.
-    "mapping.imap.learning_rate=-1e-3": "it must be 0",
-    "tables.rates_hz=[5, -1]": "it must be 0.01 to 100",
-    "scenes.width=1000000000": "it must be 11 to 4096",
-    "scenes.names=[office,bedroom]": "is no TOML",
-    "tables.rates_hz=" + 5000 * "[": "is no TOML",
-}
+REFUSED = dict.fromkeys(["tables.rates_hz=" + 5000 * "["], "is no TOML")
+LISTED = pd.read_csv(Path(__file__).parent / "data/refused_settings.csv")
+REFUSED |= dict(zip(LISTED["setting"], LISTED["says"], strict=True))
 
 
 @pytest.mark.parametrize("setting", REFUSED, ids=range(len(REFUSED)))
@@ -227,7 +208,7 @@ def use(preset: Preset, key: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory) -> Iterator[Preset]:
+def small(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NBTRACK_RUNS", str(tmp_path_factory.mktemp("small")))
         patch.setattr("nbtrack.beyond.correction._N_POINTS", 1000)

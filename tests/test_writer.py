@@ -1,6 +1,5 @@
 """The Neural RGB-D layout as it is written: whole or not at all, and nothing lost."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,7 +13,7 @@ from nbtrack.core.camera import Intrinsics
 from nbtrack.machinery.errors import DataError
 from nbtrack.recordings import writer
 from nbtrack.recordings.reading import read_sequence
-from nbtrack.recordings.writer import WrittenFrame, write_sequence
+from nbtrack.recordings.writer import write_sequence
 
 CAMERA = Intrinsics(12, 8, 10.123456789012345, 10.123456789012345, 6.0, 4.0)
 RNG = np.random.default_rng(0)
@@ -22,7 +21,7 @@ COLOR = RNG.integers(0, 256, (8, 12, 3), dtype=np.uint8)
 DEPTH = RNG.integers(0, 1 << 16, (8, 12), dtype=np.uint16)
 
 
-def frames(number: int) -> Iterator[WrittenFrame]:
+def frames(number: int):
     for i in range(number):
         depths = {"depth": DEPTH, "depth_filtered": DEPTH + np.uint16(i)}
         yield COLOR + np.uint8(i), depths, source().poses[i]
@@ -66,7 +65,7 @@ def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path, monkeypatch) -
     """Catches a half-written scene that a later run would take for a whole one, one that is
     overwritten, and words that are not true of what an interrupt leaves, also as writing ends."""
 
-    def interrupted() -> Iterator[WrittenFrame]:
+    def interrupted():
         yield from frames(2)
         raise KeyboardInterrupt
 
@@ -97,7 +96,7 @@ def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path, monkeypatch) -
 def test_two_writers_of_one_scene(tmp_path: Path) -> None:
     """Catches commands that spoil each other's files of one room: the first to finish stands."""
 
-    def late() -> Iterator[WrittenFrame]:
+    def late():
         yield from frames(1)
         write_sequence(tmp_path / "room", CAMERA, frames(2))
 
