@@ -164,7 +164,7 @@ def test_killed_and_started_again(tmp_path: Path, undisturbed: bytes) -> None:
             process.start()
         while not {*glob(f"{tmp_path}/**/{file}", recursive=True)} - {*map(str, made)}:
             assert process.is_alive(), f"it ended before its first {file}"
-            time.sleep(0.003)
+            time.sleep(0.01)
         children = psutil.Process(process.pid).children(recursive=True)
         assert len(children) >= 2 * (workers - 1)
         process.kill()
@@ -202,14 +202,13 @@ if __name__ == "__main__":
     sys.exit(main({words}))
 """
 IMPORTING = "'torch' in sys.modules", 0.1
-BEGINNING = "'multiprocessing.popen_spawn_posix' in sys.modules", 0.7
 WORKING = "glob.glob(os.environ['NBTRACK_RUNS'] + '/locks/*')", 1.0
 
 
-@pytest.mark.parametrize("moment", [IMPORTING, BEGINNING, WORKING])
+@pytest.mark.parametrize("moment", [IMPORTING, WORKING])
 def test_interrupted(moment: tuple[str, float], tmp_path: Path, monkeypatch) -> None:
-    """Catches tracebacks, also of workers that begin, Ctrl-C that does not end a command, and
-    processes left behind: then the pipe that they all write to would stay open."""
+    """Catches tracebacks, also of workers, Ctrl-C that does not end a command, and processes left
+    behind: then the pipe that they all write to would stay open."""
     monkeypatch.setenv("NBTRACK_RUNS", str(tmp_path / "runs"))
     long = "mapping.imap.iterations=100000", "mapping.neus.iterations=100000"
     words = ["tables", "--workers", "2", *tiny_words(*long)]

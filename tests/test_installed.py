@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from test_faults import assert_refused
+from test_own_method import OWN
 from tiny import TINY
 
 from nbtrack.beyond import observed
@@ -74,20 +75,17 @@ def test_without_a_place_for_compiled_code(monkeypatch) -> None:
     assert observed.compiled(lambda a, b: a + b)(2, 3) == 5
 
 
-SCRIPT = f"""
-from nbtrack import FIELDS, TRACKERS, Method, load_preset, open_scenes, track_scenes
+FEW = [
+    "mapping.fading.iterations=6",
+    "mapping.fading.n_rays=8",
+    "scenes.names=['office','bedroom']",
+]
+SCRIPT = f"""{OWN}
 from nbtrack.experiments.grid import Execution
-class Field(FIELDS["neus"]):
-    name = "mine"
-class Base(TRACKERS["sdf"]):
-    pass
-class Tracker(Base):
-    name = "mine"
-FIELDS["mine"], TRACKERS["mine"] = Field, Tracker
-preset = load_preset(settings={[*TINY, "scenes.names=['office','bedroom']"]!r})
-scenes, mine = open_scenes(preset), [Method("Mine", "mine", "mine")]
+preset = nbtrack.load_preset(settings={[*TINY, *FEW]!r})
+how = [nbtrack.open_scenes(preset), ["mine"], preset, [10]]
 for workers in (2, 1):
-    runs = track_scenes(scenes, mine, preset, [10], execution=Execution(workers=workers))
+    runs = nbtrack.track_scenes(*how, execution=Execution(workers=workers))
 print(runs["ate_m"].notna().sum(), "runs")
 """
 

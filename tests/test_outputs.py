@@ -5,8 +5,6 @@ import json
 import os
 import shlex
 import shutil
-import sys
-from collections import Counter
 from pathlib import Path
 from unittest import mock
 
@@ -17,7 +15,6 @@ import pytest
 import torch
 import trimesh
 from finished import GIVEN, MAP, OWN, SET
-from PIL.PngImagePlugin import PngImageFile
 from recordings import N_FRAMES, write_recording
 from test_faults import assert_refused, contents
 from tiny import tiny_words
@@ -222,24 +219,6 @@ def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
     assert victim.read_text() == "precious"
     assert (tmp_path / "result.txt").read_text() == "new"
     assert not (tmp_path / "result.txt").is_symlink()
-
-
-_opened: Counter[str] = Counter()
-sys.addaudithook(lambda event, about: event == "open" and _opened.update([str(about[0])]))
-
-
-def test_track_reads_a_file_once(tmp_path: Path, monkeypatch) -> None:
-    """Catches a check, an estimate of the unit, a digest, a map, a run or a picture that opens or
-    decodes for itself what another part of the command has read."""
-    folder = write_recording("neural_rgbd", tmp_path / "room")
-    decoded, end = [], PngImageFile.load_end
-    monkeypatch.setattr(PngImageFile, "load_end", lambda i: decoded.append(i.mode) or end(i))
-    _opened.clear()
-    words = ["--method", "sdf", "--steps", "2", "--out", str(tmp_path / "run")]
-    assert main(["track", str(folder), *words, *tiny_words()]) == 0
-    files = [str(file) for file in folder.glob("*/*.png")]
-    assert {_opened[file] for file in files} == {1}
-    assert len(decoded) == len(files) == 2 * decoded.count("I;16")
 
 
 @pytest.mark.parametrize("format", ["neural_rgbd", "tum"])  # depth in mm, and in another unit

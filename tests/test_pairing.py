@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from box_room import poses_at
 from recordings import N_FRAMES, START, matrix_text, source, tum_lines, write_recording
@@ -102,35 +103,23 @@ def test_times_that_tell_no_order(tmp_path: Path, name: str, times: np.ndarray) 
         open_recording(folder)
 
 
-# Images' numbers, whole multiples of the frame's time with which poses are stamped (None: without
-# stamps), format, and whose pose each image has to get: -1 for none, None for a refusal.
-LISTS = {
-    "from 0, cut": (RUN[:4], None, "plain", RUN[:4]),
-    "from 1": (range(1, 7), None, "plain", RUN),
-    "from 1, stamped": (range(1, 7), RUN, "plain", RUN),
-    "from 1, cut, stamped": (range(1, 5), RUN, "plain", None),
-    "from 1, cut, of a dataset": (range(1, 5), None, "neural_rgbd", None),
-    "chosen, of a dataset": ((2, 3, 5), None, "neural_rgbd", (2, 3, 5)),
-    "chosen": ((2, 3, 5), None, "plain", None),
-    "chosen, stamped": ((12, 13, 15), (10, 12, 13, 15, 17, 20), "plain", (1, 2, 3)),
-    "from 1, cut and one lost, stamped": ((3, 4, 6), (2, 3, 5, 8), "plain", (0, 1, 2)),
-    "from 1, one lost, stamped": ((1, 2, 4, 5, 6), RUN, "plain", (0, 1, 3, 4, 5)),
-    "one pose lost, stamped": (RUN, (0, 1, 2, 4, 5), "plain", (0, 1, 2, -1, 3, 4)),
-    "stamps of one lost": ((0, 1, 3, 4, 5, 6), RUN, "plain", RUN),
-    "one lost, stamped, of a dataset": (RUN, (0, 1, 2, 4), "neural_rgbd", (0, 1, 2, -1, 3, -1)),
-    "others lost": (RUN, (0, 1, 2, 3, 4, 6), "plain", None),
-    "another clock": (RUN, (90, 92, 93, 94, 95, 99), "plain", RUN),
-    "another clock, cut": (RUN[:4], range(90, 96), "plain", None),
-    "another rate, the first lost": (RUN, (1.2, 2.4, 3.6, 4.8, 6.0), "plain", None),
-    "the first lost, stamped": (RUN, (1, 2, 3, 4, 5), "plain", (-1, 0, 1, 2, 3, 4)),
-}
+# By case: images' numbers, whole multiples of the frame's time with which poses are stamped (none:
+# without stamps), format, and whose pose each image has to get: -1 for none; none for a refusal.
+LISTS = pd.read_csv(Path(__file__).parent / "data/lists_of_poses.csv", index_col="case")
+
+
+def of_case(case: str) -> tuple:
+    """The row, its numbers as tuples."""
+    cells = LISTS.fillna("").loc[case]
+    parts = {n: tuple(map(float, cells[n].split())) for n in ("numbers", "stamps", "expected")}
+    return parts["numbers"], parts["stamps"], cells["format"], parts["expected"]
 
 
 def listed(folder: Path, case: str) -> Recording:
-    numbers, stamps, format, _ = LISTS[case]
+    numbers, stamps, format, _ = of_case(case)
     write_recording(format, folder)
-    rename(folder, [f"{i:06}" for i in numbers])
-    if stamps is not None:
+    rename(folder, [f"{i:06.0f}" for i in numbers])
+    if stamps:
         times = np.array(stamps) / 30
         is_plain = format == "plain"
         poses = source().poses[: len(times)] * (1 if is_plain else [1, -1, -1, 1])
@@ -141,22 +130,22 @@ def listed(folder: Path, case: str) -> Recording:
     return open_recording(folder)
 
 
-@pytest.mark.parametrize("case", LISTS)
+@pytest.mark.parametrize("case", LISTS.index)
 def test_poses_of_a_list_without_names(tmp_path: Path, case: str) -> None:
     """Catches poses of neighbours: of images that count from 1, of a recording that was cut, or of
     one that lost some; as many poses as images prove nothing where stamps say otherwise."""
-    numbers, _, _, expected = LISTS[case]
-    if expected is None:
+    numbers, _, _, expected = of_case(case)
+    if not expected:
         with pytest.raises(DataError, match=r"poses but there are .*, or timestamps\.txt"):
             listed(tmp_path / "r", case)
         return
     recording = listed(tmp_path / "r", case)
     has_pose = np.array(expected) >= 0
     assert np.array_equal(recording.has_pose, has_pose)
-    wanted = source().poses[[i for i in expected if i >= 0]]
+    wanted = source().poses[[int(i) for i in expected if i >= 0]]
     np.testing.assert_allclose(recording.T_world_camera[has_pose], wanted, atol=1e-9)
     # What is taken by its place, or left out, is said.
-    is_proven = tuple(numbers) == RUN or case == "from 1, stamped"
+    is_proven = numbers == RUN or case == "from 1, stamped"
     assert bool(recording.notes) != is_proven
 
 

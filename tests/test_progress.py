@@ -1,27 +1,21 @@
 """What is printed while a command runs and no bar is shown: a line every 30 seconds."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from nbtrack.machinery.progress import ProgressBar
 
 
-class Clock:
-    """Seconds, moved by hand."""
-
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 @pytest.fixture
-def clock(monkeypatch) -> Clock:
-    """That of the bars."""
-    monkeypatch.setattr("tqdm.std.time", clock := Clock())
+def clock(monkeypatch) -> SimpleNamespace:
+    """That of the bars, in seconds, moved by hand."""
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr("tqdm.std.time", lambda: clock.now)
     return clock
 
 
-def test_a_line_now_and_then(clock: Clock, capsys) -> None:
+def test_a_line_now_and_then(clock, capsys) -> None:
     """Catches output that is silent until the end, or never, and an ETA that is not from the mean
     speed: 2 of 8 parts in 31 seconds leave 93."""
     with ProgressBar("mapping", 8) as bar:
@@ -32,7 +26,7 @@ def test_a_line_now_and_then(clock: Clock, capsys) -> None:
     assert {*others} == {"mapping: 100 %, 01:30 gone, 00:00 left, loss 0.5"}
 
 
-def test_a_warm_up_is_left_out(clock: Clock, capsys) -> None:
+def test_a_warm_up_is_left_out(clock, capsys) -> None:
     """Catches hours that are left for half an hour, because the first frame was compiled."""
     with ProgressBar("tracking", 60) as bar:
         clock.now = 600
@@ -45,7 +39,7 @@ def test_a_warm_up_is_left_out(clock: Clock, capsys) -> None:
     assert "29:58 left" in second  # 58 times 31 s
 
 
-def test_short_and_hidden_work_is_silent(clock: Clock, capsys) -> None:
+def test_short_and_hidden_work_is_silent(clock, capsys) -> None:
     """Catches noise about what takes no time, and about what nobody asked to see."""
     with ProgressBar("short", 1) as bar:
         bar.move_to(1)
