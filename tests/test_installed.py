@@ -82,7 +82,7 @@ FEW = [
 ]
 SCRIPT = f"""{OWN}
 from nbtrack.experiments.grid import Execution
-preset = nbtrack.load_preset(settings={[*TINY, *FEW]!r})
+preset = nbtrack.load_preset(settings={[*TINY, *FEW, "scenes.names=['office','bedroom']"]!r})
 how = [nbtrack.open_scenes(preset), ["mine"], preset, [10]]
 for workers in (2, 1):
     runs = nbtrack.track_scenes(*how, execution=Execution(workers=workers))
