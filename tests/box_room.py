@@ -25,13 +25,7 @@ class Formula(LearnedField):
     name, label, surface_level = "formula", "Formula", 0.0
     mapping_losses = None  # not asked for
 
-    def __init__(
-        self,
-        value,
-        bounds: SceneBounds,
-        color=grey,
-        as_density: bool = False,
-    ) -> None:
+    def __init__(self, value, bounds: SceneBounds, color=grey, as_density: bool = False) -> None:
         super().__init__(bounds)
         self.value, self.color, self.as_density = value, color, as_density
 

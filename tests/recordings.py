@@ -17,13 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from nbtrack.core.camera import Intrinsics
 from nbtrack.recordings.reading import read_sequence
-from nbtrack.synthetic import (
-    add_kinect_noise,
-    build_room,
-    filter_depth,
-    handheld_trajectory,
-    render_frame,
-)
+from nbtrack.synthetic import add_kinect_noise, build_room, filter_depth, render_frame
+from nbtrack.synthetic.motion import handheld_trajectory
 
 # The focal length of 7-Scenes at this width; pixel centres at integer + 0.5.
 CAMERA = Intrinsics.from_focal(48, 36, 585.0 * 48 / 640)

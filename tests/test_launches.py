@@ -28,16 +28,7 @@ from nbtrack.machinery.device import advise_on_memory
 from nbtrack.machinery.errors import DataError, OutOfMemory
 from nbtrack.machinery.files import naming_damaged
 from nbtrack.mapping.fit import _Fit
-from nbtrack.tracking import (
-    AdamTracker,
-    SdfSettings,
-    SdfTracker,
-    StepBudget,
-    Tracker,
-    VrTracker,
-    make_tracker,
-    track_sequence,
-)
+from nbtrack.tracking import AdamTracker, SdfTracker, StepBudget, VrTracker, track_sequence
 
 BOUNDS = SceneBounds((-1.2, -1.0, -1.4), (1.2, 1.0, 1.4))
 WAITS = "_local_scalar_dense", "nonzero", "masked_select", "is_nonzero"
@@ -123,7 +114,7 @@ class Choosy(Own):
 CPU, on_tapes = torch.device("cpu"), pytest.mark.usefixtures("as_on_a_gpu")
 
 
-def tracked(kind: type[Tracker], field_name: str, device: torch.device = CPU) -> np.ndarray:
+def tracked(kind: type, field_name: str, device: torch.device = CPU) -> np.ndarray:
     field = make_field(field_name, NetworkSettings(width=16), BOUNDS, seed=3).to(device)
     settings = kind.Settings(n_pixels=24)
     tracker = kind(field, SEQUENCE.T_world_camera[0], StepBudget(4), settings)
@@ -136,7 +127,7 @@ PAIRS = (SdfTracker, "neus"), (VrTracker, "imap"), (VrTracker, "neus"), (Own, "n
 
 @on_tapes
 @pytest.mark.parametrize(("kind", "field_name"), PAIRS)
-def test_a_replayed_step_is_the_step(kind: type[AdamTracker], field_name: str, monkeypatch) -> None:
+def test_a_replayed_step_is_the_step(kind: type, field_name: str, monkeypatch) -> None:
     """Catches a step that keeps the pixels, images, moments or random numbers of the recording, and
     one that reads a value on the host."""
     found = []
@@ -187,7 +178,7 @@ def cuda() -> torch.device:
 
 @pytest.mark.gpu
 @pytest.mark.parametrize(("kind", "field_name"), [*PAIRS, (LmTracker, "neus")])
-def test_a_gpu_tracks_as_a_cpu(kind: type[Tracker], field_name: str, cuda, monkeypatch) -> None:
+def test_a_gpu_tracks_as_a_cpu(kind: type, field_name: str, cuda, monkeypatch) -> None:
     """Catches tensors left on the host, double precision that a device lacks, other poses than a
     few steps from the start can reach, and recorded steps that draw other numbers."""
     recorded = tracked(kind, field_name, cuda)
@@ -249,8 +240,8 @@ def test_parts_answer_as_the_whole(name: str, monkeypatch) -> None:
 
 def test_many_frames_leave_no_memory_behind() -> None:
     """Catches tensors that a tracker keeps of every frame."""
-    settings, frame, counts = SdfSettings(n_pixels=16), walk(2)[1], []
-    tracker = make_tracker("sdf", frozen_field("neus"), np.eye(4), StepBudget(1), settings)
+    settings, frame, counts = SdfTracker.Settings(n_pixels=16), walk(2)[1], []
+    tracker = SdfTracker(frozen_field("neus"), np.eye(4), StepBudget(1), settings)
     for n_frames in (2, 5):
         for _ in range(n_frames):
             tracker.restart(np.eye(4))

@@ -1,5 +1,6 @@
-"""Fitting fields: what is learnt, resume, and settings that do not fit."""
+"""Fitting fields: what is learnt, resume, settings that do not fit; scores, of known errors."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from unittest import mock
@@ -7,14 +8,19 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
-from box_room import poses_at, sequence_of
+from box_room import Formula, poses_at, room_sequence, sequence_of
 
 from nbtrack.beyond.points import PointMapping
 from nbtrack.core.camera import Intrinsics
+from nbtrack.data.sequence import observed_bounds
+from nbtrack.experiments.quality import score_map
 from nbtrack.fields import MappingSettings, NetworkSettings, field_class
-from nbtrack.machinery.errors import NumericalError
+from nbtrack.machinery.errors import DataError, NumericalError
+from nbtrack.mapping.files import Map
 from nbtrack.mapping.fit import learning_rate, map_sequence
 from nbtrack.mapping.holdout import split_holdout
+from nbtrack.plots.meshes import extract_mesh, seen_by
+from nbtrack.synthetic import build_room
 
 NETWORK = NetworkSettings(width=48, n_frequencies=32)
 
@@ -119,3 +125,68 @@ def test_schedule_and_split() -> None:
     assert held_out.tolist() == [5, 15]
     assert sorted([*mapped, *held_out]) == list(range(25))
     assert len(split_holdout(5, 10)[1]) == len(split_holdout(25, 0)[1]) == 0
+
+
+ROOM = build_room("bedroom")
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    """What a camera sees of it, with clean depth."""
+    return room_sequence("bedroom", 40, 15)
+
+
+def shifted(sequence, shift: float) -> Formula:
+    """The exact room, its distance off by a constant: the surface moves by as much."""
+
+    def distance(points_world):
+        return torch.from_numpy(ROOM.sdf(points_world.double().numpy()) - shift).float()
+
+    return Formula(distance, observed_bounds(sequence))
+
+
+def quality_of(sequence, shift: float) -> dict:
+    made = {"settings": {"holdout_every": 0}}
+    return score_map(Map(shifted(sequence, shift), sequence.intrinsics, made), sequence, ROOM)
+
+
+def test_scores(sequence, monkeypatch) -> None:
+    """Catches scores that punish an exact map, blind scores and wrong units: of the truth, within
+    half a cell, and of a surface 8 cm inside the room, which is beyond 5 cm."""
+    monkeypatch.setattr("nbtrack.experiments.quality.POINTS_SCORED", 4000)
+    exact, inside = quality_of(sequence, 0.0), quality_of(sequence, 0.08)
+    assert (exact["psnr_db"], exact["depth_l1_m"]) == (None, None)
+    assert max(exact["sdf_near_m"], exact["sdf_free_m"]) < 1e-5
+    assert exact["mesh_accuracy_m"] < 0.01
+    assert exact["mesh_completion_m"] < 0.03
+    assert exact["mesh_f_score"] > 0.95
+    assert inside["sdf_near_m"] == pytest.approx(0.08, abs=1e-5)
+    assert inside["sdf_free_m"] == pytest.approx(0.08, abs=1e-5)
+    assert inside["mesh_accuracy_m"] == pytest.approx(0.08, abs=0.01)
+    assert inside["mesh_f_score"] < 0.3
+    # No surface yet is no error: its mesh scores are just empty.
+    lost = quality_of(sequence, -10.0)
+    assert {lost[name] for name in lost if name.startswith("mesh")} == {None}
+
+
+def test_seen_points(sequence) -> None:
+    """Catches wrong visibility: what a pixel measured is seen, what lies far behind it is not."""
+    T_world_camera, depth = sequence.T_world_camera[0], float(sequence.depth(0)[15, 20])
+    ahead = np.array([depth, depth / 2, depth + 0.5, -1.0])
+    points = T_world_camera[:3, 3] + ahead[:, None] * T_world_camera[:3, 2]
+    assert seen_by(points, sequence.select(slice(1))).tolist() == [True, True, False, False]
+    # A choice of frames counts: what one frame saw, a frame behind it did not.
+    others = [i for i in range(len(sequence)) if seen_by(points[3:], sequence, np.array([i]))[0]]
+    assert 0 not in others
+    asked = {*range(0, len(sequence), 5)}
+    assert seen_by(points[3:], sequence)[0] == bool(asked & {*others})
+
+
+def test_mesh_is_in_metres_and_world_frame(sequence) -> None:
+    """Catches grid units or a lost offset: every corner lies on the exact surface."""
+    whole, mesh = (extract_mesh(shifted(sequence, 0.0), part) for part in (None, sequence))
+    assert np.quantile(np.abs(ROOM.sdf(np.asarray(mesh.vertices))), 0.95) < 0.01
+    assert len(mesh.vertices) < len(whole.vertices)
+    blind = replace(sequence, depths_mm=np.zeros_like(sequence.depths_mm))
+    with pytest.raises(DataError, match="no frame saw the surface"):
+        extract_mesh(shifted(sequence, 0.0), blind)
