@@ -4,7 +4,6 @@ import pytest
 import torch
 from box_room import Formula
 from test_fields import points_inside
-from torch import Tensor
 
 from nbtrack.beyond import grid
 from nbtrack.beyond.grid import BakedField
@@ -23,11 +22,11 @@ def formula(value) -> Formula:
     return Formula(value, BOX, lambda points: 0.4 + points @ MIX)
 
 
-def linear(points: Tensor) -> Tensor:
+def linear(points):
     return points @ SLOPE + 0.1
 
 
-def with_gradient(field: Formula | BakedField, points: Tensor) -> tuple[Tensor, Tensor]:
+def with_gradient(field: Formula | BakedField, points):
     """The value at points, and its gradient."""
     points = points.clone().requires_grad_()
     value = field(points)[1]

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from finished import OWN
 from recordings import write_recording
 from scipy.spatial.transform import Rotation
 from test_faults import assert_refused
@@ -34,14 +35,13 @@ def track(path: Path | str, *more: str) -> list[str]:
     return [*words, *TINY, *more]
 
 
-def test_track_writes_what_it_promises(tmp_path: Path, capsys) -> None:
+def test_track_writes_what_it_promises(work: Path, capsys) -> None:
     """Catches missing files and keys, and an error that the trajectories do not bear out."""
-    out = tmp_path / "result"
-    assert main(track("living_room", "--out", str(out), "--seed", "3")) == 0
-    printed = capsys.readouterr().out
+    assert main(OWN) == 0
+    out, printed = work / "run", capsys.readouterr().out
     metrics = json.loads((out / "metrics.json").read_text())
     assert f"error  {1000 * metrics['ate_rmse_m']:.1f} mm (ATE)" in printed
-    assert "_m" not in printed.replace(str(tmp_path), "")  # no keys, but words
+    assert "_m" not in printed.replace(str(work), "")  # no keys, but words
     assert "2.0 steps" in printed
     promised = (
         "ate_rmse_m", "ate_rmse_aligned_m", "rotation_rmse_deg", "max_error_m", "frames",
@@ -49,7 +49,7 @@ def test_track_writes_what_it_promises(tmp_path: Path, capsys) -> None:
         "device", "field", "tracker", "seed", "config", "command",
     )  # fmt: skip
     assert set(promised) <= set(metrics)
-    assert (metrics["frames"], metrics["steps_per_frame"], metrics["seed"]) == (5, 2.0, 3)
+    assert (metrics["frames"], metrics["steps_per_frame"], metrics["seed"]) == (5, 2.0, 0)
     times, estimated = read_tum(out / "trajectory.txt")
     _, true = read_tum(out / "groundtruth.txt")
     assert times.tolist() == pytest.approx([n / 30 for n in range(1, 6)])

@@ -36,6 +36,7 @@ from nbtrack.tracking.methods import METHODS, find_methods
 from nbtrack.tracking.paper import SdfSettings, SdfTracker
 
 SEQUENCE, CAMERA = walk(4), walk(1).intrinsics
+COLOR, DEPTH = SEQUENCE.colors[0], SEQUENCE.depths_mm[0]
 NETWORK, UNIT = NetworkSettings(width=16, n_frequencies=8), ((-1.0,) * 3, (1.0,) * 3)
 SMALL = {"iterations": 3, "n_rays": 8, "holdout_every": 0}
 
@@ -86,6 +87,10 @@ REFUSED = {
     "a pose that stretches": lambda: mapped(replace(SEQUENCE, T_world_camera=poses_with(2))),
     "depth in metres": lambda: replace(SEQUENCE, depths_mm=SEQUENCE.depths_mm / 1000),
     "fewer depths": lambda: replace(SEQUENCE, depths_mm=SEQUENCE.depths_mm[:2]),
+    "millimetres as float": lambda: nbtrack.Frame.of_images(CAMERA, COLOR, DEPTH.astype(float)),
+    "colour as integers": lambda: nbtrack.Frame.of_images(CAMERA, COLOR.astype(np.int64), DEPTH),
+    "grey": lambda: nbtrack.Frame.of_images(CAMERA, COLOR[..., 0], DEPTH),
+    "another size": lambda: nbtrack.Frame.of_images(CAMERA, COLOR, DEPTH[::2, ::2]),
     "frames for a frame": lambda: SEQUENCE[0:3],
     "a frame for frames": lambda: SEQUENCE.select(3),
     "points of two": lambda: BoxRoom()(torch.zeros(5, 2)),
@@ -221,10 +226,11 @@ def test_threads_leave_the_process_as_it_was(tmp_path: Path) -> None:
     waiting.result()
 
 
+COPIES = [copy.copy, copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))]
+
+
 @pytest.mark.parametrize("name", ["sdf", "lm"])
-@pytest.mark.parametrize(
-    "copied", [copy.copy, copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))]
-)
+@pytest.mark.parametrize("copied", COPIES)
 def test_trackers_are_copied_and_fields_are_theirs(copied, name: str) -> None:
     """Catches a copy that goes elsewhere or moves the original, and a field that the tracker
     freezes, or that moves the tracker when its owner changes it."""

@@ -158,13 +158,13 @@ def test_box_by_hand() -> None:
     assert box.far_bound(starts, along).tolist() == pytest.approx([2.0, 0.5, -4.0])
 
 
-@pytest.mark.parametrize(
-    ("pose", "margin", "low", "high"),
-    [
-        (AHEAD, 0.1, [-2.0, -2.0, -0.1], [2.0, 2.0, 2.1]),  # seen at +-0.95 * 2 m; camera at z = 0
-        (TURNED, 0.0, [5.0, -1.9, -1.9], [7.0, 1.9, 1.9]),
-    ],
-)
+OBSERVED = [
+    (AHEAD, 0.1, [-2.0, -2.0, -0.1], [2.0, 2.0, 2.1]),  # seen at +-0.95 * 2 m; camera at z = 0
+    (TURNED, 0.0, [5.0, -1.9, -1.9], [7.0, 1.9, 1.9]),
+]
+
+
+@pytest.mark.parametrize(("pose", "margin", "low", "high"), OBSERVED)
 def test_observed_wall(pose, margin, low, high) -> None:
     """Catches pixels that are half off, no margin, a camera left outside: a wall is 2 m ahead."""
     box = observed_bounds(sequence_of(np.full((1, 20, 20), 2000), SQUARE, poses=pose), margin)

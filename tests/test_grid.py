@@ -37,10 +37,7 @@ class Square(Job):
     needs: "Square | None" = None
     is_done: bool = False
     kind, key = "squares", "0"
-
-    @property
-    def name(self) -> str:
-        return f"square {self.number}"
+    name = property(lambda self: f"square {self.number}")
 
     def result(self) -> int:
         return self.number**2

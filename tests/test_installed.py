@@ -33,14 +33,14 @@ def test_folders(elsewhere: Path) -> None:
     assert files.tables_folder() == elsewhere / "paper_tables"
 
 
-@pytest.mark.parametrize(
-    ("missing", "arguments", "message"),
-    [
-        ("distributed", ["tables", "--dask", "tcp://h:1"], "pip install 'nbtrack[cluster]'"),
-        ("small_gicp", ["track", "office", "--field", "points", "--tracker", "icp", "--steps", "1"],
-         "pip install 'nbtrack[icp]'"),
-    ],
-)  # fmt: skip
+EXTRAS = [
+    ("distributed", ["tables", "--dask", "tcp://h:1"], "pip install 'nbtrack[cluster]'"),
+    ("small_gicp", ["track", "office", "--field", "points", "--tracker", "icp", "--steps", "1"],
+     "pip install 'nbtrack[icp]'"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("missing", "arguments", "message"), EXTRAS)
 def test_a_missing_extra_is_told_before_any_work(
     elsewhere: Path, missing: str, arguments: list[str], message: str, monkeypatch, capsys
 ) -> None:

@@ -240,9 +240,10 @@ def test_a_file_gives_the_same_trajectory(work: Path, tmp_path: Path, monkeypatc
     np.testing.assert_allclose(np.loadtxt("kitti").reshape(-1, 3, 4), expected, atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("source", "kind"), [("map", "ply"), ("room", "ply"), ("run", "ply"), ("run", "glb")]
-)
+MESHES = [("map", "ply"), ("room", "ply"), ("run", "ply"), ("run", "glb")]
+
+
+@pytest.mark.parametrize(("source", "kind"), MESHES)
 def test_meshes_keep_their_colours(work: Path, source: str, kind: str) -> None:
     """Catches meshes that come out grey, empty, or on another side of the world, and that of a run
     that is refused."""

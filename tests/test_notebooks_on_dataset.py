@@ -13,7 +13,7 @@ NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/0*.ipynb"))
 SCENES = {"kitchen": "living_room", "whiteroom": "office"}  # what they show is a room of ours
 SIZE = 64, 48
 SETTINGS = """
-    mapping.imap.iterations=100 mapping.imap.n_rays=32 network.imap.width=32
+    mapping.imap.iterations=200 mapping.imap.n_rays=32 network.imap.width=32
     mapping.neus.iterations=100 mapping.neus.n_rays=32 network.neus.width=32
     mapping.neus_plus.iterations=60 mapping.neus_plus.n_rays=32
     mapping.neus_plus.n_surface_points=128 scenes.track_frames=20:26

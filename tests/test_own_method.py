@@ -4,7 +4,7 @@ import contextlib
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import make_dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from unittest import mock
@@ -32,7 +32,7 @@ from nbtrack.tracking import TRACKERS, tracker_class
 OWN = '''
 """A field whose distances fade, and a tracker that only looks at distances."""
 
-from dataclasses import dataclass
+from dataclasses import make_dataclass
 
 import nbtrack
 from nbtrack.core.geometry import transform_points
@@ -143,16 +143,16 @@ def test_a_file_joins_by_an_option_of_every_command(tmp_path: Path, monkeypatch,
         assert main(["export", str(made), "--to", "ply", "room.ply", "--import", "my-method"]) == 0
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "says"),
-    [
-        ("own.py", None, "no file"),
-        ("own.py", "x = 1\n1 / 0\n", "own.py, line 2 (ZeroDivisionError: division by zero)"),
-        ("own.py", "x = (\n", "own.py, line 1"),
-        ("nbtrack_nowhere", None, "No module named 'nbtrack_nowhere'"),
-        ("json.py", "", "rename"),
-    ],
-)
+NOT_IMPORTED = [
+    ("own.py", None, "no file"),
+    ("own.py", "x = 1\n1 / 0\n", "own.py, line 2 (ZeroDivisionError: division by zero)"),
+    ("own.py", "x = (\n", "own.py, line 1"),
+    ("nbtrack_nowhere", None, "No module named 'nbtrack_nowhere'"),
+    ("json.py", "", "rename"),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "says"), NOT_IMPORTED)
 def test_a_file_that_cannot_be_imported(
     name: str, text: str | None, says: str, tmp_path: Path, monkeypatch, capsys
 ) -> None:
@@ -171,17 +171,12 @@ def test_settings_of_own_classes_whenever_they_are_registered(monkeypatch) -> No
     own defaults, with what smoke changes in NeuS or SDF, and without a user's values of those; and
     a class written anew, as a cell run again does, that loses what was chosen for it."""
 
-    @dataclass(frozen=True)
-    class Network:
-        width: int = 48
+    def made(base: type, **defaults: object) -> type:
+        fields = [(name, type(value), value) for name, value in defaults.items()]
+        return make_dataclass("Own", fields, bases=(base,), frozen=True)
 
-    @dataclass(frozen=True)
-    class Mapping(NeusMapping):
-        n_surface: int = 5
-
-    @dataclass(frozen=True)
-    class Tracking(TRACKERS["sdf"].Settings):
-        motion_model: str = "constant_velocity"
+    Network, Mapping = made(object, width=48), made(NeusMapping, n_surface=5)
+    Tracking = made(TRACKERS["sdf"].Settings, motion_model="constant_velocity")
 
     def register() -> None:
         field = {"name": "mine", "Network": Network, "Settings": Mapping}
@@ -208,16 +203,16 @@ NAMED = type("Mine", (nbtrack.LearnedField,), NAME)
 OF_NO_KIND = {**NAME, "label": "Blank", "surface_level": 0.0, "is_distance": False, "forward": len}
 
 
-@pytest.mark.parametrize(
-    ("known", "kind", "says"),
-    [
-        (FIELDS, NOTHING, "'mine' lacks name"),
-        (TRACKERS, NOTHING, "'mine' lacks name"),
-        (FIELDS, FIELDS["neus"], "calls itself 'neus'"),  # its map would be read as its base's
-        (FIELDS, NAMED, "'mine' lacks label, forward, mapping_losses, weights: give them to"),
-        (FIELDS, type("Mine", (nbtrack.Field,), OF_NO_KIND), "no tracker works on field 'mine'"),
-    ],
-)
+LACKING = [
+    (FIELDS, NOTHING, "'mine' lacks name"),
+    (TRACKERS, NOTHING, "'mine' lacks name"),
+    (FIELDS, FIELDS["neus"], "calls itself 'neus'"),  # its map would be read as its base's
+    (FIELDS, NAMED, "'mine' lacks label, forward, mapping_losses, weights: give them to"),
+    (FIELDS, type("Mine", (nbtrack.Field,), OF_NO_KIND), "no tracker works on field 'mine'"),
+]
+
+
+@pytest.mark.parametrize(("known", "kind", "says"), LACKING)
 def test_classes_that_lack_something(known, kind: type, says: str, monkeypatch) -> None:
     """Catches an AttributeError in the middle of a command, and a StopIteration where no tracker of
     the package's works in an own field."""
@@ -234,13 +229,13 @@ def test_a_place_too_large_for_a_correction() -> None:
     assert not [*(runs_folder() / "maps").glob("*/map*")]
 
 
-@pytest.mark.parametrize(
-    ("last", "says"),
-    [
-        (lambda terms: sum(terms.values()), "mapping_losses of mine gave no dict"),
-        (lambda terms: {"color": terms["color"]}, "gave color after depth, color, eikonal: give"),
-    ],
-)
+NO_TERMS = [
+    (lambda terms: sum(terms.values()), "mapping_losses of mine gave no dict"),
+    (lambda terms: {"color": terms["color"]}, "gave color after depth, color, eikonal: give"),
+]
+
+
+@pytest.mark.parametrize(("last", "says"), NO_TERMS)
 def test_losses_that_are_no_terms(last, says: str, monkeypatch) -> None:
     """Catches torch's words about sizes or sparse tensors where a field returns the sum of its
     terms, or a term only now and then."""

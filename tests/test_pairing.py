@@ -28,16 +28,16 @@ def rename(recording: Path, colors, depths=None) -> None:
             path.with_name(name + path.suffix).write_bytes(content)
 
 
-@pytest.mark.parametrize(
-    ("color", "depth", "numbers"),
-    [
-        ("{:04}_cam0", "{:04}_cam0", RUN),
-        ("rgb8_{:04}", "depth16_{:04}_of_6", RUN),
-        ("2026-11-25_{}_8bit", "{}", (8, 9, 10, 11, 99, 100)),
-        ("{0}_1305031102.{0}75", "{0}_1305031102.{0}75", RUN),
-        ("scan_{:03}.color", "scan_{:03}.depth", (0, 3, 4, 7, 8, 9)),
-    ],
-)
+NAMED = [
+    ("{:04}_cam0", "{:04}_cam0", RUN),
+    ("rgb8_{:04}", "depth16_{:04}_of_6", RUN),
+    ("2026-11-25_{}_8bit", "{}", (8, 9, 10, 11, 99, 100)),
+    ("{0}_1305031102.{0}75", "{0}_1305031102.{0}75", RUN),
+    ("scan_{:03}.color", "scan_{:03}.depth", (0, 3, 4, 7, 8, 9)),
+]
+
+
+@pytest.mark.parametrize(("color", "depth", "numbers"), NAMED)
 def test_numbers_in_names(plain: Path, color: str, depth: str, numbers: tuple[int, ...]) -> None:
     """Catches a number of the camera, the bits or the date that is taken for the frame's, and an
     image that is refused, or put in another place, for it."""

@@ -30,14 +30,14 @@ def key() -> str:
     return provenance.code_fingerprint(SdfTracker)
 
 
-@pytest.mark.parametrize(
-    ("file", "counts"),
-    [
-        ("fields/rendering.py", True), ("core/geometry.py", True), ("beyond/correction.py", True),
-        ("experiments/quality.py", True), ("recordings/reading.py", True),
-        ("checks/check.py", False), ("plots/rooms.py", False), ("cli.py", False),
-    ],
-)  # fmt: skip
+EDITED = [
+    ("fields/rendering.py", True), ("core/geometry.py", True), ("beyond/correction.py", True),
+    ("experiments/quality.py", True), ("recordings/reading.py", True),
+    ("checks/check.py", False), ("plots/rooms.py", False), ("cli.py", False),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("file", "counts"), EDITED)
 def test_what_changes_a_key(package: Path, file: str, counts: bool) -> None:
     """Catches an edited loss or score that is answered from the cache, and results lost for a
     picture."""

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from box_room import Formula, poses_at, sequence_of
-from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, backproject
@@ -36,7 +35,7 @@ def random_sequence(n_frames: int):
     return sequence_of(rng.integers(0, 1 << 16, shape), CAMERA, colors, poses)
 
 
-def rays_ahead(n_rays: int, depth: Tensor) -> Rays:
+def rays_ahead(n_rays: int, depth) -> Rays:
     """Rays from the origin that fan out in x, with z = 1."""
     slope = torch.linspace(-0.4, 0.4, n_rays)
     directions = torch.stack([slope, torch.zeros(n_rays), torch.ones(n_rays)], dim=-1)

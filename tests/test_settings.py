@@ -23,29 +23,15 @@ from nbtrack.fields import NetworkSettings
 from nbtrack.machinery.errors import ConfigError, NbtrackError
 from nbtrack.machinery.settings import changed_settings, flat, with_settings
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.recordings.reading import parse_frames
-from nbtrack.synthetic import REPORTED_ROOMS, build_room
-from nbtrack.synthetic.make import MOTIONS
+from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.tables import published_table_1
 from nbtrack.tracking import StepBudget
-from nbtrack.tracking.metrics import still_metrics
 
 KEY = "mapping.neus.iterations"
 
 
 def iterations(preset: Preset) -> int:
     return preset.mapping_of("neus").iterations
-
-
-@pytest.mark.parametrize(("name", "floor_m"), [("smoke", 0.3), ("nine_rooms", 1.0)])
-def test_tracked_frames_leave_their_start(name: str, floor_m: float) -> None:
-    """Catches a preset that tracks frames in which a camera that stands still does nearly as well
-    as one that is tracked."""
-    scenes = PRESETS[name].scenes
-    tracked = parse_frames(scenes.track_frames)
-    for room in scenes.names:
-        path = MOTIONS[scenes.motion](build_room(room), scenes.n_frames, scenes.seed)
-        assert still_metrics(path[tracked])["still_ate_m"] > floor_m, room
 
 
 def test_figures_of_the_presets() -> None:

@@ -239,24 +239,22 @@ def test_written_files(tmp_path: Path) -> None:
     assert "C, $n = 512$ &" in third.read_text()
 
 
-@pytest.mark.parametrize(
-    ("given", "written"),
-    [
-        ("Errors of 95% of R&D_runs #1", r"Errors of 95\% of R\&D\_runs \#1"),
-        (r"\emph{50\% of} $x_1^2$, 5$ each", r"\emph{50\% of} $x_1^2$, 5\$ each"),
-        (r"see \ref{tab:a_b}, \cite{x_y} in \textbf{R_1} ^", None),
-        ("a { brace", r"a \{ brace"),
-        ("$50% & x$", r"$50\% \& x$"),
-        ("two\n\nparagraphs\\", r"two paragraphs\textbackslash{}"),
-    ],
-)
-def test_captions_compile(tmp_path: Path, given: str, written: str | None) -> None:
+CAPTIONS = [
+    ("Errors of 95% of R&D_runs #1", r"Errors of 95\% of R\&D\_runs \#1"),
+    (r"\emph{50\% of} $x_1^2$, 5$ each", r"\emph{50\% of} $x_1^2$, 5\$ each"),
+    (r"see \ref{tab:a_b}, \cite{x_y} ^", r"see \ref{tab:a_b}, \cite{x_y} \textasciicircum{}"),
+    ("a { brace", r"a \{ brace"),
+    ("$50% & x$", r"$50\% \& x$"),
+    ("two\n\nparagraphs\\", r"two paragraphs\textbackslash{}"),
+]
+
+
+@pytest.mark.parametrize(("given", "written"), CAPTIONS)
+def test_captions_compile(tmp_path: Path, given: str, written: str) -> None:
     """Catches a caption or label that ends a line, a cell or TeX, and LaTeX that is spoiled."""
     own = Wording(given, "tab:a_b%c#1")
     first, *_ = write_tables(tmp_path, OURS_1, OURS_2, NOTE, wording=own)
     text = first.with_suffix(".tex").read_text()
-    if written is None:
-        written = given.replace("R_1", r"R\_1").replace("^", r"\textasciicircum{}")
     assert rf"\caption{{{written} \textcolor{{red}}" in text
     assert r"\label{tab:a_b-c-1}" in text
     assert r"\label{tab:a_b-c-1-steps}" in (tmp_path / "table_2.tex").read_text()

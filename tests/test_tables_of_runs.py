@@ -21,7 +21,6 @@ from nbtrack.experiments.bench import default_pixels, measure_steps
 from nbtrack.experiments.jobs import Execution
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
-from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError
@@ -40,12 +39,12 @@ def cache(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def preset(cache: Path) -> Preset:
+def preset(cache: Path):
     return load_preset("smoke", settings=TINY)
 
 
 @pytest.fixture(scope="module")
-def scenes(preset: Preset) -> list[Scene]:
+def scenes(preset) -> list[Scene]:
     """Two rooms of a few pixels."""
     return open_scenes(preset)
 
@@ -59,7 +58,7 @@ def coarse_methods(monkeypatch) -> None:
         monkeypatch.setitem(METHODS, name, replace(method, settings=settings))
 
 
-def test_table_1_twice(preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch) -> None:
+def test_table_1_twice(preset, scenes: list[Scene], tmp_path: Path, monkeypatch) -> None:
     """Catches missing cells, runs that are made again, and hidden randomness anywhere."""
     cells = track_scenes(scenes, TABLE_1, preset)
     assert len(cells) == 2 * 2 * 2  # methods, rates, rooms
@@ -79,7 +78,7 @@ def test_table_1_twice(preset: Preset, scenes: list[Scene], tmp_path: Path, monk
     assert elsewhere["ate_m"].tolist() == here["ate_m"].tolist()
 
 
-def test_keys_change_with_what_matters(preset: Preset, scenes: list[Scene], monkeypatch) -> None:
+def test_keys_change_with_what_matters(preset, scenes: list[Scene], monkeypatch) -> None:
     """Catches a cached result that is taken for one of another setting, seed, slice or version, and
     one that is made anew for a setting that it does not read."""
     cells = [
@@ -102,7 +101,7 @@ def test_keys_change_with_what_matters(preset: Preset, scenes: list[Scene], monk
     assert replace(runs[0]).key != runs[1].key
 
 
-def test_maps_and_their_scores(preset: Preset, scenes: list[Scene]) -> None:
+def test_maps_and_their_scores(preset, scenes: list[Scene]) -> None:
     """Catches scores that are missing for a room whose truth is known, and maps made twice."""
     scores = map_scenes(scenes[1:], ["neus", "neus_plus"], preset)
     assert scores["field"].tolist() == ["neus", "neus_plus"]
@@ -114,7 +113,7 @@ def test_maps_and_their_scores(preset: Preset, scenes: list[Scene]) -> None:
     assert len(found.history) == 6
 
 
-def test_budgets(preset: Preset, scenes: list[Scene]) -> None:
+def test_budgets(preset, scenes: list[Scene]) -> None:
     """Steps of the paper's hardware, so many steps, or the clock: then no step count at all."""
     by_steps = track_scenes(scenes[1:], ["vr_neus", "sdf"], preset, [10])
     assert by_steps["steps"].tolist() == [6.8, 15.3]
@@ -141,7 +140,7 @@ def test_table_3(tmp_path: Path, coarse_methods: None, monkeypatch) -> None:
 
 
 def test_every_method_is_made_again_from_its_command(
-    preset: Preset, scenes: list[Scene], tmp_path: Path, coarse_methods: None, monkeypatch
+    preset, scenes: list[Scene], tmp_path: Path, coarse_methods: None, monkeypatch
 ) -> None:
     """Catches a command that lacks a setting, a seed or a slice, or is refused; of the first method
     the map is made anew too."""
@@ -163,7 +162,7 @@ def test_every_method_is_made_again_from_its_command(
         assert again.metrics["seed"] == 1
 
 
-def test_a_second_path(preset: Preset, scenes: list[Scene], tmp_path: Path, monkeypatch) -> None:
+def test_a_second_path(preset, scenes: list[Scene], tmp_path: Path, monkeypatch) -> None:
     """Catches a run on the mapped path, one taken for it in the cache, and a wrong command."""
     second = open_scenes(with_settings(preset, "scenes.seed=1"))[1:]
     mapped = track_scenes(scenes[1:], ["sdf"], preset, [10])
@@ -179,7 +178,7 @@ def test_a_second_path(preset: Preset, scenes: list[Scene], tmp_path: Path, monk
     assert metrics["ate_rmse_m"] == found["ate_m"][0]
 
 
-def test_a_recording_without_reference(preset: Preset, scenes: list[Scene], tmp_path: Path) -> None:
+def test_a_recording_without_reference(preset, scenes: list[Scene], tmp_path: Path) -> None:
     """Catches a table that ends, and loses its other cells, because one recording has no poses."""
     unknown = tmp_path / "unknown"
     shutil.copytree(scenes[1].folder, unknown)
@@ -193,7 +192,7 @@ def test_a_recording_without_reference(preset: Preset, scenes: list[Scene], tmp_
     assert table_1(results).isna().sum(axis=None) == 2  # of the method, and of standing still
 
 
-def test_a_cached_run_is_checked(cache: Path, preset: Preset, scenes: list[Scene]) -> None:
+def test_a_cached_run_is_checked(cache: Path, preset, scenes: list[Scene]) -> None:
     """Catches a table that ends in a traceback, or as a whole, or holds a hole without a word, for
     a spoilt file of the cache."""
     run, _ = track_scenes(scenes, ["sdf"], preset, [10])["run"]
@@ -210,7 +209,7 @@ def test_a_cached_run_is_checked(cache: Path, preset: Preset, scenes: list[Scene
     path.write_text(sound)
 
 
-def test_table_2_of_this_machine(preset: Preset, scenes: list[Scene]) -> None:
+def test_table_2_of_this_machine(preset, scenes: list[Scene]) -> None:
     """Catches empty cells: even a slow machine fits a step of 16 points into 20 ms sometimes; and
     rows that stand there twice, where two methods share a tracker."""
     steps = measure_steps(preset, scenes[0], [*TABLE_1, "vr_neus"])
@@ -243,7 +242,7 @@ def test_table_2_measures_own_settings(tmp_path: Path, scenes: list[Scene], monk
     assert "\\bfseries 8 " in (tmp_path / "table_2.tex").read_text()
 
 
-def test_wrong_scenes_are_told_first(preset: Preset, tmp_path: Path, monkeypatch) -> None:
+def test_wrong_scenes_are_told_first(preset, tmp_path: Path, monkeypatch) -> None:
     """Catches a misspelt column that is left out in silence, a column counted as two seeds, an
     unhelpful error where the dataset was not downloaded, and minutes of mapping before a recording
     turns out to be shorter than the part that the preset tracks."""
@@ -283,7 +282,7 @@ def test_a_scene_whose_tracked_part_has_no_pose(cache: Path, tmp_path: Path, cap
     assert len(pd.read_csv(tmp_path / "out/table_2.csv")) == 1
 
 
-def test_a_damaged_scene_leaves_the_others(preset: Preset, tmp_path: Path, capsys) -> None:
+def test_a_damaged_scene_leaves_the_others(preset, tmp_path: Path, capsys) -> None:
     """Catches one bad folder, or one scene that was not downloaded, that stops the whole grid."""
     broken = write_recording("neural_rgbd", tmp_path / "broken")
     (broken / "images/img2.png").unlink()
