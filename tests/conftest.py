@@ -14,8 +14,8 @@ for name in ("PRESET", "CONFIG", "SET", "DATA", "RUNS"):  # of whoever runs the 
 os.environ["NBTRACK_DEVICE"] = "cpu"  # where there is a GPU too: what is tested there says so
 os.environ["OMP_NUM_THREADS"] = "1"  # images are so small that threads would only wait for others
 LONG = [
-    "test_lm_solver", "test_grid", "test_misfits", "test_own_method", "test_tables_of_runs",
-    "test_data_check", "test_settings", "test_synthetic", "test_plots", "test_map_files",
+    "test_lm_solver", "test_grid", "test_notebooks", "test_misfits", "test_tables_of_runs",
+    "test_data_check", "test_cli", "test_installed", "test_faults", "test_own_method",
 ]  # fmt: skip
 
 

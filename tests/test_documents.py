@@ -1,12 +1,19 @@
 """Documents: tables and answers are those that the committed CSV files and the code give, and what
-the glossary names is there."""
+the glossary names is there.
+
+And pages of notebooks and texts: whole without a network, with right formulas and living links.
+"""
 
 import doctest
 import pydoc
 import re
+import runpy
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 
+import bs4
 import pandas as pd
 import pytest
 
@@ -50,3 +57,51 @@ def test_names_exist(name: str) -> None:
     found = pydoc.locate(name)
     assert found is not None
     assert found.__doc__
+
+
+FIRST = documents.PROJECT / "notebooks/01_map_imap.ipynb"
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory) -> dict[Path, bs4.BeautifulSoup]:
+    """The pages of the first notebook, with stored outputs, and of the texts that it names."""
+    # Here, since it takes seconds to import.
+    made = SimpleNamespace(**runpy.run_path(str(documents.PROJECT / "environment/pages.py")))
+
+    def read_source(path: Path, execute: bool):
+        notebook = made.read_source(path, execute)
+        if path != FIRST:
+            notebook.cells = [cell for cell in notebook.cells if cell.cell_type == "markdown"]
+        return notebook
+
+    folder = tmp_path_factory.mktemp("pages")
+    with mock.patch.dict(made.write_pages.__globals__, read_source=read_source):
+        made.write_pages(folder, [FIRST], execute=False)
+    texts = {path: path.read_text(encoding="utf-8") for path in folder.rglob("*.html")}
+    return {path: bs4.BeautifulSoup(text, "html.parser") for path, text in texts.items()}
+
+
+def test_links_lead_somewhere(pages: dict[Path, bs4.BeautifulSoup]) -> None:
+    """Catches a link to a text or a notebook that has no page, and a missing picture or heading."""
+    assert {"01_map_imap.html", "07_corrected_map.html", "choices.html"} <= {p.name for p in pages}
+    for path, page in pages.items():
+        for tag in page.select("a[href], img[src]"):
+            url, _, heading = (tag.get("href") or tag["src"]).partition("#")
+            if url.startswith(("http", "data:")):
+                continue
+            assert not url or (path.parent / url).is_file(), (path, url)
+            if heading:
+                target = pages[(path.parent / url).resolve()] if url else page
+                assert target.find(id=heading), (path, url, heading)
+
+
+def test_a_page_loads_nothing_and_tells_what_it_is(pages: dict[Path, bs4.BeautifulSoup]) -> None:
+    """Catches a script, a style sheet or an image from the network, a page without a language or a
+    title, a picture without a description, and a slider that cannot slide."""
+    (page,) = (page for path, page in pages.items() if path.stem == FIRST.stem)
+    assert not page.select("script, link, img[src^=http]")
+    assert page.html["lang"] == "en"
+    assert page.select("meta[name=viewport]")
+    assert page.title.text.startswith("1. Map known rooms")
+    assert not page.select("img[alt^='No description'], img[alt='']")
+    assert "interactive(" not in page.text

@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import jaxtyping
 import numpy as np
@@ -45,22 +44,22 @@ def mapped(sequence=SEQUENCE, name="neus", settings=None, network=NETWORK, **mor
     return map_sequence(name, sequence, network, settings or NeusMapping(**SMALL), **more)
 
 
-def tracker(field=None, pose: Any = None, name="sdf", budget: Any = 3, **options) -> Any:
+def tracker(field=None, pose=None, name="sdf", budget=3, **options):
     pose = np.eye(4) if pose is None else pose
     settings = SdfSettings(**{"n_pixels": 16} | options) if name == "sdf" else None
     return make_tracker(name, field or BoxRoom(), pose, StepBudget(budget), settings)
 
 
-def scenes() -> dict[str, Any]:
+def scenes() -> dict:
     preset = nbtrack.load_preset(settings=[*TINY, "scenes.names=['office']"])
     return {"scenes": nbtrack.open_scenes(preset), "methods": ["sdf"], "preset": preset}
 
 
-def tracked_with(**options: Any):
+def tracked_with(**options):
     return lambda: nbtrack.track_scenes(**scenes() | options)
 
 
-def poses_with(pose: Any) -> np.ndarray:
+def poses_with(pose) -> np.ndarray:
     poses = SEQUENCE.T_world_camera.copy()
     poses[2] = pose
     return poses
@@ -263,7 +262,7 @@ def test_a_map_of_the_cache_stays_as_it_was_read() -> None:
     assert other.record["quality"]
 
 
-OTHERS: dict[str, dict[str, Any]] = {
+OTHERS: dict[str, dict] = {
     "recording": {"sequence": box_sequence([[0, 0.002 * i, 0] for i in range(4)])},
     "map": {"field": mapped().field}, "budget": {"budget": 4}, "settings": {"lambda_color": 0.1},
 }  # fmt: skip
@@ -287,7 +286,7 @@ class Kept(FIELDS["neus"]):
     name = "kept"
 
     @classmethod
-    def from_state(cls, state: Any, made: Any, bounds: SceneBounds) -> Any:
+    def from_state(cls, state, made, bounds: SceneBounds):
         raise NotImplementedError
 
 

@@ -32,7 +32,7 @@ from nbtrack.tracking import TRACKERS, tracker_class
 OWN = '''
 """A field whose distances fade, and a tracker that only looks at distances."""
 
-from dataclasses import make_dataclass
+from dataclasses import dataclass
 
 import nbtrack
 from nbtrack.core.geometry import transform_points
