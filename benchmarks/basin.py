@@ -1,4 +1,4 @@
-"""The basin of convergence: from how far off a tracker still finds the pose of a frame."""
+"""The basin of convergence: from which distance a tracker still finds the pose of a frame."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -20,9 +20,10 @@ from nbtrack.machinery.settings import with_settings
 from nbtrack.tracking import StepBudget
 
 OFFSETS = ((1, 1), (2, 2), (4, 4), (8, 6), (12, 9), (20, 15), (30, 20), (50, 30))
-"""How far off the starts are: cm and degrees, from a frame's motion to a lost camera's."""
+"""Distances of the starts from the true pose, in cm and degrees: from the motion of a frame to what
+a lost camera is off."""
 RECOVERED_M, RECOVERED_DEG = 0.02, 1.0
-"""A start is recovered when its pose ends so near the truth."""
+"""A search recovers if it ends nearer to the true pose than both."""
 
 
 def find_from_afar(
@@ -33,17 +34,17 @@ def find_from_afar(
     n_starts: int = 24,
     frames: str = "::10",
 ) -> pd.DataFrame:
-    """Where each tracker ends, from starts that are off in random directions.
+    """Track single frames from starts that are off in random directions.
 
-    Each start is turned by the offset's degrees about one random axis and moved by its centimetres
-    along another, the same for every method.
+    Each start is turned by the offset's degrees about a random axis, and moved by its centimetres
+    in a random direction. All methods have the same starts.
 
     Args:
-        methods: with the steps that each is allowed.
+        methods: the methods, and the steps that each may take.
 
     Returns:
-        A row a search: method, offset ("4 cm, 4°"), error_m, error_deg, recovered, and lost, the
-        tracker's own verdict. Shares are `groupby(["method", "offset"])["recovered"].mean()`.
+        A row for each search: method, offset ("4 cm, 4°"), error_m, error_deg, recovered, and lost,
+        the tracker's own verdict. Shares are `groupby(["method", "offset"])["recovered"].mean()`.
     """
     rows, sequence = [], scene.read(frames)
     searches = [(offset, start) for offset in offsets for start in range(n_starts)]
@@ -72,7 +73,7 @@ def find_from_afar(
 
 
 def twist(seed: int, offset_cm: int, offset_deg: int) -> Tensor:
-    """A twist (omega in rad, v in m) in directions that depend on the seed alone."""
+    """A twist (omega in rad, v in m) of given lengths, in directions that the seed decides."""
     generator = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator), dim=-1)
     return torch.cat([radians(offset_deg) * directions[0], 0.01 * offset_cm * directions[1]])

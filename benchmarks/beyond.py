@@ -1,9 +1,10 @@
-"""The larger results that notebook 6 reads: CSV in paper_tables/beyond.
+"""The larger results that notebook 6 reads: CSV files in paper_tables/beyond.
 
     python benchmarks/beyond.py [convergence]
 
-On the two rooms of the `smoke` preset, with the paper's step counts; an hour on one CPU core.
-Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed run goes on.
+They are of the two rooms of the preset `smoke`, with the paper's numbers of steps, and take an hour
+on one CPU core. Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed run
+resumes.
 """
 
 import sys
@@ -41,7 +42,7 @@ _CHANGES = {
     "with four times the points": "tracking.lm.n_pixels=2048",
     "in NeuS+ without rendering": "mapping.neus_plus.lambda_rendering=0",
 }
-# LM with one thing changed at a time.
+# LM in NeuS+, and the same with one change at a time.
 INGREDIENTS = [
     METHODS["baked"],
     *(Method(label, "neus_plus", "lm", (setting,)) for label, setting in _CHANGES.items()),
@@ -50,7 +51,7 @@ INGREDIENTS = [
 
 
 def write(name: str, table: pd.DataFrame) -> None:
-    """One file of paper_tables/beyond/."""
+    """Write a table to a CSV in paper_tables/beyond."""
     print(f"{write_csv(tables_folder() / 'beyond' / f'{name}.csv', table)}: {len(table)} rows")
 
 
@@ -61,7 +62,8 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     device = device_name(choose_device())
     note = f"Preset: smoke; budget: {preset.step_counts}; whole path; {device}."
     write_table_3(tables_folder() / "beyond", results, note)
-    # Times count: one run after the other. The slice reads otherwise, so that none is cached.
+    # Times are measured: one run after the other. The slice is spelled otherwise, so that none of
+    # the runs above is taken from the cache.
     speed = track_scenes(scenes, TABLE_3, preset, [10], frames="0:", execution=Execution(workers=1))
     write("speed", speed[_COLUMNS])
     write("convergence", convergence(scenes[0], preset))
@@ -75,10 +77,11 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
 
 
 def convergence(scene: Scene, preset: Preset) -> pd.DataFrame:
-    """Seconds of a core that longer maps take, and how good they are, three seeds.
+    """Time and accuracy of maps by field and number of iterations, with three seeds.
 
-    `near_m` and `free_m` are the errors of the distance near surfaces and in free space, `lm_m` is
-    the ATE of LM with 2,048 points in the map as sampled, at every fourth frame.
+    `seconds` are those of a core. `near_m` and `free_m` are errors of the distance near surfaces
+    and in free space. `lm_m` is the ATE of LM with 2,048 points in the sampled map, without
+    correction, at every fourth frame.
     """
     sequence, tracked, rows = scene.read(), scene.read("::4"), []
     fields = "neus", "neus_plus", "grid_plus"
@@ -94,8 +97,8 @@ def convergence(scene: Scene, preset: Preset) -> pd.DataFrame:
         start = tracked.T_world_camera[0], StepBudget(30), settings
         run = track_sequence(make_tracker("lm", made.field, *start), tracked)
         lm_m = trajectory_metrics(run.T_estimated, run.T_true)["ate_rmse_m"]
-        told = scores["sdf_near_m"], scores["sdf_free_m"], lm_m
-        rows.append((seed, name, iterations, seconds, *told))
+        errors_m = scores["sdf_near_m"], scores["sdf_free_m"], lm_m
+        rows.append((seed, name, iterations, seconds, *errors_m))
     columns = ["seed", "field", "iterations", "seconds", "near_m", "free_m", "lm_m"]
     return pd.DataFrame(rows, columns=columns)
 

@@ -1,13 +1,15 @@
-"""The bound of Table I: how near any search can stay to a path, by the unit of its steps.
+"""Lower bounds of the errors in Table I, since a tracker's steps have a limited length.
 
     python benchmarks/bounds.py
 
-Reads `poses.txt` of the dataset's scenes in the data folder (`NBTRACK_DATA`; no images are needed)
-and adds rows to `paper_tables/protocol/bounds.csv`, those of a scene anew. A row is a scene, a cell
-of Table I and a reading of what the paper leaves open: the bound of a tracker that ends each frame
-as near as its reach allows (`greedy_ate_m`), and of one that knows the whole path and may move
-ahead of the camera, which is the least of all (`least_any_m`; not from constant velocity, where the
-reach of a frame grows with the speed).
+Reads `poses.txt` of the dataset's scenes in the data folder (`NBTRACK_DATA`; no images are needed),
+and replaces the rows of these scenes in `paper_tables/protocol/bounds.csv`. A row is for a scene, a
+cell of Table I, and a reading of what the paper leaves open: the unit of a step, and the motion
+model. It has two bounds of the ATE:
+
+- `greedy_ate_m`, of a tracker that ends each frame as near to the path as its reach allows;
+- `least_any_m`, the smallest possible one, of a tracker that knows the whole path and may move
+  ahead of the camera. It is empty for constant velocity, whose reach grows with the speed.
 """
 
 from itertools import product
@@ -31,15 +33,19 @@ READINGS = {"metre": PREVIOUS, "map": PREVIOUS, "metre, constant velocity": VELO
 
 
 def least_of_all(T_world_camera: np.ndarray, reach_m: float) -> float:
-    """The least ATE (m) of all paths that move by at most the reach along each axis a frame."""
+    """The smallest ATE (m) of all paths that move at most by the reach a frame along each axis.
+
+    Constrained least squares for the motion of each frame: `sums` adds motions up to positions.
+    """
     offsets = T_world_camera[1:, :3, 3] - T_world_camera[0, :3, 3]
-    sums = np.tril(np.ones((len(offsets), len(offsets))))  # of steps: positions
+    sums = np.tril(np.ones((len(offsets), len(offsets))))
+    # `cost` is half the sum of squared residuals.
     costs = [lsq_linear(sums, axis, (-reach_m, reach_m)).cost for axis in offsets.T]
     return float(np.sqrt(2 * sum(costs) / len(offsets)))
 
 
 def bounds_of(scene: str) -> pd.DataFrame:
-    """Rows of one scene."""
+    """Rows of one scene: one for each method, rate and reading."""
     file_poses = np.loadtxt(data_folder() / scene / "poses.txt").reshape(-1, 4, 4)
     path = Declaration(camera_axes="opengl").poses_to_opencv(file_poses)
     published = published_table_1().set_index(["rate_hz", "method", "scene"])["ate_m"]

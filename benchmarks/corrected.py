@@ -3,10 +3,10 @@
     python benchmarks/corrected.py [RECORDING ...]
     python benchmarks/corrected.py fast
 
-Writes tracking.csv, times.csv, agreement.csv and odd_frames.csv, or fast.csv and reliability.csv
-to paper_tables/corrected.
-RECORDING is a folder in the dataset's layout; the paper's methods and `agreement` are asked for the
-first alone. Times count: run nothing else.
+The first writes tracking.csv, times.csv, agreement.csv and odd_frames.csv to
+paper_tables/corrected, the second fast.csv and reliability.csv.
+RECORDING is a folder in the dataset's layout. The paper's methods and `agreement` are computed for
+the first one alone. Times are measured: run nothing else.
 """
 
 import sys
@@ -39,7 +39,8 @@ COMPARED = [
         "grid_corrected", "icp", "icp_middle", "icp_dense",
     )
 ]  # fmt: skip
-# The paper's methods, which only run in a recording, have their rates as in Table I.
+# The paper's methods run in a recording alone. Their learning rates are in the map's units, as in
+# Table I.
 IN_UNITS = "tracking.vr.position_unit=map", "tracking.sdf.position_unit=map"
 ON_RECORDINGS = [method for method in COMPARED if method != METHODS["neus_corrected"]]
 SEEDS = range(3)  # of map and tracker
@@ -52,9 +53,9 @@ SAID = [
     "frame_id", "translation_error_m", "rotation_error_deg", "fitting_ratio", "known_ratio",
     "intensity_ratio", "innovation", "position_std_m", "last_step", "p_lost",
 ]  # fmt: skip
-P_EDGES = [0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 1]
-WRONG_M, WRONG_DEG = 0.05, 3.0  # in a room, whose truth is known
-WRONG_IN_RECORDING_M = 0.2  # there the reference is off, too
+P_EDGES = [0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 1]  # of bins of `p_lost`
+WRONG_M, WRONG_DEG = 0.05, 3.0  # a pose in a room, whose truth is known, is wrong beyond these
+WRONG_IN_RECORDING_M = 0.2  # larger in a recording, whose reference poses are off, too
 
 
 def main() -> None:
@@ -89,7 +90,7 @@ def main() -> None:
 
 
 def _track(scenes, methods, preset, frames, path, tracked=None, steps=30, seeds=SEEDS):
-    """Runs with at most so many steps a frame; without a number those of the paper at 2 Hz."""
+    """Rows of runs with at most `steps` a frame; None: the paper's steps at 2 Hz."""
     how = {"steps": steps, "frames": frames, "seeds": seeds, "execution": ALONE}
     rates_hz = [2] if steps is None else None
     found = track_scenes(scenes, methods, preset, rates_hz, tracked=tracked, **how)
@@ -99,11 +100,11 @@ def _track(scenes, methods, preset, frames, path, tracked=None, steps=30, seeds=
 
 
 def _judged(run: str, wrong_m: float) -> dict[str, float]:
-    """What the frames of a run say of its errors and verdicts.
+    """The median error of a run, and how many of its frames are wrong or called lost.
 
     A frame is wrong if it is off by more than `wrong_m`. Wrong frames that are not called lost are
-    missed; right ones that are called lost are lost in vain. The paper's methods do not judge
-    themselves.
+    missed, and right frames that are called lost are lost in vain. The paper's methods have no
+    verdict, so that none of their frames is called lost.
     """
     frames = read_run(run).frames
     is_wrong = (frames["translation_error_m"] > wrong_m).to_numpy()
@@ -120,7 +121,7 @@ def _judged(run: str, wrong_m: float) -> dict[str, float]:
 
 
 def frame_times(rooms, preset) -> pd.DataFrame:
-    """Milliseconds a frame, all told, of both trackers in turns on the same frames."""
+    """Milliseconds a frame and errors of LM and ICP, in turns on the same frames; medians."""
     rows = []
     for room, n_pixels in product(rooms, (512, 2048, 4096)):
         sequence, trackers = room.read(":120"), {}
@@ -137,11 +138,10 @@ def frame_times(rooms, preset) -> pd.DataFrame:
 
 
 def in_turns(runs: dict[str, tuple[Tracker, RgbdSequence]]) -> pd.DataFrame:
-    """Every frame but the first by each tracker in its turn, on sequences of equal length, so that
-    a machine that slows down slows all of them alike.
+    """Track every frame but the first by each tracker in turn, on sequences of equal length.
 
-    A row a frame: of which method, milliseconds with everything but the reading of files, and the
-    error of the position (m).
+    A machine that slows down then slows all trackers alike. Returns a row for each frame and
+    method: milliseconds, without the reading of files, and the position's error (m).
     """
     rows = []
     n_frames = {len(sequence) for _, sequence in runs.values()}
@@ -155,7 +155,7 @@ def in_turns(runs: dict[str, tuple[Tracker, RgbdSequence]]) -> pd.DataFrame:
 
 
 def fast() -> pd.DataFrame:
-    """Nine rooms on a path that was never mapped: every fourth and every eighth frame."""
+    """Runs in nine rooms on a path that was not mapped, at every fourth and every eighth frame."""
     preset, second = (
         load_preset("nine_rooms", settings=[*HAND_HELD, f"scenes.seed={n}"]) for n in (0, 1)
     )
@@ -166,8 +166,7 @@ def fast() -> pd.DataFrame:
 
 
 def reliability(runs: pd.DataFrame) -> pd.DataFrame:
-    """How often LM's poses are wrong, off by more than 5 cm or 3 degrees, by how likely they were
-    said to be."""
+    """How often LM's poses are wrong (off by more than 5 cm or 3 degrees), in bins of `p_lost`."""
     runs = runs[runs["method"].str.startswith("NeuS+ corrected")]
     frames = pd.concat([read_run(run).frames for run in runs["run"]])
     limits = "translation_error_m > @WRONG_M or rotation_error_deg > @WRONG_DEG"
@@ -178,7 +177,7 @@ def reliability(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def odd_frames(runs: pd.DataFrame) -> pd.DataFrame:
-    """A row a frame of LM that its map leaves out: errors, and what LM says of its pose."""
+    """Rows of frames that LM's map left out: errors, and the numbers of LM's report."""
     runs = runs[(runs["frames"] == "1::2") & (runs["method"] == METHODS["corrected"].label)]
     tables = []
     for run in runs.itertuples():
@@ -187,7 +186,7 @@ def odd_frames(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def agreement(scene, preset) -> pd.DataFrame:
-    """How far (RMS, m) paths are from one another: both trackers, two seeds, and the reference."""
+    """RMS distances (m) between all paths: of LM and ICP with two seeds, and the reference."""
     methods, seeds = [METHODS["corrected_dense"], METHODS["icp_dense"]], [0, 1]
     how = {"steps": 30, "frames": ":", "seeds": seeds}
     found = track_scenes([scene], methods, preset, **how, execution=ALONE)
@@ -202,7 +201,7 @@ def agreement(scene, preset) -> pd.DataFrame:
 
 
 def _held_out(scene, preset, seed: int) -> pd.DataFrame:
-    """Mapped on even frames, tracked on odd ones."""
+    """Rows of runs in maps of the even frames, tracked at the odd ones."""
     rows = []
     for method in ON_RECORDINGS:
         changed = with_settings(preset, *method.settings)
@@ -219,7 +218,7 @@ def _held_out(scene, preset, seed: int) -> pd.DataFrame:
 
 
 def write_rows(name: str, rows: pd.DataFrame) -> None:
-    """With machine and date."""
+    """Write rows with machine and date to a CSV in paper_tables/corrected."""
     made = {"device": device_name(choose_device()), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
     rows = rows.drop(columns="run", errors="ignore")
     write_csv(tables_folder() / "corrected" / name, rows.assign(**made))

@@ -2,8 +2,10 @@
 
     python benchmarks/documents.py
 
-Each stands between a line `<!-- table: NAME -->` and a line `<!-- end -->`; a test holds that they
-are what this script writes.
+This script replaces what stands between a line `<!-- table: NAME -->` and a line `<!-- end -->`. A
+test checks that the documents are as this script writes them.
+
+Each function takes the rows of a CSV and returns the cells of a table as text.
 """
 
 import re
@@ -17,8 +19,8 @@ from nbtrack.tables import published_table_1, table_1
 
 PROJECT = Path(__file__).parents[1]
 DOCUMENTS = [PROJECT / name for name in ("README.md", "benchmarks/README.md", "docs/choices.md")]
-_RIGHT_TO = 0.02  # m, error of a map's distance near surfaces from which on it counts as right
-# Short heads of the methods' columns; LM is that in the corrected NeuS+ map.
+_RIGHT_TO = 0.02  # m; a map is right if its distance near surfaces has a smaller mean error
+# Short heads of the methods' columns. "LM" alone is LM in the corrected NeuS+ map.
 _HEADS = {
     "iMAP with VR": "VR",
     "NeuS with SDF": "SDF",
@@ -40,13 +42,13 @@ _COUNTS = {
 
 
 def shown(rows: pd.DataFrame, columns: dict[str, tuple[str, str]]) -> pd.DataFrame:
-    """Some columns as text: with each name its head in the document and its format."""
+    """Format some columns as text: `columns` maps a name to its head and its format."""
     texts = {head: rows[name].map(form.format) for name, (head, form) in columns.items()}
     return pd.DataFrame(texts)
 
 
 def tracking(runs: pd.DataFrame) -> pd.DataFrame:
-    """ATE (cm) of every method in each place, and of a camera that stands still."""
+    """ATE (cm) of every method, and of a camera that stands still, by scene, path and frames."""
     runs = pd.concat([runs, runs.assign(method="standing still", ate_m=runs["still_ate_m"])])
     path = runs["path"].replace({"mapped": "", "second": ", 2nd"})
     path = path.replace("odd, mapped even", ", even mapped")
@@ -56,7 +58,7 @@ def tracking(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def recordings(runs: pd.DataFrame) -> pd.DataFrame:
-    """Of a real recording: median error (cm), a mean of the seeds, and each seed's counts."""
+    """The real recording: mean of the seeds' median errors (cm), and counts of frames by seed."""
     runs = runs[runs["scene"] == "real_office"].replace({"method": _HEADS})
     groups = runs.groupby(["frames", "method"], sort=False)
     table = (100 * groups[["median_error_m"]].mean()).map("{:.2f}".format)
@@ -67,7 +69,7 @@ def recordings(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def reference(rows: pd.DataFrame) -> pd.DataFrame:
-    """RMS distances (cm) of paths from the reference, the truth, and motions between frames."""
+    """RMS distances (cm) of paths from the reference, the truth, and registered pairs of frames."""
     place = rows["scene"].replace({"living_room": "two rooms", "office": "two rooms"})
     cm = 100 * rows.groupby([place, "path"]).mean(numeric_only=True).filter(like="from_")
     cm = cm.set_axis(cm.index.map(": ".join)).rename(columns=lambda name: name[5:-2])
@@ -75,10 +77,14 @@ def reference(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def searches(rows: pd.DataFrame) -> pd.DataFrame:
-    """Shares of starts that were found, and how often the tracker's verdict was right."""
+    """Counts of searches by scene and offset.
+
+    They are of poses that were found, of wrong ones, of wrong ones that were called lost, and of
+    right ones that were called lost.
+    """
     wrong = (rows["error_m"] > 0.05) | (rows["error_deg"] > 3)
-    rows = rows.assign(told=rows["lost"] & wrong, wrong=wrong, alarm=rows["lost"] & ~wrong)
-    columns = {"recovered": "found", "wrong": "wrong", "told": "called lost", "alarm": "in vain"}
+    rows = rows.assign(caught=rows["lost"] & wrong, wrong=wrong, alarm=rows["lost"] & ~wrong)
+    columns = {"recovered": "found", "wrong": "wrong", "caught": "called lost", "alarm": "in vain"}
     groups = rows.groupby(["scene", "offset"], sort=False)
     counts = groups[[*columns]].sum().astype(int).rename(columns=columns)
     counts.insert(0, "searches", groups.size())
@@ -86,14 +92,14 @@ def searches(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def times(medians: pd.DataFrame) -> pd.DataFrame:
-    """Milliseconds a frame by points."""
+    """Milliseconds a frame, by method and number of points."""
     ms = medians.pivot_table(index="method", columns="n_pixels", values="milliseconds")
     return ms.rename(columns="{:,} points".format).map("{:.1f}".format)
 
 
 def fast(runs: pd.DataFrame) -> pd.DataFrame:
-    """ATE (cm), and wrong frames, missed ones and those lost in vain of all rooms and seeds, by
-    motion."""
+    """Mean ATE (cm), and numbers of wrong frames, of those that were missed, and of right ones that
+    were called lost; by method and frames, over all rooms and seeds."""
     of_motion = runs.groupby(["method", "frames"], sort=False)
     means = 100 * of_motion["ate_m"].mean().unstack()
     counts = of_motion[["wrong_frames", "missed_frames", "frames_lost_in_vain"]].sum()
@@ -106,9 +112,9 @@ def fast(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def steps(cells: pd.DataFrame) -> pd.DataFrame:
-    """Steps in half a second by tracker and pixels, and what a step takes (ms) at most.
+    """Steps in 500 ms by tracker and pixels, and an upper bound of a step's time (ms).
 
-    A frame has its preparation, too, and time that is left over.
+    It is an upper bound, since the preparation of a frame and unused time are part of the 500 ms.
     """
     cells = cells.query("budget_ms == 500").eval("ms = 500 / steps")
     cells.index = cells["tracker"] + " " + cells["n_pixels"].astype(str)
@@ -130,7 +136,7 @@ def mapping(times: pd.DataFrame) -> pd.DataFrame:
 
 
 def recorded(times: pd.DataFrame) -> pd.DataFrame:
-    """Milliseconds a step, queued one behind the other, by precision: called and recorded."""
+    """Milliseconds a step of queued steps, by precision, if called one by one or recorded."""
     times = times[~times["waits"]]
     precision = times["precision"].replace({"float32": "", "TF32": ", TF32"})
     times = times.assign(how=times["recorded"].map({False: "called", True: "recorded"}) + precision)
@@ -139,7 +145,7 @@ def recorded(times: pd.DataFrame) -> pd.DataFrame:
 
 
 def convergence(scores: pd.DataFrame) -> pd.DataFrame:
-    """When the distance near surfaces is first right to 2 cm."""
+    """The first number of iterations, and its time, at which distances near surfaces are right."""
     of_seeds = scores.groupby(["field", "iterations"], sort=False)[["seconds", "near_m"]]
     right = of_seeds.mean().reset_index("iterations").query("near_m < @_RIGHT_TO")
     first = right.groupby("field", sort=False).first()
@@ -147,13 +153,13 @@ def convergence(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def image_size(times: pd.DataFrame) -> pd.DataFrame:
-    """Milliseconds and error of a frame by the width of its picture."""
+    """Milliseconds and error (cm) of a frame, by the width of its picture."""
     times = times.set_index(times["width"].map("{:g} px wide".format)).eval("cm = 100 * error_m")
     return shown(times, {"milliseconds": ("ms a frame", "{:.1f}"), "cm": ("cm", "{:.2f}")}).T
 
 
 def ten_seconds(rounds: pd.DataFrame) -> pd.DataFrame:
-    """Seconds of a core from a recording to its corrected map."""
+    """Seconds of a core for mapping a recording and correcting the map; medians of the rounds."""
     rounds = rounds.eval("both_s = mapping_s + correction_s")
     medians = rounds.groupby("method", sort=False).median(numeric_only=True)
     names = ("mapping", "correction", "both")
@@ -161,7 +167,7 @@ def ten_seconds(rounds: pd.DataFrame) -> pd.DataFrame:
 
 
 def memory(peaks: pd.DataFrame) -> pd.DataFrame:
-    """Peak memory of mapping a long sequence, and what its images take of it."""
+    """Peak memory of mapping a long sequence, and the part of it that the images take."""
     # 3 bytes of colour and 2 of depth a pixel
     peaks = peaks.set_index("field").eval("images_gb = 5 * frames * width * height / 1e9")
     columns = {"peak_gb": "peak, GB", "images_gb": "images of it, GB"}
@@ -169,9 +175,9 @@ def memory(peaks: pd.DataFrame) -> pd.DataFrame:
 
 
 def choices(runs: pd.DataFrame) -> pd.DataFrame:
-    """Errors at 2 Hz with each other choice over those with ours, and VR's over SDF's, over rooms.
+    """Ratios of errors at 2 Hz: of each other choice to ours, and of VR to SDF.
 
-    Geometric means with their 95 % intervals, as notebook A1 has them.
+    Geometric means over rooms with their intervals of 95 %, as in notebook A1.
     """
     runs = runs.query("rate_hz == 2").replace({"iMAP with VR": "VR", "NeuS with SDF": "SDF"})
     place = ["choice", "scene", "seed"]
@@ -188,15 +194,16 @@ def choices(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _over_rooms(ratios: pd.Series) -> pd.Series:
-    """By choice, "mean (from to)"."""
+    """Text "mean (from to)" for each choice, from ratios of rooms and seeds."""
     means = over_rooms(ratios.reset_index(), ["choice"], "ratio").set_index("choice")
     return means.apply("{ratio:.2f} ({from:.2f} to {to:.2f})".format_map, axis=1)
 
 
 def breakfast(cells: pd.DataFrame) -> pd.DataFrame:
-    """The column Breakfast of Table I (m), as published and as ours, means of the seeds.
+    """The column Breakfast of Table I (m), published and ours, as means of the seeds.
 
-    Ours with the dataset's depth sensor, at the paper's sizes with one without its bias.
+    Our results are with the dataset's depth sensor, and those at the paper's sizes with a sensor
+    without its bias.
     """
     large = pd.read_csv(PROJECT / "paper_tables" / "paper_rooms_gpu" / "table_1_cells.csv")
     here = cells.query("sensor == 'dataset'").assign(side="here")
@@ -227,11 +234,11 @@ TABLES = {
     "memory": (memory, "benchmarks/cpu/memory.csv"),
     "choices": (choices, "paper_tables/evidence/choices.csv"),
 }
-"""By name: what makes a table, and of which file."""
+"""The function that makes each table, and the file that it takes."""
 
 
 def written(text: str) -> str:
-    """A document with its tables made anew."""
+    """The text of a document with all of its tables made anew."""
     return re.sub(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", _table, text, flags=re.DOTALL)
 
 
@@ -242,7 +249,7 @@ def _table(match: re.Match) -> str:
 
 
 def _markdown(table: pd.DataFrame) -> str:
-    """Row labels to the left, numbers to the right."""
+    """A table in Markdown, with row labels aligned left, and cells aligned right."""
     rows = [["", *table.columns], ["-"] + ["-:"] * len(table.columns)]
     rows += [[str(label), *values] for label, values in zip(table.index, table.values, strict=True)]
     return "".join(f"| {' | '.join(str(cell).strip() for cell in row)} |\n" for row in rows)

@@ -1,13 +1,14 @@
-"""The experiments behind notebooks 5, A1, A2 and A3: finished rows, appended to a CSV each.
+"""The experiments behind notebooks 5, A1, A2 and A3, each of which adds rows to a CSV.
 
     python benchmarks/evidence.py EXPERIMENT [SEEDS]
 
 EXPERIMENT is a name in `GRIDS`. Rows are added to a CSV under paper_tables/ as they are finished,
-the first seed first; those that are there are not made again, whatever has changed since: remove
-the file to begin anew. Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed
-experiment goes on where it was. All cores are used, but for by_the_clock, beside which nothing else
-may run; full_size is for a GPU. The paper's rooms have to lie below `NBTRACK_DATA` as the dataset
-has them (data/README.md).
+the first seed first. Rows that are there are not made again, whatever has changed since: remove the
+file to begin anew. Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed
+experiment resumes.
+
+All cores are used, except by by_the_clock, beside which nothing else may run. full_size is for a
+GPU. The paper's rooms have to lie below `NBTRACK_DATA` as the dataset has them (data/README.md).
 """
 
 import sys
@@ -46,14 +47,14 @@ KEPT = [
 
 @dataclass(frozen=True)
 class OtherDepth(Scene):
-    """One of the paper's rooms, read with another depth folder, or with an error taken out."""
+    """One of the paper's rooms, read with another depth folder, or with a declared depth error."""
 
     depth_folder: str | None = None
     depth_error_per_m: float = 0.0
 
     @cached_property
     def recording(self) -> Recording:
-        """With that depth."""
+        """The recording with that depth."""
         recording = open_recording(self.folder, self.format, self.depth_folder)
         declared = replace(recording.declared, depth_error_per_m=self.depth_error_per_m)
         return replace(recording, declared=declared)
@@ -61,32 +62,32 @@ class OtherDepth(Scene):
 
 @dataclass(frozen=True)
 class Case:
-    """What is changed at a time, in all scenes of an experiment."""
+    """One variation of an experiment: what is changed in all of its scenes."""
 
-    place: dict[str, str | float] = field(default_factory=dict)  # columns that name its rows
-    settings: tuple[str, ...] = ()
+    place: dict[str, str | float] = field(default_factory=dict)  # columns that identify its rows
+    settings: tuple[str, ...] = ()  # changes of the preset
     how: dict[str, Any] = field(default_factory=dict)  # arguments of `track_scenes`
-    methods: Sequence[str | Method] | None = None  # by default the experiment's
-    tracked: tuple[str, ...] = ()  # settings of the scenes that are tracked, and not mapped
-    depth: dict[str, Any] = field(default_factory=dict)  # how it is read: fields of `OtherDepth`
+    methods: Sequence[str | Method] | None = None  # None: those of the experiment
+    tracked: tuple[str, ...] = ()  # more settings, of scenes that are tracked and not mapped
+    depth: dict[str, Any] = field(default_factory=dict)  # fields of `OtherDepth`, if any
 
     def seen(self, scene: Scene) -> Scene:
-        """A scene as it is read."""
+        """The scene, read with the depth of this case."""
         return OtherDepth(scene.name, scene.folder, **self.depth) if self.depth else scene
 
 
 @dataclass(frozen=True)
 class Grid:
-    """An experiment: cases, scenes and methods, at the rates of the preset."""
+    """An experiment: the product of cases, scenes and methods, at the rates of the preset."""
 
     preset: Preset
     cases: Sequence[Case] = (Case(),)
     methods: Sequence[str | Method] = TABLE_1
     how: dict[str, Any] = field(default_factory=dict)  # more arguments of `track_scenes`
-    folder: str = "evidence"  # below paper_tables/
-    has_table: bool = False  # whether Table I is made of its rows, in a folder of its own
+    folder: str = "evidence"  # below paper_tables/; that of the CSV unless `has_table`
+    has_table: bool = False  # whether Table I is made of its rows, in a folder with its name
     has_maps: bool = False  # whether its rows have sizes and scores of the maps
-    workers: int | None = None  # so many runs side by side, where it is a GPU that does the work
+    workers: int | None = None  # number of runs at the same time, for a GPU; None: by the cores
 
 
 NINE = load_preset("nine_rooms")
@@ -119,7 +120,7 @@ READINGS["sdf_per_unit"] = replace(
 
 
 def _at_speed(speed: float) -> Case:
-    """The same path at another speed, for as many frames at most."""
+    """The same path at another speed: at a higher speed in fewer frames."""
     n_frames = min(THREE.scenes.n_frames, round(THREE.scenes.n_frames / speed))
     motion = f"scenes.motion=keyframes_at_{speed:g}"
     return Case({"speed": speed}, (motion, f"scenes.n_frames={n_frames}"))
@@ -129,7 +130,7 @@ TRAINED = 500, 1000, 2000, 4000, 8000  # iterations
 
 
 def _trained(case: Case, units: int, iterations: int, learning_rate: float) -> Case:
-    """A case with other sizes of the map."""
+    """A case with another width, number of iterations and learning rate of SDF's map."""
     sizes = {"iterations": iterations, "learning_rate": learning_rate}
     settings = [f"mapping.neus.{name}={size}" for name, size in sizes.items()]
     place = {"units": units, "iterations": iterations, **case.place}
@@ -204,12 +205,12 @@ GRIDS = {
 
 
 def main(experiment: str, seeds: int) -> None:
-    """Make the rows that are missing, and what is made of all."""
+    """Add the missing rows of an experiment, and make the tables that depend on all of them."""
     grid = GRIDS[experiment]
     name = f"{experiment}/table_1_cells" if grid.has_table else f"{grid.folder}/{experiment}"
     path = tables_folder() / f"{name}.csv"
     add_rows(path, (chunk for seed in range(seeds) for chunk in chunks_of(grid, seed)))
-    rows = pd.read_csv(path)  # as anybody has them, rounded
+    rows = pd.read_csv(path)  # rounded, as every reader of the file has them
     if experiment == "nine_rooms":
         write_csv(path.parent / "verdicts.csv", verdicts(rows), float_format="%.4g")
         rows = rows.query("path == 'mapped'")
@@ -222,11 +223,11 @@ def main(experiment: str, seeds: int) -> None:
 
 
 Chunk = tuple[dict[str, str | float], Callable[[], pd.DataFrame]]
-"""What names some rows, and what makes them."""
+"""Columns that identify some rows, and a function that makes these rows."""
 
 
 def add_rows(path: Path, chunks: Iterator[Chunk]) -> None:
-    """Add the rows that a CSV lacks, as they are finished, with machine and date."""
+    """Add the rows that a CSV lacks, each as soon as it is finished, with machine and date."""
     rows = pd.read_csv(path) if path.exists() else pd.DataFrame()
     for place, make in chunks:
         wanted = pd.Series(place).map(str)
@@ -241,14 +242,14 @@ def add_rows(path: Path, chunks: Iterator[Chunk]) -> None:
 
 
 def chunks_of(grid: Grid, seed: int) -> Iterator[Chunk]:
-    """A scene of a case at a time."""
+    """The chunks of an experiment for one seed: each has the rows of one scene in one case."""
     for case in grid.cases:
         preset = with_settings(grid.preset, *case.settings)
         scenes = open_scenes(preset)
         tracked = open_scenes(with_settings(preset, *case.tracked)) if case.tracked else scenes
         methods = case.methods or grid.methods
         how = {"seeds": [seed], **grid.how, **case.how}
-        if grid.workers:  # all at once; below they are read
+        if grid.workers:  # track all scenes at once; the calls below then read the finished runs
             track(scenes, methods, preset, grid.workers, **how)
         for mapped, seen in zip(map(case.seen, scenes), map(case.seen, tracked), strict=True):
 
@@ -260,24 +261,24 @@ def chunks_of(grid: Grid, seed: int) -> Iterator[Chunk]:
 
 
 def track(scenes: list[Scene], methods, preset, workers: int | None = None, **how) -> pd.DataFrame:
-    """Rows of `track_scenes`, with the columns that are kept; without a reach some are empty."""
+    """Rows of `track_scenes` with the columns `KEPT`, which may be empty, as without a reach."""
     rows = track_scenes(scenes, methods, preset, execution=Execution(workers), **how)
     return rows.reindex(columns=KEPT)
 
 
 def with_maps(rows: pd.DataFrame, scene: Scene, preset: Preset, seed: int) -> pd.DataFrame:
-    """Rows of Table I in a scene, with sizes and with the scores of the maps."""
+    """Add columns to rows of Table I in one scene: sizes of images and maps, and maps' scores."""
     rows["reach_over_motion"] = rows["reach_m"] / (rows["path_m"] / rows["frames"])
     rows["image_width"] = scene.read(":1").intrinsics.width
     for name in TABLE_1:
         made = map_scene(scene, METHODS[name].field, preset, seed).record
-        own = rows["method"] == METHODS[name].label
-        rows.loc[own, "units"] = made["network"]["width"]
-        rows.loc[own, "n_pixels"] = preset.tracking_of(METHODS[name].tracker).n_pixels
-        rows.loc[own, "iterations"] = made["settings"]["iterations"]
-        rows.loc[own, "mapping_seconds"] = made["seconds"]
+        is_of_method = rows["method"] == METHODS[name].label
+        rows.loc[is_of_method, "units"] = made["network"]["width"]
+        rows.loc[is_of_method, "n_pixels"] = preset.tracking_of(METHODS[name].tracker).n_pixels
+        rows.loc[is_of_method, "iterations"] = made["settings"]["iterations"]
+        rows.loc[is_of_method, "mapping_seconds"] = made["seconds"]
         for score, value in made["quality"].items():
-            rows.loc[own, score] = value
+            rows.loc[is_of_method, score] = value
     return rows
 
 

@@ -1,6 +1,6 @@
-"""How the camera of an experiment moves: hand-held, or at another speed.
+"""Motions of the camera in experiments: hand-held, or at other speeds.
 
-Importing this module makes the motions `keyframes_at_SPEED` known by name.
+To import this module adds the motions `keyframes_at_SPEED` to `MOTIONS`.
 """
 
 from functools import partial
@@ -17,22 +17,25 @@ HAND_HELD = (
     "scenes.motion=handheld", "tracking.vr.position_unit=metre", "tracking.sdf.position_unit=metre",
     "mapping.neus.iterations=1200",
 )  # fmt: skip
-"""Settings of what goes beyond the paper. With rates in metres, half a millimetre a step for 6 mm a
-frame, the reach of the paper's methods over the motion is that of the paper's data. NeuS has the
-iterations that the committed results were made with, fewer than those of `smoke`."""
+"""Settings of the experiments beyond the paper.
+
+Learning rates are in metres: half a millimetre a step, while the camera moves 6 mm a frame. So the
+reach of the paper's methods, divided by the motion, is that of the paper's data. NeuS has the
+iterations of the committed results, which are fewer than those of `smoke`."""
 SPEEDS = (0.5, 1.5)
-"""Times the speed of the path of key poses."""
+"""Factors of the speed of the path of key poses."""
 
 
 def _paced(speed: float, room: Room, n_frames: int, seed: int) -> Poses:
-    """The path of key poses at so many times its speed."""
+    """The path of key poses, sampled at `speed` times its own speed."""
     poses = MOTIONS["keyframes"](room, round(n_frames * speed), seed)
-    at = np.minimum(speed * np.arange(n_frames), len(poses) - 1)
-    known, between = np.arange(len(poses)), np.tile(np.eye(4), (n_frames, 1, 1))
-    turned = Rotation.from_matrix(poses[:, :3, :3])
-    between[:, :3, :3] = Slerp(known, turned)(at).as_matrix()
-    between[:, :3, 3] = interp1d(known, poses[:, :3, 3], axis=0)(at)
-    return between
+    known_times = np.arange(len(poses))  # in frames
+    times = np.minimum(speed * np.arange(n_frames), len(poses) - 1)
+    sampled = np.tile(np.eye(4), (n_frames, 1, 1))
+    rotations = Rotation.from_matrix(poses[:, :3, :3])
+    sampled[:, :3, :3] = Slerp(known_times, rotations)(times).as_matrix()
+    sampled[:, :3, 3] = interp1d(known_times, poses[:, :3, 3], axis=0)(times)
+    return sampled
 
 
 MOTIONS.update({f"keyframes_at_{speed:g}": partial(_paced, speed) for speed in SPEEDS})

@@ -1,4 +1,4 @@
-"""What the rows of the experiment nine_rooms say of both methods, for `evidence.py`."""
+"""A summary of the experiment nine_rooms for both methods, which `evidence.py` writes."""
 
 import numpy as np
 import pandas as pd
@@ -11,27 +11,29 @@ VR, SDF = METHODS["vr"], METHODS["sdf"]
 
 
 def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
-    """Reach, accuracy and sequences lost: a row a path and rate, intervals of 95 %.
+    """Summarise the rows: a row for each path and rate, with intervals of 95 %.
 
-    VR's error over SDF's is paired by room and seed; a room counts once, with the mean of its
-    seeds' logarithms, and rooms are drawn anew (bootstrap). Shares of sequences lost (ATE above
-    0.2 m) have Wilson's interval, as if the seeds of a room were independent.
+    - `vr_over_sdf` is the geometric mean of VR's error divided by SDF's, paired by room and seed.
+      A room counts once, with the mean logarithm of its seeds. The interval is a bootstrap over
+      rooms.
+    - The numbers of lost sequences (ATE above 0.2 m) have Wilson's interval of their share, which
+      takes the seeds of a room as independent.
     """
-    judged = []
+    summaries = []
     for (path, rate_hz), cells in rows.groupby(["path", "rate_hz"]):
         ate_m = cells.pivot(index=["scene", "seed"], columns="method", values="ate_m")
         ratio = np.log(ate_m[VR.label] / ate_m[SDF.label]).groupby("scene").mean()
-        means_span = bootstrap((ratio,), np.mean, rng=0).confidence_interval
-        mean, low, high = np.exp([ratio.mean(), *means_span])
+        interval = bootstrap((ratio,), np.mean, rng=0).confidence_interval
+        mean, low, high = np.exp([ratio.mean(), *interval])
         row = {"path": path, "rate_hz": rate_hz, "rooms": len(ratio), "sequences": len(ate_m)}
         row |= {"vr_over_sdf": mean, "from": low, "to": high, "vr_ahead": (ratio < 0).sum()}
         for method in (VR, SDF):
-            own = cells[cells["method"] == method.label]
-            motion_m = own["path_m"] / own["frames"]
-            row[f"{method.tracker}_reach_over_motion"] = (own["reach_m"] / motion_m).mean()
-            lost = binomtest(int((ate_m[method.label] > LOST_THRESHOLD_M).sum()), len(ate_m))
-            span = lost.proportion_ci(method="wilson")
+            of_method = cells[cells["method"] == method.label]
+            motion_m = of_method["path_m"] / of_method["frames"]
+            row[f"{method.tracker}_reach_over_motion"] = (of_method["reach_m"] / motion_m).mean()
+            n_lost = int((ate_m[method.label] > LOST_THRESHOLD_M).sum())
+            share = binomtest(n_lost, len(ate_m)).proportion_ci(method="wilson")
             name = f"{method.tracker}_lost"
-            row |= {name: lost.k, f"{name}_from": span.low, f"{name}_to": span.high}
-        judged.append(row)
-    return pd.DataFrame(judged)
+            row |= {name: n_lost, f"{name}_from": share.low, f"{name}_to": share.high}
+        summaries.append(row)
+    return pd.DataFrame(summaries)

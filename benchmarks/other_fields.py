@@ -1,11 +1,13 @@
-"""VR, VR by colour alone, and SDF in five fields; and a level of density in the place of SDF.
+"""VR, VR by colour alone, and SDF in five fields; and a level set of density in place of SDF.
 
     python benchmarks/other_fields.py [SEEDS]
 
-Rows are added to paper_tables/other_fields/table_1_cells.csv as they are finished; those that are
+Rows are added to paper_tables/other_fields/table_1_cells.csv as they are finished. Rows that are
 there are not made again, whatever has changed since: remove the file to begin anew. The first seed
-takes 90 minutes on one core, a further one, of NeuS and VolSDF alone, 15. Then density.csv is made:
-the rooms of `smoke` along their whole paths, from the previous pose, with the steps of SDF.
+takes 90 minutes on one core. Each further one has NeuS and VolSDF alone, and takes 15 minutes.
+
+Then rows of the tracker `level` are added to density.csv: in the rooms of `smoke`, along whole
+paths, from the previous pose, with the steps of SDF.
 """
 
 import sys
@@ -33,16 +35,16 @@ RATES_HZ = (10.0, 2.0)
 
 
 class LevelTracker(SdfTracker):
-    """Eq. 2 in a density, for which the paper says that it does not apply.
+    """Eq. 2 in a density field, for which the paper says that it does not apply.
 
-    In the place of the distance is the logarithm of the density over that of the drawn surface.
+    The distance is replaced by ln(density / level), with the level at which surfaces are drawn.
     """
 
     name = "level"
 
     @classmethod
     def works_in(cls, field: type) -> bool:
-        """In a density alone."""
+        """Whether a field is a density."""
         return issubclass(field, IMapField)
 
     def loss(
@@ -59,7 +61,7 @@ LEVEL = Method("iMAP with a level of density", "imap", "level")
 
 
 def track_rows(seeds: int) -> Iterator[Chunk]:
-    """Whole paths, method by method."""
+    """Chunks of rows of the five fields: one for each seed, room and method, on the whole path."""
     preset = load_preset("smoke", settings=HAND_HELD)
     for seed, scene, name in product(range(seeds), open_scenes(preset), ROWS):
         if seed and name not in FURTHER:
@@ -70,7 +72,7 @@ def track_rows(seeds: int) -> Iterator[Chunk]:
 
 
 def density_rows(seeds: int) -> Iterator[Chunk]:
-    """Room by room."""
+    """Chunks of rows of the tracker `level`: one for each seed and room."""
     preset = load_preset("smoke")
     for seed, scene in product(range(seeds), open_scenes(preset)):
         place, how = {"scene": scene.name, "seed": seed}, {"frames": ":", "seeds": [seed]}
@@ -78,7 +80,7 @@ def density_rows(seeds: int) -> Iterator[Chunk]:
 
 
 def main(seeds: int) -> None:
-    """Make the rows that are missing."""
+    """Add the missing rows of both files."""
     folder = tables_folder() / "other_fields"
     add_rows(folder / "table_1_cells.csv", track_rows(seeds))
     add_rows(folder / "density.csv", density_rows(seeds))

@@ -1,13 +1,14 @@
-"""What errors against reference poses say where the reference itself is off.
+"""Errors of tracked paths against reference poses that are themselves off.
 
     python benchmarks/reference.py [RECORDING]
 
-Writes paper_tables/corrected/reference.csv, of rooms whose mapped poses were moved by smooth
-errors, so that the truth is known, and of a recording, whose truth is not: how far paths are from
-the reference, from the truth, and, for frames a little apart, from the motion that generalised ICP
-finds between these two frames' points alone, which knows no map. Distances from pairs have 95 %
-intervals (blocks of frames drawn anew), and the share of these draws in which a path is nearer to
-the pairs than the reference is.
+Writes paper_tables/corrected/reference.csv. It has rooms whose mapped poses were moved by smooth
+errors, so that the truth is known, and recordings, whose truth is unknown. Three RMS distances of a
+path are computed: from the reference, from the truth, and from pairs. For a pair of frames that are
+`GAP` apart, generalised ICP finds the motion between them from their points alone, without a map.
+
+The distance from pairs has an interval of 95 % (bootstrap over blocks of frames). `nearer_share` is
+the share of the bootstrap's draws in which the path is nearer to the pairs than the reference is.
 """
 
 import sys
@@ -32,16 +33,18 @@ from nbtrack.tables import write_csv
 from nbtrack.tracking import StepBudget, track_sequence
 
 TRACKED = METHODS["corrected_dense"], METHODS["icp_dense"]
-# Smooth errors like a registration's: so far (m, degrees) about a point ahead (m), with so many
-# frames' correlation.
+# Smooth errors like those of a registration: standard deviations (m, degrees), the distance (m) of
+# the point ahead of the camera about which it is turned, and the filter's width (frames).
 OFF_M, OFF_DEG, AHEAD, SMOOTH = 0.006, 0.25, 1.5, 4
-# Frames between the two of a pair, points of each, and cells (m) and reach (m) of registering them.
+# Frames from one to the other of a pair, points of each, and the voxel (m) and the largest distance
+# of correspondences (m) of their registration.
 GAP, PAIR_POINTS, PAIR_VOXEL, PAIR_REACH = 5, 16_384, 0.02, 0.05
-BLOCK, DRAWS = 10, 1000  # frames that are drawn together, since neighbours err alike; draws
+# Bootstrap: frames of a block, whose errors are correlated, and the number of draws.
+BLOCK, DRAWS = 10, 1000
 
 
 def main(recordings: list[str]) -> None:
-    """Two rooms, two seeds of errors; then recordings as they are."""
+    """Compare paths in two rooms with two seeds of errors each, and in recordings as they are."""
     torch.set_num_threads(1)
     preset, tables = load_preset("smoke", settings=HAND_HELD), []
     for scene in open_scenes(preset):
@@ -59,7 +62,10 @@ def main(recordings: list[str]) -> None:
 
 
 def compared(given, preset, truth=None) -> pd.DataFrame:
-    """A row a path: its distances (m) from the reference, from the truth if known, from pairs."""
+    """A row for each path: its distances (m) from the reference, the truth if known, and pairs.
+
+    `given` is the sequence with the reference poses, and `truth` the same with the true poses.
+    """
     paths = {"reference": given} | ({"truth": truth} if truth else {})
     paths |= {method.label: tracked_path(method, given, preset) for method in TRACKED}
     pairs = registered_pairs(given)
@@ -77,7 +83,10 @@ def compared(given, preset, truth=None) -> pd.DataFrame:
 
 
 def moved_poses(poses: np.ndarray, seed: int) -> np.ndarray:
-    """Poses (camera to world) with smooth errors, turns about a point ahead of the camera."""
+    """Poses (camera to world) with smooth random errors.
+
+    They move the camera, and turn it about a point ahead of it.
+    """
     noise = np.random.default_rng(seed).normal(size=(len(poses), 6))
     noise = gaussian_filter1d(noise, SMOOTH, axis=0, mode="reflect")
     noise = (noise - noise.mean(axis=0)) / noise.std(axis=0)
@@ -102,14 +111,16 @@ def tracked_path(method, sequence, preset):
 
 
 def apart(path, other) -> float:
-    """RMS distance (m) of two paths' positions, but for the first, which trackers are given."""
+    """RMS distance (m) of two paths' positions, without the first, which trackers are given."""
     a, b = (sequence.T_world_camera[1:, :3, 3] for sequence in (path, other))
     return float(np.sqrt(((a - b) ** 2).sum(axis=1).mean()))
 
 
 def registered_pairs(sequence) -> np.ndarray:
-    """Poses of frames in the frame `GAP` before, by their points alone; the sequence's own poses
-    are the starts."""
+    """Poses (n x 4 x 4) of frames in the camera frame `GAP` before, from their points alone.
+
+    Registration starts at the sequence's own poses.
+    """
     seeded, clouds = torch.Generator().manual_seed(0), []
     for index in range(len(sequence)):
         points = draw_points(sequence[index], PAIR_POINTS, seeded)[0]
@@ -124,14 +135,14 @@ def registered_pairs(sequence) -> np.ndarray:
 
 
 def pair_errors(path, pairs: np.ndarray) -> np.ndarray:
-    """Distances (m) of positions in the frame `GAP` before from those of registered pairs."""
+    """Errors (m) of a path's positions, in the camera frame `GAP` before, against `pairs`."""
     poses = path.T_world_camera
     off = (np.linalg.inv(poses[:-GAP]) @ poses[GAP:] - pairs)[:, :3, 3]
     return np.linalg.norm(off, axis=1)
 
 
 def in_blocks(values: np.ndarray) -> np.ndarray:
-    """Means of values whose blocks are drawn anew, with the same blocks for all paths."""
+    """Means (DRAWS,) of bootstrap samples of blocks of values; all paths have the same blocks."""
     n_blocks = -(-len(values) // BLOCK)
     first = np.random.default_rng(0).integers(len(values), size=(DRAWS, n_blocks, 1))
     return values[(first + np.arange(BLOCK)) % len(values)].mean(axis=(1, 2))

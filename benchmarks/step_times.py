@@ -1,9 +1,11 @@
-"""Times of steps and of mapping iterations; on a GPU recorded and not, in float32 and in TF32.
+"""Times of tracking steps and of mapping iterations; on a GPU recorded and not, float32 and TF32.
 
-`python benchmarks/step_times.py steps`, `mapping` or `kernels`, CSV files into the folder $OUT. Of
-untrained networks of full size and an image of noise before a wall: a step costs the same whatever
-they show. On a CPU everything is small, which only says that the script runs; unless `full`
-follows, which takes minutes.
+    python benchmarks/step_times.py PART [full]
+
+PART is steps, mapping or kernels; a CSV of that name is written into the folder $OUT. Networks of
+full size are untrained, and images show noise on a wall, since a step takes the same time whatever
+they contain. On a CPU all sizes are small, which only tests the script. With `full` they are not,
+which takes minutes.
 """
 
 import os
@@ -42,7 +44,7 @@ PRECISIONS = {"float32": "highest", "TF32": "high"} if IS_GPU else {"float32": "
 
 
 def noise(n_frames: int) -> RgbdSequence:
-    """A wall about 2 m ahead of cameras that stand still."""
+    """Frames of cameras that stand still about 2 m before a wall, with random colours."""
     rng, size = np.random.default_rng(0), (n_frames, HEIGHT, WIDTH)
     colors = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
     depths_mm = rng.integers(1950, 2050, size).astype(np.uint16)
@@ -55,7 +57,7 @@ SEQUENCE = noise(20)
 
 
 def warm_tracker(name: str, field_name: str) -> Tracker:
-    """At the start of a frame, after all that counts nowhere."""
+    """A tracker at the start of its second frame, after all that takes time only in the first."""
     field = make_field(field_name, NETWORK, BOUNDS, seed=0).to(DEVICE)
     settings = TRACKERS[name].Settings(tf32=torch.get_float32_matmul_precision() == "high")
     settings = settings if IS_FULL else replace(settings, n_pixels=32)
@@ -66,7 +68,7 @@ def warm_tracker(name: str, field_name: str) -> Tracker:
 
 
 def warm_fit(name: str, share: float | None = None) -> _Fit:
-    """A map after its first iterations; of NeuS with another share for the eikonal term, if any."""
+    """The fit of a map after its first iterations; `share` replaces NeuS's `eikonal_share`."""
     field = make_field(name, NETWORK, BOUNDS, seed=0).to(DEVICE)
     settings = field_class(name).Settings()
     if share is not None:
@@ -78,7 +80,10 @@ def warm_fit(name: str, share: float | None = None) -> _Fit:
 
 
 def milliseconds(call: Callable[[], object], waits: bool) -> tuple[float, float, float]:
-    """Median and quartiles of a call, each waited for; or the mean where calls are queued."""
+    """Median and quartiles of a call's time. If `waits`, the device finishes before the next call.
+
+    Otherwise calls are queued, and all three numbers are the mean.
+    """
     for _ in range(N_WARM):
         call()
     synchronize(DEVICE)
@@ -108,8 +113,10 @@ def step_rows() -> Iterator[dict]:
 
 
 def mapping_rows() -> Iterator[dict]:
-    """Time of a mapping iteration, in turns after a warm-up; NeuS also with the eikonal term on one
-    sample only and on all of them."""
+    """Times of a mapping iteration after a warm-up; two iterations of each fit in turn.
+
+    NeuS is measured with the eikonal term on its usual share of the samples, on one and on all.
+    """
     shares = ("imap", None), ("neus", 0), ("neus", None), ("neus", 1), ("neus_plus", None)
     fits = {}
     for (name, share), is_recorded in product(shares, {IS_GPU, False}):
@@ -130,7 +137,7 @@ def mapping_rows() -> Iterator[dict]:
 
 
 def kernel_rows() -> Iterator[dict]:
-    """The ten kernels that take longest in a step or an iteration, and what lies between all."""
+    """The ten slowest kernels of a step or an iteration, the sum of all, and the gaps between."""
     activity = torch.profiler.ProfilerActivity.CUDA if IS_GPU else None
     calls = {name: warm_tracker(name, field).step for name, field in PAIRS}
     for name in ("imap", "neus"):
@@ -161,7 +168,7 @@ PARTS = {"steps": step_rows, "mapping": mapping_rows, "kernels": kernel_rows}
 
 
 def main(part: str) -> None:
-    """Measure one part, at each precision, and write what is there after each row."""
+    """Measure one part at each precision, and write the CSV after each row."""
     torch.set_num_threads(1)
     found, out = [], Path(os.environ.get("OUT", "runs/first_gpu_run"))
     about = {"device": device_name(DEVICE), "torch": torch.__version__}

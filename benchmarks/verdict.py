@@ -1,11 +1,11 @@
-"""Fits the probability that a pose of LM is wrong: the coefficients of `beyond/verdict.py`.
+"""Fit the coefficients of `nbtrack/beyond/verdict.py`: the probability that a pose of LM is wrong.
 
     python benchmarks/verdict.py RECORDING
 
-In corrected maps of the two rooms for tuning and of a recording: frames tracked, on the mapped path
-and on another, slow and fast; searched for from wrong starts; shown to the map of another room; and
-tracked in the map of the first third of them.
-Prints intercept and coefficients, and both kinds of mistakes at a few thresholds. Minutes.
+The data are poses of LM in corrected maps of the two rooms for tuning and of a recording. Frames
+are tracked on the mapped path and on another one, slow and fast; searched for from wrong starts;
+shown to the map of another room; and tracked in a map of the first part of the path.
+Prints intercept and coefficients, and both kinds of mistakes at some thresholds. It takes minutes.
 """
 
 import sys
@@ -35,13 +35,13 @@ from nbtrack.machinery.settings import with_settings
 from nbtrack.tracking import StepBudget, track_sequence
 from nbtrack.tracking.metrics import pose_errors
 
-STIFFNESS = 1e-3
-GROWS = (False, False, True, True)  # whether a feature speaks for a wrong pose
+STIFFNESS = 1e-3  # weight of the squared coefficients in the loss
+GROWS = (False, False, True, True)  # whether the log odds of a wrong pose grow with each feature
 OFFSETS = ((10, 8), (20, 15), (50, 40), (150, 90))  # cm, degrees
 
 
 def main() -> None:
-    """Collect, fit, print."""
+    """Collect poses of LM, fit the coefficients, and print them."""
     torch.set_num_threads(1)
     tuning = "scenes.names=['bedroom', 'kitchen_nook']"
     preset, second = (
@@ -59,7 +59,10 @@ def main() -> None:
 
 
 def collected(fields: list[Field], paths: list[list[Scene]]) -> Iterator[pd.DataFrame]:
-    """What LM says of its poses, and their errors."""
+    """Reports of LM and errors of its poses, in maps of whole paths.
+
+    `paths[i]` are the scenes that are tracked in the map `fields[i]`.
+    """
     for (place, field), n_pixels in product(enumerate(fields), (512, 2048)):
         for scene, frames in product(paths[place], ("::2", "::4", "::8")):
             found = tracked(field, scene.read(frames), n_pixels)
@@ -73,7 +76,7 @@ def collected(fields: list[Field], paths: list[list[Scene]]) -> Iterator[pd.Data
 
 
 def part_of(scene: Scene, field: str, preset: Preset) -> Field:
-    """The map of its first frames: a third of a recording, a quarter of a room's path."""
+    """A map of a scene's first frames: a third of a recording, a quarter of a room's path."""
     frames = ":60" if scene.room else ":40"
     job = MapJob.of(scene, field, preset, frames)
     run_jobs([job])
@@ -81,7 +84,7 @@ def part_of(scene: Scene, field: str, preset: Preset) -> Field:
 
 
 def in_parts(parts: list[Field], scenes: list[Scene]) -> Iterator[pd.DataFrame]:
-    """Frames tracked into what was not mapped, and searched for there."""
+    """Reports and errors of frames that leave what was mapped, tracked and searched for."""
     for (place, field), n_pixels in product(enumerate(parts), (512, 2048)):
         for frames in ("::2", "::4", "::8") if scenes[place].room else (":", "::2", "::4"):
             sequence = scenes[place].read(frames)
@@ -92,18 +95,21 @@ def in_parts(parts: list[Field], scenes: list[Scene]) -> Iterator[pd.DataFrame]:
 
 
 def settings(n_pixels: int) -> LmSettings:
-    """Without restarts, which would leave few wrong poses to learn from."""
+    """Settings of LM without restarts, which would leave few wrong poses to learn from."""
     return LmSettings(n_pixels=n_pixels, n_restarts=0)
 
 
 def tracked(field: Field, sequence: RgbdSequence, n_pixels: int) -> pd.DataFrame:
-    """A sequence tracked from its first pose."""
+    """Reports and errors of a sequence that is tracked from its first pose."""
     how = sequence.T_world_camera[0], StepBudget(30), settings(n_pixels)
     return track_sequence(make_tracker("lm", field, *how), sequence).frames
 
 
 def searched(field, sequence, cm, degrees, n_pixels, steps) -> pd.DataFrame:
-    """Frames from starts that are off; far ones as if the frame before had been lost."""
+    """Reports and errors of frames that are searched for from starts that are off.
+
+    If the starts are far off, the tracker takes the frame before for lost.
+    """
     rows = []
     tracker = make_tracker("lm", field, np.eye(4), StepBudget(steps), settings(n_pixels))
     for number in range(len(sequence)):
@@ -119,7 +125,7 @@ def searched(field, sequence, cm, degrees, n_pixels, steps) -> pd.DataFrame:
 
 
 def print_fit(rows: pd.DataFrame) -> None:
-    """Logistic regression, a little stiff; every place counts alike."""
+    """Fit a logistic regression with a weak penalty and print it; all places have equal weight."""
     rows = rows[rows["position_std_m"].notna()].reset_index(drop=True)
     is_wrong = (rows["translation_error_m"] > WRONG_M) | (rows["rotation_error_deg"] > WRONG_DEG)
     sign, x = np.where(is_wrong, 1.0, -1.0), np.stack([features(r) for _, r in rows.iterrows()])

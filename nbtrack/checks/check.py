@@ -135,10 +135,7 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
 
 
 def quick_look(recording: Recording) -> str:
-    """The gravest that a look at a few pairs of frames finds, as "warning: ..." or "note: ...".
-
-    It is empty where nothing is found.
-    """
+    """The gravest finding in a few pairs of frames, as "warning: ..." or "note: ..."; or empty."""
     if recording.has_pose.sum() < 2:
         return ""
     report = check_recording(recording, is_whole=False)
@@ -186,8 +183,8 @@ def _read(
       before, and `off_mm`, how far it is off the middle between the frames before and after; NaN if
       one of these has no pose.
 
-    Counts (2, 65536) are how often each depth value occurs, and in how many frames many pixels have
-    it. Images are read in parts, to bound the memory.
+    Counts (2, 65536) are how often each depth value occurs, and in how many frames more than the
+    share `findings.SHARED` of the pixels have it. Images are read in parts, to bound the memory.
     """
     parts, rows = [], []
     counts = np.zeros((2, 65536), int)
@@ -212,7 +209,10 @@ def _read(
 
 
 def _add_motion(frames: pd.DataFrame, T_world_camera: Poses) -> None:
-    """Add `moved_mm`, `turned_deg` and `off_mm`, as `_read` explains them, to its table."""
+    """Add the columns `moved_mm`, `turned_deg` and `off_mm` to the table of `_read`.
+
+    The table's index are numbers of frames, and `T_world_camera` are the poses of all frames.
+    """
     moves_mm = 1e3 * np.diff(T_world_camera[:, :3, 3], axis=0, prepend=np.nan)
     off_mm = np.diff(moves_mm, axis=0, append=np.nan) / 2  # from the middle of both neighbours
     frames["moved_mm"] = np.linalg.norm(moves_mm, axis=1)[frames.index]
@@ -220,13 +220,13 @@ def _add_motion(frames: pd.DataFrame, T_world_camera: Poses) -> None:
     frames["off_mm"] = np.linalg.norm(off_mm, axis=1)[frames.index]
 
 
-def _cloud(reading: Reading, stored: RgbdSequence) -> pd.DataFrame:
-    """Coloured points (m, world) of a sequence under a reading: see `DataReport.cloud`.
+def _cloud(as_declared: Reading, stored: RgbdSequence) -> pd.DataFrame:
+    """Coloured points (m, world) of a sequence that is read as declared: see `DataReport.cloud`.
 
     `stored.depths_mm` are the files' own values. Points without depth are left out, outliers not.
     """
     stride = max(1, round((stored.depths_mm[0].size / _POINTS_PER_FRAME) ** 0.5))
-    points_camera = reading.points(*on_grid(stored.depths_mm, stride)).numpy()
+    points_camera = as_declared.points(*on_grid(stored.depths_mm, stride)).numpy()
     T = stored.T_world_camera
     points_world = points_camera @ T[:, :3, :3].mT + T[:, None, :3, 3]
     colors = stored.colors[:, ::stride, ::stride].reshape(points_camera.shape)
