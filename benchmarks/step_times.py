@@ -50,7 +50,7 @@ def noise(n_frames: int) -> RgbdSequence:
     depths_mm = rng.integers(1950, 2050, size).astype(np.uint16)
     poses = np.tile(np.eye(4), (n_frames, 1, 1))
     camera, ids = Intrinsics.from_focal(WIDTH, HEIGHT, float(HEIGHT)), np.arange(n_frames)
-    return RgbdSequence("wall", camera, colors, depths_mm, poses, ids, ids)
+    return RgbdSequence("wall", camera, colors, depths_mm, poses, ids, times=ids / 30)
 
 
 SEQUENCE = noise(20)
