@@ -17,9 +17,10 @@ from nbtrack.beyond.lm_solver import (
     retract,
     robust_cost,
     robust_scales,
+    try_step,
 )
 from nbtrack.beyond.observed import LUMA, Observed, draw_points, with_normals
-from nbtrack.beyond.verdict import std_when_moved
+from nbtrack.beyond.verdict import SIGMAS, std_when_moved
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.fields import NetworkSettings, make_field
 
@@ -147,6 +148,28 @@ def test_ripples_of_a_map_hold_nothing(scene: str, low: float, high: float) -> N
     assert low < optimizer.certainty()["position_std_m"] < high
 
 
+def test_a_pose_between_steps_of_colour_is_not_held_along_a_corridor() -> None:
+    """Catches a spread by curvature that does not count, in another unit, or of the turn: nothing
+    holds a camera for some centimetres along stripes whose edges no point lies at."""
+    (planes, _), random = PLANES["corridor"], np.random.default_rng(0)
+    normals, distances = torch.tensor([*planes]).float(), torch.tensor([*planes.values()])
+    surface = Formula(
+        lambda p: (distances - p @ normals.T).amin(dim=1),
+        SceneBounds((-1.0, -0.2, 0.2), (1.0, 1.1, 1.8)),
+        lambda p: 0.5 + 0.3 * (20 * torch.sin(np.pi * p[:, 2:] / 0.2)).tanh().expand(-1, 3),
+    )
+    rays = np.insert(random.uniform(-1, 1, (3000, 2)), 2, 1, axis=1)
+    points = plane_depths(planes, rays)[:, None] * rays
+    at_edge = np.abs(np.sin(np.pi * points[:, 2] / 0.2))
+    points = points[(at_edge > 0.9) & (points[:, 2] < 1.6) & (points[:, 2] > 0.4)][:400]
+    luma = 0.5 + 0.3 * np.sign(np.sin(np.pi * points[:, 2] / 0.2))
+    seen = Observed(points, luma, NONE)
+    optimizer = LmOptimizer(grid_of(BakedField(surface, 0.025)), seen, seen, 1.0, ORIGIN)
+    optimizer.run()
+    # As the prior alone has it: 0.5 m, of which scales are two.
+    assert optimizer.certainty()["position_std_m"] == pytest.approx(0.5 / SIGMAS, rel=0.03)
+
+
 SEEN = draw_points(walk(1, narrow_room())[0], 300, torch.Generator().manual_seed(0))
 NARROW = grid_of(BakedField(narrow_room(), 0.05))
 
@@ -162,6 +185,23 @@ def test_a_rejected_step_leaves_the_pose_unchanged() -> None:
         assert optimizer.problem.stage.is_fine is is_fine
         optimizer.refine()
     assert abs(optimizer.T_world_camera - ORIGIN).max() < 2e-3
+
+
+def test_steps_that_creep_are_lengthened() -> None:
+    """Catches a limit of the series that is missed, another one, and steps that are lengthened
+    although they shrink fast, turn round or turn aside: of steps that damping makes short."""
+    problem, T = Problem(SEEN, NARROW, FINE, 1.0, ORIGIN), retract(ORIGIN, np.full(6, 0.01))
+    terms = residual_terms(problem, T)
+    scales = robust_scales(terms.residuals, np.full(2, np.inf), NARROW.accuracy.residual_sigma, 3)
+    twist = damped_step(problem, T, terms, scales, 30.0)
+    aside = twist[[1, 0, 3, 2, 5, 4]] * [1, -1, 1, -1, 1, -1]
+    series = {0.8: 5, 0.95: 10, 0.6: 2.5, 0.4: 1, -0.8: 1}
+    before = [(twist / ratio, stride) for ratio, stride in series.items()]
+    for last_twist, stride in [*before, (twist + 1.1 * aside, 1), (np.zeros(6), 1)]:
+        step = try_step(problem, T, terms, scales, 30.0, last_twist)
+        assert step.is_better
+        np.testing.assert_allclose(step.T_world_camera, retract(T, stride * twist), atol=1e-12)
+        assert step.length == pytest.approx(stride * abs(twist).max())
 
 
 def test_scales_are_never_below_those_of_the_map() -> None:

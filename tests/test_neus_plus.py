@@ -63,7 +63,7 @@ def test_targets_by_hand() -> None:
     zeros, ahead = torch.zeros(2, 3), torch.tensor([[0.0, 0.0, 1.0]] * 2)
     rays = Rays(zeros, ahead, zeros, torch.tensor([2.0, 0.0]), -ahead * torch.tensor([[1], [0]]))
     depths = torch.tensor([1.0, 1.9, 2.05, 2.3]).expand(2, 4)
-    nearest = torch.tensor([0.4, 0.11, 0.06, 0.28]).expand(2, 4)
+    nearest = torch.tensor([0.4, 0.11, 0.06, 0.3]).expand(2, 4)
     nowhere = torch.zeros(2, 4, dtype=torch.bool)
     target, known = distance_targets(rays, depths, nearest, nowhere, CONFIG)
     # At 1 m a chair is nearer (0.4 m) than the wall (1 m).

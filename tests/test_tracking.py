@@ -12,6 +12,7 @@ import torch
 from box_room import BoxRoom, box_sequence, poses_at, walk
 
 from nbtrack.beyond.grid import BakedField
+from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, field_class
 from nbtrack.machinery.errors import ConfigError, DataError, NumericalError
@@ -94,6 +95,7 @@ def test_where_a_frame_starts() -> None:
     still, errors = (tracked.frames[f"{name}_error_m"] for name in ("still", "translation"))
     np.testing.assert_allclose(still, errors, atol=1e-7)
     np.testing.assert_array_equal(tracked.T_true, sequence.T_world_camera[1:])
+    assert sequence.digest == walk(3).digest  # what a tracker writes in place is its own
     tracked.T_true[:] = np.nan  # as a user may: the sequence stays
     tracker = tracker_of("sdf", 0.1, SdfSettings(motion_model="constant_velocity"))
     tracker.estimates.append(sequence.T_world_camera[1])
@@ -205,6 +207,31 @@ def test_a_long_time_without_depth() -> None:
     for _ in range(300):
         R = tracker.track(dark).T_world_camera[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+class Sliding(Tracker):
+    """It moves by 10 cm in every step, in place."""
+
+    name = "sliding"
+    T_world_camera = torch.eye(4, dtype=torch.float64)
+
+    def begin(self, frame: Frame, T_starts: torch.Tensor) -> None:
+        pass
+
+    def step(self) -> torch.Tensor:
+        self.T_world_camera[0, 3] += 0.1
+        return self.T_world_camera[0, 3]
+
+
+def test_an_estimate_is_the_users_own() -> None:
+    """Catches an estimate that a later step moves, and one whose change by the user is taken for
+    what was found."""
+    tracker, frame = Sliding(BoxRoom(), np.eye(4), StepBudget(1)), walk(1)[0]
+    first, second = tracker.track(frame), tracker.track(frame)
+    moved = second.T_world_camera[0, 3] - first.T_world_camera[0, 3]
+    assert moved == pytest.approx(0.1)
+    second.T_world_camera[:] = np.nan
+    assert np.isfinite(np.stack(tracker.estimates)).all()
 
 
 def test_motion_models() -> None:
