@@ -1,0 +1,168 @@
+"""What the checks conclude from numbers, at their limits, by hand."""
+
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from nbtrack.checks import findings
+from nbtrack.checks.conventions import Convention, _best_of
+from nbtrack.checks.misfits import Misfit, _normal_equations, _solution
+from nbtrack.checks.readings import Reading, cost_of, mean_apart
+from nbtrack.core.camera import Intrinsics
+from nbtrack.recordings.formats import Declaration
+from nbtrack.recordings.recording import Recording
+
+READING = Reading(Declaration(), Intrinsics(64, 48, 48.0, 48.0, 32.0, 24.0))
+OWN = Convention(
+    READING, np.zeros((1, 1)), apart=0.001, depth_m=2.0, overlap=0.5, agreement=0.4,
+    subject="poses", name="own",
+)  # fmt: skip
+
+
+def frames(**changes) -> pd.DataFrame:
+    """Eight frames of which nothing is to be said."""
+    usual = {"measured": 1.0, "brightness": 0.5, "depth_step": 1, "is_repeated": False}
+    return pd.DataFrame({**usual, "moved_mm": 30.0, "off_mm": 1.0, **changes}, range(8))
+
+
+def test_a_value_that_many_pixels_share() -> None:
+    """Catches a value that is told although it is rare, no spike, in few frames or of a camera that
+    stands still, or where hardly any value occurs: of 20 values with 100 pixels each and one more,
+    in three of eight frames."""
+    counts = np.zeros((2, 6000), int)
+    counts[0, 1:21], counts[:, 50] = 100, [1001, 3]
+    assert findings.no_depth_value(counts, frames()) == 50
+    still = frames(moved_mm=[0.0] * 5 + [900.0] * 3)
+    few, flat, seldom, rare = (counts.copy() for _ in range(4))
+    few[0, 10:21], flat[0, 50], seldom[1, 50] = 0, 1000, 2
+    rare[0, 100:], rare[0, 50] = 20, 1001
+    others = [(few, frames()), (flat, frames()), (seldom, frames()), (rare, frames())]
+    assert [findings.no_depth_value(*found) for found in [*others, (counts, still)]] == [0] * 5
+
+
+def test_what_images_say() -> None:
+    """Catches frames that count although the camera stands, and means in place of medians."""
+    often, half = np.array([0, 3, 1]), [False, True] * 4
+    dark = [0.01] * 5 + [0.9] * 3
+    (black,) = findings.of_images(frames(brightness=dark), 0, often)
+    assert "are black" in black
+    (repeated,) = findings.of_images(frames(is_repeated=half), 0, often)
+    assert "50% of the depth images repeat" in repeated
+    assert "::2 of map" in repeated
+    (shared,) = findings.of_images(frames(), 1, often)
+    assert "75% of the depths are 1," in shared
+    (none,) = findings.of_images(frames(measured=0.0), 0, often)
+    assert "no pixel" in none
+    assert [*findings.of_images(frames(is_repeated=half, moved_mm=0.0), 0, often)] == []
+
+
+def test_poses_beside_the_path() -> None:
+    """Catches neighbours of an odd pose that count too, steps that do not, and a camera's one long
+    step that hides it."""
+    recording = mock.Mock(spec=Recording, color_files=[Path(f"img{k}.png") for k in range(8)])
+    off = [1.0, 1, 100, 200, 100, 1, 1, 1]
+    long = [30.0] * 7 + [2000.0]
+    (odd,) = findings.of_poses(frames(off_mm=off, moved_mm=long), recording)
+    assert odd.startswith("1 of 8 poses lie up to 20 cm beside")
+    assert "first img3.png" in odd
+    for quiet in (frames(off_mm=off, moved_mm=90.0), frames(off_mm=49.0, moved_mm=1.0)):
+        assert [*findings.of_poses(quiet, recording)] == []
+
+
+def test_what_depths_say() -> None:
+    """Catches another unit, and steps that are told of a camera that is near, or far."""
+    usual = pd.Series(np.linspace(0.5, 1.5, 100))
+    assert [*findings.of_units(usual)] == [*findings.of_units(usual * 20)] == []
+    for factor in (0.15, 25):
+        assert "median depth is" in next(findings.of_units(factor * usual))
+    assert [*findings.of_depths(frames(), usual, 1000)] == []
+    (steps,) = findings.of_depths(frames(depth_step=[50, 100] * 4), usual, 1000)
+    assert "steps of 5.0 cm" in steps
+    for step, depth in ((9, usual), (50, usual / 4)):
+        assert [*findings.of_depths(frames(depth_step=step), depth, 1000)] == []
+    far = pd.concat([usual, pd.Series([50.0, 60.0])], ignore_index=True)
+    (outliers,) = findings.of_depths(frames(), far, 1000)
+    assert outliers.startswith("1.96% of the depths are outliers, 50 to 60 m away")
+
+
+@pytest.mark.parametrize(
+    ("apart", "depth_m", "overlap", "kind"),
+    [
+        (0.0054, 2.0, 0.5, []), (0.008, 2.0, 0.5, ["doubt"]), (0.012, 2.0, 0.5, ["fault"]),
+        (0.0024, 10.0, 0.5, []), (0.0026, 10.0, 0.5, ["fault"]), (0.008, 2.0, 0.1, []),
+    ],
+)  # fmt: skip
+def test_how_far_apart_surfaces_may_lie(apart, depth_m, overlap, kind) -> None:
+    """Catches another limit: 5.5 mm a metre, or 25 mm; and a fault from twice the former on."""
+    own = replace(OWN, apart=apart, depth_m=depth_m, overlap=overlap)
+    assert [*findings.misreading(own, own, [])] == kind
+
+
+def test_a_cause_is_named() -> None:
+    """Catches a usual sensor's error that is a fault, another one that is none, and a cause that is
+    named although surfaces still lie apart."""
+    own = replace(OWN, apart=0.008)
+    reading = replace(READING, depth_error_per_m=0.003)
+    numbers = {"depth_error_per_m": (0.003, 0.002, 0.004)}
+    usual = Misfit("depths are short", reading, numbers, 0.001, 0.5)
+    large = replace(usual, numbers={"depth_error_per_m": (0.005, 0.004, 0.006)})
+    kinds = [[*findings.misreading(own, own, [main])] for main in (usual, large)]
+    assert kinds == [["note"], ["fault"]]
+    (text,) = findings.misreading(own, own, [replace(usual, apart=0.006)])["doubt"]
+    assert "nothing that is tried" in text
+    better = replace(OWN, name="other", agreement=0.8)
+    assert [*findings.misreading(own, better, [])] == ["fault"]
+    for left, low, is_significant in ((0.8, 0.002, True), (0.95, 0.002, False), (0.8, 4e-4, False)):
+        one = replace(usual, cost_left=left, numbers={"depth_error_per_m": (0.003, low, 0.004)})
+        assert one.is_significant is is_significant
+    assert not replace(large, cost_left=0.8).is_significant
+    assert not replace(usual, numbers={"depth_error_per_m": (0.06, 0.05, 0.07)}).is_significant
+
+
+def test_which_convention_is_the_best() -> None:
+    """Catches one that is taken although it is hardly better, meets too little, lies far apart or
+    has absurd depths; of those that fit alike the first counts."""
+    first, second = (replace(OWN, name=name, agreement=0.6) for name in "ab")
+    assert _best_of([OWN, first, second]) is first
+    alike = replace(first, agreement=0.575)
+    assert _best_of([OWN, alike, second]) is alike
+    assert _best_of([OWN, replace(first, agreement=0.56), second]) is second
+    nearer = replace(OWN, apart=0.0003, agreement=0.45)
+    assert _best_of([OWN, nearer]) is nearer
+    changes = {"agreement": 0.5}, {"overlap": 0.1}, {"apart": 0.02}, {"depth_m": 0.1}
+    for change in (*changes, {"depth_m": 21.0, "apart": 1e-5}):
+        assert _best_of([OWN, replace(first, **change)]) is OWN
+
+
+def test_doubts_of_poses() -> None:
+    """Catches proof that is asked for in vain, and overlap that is told in place of motion."""
+    other = replace(OWN, name="other")
+    (alike,) = findings.doubts_of_poses([OWN, other], "p.txt", True)
+    assert "tell 1 other conventions apart, such as other" in alike
+    assert [*findings.doubts_of_poses([OWN, other], "p.txt", False)] == []
+    clear = replace(other, agreement=0.3)
+    depth = replace(other, subject="depth")
+    assert [*findings.doubts_of_poses([OWN, clear, depth], "p.txt", True)] == []
+    for unknown in (replace(OWN, overlap=0.14), replace(OWN, apart=np.nan)):
+        assert "too little of the same" in next(findings.doubts_of_poses([unknown], "p", False))
+
+
+def test_a_step_of_a_fit_by_hand() -> None:
+    """Catches sums over the wrong axis, weights, a sign, and areas that are not known: gaps that
+    are linear in two numbers are solved in one step."""
+    random = np.random.default_rng(0)
+    slopes, wanted = random.normal(size=(2, 5, 7)), np.array([0.3, -0.2])
+    gaps = -np.tensordot(wanted, slopes, axes=1)
+    gaps[2, 3] = np.nan
+    H, g = _normal_equations(gaps, list(gaps + slopes), 0.5)
+    np.testing.assert_allclose(_solution(H.sum(axis=0), g.sum(axis=0)), wanted)
+    known = np.nan_to_num(gaps)
+    weights = (1 + (known / 0.5) ** 2) ** -2 * np.isfinite(gaps)
+    np.testing.assert_allclose(g, (weights * slopes * known).sum(axis=2).T)
+    np.testing.assert_allclose(H[:, 0, 1], (weights * slopes[0] * slopes[1]).sum(axis=1))
+    assert cost_of(np.array([[0.004, np.nan, -0.012]])) == pytest.approx((0.5 + 0.9) / 2)
+    assert mean_apart(np.array([[0.01, np.nan, -0.3]])) == pytest.approx((0.01 + 0.05) / 2)
