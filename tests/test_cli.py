@@ -19,6 +19,7 @@ from tiny import tiny_words
 
 from nbtrack import load_preset, open_scene, read_map
 from nbtrack.cli import COMMANDS, main
+from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import naming_damaged, runs_folder
 from nbtrack.machinery.inputs import read_object
@@ -76,12 +77,13 @@ def test_a_traceback_for_who_asks(tmp_path: Path, capsys, monkeypatch) -> None:
 
 def test_a_map_is_taken_with_the_settings_that_made_it(tmp_path: Path, capsys, monkeypatch) -> None:
     """Catches a refusal of the very settings that a map was made with, because a method set others
-    beside them; and settings that the map does not have, which no run could follow, however they
-    are given."""
+    beside them; settings that the map does not have, which no run could follow, however they are
+    given; and a corrected map that asks for the plain one it was made from."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 2000)
     folder, out = write_recording("plain", tmp_path / "r"), str(tmp_path / "m")
     made = ["map", str(folder), "--field", "neus", *TINY, "--set", "correction.neus=0.3"]
     assert main([*made, "--out", out]) == 0
+    assert MapJob.of_given(Path(out)).needs is None
     given = ["track", str(folder), "--map-from", out, "--tracker", "lm", "--steps", "2", *TINY]
     assert main([*given, "--out", str(tmp_path / "run")]) == 0
     says = ", not 77 as asked"

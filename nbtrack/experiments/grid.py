@@ -1,4 +1,4 @@
-"""The grid of maps and tracked runs, as DataFrames: what is not cached is computed."""
+"""Map and track scenes by many methods; results are DataFrames, and what is cached is reused."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,19 +25,20 @@ from nbtrack.tracking.trajectories import Trajectory
 
 
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
-    """The map of a scene, from the cache or made now."""
-    _pairs([scene], [scene], preset)
+    """The map of a scene, from the cache, or made now if it is not there."""
+    _pairs([scene], [scene], preset)  # raises for arguments of other types
     job = MapJob.of(scene, field, preset, seed=seed)
     run_jobs([job])
     return job.map()
 
 
 def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -> pd.DataFrame:
-    """A row a map of some scenes: field, scene, seed, seconds, and the scores, `SCORES`.
+    """Map scenes in fields; maps that are not cached are made.
 
-    Maps that are not cached are made. Raises ConfigError where scenes or fields are no lists.
+    Returns a row for each map: field, scene, seed, seconds, and the scores of `quality.SCORES`.
+    Raises ConfigError if scenes or fields are no lists.
     """
-    _pairs(scenes, scenes, preset)
+    _pairs(scenes, scenes, preset)  # raises for arguments of other types
     check_lists(at_least=1, fields=fields)
     jobs = [MapJob.of(scene, field, preset) for field, scene in product(fields, scenes)]
     rows = []
@@ -59,17 +60,17 @@ def track_scenes(
     execution: Execution | None = None,
     tracked: Sequence[Scene] | None = None,
 ) -> pd.DataFrame:
-    """Track some scenes with some methods; maps and runs that are not cached are made.
+    """Track scenes with methods; maps and runs that are not cached are made.
 
     Args:
-        rates_hz: by default the preset's; each frame has the steps of the paper's hardware.
-        steps, clock: so many steps a frame instead, or 1/rate seconds by this machine's clock.
-        frames: the slice to track; by default the preset's.
-        seeds: of map and run together: their spread is that of the method.
-        tracked: other recordings of the same rooms, in the same order, which no map has seen.
+        rates_hz: by default the preset's. A frame gets as many steps as on the paper's hardware.
+        steps, clock: a number of steps for each frame instead; or 1/rate seconds by the clock.
+        frames: the slice of frames to track; by default the preset's.
+        seeds: each is the seed of a map and of the run in it.
+        tracked: recordings to track instead of the mapped ones, of the same rooms in this order.
 
-    Returns a row a run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), the metrics,
-    ate_m (NaN if unknown), failure (why). Raises ConfigError first; as jobs do.
+    Returns a row for each run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), the
+    metrics, ate_m (NaN if unknown), failure (reason or empty). Raises ConfigError; then as jobs do.
     """
     pairs = _pairs(scenes, scenes if tracked is None else tracked, preset, seeds)
     rates, steps = _rates(preset.tables.rates_hz, rates_hz, steps, clock)
@@ -79,7 +80,7 @@ def track_scenes(
         tracker, with_method = method.tracker, preset.with_method(method.settings)
         settings = with_method.tracking_of(tracker)
         n_steps = steps if rate_hz is None or clock else method.paper_steps(rate_hz)
-        clock_hz = rate_hz if clock else None  # by the clock the number of steps is None
+        clock_hz = rate_hz if clock else None  # `n_steps` is None then
         make_budget(n_steps, clock_hz)  # raises for a wrong number, before anything is made
         map_job = MapJob.of(scene, method.field, with_method, seed=seed)
         job = TrackJob(map_job, seen, tracker, settings, n_steps, clock_hz, frames, map_job.seed)
@@ -90,7 +91,11 @@ def track_scenes(
 
 
 def _pairs(scenes: Sequence, tracked: Sequence, preset: Preset, seeds: Any = (0,)) -> list[tuple]:
-    """Each mapped scene and the tracked one. Raises ConfigError for what are no such lists."""
+    """Pairs of a mapped scene and the scene that is tracked in its map.
+
+    Raises ConfigError for a preset, scenes or seeds of another type, for an empty list, and if the
+    two lists of scenes differ in length.
+    """
     check_kind(Preset, preset=preset)
     check_lists(at_least=1, scenes=scenes, tracked=tracked, seeds=seeds)
     for scene in (*scenes, *tracked):
@@ -101,9 +106,10 @@ def _pairs(scenes: Sequence, tracked: Sequence, preset: Preset, seeds: Any = (0,
 
 
 def _rates(usual_hz: Sequence, rates_hz: Sequence | None, steps: Any, clock: bool) -> tuple:
-    """The rates (Hz) of the cells, None where steps are given, and steps, as Python's numbers.
+    """The rates (Hz) to track at, by default the usual ones; and the steps, as Python's numbers.
 
-    Raises ConfigError for both.
+    The rates are [None] if steps are given instead. Raises ConfigError if steps are given together
+    with rates or with the clock.
     """
     rates = usual_hz if rates_hz is None else rates_hz
     check_lists(at_least=1, rates_hz=rates)
@@ -113,10 +119,10 @@ def _rates(usual_hz: Sequence, rates_hz: Sequence | None, steps: Any, clock: boo
 
 
 def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[str, Any]:
-    """A row with its run's metrics, or with its failure.
+    """A row of the results with the metrics of its run, or with the reason why the run failed.
 
-    The row's own values win over metrics of the same name: its scene is the mapped one, that of the
-    metrics the tracked one.
+    Values in the row win over metrics of the same name: the row names the scene that was mapped,
+    the metrics name the one that was tracked.
     """
     if isinstance(result, NbtrackError):
         return {**row, "failure": str(result), "ate_m": float("nan")}
@@ -125,10 +131,10 @@ def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[
 
 
 def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:
-    """The results of some jobs, which run side by side.
+    """Run jobs side by side; returns their results.
 
-    By the clock only their maps are made side by side. The runs then follow each other, since what
-    runs beside them would cost steps.
+    With `clock`, only the maps are made side by side. The runs follow one after the other, since
+    other work at the same time would leave them fewer steps.
     """
     missing = [job for job in jobs if not job.is_done]
     for job in missing:
@@ -142,6 +148,9 @@ def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[An
 
 
 def read_run(name: str | Path) -> Trajectory:
-    """A run by its name in the column `run`, or by its folder; MissingError if there is none."""
+    """Read a finished run, given by its folder or by its name in the column `run` of results.
+
+    Raises MissingError if there is none.
+    """
     folder = absolute(name)
     return read_trajectory(folder if folder.is_dir() else runs_folder() / "tracks" / name)

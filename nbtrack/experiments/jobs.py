@@ -1,7 +1,8 @@
-"""Jobs: pieces of work that are named by all that they depend on and made once, and their running.
+"""Jobs, pieces of work that are done once and kept in the cache, and how they are run.
 
-They run one after the other here, or side by side in processes or on a Dask cluster: small networks
-gain nothing from a second thread, so scenes and methods share the cores instead.
+A job's name in the cache holds a digest of all that its result depends on. Jobs run one after the
+other in this process, or side by side in other processes or on a Dask cluster. Small networks gain
+nothing from a second thread, so it is the jobs that share the cores of a machine.
 """
 
 import importlib.util
@@ -29,47 +30,50 @@ from nbtrack.machinery.progress import ProgressBar
 from nbtrack.recordings.images import images_of
 from nbtrack.tracking import TRACKERS
 
-_LOOK_SECONDS = 1.0  # between two looks at jobs elsewhere, and between two of their reports
+_LOOK_SECONDS = 1.0  # between two looks at the progress of other processes, and two of its reports
 _DIED = "a worker process died at {}, perhaps for lack of memory: run again with fewer --workers"
-_NAME_BYTES = 180  # of a folder's name; the key, suffixes and those of temporary files follow
-Pairs = Iterator[tuple[Path, Any]]  # of a job's folder and what became of it
+# At most, of a folder's name: file systems allow 255, and the key and suffixes follow the name.
+_NAME_BYTES = 180
+# A job's folder, which identifies the job, and its outcome: its result, or the NbtrackError that
+# ended it.
+Pairs = Iterator[tuple[Path, Any]]
 Report = Callable[[float, str], None]
-"""Called by a job with the share of it that is done and a word on how it goes."""
+"""A job calls it with the share of its work that is done, and with a word on how it goes."""
 
 
 class Job:
-    """One piece of work, which can be pickled. Its result is kept in a folder of its own.
+    """One piece of work, whose result is kept in a folder of its own.
 
-    `needs` is the job whose result it is made from, if any.
+    A job can be pickled, so that another process can run it.
     """
 
-    kind: str  # the part of the cache where it is kept
-    name: str  # for readers
-    key: str  # changes with everything that the result depends on
-    doing: str = "computing"  # what its progress is called
-    work: float = 1.0  # how long it takes, in tracked runs: its weight in the time that is left
-    needs: "Job | None"
+    kind: str  # the folder of the cache for jobs of this kind
+    name: str  # for people
+    key: str  # a digest that changes with everything that the result depends on
+    doing: str = "computing"  # the title of the progress bar
+    work: float = 1.0  # how long the job takes, relative to a tracked run: its weight in the bar
+    needs: "Job | None"  # the job whose result this one is made from
     is_done: bool
-    result: Callable[[], Any]  # what a finished job has kept
-    compute: Callable[[Report], Any]  # makes it, or takes a killed attempt up; returns `result`
+    result: Callable[[], Any]  # reads the result of a finished job
+    compute: Callable[[Report], Any]  # does the work or resumes a killed one; returns the result
 
     @property
     def folder(self) -> Path:
-        """Where its files are kept, in the cache."""
-        # A recording's folder may have a name as long as a file system allows, 255 bytes.
+        """The folder in the cache with the job's files."""
+        # A job's name begins with that of a recording's folder, which may have 255 bytes by itself.
         name = self.name.encode(errors="replace")[:_NAME_BYTES].decode(errors="ignore")
         return runs_folder() / self.kind / f"{name}-{self.key}"
 
     @property
     def lock(self) -> Path:
-        """A file that keeps other processes out; how far the job is stands in one beside it."""
+        """The lock file that keeps other processes from doing the same job."""
         return runs_folder() / "locks" / f"{self.folder.name}.lock"
 
     def make(self, report: Report) -> Any:
-        """The job's `result`, which is computed where it is missing.
+        """Return the job's result, and compute it if it is missing.
 
-        If another process is computing it, this one waits for the lock, which the system frees when
-        that process ends.
+        If another process is computing it, wait for the lock. The system frees the lock when that
+        process ends.
         """
         report(0.0, "begins, or waits for another process that makes the same")
         check_no_recording(self.lock)
@@ -83,12 +87,13 @@ class Job:
 class Execution:
     """How jobs are run."""
 
-    # Processes, which share the threads; by default one a core, or this one alone where a GPU does
-    # the work: jobs share its memory, and side by side gain less (benchmarks/README.md).
+    # The number of processes. By default one for each core; or this process alone if a GPU does the
+    # work, since jobs share its memory and gain less from running side by side
+    # (benchmarks/README.md).
     workers: int | None = None
-    dask: str | None = None  # address of a Dask scheduler whose workers run the jobs instead
-    # An NbtrackError of one job stands among the results, also in place of the results of jobs that
-    # need it. The others still run.
+    dask: str | None = None  # address of a Dask scheduler, whose workers run the jobs instead
+    # Whether the other jobs still run when one raises an NbtrackError. The error is then returned
+    # in place of the result, also for jobs that need the failed one.
     keep_going: bool = False
 
     def __post_init__(self) -> None:
@@ -98,9 +103,9 @@ class Execution:
 
 
 def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[Any]:
-    """The results of all jobs, in order; those that are missing, and what they need, are made.
+    """The results of all jobs, in order. Missing ones, and the jobs that they need, are run.
 
-    Raises what the first failing job raised, unless it is to keep going.
+    Raises the NbtrackError of the first job that fails; with `keep_going` it is a result instead.
     """
     execution = execution or Execution()
     waves = _waves(jobs)
@@ -109,38 +114,40 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
     bar = ProgressBar(Job.doing, sum(job.work for job in missing.values()))
 
     def show(running: Mapping[Path, tuple[float, str]]) -> None:
-        """Move the bar to what ended, and the shares of jobs that run; the first has its status."""
+        """Move the bar; `running` has by folder the share of work done and the status of a job."""
         ended = sum(missing[folder].work for folder in outcomes)
         worked = ended + sum(missing[folder].work * share for folder, (share, _) in running.items())
         # Compilation makes the first frame slow, which says nothing of the time that is left.
         if worked > ended and not bar.warm_up_work:
             bar.end_warm_up(worked)
-        folder, (_, status) = next(iter(running.items()))
-        bar.set_description_str(missing[folder].doing, refresh=False)
-        status = f"{missing[folder].name}: {status}"
+        first, *_ = running  # the job whose status is shown
+        bar.set_description_str(missing[first].doing, refresh=False)
+        status = f"{missing[first].name}: {running[first][1]}"
         bar.move_to(worked, f"{len(outcomes)} of {len(missing)} done, {status}")
 
     def settle(folder: Path, outcome: Any) -> None:
+        """Keep the outcome of a job, or raise it if it is an error that ends all."""
         if isinstance(outcome, NbtrackError) and not execution.keep_going:
             raise outcome
         outcomes[folder] = outcome
 
-    # Whatever ends the block, the workers end with it at once.
+    # When the block ends, also by an error, the workers end at once.
     with bar, _workplace(execution, max(map(len, waves), default=0)) as workplace:
         for wave in waves:
             for folder, outcome in _outcomes(wave, outcomes, show, workplace):
                 settle(folder, outcome)
                 show({folder: (0.0, "done")})
     for job in jobs:
-        if job.folder not in outcomes:
+        if job.folder not in outcomes:  # it was done before: its result is only read
             settle(job.folder, _caught(job.result))
     return [outcomes[job.folder] for job in jobs]
 
 
 def _waves(jobs: Sequence[Job]) -> list[dict[Path, Job]]:
-    """Missing jobs by folder, in waves that run one after the other: each needs only earlier ones.
+    """The jobs that are not done, and those that they need, in groups that run one after the other.
 
-    Of tracked runs in corrected maps these are plain maps, corrected maps and runs.
+    A group maps folders to jobs, which need only jobs of earlier groups. For tracked runs in
+    corrected maps the groups are plain maps, corrected maps, and runs.
     """
     waves = []
     wave = {job.folder: job for job in jobs if not job.is_done}
@@ -152,17 +159,23 @@ def _waves(jobs: Sequence[Job]) -> list[dict[Path, Job]]:
 
 
 def _workplace(execution: Execution, n_jobs: int) -> AbstractContextManager[Workplace | None]:
-    """Where the jobs run side by side; None where they run in this process, one after the other."""
+    """The workplace where at most `n_jobs` jobs run side by side.
+
+    It is None if jobs run in this process, one after the other.
+    """
+    if execution.dask is not None:
+        images_of.cache_clear()  # as below: workers may be on this machine
+        return cluster(execution.dask, n_jobs)
     usual = device.usable_cores() if device.choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, n_jobs)
-    if execution.dask is None and workers <= 1:
+    if workers <= 1:
         return nullcontext()
-    images_of.cache_clear()  # what was read here takes memory that workers need
-    return cluster(execution.dask, n_jobs) if execution.dask else processes(workers)
+    images_of.cache_clear()  # images that this process has read take memory that workers need
+    return processes(workers)
 
 
 def _caught(work: Callable, *arguments: Any) -> Any:
-    """What a call returns, or the NbtrackError that ended it."""
+    """What a call of `work` returns, or the NbtrackError that it raises."""
     try:
         return work(*arguments)
     except NbtrackError as error:
@@ -170,21 +183,23 @@ def _caught(work: Callable, *arguments: Any) -> Any:
 
 
 def _outcomes(wave: Mapping, before: Mapping, show: Callable, place: Workplace | None) -> Pairs:
-    """Pairs of folder and outcome, as the jobs of a wave end.
+    """Run the jobs of a wave; yields the folder and the outcome of each job when it ends.
 
-    `before` are the outcomes of earlier waves. A job that is in two waves has its outcome there.
-    `show` is that of `run_jobs`.
+    `before` holds the outcomes of earlier waves, by folder. `show` reports progress, as in
+    `run_jobs`. Jobs run in this process if `place` is None.
     """
+    # A job may be in two waves; it has run in the first one then.
     ready = {folder: job for folder, job in wave.items() if folder not in before}
-    for folder, job in wave.items():
+    for folder, job in [*ready.items()]:
         needed = before.get(job.needs.folder) if job.needs else None
-        if isinstance(needed, NbtrackError) and ready.pop(folder, None):
+        if isinstance(needed, NbtrackError):
+            del ready[folder]
             yield folder, NbtrackError(f"not run, because {job.needs.name} failed: {needed}")
     if place:
         yield from _elsewhere(ready, show, place)
         return
     for folder, job in ready.items():
-        # A default argument, since the loop changes `folder`.
+        # A default argument keeps this folder: the loop changes the variable.
         def report(share: float, status: str, folder: Path = folder) -> None:
             show({folder: (share, status)})
 
@@ -192,9 +207,9 @@ def _outcomes(wave: Mapping, before: Mapping, show: Callable, place: Workplace |
 
 
 def _elsewhere(jobs: Mapping[Path, Job], show: Callable, place: Workplace) -> Pairs:
-    """Pairs of folder and outcome of jobs that run side by side, as they end.
+    """Run jobs side by side; yields the folder and the outcome of each job when it ends.
 
-    Where a process dies, that is the outcome of the job that ran there.
+    If a process dies, the outcome of the job that ran in it is an NbtrackError.
     """
     waiting = [*jobs]
     running: dict[Future, tuple[Path, Executor]] = {}
@@ -214,47 +229,50 @@ def _elsewhere(jobs: Mapping[Path, Job], show: Callable, place: Workplace) -> Pa
 
 
 def _submit(job: Job, executor: Executor, n_threads: int) -> Future:
-    """Begin a job elsewhere; the future gives its outcome.
+    """Begin a job in the process of an executor; the future gives its outcome.
 
-    Folders, device, search path, fields and trackers there are those of this process. Classes of a
-    notebook or script travel whole, those of files by the name of their module.
+    The process gets the folders, device, search path, fields and trackers of this one. A class from
+    a notebook or script is pickled with its code, a class from a file by the name of its module.
     """
     settings = {name: text for name, text in os.environ.items() if name.startswith("NBTRACK_")}
     settings |= {"NBTRACK_RUNS": str(runs_folder()), "NBTRACK_DATA": str(data_folder())}
-    _progress_file(job).unlink(missing_ok=True)  # of an attempt that was killed
+    _progress_file(job).unlink(missing_ok=True)  # an attempt that was killed has left it
     work = cloudpickle.dumps((FIELDS, TRACKERS, job))
     return executor.submit(_outcome_there, settings, sys.path, n_threads, work)
 
 
 def _outcome_there(settings: Mapping, search_path: list[str], n_threads: int, work: bytes) -> Any:
-    """What becomes of a job: runs in a worker, which may have been started elsewhere."""
+    """Run a job in a worker process, which may be on another machine; returns its outcome.
+
+    The arguments are those that `_submit` sends.
+    """
     os.environ |= settings
-    # Before the work is unpickled, which imports the modules of its classes.
+    # The path comes before the unpickling, which imports the modules of the job's classes.
     sys.path += [folder for folder in search_path if folder not in sys.path]
     fields, trackers, job = pickle.loads(work)
     FIELDS.update(fields)
     TRACKERS.update(trackers)
-    last = -_LOOK_SECONDS
+    last_written = -_LOOK_SECONDS
 
     def report(share: float, status: str) -> None:
-        nonlocal last
-        if share == 0 or time.monotonic() - last >= _LOOK_SECONDS:
+        nonlocal last_written
+        if share == 0 or time.monotonic() - last_written >= _LOOK_SECONDS:
             write_atomic(_progress_file(job), json.dumps([share, status]))
-            last = time.monotonic()
+            last_written = time.monotonic()
 
     with device.threads(n_threads):
         return _caught(job.make, report)
 
 
 def _progress_file(job: Job) -> Path:
-    """Where a job that runs elsewhere tells how far it is: its share and a word on how it goes."""
+    """The file by which a job in another process reports its share of work done and its status."""
     return job.lock.with_suffix(".progress")
 
 
 def _progress_of(job: Job) -> tuple[float, str]:
-    """How far a job that runs elsewhere is, and how it goes, as it said last."""
+    """The share of work done and the status that a job in another process reported last."""
     try:
         share, status = json.loads(_progress_file(job).read_text("utf-8"))
-    except (OSError, ValueError):  # it has said nothing yet
+    except (OSError, ValueError):  # it has reported nothing yet
         return 0.0, "running"
     return share, status

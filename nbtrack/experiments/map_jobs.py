@@ -1,4 +1,4 @@
-"""Maps as jobs: made from a scene, or given."""
+"""Maps as jobs. A map is made from a scene, or is a finished one that the user gives."""
 
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -25,41 +25,41 @@ from nbtrack.mapping.fit import map_sequence
 from nbtrack.plots.scene import up_of
 from nbtrack.recordings.reading import read_frames
 
-_FRAMES_LOOKED_AT = 20  # at most, to estimate a map's unit before there is a map
+_FRAMES_LOOKED_AT = 20  # at most so many, to estimate the unit of a map before the map is made
 
 
 @dataclass(frozen=True)
 class MapJob(Job):
-    """One map: a field fitted to some frames of a scene, and perhaps corrected by them.
+    """One map: a field that is fitted to some frames of a scene, and perhaps corrected by them.
 
-    One that the user gave is only read: it has no scene.
+    A map that the user gives is only read, and has no scene.
     """
 
     scene: Scene | None
     field: str
-    network: Any  # settings of the field's network; None where it has none
+    network: Any  # settings of the field's network; None if the field has no network
     settings: Any  # of the mapping
-    frames: str = ":"
+    frames: str = ":"  # the slice of the scene's frames that are mapped
     seed: int = 0
-    correction_voxel: float = 0.0  # m, of the cells in which the map is corrected; 0: it is not
-    # m, of the cells in which the job that needs this map will correct it. The size is only checked
-    # before this map is made, which takes minutes.
+    correction_voxel: float = 0.0  # m, the size of the cells of the correction; 0: no correction
+    # m, the size of the cells of a correction that another job will make of this map. It is only
+    # checked: if it is too fine, this job fails at once, and not that one after minutes of mapping.
     later_voxel: float = field(default=0.0, compare=False)
-    given: Path | None = None  # the user's own map: its folder, or file
+    given: Path | None = None  # the folder or file of the map that the user gives
 
     kind, doing = "maps", "mapping"
-    work = 4.0  # with `smoke` it asks the field about as many queries as four tracked runs
+    work = 4.0  # with the preset `smoke`, mapping queries the field about as often as four runs
 
     @classmethod
     def of(cls, scene: Scene, field: str, preset: Preset, frames: str = ":", seed: int = 0) -> Self:
-        """The map of a scene with the settings of a preset."""
+        """The job of a scene's map with the settings of a preset."""
         network, settings = preset.network_of(field), preset.mapping_of(field)
         seed, voxel = whole_number("seed", seed), preset.correction.get(field, 0.0)
         return cls(scene, field, network, settings, frames, seed, voxel)
 
     @classmethod
     def of_given(cls, path: Path) -> Self:
-        """A finished map that the user gave. Raises as `read_map` does."""
+        """The job of a finished map that the user gives. Raises as `read_map` does."""
         finished = _stored(path)
         name, record = finished.field.name, finished.record
         network, settings = record["network"], record["settings"]
@@ -68,9 +68,9 @@ class MapJob(Job):
 
     @property
     def setting_tree(self) -> dict[str, Any]:
-        """Its settings as a tree of the form of `Preset.settings`."""
+        """The map's settings as a tree, in the form of `Preset.settings`."""
         defaults = default_settings()
-        # A field that has no network settings of its own has those of NeuS.
+        # A field without network settings of its own uses those of NeuS.
         of_network = self.field if self.field in defaults["network"] else "neus"
         is_correctable = self.field in defaults["correction"]
         return {
@@ -83,7 +83,7 @@ class MapJob(Job):
     def key(self) -> str:
         """A digest of code, device, data, settings and seed.
 
-        For a given map it is one of code, device and the key that is stored with the map.
+        The digest of a given map is of code, device, and the key that is stored with the map.
         """
         code = provenance.code_fingerprint(field_class(self.field))
         if self.given:
@@ -94,20 +94,23 @@ class MapJob(Job):
 
     @property
     def name(self) -> str:
-        """Scene and field, and the seed if it is not the first."""
+        """The scene and the field, whether the map is corrected, and the seed if it is not 0."""
         name = f"{self.scene.name}-{self.field}{'-corrected' if self.correction_voxel else ''}"
         return f"{name}-seed{self.seed}" if self.seed else name
 
     @cached_property
     def needs(self) -> "MapJob | None":
-        """The map that this one corrects, if it is a corrected one."""
-        if not self.correction_voxel:
+        """The job of the plain map that a corrected map is made from.
+
+        None for a plain map, and for a given map, which is not made.
+        """
+        if self.given or not self.correction_voxel:
             return None
         return replace(self, correction_voxel=0.0, later_voxel=self.correction_voxel)
 
     @property
     def folder(self) -> Path:
-        """Where its files are in the cache; of a given map the user's folder or file."""
+        """The map's folder in the cache; for a given map the user's folder or file."""
         return self.given or super().folder
 
     @property
@@ -116,28 +119,31 @@ class MapJob(Job):
         return self.given is not None or (self.folder / MAP_FILE).is_file()
 
     def result(self) -> dict[str, Any]:
-        """How the finished map was made, and its scores."""
+        """A record of how the finished map was made, with its scores."""
         return deepcopy(_stored(self.folder).record)
 
     def map(self) -> Map:
-        """The finished map, ready for tracking: a copy of that in the cache."""
+        """The finished map on the device that computes; a copy, which the caller may change."""
         finished = deepcopy(_stored(self.folder))
         return replace(finished, field=finished.field.to(choose_device()))
 
     def compute(self, report: Report) -> dict[str, Any]:
-        """Map and score, or resume from a checkpoint; write the map's files. Returns its record."""
+        """Make the map, or resume from a checkpoint; score it and write its files.
+
+        Returns the map's record.
+        """
         checkpoint = self.folder / CHECKPOINT_FILE
 
         def report_losses(share: float, losses: dict[str, float | int]) -> None:
             report(share, " ".join(f"{name} {loss:.3f}" for name, loss in losses.items()))
 
         sequence = self.scene.read(self.frames)
-        if self.later_voxel:  # raises now what would else be raised after minutes of mapping
+        if self.later_voxel:  # raises an error if cells of this size are too fine
             checked_size(observed_bounds(sequence), self.later_voxel, f"correction.{self.field}")
         if self.needs:
             finished = correct_map(self.needs.map(), sequence, self.correction_voxel)
         else:
-            # `code` is the key, so that no checkpoint of another key is resumed.
+            # The key as `code` makes a checkpoint of another key an error.
             finished = map_sequence(
                 self.field, sequence, self.network, self.settings, self.seed, choose_device(),
                 checkpoint=checkpoint, on_iteration=report_losses, code=self.key,
@@ -157,7 +163,7 @@ class MapJob(Job):
 
 
 def map_unit(job: MapJob) -> float:
-    """Metres a unit of a map; an estimate for one that is still to be made."""
+    """Metres in a unit of a job's map; an estimate if the map is still to be made."""
     if job.is_done:
         return job.map().field.bounds.metres_per_unit
     return _rough_unit(job.scene, job.frames)
@@ -165,16 +171,16 @@ def map_unit(job: MapJob) -> float:
 
 @lru_cache
 def _rough_unit(scene: Scene, frames: str) -> float:
-    """Metres a unit of the map that will be made, estimated from a few of its frames."""
+    """Metres in a unit of a map of some frames of a scene, estimated from a few of them."""
     ids = scene.select(frames)
-    some = ids[np.linspace(0, len(ids) - 1, min(len(ids), _FRAMES_LOOKED_AT)).astype(int)]
-    return observed_bounds(read_frames(scene.recording, some)).metres_per_unit
+    places = np.linspace(0, len(ids) - 1, min(len(ids), _FRAMES_LOOKED_AT)).astype(int)
+    return observed_bounds(read_frames(scene.recording, ids[places])).metres_per_unit
 
 
 def _stored(path: Path) -> Map:
-    """The map of a folder or file, read once in this process.
+    """The map in a folder or file.
 
-    It is read again where its files changed, or where a class was registered since.
+    Its files are read again only if they changed, or if a class of fields was registered since.
     """
     path = absolute(path)
     parts = (path / MAP_FILE, path / HISTORY_FILE) if path.is_dir() else (path,)
@@ -184,9 +190,9 @@ def _stored(path: Path) -> Map:
 
 @lru_cache(maxsize=4)
 def _read(path: Path, modified_ns: tuple[int, ...], fields: tuple) -> Map:
-    """The map of a folder or file, kept for all runs in it: reading a corrected one takes seconds.
+    """The map in a folder or file, kept in memory for all runs in it.
 
-    `modified_ns` and `fields` only belong to the cache's key: where one changes, the files are read
-    again.
+    Reading a corrected map takes seconds. `modified_ns` (the times of the files, in ns) and
+    `fields` (the registered classes) are only parts of the key under which the map is kept.
     """
     return read_map(path)

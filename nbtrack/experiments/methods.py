@@ -1,4 +1,4 @@
-"""Which methods the tables have as rows, and the command line takes."""
+"""Which methods are rows of the tables, and which method the command line means."""
 
 from nbtrack.fields import field_class
 from nbtrack.machinery.errors import ConfigError
@@ -6,7 +6,7 @@ from nbtrack.tracking import TRACKERS, tracker_class
 from nbtrack.tracking.methods import METHODS, Method, find_methods
 
 DEFAULT_METHOD = "corrected"
-"""What the command line takes where nothing is named: the most accurate, and fast."""
+"""The method of the command line if none is named: the most accurate one, which is also fast."""
 TABLE_1 = ("vr", "sdf")
 """The rows of the paper's Table I."""
 TABLE_3 = (
@@ -14,18 +14,21 @@ TABLE_3 = (
     "baked", "neus_corrected", "corrected_sparse", "corrected", "corrected_dense",
     "corrected_geometry", "icp", "icp_middle", "icp_dense",
 )  # fmt: skip
-"""The paper's methods beside those that go beyond it."""
+"""The rows of Table III: the paper's methods beside those that go beyond it."""
 RATES_3_HZ = (30.0, 10.0, 5.0, 2.0)
-"""The rates of Table III: the paper's, and that of the camera itself."""
+"""The rates of Table III: the paper's three, and the 30 Hz of the camera itself."""
 
 
 def method_of(name: str | None, field: str | None, tracker: str | None) -> Method:
-    """A row of `METHODS` by its name, or a free combination of a field and a tracker.
+    """The method that a user means by a name, or by a field, a tracker or both.
 
-    A field alone takes the first tracker that works in it, of lm, icp, vr and then all others. A
-    tracker alone takes the field of the first row that has it, or NeuS. Without anything it is
-    `DEFAULT_METHOD`. Raises ConfigError for a name beside the others, for a field in which no
-    tracker works, and as `find_methods` does.
+    A name means a row of `METHODS`. A field alone is combined with the first tracker that works in
+    it, in the order lm, icp, vr, all others. A tracker alone is combined with the field of the
+    first row of `METHODS` that has this tracker, or with NeuS if none has it. Without any argument
+    it is `DEFAULT_METHOD`.
+
+    Raises ConfigError for a name together with a field or tracker, for a field in which no tracker
+    works, and as `find_methods` does.
     """
     if name and (field or tracker):
         raise ConfigError("--method names a field and a tracker: leave --field and --tracker out")
@@ -38,5 +41,6 @@ def method_of(name: str | None, field: str | None, tracker: str | None) -> Metho
             raise ConfigError(f"no tracker works on field {field!r}: register one of your own")
         tracker = fits[0]
     if field is None:
-        field = next((row.field for row in METHODS.values() if row.tracker == tracker), "neus")
+        fields = [row.field for row in METHODS.values() if row.tracker == tracker]
+        field = fields[0] if fields else "neus"
     return find_methods([Method(f"{field_class(field).label} with {tracker}", field, tracker)])[0]

@@ -1,4 +1,4 @@
-"""From what a user calls a sequence to a folder on disk: a path, a room, a scene of the dataset."""
+"""Find the folder of what a user calls a sequence: a path, a room or a scene of the dataset."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,33 +23,33 @@ _KNOWN = [*ROOMS, *DATASET_SCENES]
 
 @dataclass(frozen=True)
 class Scene:
-    """A sequence on disk, opened when it is first needed."""
+    """A sequence on disk, which is opened when it is first needed."""
 
     name: str
     folder: Path
-    format: str | None = None  # None: told by the files that are there
-    made: ScenesConfig | None = None  # the settings of a synthetic room that was made in the cache
+    format: str | None = None  # None: the files in the folder tell it
+    made: ScenesConfig | None = None  # settings of a synthetic room in the cache; None for others
 
     @property
     def room(self) -> Room | None:
-        """The exact geometry, if the scene is a synthetic room."""
+        """The exact geometry of a synthetic room; None for any other scene."""
         return room_of(self.folder)
 
     @cached_property
     def recording(self) -> Recording:
-        """Its files, poses and calibration. Raises as `open_recording` does."""
+        """The scene's files, poses and calibration. Raises as `open_recording` does."""
         return open_recording(self.folder, self.format)
 
     @cached_property
     def fingerprint(self) -> str:
-        """Changes with what is read."""
+        """Twelve hexadecimal digits that change with anything that is read of the scene."""
         return fingerprint(*images_of(self.recording).contents())
 
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
-        """The frames of a slice such as `10:50:2`, without depths that are outliers.
+        """Read the frames of a slice such as `10:50:2`, and set depths that are outliers to 0.
 
-        More options, and what is raised, are those of `read_frames`. Images are read-only: they are
-        shared by all that read this scene, also by what maps it.
+        Takes the other options of `read_frames`, and raises as it does. Images are read-only, since
+        all who read this scene share them, also the job that maps it.
         """
         frame_ids = reading.parse_frames(frames)
         read = reading.without_outliers(reading.read_frames(self.recording, frame_ids, **options))
@@ -57,26 +57,27 @@ class Scene:
         return read
 
     def select(self, frames: str, needs_poses: bool = True) -> Frames:
-        """Numbers of the frames of a slice; raises as `select_frames` does."""
+        """The numbers of the frames in a slice as `10:50:2`; raises as `select_frames` does."""
         return reading.select_frames(self.recording, reading.parse_frames(frames), needs_poses)
 
 
 def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) -> Scene:
-    """The scene that a user means.
+    """The scene that a user means by `sequence`.
 
-    It is a folder in a supported layout, the name of a synthetic room (made here at the size that
-    the preset gives, unless it is there already), or of a scene of the Neural RGB-D dataset below
-    the data folder. A folder of that name comes first, unless nbtrack wrote its results there. The
-    format of a folder is by default told by its files. Raises ConfigError where there is no such
-    folder, room or scene; MissingError where the scene of the dataset was not downloaded.
+    It is a path of a folder in a supported layout, the name of a synthetic room, or the name of a
+    scene of the Neural RGB-D dataset below the data folder. A room is made in the cache, at the
+    size that the preset gives, if it is not there. If a path and a name are the same text, the
+    folder is meant, unless it holds results of nbtrack. Without `format` a folder's files tell it.
+    Raises ConfigError if there is no such folder, room or scene, and MissingError if the scene of
+    the dataset was not downloaded.
     """
     check_kind(Preset, preset=preset)
     text = str(sequence)
     folder = absolute(sequence)
-    # A room or scene comes before a file of its name, and before a folder with nbtrack's results.
-    is_hidden = text in _KNOWN and (folder.is_file() or is_own_output(folder))
-    # Opening another plain file raises an error that says what to give instead.
-    if (folder.is_dir() or folder.is_file()) and not is_hidden:
+    # The name of a room or scene also wins over a plain file.
+    is_name = text in _KNOWN and (folder.is_file() or is_own_output(folder))
+    # Any other plain file becomes a scene whose opening raises an error that says what to give.
+    if (folder.is_dir() or folder.is_file()) and not is_name:
         if text in _KNOWN:
             tell(f"{text}: the folder {folder} is read, not the room or scene of that name")
         return Scene(folder.name, folder, format)
@@ -93,34 +94,37 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
 
 
 def open_scenes(preset: Preset) -> list[Scene]:
-    """The preset's scenes; synthetic rooms that are not there are made.
+    """Open the scenes that the preset names; synthetic rooms that are not there are made.
 
-    Scenes that lack a folder, or whose folder is damaged, are left out, and a line names them.
-    Raises ConfigError where no name is given, or one twice, or an unknown one; where no scene is
-    whole, what is wrong with the first.
+    A scene whose folder is missing or damaged is left out, and a printed line says so. If this
+    happens to all scenes, the error of the first one is raised. Raises ConfigError if the preset
+    names no scene, names an unknown one, or names two by paths with the same last part, which is
+    the scene's name in tables.
     """
     check_kind(Preset, preset=preset)
     names = preset.scenes.names
-    if not names or len({Path(name).name for name in names}) < len(names):
+    last_parts = {Path(name).name for name in names}
+    if not names or len(last_parts) < len(names):
         given = ", ".join(names) or "(none)"
         raise ConfigError(f"scenes {given}: give at least one, and of one name only one")
-    scenes, missing = [], {}
+    scenes, errors = [], {}
     for name in names:
         try:
             scene = open_scene(name, preset)
             scene.select(":")  # opens the recording, so that a damaged folder is found here
             scenes.append(scene)
         except (MissingError, DataError) as error:
-            missing[name] = error
+            errors[name] = error
     if not scenes:
-        raise missing[names[0]]
-    if missing:
-        tell(f"missing, and left out: {', '.join(missing)} ({next(iter(missing.values()))})")
+        raise errors[names[0]]
+    if errors:
+        first_error, *_ = errors.values()
+        tell(f"missing, and left out: {', '.join(errors)} ({first_error})")
     return scenes
 
 
 def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
-    """Write a synthetic room as a sequence folder, and show a progress bar."""
+    """Render a synthetic room and write it as a sequence folder, with a progress bar."""
     n_frames, seed, motion = config.n_frames, config.seed, config.motion
     width, height = config.width, config.width * 3 // 4
     with ProgressBar(f"room {name}", n_frames) as bar:
@@ -128,7 +132,10 @@ def write_room(name: str, folder: Path, config: ScenesConfig) -> None:
 
 
 def _room(name: str, config: ScenesConfig) -> Scene:
-    """The recording of a synthetic room with these `SIZES`, in the cache, made if missing."""
+    """A synthetic room with the motion, frames, width and seed of `config`, in the cache.
+
+    It is made if it is not there.
+    """
     recipe = f"{config.motion}-{config.n_frames}x{config.width}-seed{config.seed}"
     folder = runs_folder() / "rooms" / f"{name}-{recipe}-{room_version(name)}" / name
     if not folder.is_dir():  # `write_sequence` puts it in place when it is complete
